@@ -1,0 +1,93 @@
+"""Near-infrared eye images through refractive corneas, with exact labels.
+
+The public names below are all there is to import; they load their modules on first use, so `import eyerender` loads
+neither Mitsuba nor OpenCV.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .capture import render_folder, render_windows
+    from .comparison import Comparison, compare
+    from .errors import BackendError, EyerenderError, InputError
+    from .eye.catalogue import load_eye
+    from .eye.model import Eye
+    from .eye.spec import EyeSpec
+    from .gaze.regression import PupilGlintRegression
+    from .gaze.validation import GazeErrors, leave_one_target_out
+    from .imagefolder import ImageFolder
+    from .observation import Observations
+    from .observers import AnalyticObserver, ImageObserver
+    from .report.comparison import write_report
+    from .rig.rig import Rig
+    from .scene import Scene, SceneSpec, load_scene, shipped_scenes
+
+_HOMES = {
+    "AnalyticObserver": "observers",
+    "BackendError": "errors",
+    "Comparison": "comparison",
+    "Eye": "eye.model",
+    "EyeSpec": "eye.spec",
+    "EyerenderError": "errors",
+    "GazeErrors": "gaze.validation",
+    "ImageFolder": "imagefolder",
+    "ImageObserver": "observers",
+    "InputError": "errors",
+    "Observations": "observation",
+    "PupilGlintRegression": "gaze.regression",
+    "Rig": "rig.rig",
+    "Scene": "scene",
+    "SceneSpec": "scene",
+    "compare": "comparison",
+    "leave_one_target_out": "gaze.validation",
+    "load_eye": "eye.catalogue",
+    "load_scene": "scene",
+    "render_folder": "capture",
+    "render_windows": "capture",
+    "shipped_scenes": "scene",
+    "write_report": "report.comparison",
+}
+
+__all__ = [
+    "AnalyticObserver",
+    "BackendError",
+    "Comparison",
+    "Eye",
+    "EyeSpec",
+    "EyerenderError",
+    "GazeErrors",
+    "ImageFolder",
+    "ImageObserver",
+    "InputError",
+    "Observations",
+    "PupilGlintRegression",
+    "Rig",
+    "Scene",
+    "SceneSpec",
+    "__version__",
+    "compare",
+    "leave_one_target_out",
+    "load_eye",
+    "load_scene",
+    "render_folder",
+    "render_windows",
+    "shipped_scenes",
+    "write_report",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("eyerender")
+    if name in _HOMES:
+        return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

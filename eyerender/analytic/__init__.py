@@ -1,0 +1,1 @@
+"""The analytic observer: features of eyes by ray optics."""

@@ -1,0 +1,245 @@
+"""Features of eyes in cameras by ray optics: the apparent pupil, the glints, further Purkinje images.
+
+A batch is n (frame, eye) pairs: eyes, their poses and positions, the camera that sees each. Work is cut into chunks whose
+arrays stay in the cache, so memory beyond the result is bounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..errors import InputError
+from ..eye.batch import stack_eyes, structure_of, take_eyes
+from ..eye.fixation import Fixations, FixationStatus, LineOfSightKind, fixate
+from ..eye.model import Eye
+from ..eye.pose import Poses, rigid_motion
+from ..geometry.ellipse import fit_ellipse_direct
+from ..geometry.surfaces import Xyz
+from ..optics.trace import RayStatus
+from ..rig.camera import Camera, distort
+from .rays import glint_exits, pupil_exits
+
+Statuses = npt.NDArray[np.int8]
+
+CHUNK_POINTS = 5000
+"""Points refracted at once: about 30 arrays of this length stay in a core's second-level cache."""
+BEHIND_CAMERA = 100
+"""Status beside those of `RayStatus`: the point lies behind the camera."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features(ArrayValue):
+    """What cameras see of n eyes; pixels are full-sensor, NaN where the status is not 0.
+
+    points_px (n, k, 2), point_status (n, k), point_residual_mm (n, k): the pupil's boundary. centre_px (n, 2),
+    semi_axes_px (n, 2), angle_rad (n,), ellipse_residual_px (n,): its direct least-squares ellipse and how far (rms) the
+    boundary is from one. anatomical_centre_px (n, 2): the image of the stop's centre. glints_px (n, m, p, 2),
+    glint_status, glint_residual_mm (n, m, p): for each of m lights the Purkinje images asked for, the first is the glint.
+    pupil_in_image (n,), glint_in_image (n, m, p).
+    """
+
+    points_px: Floats
+    point_status: Statuses
+    point_residual_mm: Floats
+    centre_px: Floats
+    semi_axes_px: Floats
+    angle_rad: Floats
+    ellipse_residual_px: Floats
+    anatomical_centre_px: Floats
+    pupil_in_image: Bools
+    glints_px: Floats
+    glint_status: Statuses
+    glint_residual_mm: Floats
+    glint_in_image: Bools
+
+    @property
+    def pupil_status(self) -> Statuses:
+        """The first boundary point's status that is not 0, or 0, (n,)."""
+        first = np.argmax(self.point_status != 0, axis=1)
+        return np.asarray(self.point_status[np.arange(len(first)), first])
+
+    def __len__(self) -> int:
+        return len(self.centre_px)
+
+
+def fixations(
+    eyes: Sequence[Eye],
+    eye_index: npt.ArrayLike,
+    target_mm: npt.ArrayLike,
+    position_mm: npt.ArrayLike,
+    line_of_sight: LineOfSightKind = "chief_ray",
+) -> Fixations:
+    """Poses of n eyes (`eyes[eye_index]`, apexes at `position_mm` in the world, head included) that fixate targets."""
+    which = np.asarray(eye_index, dtype=np.intp)
+    seen = np.asarray(target_mm, dtype=np.float64) - np.asarray(position_mm, dtype=np.float64)
+    n = len(which)
+    angles = np.zeros((n, 3))
+    residual, status = np.zeros(n), np.zeros(n, dtype=np.int8)
+    point, way = np.zeros((n, 3)), np.zeros((n, 3))
+    for group, rows in _groups(eyes, which):
+        size = max(1, CHUNK_POINTS // 6) if line_of_sight == "entrance_window" else CHUNK_POINTS
+        for part, local in _chunks(group, rows, size):
+            found = fixate(local, seen[part], line_of_sight)
+            poses = found.poses
+            angles[part] = np.stack([poses.azimuth_rad, poses.elevation_rad, poses.torsion_rad], axis=-1)
+            residual[part], status[part] = found.residual_mm, found.status
+            point[part], way[part] = found.line_of_sight_mm, found.line_of_sight_direction
+    return Fixations(Poses(*angles.T), frozen(residual), frozen(status, np.int8), frozen(point), frozen(way))
+
+
+def features(
+    eyes: Sequence[Eye],
+    eye_index: npt.ArrayLike,
+    poses: Poses,
+    position_mm: npt.ArrayLike,
+    cameras: Sequence[Camera],
+    camera_index: npt.ArrayLike,
+    lights_mm: npt.ArrayLike,
+    *,
+    boundary_points: int = 30,
+    purkinje: Sequence[int] = (1,),
+) -> Features:
+    """Features of n eyes.
+
+    eyes, eye_index (n,) : which eye each row is. poses : of n. position_mm (n, 3) : the unrotated apex in the world, the
+    head's displacement included. cameras, camera_index (n,). lights_mm (m, 3) in the world. boundary_points : >= 6.
+    purkinje : orders of the images wanted of each light; one that an eye lacks has status MISSED.
+    """
+    if boundary_points < 6:
+        raise InputError("must be >= 6", path="boundary_points")
+    if not set(purkinje) <= {1, 2, 3, 4} or len(set(purkinje)) != len(purkinje):
+        raise InputError("must be different numbers from 1 to 4", path="purkinje")
+    which = np.asarray(eye_index, dtype=np.intp)
+    cams = np.asarray(camera_index, dtype=np.intp)
+    position = np.broadcast_to(np.asarray(position_mm, dtype=np.float64), (len(which), 3))
+    lights = np.asarray(lights_mm, dtype=np.float64).reshape(-1, 3)
+    n, m, p = len(which), len(lights), len(purkinje)
+    points, anatomical = np.full((n, boundary_points, 2), np.nan), np.full((n, 2), np.nan)
+    point_status = np.zeros((n, boundary_points), dtype=np.int8)
+    point_residual = np.full((n, boundary_points), np.nan)
+    ellipse, in_image = np.full((n, 6), np.nan), np.zeros(n, dtype=bool)
+    glints, glint_residual = np.full((n, m, p, 2), np.nan), np.full((n, m, p), np.nan)
+    glint_status, glint_in_image = np.zeros((n, m, p), dtype=np.int8), np.zeros((n, m, p), dtype=bool)
+    for group, rows in _groups(eyes, which):
+        for number in np.unique(cams[rows]):
+            camera = cameras[number]
+            for part, local in _chunks(group, rows[cams[rows] == number], max(1, CHUNK_POINTS // boundary_points)):
+                view = _View.of(local, _pose_rows(poses, part), position[part], camera)
+                # The last point is the stop's centre.
+                exits, residual, status = pupil_exits(local, boundary_points, view.camera_mm)
+                pixels, status = view.project(exits, status)
+                points[part], anatomical[part] = pixels[:, :-1], pixels[:, -1]
+                point_status[part], point_residual[part] = status[:, :-1], residual[:, :-1]
+                fit = fit_ellipse_direct(pixels[:, :-1])
+                ellipse[part, :2], ellipse[part, 2:4] = fit.centre_px, fit.semi_axes_px
+                ellipse[part, 4], ellipse[part, 5] = fit.angle_rad, fit.residual_px
+                in_image[part] = camera.in_image(pixels[:, :-1]).all(axis=1)
+                for j, order in enumerate(purkinje):
+                    exits, residual, status = glint_exits(local, order, view.into_eye(lights), view.camera_mm)
+                    pixels, status = view.project(exits, status)
+                    glints[part, :, j], glint_status[part, :, j] = pixels, status
+                    glint_residual[part, :, j], glint_in_image[part, :, j] = residual, camera.in_image(pixels)
+    return Features(
+        frozen(points),
+        frozen(point_status, np.int8),
+        frozen(point_residual),
+        frozen(ellipse[:, :2]),
+        frozen(ellipse[:, 2:4]),
+        frozen(ellipse[:, 4]),
+        frozen(ellipse[:, 5]),
+        frozen(anatomical),
+        frozen(in_image, bool),
+        frozen(glints),
+        frozen(glint_status, np.int8),
+        frozen(glint_residual),
+        frozen(glint_in_image, bool),
+    )
+
+
+def reason_of(status: int) -> str:
+    """A point's status in words."""
+    return "behind the camera" if status == BEHIND_CAMERA else RayStatus(status).reason
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """One camera's view of a chunk of turned eyes: x_cam = R x_eye + t for each, and the camera in the eye frame."""
+
+    rotation: Floats
+    translation: Floats
+    camera_mm: Xyz
+    motion: tuple[Floats, Floats]
+    camera: Camera
+
+    @classmethod
+    def of(cls, eye: Eye, poses: Poses, position_mm: Floats, camera: Camera) -> _View:
+        turn, shift = rigid_motion(poses, eye)
+        whole = shift + position_mm
+        rotation = np.asarray(camera.R) @ turn
+        translation = whole @ np.asarray(camera.R).T + camera.t
+        # The nodal point in the eye frame: R^T (0 - t).
+        at = -np.einsum("nij,ni->jn", rotation, translation)
+        return cls(rotation, translation, (at[0], at[1], at[2]), (turn, whole), camera)
+
+    def into_eye(self, points_mm: Floats) -> Xyz:
+        """World points (m, 3) in each eye's frame: three arrays (n, m)."""
+        turn, shift = self.motion
+        inside = np.einsum("nmi,nij->jnm", points_mm - shift[:, None, :], turn)
+        return inside[0], inside[1], inside[2]
+
+    def project(self, points: Xyz, status: Statuses) -> tuple[Floats, Statuses]:
+        """Pixels (n, k, 2) of points of the eye frame; NaN where the status says there is none."""
+        r, t = self.rotation[:, :, :, None], self.translation[:, :, None]
+        x, y, z = points
+        depth = r[:, 2, 0] * x + r[:, 2, 1] * y + r[:, 2, 2] * z + t[:, 2]
+        status = np.where((status == RayStatus.OK) & ~(depth > 0.0), np.int8(BEHIND_CAMERA), status)
+        inverse = 1.0 / np.where(status == RayStatus.OK, depth, np.nan)
+        u = (r[:, 0, 0] * x + r[:, 0, 1] * y + r[:, 0, 2] * z + t[:, 0]) * inverse
+        v = (r[:, 1, 0] * x + r[:, 1, 1] * y + r[:, 1, 2] * z + t[:, 1]) * inverse
+        camera = self.camera
+        if np.any(camera.distortion):
+            u, v = distort(u, v, camera.distortion)
+        pixels = np.empty((*u.shape, 2))
+        pixels[..., 0] = camera.K[0, 0] * u + camera.K[0, 2]
+        pixels[..., 1] = camera.K[1, 1] * v + camera.K[1, 2]
+        return pixels, status
+
+
+def _groups(eyes: Sequence[Eye], which: npt.NDArray[np.intp]) -> list[tuple[tuple[Eye, npt.NDArray[np.intp] | None], npt.NDArray[np.intp]]]:
+    """Rows whose eyes can be traced together: ((eye or stacked eyes, row -> eye of the stack), rows)."""
+    kinds: dict[object, list[int]] = {}
+    for k in np.unique(which):
+        kinds.setdefault(structure_of(eyes[k]), []).append(int(k))
+    out: list[tuple[tuple[Eye, npt.NDArray[np.intp] | None], npt.NDArray[np.intp]]] = []
+    for members in kinds.values():
+        if len(members) <= FEW_EYES:
+            out += [((eyes[k], None), np.flatnonzero(which == k)) for k in members]
+        else:
+            place = np.full(len(eyes), -1, dtype=np.intp)
+            place[members] = np.arange(len(members))
+            rows = np.flatnonzero(place[which] >= 0)
+            out.append(((stack_eyes([eyes[k] for k in members]), place[which]), rows))
+    return out
+
+
+def _chunks(
+    group: tuple[Eye, npt.NDArray[np.intp] | None], rows: npt.NDArray[np.intp], size: int
+) -> list[tuple[npt.NDArray[np.intp], Eye]]:
+    eye, place = group
+    parts = [rows[k : k + size] for k in range(0, len(rows), size)]
+    return [(part, eye if place is None else take_eyes(eye, place[part])) for part in parts]
+
+
+def _pose_rows(poses: Poses, rows: npt.NDArray[np.intp]) -> Poses:
+    return Poses(poses.azimuth_rad[rows], poses.elevation_rad[rows], poses.torsion_rad[rows])
+
+
+FEW_EYES = 4
+"""Up to so many different eyes are traced one after the other with plain numbers; more are stacked."""
+
+__all__ = ["Features", "FixationStatus", "features", "fixations", "reason_of"]

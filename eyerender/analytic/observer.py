@@ -1,0 +1,116 @@
+"""A scene observed by ray optics."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import Floats, frozen
+from ..errors import InputError
+from ..eye.fixation import FixationStatus
+from ..eye.pose import Poses, listing_torsion
+from ..observation import EYES, MISSING, OK, GlintFeatures, Observations, PoseTruth, PupilFeatures
+from ..scene import Frames, Scene
+from .features import Features, features, fixations, reason_of
+
+
+def observe(scene: Scene, *, boundary_points: int = 30) -> Observations:
+    """Every (frame, eye) of a scene, in the scene's order.
+
+    Raises:
+        InputError: a target that no pose of an eye fixates; the message says which, and why.
+    """
+    frames = scene.frames()
+    pose = poses_of(scene, frames)
+    index = frames.index
+    seen = features(
+        [scene.eye(side) for side in EYES],
+        index.eye,
+        Poses(pose.azimuth_rad, pose.elevation_rad, pose.torsion_rad),
+        index.eye_position_mm + index.head_mm,
+        scene.rig.cameras,
+        index.camera,
+        np.array([light.position_mm for light in scene.rig.lights]),
+        boundary_points=boundary_points,
+    )
+    return Observations(index, pose, pupil_features(seen), glint_features(seen))
+
+
+def poses_of(scene: Scene, frames: Frames) -> PoseTruth:
+    """The pose of each observation: given, or the one that fixates its target."""
+    index = frames.index
+    azimuth, elevation = frames.direction_rad[:, 0].copy(), frames.direction_rad[:, 1].copy()
+    residual = np.where(np.isnan(azimuth), np.nan, 0.0)
+    aimed = np.flatnonzero(np.isnan(azimuth))
+    if len(aimed):
+        # Cameras see the same pose: solve once for each head position, fixation and eye.
+        keys = np.stack([index.head[aimed], index.fixation[aimed], index.eye[aimed]], axis=-1)
+        _, first, back = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        rows = aimed[first]
+        found = fixations(
+            [scene.eye(side) for side in EYES],
+            index.eye[rows],
+            index.target_mm[rows],
+            index.eye_position_mm[rows] + index.head_mm[rows],
+            scene.spec.eye.line_of_sight,
+        )
+        bad = np.flatnonzero(found.status != FixationStatus.OK)
+        if len(bad):
+            row = rows[bad[0]]
+            target = ", ".join(f"{v:g}" for v in index.target_mm[row])
+            raise InputError(
+                f"the {EYES[index.eye[row]]} eye cannot fixate ({target}) mm: {found.reason(int(bad[0]))}",
+                path=f"targets.{index.fixation[row]}",
+            )
+        back = back.reshape(-1)
+        azimuth[aimed], elevation[aimed] = found.poses.azimuth_rad[back], found.poses.elevation_rad[back]
+        residual[aimed] = found.residual_mm[back]
+    return PoseTruth(frozen(azimuth), frozen(elevation), frozen(listing_torsion(azimuth, elevation)), frozen(residual))
+
+
+def pupil_features(seen: Features) -> PupilFeatures:
+    """The apparent pupils of a batch; missing where a boundary point has no ray, or no ellipse fits."""
+    status = seen.pupil_status
+    ok = (status == 0) & np.isfinite(seen.ellipse_residual_px)
+    reasons = np.full(len(seen), "", dtype=object)
+    for k in np.flatnonzero(~ok):
+        lost = int(np.count_nonzero(seen.point_status[k]))
+        reasons[k] = (
+            f"{reason_of(int(status[k]))} ({lost} of {seen.point_status.shape[1]} boundary points)"
+            if lost
+            else "no ellipse fits the boundary"
+        )
+    return PupilFeatures(
+        frozen(np.where(ok, OK, MISSING).astype(object), object),
+        frozen(reasons, object),
+        frozen(seen.pupil_in_image & ok, bool),
+        _where(ok, seen.centre_px),
+        _where(ok, seen.semi_axes_px),
+        _where(ok, seen.angle_rad),
+        seen.anatomical_centre_px,
+        seen.points_px,
+        frozen(np.full((len(seen), 5, 5), np.nan)),
+    )
+
+
+def glint_features(seen: Features) -> GlintFeatures:
+    """The glints (first Purkinje images) of a batch."""
+    status, xy = seen.glint_status[:, :, 0], seen.glints_px[:, :, 0]
+    n, m = status.shape
+    ok = status == 0
+    reasons = np.full((n, m), "", dtype=object)
+    for i, j in np.argwhere(~ok):
+        reasons[i, j] = reason_of(int(status[i, j]))
+    return GlintFeatures(
+        frozen(np.broadcast_to(np.arange(m), (n, m)), np.int64),
+        frozen(np.where(ok, OK, MISSING).astype(object), object),
+        frozen(reasons, object),
+        frozen(seen.glint_in_image[:, :, 0] & ok, bool),
+        frozen(xy),
+        frozen(np.full((n, m, 2, 2), np.nan)),
+    )
+
+
+def _where(ok: npt.NDArray[np.bool_], values: Floats) -> Floats:
+    mask = ok.reshape(ok.shape + (1,) * (values.ndim - 1))
+    return frozen(np.where(mask, values, np.nan))

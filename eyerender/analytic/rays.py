@@ -1,0 +1,65 @@
+"""The rays behind the features: from the stop's margin and from the lights to a camera, in the eye frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import Floats
+from ..eye.model import Eye
+from ..geometry.surfaces import Xyz, components, join
+from ..optics.solve import apparent_points, mirror_points, purkinje_points
+from ..optics.trace import RayStatus
+
+Statuses = npt.NDArray[np.int8]
+
+
+def pupil_exits(eye: Eye, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
+    """Where the rays from `count` points of the stop's margin, and last from its centre, leave the cornea.
+
+    camera_mm : nodal points (n,) in the eye frame. Returns exit points as three arrays (n, count + 1), residuals, status.
+    """
+    margin = eye.stop.boundary(count)
+    points = np.concatenate([margin, eye.stop.centre_mm[..., None, :]], axis=-2)
+    found = apparent_points(
+        eye.front, eye.front_indices, points, join(camera_mm)[:, None, :], rim_mm=eye.limbus_radius_mm
+    )
+    status = found.status.copy()
+    status[_behind_stop(eye, camera_mm)] = RayStatus.BEHIND_IRIS
+    return components(found.exit_points_mm), found.residual_mm, status
+
+
+def glint_exits(eye: Eye, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
+    """Where the light of m lights (n, m) leaves the cornea for the camera, reflected at the surface of Purkinje's `order`.
+
+    Returns exit points as three arrays (n, m), residuals, status.
+    """
+    viewpoint = join(camera_mm)[:, None, :]
+    lights = join(lights_mm)
+    if order not in eye.purkinje_orders:
+        nothing = np.full(lights.shape[:-1], np.nan)
+        status = np.full(nothing.shape, RayStatus.MISSED, dtype=np.int8)
+        return (nothing, nothing, nothing), nothing, status
+    if order == 1:
+        found = mirror_points(eye.front[0], lights, viewpoint, rim_mm=eye.limbus_radius_mm)
+    else:
+        corneal = len(eye.front)
+        depth = {2: 2, 3: corneal + 1, 4: corneal + len(eye.back)}[order]
+        found = purkinje_points(
+            (eye.front + eye.back)[:depth],
+            (eye.front_indices + eye.back_indices)[:depth],
+            ((eye.limbus_radius_mm, *(np.inf for _ in eye.front[1:])) + eye.back_rims_mm)[:depth],
+            ((False,) * corneal + eye.back_passing)[:depth],
+            lights,
+            viewpoint,
+        )
+    return components(found.exit_points_mm), found.residual_mm, found.status
+
+
+def _behind_stop(eye: Eye, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
+    """Whether the camera stands behind the plane of the iris, (n,)."""
+    normal, centre = eye.stop.normal, eye.stop.centre_mm
+    depth = sum((camera_mm[i] - centre[..., i]) * normal[..., i] for i in range(3))
+    return np.asarray(~(np.asarray(depth) > 0.0))
+
+

@@ -1,0 +1,175 @@
+"""Pictures of a scene: every window rendered, with its labels; in memory, or as a folder of images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .analytic.observer import observe
+from .arrays import Floats
+from .errors import InputError
+from .eye.model import Eye
+from .eye.pose import Poses, rigid_motion
+from .imagefile import write_png
+from .imagefolder import refuse_non_empty, staged, write_dataset
+from .observation import EYES, Observations
+from .scene import Scene
+
+Progress = Callable[[int, int, str], None]
+BackendName = Literal["auto", "cuda", "llvm"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowImage:
+    """One rendered window of the sensor.
+
+    `row` is the observation it shows; `window` is (x0, y0, width, height) in full-sensor pixels; `dn` (h, w) the
+    sensor's counts; `irradiance` (h, w) before its noise and quantisation; `mask` (h, w) the part seen at each
+    pixel's centre.
+    """
+
+    name: str
+    row: int
+    camera: int
+    window: tuple[int, int, int, int]
+    dn: NDArray[Any]
+    irradiance: NDArray[np.float32]
+    mask: NDArray[np.uint8]
+    labels: dict[str, Any]
+
+
+def render_windows(
+    scene: Scene,
+    observations: Observations,
+    *,
+    backend: BackendName = "auto",
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Iterator[WindowImage]:
+    """Render every window of a scene, in frame order, at the poses of its analytic observations.
+
+    Raises:
+        BackendError: there is nothing to render with; the message names the mend.
+    """
+    if scene.spec.image.window_px is None and len(scene.spec.subject.eyes) > 1:
+        raise InputError("missing; both eyes are rendered in a window each", path="image.window_px")
+    from .rendering.backend import choose_backend
+
+    chosen = choose_backend(backend, threads)
+    # Only now: importing the renderer imports mitsuba, which must find its backend ready.
+    from .rendering.frame import RenderJob
+    from .rendering.renderer import Renderer
+
+    renderer = Renderer(chosen, spp=scene.spec.image.spp)
+    index, windows = observations.index, scene.windows()
+    eyes = {side: scene.eye(side) for side in scene.spec.subject.eyes}
+    for row in range(len(observations)):
+        side, camera, head = EYES[index.eye[row]], int(index.camera[row]), int(index.head[row])
+        M, t = _motion(eyes[side], observations, row)
+        job = RenderJob(
+            eye=eyes[side],
+            M=M,
+            t=t + index.eye_position_mm[row] + index.head_mm[row],
+            camera=scene.rig.cameras[camera],
+            window=windows[camera, head, int(index.eye[row])],
+            lights=scene.rig.lights,
+            sensor=scene.spec.sensor,
+            look=scene.spec.look,
+            wavelength_nm=scene.spec.wavelength_nm,
+            seed=image_seed(scene.spec.seed, int(index.frame[row]), int(index.eye[row])),
+            apex_mm=index.eye_position_mm[row] + index.head_mm[row],
+        )
+        done = renderer.render(job)
+        labels = done.labels
+        assert labels is not None
+        yield WindowImage(
+            f"{index.frame[row]:06d}_{side}",
+            row,
+            camera,
+            done.window,
+            done.dn.astype(np.uint8) if scene.spec.sensor.bit_depth == 8 else done.dn,
+            done.irradiance,
+            labels.part,
+            {
+                "pupil_visible_fraction": _share(labels.visible_fraction(3)),
+                "iris_visible_fraction": _share(labels.visible_fraction(2)),
+                "failed_paths": done.failed_paths,
+            },
+        )
+        if progress is not None:
+            progress(row + 1, len(observations), "")
+
+
+def image_seed(seed: int, frame: int, eye: int) -> int:
+    """The seed of one image: a pure function of the scene's seed and of which image it is."""
+    return int(np.random.SeedSequence([seed, frame, eye]).generate_state(1, np.uint64)[0])
+
+
+def render_folder(
+    scene: Scene,
+    path: str | Path,
+    *,
+    backend: BackendName = "auto",
+    threads: int | None = None,
+    overwrite: bool = False,
+    exr: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Render a scene into a folder of labelled images (CONTRACTS); complete or not at all.
+
+    Returns:
+        What was written: schema eyerender/render/1, path, number of images.
+    """
+    refuse_non_empty(path, overwrite)  # before the work, not after it
+    truth = observe(scene)
+    records = list(truth.records())
+    lines: list[dict[str, Any]] = []
+    spec = scene.spec
+    with staged(path, overwrite=overwrite) as folder:
+        (folder / "images").mkdir()
+        (folder / "masks").mkdir()
+        for image in render_windows(scene, truth, backend=backend, threads=threads, progress=progress):
+            line: dict[str, Any] = {
+                "file_name": f"images/{image.name}.png",
+                "mask_file_name": f"masks/{image.name}.png",
+                "window_px": dict(zip(("x0", "y0", "width", "height"), image.window, strict=True)),
+                "bit_depth": spec.sensor.bit_depth,
+                "records": [records[image.row]],
+                "labels": image.labels,
+                "parameters": {
+                    "eye_model": scene.eye_spec.name,
+                    "pupil_diameter_mm": scene.pupil_diameter_mm,
+                    "wavelength_nm": spec.wavelength_nm,
+                    "spp": spec.image.spp,
+                    "seed": spec.seed,
+                    "camera": image.camera,
+                },
+            }
+            write_png(folder / line["file_name"], image.dn)
+            write_png(folder / line["mask_file_name"], image.mask)
+            if exr:
+                from .rendering.exr import write_exr
+
+                write_exr(folder / "images" / f"{image.name}.exr", image.irradiance)
+            lines.append(line)
+        statistics = {"images": len(lines), "observations": len(truth)}
+        write_dataset(folder, lines, spec=spec.to_mapping(), digest=scene.digest(), statistics=statistics)
+    return {"schema": "eyerender/render/1", "path": str(path), "images": len(lines)}
+
+
+def _motion(eye: Eye, observations: Observations, row: int) -> tuple[Floats, Floats]:
+    """The pose of one observation as a rigid motion of the eye frame: M (3, 3), t (3,)."""
+    pose = observations.pose
+    M, t = rigid_motion(
+        Poses(pose.azimuth_rad[row : row + 1], pose.elevation_rad[row : row + 1], pose.torsion_rad[row : row + 1]), eye
+    )
+    return M[0], t[0]
+
+
+def _share(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,5 @@
+"""The command line: `eyerender COMMAND`."""
+
+from .app import main
+
+__all__ = ["main"]

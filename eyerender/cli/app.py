@@ -1,0 +1,106 @@
+"""The application and its error policy: one line on stderr, the exit codes of CONTRACTS, no traceback without --debug."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from types import FrameType
+from typing import Any
+
+from cyclopts import App, CycloptsError
+
+from ..errors import EyerenderError, InputError
+
+INTERRUPTED = 130
+
+app = App(
+    name="eyerender",
+    help="Near-infrared eye images rendered through refractive corneas, with exact labels.",
+    help_epilogue="Exit codes: 0 done, 1 the run failed, 2 bad input or usage, 3 no usable render backend, "
+    "130 interrupted. --debug shows a traceback.",
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+    help_format="plaintext",
+)
+
+
+def _version() -> str:
+    from ..imagefolder import versions
+
+    found = versions()
+    return f"eyerender {found['eyerender']}"
+
+
+app.version = _version
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run one command and exit with its code."""
+    sys.exit(run(argv))
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    from . import environment, images, observe  # noqa: F401  (they register their commands)
+
+    tokens = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in tokens
+    tokens = [t for t in tokens if t != "--debug"]
+    previous = _terminate_like_interrupt()
+    try:
+        code = app(tokens, exit_on_error=False, print_error=False)
+        sys.stdout.flush()
+        return code if isinstance(code, int) else 0
+    except CycloptsError as error:
+        if debug:
+            raise
+        return _fail(" ".join(str(error).split()), InputError.exit_code)
+    except EyerenderError as error:
+        if debug:
+            raise
+        return _fail(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        if debug:
+            raise
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader has gone (`| head`): nothing is wrong, and the interpreter must not complain at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except MemoryError:
+        if debug:
+            raise
+        return _fail("out of memory", 1)
+    except OSError as error:
+        if debug:
+            raise
+        name = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{name}{error.strerror or error}", 1)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"error: {' '.join(message.splitlines())}", file=sys.stderr)
+    return code
+
+
+def _terminate_like_interrupt() -> dict[int, Any]:
+    """Let SIGTERM and SIGHUP unwind as Ctrl-C does, so that nothing half-written stays behind."""
+
+    def handler(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    previous = {}
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None:
+            try:
+                previous[number] = signal.signal(number, handler)
+            except ValueError:  # not the main thread
+                return {}
+    return previous

@@ -1,0 +1,66 @@
+"""Commands about the installation: doctor, setup-llvm, schema."""
+
+from __future__ import annotations
+
+import dataclasses
+import json as jsonlib
+from typing import Literal
+
+from .app import app
+from .output import Json, emit, say
+
+
+@app.command(name="doctor")
+def doctor(*, json: Json = None) -> int:
+    """Tell what can render here, and what would mend what cannot; exit code 0 only where rendering works.
+
+    Parameters
+    ----------
+    json
+        Write the report as JSON to a file, or to stdout with '-'.
+    """
+    from ..rendering.backend import doctor_report
+
+    report = doctor_report()
+    lines = []
+    for state in report.backends:
+        lines.append(f"{state.name:<5} {'works' if state.ok else 'does not work'}: {state.detail}")
+        if not state.ok:
+            lines.append(f"      mend: {state.mend}")
+    lines.append(f"rendering uses {report.chosen}" if report.chosen else "nothing renders here; analysis and extraction do")
+    lines += [f"python   {report.python}", f"platform {report.platform}", f"cpu      {report.cpu}"]
+    lines += [f"{name} {version}" for name, version in report.packages]
+    lines.append(f"cache    {report.cache}")
+    emit({"schema": "eyerender/doctor/1", **dataclasses.asdict(report)}, "\n".join(lines), json)
+    return 0 if report.ok else 3
+
+
+@app.command(name="setup-llvm")
+def setup_llvm() -> int:
+    """Bring the libLLVM that rendering on the processor needs, where there is none that works; no root needed."""
+    from ..rendering.backend import setup_llvm as bring
+
+    found = bring(say=say)
+    print(f"libLLVM {found.version} works: {found.path}")
+    return 0
+
+
+@app.command(name="schema")
+def schema(name: Literal["scene", "eye"] = "scene", /) -> int:
+    """Print the JSON Schema of a scene file or an eye file, for editors.
+
+    Parameters
+    ----------
+    name
+        Which kind of file.
+    """
+    if name == "scene":
+        from ..scene import SceneSpec
+
+        text = SceneSpec.json_schema()
+    else:
+        from ..eye.spec import EyeSpec
+
+        text = EyeSpec.json_schema()
+    print(jsonlib.dumps(text, indent=1))
+    return 0

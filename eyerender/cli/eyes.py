@@ -1,0 +1,87 @@
+"""Commands about eyes and scenes as such: eyes, view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from ..errors import EyerenderError, InputError
+from .app import app
+from .output import Json, emit
+
+_FORMATS = (".svg", ".pdf", ".png")
+
+
+@app.command(name="eyes")
+def eyes(name: str | None = None, /, *, json: Json = None) -> int:
+    """List the eye models of the catalogue, or print one as an eye file.
+
+    Parameters
+    ----------
+    name
+        A name of the catalogue, or an eye file.
+    json
+        Write the result as JSON to a file, or to stdout with '-'.
+    """
+    from ..eye.catalogue import catalogue_names, load_eye
+
+    if name is not None:
+        spec = load_eye(name)
+        emit({"schema": "eyerender/eye/1", "eye": spec.to_mapping()}, spec.to_yaml().rstrip(), json)
+        return 0
+    specs = {n: load_eye(n) for n in catalogue_names()}
+    width = max(map(len, specs))
+    text = "\n".join(f"{n:<{width}}  {s.description}" for n, s in specs.items())
+    emit(
+        {"schema": "eyerender/eyes/1", "eyes": [{"name": n, "description": s.description} for n, s in specs.items()]},
+        text,
+        json,
+    )
+    return 0
+
+
+@app.command(name="view")
+def view(
+    what: Literal["eye", "scene"],
+    name: str,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    eye: str | None = None,
+) -> int:
+    """Draw an eye's section, or a scene's rig with its rays, as SVG, PDF or PNG.
+
+    Parameters
+    ----------
+    what
+        An eye of the catalogue or an eye file; or a scene.
+    name
+        Its name or file.
+    output
+        The picture to write; its ending gives the format.
+    eye
+        Replace the scene's eye model.
+    """
+    if output.suffix.lower() not in _FORMATS:
+        raise InputError(f"must end with one of {', '.join(_FORMATS)}", source=str(output))
+    if what == "eye":
+        from ..eye.catalogue import load_eye
+        from ..report.eye_section import eye_section
+
+        fig = eye_section(load_eye(name).build())
+    else:
+        from ..report.scene_view import scene_view
+        from ..scene import load_scene
+
+        fig = scene_view(load_scene(name, eye=eye))
+    part = output.with_name(f".{output.name}.part")
+    try:
+        fig.savefig(part, format=output.suffix[1:].lower(), dpi=150)
+        part.replace(output)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise EyerenderError(f"{output}: cannot be written ({error.strerror or error})") from None
+    print(output)
+    return 0

@@ -1,0 +1,101 @@
+"""Commands that make images: quickstart, render."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from .app import app
+from .observe import comparison_text
+from .output import BackendName, Json, emit, progress, say
+
+
+@app.command(name="render")
+def render(
+    scene: str,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    eye: str | None = None,
+    spp: int | None = None,
+    seed: int | None = None,
+    backend: BackendName = "auto",
+    threads: int | None = None,
+    exr: bool = False,
+    overwrite: bool = False,
+    json: Json = None,
+) -> int:
+    """Render a scene into a folder of labelled near-infrared images.
+
+    Parameters
+    ----------
+    scene
+        A scene file, or the bare name of a shipped scene.
+    output
+        The folder to write.
+    eye
+        Replace the scene's eye model: a name of the catalogue, or an eye file.
+    spp
+        Replace the scene's samples per pixel.
+    seed
+        Replace the scene's seed.
+    backend
+        Where to render.
+    threads
+        Processor threads (default: all).
+    exr
+        Also write the noise-free linear irradiance as EXR.
+    overwrite
+        Replace what the folder holds.
+    json
+        Write a summary as JSON to a file, or to stdout with '-'.
+    """
+    from ..capture import render_folder
+    from ..scene import load_scene
+
+    loaded = load_scene(scene, eye=eye, spp=spp, seed=seed)
+    with progress("rendering") as steps:
+        done = render_folder(
+            loaded, output, backend=backend, threads=threads, overwrite=overwrite, exr=exr, progress=steps
+        )
+    emit(done, f"{done['images']} images in {output}", json)
+    return 0
+
+
+@app.command(name="quickstart")
+def quickstart(
+    folder: Annotated[Path, Parameter(name="DIR")],
+    /,
+    *,
+    eye: str | None = None,
+    backend: BackendName = "auto",
+    threads: int | None = None,
+    overwrite: bool = False,
+    json: Json = None,
+) -> int:
+    """Do the main job: fixate, render, extract, calibrate, compare; and write a report to look at.
+
+    Parameters
+    ----------
+    folder
+        The folder to write.
+    eye
+        Replace the eye model: a name of the catalogue, or an eye file.
+    backend
+        Where to render.
+    threads
+        Processor threads (default: all).
+    overwrite
+        Replace what the folder holds.
+    json
+        Write the comparison as JSON to a file, or to stdout with '-'.
+    """
+    from ..quickstart import run_quickstart
+
+    with progress("quickstart") as steps:
+        result = run_quickstart(folder, eye=eye, backend=backend, threads=threads, overwrite=overwrite, progress=steps)
+    data = result.to_mapping()
+    emit(data, f"{comparison_text(data)}\nreport: {folder / 'report.html'}", json)
+    return 0

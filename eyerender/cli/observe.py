@@ -1,0 +1,156 @@
+"""Commands that observe: features, extract, compare."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from cyclopts import Parameter
+
+from ..errors import InputError
+from ..observation import EYES, Observations
+from .app import app
+from .output import Json, emit, progress, say
+
+
+@app.command(name="features")
+def features(scene: str, /, *, eye: str | None = None, points: int = 30, json: Json = None) -> int:
+    """Compute the apparent pupil and the glints of a scene by ray optics; needs no renderer.
+
+    Parameters
+    ----------
+    scene
+        A scene file, or the bare name of a shipped scene.
+    eye
+        Replace the scene's eye model: a name of the catalogue, or an eye file.
+    points
+        Boundary points of the pupil.
+    json
+        Write the features as JSON to a file, or to stdout with '-'.
+    """
+    from ..observers import AnalyticObserver
+    from ..scene import load_scene
+
+    if points < 6:
+        raise InputError("must be >= 6", source="--points")
+    loaded = load_scene(scene, eye=eye)
+    observed = AnalyticObserver(boundary_points=points).observe(loaded)
+    data = {"schema": "eyerender/features/1", "rig": loaded.rig_mapping(), "records": list(observed.records())}
+    emit(data, _feature_table(observed), json)
+    return 0
+
+
+@app.command(name="extract")
+def extract(
+    *images: Path,
+    scene: str | None = None,
+    gamma: float = 1.0,
+    json: Json = None,
+) -> int:
+    """Recover the pupil ellipse and the glints from images; a pupil that is not found is a result, not an error.
+
+    Parameters
+    ----------
+    images
+        Greyscale images, or a folder of images that this package wrote.
+    scene
+        A scene whose rig identifies the glints by light.
+    gamma
+        Encoding gamma of the images' values; 1 is linear.
+    json
+        Write the records as JSON to a file, or to stdout with '-'.
+    """
+    from ..observers import ImageObserver
+    from ..scene import load_scene
+
+    if not images:
+        raise InputError("give at least one image", source="extract")
+    if not (np.isfinite(gamma) and 0.1 <= gamma <= 10):
+        raise InputError("must be between 0.1 and 10", source="--gamma")
+    loaded = load_scene(scene) if scene is not None else None
+    with progress("extracting") as steps:
+        observed = ImageObserver(gamma=gamma).observe_files(images, scene=loaded, progress=steps)
+    data = {"schema": "eyerender/features/1", "rig": None, "records": list(observed.records())}
+    names = [str(path) for path in images]
+    emit(data, _feature_table(observed, names if len(names) == len(observed) else None), json)
+    return 0
+
+
+@app.command(name="compare")
+def compare(
+    folder: Annotated[Path, Parameter(name="DIR")],
+    /,
+    *,
+    function: str = "R3",
+    json: Json = None,
+) -> int:
+    """Extract the features of a folder of images and compare them with its analytic ones, in pixels and in gaze.
+
+    Parameters
+    ----------
+    folder
+        A folder that render, quickstart or generate wrote.
+    function
+        Regression function of the gaze estimator, R1 to R12.
+    json
+        Write the comparison as JSON to a file, or to stdout with '-'.
+    """
+    from ..quickstart import compare_folder
+
+    with progress("extracting") as steps:
+        result = compare_folder(folder, function=function, progress=steps)
+    emit(result.to_mapping(), comparison_text(result.to_mapping()), json)
+    return 0
+
+
+def comparison_text(data: dict[str, Any]) -> str:
+    """The comparison as a few lines of text."""
+    f, gaze = data["features"], data["gaze"]
+    lines = [
+        f"pupils found   {f['pupils']['found']} of {f['pupils']['expected']}",
+        f"glints found   {f['glints']['found']} of {f['glints']['expected']}",
+        "error of the image observer against the analytic one, px     median      p95      max",
+    ]
+    for key, name in (("pupil_centre_px", "pupil centre"), ("semi_axes_px", "semi-axes"), ("glint_px", "glint")):
+        d = f[key]
+        if d["n"]:
+            lines.append(f"  {name:<56} {d['median']:>9.4f} {d['p95']:>8.4f} {d['max']:>8.4f}")
+    if gaze is None:
+        lines.append(f"gaze: none ({data['gaze_reason']})")
+    else:
+        lines.append(f"gaze error, degrees ({gaze['estimator']}, {gaze['protocol']})     mean      max     n")
+        for key in ("analytic", "image"):
+            d = gaze[key]
+            if d is None:
+                lines.append(f"  {key:<10} none ({data['gaze_reason']})")
+            elif d["n"]:
+                lines.append(f"  {key:<10} {d['mean_deg']:>8.4f} {d['max_deg']:>8.4f} {d['n']:>5}")
+            else:
+                lines.append(f"  {key:<10} no frame has an estimate")
+    return "\n".join(lines)
+
+
+def _feature_table(observed: Observations, names: list[str] | None = None) -> str:
+    """One line an observation."""
+    index, pupil, glints = observed.index, observed.pupil, observed.glints
+    lines = [f"{'frame':>5} {'eye':<5} {'pupil centre px':>21} {'semi-axes px':>17} {'angle deg':>9}  glints px"]
+    for i in range(len(observed)):
+        eye = EYES[index.eye[i]] if index.eye[i] >= 0 else "-"
+        if pupil.ok[i]:
+            (x, y), (a, b) = pupil.centre_px[i], pupil.semi_axes_px[i]
+            text = f"{x:>10.4f} {y:>10.4f} {a:>8.4f} {b:>8.4f} {np.degrees(pupil.angle_rad[i]):>9.3f}"
+            text += "" if pupil.in_image[i] else " (off the sensor)"
+        else:
+            text = f"{'missing: ' + str(pupil.reason[i]):<49}"
+        spots = []
+        for j in range(glints.status.shape[1]):
+            light = "?" if glints.light[i, j] < 0 else str(glints.light[i, j])
+            if glints.ok[i, j]:
+                spots.append(f"{light}: ({glints.xy_px[i, j, 0]:.4f}, {glints.xy_px[i, j, 1]:.4f})")
+            elif glints.status[i, j]:
+                spots.append(f"{light}: missing ({glints.reason[i, j]})")
+        name = f"  {names[i]}" if names else ""
+        lines.append(f"{index.frame[i]:>5} {eye:<5} {text}  {'  '.join(spots)}{name}")
+    return "\n".join(lines)

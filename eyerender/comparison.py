@@ -1,0 +1,139 @@
+"""The two observers side by side: errors of image-derived features against the analytic ones, and what gaze they give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .arrays import ArrayValue, Bools, Floats, frozen
+from .errors import InputError
+from .gaze.estimate import Estimator
+from .gaze.validation import GazeErrors, leave_one_target_out
+from .observation import Observations
+from .rig.rig import Rig
+
+SCHEMA = "eyerender/compare/1"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureErrors(ArrayValue):
+    """Image-derived minus analytic features, NaN where one of the two has none.
+
+    `centre_px` (n, 2), `semi_axes_px` (n, 2), `glint_px` (n, m, 2) by the analytic glint's entry; the flags count what the
+    analytic observer sees on the sensor and what of it was found.
+    """
+
+    centre_px: Floats
+    semi_axes_px: Floats
+    glint_px: Floats
+    pupil_expected: Bools
+    pupil_found: Bools
+    glint_expected: Bools
+    glint_found: Bools
+
+    def summary(self) -> dict[str, Any]:
+        """Medians, 95th percentiles, maxima and mean vectors in px, and the counts."""
+        return {
+            "pupils": {"expected": int(self.pupil_expected.sum()), "found": int(self.pupil_found.sum())},
+            "glints": {"expected": int(self.glint_expected.sum()), "found": int(self.glint_found.sum())},
+            "pupil_centre_px": _distances(self.centre_px),
+            "semi_axes_px": _distances(self.semi_axes_px),
+            "glint_px": _distances(self.glint_px.reshape(-1, 2)),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Analytic and image-derived observations of the same frames, their errors and both gaze errors.
+
+    The gaze errors are None where the scene gives none; `gaze_reason` says why.
+    """
+
+    truth: Observations
+    found: Observations
+    features: FeatureErrors
+    estimator: str
+    gaze_truth: GazeErrors | None
+    gaze_found: GazeErrors | None
+    gaze_reason: str | None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The JSON of `compare` (schema eyerender/compare/1)."""
+        return {
+            "schema": SCHEMA,
+            "features": self.features.summary(),
+            "gaze": None
+            if self.gaze_truth is None and self.gaze_found is None
+            else {
+                "estimator": self.estimator,
+                "protocol": "leave one target out, mean of both eyes, angle at their mid-point",
+                "analytic": _gaze_summary(self.gaze_truth),
+                "image": _gaze_summary(self.gaze_found),
+            },
+            "gaze_reason": self.gaze_reason,
+        }
+
+
+def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
+    """Errors of `found` against `truth`, row by row; raises `InputError` unless both are of the same frames and eyes."""
+    same = len(truth) == len(found) and np.array_equal(truth.index.frame, found.index.frame)
+    if not same or not np.array_equal(truth.index.eye, found.index.eye):
+        raise InputError("the two sets of observations are not of the same frames and eyes")
+    pupil_expected = truth.pupil.ok & truth.pupil.in_image
+    both = pupil_expected & found.pupil.ok
+    m = truth.glints.light.shape[1]
+    glint = np.full((len(truth), m, 2), np.nan)
+    expected = truth.glints.ok & truth.glints.in_image
+    for light in np.unique(truth.glints.light[truth.glints.light >= 0]):
+        place, seen = found.glints.of_light(int(light))
+        rows, columns = np.nonzero((truth.glints.light == light) & expected)
+        glint[rows, columns] = np.where(seen[rows, None], place[rows], np.nan) - truth.glints.xy_px[rows, columns]
+    return FeatureErrors(
+        frozen(np.where(both[:, None], found.pupil.centre_px - truth.pupil.centre_px, np.nan)),
+        frozen(np.where(both[:, None], found.pupil.semi_axes_px - truth.pupil.semi_axes_px, np.nan)),
+        frozen(glint),
+        frozen(pupil_expected, bool),
+        frozen(both, bool),
+        frozen(expected, bool),
+        frozen(np.isfinite(glint).all(axis=-1), bool),
+    )
+
+
+def compare(truth: Observations, found: Observations, rig: Rig, estimator: Estimator, name: str = "") -> Comparison:
+    """Compare two observers' reports of the same frames, in features and in gaze."""
+    gaze: list[GazeErrors | None] = []
+    reason = None
+    for observations in (truth, found):
+        try:
+            gaze.append(leave_one_target_out(estimator, observations, rig))
+        except InputError as error:
+            gaze.append(None)
+            reason = str(error)
+    return Comparison(truth, found, feature_errors(truth, found), name, gaze[0], gaze[1], reason)
+
+
+def _distances(errors: Floats) -> dict[str, Any]:
+    good = errors[np.isfinite(errors).all(axis=-1)]
+    if not len(good):
+        return {"n": 0, "median": None, "p95": None, "max": None, "mean_vector": None}
+    size = np.linalg.norm(good, axis=-1)
+    return {
+        "n": len(good),
+        "median": float(np.median(size)),
+        "p95": float(np.percentile(size, 95)),
+        "max": float(size.max()),
+        "mean_vector": good.mean(axis=0).tolist(),
+    }
+
+
+def _gaze_summary(errors: GazeErrors | None) -> dict[str, Any] | None:
+    if errors is None:
+        return None
+    return {
+        "n": int(errors.ok.sum()),
+        "missing": int((~errors.ok).sum()),
+        "mean_deg": errors.mean_deg,
+        "max_deg": errors.max_deg,
+    }

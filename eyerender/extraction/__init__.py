@@ -1,0 +1,23 @@
+"""From a near-infrared image to the pupil ellipse and the glints."""
+
+from __future__ import annotations
+
+from .assignment import Assignment, assign_lights, identify, predict_glints
+from .pipeline import extract
+from .result import Extraction, GlintResult, Goodness, PupilResult
+from .settings import FAST, REFINED, ExtractionSettings
+
+__all__ = [
+    "FAST",
+    "REFINED",
+    "Assignment",
+    "Extraction",
+    "ExtractionSettings",
+    "GlintResult",
+    "Goodness",
+    "PupilResult",
+    "assign_lights",
+    "extract",
+    "identify",
+    "predict_glints",
+]

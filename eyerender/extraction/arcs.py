@@ -1,0 +1,247 @@
+"""Which edge points belong to one ellipse: random samples of arcs, consensus, and OpenCV's AMS fit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.ellipse import Ellipse, fit_ellipse_direct, from_cv2, signed_distance
+from .coarse import Candidate
+from .edges import EdgePoints
+from .settings import ExtractionSettings
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SECTORS = 48  # of the outline, for support
+PIECES = 16  # arcs are cut at these sectors, so that a lid's margin parts from the rim it joins
+SAMPLES = 240
+POINTS_PER_PIECE = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RimFit:
+    """The ellipse through the edge points, corrected for curvature.
+
+    inliers: (n,) which edge points it rests on. points_px: those points, corrected. support: share of the outline they
+    cover; gap: of the longest stretch they leave. residual_px: their root mean square distance.
+    """
+
+    ellipse: Ellipse
+    inliers: Mask
+    points_px: Array
+    support: float
+    gap: float
+    residual_px: float
+
+
+def fit_rim(
+    edges: EdgePoints, candidate: Candidate, settings: ExtractionSettings, expected_noise_px: float
+) -> RimFit | str:
+    """The rim of the pupil among `edges`, or the reason why there is none."""
+    if edges.points_px.shape[0] < 8:
+        return f"only {edges.points_px.shape[0]} edge points around the darkest blob"
+    tolerance = float(np.clip(3.5 * expected_noise_px, 0.35, 2.5))
+    start = _consensus(edges, candidate, settings, tolerance)
+    if start is None:
+        return "no ellipse passes through the edges around the darkest blob"
+    rim = _polished(edges, start, settings, tolerance)
+    if isinstance(rim, str) or rim.residual_px < 1.3 * expected_noise_px:
+        return rim
+    freed = _without_lid(edges, rim, expected_noise_px)
+    if freed is None:
+        return rim
+    again = _polished(edges, freed, settings, max(0.35, 3.5 * expected_noise_px), free=True)
+    return rim if isinstance(again, str) or again.residual_px > 0.8 * rim.residual_px else again
+
+
+def _without_lid(edges: EdgePoints, rim: RimFit, expected_noise_px: float) -> Ellipse | None:
+    """The ellipse without the stretch of rim that is a lid's margin, if there is one.
+
+    A margin that crosses the pupil gives edges inside the true rim, and an ellipse drawn through both fits neither.
+    Every window of an eighth to nearly a half of the outline is left out in turn; the best is taken when the rest then
+    fits 1.4 times better and the edges left out lie inside the new ellipse.
+    """
+    points = edges.points_px[rim.inliers]
+    cos_t, sin_t = _parameter(rim.ellipse, points)
+    order = np.argsort(np.arctan2(sin_t, cos_t), kind="stable")
+    points = points[order]
+    turn = (np.arctan2(sin_t, cos_t)[order] / (2.0 * np.pi) + 0.5) % 1.0
+    starts, widths = np.meshgrid(np.arange(24) / 24.0, np.array([0.12, 0.2, 0.3, 0.42]))
+    outside = ((turn[None, :] - starts.reshape(-1, 1)) % 1.0) >= widths.reshape(-1, 1)
+    left = outside.sum(axis=1)
+    enough = (left >= 12) & (left < points.shape[0] - 3)
+    outside, left = outside[enough], left[enough]
+    if left.size == 0:
+        return None
+    ranks = np.argsort(~outside, axis=1, kind="stable")  # the points kept, in order, come first
+    take = (np.arange(40)[None, :] * left[:, None] / 40.0).astype(np.intp)
+    fits = fit_ellipse_direct(points[np.take_along_axis(ranks, take, axis=1)])
+    best, best_rms = None, rim.residual_px / 1.4
+    a, b = rim.ellipse.semi_axes_px
+    for i in np.nonzero(fits.ok)[0]:
+        axes = fits.semi_axes_px[i]
+        if axes[0] > 1.6 * a or axes[1] < 0.7 * b:
+            continue
+        ellipse = Ellipse(fits.centre_px[i], axes, float(fits.angle_rad[i]))
+        distance = signed_distance(ellipse, points)
+        rms = float(np.sqrt(np.mean(distance[outside[i]] ** 2)))
+        hidden = float(np.median(distance[~outside[i]]))
+        if rms < best_rms and hidden < -max(2.0 * rms, expected_noise_px):
+            best, best_rms = ellipse, rms
+    return best
+
+
+def _consensus(
+    edges: EdgePoints, candidate: Candidate, settings: ExtractionSettings, tolerance: float
+) -> Ellipse | None:
+    """The ellipse, of those through all points and through random triples of arc pieces, that most outline supports."""
+    points = edges.points_px
+    offset = points - candidate.ellipse.centre_px
+    bearing = np.arctan2(offset[:, 1], offset[:, 0])
+    sector = ((bearing / (2.0 * np.pi) + 0.5) * PIECES).astype(np.intp) % PIECES
+    _, piece = np.unique(edges.arc * PIECES + sector, return_inverse=True)
+    sizes = np.bincount(piece)
+    usable = np.nonzero(sizes >= 4)[0]
+    fits = [fit_ellipse_direct(points[None])]
+    if usable.size >= 3:
+        rng = np.random.default_rng(0)  # the same image gives the same answer
+        order = np.argsort(piece, kind="stable")
+        first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+        chance = sizes[usable] / sizes[usable].sum()
+        keys = rng.random((SAMPLES, usable.size)) ** (1.0 / chance)[None, :]  # weighted draw without replacement
+        chosen = usable[np.argsort(-keys, axis=1)[:, :3]]
+        at = rng.random((SAMPLES, 3, POINTS_PER_PIECE)) * sizes[chosen][..., None]
+        index = order[first[chosen][..., None] + at.astype(np.intp)].reshape(SAMPLES, -1)
+        fits.append(fit_ellipse_direct(points[index]))
+    centre = np.concatenate([fit.centre_px for fit in fits])
+    axes = np.concatenate([fit.semi_axes_px for fit in fits])
+    angle = np.concatenate([fit.angle_rad for fit in fits])
+    a0, b0 = candidate.ellipse.semi_axes_px
+    with np.errstate(invalid="ignore"):
+        sane = (axes[:, 0] < 2.2 * a0) & (axes[:, 1] > 0.4 * b0) & (axes[:, 1] > settings.aspect_min * axes[:, 0])
+        sane &= (axes[:, 0] <= settings.radius_max_px) & (axes[:, 1] >= 0.8 * settings.radius_min_px)
+    centre, axes, angle = centre[sane], axes[sane], angle[sane]
+    if angle.size == 0:
+        return None
+    support = _support(points, edges.normals, centre, axes, angle, tolerance)
+    best = int(np.argmax(support))
+    return Ellipse(centre[best], axes[best], float(angle[best]))
+
+
+def _support(points: Array, normals: Array, centre: Array, axes: Array, angle: Array, tolerance: float) -> Array:
+    """Score of every ellipse: the points close by with an agreeing normal, weighted by closeness, per length."""
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    a, b = axes[:, :1], axes[:, 1:]
+    dx, dy = points[None, :, 0] - centre[:, :1], points[None, :, 1] - centre[:, 1:]
+    p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
+    radius = np.sqrt(p * p + q * q)
+    nx, ny = p / a, q / b
+    slope = np.sqrt(nx * nx + ny * ny)
+    distance = (radius - 1.0) * radius / slope
+    agree = ((nx * cos - ny * sin) * normals[None, :, 0] + (nx * sin + ny * cos) * normals[None, :, 1]) > 0.9 * slope
+    closeness = np.maximum(1.0 - (distance / tolerance) ** 2, 0.0) * agree
+    perimeter = np.pi * (a + b)[:, 0]
+    # Per length of outline, so that a large loose ellipse does not win by points of other edges; total as well.
+    score: Array = closeness.sum(axis=1) / np.sqrt(perimeter)
+    return score
+
+
+def _polished(
+    edges: EdgePoints, start: Ellipse, settings: ExtractionSettings, tolerance: float, *, free: bool = False
+) -> RimFit | str:
+    """Re-select and refit with AMS until the selection settles; edge points are moved outward by the curvature shift.
+
+    A blurred convex edge has its steepest place sigma^2 kappa / 2 inside the true one.
+    """
+    ellipse, inliers = start, np.zeros(edges.points_px.shape[0], dtype=bool)
+    points = edges.points_px
+    for turn in range(5):
+        shift = 0.5 * edges.sigma_px**2 * curvature_at(ellipse, points)
+        shift = np.minimum(shift, 0.15 * float(ellipse.semi_axes_px[1]))
+        points = edges.points_px + shift[:, None] * _normals(ellipse, edges.points_px)
+        distance = signed_distance(ellipse, points)
+        agree = np.sum(_normals(ellipse, points) * edges.normals, axis=1) > 0.9
+        reach = 2.0 * tolerance if turn == 0 and not free else tolerance
+        chosen = (np.abs(distance) < reach) & agree
+        if turn >= 1 and chosen.sum() >= 8:
+            spread = 1.4826 * float(np.median(np.abs(distance[chosen] - np.median(distance[chosen]))))
+            chosen &= np.abs(distance) < max(3.5 * spread, 0.1)
+        if chosen.sum() < 8:
+            return f"only {int(chosen.sum())} edge points agree on one ellipse"
+        settled = bool((chosen == inliers).all()) and turn > 1
+        inliers = chosen
+        fitted = ams_fit(points[inliers])
+        if fitted is None:
+            return "the edge points that agree span no ellipse"
+        ellipse = fitted
+        if settled:
+            break
+    distance = signed_distance(ellipse, points[inliers])
+    support, gap = outline_support(ellipse, points[inliers])
+    a, b = ellipse.semi_axes_px
+    if support < settings.min_support:
+        return f"only {100 * support:.0f} % of the outline is seen, less than {100 * settings.min_support:.0f} %"
+    if b < settings.radius_min_px or a > settings.radius_max_px:
+        return f"its semi-axes {a:.1f} x {b:.1f} px are outside the sizes looked for"
+    if b < settings.aspect_min * a:
+        return f"its axes' ratio {b / a:.2f} is below {settings.aspect_min:g}"
+    return RimFit(ellipse, inliers, points[inliers], support, gap, float(np.sqrt(np.mean(distance**2))))
+
+
+def ams_fit(points: Array) -> Ellipse | None:
+    """cv2.fitEllipseAMS about the points' mean and scale, because OpenCV computes in float32."""
+    mean = points.mean(axis=0)
+    scale = float(np.abs(points - mean).max())
+    if not scale > 0.0:
+        return None
+    try:
+        rect = cv2.fitEllipseAMS(((points - mean) / scale).astype(np.float32))
+    except cv2.error:
+        return None
+    (cx, cy), (width, height), degrees = rect
+    if not (math.isfinite(cx + cy + width + height) and 0.0 < width < 50.0 and 0.0 < height < 50.0):
+        return None
+    unit = from_cv2(((cx, cy), (width, height), degrees))
+    return Ellipse(unit.centre_px * scale + mean, unit.semi_axes_px * scale, unit.angle_rad)
+
+
+def curvature_at(ellipse: Ellipse, points: Array) -> Array:
+    """a b / (a^2 sin^2 t + b^2 cos^2 t)^1.5, 1/px: the outline's curvature at each point's parameter t."""
+    a, b = ellipse.semi_axes_px
+    cos_t, sin_t = _parameter(ellipse, points)
+    value: Array = a * b / (a * a * sin_t**2 + b * b * cos_t**2) ** 1.5
+    return value
+
+
+def outline_support(ellipse: Ellipse, points: Array) -> tuple[float, float]:
+    """Shares of the SECTORS of the outline (equal steps of the parameter) that hold a point, and in the longest row of
+    sectors that do not."""
+    cos_t, sin_t = _parameter(ellipse, points)
+    sector = ((np.arctan2(sin_t, cos_t) / (2.0 * np.pi) + 0.5) * SECTORS).astype(np.intp) % SECTORS
+    held = np.unique(sector)
+    if held.size == 0:
+        return 0.0, 1.0
+    rows = np.diff(np.append(held, held[0] + SECTORS)) - 1
+    return held.size / SECTORS, float(rows.max()) / SECTORS
+
+
+def _parameter(ellipse: Ellipse, points: Array) -> tuple[Array, Array]:
+    offset = points - ellipse.centre_px
+    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+    p = (offset[:, 0] * cos + offset[:, 1] * sin) / ellipse.semi_axes_px[0]
+    q = (offset[:, 1] * cos - offset[:, 0] * sin) / ellipse.semi_axes_px[1]
+    radius = np.maximum(np.hypot(p, q), 1e-12)
+    return p / radius, q / radius
+
+
+def _normals(ellipse: Ellipse, points: Array) -> Array:
+    cos_t, sin_t = _parameter(ellipse, points)
+    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+    p, q = cos_t / ellipse.semi_axes_px[0], sin_t / ellipse.semi_axes_px[1]
+    out = np.stack([p * cos - q * sin, p * sin + q * cos], axis=-1)
+    return np.asarray(out / np.hypot(out[:, :1], out[:, 1:]))

@@ -1,0 +1,274 @@
+"""Which glint belongs to which light, from the geometry of the rig; nothing is known of the true gaze.
+
+The lights are mirrored in a sphere (the cornea) whose centre follows from the image of the pupil and a rough position
+of the eye. That layout may be off by a shift (where exactly the eye is) and a scale (corneal radius, distance); the glints
+are matched to it with both left free within what those can do, missing and surplus glints allowed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linear_sum_assignment
+
+from ..errors import InputError
+
+Array = NDArray[np.float64]
+
+CORNEA_RADIUS_MM = 7.8
+# Of a typical adult eye: apex to centre of rotation, that to the entrance pupil and to the cornea's centre.
+APEX_TO_ROTATION_MM = 13.5
+ROTATION_TO_PUPIL_MM = 10.4
+ROTATION_TO_CORNEA_MM = 5.7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assignment:
+    """light: (m,) index of every glint's light, -1 for none. reasons: why a glint has none (None for the others).
+    residual_px: (m,) distance to the place expected after shift and scale (0 where there is no light). shift_px: (2,),
+    scale: of the layout that fitted.
+    """
+
+    light: NDArray[np.intp]
+    reasons: tuple[str | None, ...]
+    residual_px: Array
+    shift_px: Array
+    scale: float
+
+
+def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLike, lights_mm: ArrayLike) -> Array:
+    """(l, 3) points of a sphere that mirror the lights to the camera: normal = bisector of the two directions.
+
+    Fixed-point iteration n <- (unit to camera + unit to light) / |...| from the point centre + radius n; it contracts
+    by about radius / distance. centre (3,), camera (3,), lights (l, 3), mm.
+    """
+    centre, camera = np.asarray(centre_mm, dtype=np.float64), np.asarray(camera_mm, dtype=np.float64)
+    lights = np.atleast_2d(np.asarray(lights_mm, dtype=np.float64))
+    normal = _unit(_unit(camera - centre) + _unit(lights - centre))
+    for _ in range(40):
+        point = centre + radius_mm * normal
+        updated = _unit(_unit(camera - point) + _unit(lights - point))
+        done = float(np.abs(updated - normal).max()) < 1e-12
+        normal = updated
+        if done:
+            break
+    return np.asarray(centre + radius_mm * normal)
+
+
+def project(points_mm: ArrayLike, K: ArrayLike, R: ArrayLike, t_mm: ArrayLike) -> Array:
+    """(n, 2) px of world points (n, 3): K (R X + t), OpenCV's pinhole without distortion."""
+    camera = np.asarray(points_mm, dtype=np.float64) @ np.asarray(R, dtype=np.float64).T + np.asarray(
+        t_mm, dtype=np.float64
+    )
+    image = camera @ np.asarray(K, dtype=np.float64).T
+    return np.asarray(image[:, :2] / image[:, 2:])
+
+
+def predict_glints(
+    pupil_px: ArrayLike,
+    K: ArrayLike,
+    R: ArrayLike,
+    t_mm: ArrayLike,
+    lights_mm: ArrayLike,
+    eye_mm: ArrayLike,
+    *,
+    radius_mm: float = CORNEA_RADIUS_MM,
+) -> tuple[Array, float]:
+    """((l, 2) expected glints, px; image scale at the eye, px per mm).
+
+    pupil_px: (2,) centre of the pupil on the full sensor. K (3, 3), R (3, 3), t (3,): the camera. lights (l, 3).
+    eye_mm: (3,) rough world position of the corneal apex when the eye looks along +x; where not finite, the pupil's ray
+    is cut with the plane x = 0. The gaze is the direction from the centre of rotation to where the pupil's ray meets
+    the sphere on which the entrance pupil turns (its nearest point where it misses); the cornea's centre lies on it.
+    """
+    K3, R3, t3 = (np.asarray(value, dtype=np.float64) for value in (K, R, t_mm))
+    camera = -R3.T @ t3
+    pixel = np.append(np.asarray(pupil_px, dtype=np.float64), 1.0)
+    ray = _unit(R3.T @ np.linalg.solve(K3, pixel))
+    eye = np.asarray(eye_mm, dtype=np.float64)
+    if not np.isfinite(eye).all():
+        if abs(ray[0]) < 1e-9:
+            raise InputError("the camera's view of the pupil is parallel to the plane x = 0", path="eye_mm")
+        eye = camera - ray * (camera[0] / ray[0])
+    rotation = eye - [APEX_TO_ROTATION_MM, 0.0, 0.0]
+    along = float((rotation - camera) @ ray)
+    nearest = camera + along * ray
+    missed = nearest - rotation
+    reach2 = ROTATION_TO_PUPIL_MM**2 - float(missed @ missed)
+    pupil = nearest - math.sqrt(max(reach2, 0.0)) * ray
+    gaze = _unit(pupil - rotation)
+    cornea = rotation + ROTATION_TO_CORNEA_MM * gaze
+    # The pupil's own ray is exact; the model's length errors are taken out along it.
+    cornea = cornea + (pupil - (rotation + ROTATION_TO_PUPIL_MM * gaze)) if reach2 > 0.0 else cornea
+    depth = float((R3 @ cornea + t3)[2])
+    scale = float(math.sqrt(abs(K3[0, 0] * K3[1, 1]))) / max(depth, 1e-6)
+    points = mirror_in_sphere(cornea, radius_mm, camera, lights_mm)
+    return project(points, K3, R3, t3), scale
+
+
+def assign_lights(
+    glints_px: ArrayLike,
+    predicted_px: ArrayLike,
+    *,
+    shift_sd_px: float,
+    scale_range: tuple[float, float] = (0.85, 1.18),
+    tolerance_px: float = 1.5,
+    slack: float = 0.08,
+) -> Assignment:
+    """The lights of glints (m, 2), given where the rig's lights (l, 2) are expected.
+
+    shift_sd_px: how far the whole layout may be off (standard deviation). scale_range: of the layout, 6.6 to 9.2 mm of
+    corneal radius about 7.8. A glint fits a light when, after shift and scale, it lies within tolerance_px plus `slack`
+    times the light's distance from the layout's middle (corneas are no spheres).
+
+    Every pairing of one glint with one light, and of two with two, proposes a layout; the others are matched one to
+    one.
+    A layout's merit is the number matched, less their squared misfit and the improbability of its shift. When another
+    layout that names other lights comes within 0.25 of the best, neither is chosen.
+    """
+    glints = np.asarray(glints_px, dtype=np.float64).reshape(-1, 2)
+    lights = np.asarray(predicted_px, dtype=np.float64).reshape(-1, 2)
+    m, count = glints.shape[0], lights.shape[0]
+    if m == 0 or count == 0:
+        reason = "the rig has no lights" if m else None
+        return Assignment(np.full(m, -1), (reason,) * m, np.zeros(m), np.zeros(2), 1.0)
+    middle = lights.mean(axis=0)
+    reach = tolerance_px + slack * np.hypot(*(lights - middle).T)
+    found: list[tuple[float, tuple[int, ...], Array, float]] = []
+    for shift, scale in _promising(glints, lights, middle, reach, scale_range, shift_sd_px):
+        match = _match(glints, lights, middle, reach, shift, scale)
+        shift, scale = _refitted(glints, lights, middle, match, shift, scale, scale_range)
+        match = _match(glints, lights, middle, reach, shift, scale)
+        merit = _merit(glints, lights, middle, reach, match, shift, scale, shift_sd_px)
+        found.append((merit, tuple(int(k) for k in match), shift, scale))
+    found.sort(key=lambda item: -item[0])
+    merit, names, shift, scale = found[0]
+    if float(np.hypot(*shift)) > 4.0 * shift_sd_px:
+        why = f"the glints lie {np.hypot(*shift):.0f} px from where the lights' reflections are expected"
+        return Assignment(np.full(m, -1), (why,) * m, np.zeros(m), shift, scale)
+    rival = next((item for item in found[1:] if _contradicts(item[1], names)), None)
+    if rival is not None and merit - rival[0] < 0.25:
+        why = "two arrangements of the lights fit equally well"
+        return Assignment(np.full(m, -1), (why,) * m, np.zeros(m), shift, scale)
+    light = np.array(names, dtype=np.intp)
+    residual = np.zeros(m)
+    placed = light >= 0
+    residual[placed] = np.hypot(*(glints[placed] - _placed(lights[light[placed]], middle, shift, scale)).T)
+    stray = "no light's reflection is expected there: off the sclera, a lid or spectacles"
+    return Assignment(light, tuple(None if ok else stray for ok in placed), residual, shift, scale)
+
+
+def identify(
+    glints_px: ArrayLike,
+    pupil_px: ArrayLike,
+    K: ArrayLike,
+    R: ArrayLike,
+    t_mm: ArrayLike,
+    lights_mm: ArrayLike,
+    eye_mm: ArrayLike,
+    *,
+    position_sd_mm: float = 1.0,
+) -> Assignment:
+    """`predict_glints`, then `assign_lights`. All pixels are of the full sensor.
+
+    position_sd_mm: how well the cornea's place across the line of sight follows from the pupil and `eye_mm`.
+    """
+    lights = np.asarray(lights_mm, dtype=np.float64).reshape(-1, 3)
+    if lights.shape[0] == 0:
+        return assign_lights(glints_px, np.zeros((0, 2)), shift_sd_px=1.0)
+    predicted, scale = predict_glints(pupil_px, K, R, t_mm, lights, eye_mm)
+    return assign_lights(glints_px, predicted, shift_sd_px=max(position_sd_mm * scale, 2.0))
+
+
+def _unit(v: Array) -> Array:
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+
+
+def _placed(lights: Array, middle: Array, shift: Array, scale: float) -> Array:
+    return np.asarray(middle + shift + scale * (lights - middle))
+
+
+def _promising(
+    glints: Array, lights: Array, middle: Array, reach: Array, scale_range: tuple[float, float], sd: float
+) -> list[tuple[Array, float]]:
+    """The (shift, scale) worth a one-to-one match: of all that put one light on one glint, or two on two, those with
+    the most glints near any light, and the shift of least surprise among equals."""
+    m, count = glints.shape[0], lights.shape[0]
+    shift = (glints[:, None] - lights[None]).reshape(-1, 2)
+    scale = np.ones(shift.shape[0])
+    if m > 1 and count > 1:
+        i, j = (index.ravel() for index in np.nonzero(~np.eye(m, dtype=bool)))
+        k, n = np.triu_indices(count, 1)
+        apart, seen = (lights[n] - lights[k])[None], (glints[j] - glints[i])[:, None]
+        length2 = (apart**2).sum(axis=-1)
+        ratio = (seen * apart).sum(axis=-1) / np.maximum(length2, 1.0)
+        halfway = 0.5 * (lights[k] + lights[n]) - middle
+        offset = 0.5 * (glints[i] + glints[j])[:, None] - middle - ratio[..., None] * halfway
+        fair = (ratio >= scale_range[0]) & (ratio <= scale_range[1]) & (length2 > 1.0)
+        shift, scale = np.concatenate([shift, offset[fair]]), np.concatenate([scale, ratio[fair]])
+    placed = middle + shift[:, None] + scale[:, None, None] * (lights - middle)
+    gap = glints[None, :, None] - placed[:, None]
+    near = (np.hypot(gap[..., 0], gap[..., 1]) / reach).min(axis=2)
+    merit = np.maximum(1.0 - near**2, 0.0).sum(axis=1) - 0.5 * (shift**2).sum(axis=1) / sd**2
+    best = np.argsort(-merit, kind="stable")[:24]
+    return [(shift[i], float(scale[i])) for i in best]
+
+
+def _match(glints: Array, lights: Array, middle: Array, reach: Array, shift: Array, scale: float) -> NDArray[np.intp]:
+    """(m,) light of every glint, one to one, least sum of squared misfits within reach; -1 where none is."""
+    offset = glints[:, None, :] - _placed(lights, middle, shift, scale)[None]
+    misfit = np.hypot(offset[..., 0], offset[..., 1]) / reach[None, :]
+    cost = np.where(misfit < 1.0, misfit**2 - 1.0, 0.0)  # leaving both alone costs nothing
+    rows, columns = linear_sum_assignment(cost)
+    match = np.full(glints.shape[0], -1, dtype=np.intp)
+    taken = misfit[rows, columns] < 1.0
+    match[rows[taken]] = columns[taken]
+    return match
+
+
+def _refitted(
+    glints: Array,
+    lights: Array,
+    middle: Array,
+    match: NDArray[np.intp],
+    shift: Array,
+    scale: float,
+    span: tuple[float, float],
+) -> tuple[Array, float]:
+    """Least-squares shift and scale of a match."""
+    placed = match >= 0
+    if not placed.any():
+        return shift, scale
+    seen, expected = glints[placed], lights[match[placed]] - middle
+    spread = expected - expected.mean(axis=0)
+    total = float((spread**2).sum())
+    if total > 1.0:
+        scale = float(np.clip((spread * (seen - seen.mean(axis=0))).sum() / total, *span))
+    return np.asarray((seen - scale * expected).mean(axis=0) - middle), scale
+
+
+def _merit(
+    glints: Array,
+    lights: Array,
+    middle: Array,
+    reach: Array,
+    match: NDArray[np.intp],
+    shift: Array,
+    scale: float,
+    sd: float,
+) -> float:
+    placed = match >= 0
+    offset = glints[placed] - _placed(lights[match[placed]], middle, shift, scale)
+    misfit2 = (offset**2).sum(axis=1) / reach[match[placed]] ** 2
+    return float(np.sum(1.0 - misfit2)) - 0.5 * float(shift @ shift) / sd**2
+
+
+def _contradicts(first: tuple[int, ...], second: tuple[int, ...]) -> bool:
+    """Whether two matches name different lights for a glint, or different glints for a light."""
+    if any(a != b for a, b in zip(first, second, strict=True) if a >= 0 and b >= 0):
+        return True
+    where = {light: i for i, light in enumerate(second) if light >= 0}
+    return any(light in where and where[light] != i for i, light in enumerate(first) if light >= 0)

@@ -1,0 +1,219 @@
+"""The coarse search: dark, elliptical, enclosed blobs over a sweep of thresholds, the innermost of a nest first."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.ellipse import Ellipse, points_on_ellipse
+from .preprocess import Image, Prepared, as_image
+from .settings import ExtractionSettings
+
+Array = NDArray[np.float64]
+
+LEVELS = 20
+ANGLES = 48
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A blob: its ellipse (by second moments), level inside, step to the ring outside, share of the ring that shows
+    the step, and the score the candidates are ranked by."""
+
+    ellipse: Ellipse
+    inside_dn: float
+    step_dn: float
+    enclosed: float
+    score: float
+
+
+def find_candidates(prepared: Prepared, settings: ExtractionSettings, most: int = 4) -> list[Candidate]:
+    """Up to `most` places where a pupil may be, best first; empty where nothing dark and round stands out."""
+    linear, noise_dn = prepared.linear, prepared.noise_dn
+    factor = int(np.clip(settings.radius_min_px // 3.5, 1, 4))
+    while factor < 8 and linear.size / factor**2 > 160_000:
+        factor += 1
+    small = _reduced(linear, factor, cv2.MORPH_CLOSE if prepared.inverted else cv2.MORPH_OPEN)
+    noise = noise_dn / (1.5 * factor) + 0.1  # after averaging factor^2 pixels and a 3 x 3 Gaussian
+    blobs = _sweep(small, factor, settings)
+    if not blobs:
+        return []
+    return _ranked(small, noise, factor, blobs)[:most]
+
+
+def _reduced(linear: Image, factor: int, removal: int) -> Image:
+    """Averaged, smoothed, and rid of glints: an opening removes bright spots (in a negative, a closing dark ones)."""
+    height, width = linear.shape
+    size = (max(1, width // factor), max(1, height // factor))
+    small = cv2.resize(linear[: size[1] * factor, : size[0] * factor], size, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (3, 3), 0.8)
+    spot = 2 * math.ceil(5.0 / factor) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (spot, spot))
+    return as_image(cv2.morphologyEx(small, removal, kernel))
+
+
+def _levels(small: Image) -> Array:
+    """Thresholds, half of them even in level and half even in area, so that neither a faint step nor a small dark
+    backdrop can hide the pupil between two of them."""
+    values = np.sort(small.ravel()[:: max(1, small.size // 8000)])
+    n = values.size
+    low, high = float(values[0]), float(values[int(0.98 * n)])
+    even = np.linspace(low, high, LEVELS + 2)[1:-1]
+    by_area = values[(n * np.linspace(0.004, 0.5, LEVELS // 3)).astype(int)]
+    levels = np.sort(np.concatenate([even, by_area]))
+    gap = max((high - low) / (3 * LEVELS), 1e-6)
+    keep = [0]
+    for i in range(1, levels.size):
+        if levels[i] - levels[keep[-1]] > gap:
+            keep.append(i)
+    return np.asarray(levels[keep], dtype=np.float64)
+
+
+def _sweep(small: Image, factor: int, settings: ExtractionSettings) -> list[tuple[Ellipse, float]]:
+    """Blobs of every threshold that could be a pupil: (ellipse in reduced pixels, share of the ellipse filled)."""
+    height, width = small.shape
+    least = max(0.5 * settings.radius_min_px, settings.radius_min_px - 2.0 * factor) / factor
+    most = 1.3 * settings.radius_max_px / factor
+    blobs: list[tuple[Ellipse, float]] = []
+    for level in _levels(small):
+        mask = (small <= level).view(np.uint8)
+        contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        # A contour's length in pixels is at least half its ellipse's perimeter; holes have a parent.
+        for contour, (_, _, _, parent) in zip(contours, hierarchy[0] if contours else (), strict=True):
+            if parent >= 0 or not 3.0 * least < contour.shape[0] < 15.0 * most:
+                continue
+            x, y, w, h = cv2.boundingRect(contour)
+            # A lid may leave a low segment of the pupil; a backdrop touches two sides or more.
+            sides = (x == 0) + (y == 0) + (x + w == width) + (y + h == height)
+            if sides >= 2 or min(w, h) < 1.2 * least or max(w, h) > 2.2 * most:
+                continue
+            blob = _blob_ellipse(cv2.moments(contour), least, most, settings)
+            if blob is not None:
+                blobs.append(blob)
+    return blobs
+
+
+def _blob_ellipse(
+    m: dict[str, float], least: float, most: float, settings: ExtractionSettings
+) -> tuple[Ellipse, float] | None:
+    """The ellipse with a filled contour's second moments, if the contour fills it."""
+    area = m["m00"]
+    if area < math.pi * least**2 * 0.5:
+        return None
+    c11, c22, c12 = m["mu20"] / area, m["mu02"] / area, m["mu11"] / area
+    root = math.hypot(0.5 * (c11 - c22), c12)
+    mean = 0.5 * (c11 + c22)
+    if mean - root <= 0.0:
+        return None
+    a, b = 2.0 * math.sqrt(mean + root), 2.0 * math.sqrt(mean - root)
+    filled = area / (math.pi * a * b)
+    # The contour runs through the centres of the outermost pixels.
+    a, b = a + 0.5, b + 0.5
+    if b / a < 0.7 * settings.aspect_min or filled < 0.8 or a * b < least**2 or a * b > most**2:
+        return None
+    angle = 0.5 * math.atan2(2.0 * c12, c11 - c22)
+    return Ellipse(np.array([m["m10"] / area, m["m01"] / area]), np.array([a, b]), angle), filled
+
+
+def _ranked(small: Image, noise: float, factor: int, blobs: list[tuple[Ellipse, float]]) -> list[Candidate]:
+    centre = np.array([blob[0].centre_px for blob in blobs])
+    axes = np.array([blob[0].semi_axes_px for blob in blobs])
+    angle = np.array([blob[0].angle_rad for blob in blobs])
+    filled = np.array([blob[1] for blob in blobs])
+    near_in = _sample(small, centre, axes * 0.65, angle)
+    deep_in = _sample(small, centre, axes * 0.4, angle)
+    near_out = _sample(small, centre, axes * 1.15 + 1.5, angle)
+    step = near_out - near_in
+    inside = np.median(np.concatenate([near_in, deep_in], axis=1), axis=1)
+    typical = np.median(step, axis=1)
+    enclosed = np.mean(step > np.maximum(0.35 * typical, 2.0 * noise)[:, None], axis=1)
+    rim_level = np.median(near_in, axis=1)
+    spread = np.std(np.concatenate([near_in, deep_in], axis=1), axis=1)
+    uniform = 1.0 / (1.0 + (spread / np.maximum(typical, 1e-6)) ** 2)
+    strength = np.maximum(typical, 0.0) / (np.maximum(typical, 0.0) + 8.0 * noise + 4.0)
+    score = enclosed**2 * strength * uniform * np.minimum(filled, 1.0) ** 2
+    order = np.argsort(-score, kind="stable")
+    kept: list[int] = []
+    for i in order:
+        if typical[i] < max(2.5 * noise, 0.5) or enclosed[i] < 0.3:
+            continue
+        if all(not _same(centre[i], axes[i], centre[j], axes[j]) for j in kept):
+            kept.append(int(i))
+        if len(kept) >= 12:
+            break
+    final = {i: float(score[i]) for i in kept}
+    for i in kept:
+        for j in kept:
+            inner = axes[j].prod() < 0.6 * axes[i].prod() and np.hypot(*(centre[i] - centre[j])) < 0.6 * axes[i, 1]
+            darker = rim_level[i] - rim_level[j] > max(0.1 * typical[i], 2.0 * noise)
+            # The iris holds the pupil: whatever holds a darker enclosed blob is not the pupil.
+            if inner and darker and enclosed[j] > 0.55 and typical[j] > 0.12 * typical[i]:
+                final[i] = min(final[i], 0.5 * final[j])
+    kept.sort(key=lambda i: -final[i])
+    return [
+        Candidate(
+            Ellipse((centre[i] + 0.5) * factor - 0.5, axes[i] * factor, angle[i]),
+            float(inside[i]), float(typical[i]), float(enclosed[i]), final[i],
+        )
+        for i in kept
+    ]  # fmt: skip
+
+
+def _sample(small: Image, centre: Array, axes: Array, angle: Array) -> Array:
+    """(n, ANGLES) levels at the nearest pixels of n ellipses; beyond the frame its border is repeated."""
+    points = points_on_ellipse(centre, axes, angle, ANGLES)
+    column = np.clip(np.rint(points[..., 0]).astype(np.intp), 0, small.shape[1] - 1)
+    row = np.clip(np.rint(points[..., 1]).astype(np.intp), 0, small.shape[0] - 1)
+    return small[row, column].astype(np.float64)
+
+
+def _same(centre_1: Array, axes_1: Array, centre_2: Array, axes_2: Array) -> bool:
+    near = float(np.hypot(*(centre_1 - centre_2))) < 0.35 * float(min(axes_1[1], axes_2[1]))
+    ratio = float(axes_1.prod() / axes_2.prod())
+    return near and 0.6 < ratio < 1.65
+
+
+def core_darkness(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: float) -> tuple[float, float]:
+    """How much darker the middle of an ellipse is than its outer part: (difference, its standard error), DN.
+
+    A pupil's interior is even; an iris taken for one has the pupil in its middle. The outer part ends where the rim's
+    blur begins. Medians, because of glints.
+    """
+    a, b = ellipse.semi_axes_px
+    cx, cy = ellipse.centre_px
+    x0, x1 = max(0, math.floor(cx - a)), min(linear.shape[1], math.ceil(cx + a) + 1)
+    y0, y1 = max(0, math.floor(cy - a)), min(linear.shape[0], math.ceil(cy + a) + 1)
+    dx, dy = np.arange(x0, x1)[None, :] - cx, np.arange(y0, y1)[:, None] - cy
+    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+    radius2 = ((dx * cos + dy * sin) / a) ** 2 + ((dy * cos - dx * sin) / b) ** 2
+    crop = linear[y0:y1, x0:x1]
+    end = min(0.85, 1.0 - 2.5 * blur_px / float(b))
+    core, rim = crop[radius2 < 0.35**2], crop[(radius2 > (end - 0.25) ** 2) & (radius2 < end**2)]
+    if end < 0.6 or core.size < 5 or rim.size < 5:
+        return 0.0, math.inf
+    error = 1.2533 * noise_dn * math.sqrt(1.0 / core.size + 1.0 / rim.size)
+    return float(np.median(rim) - np.median(core)), error
+
+
+def find_inside(prepared: Prepared, ellipse: Ellipse, settings: ExtractionSettings) -> list[Candidate]:
+    """Candidates inside an ellipse (an iris), searched for on a smoothed image: the step may be below the noise."""
+    linear = prepared.linear
+    a, b = ellipse.semi_axes_px
+    cx, cy = ellipse.centre_px
+    x0, x1 = max(0, math.floor(cx - a)), min(linear.shape[1], math.ceil(cx + a) + 1)
+    y0, y1 = max(0, math.floor(cy - a)), min(linear.shape[0], math.ceil(cy + a) + 1)
+    sigma = float(np.clip(0.08 * b, 1.0, 4.0))
+    smooth = as_image(cv2.GaussianBlur(cv2.medianBlur(np.ascontiguousarray(linear[y0:y1, x0:x1]), 5), (0, 0), sigma))
+    noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * sigma)
+    inner = Prepared(smooth, prepared.clip_dn, noise, prepared.inverted)
+    found = find_candidates(inner, settings)
+    moved = [
+        Candidate(c.ellipse.shifted((x0, y0)), c.inside_dn, c.step_dn, c.enclosed, c.score)
+        for c in found
+        if c.ellipse.area_px2 < 0.75 * ellipse.area_px2
+    ]
+    return [c for c in moved if math.dist(c.ellipse.centre_px, ellipse.centre_px) < 0.5 * float(b)]

@@ -1,0 +1,160 @@
+"""Sub-pixel edge points on the rim of a candidate: gradients, ridges, polarity and darkness gates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.ellipse import Ellipse
+from .coarse import Candidate
+from .preprocess import Image, as_image
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgePoints:
+    """points_px: (n, 2) ridge of the gradient, uncorrected for curvature. normals: (n, 2) unit, from dark to bright.
+    strength: (n,) gradient, DN per px. arc: (n,) label of the connected piece each point lies on. sigma_px: of the
+    whole smoothing (optics, pixel and filter) as the gradient's profile across the edge shows it.
+    filter_px: sigma of the filter alone.
+    """
+
+    points_px: Array
+    normals: Array
+    strength: Array
+    arc: NDArray[np.intp]
+    sigma_px: float
+    filter_px: float
+
+
+def find_edges(linear: Image, candidate: Candidate, noise_dn: float, bright_dn: float, *, band: float) -> EdgePoints:
+    """Edge points within `band` times the semi-axes of the candidate's outline (and at least 4 px).
+
+    A gradient ridge is kept when it points outward (within 45 deg of the candidate's normal), stands out of the noise,
+    has dark pupil behind it, and is not the flank of a spot brighter than `bright_dn`.
+    Sub-pixel position: along the gradient's larger component, the vertex of the parabola through the logarithms of
+    three magnitudes, exact for a Gaussian-blurred straight edge. Source: Devernay (1995), with the logarithm.
+    """
+    ellipse = candidate.ellipse
+    b = float(ellipse.semi_axes_px[1])
+    x0, y0, crop = _crop(linear, ellipse, 1.0 + band, 8.0)
+    sigma = filter_sigma(candidate.step_dn, noise_dn, b)
+    gx, gy = _gradient(crop, sigma)
+    magnitude = as_image(cv2.magnitude(gx, gy))
+    u, v, radius = _outward(crop.shape, ellipse, x0, y0)
+    half_band = max(band, 4.0 / b)
+    # The two coarse gates first: the rest works on the few pixels they leave.
+    floor = 3.5 * noise_dn / (2.0 * math.sqrt(2.0 * math.pi) * sigma**2)
+    gate = (np.abs(radius - 1.0) < half_band) & (magnitude > floor) & (gx * u + gy * v > 0.7 * magnitude)
+    gate[[0, -1], :] = False
+    gate[:, [0, -1]] = False
+    row, column = np.nonzero(gate)
+    dx, dy, here = gx[row, column], gy[row, column], magnitude[row, column]
+    level = np.abs(dx) >= np.abs(dy)
+    step_x, step_y = level.astype(np.intp), (~level).astype(np.intp)
+    before = magnitude[row - step_y, column - step_x]
+    after = magnitude[row + step_y, column + step_x]
+    ridge = (here > before) & (here >= after) & (here > 0.35 * _typical(here))
+    row, column, dx, dy, here, level = (value[ridge] for value in (row, column, dx, dy, here, level))
+    logs = [np.log(np.maximum(value, 1e-3).astype(np.float64)) for value in (before[ridge], here, after[ridge])]
+    bend = np.minimum(logs[0] - 2.0 * logs[1] + logs[2], -1e-4)
+    offset = np.clip(0.5 * (logs[0] - logs[2]) / bend, -0.75, 0.75)
+    points = np.stack([column + np.where(level, offset, 0.0), row + np.where(level, 0.0, offset)], axis=-1)
+    normals = np.stack([dx, dy], axis=-1).astype(np.float64) / here[:, None]
+
+    smooth = as_image(cv2.GaussianBlur(crop, (0, 0), max(0.7, 0.7 * sigma)))
+    depth = min(max(4.0, 2.5 * sigma), 0.6 * b)
+    behind, ahead = _nearest(smooth, points - depth * normals), _nearest(smooth, points + 0.5 * depth * normals)
+    noise_smooth = noise_dn / (2.0 * math.sqrt(math.pi) * max(0.7, 0.7 * sigma))
+    dark = behind < candidate.inside_dn + max(0.5 * candidate.step_dn, 4.0 * noise_smooth)
+    plain = ahead < bright_dn
+    keep = dark & plain
+    arc = _arcs(crop.shape, row, column)
+    # The profile's width: log of a Gaussian bends by -1 / sigma^2 along the normal, less along the axis.
+    lean = np.where(level, np.abs(normals[:, 0]), np.abs(normals[:, 1]))
+    spread = sigma * 1.1
+    if keep.sum() >= 8:
+        spread = float(np.sqrt(np.median(lean[keep] ** 2 / -bend[keep])))
+    return EdgePoints(
+        points[keep] + np.array([x0, y0]),
+        normals[keep],
+        here[keep].astype(np.float64),
+        arc[keep],
+        float(np.clip(spread, sigma, 8.0)),
+        sigma,
+    )
+
+
+def filter_sigma(step_dn: float, noise_dn: float, b: float) -> float:
+    """Width of the derivative filter: 1 px where the edge is clear, up to 2.5 px (and b / 6) where noise needs it."""
+    return float(np.clip(9.0 * noise_dn / max(step_dn, 1e-6), 1.0, max(1.0, min(2.5, b / 6.0))))
+
+
+def edge_noise_px(step_dn: float, noise_dn: float, sigma_filter: float, sigma_total: float) -> float:
+    """Standard deviation of one edge point along its normal, px.
+
+    sigma_x = n'' / |g''|: the noise's second derivative along the normal after filtering, noise sqrt(3 / (16 pi)) /
+    s_f^3, over the bend of the gradient's ridge, step / (sqrt(2 pi) s_t^3); s_f of the filter, s_t of the whole blur.
+    """
+    curvature = step_dn / (math.sqrt(2.0 * math.pi) * sigma_total**3)
+    slope_noise = noise_dn * math.sqrt(3.0 / (16.0 * math.pi)) / sigma_filter**3
+    return slope_noise / max(curvature, 1e-9)
+
+
+def _crop(linear: Image, ellipse: Ellipse, scale: float, margin: float) -> tuple[int, int, Image]:
+    reach = float(ellipse.semi_axes_px[0]) * scale + margin
+    cx, cy = ellipse.centre_px
+    height, width = linear.shape
+    x0, x1 = max(0, math.floor(cx - reach)), min(width, math.ceil(cx + reach) + 1)
+    y0, y1 = max(0, math.floor(cy - reach)), min(height, math.ceil(cy + reach) + 1)
+    return x0, y0, linear[y0:y1, x0:x1]
+
+
+def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
+    """Derivatives of a Gaussian, normalised so that a ramp of 1 DN per px gives 1."""
+    t = np.arange(-math.ceil(4.0 * sigma), math.ceil(4.0 * sigma) + 1, dtype=np.float64)
+    smooth = np.exp(-0.5 * (t / sigma) ** 2)
+    smooth /= smooth.sum()
+    slope = t * smooth
+    slope /= (t * slope).sum()
+    return (
+        as_image(cv2.sepFilter2D(crop, cv2.CV_32F, slope, smooth, borderType=cv2.BORDER_REPLICATE)),
+        as_image(cv2.sepFilter2D(crop, cv2.CV_32F, smooth, slope, borderType=cv2.BORDER_REPLICATE)),
+    )
+
+
+def _outward(shape: tuple[int, ...], ellipse: Ellipse, x0: int, y0: int) -> tuple[Image, Image, Image]:
+    """Unit outward normal of the concentric ellipses, and the radius in units of the semi-axes, at every pixel."""
+    a, b = ellipse.semi_axes_px
+    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+    x = (np.arange(shape[1]) + x0 - ellipse.centre_px[0]).astype(np.float32)[None, :]
+    y = (np.arange(shape[0]) + y0 - ellipse.centre_px[1]).astype(np.float32)[:, None]
+    p = x * np.float32(cos / a) + y * np.float32(sin / a)
+    q = y * np.float32(cos / b) - x * np.float32(sin / b)
+    radius = as_image(cv2.magnitude(p, q))
+    u, v = p * np.float32(cos / a) - q * np.float32(sin / b), p * np.float32(sin / a) + q * np.float32(cos / b)
+    length = np.maximum(as_image(cv2.magnitude(u, v)), np.float32(1e-12))
+    return u / length, v / length, radius
+
+
+def _typical(strength: Image) -> float:
+    """The strong edges' level: an upper percentile, because a ridge has more flank than crest."""
+    return float(np.percentile(strength, 90.0)) if strength.size else 0.0
+
+
+def _nearest(image: Image, points: Array) -> Image:
+    column = np.clip(np.rint(points[:, 0]).astype(np.intp), 0, image.shape[1] - 1)
+    row = np.clip(np.rint(points[:, 1]).astype(np.intp), 0, image.shape[0] - 1)
+    return image[row, column]
+
+
+def _arcs(shape: tuple[int, ...], row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[np.intp]:
+    mask = np.zeros(shape[:2], np.uint8)
+    mask[row, column] = 1
+    _, labels = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
+    return labels[row, column].astype(np.intp)

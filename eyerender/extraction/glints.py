@@ -1,0 +1,135 @@
+"""Bright spots near the pupil: detection, and the reasons why a reflection is no glint of the cornea."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.ellipse import Ellipse
+from .preprocess import DN, Image, Prepared, as_image
+from .result import GlintResult, frozen
+from .settings import ExtractionSettings
+from .spotfit import SpotFit
+
+Array = NDArray[np.float64]
+
+SMOOTH_PX = 0.7
+MAX_SIGMA_PX = 8.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spots:
+    """Detected spots: xy_px (n, 2) of the peak pixels, width_px (n,) sigma guessed from the area above half height,
+    height_dn (n,) above the surroundings."""
+
+    xy_px: Array
+    width_px: Array
+    height_dn: Array
+
+
+def detect_spots(
+    prepared: Prepared, ellipse: Ellipse, step_dn: float, blur_px: float, settings: ExtractionSettings
+) -> Spots:
+    """Local maxima that stand out of their surroundings, a white top-hat, within the settings' reach of the pupil."""
+    linear = prepared.linear
+    reach = float(ellipse.semi_axes_px[0]) * settings.glint_reach + 8.0
+    cx, cy = ellipse.centre_px
+    x0, x1 = max(0, math.floor(cx - reach)), min(linear.shape[1], math.ceil(cx + reach) + 1)
+    y0, y1 = max(0, math.floor(cy - reach)), min(linear.shape[0], math.ceil(cy + reach) + 1)
+    crop = linear[y0:y1, x0:x1]
+    if crop.shape[0] < 5 or crop.shape[1] < 5:
+        return _no_spots()
+    smooth = as_image(cv2.GaussianBlur(crop, (0, 0), SMOOTH_PX))
+    size = 2 * math.ceil(3.0 * max(blur_px, 1.0) + 3.0) + 1
+    opened = _opening(smooth, size)
+    hat = smooth - opened
+    # A top-hat of noise alone is near 3 sigma of the smoothed noise everywhere.
+    noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * SMOOTH_PX)
+    threshold = max(9.0 * noise, 0.45 * step_dn)
+    peak = (hat > threshold) & (smooth >= cv2.dilate(smooth, np.ones((5, 5), np.uint8)))
+    row, column = np.nonzero(peak)
+    if row.size == 0:
+        return _no_spots()
+    height = hat[row, column].astype(np.float64)
+    order = np.argsort(-height, kind="stable")[: 3 * max(settings.max_glints, 1)]
+    xy = np.stack([column[order], row[order]], axis=-1).astype(np.float64)
+    keep: list[int] = []
+    for i in range(order.size):  # flat tops of clipped spots give several maxima
+        if all(np.hypot(*(xy[i] - xy[j])) > 2.5 for j in keep):
+            keep.append(i)
+    xy, height = xy[keep], height[order[keep]]
+    return Spots(xy + np.array([x0, y0]), _widths(hat, xy, height, size), height)
+
+
+def _no_spots() -> Spots:
+    return Spots(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+
+
+def _opening(smooth: Image, size: int) -> Image:
+    """A square opening, because OpenCV runs it as two passes along rows and columns."""
+    return as_image(cv2.morphologyEx(smooth, cv2.MORPH_OPEN, np.ones((size, size), np.uint8)))
+
+
+def _widths(hat: Image, xy: Array, height: Array, size: int) -> Array:
+    """sigma = sqrt(area above half height / (2 pi ln 2)), counted in a window of the opening's size."""
+    half = size // 2
+    out = np.empty(height.size)
+    for i, (x, y) in enumerate(xy.astype(int)):
+        window = hat[max(0, y - half) : y + half + 1, max(0, x - half) : x + half + 1]
+        area = np.count_nonzero(window > 0.5 * height[i])
+        out[i] = math.sqrt(max(area, 1) / (2.0 * math.pi * math.log(2.0)))
+    return np.asarray(np.clip(np.sqrt(np.maximum(out**2 - SMOOTH_PX**2, 0.3)), 0.5, MAX_SIGMA_PX))
+
+
+def judge_spots(
+    spots: Spots, fit: SpotFit, prepared: Prepared, step_dn: float, settings: ExtractionSettings
+) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
+    """(accepted, rejected), brightest first."""
+    accepted: list[GlintResult] = []
+    rejected: list[GlintResult] = []
+    for i in np.argsort(-fit.amplitude_dn, kind="stable"):
+        reason = _objection(spots, fit, int(i), prepared, step_dn)
+        spread = np.sqrt(fit.sigma_px[i].prod())
+        result = GlintResult(
+            status="ok" if reason is None else "rejected",
+            reason=reason,
+            xy_px=frozen(fit.xy_px[i]) if fit.converged[i] else frozen(spots.xy_px[i]),
+            covariance=frozen(fit.covariance[i]) if fit.converged[i] else None,
+            amplitude=float(fit.amplitude_dn[i] / DN),
+            sigma_px=float(spread),
+            saturated=bool(fit.clipped[i] > 0),
+        )
+        (accepted if reason is None else rejected).append(result)
+    surplus = accepted[settings.max_glints :]
+    return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus)
+
+
+def _objection(spots: Spots, fit: SpotFit, i: int, prepared: Prepared, step_dn: float) -> str | None:
+    """Why spot i is no glint, or None."""
+    if not fit.converged[i]:
+        return "the spot's fit did not converge"
+    narrow, wide = float(fit.sigma_px[i].min()), float(fit.sigma_px[i].max())
+    moved = float(np.hypot(*(fit.xy_px[i] - spots.xy_px[i])))
+    if moved > max(2.5, 2.0 * wide):
+        return f"no spot: the fit moved {moved:.1f} px from the bright pixel"
+    if wide > MAX_SIGMA_PX:
+        return f"too wide for a glint: sigma {wide:.1f} px"
+    if wide > 2.2 * max(narrow, 0.4):
+        return f"elongated {wide / narrow:.1f} : 1, as reflections off the sclera and wet lid margins are"
+    if fit.amplitude_dn[i] < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
+        return "too faint for a glint"
+    if fit.residual_dn[i] > max(0.3 * min(fit.amplitude_dn[i], DN), 3.0 * prepared.noise_dn):
+        return "no spot: the bright patch is not bell-shaped"
+    return None
+
+
+def assign(results: tuple[GlintResult, ...], lights: tuple[int | None, ...]) -> tuple[GlintResult, ...]:
+    """The same glints with their lights' indices."""
+    return tuple(
+        GlintResult(g.status, g.reason, g.xy_px, g.covariance, g.amplitude, g.sigma_px, g.saturated, light)
+        for g, light in zip(results, lights, strict=True)
+    )

@@ -1,0 +1,203 @@
+"""From an image to the pupil and the glints."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.ellipse import signed_distance
+from .arcs import RimFit, curvature_at, fit_rim
+from .coarse import Candidate, core_darkness, find_candidates, find_inside
+from .confidence import confidence
+from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
+from .glints import Spots, detect_spots, judge_spots
+from .preprocess import DN, Prepared, invert, prepare
+from .refine import SECTORS, PixelFit, edge_covariance, refine, rim_deviation, sector_of
+from .result import Extraction, GlintResult, Goodness, PupilResult, frozen
+from .rimmodel import Place, RimModel
+from .settings import ExtractionSettings
+from .spotfit import fit_spots
+
+Array = NDArray[np.float64]
+
+
+def extract(
+    image: object,
+    *,
+    bit_depth: int | None = None,
+    gamma: float = 1.0,
+    settings: ExtractionSettings | None = None,
+) -> Extraction:
+    """The pupil ellipse and the glints of a single-channel image.
+
+    image: (h, w) array of unsigned integers (full scale 2^bit_depth - 1, or that of the type) or floats.
+    gamma: the image stores intensity^(1 / gamma); 1 for linear data.
+    Raises `InputError` for what is no single-channel image or contradicts bit_depth; whatever an image may show,
+    nothing at all included, is a result with a status and a reason.
+    """
+    settings = settings or ExtractionSettings()
+    prepared = prepare(image, bit_depth, gamma)
+    shape = np.asarray(image).shape[:2]
+    size = (int(shape[0]), int(shape[1]))
+    if isinstance(prepared, str):
+        return Extraction(PupilResult.missing("input", prepared), (), (), 0.0, size)
+    noise = prepared.noise_dn / DN
+    work = invert(prepared) if settings.polarity == "bright" else prepared
+    found = _search(work, settings)
+    if isinstance(found, PupilResult):
+        return Extraction(found, (), (), noise, size)
+    model = _edge_model(found)
+    spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
+    pixel_fit: PixelFit | None = None
+    if settings.method == "refined":
+        masked = _spot_mask(prepared, spots.xy_px, spots.width_px, spots.height_dn)
+        refined = refine(work.linear, model, _seen(found), masked, work.noise_dn)
+        if isinstance(refined, PixelFit) and _agrees(refined, found):
+            pixel_fit, model = refined, refined.model
+    accepted, rejected = _glints(prepared, work, spots, model, settings)
+    return Extraction(_pupil(found, work, model, pixel_fit), accepted, rejected, noise, size)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    candidate: Candidate
+    edges: EdgePoints
+    rim: RimFit
+    quality: float
+
+
+def _search(work: Prepared, settings: ExtractionSettings) -> _Found | PupilResult:
+    """The best candidate by what its rim shows at full resolution."""
+    candidates = find_candidates(work, settings)
+    if not candidates:
+        return PupilResult.missing("coarse search", "no dark round region stands out of its surroundings")
+    found, reason = _first_good(work, candidates, settings)
+    if found is None:
+        return PupilResult.missing("edges", reason)
+    return _without_core(work, found, settings)
+
+
+def _first_good(work: Prepared, candidates: list[Candidate], settings: ExtractionSettings) -> tuple[_Found | None, str]:
+    """The first candidate with a well-seen rim, else the best-seen one; and the first one's objection."""
+    best: _Found | None = None
+    reason = ""
+    for candidate in candidates:
+        found = _rim(work, candidate, settings)
+        if isinstance(found, str):
+            reason = reason or found
+            continue
+        if best is None or found.quality > best.quality:
+            best = found
+        # The ranking knows what lies inside what; a later candidate must only stand in for a failed one.
+        if found.rim.support > 0.45:
+            return (best if _holds(found, best) else found), reason
+    return best, reason
+
+
+def _holds(outer: _Found, inner: _Found) -> bool:
+    """Whether a smaller rim found earlier, however little of it is seen, lies inside."""
+    ratio = inner.rim.ellipse.area_px2 / outer.rim.ellipse.area_px2
+    apart = math.dist(inner.rim.ellipse.centre_px, outer.rim.ellipse.centre_px)
+    return ratio < 0.7 and apart < 0.7 * float(outer.rim.ellipse.semi_axes_px[1])
+
+
+def _without_core(work: Prepared, found: _Found, settings: ExtractionSettings) -> _Found | PupilResult:
+    """The same rim if its inside is even; what lies inside it if there is a darker core, as an iris has."""
+    for _ in range(2):
+        darker, error = core_darkness(work.linear, found.rim.ellipse, _edge_model(found).sigma_px, work.noise_dn)
+        if darker < max(4.0 * error, 0.08 * found.candidate.step_dn):
+            return found
+        inner, _ = _first_good(work, find_inside(work, found.rim.ellipse, settings), settings)
+        if inner is None or inner.rim.ellipse.area_px2 > 0.8 * found.rim.ellipse.area_px2:
+            reason = "the dark region has a darker core, as an iris has, but no rim was found in it"
+            return PupilResult.missing("edges", reason)
+        found = inner
+    return found
+
+
+def _rim(work: Prepared, candidate: Candidate, settings: ExtractionSettings) -> _Found | str:
+    bright = candidate.inside_dn + 4.0 * candidate.step_dn
+    edges = find_edges(work.linear, candidate, work.noise_dn, bright, band=0.4)
+    sigma = filter_sigma(candidate.step_dn, work.noise_dn, float(candidate.ellipse.semi_axes_px[1]))
+    expected = edge_noise_px(candidate.step_dn, work.noise_dn, sigma, edges.sigma_px)
+    rim = fit_rim(edges, candidate, settings, expected)
+    if isinstance(rim, str):
+        return rim
+    return _Found(candidate, edges, rim, rim.support * min(1.0, 4.0 * candidate.score))
+
+
+def _edge_model(found: _Found) -> RimModel:
+    """The pixel model's parameters as far as the edges tell them."""
+    candidate = found.candidate
+    sigma = math.sqrt(max(found.edges.sigma_px**2 - found.edges.filter_px**2, 0.25))
+    outer = np.array([candidate.inside_dn + candidate.step_dn])
+    return RimModel(found.rim.ellipse, candidate.inside_dn, outer, sigma)
+
+
+def _seen(found: _Found) -> NDArray[np.bool_]:
+    """Sectors of the outline with an edge point in them or beside them."""
+    place = Place.of(found.rim.ellipse, *found.edges.points_px[found.rim.inliers].T)
+    hit = np.bincount(sector_of(place), minlength=SECTORS) > 0
+    return np.asarray(hit | np.roll(hit, 1) | np.roll(hit, -1))
+
+
+def _agrees(fit: PixelFit, found: _Found) -> bool:
+    """Whether the refined rim still passes along the edges: it may move by what noise and texture move it, no more."""
+    points = found.edges.points_px[found.rim.inliers]
+    ellipse = fit.model.ellipse
+    shift = 0.5 * found.edges.sigma_px**2 * curvature_at(ellipse, points)
+    distance = float(np.median(np.abs(signed_distance(ellipse, points) + shift)))
+    return distance < max(2.5 * found.rim.residual_px, 0.3)
+
+
+def _spot_mask(prepared: Prepared, xy: Array, width: Array, height: Array) -> NDArray[np.bool_]:
+    """Pixels to which a spot adds more than a fifth of the noise, and those that the sensor clipped."""
+    mask = prepared.linear >= prepared.clip_dn
+    for (x, y), sigma, peak in zip(xy, width, height, strict=True):
+        ratio = max(5.0 * peak / prepared.noise_dn, math.e)
+        radius = 1.2 * sigma * math.sqrt(2.0 * math.log(ratio)) + 1.0
+        x0, x1 = max(0, math.floor(x - radius)), min(mask.shape[1], math.ceil(x + radius) + 1)
+        y0, y1 = max(0, math.floor(y - radius)), min(mask.shape[0], math.ceil(y + radius) + 1)
+        near = (np.arange(x0, x1)[None, :] - x) ** 2 + (np.arange(y0, y1)[:, None] - y) ** 2 < radius**2
+        mask[y0:y1, x0:x1] |= near
+    return mask
+
+
+def _pupil(found: _Found, work: Prepared, model: RimModel, fit: PixelFit | None) -> PupilResult:
+    rim, ellipse = found.rim, model.ellipse
+    covariance = edge_covariance(ellipse, rim.points_px, rim.residual_px) if fit is None else fit.covariance
+    darker, error = core_darkness(work.linear, ellipse, model.sigma_px, work.noise_dn)
+    goodness = Goodness(
+        support=rim.support,
+        gap=rim.gap,
+        explained=rim.support if fit is None else float(fit.sectors.mean()),
+        contrast=model.step_dn / DN,
+        contrast_to_noise=model.step_dn / work.noise_dn,
+        residual_px=rim.residual_px,
+        reduced_chi2=0.0 if fit is None else fit.reduced_chi2,
+        blur_px=model.sigma_px,
+        unevenness=darker / model.step_dn if math.isfinite(error) else 0.0,
+        rim_sd_px=rim_deviation(ellipse, covariance),
+        refined=fit is not None,
+    )
+    contour = frozen(found.edges.points_px[rim.inliers])
+    return PupilResult("ok", None, None, ellipse, frozen(covariance), confidence(ellipse, goodness), goodness, contour)
+
+
+def _glints(
+    prepared: Prepared, work: Prepared, spots: Spots, model: RimModel, settings: ExtractionSettings
+) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
+    step = abs(model.step_dn)
+
+    def known(x: Array, y: Array) -> Array:
+        level = model.level(x, y)
+        return -level if work.inverted else level  # up to a constant, which the fit has anyway
+
+    fit = fit_spots(
+        prepared.linear, known, spots.xy_px, spots.width_px, spots.height_dn,
+        prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * step),
+    )  # fmt: skip
+    return judge_spots(spots, fit, prepared, step, settings)

@@ -1,0 +1,139 @@
+"""From whatever was read to linear grey levels: type, depth, gamma, clip level and noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+Image = NDArray[np.float32]
+
+MAX_PIXELS = 64_000_000
+MIN_SIDE = 16
+DN = 255.0  # grey levels of full scale; every level inside the extractor is in these
+
+
+def as_image(array: NDArray[np.generic]) -> Image:
+    """float32 without a copy where it is that already (OpenCV's types say less than it returns)."""
+    return np.asarray(array, dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """linear: (h, w) float32 linear intensity, full scale 255. clip_dn: level at which the sensor saturates (infinite
+    for float images). noise_dn: standard deviation of a pixel's noise. inverted: whether this is a negative.
+    """
+
+    linear: Image
+    clip_dn: float
+    noise_dn: float
+    inverted: bool = False
+
+
+def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | str:
+    """The prepared image, or the reason why nothing can be found in it.
+
+    image: (h, w) integers (full scale 2^bit_depth - 1; without bit_depth, that of the type) or floats (linear scale
+    free). gamma: the image stores intensity^(1 / gamma). Raises `InputError` for what is no single-channel image.
+    """
+    array = _checked(image)
+    if not (np.isfinite(gamma) and 0.1 <= gamma <= 10.0):
+        raise InputError(f"must be between 0.1 and 10, not {gamma!r}", path="gamma")
+    height, width = array.shape
+    if height * width > MAX_PIXELS:
+        return f"the image is {width} x {height}, more than {MAX_PIXELS // 1_000_000} million pixels"
+    if min(height, width) < MIN_SIDE:
+        return f"the image is {width} x {height}; both sides must be at least {MIN_SIDE} px"
+    if array.dtype.kind == "f":
+        scaled = _from_float(array, gamma)
+        if isinstance(scaled, str):
+            return scaled
+        linear, clip, quantum = scaled, float("inf"), 0.0
+    else:
+        linear, clip, quantum = _from_integers(array, bit_depth, gamma)
+    low, high = float(linear.min()), float(linear.max())
+    if low == high:
+        name = "all black" if high == 0.0 else "all white" if high >= clip else "of one grey level"
+        return f"the image is {name}"
+    # Rounding to integers is noise of 1/sqrt(12) of a step.
+    noise = max(estimate_noise(linear), quantum / np.sqrt(12.0), 1e-3)
+    return Prepared(linear, clip, float(noise))
+
+
+def _checked(image: object) -> NDArray[np.generic]:
+    array = np.asarray(image)
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[:, :, 0]
+    if array.ndim == 3 and array.shape[2] in (2, 3, 4):
+        raise InputError(f"is a colour image of {array.shape[2]} channels; expected one channel (near-infrared grey)")
+    if array.ndim != 2:
+        raise InputError(f"has the shape {array.shape}; expected a single-channel image (height, width)")
+    if array.dtype.kind not in "uif" or array.size == 0:
+        raise InputError(f"holds {array.size} values of type {array.dtype}; expected integers or floats")
+    return array
+
+
+def _from_integers(array: NDArray[np.generic], bit_depth: int | None, gamma: float) -> tuple[Image, float, float]:
+    bits = array.dtype.itemsize * 8 if bit_depth is None else bit_depth
+    if isinstance(bits, bool) or not 1 <= bits <= 16:
+        raise InputError(f"must be between 1 and 16, not {bits!r}", path="bit_depth")
+    full = (1 << bits) - 1
+    low, high = int(array.min()), int(array.max())
+    if high > full or low < 0:
+        raise InputError(f"holds levels {low} to {high}, outside the {bits} bits stated", path="bit_depth")
+    if gamma == 1.0:
+        return np.multiply(array, np.float32(DN / full), dtype=np.float32), DN, DN / full
+    table = (DN * (np.arange(full + 1) / full) ** gamma).astype(np.float32)
+    linear = table[array.astype(np.intp, copy=False)]
+    # The decoded step at the image's own middle level.
+    middle = max(int(np.median(array[::4, ::4].astype(np.float64))), 1)
+    return linear, DN, float(table[middle] - table[middle - 1])
+
+
+def _from_float(array: NDArray[np.generic], gamma: float) -> Image | str:
+    values = array.astype(np.float64)
+    if not np.isfinite(values).all():
+        return "the image holds values that are not finite"
+    if gamma != 1.0:
+        values = np.maximum(values, 0.0) ** gamma
+    step = max(1, int(np.sqrt(values.size / 40_000)))
+    scale = float(np.percentile(values[::step, ::step], 99.5))
+    if scale <= 0.0:
+        scale = float(values.max())
+    if not (scale > 0.0 and np.isfinite(scale) and np.isfinite(values.max() / scale)):
+        return "the image holds no positive intensity"
+    linear = (values * (DN / (1.7 * scale))).astype(np.float32)
+    return linear if np.isfinite(linear).all() else "the image's range is too large"
+
+
+def estimate_noise(linear: Image) -> float:
+    """sigma = 1.4826 median|d| / 2, d = I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1), on about 20,000 places.
+
+    The difference removes any plane; the median ignores edges. Source: Immerkaer (1996), with a median for the mean.
+    """
+    step = max(1, int(np.sqrt(linear.size / 20_000)))
+    a, b = linear[:-1:step, :-1:step], linear[:-1:step, 1::step]
+    c, d = linear[1::step, :-1:step], linear[1::step, 1::step]
+    difference = np.abs(a - b - c + d).ravel()
+    # Flat areas that sensor clipping made exactly constant say nothing about the noise.
+    moving = difference[difference > 0.0]
+    if moving.size < 0.05 * difference.size:
+        return 0.0
+    source = difference if moving.size > 0.6 * difference.size else moving
+    return float(0.7413 * np.median(source))
+
+
+def invert(prepared: Prepared) -> Prepared:
+    """The negative, for bright pupils: level -> ceiling - level, with the ceiling above the pupil.
+
+    Glints, brighter than the pupil, become dark specks; they are cut at the ceiling, the 99th percentile of the
+    smoothed image, so that a bright pupil's own level stays apart from them.
+    """
+    smooth = cv2.medianBlur(prepared.linear, 5)
+    ceiling = float(np.percentile(smooth[::2, ::2], 99.9)) + 3.0 * prepared.noise_dn
+    negative = np.maximum(np.subtract(np.float32(ceiling), prepared.linear), np.float32(0.0))
+    return Prepared(negative, float("inf"), prepared.noise_dn, inverted=True)

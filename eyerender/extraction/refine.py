@@ -1,0 +1,311 @@
+"""Maximum-likelihood refinement: the pixel model of the rim fitted to the pixels around it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.ellipse import Ellipse
+from .preprocess import Image
+from .rimmodel import Place, RimModel, blurred_edge, harmonics
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SECTORS = 48
+ORDERS = (0, 2, 4, 6, 8)  # Fourier orders of the outer level that are tried
+SHAPE = 5  # the first parameters: cx, cy, and the change of the shape matrix in the ellipse's axes (aa, bb, ab)
+OUTLIER = 5.0  # pixels beyond this many standard deviations do not count
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PixelFit:
+    """model; covariance (5, 5) of (cx, cy, a, b, angle); reduced_chi2 against the image's noise; residual_dn; pixels
+    used; sectors: (SECTORS,) which parts of the outline count."""
+
+    model: RimModel
+    covariance: Array
+    reduced_chi2: float
+    residual_dn: float
+    pixels: int
+    sectors: Mask
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pixels:
+    x: Array
+    y: Array
+    level: Array
+
+
+def refine(linear: Image, start: RimModel, sectors: Mask, masked: Mask, noise_dn: float) -> PixelFit | str:
+    """The most likely rim, or why the refinement failed.
+
+    linear: image. start: from the edges. sectors: (SECTORS,) parts of the outline that the edges saw. masked: image of
+    pixels that glints touch or the sensor clipped. Gauss-Newton with Levenberg's damping; the Fourier order of the
+    outer level is the one of least BIC, by the drop of chi^2 that one linear step with its columns promises. Pixels and
+    sectors that the model cannot explain (lids, lashes, reflections) are put aside, and the rest is fitted again.
+    """
+    model = start
+    pixels = _band(linear, model, masked)
+    use = np.ones(pixels.x.size, dtype=bool)
+    result: tuple[RimModel, Array, Array, Place] | None = None
+    seen = sectors.copy()
+    order_settled = False
+    for turn in range(4):
+        place = Place.of(model.ellipse, pixels.x, pixels.y)
+        bins = sector_of(place)
+        use_now = use & seen[bins]
+        if use_now.sum() < 60:
+            return "too few pixels on the rim are free of glints and lids"
+        chosen = _Pixels(pixels.x[use_now], pixels.y[use_now], pixels.level[use_now])
+        result = _gauss_newton(chosen, model, steps=6 if turn == 0 else 4)
+        model = result[0]
+        if not order_settled:
+            order = _best_order(chosen, model, noise_dn)
+            if order > 0:
+                model = RimModel(model.ellipse, model.inner_dn, _padded(model.outer, order), model.sigma_px)
+                result = _gauss_newton(chosen, model, steps=4)
+                model = result[0]
+            order_settled = True
+        if not _sane(model, start):
+            return "the pixel model's fit ran away from the edges"
+        residual = pixels.level - _predict(model, pixels)
+        scale = max(1.4826 * float(np.median(np.abs(residual[use_now]))), 1e-3)
+        new_use = np.abs(residual) < OUTLIER * max(scale, noise_dn)
+        new_seen = _explained(residual, new_use, bins, seen, sectors, max(scale, noise_dn))
+        new_seen = _clear_of_lids(new_seen, model)
+        same = bool((new_use == use).all() and (new_seen == seen).all())
+        use, seen = new_use, new_seen
+        if same:
+            break
+        if seen.sum() < 0.15 * SECTORS:
+            return "too little of the rim fits the pixel model"
+    if result is None:
+        return "nothing was fitted"
+    return _report(chosen, result, noise_dn, seen)
+
+
+def _band(linear: Image, model: RimModel, masked: Mask) -> _Pixels:
+    """The pixels whose distance to the rim matters: 4 sigma inside, 3 sigma and a pixel outside."""
+    ellipse, sigma = model.ellipse, model.sigma_px
+    a, b = ellipse.semi_axes_px
+    inward, outward = min(4.0 * sigma + 1.0, 0.8 * b), 3.0 * sigma + 1.0
+    reach = float(a) + outward + 2.0
+    cx, cy = ellipse.centre_px
+    x0, x1 = max(0, math.floor(cx - reach)), min(linear.shape[1], math.ceil(cx + reach) + 1)
+    y0, y1 = max(0, math.floor(cy - reach)), min(linear.shape[0], math.ceil(cy + reach) + 1)
+    conic_x = np.arange(x0, x1)[None, :] - cx
+    conic_y = np.arange(y0, y1)[:, None] - cy
+    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+    p, q = conic_x * cos + conic_y * sin, conic_y * cos - conic_x * sin
+    # Inside the larger concentric ellipse and outside the smaller one: a cheap cover of the band.
+    outer = (p / (a + outward)) ** 2 + (q / (b + outward)) ** 2 < 1.0
+    inner = (p / max(a - inward, 0.5)) ** 2 + (q / max(b - inward, 0.5)) ** 2 > 1.0
+    row, column = np.nonzero(outer & inner & ~masked[y0:y1, x0:x1])
+    level = linear[row + y0, column + x0].astype(np.float64)
+    return _Pixels((column + x0).astype(np.float64), (row + y0).astype(np.float64), level)
+
+
+def sector_of(place: Place) -> NDArray[np.intp]:
+    """(n,) which of the SECTORS equal steps of the ellipse's parameter each point belongs to."""
+    share = np.arctan2(place.sin_t, place.cos_t) / (2.0 * np.pi) + 0.5
+    return (share * SECTORS).astype(np.intp) % SECTORS
+
+
+def _predict(model: RimModel, pixels: _Pixels) -> Array:
+    return model.level(pixels.x, pixels.y)
+
+
+def _jacobian(model: RimModel, place: Place) -> tuple[Array, Array]:
+    """Model levels (n,) and their derivatives (n, 5 + 2 + 1 + 2 K): shape, sigma, inner, outer coefficients."""
+    edge, by_distance, by_sigma = blurred_edge(place.distance, place.curvature, model.sigma_px)
+    basis = harmonics(place.cos_t, place.sin_t, (model.outer.size - 1) // 2)
+    step = basis @ model.outer - model.inner_dn
+    out = np.empty((place.distance.size, SHAPE + 2 + basis.shape[1]))
+    out[:, :SHAPE] = (step * by_distance)[:, None] * distance_slopes(model.ellipse, place)
+    out[:, 5] = step * by_sigma
+    out[:, 6] = 1.0 - edge
+    out[:, 7:] = basis * edge[:, None]
+    return model.inner_dn + step * edge, out
+
+
+def _moved(model: RimModel, step: Array) -> RimModel:
+    """The model after a step of the parameters; the shape matrix's eigenvectors give the new axes."""
+    a, b = model.ellipse.semi_axes_px
+    shape = np.array([[a + step[2], step[4]], [step[4], b + step[3]]])
+    values, vectors = np.linalg.eigh(shape)
+    angle = model.ellipse.angle_rad + math.atan2(vectors[1, 1], vectors[0, 1])
+    axes = np.maximum(values[::-1], 0.5)
+    sigma = float(np.clip(model.sigma_px + step[5], 0.5 * model.sigma_px, 2.0 * model.sigma_px))
+    ellipse = Ellipse(model.ellipse.centre_px + step[:2], axes, angle)
+    return RimModel(ellipse, model.inner_dn + float(step[6]), model.outer + step[7:], max(sigma, 0.3))
+
+
+def _gauss_newton(pixels: _Pixels, model: RimModel, steps: int) -> tuple[RimModel, Array, Array, Place]:
+    """(model, residual, Jacobian, place) after at most `steps` steps."""
+    place = Place.of(model.ellipse, pixels.x, pixels.y)
+    value, jacobian = _jacobian(model, place)
+    residual = pixels.level - value
+    cost = float(residual @ residual)
+    damping = 1e-4
+    for _ in range(steps):
+        matrix = jacobian.T @ jacobian
+        scale = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
+        system = matrix / np.outer(scale, scale) + damping * np.eye(scale.size)
+        step = np.linalg.solve(system, (jacobian.T @ residual) / scale) / scale
+        largest = float(np.abs(step[:SHAPE]).max())
+        if largest > 3.0:
+            step *= 3.0 / largest
+        trial = _moved(model, step)
+        trial_place = Place.of(trial.ellipse, pixels.x, pixels.y)
+        trial_value, trial_jacobian = _jacobian(trial, trial_place)
+        trial_residual = pixels.level - trial_value
+        trial_cost = float(trial_residual @ trial_residual)
+        if trial_cost <= cost:
+            model, place, jacobian, residual = trial, trial_place, trial_jacobian, trial_residual
+            gained, cost = cost - trial_cost, trial_cost
+            damping *= 0.1
+            if largest < 1e-4 or gained < 1e-7 * cost:
+                break
+        else:
+            damping = min(max(damping * 30.0, 1e-3), 1e6)
+    return model, residual, jacobian, place
+
+
+def _padded(outer: Array, order: int) -> Array:
+    out = np.zeros(1 + 2 * order)
+    out[: outer.size] = outer
+    return out
+
+
+def _best_order(pixels: _Pixels, model: RimModel, noise_dn: float) -> int:
+    """Fourier order of the outer level by BIC, from one linear step with the largest order's columns."""
+    full = RimModel(model.ellipse, model.inner_dn, _padded(model.outer, ORDERS[-1]), model.sigma_px)
+    value, jacobian = _jacobian(full, Place.of(full.ellipse, pixels.x, pixels.y))
+    residual = pixels.level - value
+    matrix, vector = jacobian.T @ jacobian, jacobian.T @ residual
+    count = residual.size
+    best, best_bic = 0, math.inf
+    for order in ORDERS:
+        size = SHAPE + 3 + 2 * order
+        part = matrix[:size, :size] + 1e-9 * np.diag(np.diag(matrix)[:size] + 1e-9)
+        drop = float(vector[:size] @ np.linalg.solve(part, vector[:size]))
+        chi2 = max(float(residual @ residual) - drop, 1e-9)
+        bic = count * math.log(chi2 / count) + size * math.log(count)
+        if bic < best_bic:
+            best, best_bic = order, bic
+    return best
+
+
+def _explained(residual: Array, use: Mask, bins: NDArray[np.intp], seen: Mask, sectors: Mask, scale: float) -> Mask:
+    """Sectors whose pixels fit: their mean square is at most a multiple of the typical sector's, and few are outliers.
+
+    Where the edges saw the rim the multiple is generous, because iris texture is no lid; elsewhere the pixels must
+    show by themselves that the rim is there.
+    """
+    total = np.maximum(np.bincount(bins, minlength=SECTORS), 1)
+    capped = np.minimum((residual / scale) ** 2, OUTLIER**2)
+    mean_square = np.bincount(bins, weights=capped, minlength=SECTORS) / total
+    outliers = np.bincount(bins, weights=~use, minlength=SECTORS) / total
+    typical = float(np.median(mean_square[seen])) if seen.any() else 1.0
+    limit = np.where(sectors, 5.0, 2.5) * max(typical, 1.0)
+    return np.asarray((mean_square < limit) & (outliers < np.where(sectors, 0.25, 0.1)))
+
+
+def _clear_of_lids(seen: Mask, model: RimModel) -> Mask:
+    """Leave out the neighbours of every gap of two sectors or more, as far as a lid's margin is blurred into them."""
+    if seen.all():
+        return seen
+    gap = ~seen & (~np.roll(seen, 1) | ~np.roll(seen, -1))
+    length = math.pi * float(model.ellipse.semi_axes_px.sum()) / SECTORS
+    for _ in range(min(math.ceil(2.0 * model.sigma_px / length), 3)):
+        gap = gap | np.roll(gap, 1) | np.roll(gap, -1)
+    return np.asarray(seen & ~gap)
+
+
+def _sane(model: RimModel, start: RimModel) -> bool:
+    b = start.ellipse.semi_axes_px[1]
+    moved = float(np.hypot(*(model.ellipse.centre_px - start.ellipse.centre_px)))
+    ratio = model.ellipse.semi_axes_px / start.ellipse.semi_axes_px
+    return moved < 0.25 * float(b) + 1.0 and bool((ratio > 0.7).all() and (ratio < 1.4).all()) and model.step_dn > 0.0
+
+
+def _report(pixels: _Pixels, result: tuple[RimModel, Array, Array, Place], noise_dn: float, seen: Mask) -> PixelFit:
+    model, residual, jacobian, place = result
+    free = max(residual.size - jacobian.shape[1], 1)
+    variance = float(residual @ residual) / free
+    matrix = jacobian.T @ jacobian
+    inverse = np.linalg.inv(matrix + 1e-12 * np.diag(np.diag(matrix)))
+    plain = inverse[:SHAPE, :SHAPE] * variance
+    # Texture leaves residuals that agree within a sector; their excess over white noise scales the covariance.
+    excess = sector_excess(plain, inverse[:SHAPE] @ (jacobian * residual[:, None]).T, sector_of(place))
+    covariance = plain * (excess if excess > 1.25 else 1.0)
+    return PixelFit(
+        model, to_axes(covariance, model.ellipse), variance / noise_dn**2, math.sqrt(variance), residual.size, seen
+    )
+
+
+def sector_excess(plain: Array, influence: Array, bins: NDArray[np.intp]) -> float:
+    """How much more the parameters scatter than independent residuals would make them: trace(plain^-1 S) / 5, S the sum
+    over sectors of the outer square of the summed influences. plain (5, 5), influence (5, n), bins (n,).
+
+    Source: the cluster-robust ("sandwich") covariance, Liang and Zeger (1986), reduced to one factor.
+    """
+    summed = np.stack([np.bincount(bins, weights=row, minlength=SECTORS) for row in influence])
+    return float(np.trace(np.linalg.solve(plain, summed @ summed.T))) / SHAPE
+
+
+def distance_slopes(ellipse: Ellipse, place: Place) -> Array:
+    """(n, 5) derivatives of the signed distance by cx, cy and the shape matrix (aa, bb, ab) in the ellipse's axes."""
+    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+    return -np.stack(
+        [
+            place.nx * cos - place.ny * sin,
+            place.nx * sin + place.ny * cos,
+            place.nx * place.cos_t,
+            place.ny * place.sin_t,
+            place.nx * place.sin_t + place.ny * place.cos_t,
+        ],
+        axis=-1,
+    )
+
+
+def edge_covariance(ellipse: Ellipse, points: Array, residual_px: float) -> Array:
+    """(5, 5) covariance of (cx, cy, a, b, angle) of an ellipse fitted to edge points with this residual.
+
+    Neighbouring edge points share their noise (the filter's reach, the texture), which the sector excess measures.
+    """
+    place = Place.of(ellipse, points[:, 0], points[:, 1])
+    slopes = distance_slopes(ellipse, place)
+    matrix = slopes.T @ slopes
+    inverse = np.linalg.inv(matrix + 1e-9 * np.trace(matrix) * np.eye(SHAPE))
+    plain = inverse * max(residual_px, 1e-4) ** 2
+    # A third of the sectors, so that one is longer than the noise's reach; n / (n - 5) for the parameters fitted.
+    coarse = sector_of(place) // 3
+    groups = max(np.unique(coarse).size, SHAPE + 1)
+    excess = sector_excess(plain, inverse @ (slopes * place.distance[:, None]).T, coarse) * groups / (groups - SHAPE)
+    return to_axes(plain * max(excess, 1.0), ellipse)
+
+
+def to_axes(covariance: Array, ellipse: Ellipse) -> Array:
+    """From the shape matrix's changes to (cx, cy, a, b, angle): d angle = d ab / (a - b), at most a uniform angle's."""
+    a, b = ellipse.semi_axes_px
+    jacobian = np.eye(SHAPE)
+    # The angle's deviation cannot exceed that of a uniform orientation, pi / sqrt(12).
+    floor = math.sqrt(covariance[4, 4] * 12.0) / math.pi
+    jacobian[4, 4] = 1.0 / max(float(a - b), floor, 1e-9)
+    return np.asarray(jacobian @ covariance @ jacobian.T)
+
+
+def rim_deviation(ellipse: Ellipse, covariance: Array) -> float:
+    """Root mean square, over the outline, of the rim's standard deviation along its normal, px."""
+    points = ellipse.points(32)
+    slopes = distance_slopes(ellipse, Place.of(ellipse, points[:, 0], points[:, 1]))
+    a, b = ellipse.semi_axes_px
+    # By the angle instead of the shape matrix's off-diagonal term: d ab = (a - b) d angle.
+    slopes[:, 4] *= float(a - b)
+    return math.sqrt(float(np.mean(np.einsum("ni,ij,nj->n", slopes, covariance, slopes))))

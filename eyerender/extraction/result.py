@@ -1,0 +1,107 @@
+"""What the extractor reports: a pupil and glints, each found or not, with the reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.ellipse import Ellipse
+
+Array = NDArray[np.float64]
+
+Stage = Literal["input", "coarse search", "edges", "fit", "refinement"]
+
+
+def frozen(values: object) -> Array:
+    """A read-only float64 copy."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, slots=True)
+class Goodness:
+    """How well the ellipse explains the image.
+
+    support: share of the outline with an edge on it, 0..1. gap: share of the longest stretch without. explained: share
+    of the outline whose pixels the refined model explains (the support where it was not fitted). contrast: step from
+    pupil to iris as a share of full scale. contrast_to_noise: that step over a pixel's noise. residual_px: root mean
+    square distance of the edge points. reduced_chi2: of the pixel model, 1 when noise alone explains the residual; 0
+    where it was not fitted. blur_px: sigma of the edge's blur. unevenness: how much darker the pupil's middle is than
+    its outer part, as a share of the step. rim_sd_px: standard deviation of the rim's position, averaged along it,
+    from the covariance. refined: whether the ellipse is the pixel model's.
+    """
+
+    support: float
+    gap: float
+    explained: float
+    contrast: float
+    contrast_to_noise: float
+    residual_px: float
+    reduced_chi2: float
+    blur_px: float
+    unevenness: float
+    rim_sd_px: float
+    refined: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PupilResult:
+    """The pupil, or why there is none.
+
+    covariance: (5, 5) of (cx, cy, a, b, angle), px and rad. confidence: probability that the ellipse overlaps the true
+    one with IoU > 0.9. contour_px: (n, 2) the edge points the fit rests on. Where status is "missing", `stage` and
+    `reason` say what failed, confidence is 0 and the rest is None or empty.
+    """
+
+    status: Literal["ok", "missing"]
+    stage: Stage | None
+    reason: str | None
+    ellipse: Ellipse | None
+    covariance: Array | None
+    confidence: float
+    goodness: Goodness | None
+    contour_px: Array
+
+    @staticmethod
+    def missing(stage: Stage, reason: str) -> PupilResult:
+        """No pupil: the stage that failed and why."""
+        return PupilResult("missing", stage, f"{stage}: {reason}", None, None, 0.0, None, frozen(np.zeros((0, 2))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GlintResult:
+    """One bright spot.
+
+    xy_px: (2,). covariance: (2, 2) px^2. amplitude: peak over the background as a share of full scale (the fitted one:
+    above 1 for a clipped spot). sigma_px: of the spot. status "rejected" is a reflection that is no glint of the
+    cornea, with the reason; light: index of the light, None until assigned.
+    """
+
+    status: Literal["ok", "missing", "rejected"]
+    reason: str | None
+    xy_px: Array | None
+    covariance: Array | None
+    amplitude: float
+    sigma_px: float
+    saturated: bool
+    light: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extraction:
+    """All that was found in one image; coordinates are relative to it, pixel centres at integers.
+
+    glints: accepted ones, brightest first. rejected: reflections turned down, each with its reason. noise: standard
+    deviation of a pixel's noise as a share of full scale. Full scale is the largest code of the stated bit depth; a
+    float image's full scale is 1.7 times its 99.5th percentile.
+    """
+
+    pupil: PupilResult
+    glints: tuple[GlintResult, ...]
+    rejected: tuple[GlintResult, ...]
+    noise: float
+    shape: tuple[int, int]

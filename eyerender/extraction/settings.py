@@ -1,0 +1,41 @@
+"""What the extractor may be told: polarity, sizes, and how much work to spend."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from ..spec import Positive, Spec
+
+
+class ExtractionSettings(Spec):
+    """Settings of `extract`; the defaults suit dark pupils in 320 x 240 to 1280 x 1024 images.
+
+    Nothing here is tuned to a data set: thresholds follow the image's own noise and contrast.
+    """
+
+    method: Literal["fast", "refined"] = Field(
+        default="refined", description="fast: edges and an algebraic fit; refined: a maximum-likelihood fit as well"
+    )
+    polarity: Literal["dark", "bright"] = Field(default="dark", description="pupil darker or brighter than the iris")
+    radius_min_px: Positive = Field(default=7.0, description="smallest semi-axis b looked for")
+    radius_max_px: Positive = Field(default=160.0, description="largest semi-axis a looked for")
+    aspect_min: Annotated[float, Field(gt=0, le=1)] = Field(default=0.3, description="smallest b / a accepted")
+    min_support: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.2, description="smallest share of the pupil's outline that must be seen"
+    )
+    max_glints: Annotated[int, Field(ge=0, le=64)] = Field(default=16, description="most glints reported")
+    glint_reach: Positive = Field(
+        default=4.0, description="how far from the pupil's centre glints are looked for, in semi-axes a"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.radius_max_px <= self.radius_min_px:
+            raise ValueError("radius_max_px must be > radius_min_px")
+        return self
+
+
+FAST = ExtractionSettings(method="fast")
+REFINED = ExtractionSettings(method="refined")

@@ -1,0 +1,270 @@
+"""Censored fits of Gaussian spots on a known background, all spots of an image at once.
+
+Model of a spot in pixel (x, y): B(x, y) + b0 + bx (x - xc) + by (y - yc) + A Gx(x) Gy(y), with Gx the mean over the
+pixel of exp(-(x - x0)^2 / (2 sx^2)). B is the image expected without spots (pupil, iris, the blurred edge between
+them). A pixel at the clip level only says that the intensity is at least that: it counts only where the model is below.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from .preprocess import Image
+
+Array = NDArray[np.float64]
+
+PARAMETERS = 8  # x, y, ln A, ln sx, ln sy, b0, bx, by
+MAX_TURNS = 25
+_ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpotFit:
+    """A batch of fitted spots. xy_px (n, 2), covariance (n, 2, 2), amplitude_dn (n,), sigma_px (n, 2) along x and y,
+    background_dn (n,) at the spot, residual_dn (n,) root mean square over the window, clipped (n,) number of pixels
+    at the clip level, converged (n,).
+    """
+
+    xy_px: Array
+    covariance: Array
+    amplitude_dn: Array
+    sigma_px: Array
+    background_dn: Array
+    residual_dn: Array
+    clipped: NDArray[np.intp]
+    converged: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Windows:
+    x: Array  # (n, 1, k) pixel coordinates
+    y: Array  # (n, k, 1)
+    data: Array  # (n, k, k)
+    known: Array  # (n, k, k) B
+    weight: Array  # (n, k, k) 1 inside the image, else 0
+    clip: NDArray[np.bool_]  # (n, k, k)
+    centre: Array  # (n, 2)
+
+
+def fit_spots(
+    linear: Image,
+    known: Callable[[Array, Array], Array],
+    start_px: Array,
+    width_px: Array,
+    height_dn: Array,
+    noise_dn: float,
+    clip_dn: float,
+    slope_dn: float,
+) -> SpotFit:
+    """Fit all spots. linear: image (DN). known: B at pixels (x, y).
+
+    start_px (n, 2), width_px (n,), height_dn (n,): from detection.
+    slope_dn: how steep the background may be beyond `known`, DN per px (standard deviation of its prior).
+
+    Spots closer than 5 sigma are fitted in turn, each on the image less the others, until they settle.
+    """
+    count = start_px.shape[0]
+    if count == 0:
+        return _empty()
+    half = int(np.clip(math.ceil(3.2 * float(np.max(width_px)) + 1.0), 4, 20))
+    windows = _cut(linear, known, start_px, half, clip_dn)
+    theta = _start(windows, start_px, width_px, height_dn, clip_dn)
+    distance = np.hypot(*np.moveaxis(start_px[:, None] - start_px[None], -1, 0)) + 1e9 * np.eye(count)
+    crowded = bool((distance < 2.0 * half).any())
+    if not crowded:
+        theta, settled = _fit(windows, theta, np.zeros_like(windows.data), noise_dn, clip_dn, slope_dn)
+        others = np.zeros_like(windows.data)
+    else:
+        others = _others(windows, theta)
+        for _ in range(6):
+            previous = theta
+            theta, settled = _fit(windows, theta, others, noise_dn, clip_dn, slope_dn, turns=6)
+            others = _others(windows, theta)
+            if np.abs(theta[:, :2] - previous[:, :2]).max() < 1e-4:
+                break
+        settled |= np.abs(theta[:, :2] - previous[:, :2]).max(axis=1) < 0.02
+    return _report(windows, theta, settled, others, noise_dn, clip_dn, slope_dn)
+
+
+def _cut(linear: Image, known: Callable[[Array, Array], Array], start: Array, half: int, clip_dn: float) -> _Windows:
+    centre = np.rint(start).astype(np.intp)
+    step = np.arange(-half, half + 1)
+    x, y = centre[:, :1] + step, centre[:, 1:] + step
+    height, width = linear.shape
+    inside = ((x >= 0) & (x < width))[:, None, :] & ((y >= 0) & (y < height))[:, :, None]
+    row, column = np.clip(y, 0, height - 1)[:, :, None], np.clip(x, 0, width - 1)[:, None, :]
+    data = linear[row, column].astype(np.float64)
+    return _Windows(
+        x[:, None, :].astype(np.float64),
+        y[:, :, None].astype(np.float64),
+        data,
+        known(*(part.astype(np.float64) for part in np.broadcast_arrays(x[:, None, :], y[:, :, None]))),
+        inside.astype(np.float64),
+        data >= clip_dn * (1.0 - 1e-6),
+        centre.astype(np.float64),
+    )
+
+
+def _start(windows: _Windows, start: Array, width: Array, height: Array, clip_dn: float) -> Array:
+    n = start.shape[0]
+    theta = np.zeros((n, PARAMETERS))
+    theta[:, :2] = start
+    clipped = windows.clip.sum(axis=(1, 2))
+    for i in np.nonzero(clipped > 2)[0]:  # a flat top's centre is its mean, its pixel of first maximum is anywhere
+        distance = np.hypot(windows.x[i] - start[i, 0], windows.y[i] - start[i, 1])
+        weight = windows.clip[i] & (distance < 3.0 + 2.5 * width[i])
+        theta[i, 0] = (windows.x[i] * weight).sum() / max(weight.sum(), 1)
+        theta[i, 1] = (windows.y[i] * weight).sum() / max(weight.sum(), 1)
+    amplitude = np.maximum(height, 1.0) * np.where(clipped > 2, 2.0, 1.3)
+    theta[:, 2] = np.log(amplitude)
+    theta[:, 3:5] = np.log(width * np.where(clipped > 2, 0.8, 1.0))[:, None]
+    excess = windows.data - windows.known
+    border = np.concatenate([excess[:, 0], excess[:, -1], excess[:, :, 0], excess[:, :, -1]], axis=1)
+    theta[:, 5] = np.median(border, axis=1)
+    return theta
+
+
+def _profile(x: Array, centre: Array | float, sigma: Array | float) -> tuple[Array, Array, Array]:
+    """Mean over the pixel of exp(-(x - c)^2 / (2 s^2)), and its derivatives by c and by ln s."""
+    low, high = (x - 0.5 - centre) / sigma, (x + 0.5 - centre) / sigma
+    tail_low, tail_high = np.exp(-0.5 * low * low), np.exp(-0.5 * high * high)
+    value = sigma * _ROOT_HALF_PI * (erf(high / math.sqrt(2.0)) - erf(low / math.sqrt(2.0)))
+    return value, tail_low - tail_high, value - sigma * (high * tail_high - low * tail_low)
+
+
+def _model(windows: _Windows, theta: Array) -> tuple[Array, Array]:
+    """Spot plus fitted background plane (n, k, k), and its Jacobian (n, k, k, PARAMETERS)."""
+    p = theta[:, :, None, None]
+    gx, gx_c, gx_s = _profile(windows.x, p[:, 0], np.exp(p[:, 3]))
+    gy, gy_c, gy_s = _profile(windows.y, p[:, 1], np.exp(p[:, 4]))
+    amplitude = np.exp(p[:, 2])
+    spot = amplitude * gx * gy
+    jacobian = np.empty((*spot.shape, PARAMETERS))
+    jacobian[..., 0] = amplitude * gx_c * gy
+    jacobian[..., 1] = amplitude * gx * gy_c
+    jacobian[..., 2] = spot
+    jacobian[..., 3] = amplitude * gx_s * gy
+    jacobian[..., 4] = amplitude * gx * gy_s
+    jacobian[..., 5] = 1.0
+    jacobian[..., 6] = windows.x - windows.centre[:, 0, None, None]
+    jacobian[..., 7] = windows.y - windows.centre[:, 1, None, None]
+    value = spot + p[:, 5] + p[:, 6] * jacobian[..., 6] + p[:, 7] * jacobian[..., 7]
+    return value, jacobian
+
+
+def _normal(
+    windows: _Windows, theta: Array, others: Array, noise: float, clip: float, slope: float
+) -> tuple[Array, Array, Array, Array]:
+    """(cost, gradient, normal matrix, squared residual of the data alone) in units of the noise."""
+    value, jacobian = _model(windows, theta)
+    total = value + windows.known + others
+    target = np.where(windows.clip, np.maximum(total, clip), windows.data)
+    weight = windows.weight * ~(windows.clip & (total >= clip)) / noise
+    residual = (target - total) * weight
+    n = theta.shape[0]
+    flat = (jacobian * weight[..., None]).reshape(n, -1, PARAMETERS)
+    r = residual.reshape(n, -1)
+    gradient = np.einsum("nkp,nk->np", flat, r)
+    matrix = np.einsum("nkp,nkq->npq", flat, flat, optimize=True) if n > 64 else flat.transpose(0, 2, 1) @ flat
+    data_cost = (r * r).sum(axis=1)
+    # Priors: nearly round (10 % each way per ... 0.3 in ln), and a background that is flat to within `slope`.
+    round_weight, slope_weight = 1.0 / 0.3**2, 1.0 / slope**2
+    gap = theta[:, 3] - theta[:, 4]
+    gradient[:, 3] -= round_weight * gap
+    gradient[:, 4] += round_weight * gap
+    matrix[:, 3, 3] += round_weight
+    matrix[:, 4, 4] += round_weight
+    matrix[:, 3, 4] -= round_weight
+    matrix[:, 4, 3] -= round_weight
+    gradient[:, 6:] -= slope_weight * theta[:, 6:]
+    matrix[:, 6, 6] += slope_weight
+    matrix[:, 7, 7] += slope_weight
+    cost = data_cost + round_weight * gap**2 + slope_weight * (theta[:, 6:] ** 2).sum(axis=1)
+    return cost, gradient, matrix, data_cost
+
+
+def _fit(
+    windows: _Windows, theta: Array, others: Array, noise: float, clip: float, slope: float, turns: int = MAX_TURNS
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Levenberg-Marquardt on every spot side by side."""
+    n = theta.shape[0]
+    damping = np.full(n, 1e-2)
+    settled = np.zeros(n, dtype=bool)
+    cost, gradient, matrix, _ = _normal(windows, theta, others, noise, clip, slope)
+    diagonal = np.arange(PARAMETERS)
+    for _ in range(turns):
+        damped = matrix.copy()
+        damped[:, diagonal, diagonal] *= 1.0 + damping[:, None]
+        damped[:, diagonal, diagonal] += 1e-9
+        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+        step[:, :2] = np.clip(step[:, :2], -1.5, 1.5)
+        step[:, 2:5] = np.clip(step[:, 2:5], -0.7, 0.7)
+        trial = theta + step
+        trial[:, 3:5] = np.clip(trial[:, 3:5], math.log(0.2), math.log(30.0))
+        trial[:, 2] = np.clip(trial[:, 2], -5.0, 15.0)
+        new_cost, new_gradient, new_matrix, _ = _normal(windows, trial, others, noise, clip, slope)
+        better = new_cost <= cost * (1.0 + 1e-12)
+        small = np.abs(step[:, :2]).max(axis=1) < 2e-4
+        settled |= better & small & (np.abs(step[:, 2:5]).max(axis=1) < 2e-3)
+        theta = np.where(better[:, None], trial, theta)
+        gradient = np.where(better[:, None], new_gradient, gradient)
+        matrix = np.where(better[:, None, None], new_matrix, matrix)
+        cost = np.where(better, new_cost, cost)
+        damping = np.clip(np.where(better, 0.1 * damping, 8.0 * damping), 1e-7, 1e7)
+        settled |= damping > 1e5
+        if settled.all():
+            break
+    return theta, settled
+
+
+def _others(windows: _Windows, theta: Array) -> Array:
+    """(n, k, k): in every spot's window, the light of the other spots."""
+    out = np.zeros_like(windows.data)
+    for i in range(theta.shape[0]):
+        gx = _profile(windows.x, theta[i, 0], math.exp(theta[i, 3]))[0]
+        gy = _profile(windows.y, theta[i, 1], math.exp(theta[i, 4]))[0]
+        spot = math.exp(theta[i, 2]) * gx * gy
+        spot[i] = 0.0
+        out += spot
+    return out
+
+
+def _report(
+    windows: _Windows, theta: Array, settled: NDArray[np.bool_], others: Array, noise: float, clip: float, slope: float
+) -> SpotFit:
+    _, _, matrix, data_cost = _normal(windows, theta, others, noise, clip, slope)
+    value, _ = _model(windows, theta)
+    used = windows.weight * ~(windows.clip & (value + windows.known + others >= clip))
+    pixels = used.sum(axis=(1, 2))
+    free = np.maximum(pixels - PARAMETERS, 1.0)
+    diagonal = np.arange(PARAMETERS)
+    matrix[:, diagonal, diagonal] += 1e-9
+    inverse = np.linalg.inv(matrix)
+    scale = np.maximum(data_cost / free, 1.0)  # what the noise does not explain counts as noise
+    covariance = inverse[:, :2, :2] * scale[:, None, None]
+    at = theta[:, :2] - windows.centre
+    background = theta[:, 5] + (theta[:, 6:] * at).sum(axis=1)
+    middle = windows.known.shape[1] // 2
+    return SpotFit(
+        theta[:, :2].copy(),
+        covariance,
+        np.exp(theta[:, 2]),
+        np.exp(theta[:, 3:5]),
+        background + windows.known[:, middle, middle],
+        np.sqrt(data_cost / np.maximum(pixels, 1.0)) * noise,
+        windows.clip.sum(axis=(1, 2)),
+        settled & np.isfinite(theta).all(axis=1) & (pixels >= 12),
+    )
+
+
+def _empty() -> SpotFit:
+    return SpotFit(
+        np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2)), np.zeros(0), np.zeros(0),
+        np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool),
+    )  # fmt: skip

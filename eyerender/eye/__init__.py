@@ -1,0 +1,1 @@
+"""The eye: its models, their catalogue with sources, pose and fixation."""

@@ -1,0 +1,103 @@
+"""Eyes with differing parameters as one eye whose numbers have a leading axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from ..geometry.surfaces import Surface
+from ..geometry.transforms import Array, read_only
+from ..optics.interface import Number
+from .model import Eye, LineOfSight, RotationCentres, Sphere, Stop
+
+Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], str]
+S = TypeVar("S", bound=Surface)
+
+
+def structure_of(eye: Eye) -> Structure:
+    """What must agree between eyes that are to be stacked: kinds and numbers of surfaces."""
+    return tuple(s.kind for s in eye.front), tuple(s.kind for s in eye.back), eye.back_passing, eye.retina.kind
+
+
+def stack_eyes(eyes: Sequence[Eye]) -> Eye:
+    """A batch of n eyes of one structure; name and side are those of the first."""
+    first = eyes[0]
+    if any(structure_of(eye) != structure_of(first) for eye in eyes):
+        raise ValueError("eyes of different structure cannot be stacked")
+
+    def numbers(values: Sequence[Number]) -> Array:
+        return read_only([float(v) for v in values])
+
+    def points(values: Sequence[Array]) -> Array:
+        return read_only(np.stack(values))
+
+    return Eye(
+        name=first.name,
+        side=first.side,
+        wavelength_nm=first.wavelength_nm,
+        front=tuple(_stack(surfaces) for surfaces in zip(*(e.front for e in eyes), strict=True)),
+        front_indices=tuple(numbers(n) for n in zip(*(e.front_indices for e in eyes), strict=True)),
+        back=tuple(_stack(surfaces) for surfaces in zip(*(e.back for e in eyes), strict=True)),
+        back_indices=tuple(numbers(n) for n in zip(*(e.back_indices for e in eyes), strict=True)),
+        back_rims_mm=tuple(numbers(n) for n in zip(*(e.back_rims_mm for e in eyes), strict=True)),
+        back_passing=first.back_passing,
+        retina=_stack(tuple(e.retina for e in eyes)),
+        stop=Stop(*(points(v) for v in zip(*(_stop_parts(e.stop) for e in eyes), strict=True))),
+        limbus_radius_mm=numbers([e.limbus_radius_mm for e in eyes]),
+        iris_root_radius_mm=numbers([e.iris_root_radius_mm for e in eyes]),
+        sclera=Sphere(points([e.sclera.centre_mm for e in eyes]), numbers([e.sclera.radius_mm for e in eyes])),
+        rotation=RotationCentres(
+            points([e.rotation.azimuth_centre_mm for e in eyes]),
+            points([e.rotation.elevation_centre_mm for e in eyes]),
+            points([e.rotation.torsion_centre_mm for e in eyes]),
+        ),
+        fovea_mm=points([e.fovea_mm for e in eyes]),
+        incident_node_mm=points([e.incident_node_mm for e in eyes]),
+        chief_ray=LineOfSight(
+            points([e.chief_ray.point_mm for e in eyes]), points([e.chief_ray.direction for e in eyes])
+        ),
+    )
+
+
+def take_eyes(eye: Eye, index: npt.NDArray[np.intp]) -> Eye:
+    """The eyes at `index` of a batch; a single eye is returned as it is."""
+    if eye.fovea_mm.ndim == 1:
+        return eye
+
+    def numbers(values: Sequence[Number]) -> tuple[Number, ...]:
+        return tuple(np.asarray(v)[index] for v in values)
+
+    rotation, ray = eye.rotation, eye.chief_ray
+    return Eye(
+        name=eye.name,
+        side=eye.side,
+        wavelength_nm=eye.wavelength_nm,
+        front=tuple(s.take(index) for s in eye.front),
+        front_indices=numbers(eye.front_indices),
+        back=tuple(s.take(index) for s in eye.back),
+        back_indices=numbers(eye.back_indices),
+        back_rims_mm=numbers(eye.back_rims_mm),
+        back_passing=eye.back_passing,
+        retina=eye.retina.take(index),
+        stop=Stop(*(part[index] for part in _stop_parts(eye.stop))),
+        limbus_radius_mm=np.asarray(eye.limbus_radius_mm)[index],
+        iris_root_radius_mm=np.asarray(eye.iris_root_radius_mm)[index],
+        sclera=Sphere(eye.sclera.centre_mm[index], np.asarray(eye.sclera.radius_mm)[index]),
+        rotation=RotationCentres(
+            rotation.azimuth_centre_mm[index], rotation.elevation_centre_mm[index], rotation.torsion_centre_mm[index]
+        ),
+        fovea_mm=eye.fovea_mm[index],
+        incident_node_mm=eye.incident_node_mm[index],
+        chief_ray=LineOfSight(ray.point_mm[index], ray.direction[index]),
+    )
+
+
+def _stack(surfaces: tuple[S, ...]) -> S:
+    return type(surfaces[0]).stack(surfaces)
+
+
+def _stop_parts(stop: Stop) -> tuple[Array, Array, Array, Array]:
+    return stop.centre_mm, stop.rotation, stop.semi_axes_mm, stop.handed

@@ -1,0 +1,284 @@
+"""From an eye file to the numeric eye."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ..errors import InputError
+from ..geometry.surfaces import Surface
+from ..geometry.surfaces_biconic import Biconic
+from ..geometry.surfaces_quadric import Quadric
+from ..geometry.transforms import Array, flip_y, mirror_rotation, read_only, rotation_x, tilt_rotation
+from ..optics.interface import Number
+from ..optics.media import CauchyMedium, ConstantMedium, Medium
+from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
+from .model import Eye, LineOfSight, RotationCentres, Sphere, Stop
+from .spec import (
+    BiconicSpec,
+    ConicSpec,
+    EllipsoidSpec,
+    EyeSpec,
+    GradientLensSpec,
+    MediumSpec,
+    PlacedSpec,
+    PlaneSpec,
+    QuadricSpec,
+    Side,
+    SphereSpec,
+    SurfaceLensSpec,
+)
+
+
+def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm: float | None) -> Eye:
+    """The numeric eye; raises `InputError` for a pupil that does not fit or an index below 1 at this wavelength."""
+    if not (np.isfinite(wavelength_nm) and wavelength_nm > 0.0):
+        raise InputError("must be a positive number", path="wavelength_nm")
+    diameter = spec.stop.diameter_mm if pupil_diameter_mm is None else float(pupil_diameter_mm)
+    widest = 2.0 * min(spec.limbus_radius_mm, spec.iris.root_radius_mm)
+    path = "stop.diameter_mm" if pupil_diameter_mm is None else "pupil_diameter_mm"
+    if not (np.isfinite(diameter) and diameter > 0.0):
+        raise InputError("must be > 0", path=path)
+    stop = stop_of(spec, diameter)
+    if 2.0 * float(np.max(stop.semi_axes_mm)) >= widest:
+        raise InputError(f"the pupil is wider than the iris or the cornea ({widest:g} mm)", path=path)
+    x, y, z = (float(v) for v in stop.centre_mm)
+    eye = replace(_compiled(_Key(spec), float(wavelength_nm), (x, y, z)), stop=stop)
+    return eye if side == "right" else mirrored_eye(eye)
+
+
+def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> Eye:
+    """The right eye without its landmarks (fovea, node, chief ray: zeros): enough to trace with."""
+    front = tuple(surface_of(s) for s in spec.cornea)
+    front_indices = tuple(
+        index_at(s.medium, wavelength_nm, f"cornea.{k}.medium") for k, s in enumerate(spec.cornea)
+    )
+    back: tuple[Surface, ...] = ()
+    back_indices: tuple[Number, ...] = ()
+    rims: tuple[Number, ...] = ()
+    passing: tuple[bool, ...] = ()
+    if isinstance(spec.lens, SurfaceLensSpec):
+        back = tuple(surface_of(s) for s in spec.lens.surfaces)
+        back_indices = tuple(
+            index_at(s.medium, wavelength_nm, f"lens.surfaces.{k}.medium") for k, s in enumerate(spec.lens.surfaces)
+        )
+        rims, passing = (np.inf,) * len(back), (False,) * len(back)
+    elif isinstance(spec.lens, GradientLensSpec):
+        back, back_indices, rims = gradient_shells(spec.lens, wavelength_nm)
+        count = spec.lens.shells
+        passing = tuple(k not in (0, 2 * count - 1) for k in range(2 * count))
+    zero = read_only(np.zeros(3))
+    return Eye(
+        name=spec.name,
+        side="right",
+        wavelength_nm=float(wavelength_nm),
+        front=front,
+        front_indices=front_indices,
+        back=back,
+        back_indices=back_indices,
+        back_rims_mm=rims,
+        back_passing=passing,
+        retina=surface_of(spec.retina),
+        stop=stop,
+        limbus_radius_mm=spec.limbus_radius_mm,
+        iris_root_radius_mm=spec.iris.root_radius_mm,
+        sclera=sclera_of(spec, front[0]),
+        rotation=RotationCentres(
+            read_only(spec.rotation.azimuth_centre_mm),
+            read_only(spec.rotation.elevation_centre_mm),
+            read_only(spec.rotation.torsion_centre_mm),
+        ),
+        fovea_mm=zero,
+        incident_node_mm=zero,
+        chief_ray=LineOfSight(zero, zero),
+    )
+
+
+def surface_of(placed: PlacedSpec) -> Surface:
+    """A placed shape as a surface of the eye frame."""
+    shape = placed.shape
+    rotation = tilt_rotation(np.radians(placed.tilt_deg), placed.tilt_order)
+    position = np.array(placed.position_mm)
+    by_centre = placed.placed_by == "centre"
+    if isinstance(shape, PlaneSpec):
+        return Quadric.plane(position, rotation)
+    if isinstance(shape, SphereSpec | ConicSpec):
+        conic_constant = shape.conic_constant if isinstance(shape, ConicSpec) else 0.0
+        lead = shape.radius_mm / (1.0 + conic_constant) if by_centre else 0.0
+        return Quadric.conic(shape.radius_mm, conic_constant, position + rotation[:, 0] * lead, rotation)
+    if isinstance(shape, BiconicSpec):
+        return Biconic(position, rotation, np.array(shape.radii_mm), np.array(shape.conic_constants))
+    if isinstance(shape, EllipsoidSpec):
+        front = shape.side == "front"
+        lead = 0.0 if by_centre else shape.semi_axes_mm[0] * (-1.0 if front else 1.0)
+        return Quadric.ellipsoid(shape.semi_axes_mm, position + rotation[:, 0] * lead, rotation, front)
+    return _general_quadric(shape, position, rotation)
+
+
+def _general_quadric(shape: QuadricSpec, position: Array, rotation: Array) -> Quadric:
+    a, b, c, d, e, f, g, h, i, k = shape.coefficients
+    # Scaled so that distances, not the coefficients' own unit, set the size of rounding.
+    scale = max(abs(v) for v in (a, b, c, d, e, f)) or max(abs(v) for v in (g, h, i))
+    if b == c and d == e == f == 0.0 and b != 0.0:
+        scale = abs(b)
+    matrix = np.array([[a, d, e], [d, b, f], [e, f, c]]) / scale
+    sign = 1.0 if shape.side == "front" else -1.0
+    return Quadric.oriented(matrix, np.array([g, h, i]) / scale, np.array(k / scale), sign, position, rotation)
+
+
+def medium_of(spec: MediumSpec) -> Medium:
+    """The medium a spec describes."""
+    if spec.cauchy is not None:
+        return CauchyMedium(*spec.cauchy)
+    return ConstantMedium(1.0 if spec.index is None else spec.index)
+
+
+def index_at(spec: MediumSpec, wavelength_nm: float, path: str) -> float:
+    """The index at a wavelength; raises `InputError` below 1."""
+    index = medium_of(spec).index(wavelength_nm)
+    if not index >= 1.0:
+        raise InputError(f"the index at {wavelength_nm:g} nm is {index:.6g}; must be >= 1", path=path)
+    return index
+
+
+def stop_of(spec: EyeSpec, diameter_mm: float) -> Stop:
+    """The right eye's stop at a diameter."""
+    stop = spec.stop
+    change = diameter_mm - stop.diameter_mm
+    centre = np.array(stop.position_mm) + np.array([0.0, *stop.shift_mm_per_mm]) * change
+    rotation = tilt_rotation(np.radians(stop.tilt_deg)) @ rotation_x(np.radians(stop.axis_deg))
+    ratio = np.sqrt(1.0 - stop.ellipticity)
+    return Stop(centre, rotation, 0.5 * diameter_mm * np.array([1.0 / ratio, ratio]), np.array(1.0))
+
+
+def sclera_of(spec: EyeSpec, cornea: Surface) -> Sphere:
+    """The sphere through the limbus circle, centre on the cornea's axis, unless the file gives the centre."""
+    radius = spec.sclera.radius_mm
+    if spec.sclera.centre_mm is not None:
+        return Sphere(read_only(spec.sclera.centre_mm), radius)
+    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    rim = spec.limbus_radius_mm
+    depth = float(np.mean(cornea.sag(rim * np.cos(angle), rim * np.sin(angle))))
+    local = np.array([depth - np.sqrt(max(radius**2 - rim**2, 0.0)), 0.0, 0.0])
+    return Sphere(read_only(cornea.to_eye(local)), radius)
+
+
+def gradient_shells(
+    lens: GradientLensSpec, wavelength_nm: float
+) -> tuple[tuple[Surface, ...], tuple[Number, ...], tuple[Number, ...]]:
+    """(surfaces, the index behind each, rims) of a gradient lens, outside in: front shells, then back shells."""
+    edge = index_at(lens.edge, wavelength_nm, "lens.edge")
+    core = index_at(lens.core, wavelength_nm, "lens.core")
+    vitreous = index_at(lens.vitreous, wavelength_nm, "lens.vitreous")
+    count = lens.shells
+    size = np.sqrt(1.0 - np.arange(count) / (lens.index_rate * count))
+    inside = edge + (core - edge) * (np.arange(count) + 0.5) / count
+    front_apex, back_apex = np.array(lens.front.position_mm), np.array(lens.back.position_mm)
+    centre = front_apex + lens.centre_fraction * (back_apex - front_apex)
+    equator = _equator_radius(lens)
+    fronts = tuple(surface_of(_scaled(lens.front, centre, float(p))) for p in size)
+    backs = tuple(surface_of(_scaled(lens.back, centre, float(p))) for p in size[::-1])
+    behind = [float(n) for n in inside] + [float(n) for n in inside[-2::-1]] + [vitreous]
+    rims = [float(equator * p) for p in size] + [float(equator * p) for p in size[::-1]]
+    return fronts + backs, tuple(behind), tuple(rims)
+
+
+def _scaled(placed: PlacedSpec, centre: Array, p: float) -> PlacedSpec:
+    """A lens surface scaled by p about the lens' centre: the radius and the apex' distance shrink, Q stays."""
+    position = centre + p * (np.array(placed.position_mm) - centre)
+    shape = placed.shape
+    scaled: SphereSpec | ConicSpec | BiconicSpec
+    if isinstance(shape, SphereSpec | ConicSpec):
+        scaled = shape.model_copy(update={"radius_mm": shape.radius_mm * p})
+    elif isinstance(shape, BiconicSpec):
+        scaled = shape.model_copy(update={"radii_mm": (shape.radii_mm[0] * p, shape.radii_mm[1] * p)})
+    else:
+        raise InputError("a gradient lens is made of spheres, conics or biconics", path="lens")
+    x, y, z = (float(v) for v in position)
+    return placed.model_copy(update={"shape": scaled, "position_mm": (x, y, z)})
+
+
+def _equator_radius(lens: GradientLensSpec) -> float:
+    """Where the outer front and back surfaces meet (mm from the axis); infinite if they do not."""
+    front, back = surface_of(lens.front), surface_of(lens.back)
+    thickness = float(np.linalg.norm(front.origin_mm - back.origin_mm))
+
+    def gap(r: float) -> float:
+        height, zero = np.array(r), np.array(0.0)
+        return float(thickness + front.sag(height, zero) - back.sag(height, zero))
+
+    reach = 0.1
+    while reach < 20.0 and gap(reach) > 0.0:
+        reach += 0.1
+    return float(brentq(gap, reach - 0.1, reach)) if gap(reach) <= 0.0 else np.inf
+
+
+def mirrored_eye(eye: Eye) -> Eye:
+    """The other eye: every point (x, y, z) -> (x, -y, z)."""
+    side: Literal["right", "left"] = "left" if eye.side == "right" else "right"
+    return Eye(
+        name=eye.name,
+        side=side,
+        wavelength_nm=eye.wavelength_nm,
+        front=tuple(s.mirrored() for s in eye.front),
+        front_indices=eye.front_indices,
+        back=tuple(s.mirrored() for s in eye.back),
+        back_indices=eye.back_indices,
+        back_rims_mm=eye.back_rims_mm,
+        back_passing=eye.back_passing,
+        retina=eye.retina.mirrored(),
+        stop=Stop(
+            flip_y(eye.stop.centre_mm), mirror_rotation(eye.stop.rotation), eye.stop.semi_axes_mm, -eye.stop.handed
+        ),
+        limbus_radius_mm=eye.limbus_radius_mm,
+        iris_root_radius_mm=eye.iris_root_radius_mm,
+        sclera=Sphere(read_only(flip_y(eye.sclera.centre_mm)), eye.sclera.radius_mm),
+        rotation=RotationCentres(
+            read_only(flip_y(eye.rotation.azimuth_centre_mm)),
+            read_only(flip_y(eye.rotation.elevation_centre_mm)),
+            read_only(flip_y(eye.rotation.torsion_centre_mm)),
+        ),
+        fovea_mm=read_only(flip_y(eye.fovea_mm)),
+        incident_node_mm=read_only(flip_y(eye.incident_node_mm)),
+        chief_ray=LineOfSight(
+            read_only(flip_y(eye.chief_ray.point_mm)), read_only(flip_y(eye.chief_ray.direction))
+        ),
+    )
+
+
+class _Key:
+    """A spec that hashes by its digest, so that landmarks are computed once for an eye."""
+
+    __slots__ = ("digest", "spec")
+
+    def __init__(self, spec: EyeSpec) -> None:
+        self.spec, self.digest = spec, spec.digest()
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and other.digest == self.digest
+
+
+@lru_cache(maxsize=256)
+def _compiled(key: _Key, wavelength_nm: float, stop_centre_mm: tuple[float, float, float]) -> Eye:
+    """The right eye with its landmarks, which depend on the stop by its centre alone."""
+    spec = key.spec
+    nominal = stop_of(spec, spec.stop.diameter_mm)
+    bare = bare_eye(spec, wavelength_nm, replace(nominal, centre_mm=np.array(stop_centre_mm)))
+    node = incident_node(bare)
+    if spec.fovea.position_mm is not None:
+        fovea = np.array(spec.fovea.position_mm)
+    else:
+        fovea = fovea_by_nodal_ray(bare, node, np.radians(spec.fovea.field_deg), spec.fovea.distance_mm)
+    return replace(
+        bare,
+        incident_node_mm=read_only(node),
+        fovea_mm=read_only(fovea),
+        chief_ray=chief_ray_in_air(bare, fovea),
+    )

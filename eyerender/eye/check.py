@@ -1,0 +1,159 @@
+"""What pydantic cannot see in an eye file: whether the geometry it describes can be an eye."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.surfaces import Surface
+from ..geometry.transforms import Array
+from .spec import (
+    BiconicSpec,
+    ConicSpec,
+    EllipsoidSpec,
+    EyeSpec,
+    MediumSpec,
+    PlacedSpec,
+    QuadricSpec,
+    SphereSpec,
+    SurfaceLensSpec,
+)
+
+_TOUCH_MM = 1e-6
+
+
+def check_eye(spec: EyeSpec, *, source: str = "") -> None:
+    """Raise `InputError` with the path of the first key that cannot stand."""
+
+    def refuse(path: str, reason: str) -> None:
+        raise InputError(reason, source=source, path=path)
+
+    for path, placed in _placed(spec):
+        reason = _shape_problem(placed)
+        if reason is not None:
+            refuse(f"{path}.{reason[0]}", reason[1])
+    for path, medium in _media(spec):
+        if (medium.index is None) == (medium.cauchy is None):
+            refuse(path, "give either 'index' or 'cauchy'")
+    radius = spec.stop.diameter_mm / 2.0 / np.sqrt(1.0 - spec.stop.ellipticity)
+    if radius >= spec.limbus_radius_mm:
+        refuse("stop.diameter_mm", f"the pupil is wider than the cornea ({2 * spec.limbus_radius_mm:g} mm)")
+    if radius >= spec.iris.root_radius_mm:
+        refuse("stop.diameter_mm", f"the pupil is wider than the iris ({2 * spec.iris.root_radius_mm:g} mm)")
+    if spec.iris.root_radius_mm > spec.limbus_radius_mm:
+        refuse("iris.root_radius_mm", f"the iris is wider than the cornea ({spec.limbus_radius_mm:g} mm)")
+    if spec.sclera.radius_mm <= spec.limbus_radius_mm:
+        refuse("sclera.radius_mm", f"must be > limbus_radius_mm ({spec.limbus_radius_mm:g})")
+    if any(abs(angle) >= 60.0 for angle in spec.fovea.field_deg):
+        refuse("fovea.field_deg", "must be within 60 degrees of the optic axis")
+    _check_order(spec, source, radius)
+
+
+def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:
+    """Surfaces lie one behind the other within the aperture: cornea, stop, lens, retina."""
+    from .build import stop_of, surface_of
+
+    def refuse(path: str, reason: str) -> None:
+        raise InputError(reason, source=source, path=path)
+
+    cornea = [(f"cornea.{k}", surface_of(s)) for k, s in enumerate(spec.cornea)]
+    stop = stop_of(spec, spec.stop.diameter_mm)
+    wide = _disc(spec.limbus_radius_mm, np.zeros(2))
+    narrow = _disc(pupil_radius_mm, stop.centre_mm[1:])
+    depth_wide = _stop_depth(stop.centre_mm, stop.normal, wide)
+    front = _depth(cornea[0][1], wide)
+    if not np.isfinite(front).all():
+        reach = np.min(np.linalg.norm(wide[~np.isfinite(front)], axis=1))
+        refuse("limbus_radius_mm", f"the front cornea ends {reach:.3g} mm from the axis")
+    for (path_before, before), (path, surface) in zip(cornea[:-1], cornea[1:], strict=True):
+        ahead, depth = _depth(before, wide), _depth(surface, wide)
+        # Behind the plane of the iris the inner cornea is not there any more.
+        counts = np.isfinite(ahead) & np.isfinite(depth) & (ahead > depth_wide)
+        crossing = counts & (depth > ahead - _TOUCH_MM)
+        if crossing.any():
+            refuse(f"{path}.position_mm", f"crosses {path_before} {_where(wide, crossing)}")
+    inner = cornea[-1]
+    depth = _depth(inner[1], narrow)
+    if not (depth > _stop_depth(stop.centre_mm, stop.normal, narrow)).all():
+        refuse("stop.position_mm", f"the stop is not behind {inner[0]} within the pupil")
+    behind: list[tuple[str, Surface]] = []
+    if isinstance(spec.lens, SurfaceLensSpec):
+        behind = [(f"lens.surfaces.{k}", surface_of(s)) for k, s in enumerate(spec.lens.surfaces)]
+    elif spec.lens is not None:
+        behind = [("lens.front", surface_of(spec.lens.front)), ("lens.back", surface_of(spec.lens.back))]
+    behind.append(("retina", surface_of(spec.retina)))
+    path_before, ahead = "stop", _stop_depth(stop.centre_mm, stop.normal, narrow)
+    for path, surface in behind:
+        depth = _depth(surface, narrow)
+        if not np.isfinite(depth).all():
+            refuse(f"{path}.shape", "does not reach as far as the pupil")
+        # A lens may touch the stop, and a decentred one may bulge through its plane by a little.
+        slack = _BULGE_MM if path_before == "stop" else -_TOUCH_MM
+        crossing = depth > ahead + slack
+        if crossing.any():
+            refuse(f"{path}.position_mm", f"crosses the {path_before} {_where(narrow, crossing)}")
+        path_before, ahead = path, depth
+
+
+def _depth(surface: Surface, grid: Array) -> Array:
+    """x (mm, eye frame) of the surface over points (y, z), (m, 2) -> (m,); NaN where it is not met."""
+    start = np.column_stack([np.full(len(grid), 60.0), grid])
+    way = np.array([-1.0, 0.0, 0.0])
+    hit = surface.hit(
+        (start[:, 0], start[:, 1], start[:, 2]), tuple(np.full(len(grid), v) for v in way), True  # type: ignore[arg-type]
+    )
+    return np.where(hit.ok, 60.0 - hit.distance, np.nan)
+
+
+def _stop_depth(centre: Array, normal: Array, grid: Array) -> Array:
+    offset = grid - centre[1:]
+    return np.asarray(centre[0] - (offset @ normal[1:]) / normal[0])
+
+
+def _disc(radius_mm: float, centre: Array) -> Array:
+    """Points (y, z) that fill a disc."""
+    radius, angle = np.meshgrid(np.linspace(0.0, radius_mm, 25), np.linspace(0.0, 2 * np.pi, 32, endpoint=False))
+    return centre + np.column_stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()])
+
+
+def _where(grid: Array, mask: Array) -> str:
+    return f"{np.min(np.linalg.norm(grid[mask.astype(bool)], axis=1)):.3g} mm from the axis"
+
+
+def _placed(spec: EyeSpec) -> list[tuple[str, PlacedSpec]]:
+    found: list[tuple[str, PlacedSpec]] = [(f"cornea.{k}", s) for k, s in enumerate(spec.cornea)]
+    if isinstance(spec.lens, SurfaceLensSpec):
+        found += [(f"lens.surfaces.{k}", s) for k, s in enumerate(spec.lens.surfaces)]
+    elif spec.lens is not None:
+        found += [("lens.front", spec.lens.front), ("lens.back", spec.lens.back)]
+    return [*found, ("retina", spec.retina)]
+
+
+def _media(spec: EyeSpec) -> list[tuple[str, MediumSpec]]:
+    found = [(f"cornea.{k}.medium", s.medium) for k, s in enumerate(spec.cornea)]
+    if isinstance(spec.lens, SurfaceLensSpec):
+        found += [(f"lens.surfaces.{k}.medium", s.medium) for k, s in enumerate(spec.lens.surfaces)]
+    elif spec.lens is not None:
+        found += [("lens.edge", spec.lens.edge), ("lens.core", spec.lens.core), ("lens.vitreous", spec.lens.vitreous)]
+    return found
+
+
+def _shape_problem(placed: PlacedSpec) -> tuple[str, str] | None:
+    shape = placed.shape
+    if isinstance(shape, SphereSpec | ConicSpec) and shape.radius_mm == 0.0:
+        return "shape.radius_mm", "must not be 0"
+    if isinstance(shape, BiconicSpec):
+        first, second = shape.radii_mm
+        if first * second <= 0.0:
+            return "shape.radii_mm", "must both be > 0 or both be < 0"
+    if isinstance(shape, QuadricSpec) and not any(shape.coefficients[:9]):
+        return "shape.coefficients", "must not all be 0"
+    if placed.placed_by == "centre":
+        if isinstance(shape, ConicSpec) and shape.conic_constant == -1.0:
+            return "placed_by", "a paraboloid has no centre"
+        if not isinstance(shape, SphereSpec | ConicSpec | EllipsoidSpec):
+            return "placed_by", f"a {shape.kind} is placed by its apex"
+    return None
+
+
+_BULGE_MM = 0.5

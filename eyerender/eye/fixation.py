@@ -1,0 +1,270 @@
+"""Fixation: the pose in which the line of sight of an eye runs from a target to the fovea.
+
+Two readings of the line of sight:
+
+`chief_ray` : the ray from the target that passes the centre of the stop and ends on the fovea. Its course in the eye does
+not depend on the target, so outside it is one line fixed in the eye, and the pose is the one that turns this line through
+the target: two equations in azimuth and elevation, solved by Newton with exact derivatives.
+
+`entrance_window` : six points evenly spaced on the stop's margin are each joined to the target by a refracted ray; the
+six exit rays, run backwards, are cut at one common length, chosen so that the mean of the six points comes closest to the
+optic axis. That mean is the window's centre; the line of sight starts from the target towards it and must end on the
+fovea. (gkaModelEye's definition, Aguirre 2019, "A model of the entrance pupil of the human eye", Sci. Rep. 9, 9360.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import ArrayValue
+from ..errors import InputError
+from ..geometry.surfaces import Xyz, components, join
+from ..geometry.transforms import Array, normalize
+from ..optics.solve import apparent_points
+from ..optics.trace import RayStatus, trace
+from .landmarks import path_to_retina
+from .model import Eye
+from .pose import Poses, Turning, into_eye, listing_torsion
+
+LineOfSightKind = Literal["chief_ray", "entrance_window"]
+
+RESIDUAL_LIMIT_MM = 1e-6
+"""A pose whose line of sight misses by more is refused."""
+REACH_RAD = np.radians(80.0)
+"""No eye turns farther; targets that would need it are out of reach."""
+WINDOW_POINTS = 6
+
+_STEPS = 20
+
+
+class FixationStatus(IntEnum):
+    """Whether a target can be fixated."""
+
+    OK = 0
+    TARGET_TOO_NEAR = 1
+    OUT_OF_REACH = 2
+    NO_LINE_OF_SIGHT = 3
+    NOT_CONVERGED = 4
+
+    @property
+    def reason(self) -> str:
+        """The status in words."""
+        return _REASONS[self]
+
+
+_REASONS = {
+    FixationStatus.OK: "",
+    FixationStatus.TARGET_TOO_NEAR: "the target lies inside the eye",
+    FixationStatus.OUT_OF_REACH: "the target is out of reach of the eye's rotation",
+    FixationStatus.NO_LINE_OF_SIGHT: "no line of sight joins the target and the fovea",
+    FixationStatus.NOT_CONVERGED: "the solver did not converge",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixations(ArrayValue):
+    """A batch of fixations, leading axis n.
+
+    poses; residual_mm (n,): by how much the line of sight misses (chief ray: the target; entrance window: the fovea);
+    status (n,) of `FixationStatus`; line_of_sight_mm (n, 3): the point of the unturned eye where the line of sight meets
+    the cornea; line_of_sight_direction (n, 3): unit, from there to the target, in the eye-fixed frame.
+    """
+
+    poses: Poses
+    residual_mm: Array
+    status: npt.NDArray[np.int8]
+    line_of_sight_mm: Array
+    line_of_sight_direction: Array
+
+    def reason(self, item: int) -> str:
+        """Why fixation `item` failed; empty if it did not."""
+        return FixationStatus(int(self.status[item])).reason
+
+    def __len__(self) -> int:
+        return len(self.residual_mm)
+
+
+def fixate(eye: Eye, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKind = "chief_ray") -> Fixations:
+    """The poses of `eye` (one, or a batch of n) that fixate targets (n, 3).
+
+    target_mm : in the eye frame, i.e. the world's target minus the eye's position minus the head's.
+    """
+    target = np.atleast_2d(np.asarray(target_mm, dtype=np.float64))
+    if target.ndim != 2 or target.shape[1] != 3 or not np.isfinite(target).all():
+        raise InputError("must be finite points (x, y, z)", path="target_mm")
+    if line_of_sight == "chief_ray":
+        return _by_chief_ray(eye, target)
+    if line_of_sight == "entrance_window":
+        return _by_entrance_window(eye, target)
+    raise InputError(f"must be chief_ray or entrance_window, not {line_of_sight!r}", path="line_of_sight")
+
+
+def _by_chief_ray(eye: Eye, target_mm: Array) -> Fixations:
+    """Turn the fixed line p + s u through the target: e1.(q - p) = e2.(q - p) = 0, q the target seen by the turned eye."""
+    point, direction = eye.chief_ray.point_mm, eye.chief_ray.direction
+    azimuth, elevation, miss, ahead = _turn_line(eye, components(target_mm), _split(point), _split(direction))
+    status = _status(target_mm, azimuth, elevation, miss)
+    status[(status == FixationStatus.OK) & ~(ahead > 0.0)] = FixationStatus.TARGET_TOO_NEAR
+    poses = Poses.listing(azimuth, elevation)
+    return Fixations(
+        poses,
+        miss,
+        status,
+        np.broadcast_to(point, target_mm.shape),
+        np.broadcast_to(direction, target_mm.shape),
+    )
+
+
+def _turn_line(eye: Eye, target: Xyz, point: Xyz, direction: Xyz) -> tuple[Array, Array, Array, Array]:
+    """(azimuth, elevation, distance of the target from the line, its distance along the line), Newton with Listing."""
+    e1, e2 = _tangents(direction)
+    centre = eye.rotation.azimuth_centre_mm
+    x, y = target[0] - centre[..., 0], target[1] - centre[..., 1]
+    z = target[2] - eye.rotation.elevation_centre_mm[..., 2]
+    azimuth = np.arctan2(y, x) - np.arctan2(direction[1], direction[0])
+    elevation = np.arctan2(z, np.hypot(x, y)) - np.arctan2(direction[2], np.hypot(direction[0], direction[1]))
+    azimuth, elevation = np.clip(azimuth, -_START_RAD, _START_RAD), np.clip(elevation, -_START_RAD, _START_RAD)
+    for step in range(_STEPS):
+        seen, by_azimuth, by_elevation = _seen(eye, target, azimuth, elevation)
+        gap = (seen[0] - point[0], seen[1] - point[1], seen[2] - point[2])
+        r1, r2 = _dot(e1, gap), _dot(e2, gap)
+        if step and not np.max(np.abs(r1) + np.abs(r2)) > _SETTLED_MM:
+            break
+        a, b = _dot(e1, by_azimuth), _dot(e1, by_elevation)
+        c, d = _dot(e2, by_azimuth), _dot(e2, by_elevation)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = 1.0 / (a * d - b * c)
+            turn, lift = (d * r1 - b * r2) * scale, (a * r2 - c * r1) * scale
+        # Far from the solution a full step can leave the hemisphere, where Listing's law has no meaning.
+        turn, lift = np.clip(np.nan_to_num(turn), -0.5, 0.5), np.clip(np.nan_to_num(lift), -0.5, 0.5)
+        azimuth, elevation = azimuth - turn, elevation - lift
+        if max(np.max(np.abs(turn)), np.max(np.abs(lift))) < 1e-9:
+            # Newton is quadratic: what is left is below rounding; measure it.
+            seen, _, _ = _seen(eye, target, azimuth, elevation)
+            gap = (seen[0] - point[0], seen[1] - point[1], seen[2] - point[2])
+            r1, r2 = _dot(e1, gap), _dot(e2, gap)
+            break
+    return azimuth, elevation, np.hypot(r1, r2), _dot(direction, gap)
+
+
+def _seen(eye: Eye, target: Xyz, azimuth: Array, elevation: Array) -> tuple[Xyz, Xyz, Xyz]:
+    """The target as the turned eye has it, with its derivatives by azimuth and elevation (Listing's torsion included)."""
+    rotation = eye.rotation
+    ca, ce, ct = (_split(c) for c in (rotation.azimuth_centre_mm, rotation.elevation_centre_mm, rotation.torsion_centre_mm))
+    cos_a, sin_a, cos_e, sin_e = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+    whole = 1.0 + cos_a * cos_e
+    sin_t = -sin_a * sin_e / whole
+    cos_t = np.sqrt(np.maximum(1.0 - sin_t * sin_t, 1e-300))
+    tau_a = -sin_e * (cos_a + cos_e) / (whole * whole * cos_t)
+    tau_e = -sin_a * (cos_e + cos_a) / (whole * whole * cos_t)
+    # Rz(-az) about ca, and its derivative (y, -x, 0).
+    x, y = target[0] - ca[0], target[1] - ca[1]
+    x, y = cos_a * x + sin_a * y, cos_a * y - sin_a * x
+    ax, ay = y, -x
+    # Ry(el) about ce, and its derivative (z, 0, -x).
+    x, y, z = x + (ca[0] - ce[0]), y + (ca[1] - ct[1]), target[2] - ce[2]
+    x, z = cos_e * x + sin_e * z, cos_e * z - sin_e * x
+    ax, az = cos_e * ax, -sin_e * ax
+    ex, ez = z, -x
+    # Rx(-tau) about ct, and its derivative (0, z, -y).
+    x, z = x + ce[0], z + (ce[2] - ct[2])
+    y, z = cos_t * y + sin_t * z, cos_t * z - sin_t * y
+    by_a = (ax, cos_t * ay + sin_t * az + tau_a * z, cos_t * az - sin_t * ay - tau_a * y)
+    by_e = (ex, sin_t * ez + tau_e * z, cos_t * ez - tau_e * y)
+    return (x, y + ct[1], z + ct[2]), by_a, by_e
+
+
+def _by_entrance_window(eye: Eye, target_mm: Array) -> Fixations:
+    """Broyden on the pose, started at the chief ray's; the error is the miss at the fovea across the line of sight."""
+    start = _by_chief_ray(eye, target_mm)
+    angles = np.stack([start.poses.azimuth_rad, start.poses.elevation_rad], axis=-1)
+    ok = start.status == FixationStatus.OK
+    angles = np.where(ok[:, None], angles, 0.0)
+    miss, entry, way, lost = _window_miss(eye, target_mm, angles)
+    slope = np.stack(
+        [(_window_miss(eye, target_mm, angles + step)[0] - miss) / _NUDGE_RAD for step in _NUDGE_RAD * np.eye(2)],
+        axis=-1,
+    )
+    for _ in range(_STEPS):
+        if not np.max(np.abs(miss), where=(ok & ~lost)[:, None], initial=0.0) > _SETTLED_MM:
+            break
+        sound = np.abs(np.linalg.det(slope)) > 1e-12
+        safe = np.where(sound[:, None, None], slope, np.eye(2))
+        step = -np.linalg.solve(safe, np.where(sound[:, None], miss, 0.0)[..., None])[..., 0]
+        step = np.clip(step, -0.2, 0.2)
+        angles = angles + step
+        new, entry, way, lost = _window_miss(eye, target_mm, angles)
+        square = np.maximum(np.sum(step * step, -1), 1e-300)
+        surprise = new - miss - np.einsum("nij,nj->ni", slope, step)
+        # Tiny steps carry only rounding; they would spoil the slope.
+        learn = (square > 1e-22)[:, None, None]
+        slope = slope + np.where(learn, surprise[:, :, None] * step[:, None, :] / square[:, None, None], 0.0)
+        miss = new
+    residual = np.linalg.norm(miss, axis=-1)
+    status = np.where(ok, _status(target_mm, angles[:, 0], angles[:, 1], residual), start.status).astype(np.int8)
+    status[ok & lost] = FixationStatus.NO_LINE_OF_SIGHT
+    return Fixations(Poses.listing(angles[:, 0], angles[:, 1]), residual, status, entry, way)
+
+
+def _window_miss(eye: Eye, target_mm: Array, angles: Array) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
+    """(miss at the fovea (n, 2), point on the cornea, direction to the target, whether there is no such ray)."""
+    poses = Poses.listing(angles[:, 0], angles[:, 1])
+    seen = join(into_eye(Turning.of(poses), eye, components(target_mm)))
+    centre, lost = entrance_window_centre(eye, seen)
+    direction = normalize(centre - seen)
+    traced = trace(path_to_retina(eye), 1.0, seen, direction)
+    lost = lost | (traced.status != RayStatus.OK)
+    first, second = _tangents(_split(eye.chief_ray.direction))
+    gap = traced.points_mm[-1] - eye.fovea_mm
+    miss = np.stack([_dot(first, _split(gap)), _dot(second, _split(gap))], axis=-1)
+    return np.where(lost[:, None], 0.0, miss), traced.points_mm[1], -direction, lost
+
+
+def entrance_window_centre(eye: Eye, viewpoint_mm: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """The centre of the entrance window seen from viewpoints (n, 3) of the eye frame, and where there is none.
+
+    c = mean(p_i) - t mean(u_i) with exit points p_i and directions u_i; t makes c come closest to the optic axis.
+    """
+    margin = eye.stop.boundary(WINDOW_POINTS)
+    found = apparent_points(eye.front, eye.front_indices, margin, viewpoint_mm[:, None, :])
+    point, way = np.mean(found.exit_points_mm, axis=1), np.mean(found.directions, axis=1)
+    square = np.sum(way[:, 1:] ** 2, axis=-1)
+    # Seen along the optic axis every length does; there the window lies where near-axial ones do.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        length = np.where(square > 1e-24, np.sum(way[:, 1:] * point[:, 1:], axis=-1) / square, 0.0)
+    return point - length[:, None] * way, (found.status != RayStatus.OK).any(axis=1)
+
+
+def _status(target_mm: Array, azimuth: Array, elevation: Array, residual: Array) -> npt.NDArray[np.int8]:
+    status = np.full(residual.shape, int(FixationStatus.OK), dtype=np.int8)
+    status[~(residual <= RESIDUAL_LIMIT_MM)] = FixationStatus.NOT_CONVERGED
+    turned = ~((np.abs(azimuth) <= REACH_RAD) & (np.abs(elevation) <= REACH_RAD))
+    status[turned] = FixationStatus.OUT_OF_REACH
+    status[(target_mm[:, 0] < 0.0) & (status == FixationStatus.NOT_CONVERGED)] = FixationStatus.OUT_OF_REACH
+    return status
+
+
+def _tangents(direction: Xyz) -> tuple[Xyz, Xyz]:
+    """Two unit vectors across a direction that points roughly along +x."""
+    x, y, z = direction
+    scale = 1.0 / np.sqrt(x * x + y * y)
+    e1 = (-y * scale, x * scale, 0.0 * x)
+    return e1, (-z * e1[1], z * e1[0], x * e1[1] - y * e1[0])
+
+
+def _dot(a: Xyz, b: Xyz) -> Array:
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def _split(vector: Array) -> Xyz:
+    return vector[..., 0], vector[..., 1], vector[..., 2]
+
+
+_SETTLED_MM = 1e-11
+_NUDGE_RAD = 1e-5
+_START_RAD = np.radians(85.0)

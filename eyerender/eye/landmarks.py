@@ -1,0 +1,161 @@
+"""Landmarks found by tracing: the incident node, the fovea, the chief ray to the fovea."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.surfaces import components, join
+from ..geometry.transforms import Array, normalize, read_only
+from ..optics.shooting import connect
+from ..optics.trace import Crossing, RayStatus, Traced, outward_path, trace
+from .model import Eye, LineOfSight
+
+NODE_RING_DEG = 14.3
+"""Field angle of the ring of nodal rays whose waist is the node (Harris 2010, example 3)."""
+NODE_RAYS = 16
+NODE_DISTANCE_MM = 1500.0
+
+
+def path_to_retina(eye: Eye) -> tuple[Crossing, ...]:
+    """All crossings from air to the retina; light ends there, so the last one does not bend it."""
+    last = eye.back_indices[-1] if eye.back else eye.front_indices[-1]
+    lens = zip(eye.back, eye.back_indices, eye.back_rims_mm, eye.back_passing, strict=True)
+    return (
+        *(Crossing(s, n) for s, n in zip(eye.front, eye.front_indices, strict=True)),
+        *(
+            Crossing(s, n, rim_mm=rim, beyond_rim=None if passing else RayStatus.MISSED)
+            for s, n, rim, passing in lens
+        ),
+        Crossing(eye.retina, last),
+    )
+
+
+def nodal_rays(eye: Eye, objects_mm: Array, guess_mm: Array) -> tuple[Array, Array]:
+    """The rays from objects (m, 3) that reach the retina parallel to themselves: directions (m, 3), retina points (m, 3).
+
+    Raises `InputError` where there is none.
+    """
+    path = path_to_retina(eye)
+    direction, error, retina = _parallel_rays(path, objects_mm, normalize(guess_mm - objects_mm))
+    for k in np.flatnonzero(~(error < _PARALLEL)):
+        row = slice(k, k + 1)
+        # The ray stands on the edge of a shell, where the index jumps: solve with the shells met next to the edge.
+        met = crossed(path, trace(path, 1.0, objects_mm[row], direction[row]))
+        direction[row], error[row], retina[row] = _parallel_rays(met, objects_mm[row], direction[row])
+    if not (error < _PARALLEL).all():
+        raise InputError("no nodal ray meets the retina", path="fovea")
+    return direction, retina
+
+
+def _parallel_rays(path: Sequence[Crossing], objects_mm: Array, direction: Array) -> tuple[Array, Array, Array]:
+    """Newton on the change of direction, with differences over 1e-5 rad: directions, |change|, retina points."""
+    for _ in range(30):
+        first, second = _tangents(direction)
+        bundle = np.stack([direction, direction + _STEP * first, direction + _STEP * second])
+        traced = trace(path, 1.0, np.broadcast_to(objects_mm, bundle.shape), normalize(bundle))
+        turn = traced.directions[-1] - traced.directions[0]
+        error = np.stack([np.sum(turn * first, -1), np.sum(turn * second, -1)], axis=-1)
+        ok = (traced.status == RayStatus.OK).all(axis=0)
+        size = np.where(ok, np.linalg.norm(error[0], axis=-1), np.inf)
+        retina = traced.points_mm[-1, 0]
+        slope = np.stack([(error[1] - error[0]) / _STEP, (error[2] - error[0]) / _STEP], axis=-1)
+        singular = ~ok | ~(np.abs(np.linalg.det(slope)) > 1e-12)
+        slope = np.where(singular[:, None, None], np.eye(2), slope)
+        step = np.linalg.solve(slope, np.where(singular[:, None], 0.0, error[0])[..., None])[..., 0]
+        if np.max(np.abs(step)) < 1e-16:
+            break
+        direction = normalize(direction - step[..., :1] * first - step[..., 1:] * second)
+    return direction, size, retina
+
+
+def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
+    """The crossings that one traced ray (leading shape (1,)) really met, now without rims."""
+    moved = np.linalg.norm(np.diff(traced.points_mm[:, 0], axis=0), axis=-1) > 0.0
+    return tuple(
+        replace(c, rim_mm=np.inf, beyond_rim=RayStatus.MISSED) for c, met in zip(path, moved, strict=True) if met
+    )
+
+
+def incident_node(eye: Eye) -> Array:
+    """The waist of a ring of nodal rays on the optic axis (3,).
+
+    16 nodal rays from (h, v) = 14.3 deg (sin f, cos f), objects 1500 mm from the apex; the node is the mean of the points
+    of closest approach of all pairs, on the axis. (Harris 2010, "Nodes and nodal points and lines in eyes and other optical
+    systems", Ophthalmic Physiol. Opt. 30, 24-42: an aspheric or tilted eye has no nodal point, but a waist.)
+    """
+    angle = 2.0 * np.pi * np.arange(NODE_RAYS) / NODE_RAYS
+    ring = np.radians(NODE_RING_DEG) * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+    objects = NODE_DISTANCE_MM * field_direction(ring)
+    directions, _ = nodal_rays(eye, objects, np.array([-7.0, 0.0, 0.0]))
+    i, j = np.triu_indices(NODE_RAYS, 1)
+    gap = objects[i] - objects[j]
+    cosine = np.sum(directions[i] * directions[j], -1)
+    along_i, along_j = np.sum(directions[i] * gap, -1), np.sum(directions[j] * gap, -1)
+    square = 1.0 - cosine**2
+    s, t = (cosine * along_j - along_i) / square, (along_j - cosine * along_i) / square
+    middle = 0.5 * (objects[i] + s[:, None] * directions[i] + objects[j] + t[:, None] * directions[j])
+    return np.array([np.mean(middle[:, 0]), 0.0, 0.0])
+
+
+def fovea_by_nodal_ray(eye: Eye, node_mm: Array, field_rad: Array, distance_mm: float) -> Array:
+    """Where the nodal ray from the field direction (h nasal, v up) meets the retina, (3,).
+
+    The object lies in the direction (1, tan h, tan v) from the incident node, `distance_mm` from the corneal apex.
+    """
+    direction = field_direction(field_rad)
+    along = float(node_mm @ direction)
+    reach = -along + np.sqrt(along**2 - float(node_mm @ node_mm) + distance_mm**2)
+    _, retina = nodal_rays(eye, (node_mm + reach * direction)[None], node_mm)
+    return np.asarray(retina[0])
+
+
+def chief_ray_in_air(eye: Eye, fovea_mm: Array) -> LineOfSight:
+    """The ray that leaves the fovea, passes the stop's centre and goes out into the air.
+
+    It is fixed in the eye, so that fixation by chief ray only has to turn the eye until it meets the target.
+    """
+    centre = eye.stop.centre_mm
+    if eye.back:
+        path = [
+            Crossing(surface, n, inward=False, rim_mm=rim, beyond_rim=None if passing else RayStatus.MISSED)
+            for surface, n, rim, passing in zip(
+                reversed(eye.back),
+                reversed([eye.front_indices[-1], *eye.back_indices[:-1]]),
+                reversed(eye.back_rims_mm),
+                reversed(eye.back_passing),
+                strict=True,
+            )
+        ]
+        start, target = components(fovea_mm[None]), components(centre[None])
+        found = connect(path, eye.back_indices[-1], start, target, target)
+        if found.status[0] == RayStatus.NOT_CONVERGED and any(eye.back_passing):
+            met = crossed(path, trace(path, eye.back_indices[-1], fovea_mm[None], join(found.start)))
+            found = connect(met, eye.back_indices[-1], start, target, target)
+        if found.status[0] != RayStatus.OK:
+            raise InputError("no ray joins the fovea and the centre of the stop", path="fovea")
+        direction = join(found.end)[0]
+    else:
+        direction = normalize(centre - fovea_mm)
+    traced = trace(outward_path(eye.front, eye.front_indices), eye.front_indices[-1], centre, direction)
+    if traced.status != RayStatus.OK:
+        raise InputError("the chief ray does not leave the eye", path="fovea")
+    return LineOfSight(read_only(traced.points_mm[-1]), read_only(traced.directions[-1]))
+
+
+def field_direction(field_rad: Array) -> Array:
+    """(1, tan h, tan v), normalized; field angles (..., 2) -> (..., 3)."""
+    field = np.asarray(field_rad, dtype=np.float64)
+    return normalize(np.stack([np.ones(field.shape[:-1]), np.tan(field[..., 0]), np.tan(field[..., 1])], axis=-1))
+
+
+def _tangents(direction: Array) -> tuple[Array, Array]:
+    first = normalize(np.cross(direction, np.array([0.0, 0.0, 1.0])))
+    return first, np.cross(direction, first)
+
+
+_STEP = 1e-5
+_PARALLEL = 1e-13

@@ -1,0 +1,121 @@
+"""The eye as numbers: surfaces, stop, landmarks, in the eye frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import ArrayValue
+from ..geometry.surfaces import Surface
+from ..geometry.transforms import Array, read_only
+from ..optics.interface import Number
+from .spec import EyeSpec, Side
+
+__all__ = ["Eye", "EyeSpec", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stop(ArrayValue):
+    """The aperture stop (the anatomical pupil): an ellipse with semi-axes along local y and z of its frame.
+
+    centre_mm (3,), rotation (3, 3) local -> eye, semi_axes_mm (2,), handed: +1 right eye, -1 left eye. In a batch all
+    arrays have a leading axis, `handed` too.
+    """
+
+    centre_mm: Array
+    rotation: Array
+    semi_axes_mm: Array
+    handed: Array
+
+    def __post_init__(self) -> None:
+        for name in ("centre_mm", "rotation", "semi_axes_mm", "handed"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    @property
+    def normal(self) -> Array:
+        """Unit normal of the plane, towards the cornea, (..., 3)."""
+        return np.asarray(self.rotation[..., :, 0])
+
+    def boundary(self, count: int) -> Array:
+        """`count` points evenly spaced in the ellipse's parameter, (..., count, 3).
+
+        The first lies on the first semi-axis (nasal where it is not turned), the next follow towards up; those of a
+        left eye are the mirror images of the right eye's.
+        """
+        angle = 2.0 * np.pi * np.arange(count) / count
+        first = (self.handed * self.semi_axes_mm[..., 0])[..., None] * np.cos(angle)
+        second = self.semi_axes_mm[..., 1, None] * np.sin(angle)
+        r, c = self.rotation[..., None, :, :], self.centre_mm[..., None, :]
+        return np.asarray(c + first[..., None] * r[..., :, 1] + second[..., None] * r[..., :, 2])
+
+    def contains(self, points_mm: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether points (..., 3) of the plane lie inside the ellipse (one stop, not a batch)."""
+        local = (np.asarray(points_mm, dtype=np.float64) - self.centre_mm) @ self.rotation
+        square = (local[..., 1] / self.semi_axes_mm[0]) ** 2 + (local[..., 2] / self.semi_axes_mm[1]) ** 2
+        return np.asarray(square <= 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sphere(ArrayValue):
+    """centre_mm (3,), radius_mm."""
+
+    centre_mm: Array
+    radius_mm: Number
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RotationCentres(ArrayValue):
+    """Where the eye turns: azimuth about z, elevation about y, torsion about x; (3,) each."""
+
+    azimuth_centre_mm: Array
+    elevation_centre_mm: Array
+    torsion_centre_mm: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineOfSight(ArrayValue):
+    """The chief ray to the fovea, in air: `point_mm` where it leaves the cornea, unit `direction` outward, (3,) each."""
+
+    point_mm: Array
+    direction: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Eye(ArrayValue):
+    """An eye in the eye frame, at one wavelength and with one pupil.
+
+    front, front_indices : refracting surfaces between air and the stop, outside in; the index behind each.
+    back, back_indices : the lens' surfaces, likewise (a gradient lens: many shells); empty without a lens.
+    back_rims_mm, back_passing : where each ends, and whether a ray that does not meet it passes on.
+    fovea_mm, incident_node_mm (3,); chief_ray : the fixed ray in air that the fovea sees through the stop's centre.
+    """
+
+    name: str
+    side: Side
+    wavelength_nm: float
+    front: tuple[Surface, ...]
+    front_indices: tuple[Number, ...]
+    back: tuple[Surface, ...]
+    back_indices: tuple[Number, ...]
+    back_rims_mm: tuple[Number, ...]
+    back_passing: tuple[bool, ...]
+    retina: Surface
+    stop: Stop
+    limbus_radius_mm: Number
+    iris_root_radius_mm: Number
+    sclera: Sphere
+    rotation: RotationCentres
+    fovea_mm: Array
+    incident_node_mm: Array
+    chief_ray: LineOfSight
+
+    @property
+    def purkinje_orders(self) -> tuple[int, ...]:
+        """The Purkinje images this eye has: 1 front cornea, 2 back cornea, 3 lens front, 4 lens back."""
+        orders = [1]
+        if len(self.front) > 1:
+            orders.append(2)
+        if len(self.back) > 1:
+            orders += [3, 4]
+        return tuple(orders)

@@ -1,0 +1,128 @@
+"""Pose: how an eye stands, and how its points move with it.
+
+M = Rz(azimuth) Ry(-elevation) Rx(torsion), right-handed; azimuth > 0 turns to the subject's left for both eyes, elevation > 0
+up. Listing's law sets the torsion:
+
+    tau = -asin(sin az sin el / (1 + cos az cos el)),
+
+which makes M the torsion-free rotation from +x to the gaze. Azimuth and elevation have separate centres:
+x' = A(E(T(x))), each turning about its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import ArrayValue
+from ..geometry.surfaces import Xyz
+from ..geometry.transforms import Array, read_only, rotation_x, rotation_y, rotation_z
+from .model import Eye
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses(ArrayValue):
+    """A batch of poses, (n,) each, in radians."""
+
+    azimuth_rad: Array
+    elevation_rad: Array
+    torsion_rad: Array
+
+    def __post_init__(self) -> None:
+        for name in ("azimuth_rad", "elevation_rad", "torsion_rad"):
+            object.__setattr__(self, name, read_only(np.atleast_1d(getattr(self, name))))
+
+    @classmethod
+    def listing(cls, azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Poses:
+        """Poses whose torsion follows Listing's law."""
+        azimuth = np.asarray(azimuth_rad, dtype=np.float64)
+        elevation = np.asarray(elevation_rad, dtype=np.float64)
+        return cls(azimuth, elevation, listing_torsion(azimuth, elevation))
+
+    @classmethod
+    def from_degrees(cls, azimuth_deg: npt.ArrayLike, elevation_deg: npt.ArrayLike) -> Poses:
+        """The same, in degrees."""
+        return cls.listing(np.radians(azimuth_deg), np.radians(elevation_deg))
+
+    def __len__(self) -> int:
+        return len(self.azimuth_rad)
+
+
+def listing_torsion(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Array:
+    """tau = -asin(sin az sin el / (1 + cos az cos el))."""
+    azimuth, elevation = np.asarray(azimuth_rad), np.asarray(elevation_rad)
+    return np.asarray(
+        -np.arcsin(np.sin(azimuth) * np.sin(elevation) / (1.0 + np.cos(azimuth) * np.cos(elevation)))
+    )
+
+
+def rotation_matrices(poses: Poses) -> Array:
+    """M, (n, 3, 3)."""
+    return np.asarray(
+        rotation_z(poses.azimuth_rad) @ rotation_y(-poses.elevation_rad) @ rotation_x(poses.torsion_rad)
+    )
+
+
+def rigid_motion(poses: Poses, eye: Eye) -> tuple[Array, Array]:
+    """(M (n, 3, 3), t (n, 3)): x_turned = M x + t in the eye frame.
+
+    The world's point is x_turned + the eye's position + the head's position. `eye` may be a batch of n.
+    """
+    centres = eye.rotation
+    azimuth, elevation = rotation_z(poses.azimuth_rad), rotation_y(-poses.elevation_rad)
+    torsion = rotation_x(poses.torsion_rad)
+    shift = _about(torsion, centres.torsion_centre_mm)
+    shift = _apply(elevation, shift) + _about(elevation, centres.elevation_centre_mm)
+    shift = _apply(azimuth, shift) + _about(azimuth, centres.azimuth_centre_mm)
+    return np.asarray(azimuth @ elevation @ torsion), shift
+
+
+class Turning(NamedTuple):
+    """Sines and cosines of poses, one array an angle: what moves points in and out of the turned eye cheaply."""
+
+    azimuth: tuple[Array, Array]
+    elevation: tuple[Array, Array]
+    torsion: tuple[Array, Array]
+
+    @classmethod
+    def of(cls, poses: Poses) -> Turning:
+        """From poses."""
+        return cls(
+            (np.cos(poses.azimuth_rad), np.sin(poses.azimuth_rad)),
+            (np.cos(poses.elevation_rad), np.sin(poses.elevation_rad)),
+            (np.cos(poses.torsion_rad), np.sin(poses.torsion_rad)),
+        )
+
+
+def into_eye(turning: Turning, eye: Eye, point: Xyz) -> Xyz:
+    """Where points (n,) of the space around the eye lie for the turned eye: the inverse of the rigid motion."""
+    ca, ce, ct = (_split(c) for c in _centres(eye))
+    (cos_a, sin_a), (cos_e, sin_e), (cos_t, sin_t) = turning
+    x, y, z = point[0] - ca[0], point[1] - ca[1], point[2] - ca[2]
+    x, y = cos_a * x + sin_a * y, cos_a * y - sin_a * x
+    x, y, z = x + (ca[0] - ce[0]), y + (ca[1] - ce[1]), z + (ca[2] - ce[2])
+    x, z = cos_e * x + sin_e * z, cos_e * z - sin_e * x
+    x, y, z = x + (ce[0] - ct[0]), y + (ce[1] - ct[1]), z + (ce[2] - ct[2])
+    y, z = cos_t * y + sin_t * z, cos_t * z - sin_t * y
+    return x + ct[0], y + ct[1], z + ct[2]
+
+
+def _centres(eye: Eye) -> tuple[Array, Array, Array]:
+    r = eye.rotation
+    return r.azimuth_centre_mm, r.elevation_centre_mm, r.torsion_centre_mm
+
+
+def _split(centre: Array) -> tuple[Array, Array, Array]:
+    return centre[..., 0], centre[..., 1], centre[..., 2]
+
+
+def _apply(matrix: Array, vector: Array) -> Array:
+    return np.asarray((matrix @ vector[..., None])[..., 0])
+
+
+def _about(matrix: Array, centre: Array) -> Array:
+    """c - R c, the translation of a turn about c."""
+    return np.asarray(centre - (matrix @ centre[..., None])[..., 0])

@@ -1,0 +1,238 @@
+"""The eye file: what a person writes about a right eye.
+
+Eye frame (mm): origin at the front corneal apex of the unrotated eye, +x outward along the optic axis, +y nasal, +z up. A
+left eye is the mirror image y -> -y. Lists of surfaces run from outside in; a medium is the one BEHIND its surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Literal, Self
+
+from pydantic import Discriminator, Field, Tag
+
+from ..geometry.transforms import TiltOrder
+from ..spec import FileSpec, NonNegative, Positive, Spec, Vec2, Vec3
+
+if TYPE_CHECKING:
+    from .model import Eye
+
+Side = Literal["right", "left"]
+Facing = Literal["front", "back"]
+
+
+class SphereSpec(Spec):
+    """y^2 + z^2 + 2 R s + s^2 = 0 from the apex; R > 0 opens to -x (cornea), R < 0 to +x (lens back, retina)."""
+
+    kind: Literal["sphere"]
+    radius_mm: float
+
+
+class ConicSpec(Spec):
+    """y^2 + z^2 + 2 R s + (1 + Q) s^2 = 0 from the apex, on the sheet that holds the apex."""
+
+    kind: Literal["conic"]
+    radius_mm: float
+    conic_constant: float
+
+
+class BiconicSpec(Spec):
+    """Two apex radii and conic constants, for the meridians of y and z."""
+
+    kind: Literal["biconic"]
+    radii_mm: Vec2
+    conic_constants: Vec2
+
+
+class EllipsoidSpec(Spec):
+    """(x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about its centre; the half towards +x ('front') or -x ('back')."""
+
+    kind: Literal["ellipsoid"]
+    semi_axes_mm: tuple[Positive, Positive, Positive]
+    side: Facing = "front"
+
+
+class QuadricSpec(Spec):
+    """A x^2 + B y^2 + C z^2 + 2 D xy + 2 E xz + 2 F yz + 2 G x + 2 H y + 2 I z + K = 0 about its position.
+
+    The sheet is where dF/dx > 0 ('front') or < 0 ('back') with the coefficients as they stand.
+    """
+
+    kind: Literal["quadric"]
+    coefficients: tuple[float, float, float, float, float, float, float, float, float, float]
+    side: Facing = "front"
+
+
+class PlaneSpec(Spec):
+    """x = 0 of its frame."""
+
+    kind: Literal["plane"]
+
+
+def _shape_tag(value: object) -> str | None:
+    kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
+    return f"{str(kind).capitalize()}Spec"
+
+
+ShapeSpec = Annotated[
+    Annotated[SphereSpec, Tag("SphereSpec")]
+    | Annotated[ConicSpec, Tag("ConicSpec")]
+    | Annotated[BiconicSpec, Tag("BiconicSpec")]
+    | Annotated[EllipsoidSpec, Tag("EllipsoidSpec")]
+    | Annotated[QuadricSpec, Tag("QuadricSpec")]
+    | Annotated[PlaneSpec, Tag("PlaneSpec")],
+    Discriminator(
+        _shape_tag,
+        custom_error_type="unknown_kind",
+        custom_error_message="kind must be sphere, conic, biconic, ellipsoid, quadric or plane",
+    ),
+]
+
+
+class MediumSpec(Spec):
+    """A constant `index`, or `cauchy` = (c0, c1, c2, c3): n = c0 + c1/l^2 + c2/l^4 + c3/l^6, l in nm."""
+
+    index: float | None = Field(default=None, ge=1.0)
+    cauchy: tuple[float, float, float, float] | None = None
+
+
+class PlacedSpec(Spec):
+    """A shape in the eye: moved to `position_mm`, turned about it by `tilt_deg` = (about x, y, z)."""
+
+    shape: ShapeSpec
+    position_mm: Vec3 = (0.0, 0.0, 0.0)
+    placed_by: Literal["apex", "centre"] = "apex"
+    tilt_deg: Vec3 = (0.0, 0.0, 0.0)
+    tilt_order: TiltOrder = Field(default="zyx", description="zyx: Rz Ry Rx; xyz: Rx Ry Rz")
+
+
+class SurfaceSpec(PlacedSpec):
+    """A refracting surface and the medium behind it."""
+
+    name: str = ""
+    medium: MediumSpec
+
+
+class SurfaceLensSpec(Spec):
+    """A lens of homogeneous media; the last medium is the vitreous."""
+
+    kind: Literal["surfaces"]
+    surfaces: tuple[SurfaceSpec, ...] = Field(min_length=1)
+
+
+class GradientLensSpec(Spec):
+    """A gradient-index lens as iso-indicial shells.
+
+    The shell of relative size p in (0, 1] is the outer surface scaled by p about the lens' centre, which lies on the line
+    between the two apexes at `centre_fraction` of it, counted from the front; n(p) = n_core - (n_core - n_edge) p^2.
+    `shells` shells a half stand at evenly spaced n_k from edge to core; the medium inside shell k has the mid index
+    between n_k and n_(k+1). `index_rate` 2 reproduces software that steps the index twice as fast as the shells: shell k
+    stands where n has gone half as far as the index inside it says.
+    """
+
+    kind: Literal["gradient"]
+    front: PlacedSpec
+    back: PlacedSpec
+    edge: MediumSpec
+    core: MediumSpec
+    vitreous: MediumSpec
+    shells: int = Field(default=21, ge=1, le=200)
+    centre_fraction: float = Field(default=0.4, gt=0.0, lt=1.0)
+    index_rate: Literal[1, 2] = 1
+
+
+def _lens_tag(value: object) -> str | None:
+    kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
+    return {"surfaces": "SurfaceLensSpec", "gradient": "GradientLensSpec"}.get(str(kind), "UnknownSpec")
+
+
+LensSpec = Annotated[
+    Annotated[SurfaceLensSpec, Tag("SurfaceLensSpec")] | Annotated[GradientLensSpec, Tag("GradientLensSpec")],
+    Discriminator(
+        _lens_tag,
+        custom_error_type="unknown_kind",
+        custom_error_message="kind must be surfaces or gradient",
+    ),
+]
+
+
+class StopSpec(Spec):
+    """The anatomical pupil: an ellipse in a plane.
+
+    `ellipticity` = 1 - b/a at the area of the circle of `diameter_mm`; the long axis lies `axis_deg` from nasal towards up.
+    A pupil of another diameter d is centred at position_mm + (0, s_y, s_z) (d - diameter_mm), s = `shift_mm_per_mm`.
+    """
+
+    diameter_mm: Positive
+    position_mm: Vec3
+    tilt_deg: Vec3 = (0.0, 0.0, 0.0)
+    ellipticity: float = Field(default=0.0, ge=0.0, lt=1.0)
+    axis_deg: float = 0.0
+    shift_mm_per_mm: Vec2 = (0.0, 0.0)
+
+
+class IrisSpec(Spec):
+    """The iris: the annulus in the pupil's plane out to `root_radius_mm` from the eye's axis."""
+
+    root_radius_mm: Positive
+
+
+class ScleraSpec(Spec):
+    """A sphere; without a centre, the one through the limbus circle with its centre on the cornea's axis."""
+
+    radius_mm: Positive
+    centre_mm: Vec3 | None = None
+
+
+class RotationSpec(Spec):
+    """Centres of rotation: azimuth (about z), elevation (about y), torsion (about x)."""
+
+    azimuth_centre_mm: Vec3
+    elevation_centre_mm: Vec3
+    torsion_centre_mm: Vec3 = (0.0, 0.0, 0.0)
+
+
+class FoveaSpec(Spec):
+    """Where the fovea lies: at `position_mm`, or where a nodal ray meets the retina.
+
+    The nodal ray comes from the field direction (1, tan h, tan v), (h, v) = `field_deg` nasal and up, seen from the
+    incident node, from an object `distance_mm` from the corneal apex.
+    """
+
+    field_deg: Vec2 = (0.0, 0.0)
+    distance_mm: Positive = 1500.0
+    position_mm: Vec3 | None = None
+
+
+class EyeSpec(FileSpec):
+    """A right eye. `sources` says where values come from: dotted path (or the beginning of one) -> text."""
+
+    name: str
+    description: str = ""
+    cornea: tuple[SurfaceSpec, ...] = Field(min_length=1, description="surfaces between air and the stop")
+    lens: LensSpec | None = None
+    retina: PlacedSpec
+    stop: StopSpec
+    limbus_radius_mm: Positive = 5.85
+    iris: IrisSpec
+    sclera: ScleraSpec = ScleraSpec(radius_mm=12.0)
+    rotation: RotationSpec
+    fovea: FoveaSpec
+    sources: dict[str, str] = Field(default_factory=dict)
+
+    @classmethod
+    def from_mapping(cls, data: object, *, source: str = "") -> Self:
+        """Validate a plain mapping and the geometry it describes; raises `InputError` with the path of the bad key."""
+        from .check import check_eye
+
+        spec = super().from_mapping(data, source=source)
+        check_eye(spec, source=source)
+        return spec
+
+    def build(
+        self, *, eye: Side = "right", wavelength_nm: float = 850.0, pupil_diameter_mm: float | None = None
+    ) -> Eye:
+        """The numeric model at a wavelength (nm) with a pupil (mm; the file's own if None)."""
+        from .build import build_eye
+
+        return build_eye(self, eye, wavelength_nm, pupil_diameter_mm)

@@ -1,0 +1,1 @@
+"""Gaze estimators: observations in, gaze points out."""

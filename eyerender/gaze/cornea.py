@@ -1,0 +1,218 @@
+"""The centre of corneal curvature from glints, and the optic axis from it and the pupil.
+
+The cornea is a spherical mirror (centre c, radius R) in front of an eye that refracts once (index n):
+
+    q_i = O + k_i u_i,   c = q_i - R unit(unit(L_i - q_i) + unit(O - q_i))            Guestrin & Eizenman 2006, (1)-(3)
+
+Source: Guestrin & Eizenman, IEEE TBME 53(6), 2006. Leading axes broadcast, so that many sets of parameters are one batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import ArrayValue, Bools, Floats, frozen
+from .rays import unit
+
+# Distances of a cornea from its camera that are tried to start from, in corneal radii: 30 mm to 10 m.
+_START = np.geomspace(4.0, 1300.0, 12)
+_ITERATIONS = 60
+# Two rays closer than this to one plane's normal leave the line to the centre undefined (rad).
+COPLANAR = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorneaCentres(ArrayValue):
+    """Centres (..., 3) mm, distances (..., m) mm of the mirror points along their rays, the disagreement (...) mm.
+
+    `residual_mm` is the root mean square distance of the single glints' centres from their mean (method A), or of the
+    centre from the line it must lie on (method B); `ok` (...) is False where no centre was found.
+    """
+
+    centre_mm: Floats
+    distance_mm: Floats
+    residual_mm: Floats
+    ok: Bools
+
+
+def from_all_glints(
+    origin_mm: Floats, glints: Floats, light_mm: Floats, radius_mm: Floats, start_mm: Floats | None = None
+) -> CorneaCentres:
+    """Method A: the k that minimise sum_{i<j} |c_i(k_i) - c_j(k_j)|^2; the centre is the mean of the c_i.
+
+    Damped Gauss-Newton on the m distances of every row at once. The cost is that of the deviations from the mean, which
+    is the same up to the factor m: sum_{i<j} |c_i - c_j|^2 = m sum_i |c_i - mean|^2.
+
+    Args:
+        origin_mm: (..., 3) nodal points. glints: (..., m, 3) unit rays, m >= 2. light_mm: (m, 3).
+        radius_mm: (...) corneal radius.
+        start_mm: (..., m) distances to start from; default: the best of a coarse search.
+    """
+    m = glints.shape[-2]
+    radius = np.broadcast_to(np.asarray(radius_mm, dtype=float), np.broadcast_shapes(np.shape(radius_mm), glints.shape[:-2]))
+    origin = origin_mm[..., None, :]
+    k = _coarse(origin, glints, light_mm, radius) if start_mm is None else np.array(start_mm, dtype=float)
+    k = np.broadcast_to(k, (*radius.shape, m)).copy()
+    c, slope = _mirror_centres(origin, glints, light_mm, radius, k)
+    deviation = c - c.mean(axis=-2, keepdims=True)
+    cost = (deviation * deviation).sum(axis=(-1, -2))
+    shrink = np.eye(m) - 1.0 / m
+    damping = np.full(radius.shape, 1e-12)
+    for _ in range(_ITERATIONS):
+        normal = np.matmul(slope, np.swapaxes(slope, -1, -2)) * shrink
+        gradient = (slope * deviation).sum(axis=-1)
+        diagonal = (slope * slope).sum(axis=-1) * (1 - 1 / m)
+        system = normal + (damping[..., None] * diagonal)[..., None] * np.eye(m)
+        step = _solved(system, gradient)
+        trial = k - step
+        c_new, slope_new = _mirror_centres(origin, glints, light_mm, radius, trial)
+        deviation_new = c_new - c_new.mean(axis=-2, keepdims=True)
+        cost_new = (deviation_new * deviation_new).sum(axis=(-1, -2))
+        better = (cost_new <= cost) & (trial > 0).all(axis=-1)
+        pick = better[..., None, None]
+        k = np.where(better[..., None], trial, k)
+        c, slope = np.where(pick, c_new, c), np.where(pick, slope_new, slope)
+        deviation, cost = np.where(pick, deviation_new, deviation), np.where(better, cost_new, cost)
+        damping = np.where(better, np.maximum(damping * 0.1, 1e-14), np.maximum(damping * 30, 1e-10))
+        small = np.abs(step).max(axis=-1) <= 1e-13 * np.abs(k).max(axis=-1)
+        # A row that cannot be bettered by rounding-sized steps is as done as one whose step is small.
+        if bool(np.all(small | (damping > 1.0) | ~np.isfinite(cost))):
+            break
+    centre = c.mean(axis=-2)
+    residual = np.sqrt(cost / m)
+    ok = np.isfinite(centre).all(axis=-1)
+    return CorneaCentres(frozen(centre), frozen(k), frozen(residual), frozen(ok, bool))
+
+
+def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple[Floats, Bools]:
+    """Unit direction (..., 3) from the camera to the cornea's centre, without any eye parameter, and whether it exists.
+
+    Each plane of camera, light and glint holds the centre: b is normal to all (L_i - O) x u_i. With two lights
+    b = unit[((L_1 - O) x u_1) x ((L_2 - O) x u_2)] (Guestrin & Eizenman 2006, (18); Shih, Wu & Liu 2000); with more the
+    right singular vector of the smallest singular value. There is none where camera, lights and centre are coplanar.
+    """
+    normals = unit(np.cross(light_mm - origin_mm[..., None, :], glints))
+    if glints.shape[-2] == 2:
+        cross = np.cross(normals[..., 0, :], normals[..., 1, :])
+        spread = np.sqrt((cross * cross).sum(axis=-1))
+        b = unit(cross)
+    else:
+        finite = np.isfinite(normals).all(axis=(-1, -2))
+        _, values, vt = np.linalg.svd(np.where(finite[..., None, None], normals, 0.0))
+        b, spread = vt[..., -1, :], np.where(finite, values[..., 1], 0.0)
+    ok = np.asarray(spread > COPLANAR)
+    towards = np.sign((b * glints[..., 0, :]).sum(axis=-1))
+    return np.where(ok[..., None], b * towards[..., None], np.nan), ok
+
+
+def from_plane(
+    origin_mm: Floats, glints: Floats, light_mm: Floats, radius_mm: Floats, mirror: int = 0
+) -> CorneaCentres:
+    """Method B: c = O + k_c b, with k_c from the mirror condition of the one glint `mirror`.
+
+    In the plane of camera, light and glint, with e the unit vector normal to b: (c(k) - O) . e = k u.e - R n(k).e = 0,
+    solved by Newton's method for the distance k of the mirror point. The arguments are those of `from_all_glints`.
+    """
+    b, ok = line_to_centre(origin_mm, glints, light_mm)
+    radius = np.broadcast_to(np.asarray(radius_mm, dtype=float), np.broadcast_shapes(np.shape(radius_mm), b.shape[:-1]))
+    u, light = glints[..., mirror, :], light_mm[mirror]
+    e = unit(u - (u * b).sum(axis=-1, keepdims=True) * b)
+    side = (u * e).sum(axis=-1)
+    k = 80.0 * radius
+    origin = origin_mm[..., None, :]
+    for step in range(_ITERATIONS):
+        c, slope = _mirror_centres(origin, u[..., None, :], light[None, :], radius, k[..., None])
+        value = ((c[..., 0, :] - origin_mm) * e).sum(axis=-1)
+        # The first step takes the normal as it is, which holds from any distance; then Newton's.
+        rate = side if step == 0 else (slope[..., 0, :] * e).sum(axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            change = value / rate
+        k = np.where(k - change > 0, k - change, 0.5 * k)
+        if bool(np.all((np.abs(change) <= 1e-13 * np.abs(k)) | ~np.isfinite(change))):
+            break
+    c, _ = _mirror_centres(origin, u[..., None, :], light[None, :], radius, k[..., None])
+    off = c[..., 0, :] - origin_mm
+    k_c = (off * b).sum(axis=-1)
+    residual = np.abs((off * e).sum(axis=-1))
+    centre = origin_mm + k_c[..., None] * b
+    good = ok & np.isfinite(centre).all(axis=-1) & (k_c > 0) & (residual < 1e-6 * radius)
+    return CorneaCentres(
+        frozen(np.where(good[..., None], centre, np.nan)), frozen(k[..., None]), frozen(residual), frozen(good, bool)
+    )
+
+
+def optic_axis(
+    origin_mm: Floats, pupil: Floats, centre_mm: Floats, radius_mm: Floats, distance_mm: Floats, index: Floats
+) -> tuple[Floats, Bools, Bools]:
+    """The optic axis w (..., 3): from the cornea's centre through the pupil centre.
+
+    r = near intersection of the pupil ray with sphere(c, R), refracted (1 -> n) into t; p = r + k_p t on sphere(c, K);
+    w = unit(p - c)                                                            Guestrin & Eizenman 2006, (4)-(7), (10)
+
+    Args:
+        origin_mm, pupil: (..., 3) nodal point and unit ray to the pupil centre. centre_mm: (..., 3).
+        radius_mm, distance_mm, index: (...) R, K and n.
+
+    Returns:
+        w; whether the ray meets the cornea (...); whether the refracted ray meets the sphere of radius K (...). Where the
+        ray misses the cornea w is that of the nearest point, where it misses the inner sphere that of its nearest point,
+        so that a search for parameters sees no step.
+    """
+    R, K, n = (np.asarray(v, dtype=float)[..., None] for v in (radius_mm, distance_mm, index))
+    r, meets = _near_intersection(origin_mm, pupil, centre_mm, R)
+    normal = (r - centre_mm) / np.sqrt(((r - centre_mm) ** 2).sum(axis=-1, keepdims=True))
+    cosine = -(pupil * normal).sum(axis=-1, keepdims=True)
+    eta = 1.0 / n
+    t = eta * pupil + (eta * cosine - np.sqrt(np.maximum(1 - eta**2 * (1 - cosine**2), 0.0))) * normal
+    p, inside = _near_intersection(r, t, centre_mm, K)
+    return unit(p - centre_mm), meets, inside
+
+
+def _near_intersection(origin: Floats, ray: Floats, centre: Floats, radius: Floats) -> tuple[Floats, Bools]:
+    """Where unit rays first meet spheres, and whether they do; the nearest point of the ray where they do not."""
+    m = origin - centre
+    b = (m * ray).sum(axis=-1, keepdims=True)
+    square = b * b - (m * m).sum(axis=-1, keepdims=True) + radius * radius
+    return origin + (-b - np.sqrt(np.maximum(square, 0.0))) * ray, np.asarray(square[..., 0] >= 0)
+
+
+def _mirror_centres(
+    origin: Floats, glints: Floats, light_mm: Floats, radius: Floats, k: Floats
+) -> tuple[Floats, Floats]:
+    """c_i(k_i) and dc_i/dk_i, both (..., m, 3)."""
+    q = origin + k[..., None] * glints
+    to_light = light_mm - q
+    far = np.sqrt((to_light * to_light).sum(axis=-1, keepdims=True))
+    a = to_light / far
+    s = a - glints  # unit(O - q) = -u
+    size = np.sqrt((s * s).sum(axis=-1, keepdims=True))
+    normal = s / size
+    a_slope = -(glints - a * (a * glints).sum(axis=-1, keepdims=True)) / far
+    n_slope = (a_slope - normal * (normal * a_slope).sum(axis=-1, keepdims=True)) / size
+    R = radius[..., None, None]
+    return q - R * normal, glints - R * n_slope
+
+
+def _coarse(origin: Floats, glints: Floats, light_mm: Floats, radius: Floats) -> Floats:
+    """The equal distances, of some, whose centres disagree least, (..., m)."""
+    m = glints.shape[-2]
+    k = _START.reshape(-1, *([1] * radius.ndim)) * radius
+    c, _ = _mirror_centres(origin, glints, light_mm, np.broadcast_to(radius, k.shape), np.repeat(k[..., None], m, axis=-1))
+    spread = ((c - c.mean(axis=-2, keepdims=True)) ** 2).sum(axis=(-1, -2))
+    best = np.argmin(np.where(np.isfinite(spread), spread, np.inf), axis=0)
+    return np.repeat(np.take_along_axis(k, best[None], axis=0)[0][..., None], m, axis=-1)
+
+
+def _solved(system: Floats, right: Floats) -> Floats:
+    """Solutions of small symmetric systems (..., m, m); by Cramer's rule for two, which is what most rigs have."""
+    if system.shape[-1] == 2:
+        a, b, d = system[..., 0, 0], system[..., 0, 1], system[..., 1, 1]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            det = a * d - b * b
+            return np.stack([d * right[..., 0] - b * right[..., 1], a * right[..., 1] - b * right[..., 0]], -1) / det[..., None]
+    finite = np.isfinite(system).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
+    safe = np.where(finite[..., None, None], system, np.eye(system.shape[-1]))
+    out = np.linalg.solve(safe, np.where(finite[..., None], right, 0.0)[..., None])[..., 0]
+    return np.where(finite[..., None], out, np.nan)

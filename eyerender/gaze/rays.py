@@ -1,0 +1,97 @@
+"""From features to rays: what the model-based estimators work on.
+
+    u = direction in which the camera sees a feature;  O = its nodal point;  L = a light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import ArrayValue, Floats, Ints, Objects, frozen
+from ..errors import InputError
+from ..observation import Observations
+from ..rig.rig import Rig
+from ..rig.screen import Screen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureRays(ArrayValue):
+    """Rays of observations: nodal points (n, 3) mm, unit rays to the pupil centre (n, 3) and to the glints (n, m, 3).
+
+    `light_mm` (m, 3) are the glints' lights; `reason` (n,) says why an observation has no rays, None where it has.
+    """
+
+    origin_mm: Floats
+    pupil: Floats
+    glints: Floats
+    light_mm: Floats
+    reason: Objects
+
+
+def feature_rays(observations: Observations, rig: Rig, lights: Sequence[int] | None, *, least: int) -> FeatureRays:
+    """Rays to the pupil centre and to the glints of `lights` (None: all of the rig's).
+
+    Raises:
+        InputError: the rig has fewer than `least` lights, or not those that are named.
+    """
+    wanted = chosen_lights(rig, lights, least)
+    camera, reason = camera_of(observations, rig)
+    n, m = len(observations), len(wanted)
+    pupil_ok = observations.pupil.ok
+    reason[(reason == None) & ~pupil_ok] = "no pupil"  # noqa: E711  (element by element)
+    places = np.full((n, m, 2), np.nan)
+    for j, light in enumerate(wanted):
+        places[:, j], found = observations.glints.of_light(light)
+        reason[(reason == None) & ~found] = f"no glint of light {light}"  # noqa: E711
+    origin, pupil, glints = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, m, 3), np.nan)
+    for k in np.unique(camera[camera >= 0]):
+        rows = camera == k
+        origin[rows] = rig.cameras[k].nodal_point_mm
+        pupil[rows] = rig.cameras[k].rays(observations.pupil.centre_px[rows])
+        glints[rows] = rig.cameras[k].rays(places[rows])
+    light_mm = np.array([rig.lights[j].position_mm for j in wanted], dtype=float).reshape(m, 3)
+    return FeatureRays(frozen(origin), frozen(pupil), frozen(glints), frozen(light_mm), frozen(reason, object))
+
+
+def chosen_lights(rig: Rig, lights: Sequence[int] | None, least: int) -> tuple[int, ...]:
+    """The lights to use, at least `least` different ones of the rig's; raises `InputError`."""
+    wanted = tuple(range(len(rig.lights))) if lights is None else tuple(lights)
+    if len(set(wanted)) != len(wanted) or any(not 0 <= k < len(rig.lights) for k in wanted):
+        raise InputError(f"lights {list(wanted)} are not different lights of a rig that has {len(rig.lights)}")
+    if len(wanted) < least:
+        raise InputError(f"this estimator needs {least} lights, the rig has {len(wanted)}")
+    return wanted
+
+
+def camera_of(observations: Observations, rig: Rig) -> tuple[Ints, Objects]:
+    """The camera of each observation (n,), -1 with a reason (n,) where it is not known; one camera is always known."""
+    camera = np.array(observations.index.camera, dtype=np.int64)
+    if len(rig.cameras) == 1:
+        camera[camera < 0] = 0
+    reason = np.full(len(camera), None, dtype=object)
+    bad = (camera < 0) | (camera >= len(rig.cameras))
+    reason[bad] = "the camera is not one of the rig's"
+    camera[bad] = -1
+    return camera, reason
+
+
+def screen_of(rig: Rig) -> Screen:
+    """The rig's screen; raises `InputError` without one."""
+    if rig.screen is None:
+        raise InputError("this estimator needs a screen in the rig")
+    return rig.screen
+
+
+def unit(v: Floats) -> Floats:
+    """v / |v| along the last axis; NaN for a zero vector."""
+    length = np.sqrt((v * v).sum(axis=-1, keepdims=True))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(v / np.where(length > 0, length, np.nan))
+
+
+def nasal_sign(eye: Ints) -> Floats:
+    """+1 where +y is nasal (right eye, and eyes of unknown side), -1 for a left eye."""
+    return np.where(np.asarray(eye) == 1, -1.0, 1.0)

@@ -1,0 +1,197 @@
+"""Interpolation-based gaze estimation: polynomials of the normalised pupil-glint vector (Blignaut 2014).
+
+    v = (pupil - glint) / |pupil_right - pupil_left|,   x = sum_k a_k m_k(v),   y = sum_k b_k m_k(v)
+
+with monomials m_k from Table 2 of the comparative study, fitted by least squares for each eye.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import Bools, Floats, Objects
+from ..errors import InputError
+from ..observation import Observations
+from ..rig.rig import Rig
+from ..rig.screen import Screen
+from .estimate import GazePoints, gaze_points
+
+Terms = tuple[tuple[int, int], ...]  # exponents (i, j) of x^i y^j
+
+
+def _terms(text: str) -> Terms:
+    """Terms written as in the literature, 'x + x2y + 1': exponents after the letters."""
+    out = []
+    for term in text.replace(" ", "").split("+"):
+        i = j = 0
+        rest = term
+        for letter in "xy":
+            if rest.startswith(letter):
+                digits = "".join(c for c in rest[1:2] if c.isdigit())
+                power = int(digits) if digits else 1
+                rest = rest[1 + len(digits) :]
+                i, j = (power, j) if letter == "x" else (i, power)
+        if rest not in ("", "1") or (rest == "1" and (i or j)):
+            raise InputError(f"{term!r} is no term such as x, y2, x2y or 1")
+        out.append((i, j))
+    if len(set(out)) != len(out):
+        raise InputError(f"{text!r} holds a term twice")
+    return tuple(out)
+
+
+_Y10 = "x + x2 + x3 + x4 + x5 + y + xy + x2y + x3y + x4y + x5y + 1"
+_Y7 = "x + x2 + y + y2 + xy + x2y + 1"
+_X8 = "x + x2 + x3 + y + xy + x2y + x3y + 1"
+_X11 = "x + x2 + x3 + y + y2 + y3 + xy + x2y + x3y + 1"
+
+# Table 2: the terms of x and of y.
+FUNCTIONS: dict[str, tuple[str, str]] = {
+    "R1": ("x + 1", "y + 1"),
+    "R2": ("x + y + xy + 1", "x + y + xy + 1"),
+    "R3": ("x + x2 + y + y2 + xy + 1", "x + x2 + y + y2 + xy + 1"),
+    "R4": ("x + x2 + y + y2 + xy + x2y2 + 1", "x + x2 + y + y2 + xy + x2y2 + 1"),
+    "R5": ("x + y + xy + 1", "x + y + y2 + 1"),
+    "R6": ("x + x2 + y + 1", "x2 + y + xy + x2y + 1"),
+    "R7": ("x + x3 + y2 + xy + 1", _Y7),
+    "R8": (_X8, _Y7),
+    "R9": (_X8, "x + x2 + y + xy + x2y + 1"),
+    "R10": (_X8, _Y10),
+    "R11": (_X11, "x + x2 + y + xy + x2y + 1"),
+    "R12": (_X11, _Y10),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Coefficients of one eye on the scaled vector (v - centre) / scale."""
+
+    centre: Floats
+    scale: Floats
+    a: Floats
+    b: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class PupilGlintRegression:
+    """Polynomial regression on the pupil-glint vector of one light's glint.
+
+    Args:
+        function: R1 to R12 of Table 2, or the terms of x and y, as ("x + y + 1", "x + y2 + 1").
+        light: which light's glint the vector runs from.
+        minimum_norm: allow fewer targets than terms and take the minimum-norm solution, as the study's authors did.
+    """
+
+    function: str | tuple[str, str] = "R3"
+    light: int = 0
+    minimum_norm: bool = False
+    _fits: dict[int, _Fit] = field(default_factory=dict, repr=False)
+
+    @property
+    def terms(self) -> tuple[Terms, Terms]:
+        """Exponents of the terms of x and of y."""
+        if isinstance(self.function, str):
+            if self.function not in FUNCTIONS:
+                raise InputError(f"{self.function!r} is no function of Table 2 (R1 to R12)")
+            x, y = FUNCTIONS[self.function]
+        else:
+            x, y = self.function
+        return _terms(x), _terms(y)
+
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+        """Calibrate each eye; raises `InputError` for too few usable targets or targets that do not determine it."""
+        screen = _screen(rig)
+        targets = np.asarray(targets_mm, dtype=float) - screen.centre_mm
+        wanted = np.stack([targets @ screen.right, targets @ screen.up], axis=-1)
+        v, reason = pupil_glint_vectors(observations, self.light)
+        usable = np.array([r is None for r in reason], dtype=bool) & np.isfinite(wanted).all(axis=1)
+        x_terms, y_terms = self.terms
+        fits = {}
+        for eye in np.unique(observations.index.eye):
+            rows = usable & (observations.index.eye == eye)
+            need = max(len(x_terms), len(y_terms))
+            name = "right" if eye == 0 else "left"
+            if rows.sum() < (1 if self.minimum_norm else need):
+                raise InputError(
+                    f"{name} eye: {rows.sum()} usable calibration targets, but {self.function} has {need} terms"
+                )
+            centre = v[rows].mean(axis=0)
+            scale = np.maximum(np.abs(v[rows] - centre).max(axis=0), 1e-300)
+            u = (v[rows] - centre) / scale
+            if self.minimum_norm:
+                # The minimum norm depends on the variables; the study's is that of the unscaled polynomial.
+                centre, scale, u = np.zeros(2), np.ones(2), v[rows]
+            a = self._solve(_monomials(u, x_terms), wanted[rows, 0], name)
+            b = self._solve(_monomials(u, y_terms), wanted[rows, 1], name)
+            fits[int(eye)] = _Fit(centre, scale, a, b)
+        return replace(self, _fits=fits)
+
+    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+        """Gaze points on the screen's plane."""
+        if not self._fits:
+            raise InputError("the estimator is not calibrated; call fit first")
+        screen = _screen(rig)
+        v, reason = pupil_glint_vectors(observations, self.light)
+        reason = reason.copy()
+        x_terms, y_terms = self.terms
+        on_screen = np.full((len(observations), 2), np.nan)
+        for eye in np.unique(observations.index.eye):
+            rows = np.flatnonzero(observations.index.eye == eye)
+            fit = self._fits.get(int(eye))
+            if fit is None:
+                reason[rows] = "this eye is not calibrated"
+                continue
+            u = (v[rows] - fit.centre) / fit.scale
+            on_screen[rows] = np.stack([_monomials(u, x_terms) @ fit.a, _monomials(u, y_terms) @ fit.b], axis=-1)
+        return gaze_points(screen.world(on_screen), reason)
+
+    def _solve(self, design: Floats, wanted: Floats, eye: str) -> Floats:
+        solution, _, rank, _ = np.linalg.lstsq(design, wanted, rcond=None)
+        if rank < design.shape[1] and not self.minimum_norm:
+            raise InputError(f"{eye} eye: the calibration targets do not determine {self.function} (rank {rank})")
+        return np.asarray(solution)
+
+
+def pupil_glint_vectors(observations: Observations, light: int = 0) -> tuple[Floats, Objects]:
+    """The normalised pupil-glint vector (n, 2) and why there is none (n,), None where there is.
+
+    Both eyes of one frame are needed: the distance of their pupils is the unit.
+    """
+    index, pupil = observations.index, observations.pupil
+    n = len(observations)
+    glint, found = observations.glints.of_light(light)
+    reason = np.full(n, None, dtype=object)
+    reason[~pupil.ok] = "no pupil"
+    reason[pupil.ok & ~found] = f"no glint of light {light}"
+    partner = _partners(index.frame, index.eye)
+    lone = (partner < 0) & (reason == None)  # noqa: E711  (element by element)
+    reason[lone] = "the frame shows one eye; the vector is normalised by the distance of two pupils"
+    unit: Bools = (partner >= 0) & ~pupil.ok[partner]
+    reason[unit & (reason == None)] = "no pupil of the other eye"  # noqa: E711
+    with np.errstate(invalid="ignore"):
+        distance = np.linalg.norm(pupil.centre_px - pupil.centre_px[partner], axis=1)
+        v = (pupil.centre_px - glint) / np.where(distance > 0, distance, np.nan)[:, None]
+    good = np.array([r is None for r in reason], dtype=bool)
+    return np.where(good[:, None], v, np.nan), reason
+
+
+def _partners(frame: Any, eye: Any) -> Any:
+    """Row of the other eye of the same frame, -1 where there is none."""
+    out = np.full(len(frame), -1)
+    where = {(int(f), int(e)): k for k, (f, e) in enumerate(zip(frame, eye, strict=True))}
+    for (f, e), k in where.items():
+        out[k] = where.get((f, 1 - e), -1)
+    return out
+
+
+def _monomials(v: Floats, terms: Terms) -> Floats:
+    return np.stack([v[:, 0] ** i * v[:, 1] ** j for i, j in terms], axis=1)
+
+
+def _screen(rig: Rig) -> Screen:
+    if rig.screen is None:
+        raise InputError("interpolation-based gaze estimation needs a screen in the rig")
+    return rig.screen

@@ -1,0 +1,72 @@
+"""How good a gaze estimator is on observations of known targets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import ArrayValue, Bools, Floats, Objects
+from ..errors import InputError
+from ..observation import Observations
+from ..rig.rig import Rig
+from .estimate import Estimator, GazePoints, angular_error_deg, binocular_average, gaze_points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GazeErrors(ArrayValue):
+    """Binocular gaze errors by frame: estimate and target (f, 3) mm, error (f,) degrees at the mid-point of the eyes.
+
+    Where a frame has no estimate the error is NaN and `reason` (f,) says why.
+    """
+
+    frame: Floats
+    point_mm: Floats
+    target_mm: Floats
+    error_deg: Floats
+    reason: Objects
+
+    @property
+    def ok(self) -> Bools:
+        """Frames with an estimate, (f,)."""
+        return np.isfinite(self.error_deg)
+
+    @property
+    def mean_deg(self) -> float | None:
+        """Mean over the frames with an estimate; None without any."""
+        return float(self.error_deg[self.ok].mean()) if self.ok.any() else None
+
+    @property
+    def max_deg(self) -> float | None:
+        """Largest error; None without any."""
+        return float(self.error_deg[self.ok].max()) if self.ok.any() else None
+
+
+def leave_one_target_out(estimator: Estimator, observations: Observations, rig: Rig) -> GazeErrors:
+    """Errors of each target estimated by a calibration on all the others.
+
+    A residual at the calibration targets themselves would flatter every estimator with many terms.
+
+    Raises:
+        InputError: there are no targets, or too few to calibrate on.
+    """
+    targets = observations.index.target_mm
+    if not np.isfinite(targets).all():
+        raise InputError("gaze errors need observations with targets")
+    points = np.full((len(observations), 3), np.nan)
+    reason = np.full(len(observations), None, dtype=object)
+    for fixation in np.unique(observations.index.fixation):
+        held_out = observations.index.fixation == fixation
+        fitted = estimator.fit(observations.take(~held_out), targets[~held_out], rig)
+        gaze = fitted.predict(observations.take(held_out), rig)
+        points[held_out] = gaze.point_mm
+        reason[held_out] = gaze.reason
+    return gaze_errors(observations, gaze_points(points, reason))
+
+
+def gaze_errors(observations: Observations, gaze: GazePoints) -> GazeErrors:
+    """Binocular errors of gaze points (n) of observations (n): both eyes' mean against the target."""
+    frames, both = binocular_average(observations, gaze)
+    index = frames.index
+    error = angular_error_deg(both.point_mm, index.target_mm, index.head_mm)
+    return GazeErrors(index.frame.astype(float), both.point_mm, index.target_mm, error, both.reason)

@@ -1,0 +1,1 @@
+"""Geometry shared by every observer: transforms, surfaces and the ellipse."""

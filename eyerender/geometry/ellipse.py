@@ -1,0 +1,389 @@
+"""The ellipse and the pixel convention: one type, one float64 direct fit, one place for every conversion.
+
+Pixel centres are at integers; x to the right, y down. An ellipse is the centre, the semi-axes a >= b and the angle
+of a, measured from +x toward +y, in [0, pi):
+
+    p(t) = c + a cos(t) (cos phi, sin phi) + b sin(t) (-sin phi, cos phi)
+
+As a conic it is A x^2 + B x y + C y^2 + D x + E y + F = 0 with 4 A C - B^2 > 0, written (A, B, C, D, E, F).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+
+Array = NDArray[np.float64]
+
+# Points handled at once: a chunk's temporaries (about 20 arrays) then stay in a core's second-level cache.
+_CHUNK_POINTS = 16384
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ellipse:
+    """One ellipse in pixels.
+
+    centre_px: (2,) px. semi_axes_px: (2,) px, a >= b > 0. angle_rad: angle of a from +x toward +y, [0, pi).
+    The constructor brings equivalent forms (b > a, any angle) to the one above; raises `InputError` for an axis that is
+    not positive or a number that is not finite.
+    """
+
+    centre_px: Array
+    semi_axes_px: Array
+    angle_rad: float
+
+    def __post_init__(self) -> None:
+        centre = np.array(self.centre_px, dtype=np.float64)
+        axes = np.array(self.semi_axes_px, dtype=np.float64)
+        angle = float(self.angle_rad)
+        if centre.shape != (2,) or axes.shape != (2,):
+            raise InputError("an ellipse needs a centre (x, y) and two semi-axes")
+        if not (np.isfinite(centre).all() and np.isfinite(axes).all() and math.isfinite(angle)):
+            raise InputError("an ellipse's numbers must be finite")
+        if axes.min() <= 0.0:
+            raise InputError("an ellipse's semi-axes must be > 0")
+        if axes[1] > axes[0]:
+            axes = axes[::-1].copy()
+            angle += 0.5 * math.pi
+        centre.setflags(write=False)
+        axes.setflags(write=False)
+        object.__setattr__(self, "centre_px", centre)
+        object.__setattr__(self, "semi_axes_px", axes)
+        object.__setattr__(self, "angle_rad", float(wrap_angle(angle)))
+
+    def _key(self) -> tuple[float, ...]:
+        return (*self.centre_px.tolist(), *self.semi_axes_px.tolist(), self.angle_rad)
+
+    def __eq__(self, other: object) -> bool:
+        return self._key() == other._key() if isinstance(other, Ellipse) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Ellipse, (self.centre_px.tolist(), self.semi_axes_px.tolist(), self.angle_rad)
+
+    @property
+    def area_px2(self) -> float:
+        """pi a b."""
+        return math.pi * float(self.semi_axes_px[0] * self.semi_axes_px[1])
+
+    @property
+    def aspect(self) -> float:
+        """b / a, in (0, 1]."""
+        return float(self.semi_axes_px[1] / self.semi_axes_px[0])
+
+    def conic(self) -> Array:
+        """(6,) conic coefficients; see `conic_from_parameters`."""
+        return conic_from_parameters(self.centre_px, self.semi_axes_px, self.angle_rad)
+
+    def points(self, count: int) -> Array:
+        """(count, 2) boundary points at equal steps of the parameter t."""
+        return points_on_ellipse(self.centre_px, self.semi_axes_px, self.angle_rad, count)
+
+    def shifted(self, offset_px: ArrayLike) -> Ellipse:
+        """The same ellipse moved by (dx, dy)."""
+        return Ellipse(self.centre_px + np.asarray(offset_px, dtype=np.float64), self.semi_axes_px, self.angle_rad)
+
+    def scaled(self, factor: float) -> Ellipse:
+        """The same centre and angle, both axes times `factor` > 0."""
+        return Ellipse(self.centre_px, self.semi_axes_px * factor, self.angle_rad)
+
+
+class EllipseFit(NamedTuple):
+    """A batch of fitted ellipses: centre (..., 2) px, semi-axes (..., 2) px, angle (...) rad, residual (...) px.
+
+    `residual` is the root mean square Sampson distance. Where no ellipse fits (collinear points, a number that is not
+    finite) the residual is infinite and the parameters are NaN; `ok` tells them apart.
+    """
+
+    centre_px: Array
+    semi_axes_px: Array
+    angle_rad: Array
+    residual_px: Array
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(...) whether there is an ellipse."""
+        return np.isfinite(self.residual_px)
+
+
+def wrap_angle(angle_rad: ArrayLike) -> Array:
+    """angle mod pi, in [0, pi): the orientation of an undirected axis."""
+    wrapped = np.mod(np.asarray(angle_rad, dtype=np.float64), np.pi)
+    # np.mod rounds a tiny negative angle up to pi itself.
+    return np.where(wrapped >= np.pi, 0.0, wrapped)
+
+
+def fit_ellipse_direct(points: ArrayLike) -> EllipseFit:
+    """Direct least-squares ellipses: minimise sum F(p_i)^2 subject to 4 A C - B^2 = 1.
+
+    points: (..., k, 2) px, k >= 5 (6 or more for a residual); every leading axis is a batch of ellipses.
+    Raises `InputError` for a wrong shape; an item that has no ellipse is a value, see `EllipseFit`.
+
+    The fit is affine invariant (F is, and 4 A C - B^2 only scales), so each item's points are first whitened: mean 0,
+    covariance 1. In the basis (u^2 + v^2, u^2 - v^2, 2 u v) the constraint is p^2 - q^2 - r^2 > 0, the scatter
+    of the linear terms is the identity, and the reduced 3 x 3 problem M w = lambda diag(1, -1, -1) w has one
+    non-negative eigenvalue, found in closed form and polished by one Rayleigh step.
+    Source: Halir and Flusser (1998), eqs. 22-29; Fitzgibbon, Pilu and Fisher (1999), section 3.1 for the invariance.
+    """
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim < 2 or array.shape[-1] != 2 or array.shape[-2] < 5:
+        raise InputError(f"points must have the shape (..., k >= 5, 2), not {array.shape}")
+    lead, count = array.shape[:-2], array.shape[-2]
+    flat = array.reshape(-1, count, 2)
+    out = np.empty((flat.shape[0], 6))
+    step = max(1, _CHUNK_POINTS // count)
+    with np.errstate(all="ignore"):
+        for start in range(0, flat.shape[0], step):
+            out[start : start + step] = _fit_chunk(flat[start : start + step])
+    out = out.reshape(*lead, 6)
+    return EllipseFit(out[..., 0:2], out[..., 2:4], out[..., 4], out[..., 5])
+
+
+def _fit_chunk(points: Array) -> Array:
+    """(n, k, 2) points -> (n, 6) rows of cx, cy, a, b, angle, residual."""
+    x = np.ascontiguousarray(points[..., 0])
+    y = np.ascontiguousarray(points[..., 1])
+    mean_x, mean_y = x.mean(axis=1), y.mean(axis=1)
+    x -= mean_x[:, None]
+    y -= mean_y[:, None]
+    k = x.shape[1]
+    sxx, sxy, syy = _dot(x, x) / k, _dot(x, y) / k, _dot(y, y) / k
+    # Cholesky factor L of the covariance: (x, y) = L (u, v).
+    l11 = np.sqrt(sxx)
+    l21 = sxy / l11
+    l22 = np.sqrt(syy - l21 * l21)
+    # Collinear to rounding error: the smaller spread is lost in the larger one's last digits.
+    flat = ~(l22 * l11 > 1e-10 * (sxx + syy))
+    u = x / l11[:, None]
+    v = (y - l21[:, None] * u) / l22[:, None]
+
+    uu, vv = u * u, v * v
+    p, q, r = uu + vv - 2.0, uu - vv, 2.0 * u * v
+    linear = []
+    for basis in (p, q, r):
+        along_u, along_v = _dot(basis, u) / k, _dot(basis, v) / k
+        basis -= along_u[:, None] * u
+        basis -= along_v[:, None] * v
+        linear.append((along_u, along_v))
+    m = (_dot(p, p) / k, _dot(p, q) / k, _dot(p, r) / k, _dot(q, q) / k, _dot(q, r) / k, _dot(r, r) / k)
+    wp, wq, wr = _positive_eigenvector(m)
+
+    # F(u, v) = wp (u^2 + v^2 - 2) + wq (u^2 - v^2) + wr 2 u v - (d u + e v); quadratic part [[A, H], [H, C]].
+    a2, h2, c2 = wp + wq, wr, wp - wq
+    d = wp * linear[0][0] + wq * linear[1][0] + wr * linear[2][0]
+    e = wp * linear[0][1] + wq * linear[1][1] + wr * linear[2][1]
+    det = a2 * c2 - h2 * h2
+    cu, cv = 0.5 * (c2 * d - h2 * e) / det, 0.5 * (a2 * e - h2 * d) / det
+    level = 2.0 * wp + 0.5 * (d * cu + e * cv)  # F = quadratic(u - cu) - level
+
+    residual = _sampson_rms((p, q, r), (wp, wq, wr), (a2, h2, c2), (d, e), (u, v), (l11, l21, l22))
+    # Back to pixels: the quadratic form Q becomes L^-T Q L^-1; the centre c becomes L c + mean.
+    centre_x = l11 * cu + mean_x
+    centre_y = l21 * cu + l22 * cv + mean_y
+    # Inverse of Q/level is the form's covariance-like matrix P = level Q^-1; L P L^T has the semi-axes squared.
+    scale = level / det
+    p11, p12, p22 = scale * c2, -scale * h2, scale * a2
+    g11 = l11 * l11 * p11
+    g12 = l11 * (l21 * p11 + l22 * p12)
+    g22 = l21 * l21 * p11 + 2.0 * l21 * l22 * p12 + l22 * l22 * p22
+    semi_a, semi_b, angle = _axes_from_shape_matrix(g11, g12, g22)
+    rows = np.stack([centre_x, centre_y, semi_a, semi_b, angle, residual], axis=-1)
+    bad = flat | ~np.isfinite(rows).all(axis=1) | ~(semi_b > 0.0)
+    rows[bad] = np.nan
+    rows[bad, 5] = np.inf
+    return rows
+
+
+def _dot(first: Array, second: Array) -> Array:
+    product: Array = np.einsum("nk,nk->n", first, second)
+    return product
+
+
+def _positive_eigenvector(m: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+    """The w of M w = lambda diag(1, -1, -1) w for the largest lambda; M symmetric (pp, pq, pr, qq, qr, rr)."""
+    pp, pq, pr, qq, qr, rr = m
+    # Eigenvalues of diag(1, -1, -1) M, whose characteristic polynomial is x^3 - t x^2 + s x - det = 0.
+    t = pp - qq - rr
+    s = pq * pq + pr * pr - pp * (qq + rr) + qq * rr - qr * qr
+    det = pp * (qq * rr - qr * qr) - pq * (pq * rr - qr * pr) + pr * (pq * qr - qq * pr)
+    # All three roots are real because M is positive semi-definite: Viete's trigonometric form, largest root.
+    third = t / 3.0
+    spread = np.sqrt(np.maximum(third * third - s / 3.0, 0.0))
+    half = third * third * third - 0.5 * third * s + 0.5 * det
+    cosine = np.clip(half / np.maximum(spread * spread * spread, 1e-300), -1.0, 1.0)
+    value = third + 2.0 * spread * np.cos(np.arccos(cosine) / 3.0)
+    w = _null_vector(m, value)
+    for _ in range(2):
+        # Rayleigh quotient: its error is the square of the vector's, which removes the cancellation in the cubic.
+        wp, wq, wr = w
+        energy = pp * wp * wp + qq * wq * wq + rr * wr * wr + 2.0 * (pq * wp * wq + pr * wp * wr + qr * wq * wr)
+        value = energy / (wp * wp - wq * wq - wr * wr)
+        w = _null_vector(m, value)
+    return w
+
+
+def _null_vector(m: tuple[Array, ...], value: Array) -> tuple[Array, Array, Array]:
+    """The null vector of M - value diag(1, -1, -1), normalised to w_p > 0.
+
+    It is the first column of the adjugate: an ellipse has w_p^2 > w_q^2 + w_r^2, so no other column is longer.
+    """
+    _, pq, pr, qq, qr, rr = m
+    d, f = qq + value, rr + value
+    wp, wq, wr = d * f - qr * qr, pr * qr - pq * f, pq * qr - pr * d
+    norm = np.copysign(np.sqrt(wp * wp + wq * wq + wr * wr), wp)
+    return wp / norm, wq / norm, wr / norm
+
+
+def _sampson_rms(
+    basis: tuple[Array, Array, Array],
+    w: tuple[Array, Array, Array],
+    quadratic: tuple[Array, Array, Array],
+    linear: tuple[Array, Array],
+    uv: tuple[Array, Array],
+    factor: tuple[Array, Array, Array],
+) -> Array:
+    """sqrt(mean(F^2 / |grad F|^2)), px; the gradient is taken back to pixels by L^-T."""
+    a2, h2, c2 = (term[:, None] for term in quadratic)
+    d, e = (term[:, None] for term in linear)
+    u, v = uv
+    l11, l21, l22 = (term[:, None] for term in factor)
+    value = w[0][:, None] * basis[0] + w[1][:, None] * basis[1] + w[2][:, None] * basis[2]
+    gu = 2.0 * (a2 * u + h2 * v) - d
+    gv = (2.0 * (h2 * u + c2 * v) - e) / l22
+    gx = (gu - l21 * gv) / l11
+    rms: Array = np.sqrt((value * value / (gx * gx + gv * gv)).mean(axis=1))
+    return rms
+
+
+def _axes_from_shape_matrix(g11: Array, g12: Array, g22: Array) -> tuple[Array, Array, Array]:
+    """Semi-axes and angle of {x : x^T G^-1 x = 1}: the square roots of G's eigenvalues and its first eigenvector."""
+    mean, half = 0.5 * (g11 + g22), 0.5 * (g11 - g22)
+    radius = np.hypot(half, g12)
+    major = mean + radius
+    # det / major, because mean - radius cancels for a thin ellipse.
+    minor = (g11 * g22 - g12 * g12) / major
+    return np.sqrt(major), np.sqrt(minor), wrap_angle(0.5 * np.arctan2(g12, half))
+
+
+def points_on_ellipse(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: ArrayLike, count: int) -> Array:
+    """p(t_j), t_j = 2 pi j / count. centre (..., 2), semi-axes (..., 2), angle (...) -> (..., count, 2) px."""
+    centre = np.asarray(centre_px, dtype=np.float64)
+    axes = np.asarray(semi_axes_px, dtype=np.float64)
+    angle = np.asarray(angle_rad, dtype=np.float64)[..., None]
+    t = 2.0 * np.pi * np.arange(count) / count
+    along, across = axes[..., :1] * np.cos(t), axes[..., 1:] * np.sin(t)
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack(
+        [centre[..., :1] + along * cos - across * sin, centre[..., 1:] + along * sin + across * cos], axis=-1
+    )
+
+
+def conic_from_parameters(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: ArrayLike) -> Array:
+    """(..., 6) conic (A, B, C, D, E, F) with F(p) = |p'|^2 - 1, p' in units of the semi-axes.
+
+    F is -1 at the centre, 0 on the boundary, positive outside. centre (..., 2), semi-axes (..., 2), angle (...).
+    """
+    centre = np.asarray(centre_px, dtype=np.float64)
+    axes = np.asarray(semi_axes_px, dtype=np.float64)
+    angle = np.asarray(angle_rad, dtype=np.float64)
+    cx, cy = centre[..., 0], centre[..., 1]
+    ia, ib = axes[..., 0] ** -2.0, axes[..., 1] ** -2.0
+    cos, sin = np.cos(angle), np.sin(angle)
+    a = cos * cos * ia + sin * sin * ib
+    b = 2.0 * cos * sin * (ia - ib)
+    c = sin * sin * ia + cos * cos * ib
+    return np.stack(
+        [a, b, c, -2.0 * a * cx - b * cy, -b * cx - 2.0 * c * cy, a * cx * cx + b * cx * cy + c * cy * cy - 1.0],
+        axis=-1,
+    )
+
+
+def parameters_from_conic(conic: ArrayLike) -> tuple[Array, Array, Array]:
+    """(centre (..., 2), semi-axes (..., 2), angle (...)) of (..., 6) conics; NaN where it is no real ellipse."""
+    a, b, c, d, e, f = np.moveaxis(np.asarray(conic, dtype=np.float64), -1, 0)
+    with np.errstate(all="ignore"):
+        det = 4.0 * a * c - b * b
+        cx, cy = (b * e - 2.0 * c * d) / det, (b * d - 2.0 * a * e) / det
+        level = -(f + 0.5 * (d * cx + e * cy))  # the quadratic form's value on the boundary
+        scale = 4.0 * level / det
+        semi_a, semi_b, angle = _axes_from_shape_matrix(scale * c, -0.5 * scale * b, scale * a)
+    real = (det > 0.0) & (level * (a + c) > 0.0)
+    nan = np.where(real, 1.0, np.nan)
+    return np.stack([cx * nan, cy * nan], axis=-1), np.stack([semi_a * nan, semi_b * nan], axis=-1), angle * nan
+
+
+def from_cv2(rotated_rect: tuple[tuple[float, float], tuple[float, float], float]) -> Ellipse:
+    """An OpenCV rotated rectangle (centre, (width, height) = full axes, degrees of the width from +x toward +y)."""
+    (cx, cy), (width, height), degrees = rotated_rect
+    return Ellipse(np.array([cx, cy]), np.array([0.5 * width, 0.5 * height]), math.radians(degrees))
+
+
+def to_cv2(ellipse: Ellipse) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """OpenCV's form, minor axis first as `cv2.fitEllipse` gives it: width = 2 b, its angle in [0, 180) degrees."""
+    a, b = ellipse.semi_axes_px.tolist()
+    degrees = math.degrees(float(wrap_angle(ellipse.angle_rad + 0.5 * math.pi)))
+    cx, cy = ellipse.centre_px.tolist()
+    return (cx, cy), (2.0 * b, 2.0 * a), degrees
+
+
+def signed_distance(ellipse: Ellipse, points: ArrayLike) -> Array:
+    """First-order (Sampson) signed distance of (..., 2) points to the boundary, px: F / |grad F|, positive outside."""
+    p = np.asarray(points, dtype=np.float64) - ellipse.centre_px
+    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+    a, b = ellipse.semi_axes_px
+    x, y = (p[..., 0] * cos + p[..., 1] * sin) / a, (-p[..., 0] * sin + p[..., 1] * cos) / b
+    # F = x^2 + y^2 - 1; sqrt(1 + F) - 1 instead of F / 2 keeps the sign and is exact for a circle.
+    radius = np.hypot(x, y)
+    slope = np.hypot(x / a, y / b)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        distance = (radius - 1.0) * radius / slope
+    return np.where(radius > 0.0, distance, -float(b))
+
+
+def iou(first: Ellipse, second: Ellipse, nodes: int = 2048) -> float:
+    """Intersection over union of two filled ellipses.
+
+    Intersection = integral over y of the overlap of the two chords, y = mid + half sin(t), midpoint rule: the
+    substitution removes the square-root ends; absolute error below 1e-5 for 2048 nodes.
+    """
+    spans = [_vertical_span(ellipse) for ellipse in (first, second)]
+    low, high = max(span[0] for span in spans), min(span[1] for span in spans)
+    if low >= high:
+        return 0.0
+    t = (np.arange(nodes) + 0.5) * (np.pi / nodes) - 0.5 * np.pi
+    y = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(t)
+    left_1, right_1 = _chord(first, y)
+    left_2, right_2 = _chord(second, y)
+    overlap = np.maximum(np.minimum(right_1, right_2) - np.maximum(left_1, left_2), 0.0)
+    common = float(np.sum(overlap * np.cos(t))) * 0.5 * (high - low) * np.pi / nodes
+    return common / (first.area_px2 + second.area_px2 - common)
+
+
+def _vertical_span(ellipse: Ellipse) -> tuple[float, float]:
+    a, b = ellipse.semi_axes_px
+    half = math.hypot(a * math.sin(ellipse.angle_rad), b * math.cos(ellipse.angle_rad))
+    return float(ellipse.centre_px[1]) - half, float(ellipse.centre_px[1]) + half
+
+
+def _chord(ellipse: Ellipse, y: Array) -> tuple[Array, Array]:
+    """Ends of the horizontal chord at each y (equal where the line misses)."""
+    a, b, c, d, e, f = ellipse.conic()
+    linear = b * y + d
+    root = np.sqrt(np.maximum(linear * linear - 4.0 * a * (c * y * y + e * y + f), 0.0))
+    return (-linear - root) / (2.0 * a), (-linear + root) / (2.0 * a)
+
+
+def polygon_area(points: ArrayLike) -> Array:
+    """Shoelace area of closed polygons (..., k, 2), px^2; positive when the turn is from +x toward +y."""
+    p = np.asarray(points, dtype=np.float64)
+    q = np.roll(p, -1, axis=-2)
+    area: Array = 0.5 * np.sum(p[..., 0] * q[..., 1] - q[..., 0] * p[..., 1], axis=-1)
+    return area

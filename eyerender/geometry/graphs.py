@@ -1,0 +1,143 @@
+"""Surfaces as graphs x = h(y, z) over one plane, with first and second derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from .surfaces import Surface, fit
+from .surfaces_biconic import Biconic
+from .surfaces_quadric import Quadric
+from .transforms import Array
+
+Number = Array | float
+
+
+class Jet(NamedTuple):
+    """h, its slopes and its second derivatives."""
+
+    x: Array
+    y: Array
+    z: Array
+    yy: Array
+    yz: Array
+    zz: Array
+
+
+class Graph(Protocol):
+    """A surface over the (y, z) plane of a working frame."""
+
+    def height(self, y: Array, z: Array) -> Array:
+        """h(y, z)."""
+
+    def jet(self, y: Array, z: Array) -> Jet:
+        """h with its derivatives up to the second."""
+
+
+class AxialGraph(NamedTuple):
+    """y^2 + z^2 + p x^2 + 2 b x + c = 0 on the sheet where p x + b > 0; u = p x + b = sqrt(b^2 - p (y^2 + z^2 + c))."""
+
+    p: Number
+    b: Number
+    c: Number
+    ndim: int
+
+    def height(self, y: Array, z: Array) -> Array:
+        b = fit(self.b, self.ndim)
+        rest = y * y + z * z
+        rest += fit(self.c, self.ndim)
+        return np.asarray(-rest / (b + np.sqrt(b * b - fit(self.p, self.ndim) * rest)))
+
+    def jet(self, y: Array, z: Array) -> Jet:
+        p, b = fit(self.p, self.ndim), fit(self.b, self.ndim)
+        rest = y * y + z * z
+        rest += fit(self.c, self.ndim)
+        u = np.sqrt(b * b - p * rest)
+        x = rest / (-b - u)
+        inverse = -1.0 / u
+        hy, hz = y * inverse, z * inverse
+        lean = p * inverse
+        ty = lean * hy
+        return Jet(x, hy, hz, ty * hy + inverse, ty * hz, lean * (hz * hz) + inverse)
+
+
+class QuadricGraph(NamedTuple):
+    """Any quadric: A_xx x^2 + 2 (A_xy y + A_xz z + b_x) x + F(0, y, z) = 0 on the sheet where g_x > 0."""
+
+    coefficients: tuple[Number, ...]
+    ndim: int
+
+    def height(self, y: Array, z: Array) -> Array:
+        return self._root(y, z)[0]
+
+    def jet(self, y: Array, z: Array) -> Jet:
+        xx, yy, zz, xy, xz, yz, _, by, bz, _ = (fit(v, self.ndim) for v in self.coefficients)
+        x, u = self._root(y, z)
+        inverse = -1.0 / u
+        hy = (xy * x + yy * y + yz * z + by) * inverse
+        hz = (xz * x + yz * y + zz * z + bz) * inverse
+        ay, az = xx * hy + xy, xx * hz + xz
+        return Jet(
+            x,
+            hy,
+            hz,
+            (ay * hy + xy * hy + yy) * inverse,
+            (ay * hz + xz * hy + yz) * inverse,
+            (az * hz + xz * hz + zz) * inverse,
+        )
+
+    def _root(self, y: Array, z: Array) -> tuple[Array, Array]:
+        xx, yy, zz, xy, xz, yz, bx, by, bz, c = (fit(v, self.ndim) for v in self.coefficients)
+        half = xy * y + xz * z + bx
+        rest = y * (yy * y + 2.0 * (yz * z + by)) + z * (zz * z + 2.0 * bz) + c
+        u = np.sqrt(half * half - xx * rest)
+        return np.asarray(-rest / (half + u)), u
+
+
+class BiconicGraph(NamedTuple):
+    """A biconic in its own frame."""
+
+    surface: Biconic
+
+    def height(self, y: Array, z: Array) -> Array:
+        return self.surface.local_sag(y, z)
+
+    def jet(self, y: Array, z: Array) -> Jet:
+        return Jet(*self.surface.sag_derivatives(y, z)[:6])
+
+
+def graphs_of(surfaces: Sequence[Surface], ndim: int) -> tuple[list[Graph], Array, Array] | None:
+    """(graphs, origin, rotation) in one working frame, or None where the surfaces have none in common.
+
+    ndim : axes of the arrays that will be handed in. The frame is the eye's, or that of a biconic; two biconics in
+    different frames have none.
+    """
+    frame: Biconic | None = None
+    for surface in surfaces:
+        if isinstance(surface, Biconic):
+            if frame is not None:
+                return None
+            frame = surface
+    first = surfaces[0]
+    origin = np.zeros_like(first.origin_mm) if frame is None else frame.origin_mm
+    rotation = np.broadcast_to(np.eye(3), first.rotation.shape) if frame is None else frame.rotation
+    graphs: list[Graph] = []
+    for surface in surfaces:
+        if isinstance(surface, Biconic):
+            graphs.append(BiconicGraph(surface))
+        elif isinstance(surface, Quadric):
+            moved = surface if frame is None else surface.seen_from(origin, rotation)
+            if not np.all(moved.rotation[..., 0, 0] > 0.5):
+                return None
+            p, b, c = moved.axial_coefficients or (None, None, None)
+            if p is not None and b is not None and c is not None:
+                graphs.append(AxialGraph(p, b, c, ndim))
+            else:
+                graphs.append(QuadricGraph(moved.coefficients, ndim))
+        else:
+            return None
+    return graphs, origin, rotation
+
+

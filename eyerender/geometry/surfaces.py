@@ -1,0 +1,218 @@
+"""Refracting and reflecting surfaces: the interface every kind of surface has, and points as components.
+
+A surface is the zero set of an implicit function F, oriented so that its half gradient g = grad F / 2 points to +x of the
+surface's local frame (the optic axis outward, towards the air) everywhere on the sheet that counts. A line parallel to
+the local x axis therefore meets the sheet at most once, and the sign of d.g tells a ray going into the eye (d.g < 0)
+from one coming out, which makes the choice of the root unambiguous for spheres, ellipsoids and hyperboloids alike.
+
+Points travel as one array per coordinate (`Xyz`): chunks of such arrays stay in the cache. Parameters of a surface are
+numbers, or arrays with one leading batch axis (one surface an eye); points then have that axis first.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from .transforms import Array
+
+Mask = npt.NDArray[np.bool_]
+Xyz = tuple[Array, Array, Array]
+
+
+class Hit(NamedTuple):
+    """Where rays meet a surface: `distance` along the unit direction (mm), `point`, half `gradient`, `ok` (it exists)."""
+
+    distance: Array
+    point: Xyz
+    gradient: Xyz
+    ok: Mask
+
+
+class SymmetricMatrix(NamedTuple):
+    """A symmetric 3 x 3 matrix as components, numbers or arrays: the derivative of the half gradient."""
+
+    xx: Array | float
+    yy: Array | float
+    zz: Array | float
+    xy: Array | float
+    xz: Array | float
+    yz: Array | float
+
+    def times(self, vector: Xyz) -> Xyz:
+        """The product with a vector; off-diagonal zeros cost nothing."""
+        x, y, z = vector
+        out_x, out_y, out_z = self.xx * x, self.yy * y, self.zz * z
+        if not _is_zero(self.xy):
+            out_x, out_y = out_x + self.xy * y, out_y + self.xy * x
+        if not _is_zero(self.xz):
+            out_x, out_z = out_x + self.xz * z, out_z + self.xz * x
+        if not _is_zero(self.yz):
+            out_y, out_z = out_y + self.yz * z, out_z + self.yz * y
+        return out_x, out_y, out_z
+
+
+class Surface(ABC):
+    """One sheet of a surface in the eye frame.
+
+    `origin_mm` (..., 3) and `rotation` (..., 3, 3) place the local frame: p_eye = rotation p_local + origin_mm.
+    """
+
+    __slots__ = ()
+
+    origin_mm: Array
+    rotation: Array
+
+    @property
+    @abstractmethod
+    def kind(self) -> str:
+        """'quadric' or 'biconic'."""
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one surface, (n,) for one surface an eye."""
+        return self.origin_mm.shape[:-1]
+
+    # -- one array per coordinate -------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
+        """Where rays with unit `direction` cross the sheet, going in (d.g < 0) or out (d.g > 0)."""
+
+    @abstractmethod
+    def value_at(self, point: Xyz) -> Array:
+        """The implicit function F."""
+
+    @abstractmethod
+    def gradient_at(self, point: Xyz) -> Xyz:
+        """The half gradient g, not normalized."""
+
+    @abstractmethod
+    def hessian_at(self, point: Xyz) -> SymmetricMatrix:
+        """H with dg = H dp."""
+
+    @abstractmethod
+    def local_sag(self, y: Array, z: Array) -> Array:
+        """x of the sheet in the local frame over the local (y, z); NaN where the sheet does not reach."""
+
+    @abstractmethod
+    def take(self, index: npt.NDArray[np.intp]) -> Self:
+        """The batch of surfaces at `index`; a single surface is returned as it is."""
+
+    @abstractmethod
+    def mirrored(self) -> Self:
+        """The surface with y -> -y: that of the other eye."""
+
+    @classmethod
+    @abstractmethod
+    def stack(cls, surfaces: tuple[Self, ...]) -> Self:
+        """Single surfaces of this kind as one batch."""
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and all(np.array_equal(a, b) for a, b in zip(self._key(), other._key(), strict=True))
+
+    def __hash__(self) -> int:
+        return hash((type(self), *((a + 0.0).tobytes() for a in self._key())))
+
+    @abstractmethod
+    def _key(self) -> tuple[Array, ...]:
+        """The arrays that make the surface what it is."""
+
+    # -- points (..., 3) ----------------------------------------------------------------------------------------------
+
+    def implicit(self, points: npt.ArrayLike) -> Array:
+        """F at points (..., 3); zero on the surface."""
+        return self.value_at(components(points))
+
+    def gradient(self, points: npt.ArrayLike) -> Array:
+        """grad F at points (..., 3)."""
+        return 2.0 * join(self.gradient_at(components(points)))
+
+    def normal(self, points: npt.ArrayLike) -> Array:
+        """Unit normal g/|g| at points (..., 3), pointing to the air side (+x of the local frame)."""
+        gradient = join(self.gradient_at(components(points)))
+        return gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
+
+    def sag(self, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike) -> Array:
+        """x (mm, local frame) of the sheet over local y and z; NaN where it does not reach."""
+        return self.local_sag(np.asarray(y_mm, dtype=np.float64), np.asarray(z_mm, dtype=np.float64))
+
+    def intersect(self, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Array, Mask]:
+        """Distance (mm) to the nearest crossing ahead and whether there is one; shapes (..., 3) -> (...,).
+
+        `directions` are unit vectors. Where nothing is met the distance is infinite.
+        """
+        origin, direction = components(origins_mm), components(directions)
+        hits = [self.hit(origin, direction, inward) for inward in (True, False)]
+        distances = [np.where(hit.ok & (hit.distance > 0.0), hit.distance, np.inf) for hit in hits]
+        nearest = np.minimum(distances[0], distances[1])
+        return nearest, np.isfinite(nearest)
+
+    def to_local(self, points: npt.ArrayLike) -> Array:
+        """Points (..., 3) of the eye frame in the local frame."""
+        return join(turn_back(self.rotation, shift(components(points), self.origin_mm, -1.0)))
+
+    def to_eye(self, points: npt.ArrayLike) -> Array:
+        """Points (..., 3) of the local frame in the eye frame."""
+        return join(shift(turn(self.rotation, components(points)), self.origin_mm, 1.0))
+
+    def axis_distance(self, point: Xyz) -> Array:
+        """Distance (mm) of points from the local x axis."""
+        local_x, local_y, local_z = shift(point, self.origin_mm, -1.0)
+        axis_x, axis_y, axis_z = (fit(self.rotation[..., i, 0], point[0].ndim) for i in range(3))
+        along = local_x * axis_x + local_y * axis_y + local_z * axis_z
+        return np.asarray(np.sqrt(np.maximum(local_x**2 + local_y**2 + local_z**2 - along**2, 0.0)))
+
+
+def components(points: npt.ArrayLike) -> Xyz:
+    """(..., 3) -> three contiguous arrays."""
+    array = np.asarray(points, dtype=np.float64)
+    return np.array(array[..., 0]), np.array(array[..., 1]), np.array(array[..., 2])
+
+
+def join(point: Xyz) -> Array:
+    """Three arrays -> (..., 3)."""
+    return np.stack(np.broadcast_arrays(*point), axis=-1)
+
+
+def fit(value: Array | float, ndim: int) -> Array | float:
+    """A parameter () or (n,) made to broadcast with points that have `ndim` axes, the batch axis first."""
+    if isinstance(value, float):
+        return value
+    if value.ndim == 0:
+        return float(value)
+    return value.reshape(value.shape + (1,) * (ndim - value.ndim))
+
+
+def shift(point: Xyz, offset: Array, sign: float) -> Xyz:
+    """point + sign offset, offset (3,) or (n, 3)."""
+    ndim = point[0].ndim
+    return (
+        point[0] + sign * fit(offset[..., 0], ndim),
+        point[1] + sign * fit(offset[..., 1], ndim),
+        point[2] + sign * fit(offset[..., 2], ndim),
+    )
+
+
+def turn(rotation: Array, vector: Xyz) -> Xyz:
+    """rotation vector, rotation (3, 3) or (n, 3, 3)."""
+    ndim = vector[0].ndim
+    rows = [[fit(rotation[..., i, j], ndim) for j in range(3)] for i in range(3)]
+    x, y, z = vector
+    return (
+        rows[0][0] * x + rows[0][1] * y + rows[0][2] * z,
+        rows[1][0] * x + rows[1][1] * y + rows[1][2] * z,
+        rows[2][0] * x + rows[2][1] * y + rows[2][2] * z,
+    )
+
+
+def turn_back(rotation: Array, vector: Xyz) -> Xyz:
+    """rotation^T vector, rotation (3, 3) or (n, 3, 3)."""
+    return turn(np.swapaxes(rotation, -1, -2), vector)
+
+
+def _is_zero(value: Array | float) -> bool:
+    return isinstance(value, float) and value == 0.0

@@ -1,0 +1,224 @@
+"""Quadrics: sphere, conic, ellipsoid, plane, and any other surface of second order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from .surfaces import Hit, Mask, Surface, SymmetricMatrix, Xyz, fit
+from .transforms import MIRROR, Array, flip_y, mirror_rotation, read_only
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quadric(Surface):
+    """F(p) = p^T A p + 2 b.p + c = 0 in the local frame, on the sheet where g_x = (A p + b)_x > 0.
+
+    matrix : A, symmetric, (..., 3, 3)
+    vector : b (mm), (..., 3)
+    constant : c (mm^2), (...,)
+    """
+
+    origin_mm: Array
+    rotation: Array
+    matrix: Array
+    vector: Array
+    constant: Array
+    _eye: tuple[Array | float, ...] = field(init=False, repr=False)
+    _axial: bool = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("origin_mm", "rotation", "matrix", "vector", "constant"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+        turned = self.rotation @ self.matrix @ np.swapaxes(self.rotation, -1, -2)
+        turned_vector = np.einsum("...ij,...j->...i", self.rotation, self.vector)
+        pulled = np.einsum("...ij,...j->...i", turned, self.origin_mm)
+        vector = turned_vector - pulled
+        constant = self.constant + np.sum(self.origin_mm * (pulled - 2.0 * turned_vector), axis=-1)
+        entries = [turned[..., i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+        entries += [vector[..., i] for i in range(3)] + [constant]
+        values = tuple(float(e) if np.ndim(e) == 0 else read_only(e) for e in entries)
+        object.__setattr__(self, "_eye", values)
+        off_axis = (*values[3:6], values[7], values[8])
+        axial = all(np.all(np.asarray(v) == 0.0) for v in off_axis) and bool(np.all(values[1] == values[2]))
+        object.__setattr__(self, "_axial", axial and bool(np.all(np.asarray(values[1]) == 1.0)))
+
+    @classmethod
+    def conic(
+        cls,
+        radius_mm: npt.ArrayLike,
+        conic_constant: npt.ArrayLike = 0.0,
+        origin_mm: npt.ArrayLike = (0.0, 0.0, 0.0),
+        rotation: npt.ArrayLike | None = None,
+    ) -> Quadric:
+        """y^2 + z^2 + 2 R x + (1 + Q) x^2 = 0 with the apex at the local origin; R > 0 opens to -x, R < 0 to +x."""
+        radius = np.asarray(radius_mm, dtype=np.float64)
+        shape = np.broadcast_shapes(radius.shape, np.shape(conic_constant), np.shape(origin_mm)[:-1])
+        sign = np.broadcast_to(np.sign(radius), shape)
+        matrix = np.zeros((*shape, 3, 3))
+        matrix[..., 0, 0] = 1.0 + np.asarray(conic_constant)
+        matrix[..., 1, 1] = matrix[..., 2, 2] = 1.0
+        vector = np.zeros((*shape, 3))
+        vector[..., 0] = radius
+        return cls.oriented(matrix, vector, np.zeros(shape), sign, origin_mm, rotation)
+
+    @classmethod
+    def ellipsoid(
+        cls,
+        semi_axes_mm: npt.ArrayLike,
+        centre_mm: npt.ArrayLike,
+        rotation: npt.ArrayLike | None = None,
+        front: bool = True,
+    ) -> Quadric:
+        """(x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about `centre_mm`: its half towards +x (`front`) or towards -x."""
+        axes = np.asarray(semi_axes_mm, dtype=np.float64)
+        matrix = np.zeros((*axes.shape[:-1], 3, 3))
+        scale = axes[..., 1] * axes[..., 2]
+        for i in range(3):
+            matrix[..., i, i] = scale / axes[..., i] ** 2
+        return cls.oriented(matrix, np.zeros(axes.shape), -scale, 1.0 if front else -1.0, centre_mm, rotation)
+
+    @classmethod
+    def plane(cls, origin_mm: npt.ArrayLike, rotation: npt.ArrayLike | None = None) -> Quadric:
+        """x = 0 of the local frame."""
+        return cls.oriented(np.zeros((3, 3)), np.array([1.0, 0.0, 0.0]), np.array(0.0), 1.0, origin_mm, rotation)
+
+    @classmethod
+    def oriented(
+        cls,
+        matrix: npt.ArrayLike,
+        vector: npt.ArrayLike,
+        constant: npt.ArrayLike,
+        sign: npt.ArrayLike = 1.0,
+        origin_mm: npt.ArrayLike = (0.0, 0.0, 0.0),
+        rotation: npt.ArrayLike | None = None,
+    ) -> Quadric:
+        """F times `sign`: the sheet where the half gradient of F as given has the sign of `sign` along x."""
+        factor = np.asarray(sign, dtype=np.float64)
+        full = factor[..., None, None] * np.asarray(matrix)
+        shape = full.shape[:-2]
+        origin = np.broadcast_to(np.asarray(origin_mm, dtype=np.float64), (*shape, 3))
+        frame = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
+        return cls(
+            origin,
+            np.broadcast_to(frame, (*shape, 3, 3)),
+            full,
+            np.broadcast_to(factor[..., None] * np.asarray(vector), (*shape, 3)),
+            np.broadcast_to(factor * np.asarray(constant), shape),
+        )
+
+    @property
+    def kind(self) -> str:
+        return "quadric"
+
+    @property
+    def coefficients(self) -> tuple[Array | float, ...]:
+        """(A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c) in the eye frame, numbers or (n,) arrays."""
+        return self._eye
+
+    @property
+    def axial_coefficients(self) -> tuple[Array | float, Array | float, Array | float] | None:
+        """(A_xx, b_x, c) of y^2 + z^2 + A_xx x^2 + 2 b_x x + c = 0 in the eye frame, if the surface is of that form."""
+        return (self._eye[0], self._eye[6], self._eye[9]) if self._axial else None
+
+    def seen_from(self, origin_mm: Array, rotation: Array) -> Quadric:
+        """The same surface with another frame taken as the eye's: p = rotation p' + origin_mm."""
+        back = np.swapaxes(rotation, -1, -2)
+        moved = (back @ (self.origin_mm - origin_mm)[..., None])[..., 0]
+        return Quadric(moved, back @ self.rotation, self.matrix, self.vector, self.constant)
+
+    def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
+        """Root of (d.Ad) t^2 + 2 (d.g(o)) t + F(o) = 0 with d.g of the wanted sign, as F / (-b -+ sqrt(b^2 - aF))."""
+        ox, oy, oz = origin
+        dx, dy, dz = direction
+        xx, yy, zz, xy, xz, yz, bx, by, bz, c = (fit(v, max(ox.ndim, dx.ndim)) for v in self._eye)
+        if self._axial:
+            a = 1.0 + (xx - 1.0) * (dx * dx)
+            gx = xx * ox + bx
+            b = gx * dx + oy * dy + oz * dz
+            value = (gx + bx) * ox + oy * oy + oz * oz + c
+        else:
+            ux, uy, uz = SymmetricMatrix(xx, yy, zz, xy, xz, yz).times(direction)
+            a = dx * ux + dy * uy + dz * uz
+            gx, gy, gz = self.gradient_at(origin)
+            b = gx * dx + gy * dy + gz * dz
+            value = (gx + bx) * ox + (gy + by) * oy + (gz + bz) * oz + c
+        square = b * b - a * value
+        root = np.sqrt(np.maximum(square, 0.0))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = value / (root - b) if inward else value / (-root - b)
+            point = (ox + t * dx, oy + t * dy, oz + t * dz)
+        gradient = self.gradient_at(point)
+        return Hit(t, point, gradient, (square >= 0.0) & np.isfinite(t) & self.on_sheet(gradient))
+
+    def on_sheet(self, gradient: Xyz) -> Mask:
+        """Whether a half gradient in the eye frame points to local +x."""
+        if self._axial:
+            return np.asarray(gradient[0] > 0.0)
+        ndim = gradient[0].ndim
+        ax, ay, az = (fit(self.rotation[..., i, 0], ndim) for i in range(3))
+        return np.asarray(ax * gradient[0] + ay * gradient[1] + az * gradient[2] > 0.0)
+
+    def value_at(self, point: Xyz) -> Array:
+        x, y, z = point
+        gx, gy, gz = self.gradient_at(point)
+        bx, by, bz, c = (fit(v, x.ndim) for v in self._eye[6:])
+        return np.asarray((gx + bx) * x + (gy + by) * y + (gz + bz) * z + c)
+
+    def gradient_at(self, point: Xyz) -> Xyz:
+        x, y, z = point
+        if self._axial:
+            return fit(self._eye[0], x.ndim) * x + fit(self._eye[6], x.ndim), y, z
+        gx, gy, gz = self.hessian_at(point).times(point)
+        bx, by, bz = (fit(v, x.ndim) for v in self._eye[6:9])
+        return gx + bx, gy + by, gz + bz
+
+    def hessian_at(self, point: Xyz) -> SymmetricMatrix:
+        return SymmetricMatrix(*(fit(v, point[0].ndim) for v in self._eye[:6]))
+
+    def local_sag(self, y: Array, z: Array) -> Array:
+        """The root of A_xx x^2 + 2 (A_xy y + A_xz z + b_x) x + F(0, y, z) = 0 on the sheet."""
+        m, v = self.matrix, self.vector
+        ndim = max(y.ndim, z.ndim)
+        xx, yy, zz, xy, xz, yz = (
+            fit(m[..., i, j], ndim) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+        )
+        bx, by, bz, c = (fit(e, ndim) for e in (v[..., 0], v[..., 1], v[..., 2], self.constant))
+        half = xy * y + xz * z + bx
+        rest = yy * y * y + zz * z * z + 2.0 * (yz * y * z + by * y + bz * z) + c
+        square = half * half - xx * rest
+        with np.errstate(invalid="ignore", divide="ignore"):
+            root = np.sqrt(square)  # NaN where the sheet does not reach
+            # x = (root - half) / xx, without cancellation near the apex and without dividing by a small xx
+            stable = half >= 0.0
+            return np.asarray(np.where(stable, -rest / np.where(stable, half + root, 1.0), (root - half) / xx))
+
+    def take(self, index: npt.NDArray[np.intp]) -> Self:
+        if not self.batch_shape:
+            return self
+        return type(self)(*(part[index] for part in self._key()))
+
+    def mirrored(self) -> Self:
+        # In the mirrored local frame y changes sign too, so the local implicit function is mirrored with it.
+        return type(self)(
+            flip_y(self.origin_mm),
+            mirror_rotation(self.rotation),
+            MIRROR @ self.matrix @ MIRROR,
+            flip_y(self.vector),
+            self.constant,
+        )
+
+    def _key(self) -> tuple[Array, ...]:
+        return self.origin_mm, self.rotation, self.matrix, self.vector, self.constant
+
+    @classmethod
+    def stack(cls, surfaces: tuple[Self, ...]) -> Self:
+        return cls(*(np.stack(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
+
+
+def centre_of(quadric: Quadric) -> Array:
+    """Where the gradient vanishes, -A^-1 b, in the eye frame (..., 3); raises LinAlgError for a paraboloid or plane."""
+    local = -np.linalg.solve(quadric.matrix, quadric.vector[..., None])[..., 0]
+    return quadric.to_eye(local)

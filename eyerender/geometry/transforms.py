@@ -1,0 +1,75 @@
+"""Rotations, mirroring and unit vectors, batched over leading axes.
+
+All rotations are right-handed and active: `rotation_z(a) @ (1, 0, 0) = (cos a, sin a, 0)`.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+TiltOrder = Literal["zyx", "xyz"]
+
+MIRROR = np.diag([1.0, -1.0, 1.0])
+"""Right eye <-> left eye: (x, y, z) -> (x, -y, z)."""
+MIRROR.setflags(write=False)
+
+
+def read_only(array: npt.ArrayLike) -> Array:
+    """A float64 copy that cannot be written to."""
+    copy = np.array(array, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy
+
+
+def rotation_x(angle_rad: npt.ArrayLike) -> Array:
+    """Rotation about x by `angle_rad`, shape (...,) -> (..., 3, 3)."""
+    return _plane_rotation(angle_rad, 1, 2)
+
+
+def rotation_y(angle_rad: npt.ArrayLike) -> Array:
+    """Rotation about y by `angle_rad`, shape (...,) -> (..., 3, 3)."""
+    return _plane_rotation(angle_rad, 2, 0)
+
+
+def rotation_z(angle_rad: npt.ArrayLike) -> Array:
+    """Rotation about z by `angle_rad`, shape (...,) -> (..., 3, 3)."""
+    return _plane_rotation(angle_rad, 0, 1)
+
+
+def tilt_rotation(tilt_rad: npt.ArrayLike, order: TiltOrder = "zyx") -> Array:
+    """Rz(t_z) Ry(t_y) Rx(t_x), or Rx Ry Rz for order 'xyz'; `tilt_rad` about (x, y, z), shape (..., 3)."""
+    tilt = np.asarray(tilt_rad, dtype=np.float64)
+    about_x, about_y, about_z = rotation_x(tilt[..., 0]), rotation_y(tilt[..., 1]), rotation_z(tilt[..., 2])
+    return about_z @ about_y @ about_x if order == "zyx" else about_x @ about_y @ about_z
+
+
+def flip_y(points: npt.ArrayLike) -> Array:
+    """(x, y, z) -> (x, -y, z), shape (..., 3)."""
+    return np.asarray(points, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
+
+
+def mirror_rotation(rotation: npt.ArrayLike) -> Array:
+    """S R S with S the mirroring of y: the same rotation seen in the mirror; shape (..., 3, 3)."""
+    return MIRROR @ np.asarray(rotation, dtype=np.float64) @ MIRROR
+
+
+def normalize(vectors: npt.ArrayLike) -> Array:
+    """v / |v| along the last axis."""
+    array = np.asarray(vectors, dtype=np.float64)
+    return array / np.linalg.norm(array, axis=-1, keepdims=True)
+
+
+def _plane_rotation(angle_rad: npt.ArrayLike, first: int, second: int) -> Array:
+    angle = np.asarray(angle_rad, dtype=np.float64)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    matrix = np.zeros((*angle.shape, 3, 3))
+    matrix[..., 3 - first - second, 3 - first - second] = 1.0
+    matrix[..., first, first] = cosine
+    matrix[..., second, second] = cosine
+    matrix[..., first, second] = -sine
+    matrix[..., second, first] = sine
+    return matrix

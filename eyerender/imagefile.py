@@ -1,0 +1,90 @@
+"""Reading and writing image files: 16- and 8-bit greyscale PNG, any greyscale Pillow can read.
+
+Pixel values are linear sensor counts; nothing here scales or gamma-encodes them, except `preview`, which is for people.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from .errors import EyerenderError, InputError
+
+# A sensor of 65536 x 65536 is refused anyway; this bounds what a hostile file can make us allocate.
+MAX_PIXELS = 200_000_000
+
+
+def write_png(path: str | Path, image: NDArray[Any]) -> None:
+    """Write (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour; complete or not at all."""
+    path = Path(path)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        # Fast compression: noise does not compress, and writing must not cost more than rendering.
+        Image.fromarray(np.ascontiguousarray(image)).save(part, format="PNG", compress_level=1)
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
+    """A greyscale image and its bit depth (8 or 16).
+
+    Returns:
+        (h, w) uint8 or uint16, or float32 for a float TIFF; bit depth (32 for float).
+
+    Raises:
+        InputError: missing, unreadable, empty, or with more than one channel.
+    """
+    source = str(path)
+    try:
+        if os.path.getsize(path) == 0:
+            raise InputError("is empty", source=source)
+        with Image.open(path) as file:
+            if file.width * file.height > MAX_PIXELS:
+                raise InputError(f"is too large ({file.width} x {file.height} pixels)", source=source)
+            mode = file.mode
+            if mode in ("RGB", "RGBA", "P", "LA", "CMYK", "YCbCr", "HSV", "LAB"):
+                grey = _same_channels(file)
+                if grey is None:
+                    raise InputError(
+                        f"has colour channels ({mode}); greyscale near-infrared images are read", source=source
+                    )
+                return grey, 8
+            file.load()
+            data = np.asarray(file)
+    except InputError:
+        raise
+    except FileNotFoundError:
+        raise InputError("no such file", source=source) from None
+    except IsADirectoryError:
+        raise InputError("is a folder, not an image", source=source) from None
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError):
+        raise InputError("is not a readable image", source=source) from None
+    if mode == "1":
+        return data.astype(np.uint8) * np.uint8(255), 8
+    if mode == "L":
+        return data, 8
+    if mode == "F":
+        return data.astype(np.float32), 32
+    if data.min(initial=0) < 0 or data.max(initial=0) > 65535:
+        raise InputError("has values outside 16 bits", source=source)
+    return data.astype(np.uint16), 16
+
+
+def _same_channels(file: Image.Image) -> NDArray[np.uint8] | None:
+    """The one grey channel of a colour file whose channels are all equal; None for real colour."""
+    rgb = np.asarray(file.convert("RGB"))
+    equal = np.array_equal(rgb[..., 0], rgb[..., 1]) and np.array_equal(rgb[..., 0], rgb[..., 2])
+    return np.ascontiguousarray(rgb[..., 0]) if equal else None
+
+
+def preview(image: NDArray[Any], full_scale: float, gamma: float = 2.2) -> NDArray[np.uint8]:
+    """An 8-bit, gamma-encoded copy for people to look at; never to measure in."""
+    linear = np.clip(np.asarray(image, dtype=float) / full_scale, 0, 1)
+    return np.asarray(np.round(255 * linear ** (1 / gamma)), dtype=np.uint8)

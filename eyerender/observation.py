@@ -1,0 +1,372 @@
+"""Observations: what an observer reports of every (frame, eye), as structs of arrays; and their record.
+
+Both observers report this type and gaze estimators take nothing else. A frame is one exposure of one camera and may
+hold both eyes; an observation belongs to (frame, eye). Where a status is not OK the numbers beside it are NaN in memory
+and null in the record; the reason says why.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from .arrays import ArrayValue, Bools, Floats, Ints, Objects, frozen
+from .errors import InputError
+
+SCHEMA = "eyerender/record/1"
+OK, MISSING = "ok", "missing"
+EYES = ("right", "left")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Index(ArrayValue):
+    """Which observation is which; all arrays (n,).
+
+    `eye` is 0 for the right and 1 for the left eye; `fixation`, `camera`, `head` count from 0 in the scene's order and
+    are -1 where unknown. `target_mm` (n, 3) is NaN where there is no target; `eye_position_mm` (n, 3) is the apex of the
+    unrotated eye in the world, without `head_mm` (n, 3).
+    """
+
+    frame: Ints
+    fixation: Ints
+    camera: Ints
+    head: Ints
+    eye: Ints
+    eye_model: Objects
+    target_mm: Floats
+    head_mm: Floats
+    eye_position_mm: Floats
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseTruth(ArrayValue):
+    """The eye's pose, arrays (n,) in radians, NaN where unknown; `residual_mm` of the fixation at the fovea."""
+
+    azimuth_rad: Floats
+    elevation_rad: Floats
+    torsion_rad: Floats
+    residual_mm: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PupilFeatures(ArrayValue):
+    """The apparent pupil in full-sensor pixels, arrays with a leading axis n.
+
+    `centre_px` (n, 2), `semi_axes_px` (n, 2) with a >= b and `angle_rad` (n,) of a in [0, pi) are the direct
+    least-squares ellipse of the boundary; `points_px` (n, k, 2) the boundary itself; `anatomical_centre_px` (n, 2) the
+    image of the stop's centre; `covariance` (n, 5, 5) over (cx, cy, a, b, angle).
+    """
+
+    status: Objects
+    reason: Objects
+    in_image: Bools
+    centre_px: Floats
+    semi_axes_px: Floats
+    angle_rad: Floats
+    anatomical_centre_px: Floats
+    points_px: Floats
+    covariance: Floats
+
+    @property
+    def ok(self) -> Bools:
+        """Where the pupil was found, (n,)."""
+        return np.asarray(self.status == OK)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GlintFeatures(ArrayValue):
+    """Glints in full-sensor pixels, arrays with leading axes (n, m); `light` is -1 where it is not known.
+
+    Rows with fewer than m glints are filled up with status "" (no entry at all).
+    """
+
+    light: Ints
+    status: Objects
+    reason: Objects
+    in_image: Bools
+    xy_px: Floats
+    covariance: Floats
+
+    @property
+    def ok(self) -> Bools:
+        """Where a glint was found, (n, m)."""
+        return np.asarray(self.status == OK)
+
+    def of_light(self, light: int) -> tuple[Floats, Bools]:
+        """Place (n, 2) of one light's glint, and where it was found (n,)."""
+        here = (self.light == light) & self.ok
+        found = here.any(axis=1)
+        at = here.argmax(axis=1)
+        xy = self.xy_px[np.arange(len(at)), at] if self.light.shape[1] else np.full((len(found), 2), np.nan)
+        return np.where(found[:, None], xy, np.nan), found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations(ArrayValue):
+    """A batch of observations, in frame order and within a frame right eye first."""
+
+    index: Index
+    pose: PoseTruth
+    pupil: PupilFeatures
+    glints: GlintFeatures
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def take(self, rows: Any) -> Observations:
+        """The observations of some rows (indices, a slice or a mask)."""
+
+        def part(group: Any) -> Any:
+            return replace(group, **{f.name: frozen(v := getattr(group, f.name)[rows], v.dtype) for f in fields(group)})
+
+        return Observations(part(self.index), part(self.pose), part(self.pupil), part(self.glints))
+
+    def records(self) -> Iterator[dict[str, Any]]:
+        """One record of CONTRACTS an observation; every key always present, null where it does not apply."""
+        for i in range(len(self)):
+            yield self._record(i)
+
+    def _record(self, i: int) -> dict[str, Any]:
+        at, pose, pupil, glints = self.index, self.pose, self.pupil, self.glints
+        return {
+            "schema": SCHEMA,
+            "frame": int(at.frame[i]),
+            "fixation": _count(at.fixation[i]),
+            "camera": _count(at.camera[i]),
+            "eye": EYES[int(at.eye[i])] if at.eye[i] >= 0 else None,
+            "eye_model": at.eye_model[i],
+            "target_mm": _numbers(at.target_mm[i]),
+            "head_mm": _numbers(at.head_mm[i]),
+            "eye_position_mm": _numbers(at.eye_position_mm[i]),
+            "pose": {
+                "azimuth_deg": _numbers(np.degrees(pose.azimuth_rad[i])),
+                "elevation_deg": _numbers(np.degrees(pose.elevation_rad[i])),
+                "torsion_deg": _numbers(np.degrees(pose.torsion_rad[i])),
+                "residual_mm": _numbers(pose.residual_mm[i]),
+            },
+            "pupil": {
+                "status": pupil.status[i],
+                "reason": pupil.reason[i] or None,
+                "in_image": bool(pupil.in_image[i]) if pupil.status[i] == OK else None,
+                "centre_px": _numbers(pupil.centre_px[i]),
+                "semi_axes_px": _numbers(pupil.semi_axes_px[i]),
+                "angle_rad": _numbers(pupil.angle_rad[i]),
+                "anatomical_centre_px": _numbers(pupil.anatomical_centre_px[i]),
+                "points_px": _points(pupil.points_px[i]),
+                "covariance": _numbers(pupil.covariance[i]),
+            },
+            "glints": [
+                {
+                    "light": _count(glints.light[i, j]),
+                    "status": glints.status[i, j],
+                    "reason": glints.reason[i, j] or None,
+                    "in_image": bool(glints.in_image[i, j]) if glints.status[i, j] == OK else None,
+                    "xy_px": _numbers(glints.xy_px[i, j]),
+                    "covariance": _numbers(glints.covariance[i, j]),
+                }
+                for j in range(glints.status.shape[1])
+                if glints.status[i, j]
+            ],
+        }
+
+    @classmethod
+    def from_records(cls, records: Sequence[dict[str, Any]], *, source: str = "") -> Observations:
+        """Read records back; raises `InputError` naming the record and the key."""
+        rows = list(records)
+        for k, record in enumerate(rows):
+            if not isinstance(record, dict):
+                raise InputError("must be a record", source=source, path=f"records.{k}")
+            if record.get("schema") != SCHEMA:
+                raise InputError(
+                    f"is {record.get('schema')!r}; this version reads {SCHEMA!r}",
+                    source=source,
+                    path=f"records.{k}.schema",
+                )
+        reader = _Reader(rows, source)
+        n = len(rows)
+        eye = reader.texts("eye")
+        for k, name in enumerate(eye):
+            if name is not None and name not in EYES:
+                raise InputError("must be 'right' or 'left'", source=source, path=f"records.{k}.eye")
+        head = reader.array("head_mm", (3,))
+        # The record holds no count of head positions: equal positions are the same one, in order of appearance.
+        heads: dict[bytes, int] = {}
+        head_index = [heads.setdefault((np.round(h, 9) + 0.0).tobytes(), len(heads)) for h in head]
+        points = [r["pupil"]["points_px"] or [] for r in rows if reader.has_pupil(r)]
+        k_points = max((len(p) for p in points), default=0)
+        m = max((len(r.get("glints") or []) for r in rows), default=0)
+        glints = [reader.glints(k, m) for k in range(n)]
+        pupil_status = reader.texts("pupil.status")
+        return cls(
+            Index(
+                reader.counts("frame"),
+                reader.counts("fixation"),
+                reader.counts("camera"),
+                frozen(head_index, np.int64),
+                frozen([EYES.index(e) if e else -1 for e in eye], np.int64),
+                reader.texts("eye_model"),
+                reader.array("target_mm", (3,)),
+                head,
+                reader.array("eye_position_mm", (3,)),
+            ),
+            PoseTruth(
+                frozen(np.radians(reader.array("pose.azimuth_deg", ()))),
+                frozen(np.radians(reader.array("pose.elevation_deg", ()))),
+                frozen(np.radians(reader.array("pose.torsion_deg", ()))),
+                reader.array("pose.residual_mm", ()),
+            ),
+            PupilFeatures(
+                pupil_status,
+                reader.texts("pupil.reason"),
+                frozen([bool(v) for v in reader.values("pupil.in_image")], bool),
+                reader.array("pupil.centre_px", (2,)),
+                reader.array("pupil.semi_axes_px", (2,)),
+                reader.array("pupil.angle_rad", ()),
+                reader.array("pupil.anatomical_centre_px", (2,)),
+                reader.points("pupil.points_px", k_points),
+                reader.array("pupil.covariance", (5, 5)),
+            ),
+            GlintFeatures(
+                frozen(np.array([g[0] for g in glints], dtype=np.int64).reshape(n, m), np.int64),
+                frozen(np.array([g[1] for g in glints], dtype=object).reshape(n, m), object),
+                frozen(np.array([g[2] for g in glints], dtype=object).reshape(n, m), object),
+                frozen(np.array([g[3] for g in glints], dtype=bool).reshape(n, m), bool),
+                frozen(np.array([g[4] for g in glints], dtype=float).reshape(n, m, 2)),
+                frozen(np.array([g[5] for g in glints], dtype=float).reshape(n, m, 2, 2)),
+            ),
+        )
+
+
+class _Reader:
+    """Columns out of records, with the record and key named where one is wrong."""
+
+    def __init__(self, records: list[dict[str, Any]], source: str) -> None:
+        self.records = records
+        self.source = source
+
+    def values(self, path: str) -> list[Any]:
+        out = []
+        for k, record in enumerate(self.records):
+            value: Any = record
+            for key in path.split("."):
+                if not isinstance(value, dict) or key not in value:
+                    raise InputError("missing", source=self.source, path=f"records.{k}.{path}")
+                value = value[key]
+            out.append(value)
+        return out
+
+    def texts(self, path: str) -> Objects:
+        out = np.empty(len(self.records), dtype=object)
+        out[:] = self.values(path)
+        return frozen(out, object)
+
+    def counts(self, path: str) -> Ints:
+        values = self.values(path)
+        for k, v in enumerate(values):
+            if v is not None and (isinstance(v, bool) or not isinstance(v, int)):
+                raise InputError("must be a whole number or null", source=self.source, path=f"records.{k}.{path}")
+        return frozen([-1 if v is None else v for v in values], np.int64)
+
+    def array(self, path: str, shape: tuple[int, ...]) -> Floats:
+        out = np.full((len(self.records), *shape), np.nan)
+        for k, value in enumerate(self.values(path)):
+            if value is None:
+                continue
+            try:
+                out[k] = np.asarray(value, dtype=float)
+            except (TypeError, ValueError):
+                raise InputError(
+                    f"must be null or {'x'.join(map(str, shape)) or 'one'} number(s)",
+                    source=self.source,
+                    path=f"records.{k}.{path}",
+                ) from None
+        return frozen(out)
+
+    def points(self, path: str, width: int) -> Floats:
+        out = np.full((len(self.records), width, 2), np.nan)
+        for k, value in enumerate(self.values(path)):
+            if value:
+                try:
+                    out[k, : len(value)] = np.asarray(value, dtype=float)
+                except (TypeError, ValueError):
+                    raise InputError(
+                        "must be null or a list of points", source=self.source, path=f"records.{k}.{path}"
+                    ) from None
+        return frozen(out)
+
+    @staticmethod
+    def has_pupil(record: dict[str, Any]) -> bool:
+        pupil = record.get("pupil")
+        return isinstance(pupil, dict) and isinstance(pupil.get("points_px"), list)
+
+    def glints(self, k: int, m: int) -> tuple[list[Any], ...]:
+        entries = self.records[k].get("glints")
+        if not isinstance(entries, list):
+            raise InputError("must be a list", source=self.source, path=f"records.{k}.glints")
+        light, status, reason = [-1] * m, [""] * m, [None] * m
+        inside = [False] * m
+        xy, cov = np.full((m, 2), np.nan), np.full((m, 2, 2), np.nan)
+        for j, g in enumerate(entries):
+            try:
+                light[j] = -1 if g["light"] is None else int(g["light"])
+                status[j], reason[j], inside[j] = g["status"], g["reason"], bool(g["in_image"])
+                if g["xy_px"] is not None:
+                    xy[j] = g["xy_px"]
+                if g["covariance"] is not None:
+                    cov[j] = g["covariance"]
+            except (KeyError, TypeError, ValueError):
+                raise InputError("not a glint record", source=self.source, path=f"records.{k}.glints.{j}") from None
+        return light, status, reason, inside, xy.tolist(), cov.tolist()
+
+
+def concatenate(parts: Iterable[Observations]) -> Observations:
+    """One batch of several, in order; glints and boundary points are filled up to the widest."""
+    batches = list(parts)
+    if len(batches) == 1:
+        return batches[0]
+
+    def joined(name: str) -> Any:
+        groups = [getattr(b, name) for b in batches]
+        columns = {}
+        for f in fields(groups[0]):
+            arrays = [getattr(g, f.name) for g in groups]
+            width = max((a.shape[1] for a in arrays if a.ndim > 1), default=0)
+            columns[f.name] = frozen(np.concatenate([_widened(a, width) for a in arrays]), arrays[0].dtype)
+        return replace(groups[0], **columns)
+
+    return Observations(joined("index"), joined("pose"), joined("pupil"), joined("glints"))
+
+
+def _widened(a: Any, width: int) -> Any:
+    if a.ndim < 2 or a.shape[1] == width:
+        return a
+    fill = {"f": np.nan, "i": -1, "b": False, "O": ""}[a.dtype.kind]
+    return np.concatenate([a, np.full((len(a), width - a.shape[1], *a.shape[2:]), fill, dtype=a.dtype)], axis=1)
+
+
+def write_jsonl(observations: Observations, path: str) -> None:
+    """Records, one a line."""
+    with open(path, "w", encoding="utf-8") as file:
+        for record in observations.records():
+            file.write(json.dumps(record, allow_nan=False) + "\n")
+
+
+def _numbers(values: Any) -> Any:
+    a = np.asarray(values, dtype=float)
+    return None if not np.all(np.isfinite(a)) else a.tolist()
+
+
+def _points(values: Floats) -> Any:
+    good = values[np.isfinite(values).all(axis=-1)]
+    return good.tolist() if len(good) else None
+
+
+def _count(value: Any) -> int | None:
+    return int(value) if value >= 0 else None

@@ -1,0 +1,244 @@
+"""The two observers of a scene. Both report `Observations`; swapping one for the other is the whole comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .analytic.observer import observe
+from .arrays import Floats, Ints, frozen
+from .capture import render_windows
+from .errors import InputError
+from .extraction import Extraction, ExtractionSettings, extract
+from .extraction.assignment import assign_lights, predict_glints
+from .imagefile import read_image
+from .imagefolder import DATASET, ImageFolder
+from .observation import MISSING, OK, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
+from .rig.camera import Camera
+from .scene import Scene, SceneSpec
+
+Progress = Callable[[int, int, str], None]
+
+# How far the reflections of a real eye lie from those of a typical one that is placed by its pupil.
+_PLACE_MM = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class AnalyticObserver:
+    """Ray optics: the apparent pupil and the glints as they exactly are."""
+
+    boundary_points: int = 30
+
+    def observe(self, scene: Scene) -> Observations:
+        """Every (frame, eye) of the scene.
+
+        Raises:
+            InputError: a target that no pose of the eye fixates.
+        """
+        return observe(scene, boundary_points=self.boundary_points)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageObserver:
+    """Pixels: the pupil ellipse and the glints as OpenCV recovers them; it never sees the truth.
+
+    Args:
+        settings: of the extraction; the range of pupil sizes is narrowed where the rig is known.
+        gamma: encoding gamma of the images; 1 is linear.
+    """
+
+    settings: ExtractionSettings = field(default_factory=ExtractionSettings)
+    gamma: float = 1.0
+
+    def observe(
+        self,
+        scene: Scene,
+        *,
+        backend: Literal["auto", "cuda", "llvm"] = "auto",
+        threads: int | None = None,
+        progress: Progress | None = None,
+    ) -> Observations:
+        """Render a scene's windows in memory and extract their features."""
+        truth = observe(scene)
+        images = render_windows(scene, truth, backend=backend, threads=threads, progress=progress)
+        parts = [
+            self._observe_rows(image.dn, scene.spec.sensor.bit_depth, image.window[:2], truth.index, np.array([image.row]), scene)
+            for image in images
+        ]
+        return concatenate(parts)
+
+    def observe_folder(
+        self, folder: ImageFolder, scene: Scene, *, progress: Progress | None = None
+    ) -> Observations:
+        """Extract the features of a folder's images, row by row as its records."""
+        index = folder.truth().index
+        parts, row = [], 0
+        for k, entry in enumerate(folder.entries):
+            image, stored = read_image(entry.path)
+            if image.shape != (entry.window[3], entry.window[2]):
+                raise InputError(f"is {image.shape[1]} x {image.shape[0]} px, its window is not", source=str(entry.path))
+            rows = np.arange(row, row + len(entry.line["records"]))
+            depth = int(entry.line.get("bit_depth") or stored)
+            parts.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene))
+            row = int(rows[-1]) + 1 if len(rows) else row
+            if progress is not None:
+                progress(k + 1, len(folder.entries), "")
+        return concatenate(parts)
+
+    def observe_files(
+        self, paths: Sequence[str | Path], *, scene: Scene | None = None, progress: Progress | None = None
+    ) -> Observations:
+        """Extract the features of any greyscale images, or of one folder that this package wrote.
+
+        Each image shows one eye and counts as a frame; with a scene its glints are identified by light.
+        """
+        if len(paths) == 1 and Path(paths[0]).is_dir():
+            folder = ImageFolder.load(paths[0])
+            return self.observe_folder(folder, scene or scene_of(folder), progress=progress)
+        parts = []
+        for k, path in enumerate(paths):
+            image, depth = read_image(path)
+            found = extract(image, bit_depth=depth if depth <= 16 else None, gamma=self.gamma, settings=self.settings)
+            lights = [-1] * len(found.glints)
+            reasons: Sequence[str | None] = [None] * len(found.glints)
+            if scene is not None:
+                # Which part of the sensor a loose image shows is not known: only a whole one can be placed.
+                camera = scene.rig.cameras[0]
+                if image.shape != (camera.resolution_px[1], camera.resolution_px[0]):
+                    raise InputError(
+                        f"is {image.shape[1]} x {image.shape[0]} px; the scene's sensor is not", source=str(path)
+                    )
+                lights, reasons = _lights(found, np.zeros(2), scene, camera, np.full(3, np.nan))
+            parts.append(_observation(found, lights, reasons, np.zeros(2), _anonymous(k)))
+            if progress is not None:
+                progress(k + 1, len(paths), "")
+        return concatenate(parts)
+
+    def _observe_rows(
+        self, image: NDArray[Any], depth: int, origin: tuple[int, int], index: Index, rows: Ints, scene: Scene
+    ) -> Observations:
+        """The eyes that one image shows; where there are two, each in the part of the image where it must be."""
+        parts = []
+        for row in rows:
+            camera = scene.rig.cameras[int(index.camera[row])]
+            eye_mm = index.eye_position_mm[row] + index.head_mm[row]
+            px_per_mm = camera.scale_at(eye_mm)
+            cut, corner = image, np.array(origin)
+            if len(rows) > 1:
+                cut, corner = _around(image, corner, camera.project(eye_mm)[0], 16.0 * px_per_mm)
+            # Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens.
+            settings = self.settings.model_copy(
+                update={
+                    "radius_min_px": max(0.6 * px_per_mm, 3.0),
+                    "radius_max_px": max(5.0 * px_per_mm, 8.0),
+                }
+            )
+            found = extract(cut, bit_depth=depth, gamma=self.gamma, settings=settings)
+            lights, reasons = _lights(found, corner, scene, camera, eye_mm)
+            parts.append(_observation(found, lights, reasons, corner, _one(index, row)))
+        return concatenate(parts)
+
+
+def scene_of(folder: ImageFolder) -> Scene:
+    """The scene that a folder of images was rendered from."""
+    source = str(folder.path / DATASET)
+    spec = folder.dataset.get("spec")
+    if not isinstance(spec, dict):
+        raise InputError("missing", source=source, path="spec")
+    return Scene.of(SceneSpec.from_mapping(spec, source=source), source=source)
+
+
+def _around(
+    image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: float
+) -> tuple[NDArray[Any], Floats]:
+    """The part of an image within `half_px` of a full-sensor point, and its own first pixel on the sensor."""
+    h, w = image.shape
+    x0, y0 = np.clip(np.floor(centre_px - corner - half_px), 0, [w - 16, h - 16]).astype(int)
+    x1, y1 = np.clip(np.ceil(centre_px - corner + half_px), [x0 + 16, y0 + 16], [w, h]).astype(int)
+    return image[y0:y1, x0:x1], corner + [x0, y0]
+
+
+def _one(index: Index, row: int) -> Index:
+    return replace(index, **{f: frozen(a := getattr(index, f)[[row]], a.dtype) for f in Index.__dataclass_fields__})
+
+
+def _anonymous(frame: int) -> Index:
+    """The index of an image of which nothing is known."""
+    unknown = frozen([-1], np.int64)
+    nothing = frozen(np.full((1, 3), np.nan))
+    return Index(
+        frozen([frame], np.int64), unknown, unknown, unknown, unknown, frozen([None], object), nothing, nothing, nothing
+    )
+
+
+def _lights(
+    found: Extraction, corner: Floats, scene: Scene, camera: Camera, eye_mm: Floats
+) -> tuple[list[int], Sequence[str | None]]:
+    """The light of each glint (-1: none) and why it has none, from the rig and a rough position of the eye."""
+    if not found.glints or found.pupil.ellipse is None:
+        return [-1] * len(found.glints), ["no pupil to place the reflections by"] * len(found.glints)
+    spots = np.array([g.xy_px if g.xy_px is not None else [np.nan, np.nan] for g in found.glints]) + corner
+    pupil = np.asarray(found.pupil.ellipse.centre_px) + corner
+    places = np.array([light.position_mm for light in scene.rig.lights])
+    predicted, px_per_mm = predict_glints(camera.ideal(pupil), camera.K, camera.R, camera.t, places, eye_mm)
+    assigned = assign_lights(camera.ideal(spots), predicted, shift_sd_px=_PLACE_MM * px_per_mm)
+    return [int(k) for k in assigned.light], assigned.reasons
+
+
+def _observation(
+    found: Extraction, lights: Sequence[int], reasons: Sequence[str | None], corner: Floats, index: Index
+) -> Observations:
+    """What was extracted from one image as a batch of one; `corner` moves it to full-sensor pixels."""
+    nan = frozen([np.nan])
+    pupil, glints = found.pupil, found.glints
+    centre, axes, angle = np.full((1, 2), np.nan), np.full((1, 2), np.nan), np.full(1, np.nan)
+    if pupil.ellipse is not None:
+        centre = np.asarray(pupil.ellipse.centre_px)[None] + corner
+        axes = np.asarray(pupil.ellipse.semi_axes_px, dtype=float)[None]
+        angle = np.array([pupil.ellipse.angle_rad])
+    covariance = np.full((1, 5, 5), np.nan) if pupil.covariance is None else pupil.covariance[None]
+    ok = pupil.status == OK
+    m = len(glints)
+    xy = np.full((1, m, 2), np.nan)
+    spread = np.full((1, m, 2, 2), np.nan)
+    for j, glint in enumerate(glints):
+        if glint.xy_px is not None:
+            xy[0, j] = glint.xy_px + corner
+        if glint.covariance is not None:
+            spread[0, j] = glint.covariance
+    # What was measured in an image lies in the image.
+    seen = np.array([[g.status == OK for g in glints]], dtype=bool).reshape(1, m)
+    return Observations(
+        index,
+        PoseTruth(nan, nan, nan, nan),
+        PupilFeatures(
+            frozen([OK if ok else MISSING], object),
+            frozen([pupil.reason], object),
+            frozen([ok], bool),
+            frozen(centre),
+            frozen(axes),
+            frozen(angle),
+            frozen(np.full((1, 2), np.nan)),
+            frozen(np.full((1, 0, 2), np.nan)),
+            frozen(covariance),
+        ),
+        GlintFeatures(
+            frozen(np.array(lights, dtype=np.int64).reshape(1, m), np.int64),
+            frozen(_texts([OK if g.status == OK else MISSING for g in glints]).reshape(1, m), object),
+            frozen(_texts([g.reason or r for g, r in zip(glints, reasons, strict=True)]).reshape(1, m), object),
+            frozen(seen, bool),
+            frozen(xy),
+            frozen(spread),
+        ),
+    )
+
+
+def _texts(values: Sequence[str | None]) -> NDArray[np.object_]:
+    out = np.empty(len(values), dtype=object)
+    out[:] = values
+    return out

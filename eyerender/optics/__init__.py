@@ -1,0 +1,1 @@
+"""Ray optics: media, interfaces, tracing, and the solvers for apparent points and mirror points."""

@@ -1,0 +1,74 @@
+"""What happens to a ray at an interface: reflection, refraction, Fresnel's shares of the energy.
+
+Vectors are `Xyz` (one array per coordinate). d is the unit direction of travel, N a unit normal on either side.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..geometry.surfaces import Mask, Xyz
+from ..geometry.transforms import Array
+
+Number = Array | float
+
+
+def reflect(direction: Xyz, normal: Xyz) -> Xyz:
+    """w = d - 2 (d.N) N."""
+    double = 2.0 * dot(direction, normal)
+    return (
+        direction[0] - double * normal[0],
+        direction[1] - double * normal[1],
+        direction[2] - double * normal[2],
+    )
+
+
+def refract(direction: Xyz, normal: Xyz, n_before: Number, n_after: Number) -> tuple[Xyz, Mask]:
+    """Snell's law: w = eta d + (eta c - c2) N, eta = n_before / n_after, c = -d.N, c2 = sqrt(1 - eta^2 (1 - c^2)).
+
+    N is taken against d whichever side it is given on. Returns w and where light passes (False: total reflection; w is
+    the grazing direction there).
+    """
+    eta = n_before / n_after
+    cosine = -dot(direction, normal)
+    square = 1.0 - eta * eta * (1.0 - cosine * cosine)
+    passes = np.asarray(square > 0.0)
+    root = np.sqrt(np.maximum(square, 0.0))
+    factor = eta * cosine - np.copysign(root, cosine)
+    refracted = (
+        eta * direction[0] + factor * normal[0],
+        eta * direction[1] + factor * normal[1],
+        eta * direction[2] + factor * normal[2],
+    )
+    return refracted, passes
+
+
+class FresnelShares(NamedTuple):
+    """Reflected shares of the energy: s and p polarized, and unpolarized; the rest is transmitted."""
+
+    s: Array
+    p: Array
+    unpolarized: Array
+
+
+def fresnel(cosine_incidence: npt.ArrayLike, n_before: Number, n_after: Number) -> FresnelShares:
+    """R_s = ((n1 c1 - n2 c2) / (n1 c1 + n2 c2))^2, R_p = ((n2 c1 - n1 c2) / (n2 c1 + n1 c2))^2; 1 at total reflection.
+
+    Source: Born & Wolf 1999, Principles of Optics, 1.5.2 eq. (21) and (33).
+    """
+    c1 = np.abs(np.asarray(cosine_incidence, dtype=np.float64))
+    eta = n_before / n_after
+    square = 1.0 - eta * eta * (1.0 - c1 * c1)
+    c2 = np.sqrt(np.maximum(square, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = np.where(square > 0.0, ((n_before * c1 - n_after * c2) / (n_before * c1 + n_after * c2)) ** 2, 1.0)
+        p = np.where(square > 0.0, ((n_after * c1 - n_before * c2) / (n_after * c1 + n_before * c2)) ** 2, 1.0)
+    return FresnelShares(s, p, 0.5 * (s + p))
+
+
+def dot(a: Xyz, b: Xyz) -> Array:
+    """a.b"""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

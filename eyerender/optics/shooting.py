@@ -1,0 +1,373 @@
+"""The two-point problem by shooting: the ray that leaves one point, passes a path of crossings and meets another point.
+
+Newton on the direction at the source with ray differentials. A unit direction d is varied along e1, e2 orthogonal to it;
+each crossing carries the differentials dy of the point and dw of the direction along (Igehy 1999, "Tracing ray
+differentials", eq. 8-19):
+
+    transfer    dt = -N.(dy + t dw) / (N.w),  dy <- dy + t dw + dt w,   dN = (H dy - N (N.H dy)) / |g|
+    refraction  w = eta d + f N, f = eta c - c2:  dw = eta dd + df N + f dN,  df = (eta - eta^2 c / c2) dc
+    reflection  w = d + 2 c N:                    dw = dd + 2 (dc N + c dN)
+
+with c = -d.N and dc = -(dd.N + d.dN). In the last medium the ray passes the target at y + s w, missing it by r; with
+a_i = dy_i + s dw_i the step is d <- d + e1 w.(r x a2)/det + e2 w.(a1 x r)/det, det = w.(a1 x a2). |det| is also the ratio
+of the ray tube's cross section at the target to its solid angle at the source (mm^2/sr).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..geometry.surfaces import Mask, Xyz, fit
+from ..geometry.transforms import Array
+from .interface import Number, dot
+from .trace import BEHIND_MM, Crossing, RayStatus, Status, inside_rim, mark
+
+SETTLED_MM = 1e-12
+"""Newton stops where a ray misses by no more than this and what one rounding of the direction makes at the target."""
+ROUNDING_RAD = 4e-16
+RESIDUAL_LIMIT_MM = 1e-9
+"""A ray that misses its end by more is no solution."""
+
+_FAST_STEPS = 8
+_GUARDED_STEPS = 60
+_RETREATS = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Connection:
+    """The connecting rays, one array per coordinate.
+
+    start : unit direction at the source; first : the point on the first crossing; last : the point on the last one;
+    turning : the point where the ray was last reflected (the first one if it never was);
+    end : unit direction in the last medium; residual_mm : by how much the traced ray misses the target;
+    tube_mm2_sr : |det|; status.
+    """
+
+    start: Xyz
+    first: Xyz
+    last: Xyz
+    turning: Xyz
+    end: Xyz
+    residual_mm: Array
+    tube_mm2_sr: Array
+    status: Status
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shot:
+    first: Xyz
+    last: Xyz
+    turning: Xyz
+    end: Xyz
+    along: Array
+    miss: Xyz
+    residual_mm: Array
+    tubes: tuple[Xyz, Xyz]
+    determinant: Array
+    status: Status
+
+
+def connect(path: Sequence[Crossing], n_start: Number, source: Xyz, target: Xyz, aim: Xyz) -> Connection:
+    """Find the rays from `source` through `path` to `target` (arrays that broadcast), first aimed at `aim`.
+
+    Undamped Newton for all; what it leaves over goes through a guarded search (steps are halved until the miss
+    shrinks) from `aim`, and then from points between it and the target.
+    """
+    shape = np.broadcast_shapes(*(p.shape for p in (*source, *target, *aim)))
+    source, target = _spread(source, shape), _spread(target, shape)
+    direction = _unit(_minus(_spread(aim, shape), source))
+    shot = _shoot(path, n_start, source, direction, target)
+    for _ in range(_FAST_STEPS):
+        if not ((shot.status == RayStatus.OK) & ~_settled(shot, 1.0)).any():
+            break
+        direction = _stepped(direction, shot, 1.0)
+        shot = _shoot(path, n_start, source, direction, target)
+    settled = (shot.status == RayStatus.OK) & _settled(shot, 100.0)
+    if not settled.all():
+        direction, shot = _rescue(path, n_start, source, target, _spread(aim, shape), direction, shot, ~settled)
+    status = shot.status.copy()
+    mark(status, ~(shot.residual_mm <= RESIDUAL_LIMIT_MM), RayStatus.NOT_CONVERGED)
+    for crossing, point in zip((path[0], path[-1]), (shot.first, shot.last), strict=True):
+        if crossing.beyond_rim is not None:
+            mark(status, ~inside_rim(crossing, point), crossing.beyond_rim)
+    return Connection(
+        direction, shot.first, shot.last, shot.turning, shot.end, shot.residual_mm, np.abs(shot.determinant), status
+    )
+
+
+def _shoot(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xyz, target: Xyz) -> _Shot:
+    """Trace `direction` with its two differentials to the point of closest approach to `target`.
+
+    Rims are not held against a ray here: the iteration may wander beyond them.
+    """
+    point, way = source, direction
+    basis = _basis(direction)
+    zero = np.zeros_like(way[0])
+    moves: list[Xyz] = [(zero, zero, zero), (zero, zero, zero)]
+    turns: list[Xyz] = [basis[0], basis[1]]
+    status = np.zeros(way[0].shape, dtype=np.int8)
+    index: Number = n_start if isinstance(n_start, float) else fit(np.asarray(n_start), way[0].ndim)
+    first: Xyz | None = None
+    turning: Xyz | None = None
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for crossing in path:
+            lead = -dot(point, way)
+            near = _moved(point, way, lead)
+            hit = crossing.surface.hit(near, way, crossing.inward)
+            step = hit.distance + lead
+            met = hit.ok & (step > -BEHIND_MM)
+            skip: Mask | None = None
+            if crossing.beyond_rim is None:
+                skip = ~(met & inside_rim(crossing, hit.point))
+            else:
+                mark(status, ~met, RayStatus.MISSED)
+            scale = 1.0 / np.sqrt(dot(hit.gradient, hit.gradient))
+            normal = (hit.gradient[0] * scale, hit.gradient[1] * scale, hit.gradient[2] * scale)
+            cosine = -dot(way, normal)
+            if crossing.reflects:
+                eta: Number = 1.0
+                factor, slope = 2.0 * cosine, 2.0 + zero
+                after = index
+            else:
+                n_after = crossing.n_after
+                after = n_after if isinstance(n_after, float) else fit(np.asarray(n_after), way[0].ndim)
+                eta = index / after
+                square = 1.0 - eta * eta * (1.0 - cosine * cosine)
+                blocked = ~(square > 0.0)
+                mark(status, blocked if skip is None else blocked & ~skip, RayStatus.TOTAL_REFLECTION)
+                root = np.copysign(np.sqrt(np.maximum(square, 0.0)), cosine)
+                factor = eta * cosine - root
+                slope = eta - eta * eta * cosine / root
+            new_way = (
+                eta * way[0] + factor * normal[0],
+                eta * way[1] + factor * normal[1],
+                eta * way[2] + factor * normal[2],
+            )
+            hessian = crossing.surface.hessian_at(hit.point)
+            for k in (0, 1):
+                move = _moved(moves[k], turns[k], step)
+                move = _moved(move, way, dot(normal, move) / cosine)
+                bend = hessian.times(move)
+                bend = _moved(bend, normal, -dot(normal, bend))
+                tilt = (bend[0] * scale, bend[1] * scale, bend[2] * scale)
+                change = slope * -(dot(turns[k], normal) + dot(way, tilt))
+                turned = (
+                    eta * turns[k][0] + change * normal[0] + factor * tilt[0],
+                    eta * turns[k][1] + change * normal[1] + factor * tilt[1],
+                    eta * turns[k][2] + change * normal[2] + factor * tilt[2],
+                )
+                moves[k] = move if skip is None else _choose(skip, moves[k], move)
+                turns[k] = turned if skip is None else _choose(skip, turns[k], turned)
+            if skip is None:
+                point, way, index = hit.point, new_way, after
+            else:
+                point, way = _choose(skip, point, hit.point), _choose(skip, way, new_way)
+                index = np.where(skip, index, after)
+            first = point if first is None else first
+            turning = point if crossing.reflects or turning is None else turning
+        gap = _minus(target, point)
+        along = dot(gap, way)
+        miss = _moved(gap, way, -along)
+        a1, a2 = _moved(moves[0], turns[0], along), _moved(moves[1], turns[1], along)
+        residual = np.sqrt(dot(miss, miss))
+        determinant = _triple(way, a1, a2)
+    mark(status, ~np.isfinite(residual), RayStatus.MISSED)
+    # The target lies ahead in the last medium, or the ray would have to run backwards to it.
+    mark(status, along < -BEHIND_MM, RayStatus.MISSED)
+    return _Shot(first or point, point, turning or point, way, along, miss, residual, (a1, a2), determinant, status)
+
+
+def _stepped(direction: Xyz, shot: _Shot, fraction: Array | float) -> Xyz:
+    """Newton's next direction, or a fraction of the way to it."""
+    a1, a2 = shot.tubes
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = fraction / shot.determinant
+        first = _triple(shot.end, shot.miss, a2) * scale
+        second = _triple(shot.end, a1, shot.miss) * scale
+    # A singular tube or a failed ray stays where it is.
+    usable = np.isfinite(first) & np.isfinite(second)
+    first, second = np.where(usable, first, 0.0), np.where(usable, second, 0.0)
+    e1, e2 = _basis(direction)
+    return _unit(_moved(_moved(direction, e1, first), e2, second))
+
+
+def _rescue(
+    path: Sequence[Crossing],
+    n_start: Number,
+    source: Xyz,
+    target: Xyz,
+    aim: Xyz,
+    direction: Xyz,
+    shot: _Shot,
+    left: Mask,
+) -> tuple[Xyz, _Shot]:
+    """Guarded Newton for the rays that the undamped one left over; the rest are handed on unchanged."""
+    index = np.nonzero(left)
+    frame = index[0] if left.ndim else np.zeros(1, dtype=np.intp)
+    few_path = [_taken(crossing, frame) for crossing in path]
+    few_start = n_start if isinstance(n_start, float) or np.ndim(n_start) == 0 else np.asarray(n_start)[frame]
+    few_source, few_target, few_aim = _pick(source, index), _pick(target, index), _pick(aim, index)
+    best_way = _pick(direction, index)
+    best = _shoot(few_path, few_start, few_source, best_way, few_target)
+    done = np.zeros(frame.shape, dtype=bool)
+    for blend in (0.0, 0.5, -0.5, 1.0):
+        aimed = _moved(few_aim, _minus(few_target, few_aim), np.full(frame.shape, blend))
+        way = _unit(_minus(aimed, few_source))
+        trial = _shoot(few_path, few_start, few_source, way, few_target)
+        way, trial = _guarded(few_path, few_start, few_source, few_target, way, trial, done)
+        better = ~done & _better(trial, best)
+        best_way, best = _choose(~better, best_way, way), _merge(better, trial, best)
+        done = (best.status == RayStatus.OK) & _settled(best, 100.0)
+        if done.all():
+            break
+    return _put(direction, best_way, index), _merge_at(shot, best, index)
+
+
+def _guarded(
+    path: Sequence[Crossing], n_start: Number, source: Xyz, target: Xyz, way: Xyz, shot: _Shot, done: Mask
+) -> tuple[Xyz, _Shot]:
+    """Newton with steps halved until the miss shrinks."""
+    for _ in range(_GUARDED_STEPS):
+        active = ~done & (shot.status == RayStatus.OK) & ~_settled(shot, 1.0)
+        if not active.any():
+            break
+        fraction = np.ones(active.shape)
+        moved = np.zeros(active.shape, dtype=bool)
+        for _ in range(_RETREATS):
+            trial_way = _stepped(way, shot, np.where(active & ~moved, fraction, 0.0))
+            trial = _shoot(path, n_start, source, trial_way, target)
+            accept = active & ~moved & (trial.status == RayStatus.OK) & (trial.residual_mm < shot.residual_mm)
+            way, shot = _choose(~accept, way, trial_way), _merge(accept, trial, shot)
+            moved |= accept
+            if (moved | ~active).all():
+                break
+            fraction = fraction * 0.5
+        if not moved.any():
+            break
+    return way, shot
+
+
+def _settled(shot: _Shot, slack: float) -> Mask:
+    """Whether the miss is down to `slack` times what Newton can reach."""
+    reach = SETTLED_MM + ROUNDING_RAD * np.sqrt(np.abs(shot.determinant))
+    return np.asarray(shot.residual_mm <= slack * reach)
+
+
+def _better(trial: _Shot, best: _Shot) -> Mask:
+    ok, held = trial.status == RayStatus.OK, best.status == RayStatus.OK
+    return np.asarray((ok & ~held) | ((ok == held) & (trial.residual_mm < best.residual_mm)))
+
+
+def _taken(crossing: Crossing, frame: npt.NDArray[np.intp]) -> Crossing:
+    """The crossing with its per-eye parameters gathered for single rays."""
+    n_after, rim = crossing.n_after, crossing.rim_mm
+    return Crossing(
+        crossing.surface.take(frame),
+        n_after if np.ndim(n_after) == 0 else np.asarray(n_after)[frame],
+        crossing.inward,
+        crossing.reflects,
+        rim if np.ndim(rim) == 0 else np.asarray(rim)[frame],
+        crossing.beyond_rim,
+    )
+
+
+def _merge(mask: Mask, new: _Shot, old: _Shot) -> _Shot:
+    def both(a: Xyz, b: Xyz) -> Xyz:
+        return _choose(~mask, b, a)
+
+    return _Shot(
+        both(new.first, old.first),
+        both(new.last, old.last),
+        both(new.turning, old.turning),
+        both(new.end, old.end),
+        np.where(mask, new.along, old.along),
+        both(new.miss, old.miss),
+        np.where(mask, new.residual_mm, old.residual_mm),
+        (both(new.tubes[0], old.tubes[0]), both(new.tubes[1], old.tubes[1])),
+        np.where(mask, new.determinant, old.determinant),
+        np.where(mask, new.status, old.status),
+    )
+
+
+def _merge_at(shot: _Shot, few: _Shot, index: tuple[npt.NDArray[np.intp], ...]) -> _Shot:
+    def place(old: Array, new: Array) -> Array:
+        out = np.array(old)
+        out[index] = new
+        return out
+
+    return _Shot(
+        _put(shot.first, few.first, index),
+        _put(shot.last, few.last, index),
+        _put(shot.turning, few.turning, index),
+        _put(shot.end, few.end, index),
+        place(shot.along, few.along),
+        _put(shot.miss, few.miss, index),
+        place(shot.residual_mm, few.residual_mm),
+        (_put(shot.tubes[0], few.tubes[0], index), _put(shot.tubes[1], few.tubes[1], index)),
+        place(shot.determinant, few.determinant),
+        np.asarray(place(shot.status, few.status)),  # type: ignore[arg-type]
+    )
+
+
+def _put(old: Xyz, new: Xyz, index: tuple[npt.NDArray[np.intp], ...]) -> Xyz:
+    out = (np.array(old[0]), np.array(old[1]), np.array(old[2]))
+    for whole, part in zip(out, new, strict=True):
+        whole[index] = part
+    return out
+
+
+def _pick(point: Xyz, index: tuple[npt.NDArray[np.intp], ...]) -> Xyz:
+    return point[0][index], point[1][index], point[2][index]
+
+
+def _choose(old_where: Mask, old: Xyz, new: Xyz) -> Xyz:
+    return (
+        np.where(old_where, old[0], new[0]),
+        np.where(old_where, old[1], new[1]),
+        np.where(old_where, old[2], new[2]),
+    )
+
+
+def _spread(point: Xyz, shape: tuple[int, ...]) -> Xyz:
+    # One axis at least, so that rays can be picked out of the batch.
+    full = shape or (1,)
+    return np.broadcast_to(point[0], full), np.broadcast_to(point[1], full), np.broadcast_to(point[2], full)
+
+
+def _basis(direction: Xyz) -> tuple[Xyz, Xyz]:
+    """Two unit vectors orthogonal to a unit direction and to each other (Duff et al. 2017, listing 3)."""
+    x, y, z = direction
+    # The formula's singular direction is -z; it is turned here so that -sign(x) x is the pole.
+    sign = np.copysign(1.0, x)
+    a = -1.0 / (sign + x)
+    b = y * z * a
+    return (
+        (-sign * y, 1.0 + sign * y * y * a, sign * b),
+        (-z, b, sign + z * z * a),
+    )
+
+
+def _unit(vector: Xyz) -> Xyz:
+    scale = 1.0 / np.sqrt(dot(vector, vector))
+    return vector[0] * scale, vector[1] * scale, vector[2] * scale
+
+
+def _minus(a: Xyz, b: Xyz) -> Xyz:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def _moved(point: Xyz, way: Xyz, distance: Array | float) -> Xyz:
+    return point[0] + distance * way[0], point[1] + distance * way[1], point[2] + distance * way[2]
+
+
+def _triple(a: Xyz, b: Xyz, c: Xyz) -> Array:
+    """a.(b x c)"""
+    return np.asarray(
+        a[0] * (b[1] * c[2] - b[2] * c[1])
+        + a[1] * (b[2] * c[0] - b[0] * c[2])
+        + a[2] * (b[0] * c[1] - b[1] * c[0])
+    )

@@ -1,0 +1,168 @@
+"""Tracing rays through any number of surfaces, in sequence, with a status for each ray."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import ArrayValue
+from ..geometry.surfaces import Mask, Surface, Xyz, components, fit, join
+from ..geometry.transforms import Array
+from .interface import Number, dot, reflect, refract
+
+Status = npt.NDArray[np.int8]
+
+
+class RayStatus(IntEnum):
+    """What became of a ray, or of the search for one."""
+
+    OK = 0
+    MISSED = 1
+    TOTAL_REFLECTION = 2
+    OUTSIDE_LIMBUS = 3
+    BEHIND_IRIS = 4
+    NOT_CONVERGED = 5
+
+    @property
+    def reason(self) -> str:
+        """The status in words."""
+        return _REASONS[self]
+
+
+_REASONS = {
+    RayStatus.OK: "",
+    RayStatus.MISSED: "the ray misses a surface",
+    RayStatus.TOTAL_REFLECTION: "total reflection",
+    RayStatus.OUTSIDE_LIMBUS: "outside the limbus",
+    RayStatus.BEHIND_IRIS: "behind the iris",
+    RayStatus.NOT_CONVERGED: "the solver did not converge",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Crossing:
+    """A surface as a ray meets it.
+
+    n_after : index behind the crossing; () or (n,), one an eye. Ignored where the ray is reflected.
+    inward : the ray goes into the eye (towards -x of the surface's frame).
+    reflects : the ray is thrown back instead of refracted.
+    rim_mm : the surface ends at this distance from its axis (infinite: it does not end).
+    beyond_rim : the status of a ray that meets the surface outside its rim; None: such a ray passes on undisturbed, as
+        does one that misses the surface (the inner shells of a gradient lens do not reach as far as the pupil).
+    """
+
+    surface: Surface
+    n_after: Number
+    inward: bool = True
+    reflects: bool = False
+    rim_mm: Number = np.inf
+    beyond_rim: RayStatus | None = RayStatus.MISSED
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Traced(ArrayValue):
+    """The rays of a trace over S crossings; leading axis of the points: 0 the start, k the k-th crossing.
+
+    points_mm (S + 1, ..., 3), directions (S + 1, ..., 3): the direction on leaving each point; optical_path_mm (...,)
+    from the start to the last crossing; status (...,). What follows a failed crossing is not meaningful.
+    """
+
+    points_mm: Array
+    directions: Array
+    optical_path_mm: Array
+    status: Status
+
+
+def inward_path(surfaces: Sequence[Surface], indices: Sequence[Number]) -> tuple[Crossing, ...]:
+    """Refraction at `surfaces`, listed from outside in, with the index behind each."""
+    return tuple(Crossing(surface, index) for surface, index in zip(surfaces, indices, strict=True))
+
+
+def outward_path(
+    surfaces: Sequence[Surface], indices: Sequence[Number], n_outside: Number = 1.0
+) -> tuple[Crossing, ...]:
+    """The same surfaces (listed from outside in) crossed on the way out."""
+    behind = [n_outside, *indices[:-1]]
+    return tuple(Crossing(s, n, inward=False) for s, n in zip(reversed(surfaces), reversed(behind), strict=True))
+
+
+def trace(
+    path: Sequence[Crossing], n_start: Number, origins_mm: npt.ArrayLike, directions: npt.ArrayLike
+) -> Traced:
+    """Trace rays (origins and unit directions (..., 3)) through `path`, starting in a medium of index `n_start`."""
+    point, direction = components(origins_mm), components(directions)
+    ndim = max(point[0].ndim, direction[0].ndim)
+    shape = np.broadcast_shapes(point[0].shape, direction[0].shape)
+    points, ways = [point], [direction]
+    status = np.zeros(shape, dtype=np.int8)
+    length = np.zeros(shape)
+    index: Number = n_start if isinstance(n_start, float) else fit(np.asarray(n_start, dtype=np.float64), ndim)
+    for crossing in path:
+        # A far origin loses digits in the quadratic; the foot of the perpendicular from the eye's origin does not.
+        lead = -dot(point, direction)
+        near = (point[0] + lead * direction[0], point[1] + lead * direction[1], point[2] + lead * direction[2])
+        hit = crossing.surface.hit(near, direction, crossing.inward)
+        step = hit.distance + lead
+        met = hit.ok & (step > -BEHIND_MM)
+        within = met & inside_rim(crossing, hit.point)
+        after, way, passes = cross(crossing, hit.gradient, direction, index)
+        if crossing.beyond_rim is None:
+            step = np.where(within, step, 0.0)
+            passes = passes | ~within
+            moved = tuple(np.where(within, new, old) for new, old in zip(hit.point, point, strict=True))
+            turned = tuple(np.where(within, new, old) for new, old in zip(way, direction, strict=True))
+            after = np.where(within, after, index)
+        else:
+            moved, turned = hit.point, way
+            mark(status, ~met, RayStatus.MISSED)
+            mark(status, met & ~within, crossing.beyond_rim)
+        mark(status, ~passes, RayStatus.TOTAL_REFLECTION)
+        length = length + index * step
+        point, direction = (moved[0], moved[1], moved[2]), (turned[0], turned[1], turned[2])
+        index = after
+        points.append(point)
+        ways.append(direction)
+    full = (*shape, 3)
+    return Traced(
+        np.stack([np.broadcast_to(join(p), full) for p in points]),
+        np.stack([np.broadcast_to(join(w), full) for w in ways]),
+        length,
+        status,
+    )
+
+
+def cross(crossing: Crossing, gradient: Xyz, direction: Xyz, n_before: Number) -> tuple[Number, Xyz, Mask]:
+    """(index after, direction after, light passes) at a point with half gradient `gradient`."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / np.sqrt(dot(gradient, gradient))
+        normal = (gradient[0] * scale, gradient[1] * scale, gradient[2] * scale)
+        if crossing.reflects:
+            way = reflect(direction, normal)
+            return n_before, way, np.ones(way[0].shape, dtype=bool)
+        n_after = crossing.n_after
+        after = n_after if isinstance(n_after, float) else fit(np.asarray(n_after), direction[0].ndim)
+        way, passes = refract(direction, normal, n_before, after)
+        return after, way, passes
+
+
+def inside_rim(crossing: Crossing, point: Xyz) -> Mask:
+    """Whether points of the surface lie within its rim."""
+    rim = crossing.rim_mm
+    if isinstance(rim, float) and rim == np.inf:
+        return np.ones(point[0].shape, dtype=bool)
+    limit = rim if isinstance(rim, float) else fit(np.asarray(rim), point[0].ndim)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(crossing.surface.axis_distance(point) <= limit)
+
+
+def mark(status: Status, where: Mask, value: RayStatus) -> None:
+    """Set `value` where nothing has gone wrong before (in place: `status` belongs to the caller)."""
+    status[(status == RayStatus.OK) & where] = value
+
+
+BEHIND_MM = 1e-9
+"""A crossing this little behind the start counts as one at the start (rounding)."""

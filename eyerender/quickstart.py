@@ -1,0 +1,85 @@
+"""The main job: fixate, render, extract, calibrate on both kinds of features, compare, report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from .capture import render_folder
+from .comparison import Comparison, compare
+from .errors import InputError
+from .gaze.regression import FUNCTIONS, PupilGlintRegression
+from .imagefolder import ImageFolder, same_run
+from .observers import ImageObserver, scene_of
+from .report.comparison import Timing, write_report
+from .scene import Scene, load_scene
+
+Progress = Callable[[int, int, str], None]
+REPORT = "report.html"
+
+
+def run_quickstart(
+    folder: str | Path,
+    *,
+    scene: str = "quickstart",
+    eye: str | None = None,
+    function: str = "R3",
+    backend: Literal["auto", "cuda", "llvm"] = "auto",
+    threads: int | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Do the main job in a folder and write `report.html` there.
+
+    Images of the same scene, seed and versions that the folder already holds are used again.
+
+    Raises:
+        InputError: the folder holds something else and `overwrite` is not given.
+        BackendError: there is nothing to render with.
+    """
+    folder = Path(folder)
+    loaded = load_scene(scene, eye=eye)
+    count = len(loaded.frames())
+
+    def step(offset: int, what: str) -> Progress:
+        def show(done: int, _total: int, _note: str) -> None:
+            if progress is not None:
+                progress(offset + done, 2 * count + 1, what)
+
+        return show
+
+    start = time.monotonic()
+    timings = []
+    if overwrite or not same_run(folder, loaded.digest()):
+        render_folder(
+            loaded,
+            folder,
+            backend=backend,
+            threads=threads,
+            overwrite=overwrite,
+            progress=step(0, "rendering"),
+        )
+        timings.append(Timing(f"observing and rendering {count} windows", time.monotonic() - start))
+    start = time.monotonic()
+    images = ImageFolder.load(folder)
+    result = _compare(loaded, images, function, step(count, "extracting"))
+    timings.append(Timing("extracting and calibrating", time.monotonic() - start))
+    write_report(folder / REPORT, loaded, result, images.entries, timings)
+    if progress is not None:
+        progress(2 * count + 1, 2 * count + 1, "done")
+    return result
+
+
+def compare_folder(folder: str | Path, *, function: str = "R3", progress: Progress | None = None) -> Comparison:
+    """Extract the features of a folder's images and compare them with its analytic ones."""
+    images = ImageFolder.load(folder)
+    return _compare(scene_of(images), images, function, progress)
+
+
+def _compare(scene: Scene, images: ImageFolder, function: str, progress: Progress | None) -> Comparison:
+    if function not in FUNCTIONS:
+        raise InputError(f"{function!r} is no function of Table 2 (R1 to R12)", source="--function")
+    found = ImageObserver().observe_folder(images, scene, progress=progress)
+    return compare(images.truth(), found, scene.rig, PupilGlintRegression(function), f"regression {function}")

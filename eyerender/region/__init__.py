@@ -1,0 +1,1 @@
+"""The region of the eye: materials and textures as geometry and numbers, without any renderer."""

@@ -1,0 +1,188 @@
+"""Procedural textures of iris, sclera and skin as relative albedos with mean 1: seeded, deterministic, numbers only.
+
+The iris follows its anatomy from the pupil's margin outwards: the pigment ruff, the pupillary zone with fine radial
+fibres, the collarette (a wavy ridge at about a third of the width), the ciliary zone with coarser, wavy fibres, Fuchs'
+crypts (dark, radially drawn out, with a paler rim) mostly along the collarette, concentric contraction furrows, and the
+darker periphery (Bron, Tripathi and Tripathi 1997, Wolff's Anatomy of the Eye and Orbit, chapter 10). At 850 nm melanin
+hardly absorbs, so that the stroma's relief shows in every eye colour.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Texture = NDArray[np.float32]
+_Array = NDArray[np.float64]
+
+
+def _noise(rng: np.random.Generator, shape: tuple[int, int], rows: tuple[float, float], columns: tuple[float, float],
+           periodic_rows: bool = False) -> _Array:
+    """Gaussian noise of unit variance, band-passed: `rows`, `columns` are (low, high) cycles over the whole extent."""
+    h, w = shape
+    height = h if periodic_rows else 2 * h
+    spectrum = np.fft.rfft2(rng.standard_normal((height, w)))
+    extent = 1 if periodic_rows else 2
+    fy = np.abs(np.fft.fftfreq(height) * height)[:, None] / extent
+    fx = np.abs(np.fft.rfftfreq(w) * w)[None, :]
+
+    def band(f: _Array, low: float, high: float) -> _Array:
+        keep: _Array = np.exp(-((f / high) ** 2))
+        return keep * (1 - np.exp(-((f / low) ** 2))) if low > 0 else keep
+
+    spectrum *= band(fy, *rows) * band(fx, *columns)
+    spectrum[0, 0] = 0
+    field = np.fft.irfft2(spectrum, s=(height, w))[:h]
+    return np.asarray(field / (field.std() + 1e-30))
+
+
+def _step(x: Any, low: float, high: float) -> Any:
+    s = np.clip((x - low) / (high - low), 0, 1)
+    return s * s * (3 - 2 * s)
+
+
+@lru_cache(maxsize=16)
+def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
+    """Relative albedo (radial, angular): rows from the pupil's margin (0) to the root (1), columns once around.
+
+    The mean over the iris' area (pupil 4 mm, root 11.6 mm in diameter) is 1.
+    """
+    rng = np.random.default_rng((0x1815, seed))
+    shape = (radial, angular)
+    s = ((np.arange(radial) + 0.5) / radial)[:, None]
+    turn = ((np.arange(angular) + 0.5) / angular)[None, :]
+
+    collarette = 0.34 + 0.022 * _noise(rng, (1, angular), (0, 1), (0, 7), True) + 0.010 * _noise(
+        rng, (1, angular), (0, 1), (8, 26), True
+    )
+    ciliary = _step(s - collarette, -0.02, 0.05)
+
+    # Fibres: angular noise drawn out along the radius, its columns bent by a slow sideways warp.
+    warp = 3.6 * _noise(rng, shape, (0, 2.2), (0, 14)) + 1.0 * _noise(rng, shape, (0, 6), (0, 60))
+    rows, columns = np.meshgrid(np.arange(radial), np.arange(angular), indexing="ij")
+
+    def bent(field: _Array, strength: float) -> _Array:
+        return np.asarray(
+            ndimage.map_coordinates(field, [rows, columns + strength * warp], order=1, mode="grid-wrap")
+        )
+
+    coarse = bent(_noise(rng, shape, (0, 1.6), (22, 60)), 1.0)
+    medium = bent(_noise(rng, shape, (0, 2.5), (50, 120)), 1.0)
+    fine = bent(_noise(rng, shape, (0, 3.0), (90, 190)), 0.7)
+    ridges = 1.0 - np.abs(medium)  # strands stand out bright between darker gaps
+    fibres = ciliary * (0.055 * coarse + 0.085 * (ridges - 0.2) + 0.045 * fine) + (1 - ciliary) * (
+        0.035 * coarse + 0.075 * fine + 0.03 * medium
+    )
+
+    tone = 1.0 + 0.05 * _noise(rng, shape, (0, 2.0), (0, 5)) + 0.035 * _noise(rng, shape, (0, 14), (0, 60))
+    tone = tone + 0.10 * (1 - ciliary) - 0.16 * _step(s, 0.72, 1.0)
+    crest = np.exp(-(((s - collarette) / 0.022) ** 2))
+    tone = tone + 0.15 * crest * (1 + 0.45 * _noise(rng, (1, angular), (0, 1), (6, 40), True))
+    tone = tone - 0.06 * np.exp(-(((s - collarette - 0.055) / 0.03) ** 2))
+
+    texture = tone * (1.0 + 1.25 * fibres)
+    texture = texture * _furrows(rng, s, turn) * _crypts(rng, s, turn, collarette)
+    # The ruff: the pigment epithelium turned over the margin, a dark beaded seam.
+    beads = 0.018 * (1 + 0.35 * _noise(rng, (1, angular), (0, 1), (30, 75), True))
+    texture = texture * (1 - 0.45 * np.exp(-((s / np.maximum(beads, 0.006)) ** 2)))
+
+    texture = np.clip(texture, 0.30, 1.9)
+    area = 2.0 + s * 3.8
+    texture = texture / (np.sum(texture * area) / np.sum(np.broadcast_to(area, shape)))
+    out = texture.astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
+def _furrows(rng: np.random.Generator, s: _Array, turn: _Array) -> _Array:
+    """Concentric contraction furrows: dark arcs in the outer half, each over a part of the circle."""
+    out = np.ones(np.broadcast_shapes(s.shape, turn.shape))
+    for place in (0.60, 0.71, 0.82, 0.91):
+        start, span = rng.uniform(0, 1), rng.uniform(0.35, 0.9)
+        wave = 0.008 * np.sin(2 * np.pi * (turn * rng.integers(2, 6) + rng.uniform()))
+        along = np.mod(turn - start, 1.0)
+        mask = _step(along, 0.0, 0.08) * (1 - _step(along, span - 0.08, span))
+        d = (s - place - wave) / 0.011
+        out -= mask * rng.uniform(0.05, 0.11) * (np.exp(-(d**2)) - 0.5 * np.exp(-((d - 1.8) ** 2)))
+    return out
+
+
+def _crypts(rng: np.random.Generator, s: _Array, turn: _Array, collarette: _Array) -> _Array:
+    """Fuchs' crypts: lens-shaped gaps in the front layer, dark with a paler rim."""
+    out = np.ones(np.broadcast_shapes(s.shape, turn.shape))
+    columns = turn.shape[1]
+    for _ in range(int(rng.integers(14, 34))):
+        centre = rng.uniform(0, 1)
+        inner = float(collarette[0, int(centre * columns) % columns])
+        place = inner + rng.normal(0.06, 0.05) if rng.uniform() < 0.75 else rng.uniform(0.5, 0.88)
+        length, width = rng.uniform(0.04, 0.10), rng.uniform(0.003, 0.008)
+        depth = rng.uniform(0.12, 0.38)
+        du = (np.mod(turn - centre + 0.5, 1.0) - 0.5) / width
+        dv = (s - place) / length
+        r = np.sqrt(du * du + dv * dv)
+        out -= depth * (1 - _step(r, 0.6, 1.1))
+        out += 0.35 * depth * np.exp(-(((r - 1.25) / 0.18) ** 2))
+    return np.maximum(out, 0.35)
+
+
+@lru_cache(maxsize=4)
+def sclera_texture(seed: int, size: int = 768) -> Texture:
+    """Relative albedo (size, size) of the globe's front, azimuthal equidistant to 108 degrees from the pole.
+
+    Slow unevenness and conjunctival vessels, which are faint at 850 nm: they run in from the fornices, branch and thin
+    out short of the limbus.
+    """
+    rng = np.random.default_rng((0x5C1E, seed))
+    shade = 1 + 0.025 * _noise(rng, (size, size), (0, 5), (0, 5), True) + 0.012 * _noise(
+        rng, (size, size), (10, 40), (10, 40), True
+    )
+    layers = [np.zeros((size, size)) for _ in range(3)]
+    limbus = 0.29 / 0.6 / 2 * size / np.pi * 1.02  # 29 degrees of polar angle, in pixels of the map
+
+    def grow(x: float, y: float, heading: float, weight: float, steps: int, level: int) -> None:
+        for _ in range(steps):
+            r = np.hypot(x - size / 2, y - size / 2)
+            if r < limbus * rng.uniform(1.05, 1.7) or not (1 < x < size - 2 and 1 < y < size - 2):
+                return
+            inward = np.arctan2(size / 2 - y, size / 2 - x)
+            heading += rng.normal(0, 0.16) + 0.02 * np.sin(inward - heading)
+            x, y = x + 0.8 * np.cos(heading), y + 0.8 * np.sin(heading)
+            layers[min(level, 2)][int(y), int(x)] += weight
+            weight *= 0.9985
+            if level < 3 and rng.uniform() < 0.012:
+                grow(x, y, heading + rng.choice([-1, 1]) * rng.uniform(0.3, 0.8), weight * 0.7, steps // 2, level + 1)
+
+    for _ in range(70):
+        a = rng.uniform(0, 2 * np.pi)
+        r = size * rng.uniform(0.36, 0.48)
+        grow(
+            size / 2 + r * np.cos(a), size / 2 + r * np.sin(a), a + np.pi + rng.normal(0, 0.5), rng.uniform(0.3, 1),
+            int(rng.integers(120, 420)), int(rng.integers(0, 3)),
+        )  # fmt: skip
+    vessels = sum(
+        0.16 * width * ndimage.gaussian_filter(layer, width) for layer, width in zip(layers, (2.2, 1.4, 0.9), strict=True)
+    )
+    vessels = vessels + 0.05 * ndimage.gaussian_filter(layers[0] + layers[1], 5.0) * 5
+    texture = shade * (1 - np.clip(vessels, 0, 0.3))
+    out = (texture / texture.mean()).astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
+@lru_cache(maxsize=4)
+def skin_texture(seed: int, size: int = 768) -> Texture:
+    """Relative albedo (size, size) of a tile of skin, periodic: slow unevenness, the net of furrows, pores."""
+    rng = np.random.default_rng((0x5817, seed))
+    shape = (size, size)
+    slow = 0.05 * _noise(rng, shape, (0, 4), (0, 4), True)
+    net = np.abs(_noise(rng, shape, (24, 60), (24, 60), True))
+    net = 0.06 * (np.minimum(net, 1.2) - 0.7)
+    grain = 0.03 * _noise(rng, shape, (60, 150), (60, 150), True)
+    texture = np.clip(1 + slow + net + grain, 0.5, 1.5)
+    out = (texture / texture.mean()).astype(np.float32)
+    out.flags.writeable = False
+    return out

@@ -1,0 +1,211 @@
+"""libLLVM for Mitsuba's llvm variants: finding one that renders, and having Dr.Jit load it.
+
+pip brings none. Some versions are refused, some end the process at their first kernel, so each candidate is probed in a
+process of its own (`probe`). Dr.Jit loads a libLLVM when drjit is first imported, and only then: `ensure_llvm` runs
+before that, or checks what was loaded.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import BackendError
+from .libraries import library_folders, load_library, load_runtime, stored_folders
+from .mend import llvm_mend
+from .probe import Verdict, probe
+
+VARIANT = "llvm_ad_mono"
+ENVIRONMENT = "DRJIT_LIBLLVM_PATH"
+
+
+@dataclass(frozen=True, slots=True)
+class LibLlvm:
+    """A libLLVM that renders: its file (None where the loader's choice is unknown) and version."""
+
+    path: Path | None
+    version: str
+
+    @classmethod
+    def probed(cls, path: Path, verdict: Verdict) -> LibLlvm:
+        """From the verdict that it renders."""
+        return cls(path, verdict.detail.removeprefix("LLVM "))
+
+
+@dataclass(frozen=True, slots=True)
+class Examined:
+    """A candidate and what probing it said."""
+
+    path: Path
+    verdict: Verdict
+
+
+_active: LibLlvm | None = None
+
+
+def candidates() -> Iterator[Path]:
+    """Every libLLVM of this machine, once: the one the user names, our own, then the system's, newest first."""
+    seen: set[Path] = set()
+    for group in (_named, _stored, _installed):
+        for path in sorted(group(), key=_order):
+            real = path.resolve()
+            if real not in seen and real.is_file():
+                seen.add(real)
+                yield real
+
+
+def examine(*, refresh: bool = False) -> Iterator[Examined]:
+    """Probe the candidates one after another, lazily; `refresh` forgets earlier refusals (never successes)."""
+    for path in candidates():
+        verdict = probe(VARIANT, path)
+        if refresh and not verdict.ok:
+            verdict = probe(VARIANT, path, refresh=True)
+        yield Examined(path, verdict)
+
+
+def find_llvm(*, refresh: bool = False) -> LibLlvm | None:
+    """The first candidate that renders."""
+    for examined in examine(refresh=refresh):
+        if examined.verdict.ok:
+            return LibLlvm.probed(examined.path, examined.verdict)
+    return None
+
+
+def ensure_llvm() -> LibLlvm:
+    """Have this process's Dr.Jit use a libLLVM that renders.
+
+    Raises
+    ------
+    BackendError
+        There is none, or drjit was imported before and has loaded another, or none; the message names the mend.
+    """
+    global _active
+    if _active is None:
+        _active = _loaded() if "drjit" in sys.modules else _activate()
+    return _active
+
+
+def version_of(path: Path) -> tuple[int, ...]:
+    """Version that a file's name tells ("libLLVM-19.so", "libLLVM.so.19.1", "libLLVM.19.1.dylib"), () if none."""
+    match = re.match(r"(?:lib)?LLVM(?:-C)?[-.](?:so\.)?(\d+(?:\.\d+)*)", path.name)
+    return tuple(int(part) for part in match[1].split(".")) if match else ()
+
+
+def _activate() -> LibLlvm:
+    before = os.environ.get(ENVIRONMENT)
+    for examined in examine():
+        if not examined.verdict.ok:
+            continue
+        try:
+            folders = library_folders(examined.path)
+            load_runtime(folders)
+            load_library(examined.path, folders)
+        except OSError:
+            # Remembered as good, and something it needs is gone since.
+            probe(VARIANT, examined.path, refresh=True)
+            continue
+        os.environ[ENVIRONMENT] = str(examined.path)
+        import drjit as dr
+
+        if dr.has_backend(dr.JitBackend.LLVM):
+            return LibLlvm.probed(examined.path, examined.verdict)
+        if before is not None:
+            os.environ[ENVIRONMENT] = before
+        raise BackendError(f"Dr.Jit does not load {examined.path}, though it did in a process of its own")
+    raise BackendError(f"no libLLVM here renders (the llvm backend needs one); {llvm_mend()}")
+
+
+def _loaded() -> LibLlvm:
+    """What the drjit that was imported before us has loaded, if it renders."""
+    import drjit as dr
+
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        raise BackendError(f"mitsuba was imported earlier and found no libLLVM; {_too_late()}")
+    version = ".".join(map(str, dr.detail.llvm_version()))
+    path = _mapped(dr.detail.llvm_version())
+    verdict = probe(VARIANT, path)
+    if not verdict.ok:
+        raise BackendError(
+            f"mitsuba was imported earlier and loaded {path or 'a libLLVM'} (LLVM {version}), which does not render "
+            f"({verdict.detail}); {_too_late()}"
+        )
+    return LibLlvm(path, version)
+
+
+def _too_late() -> str:
+    found = find_llvm()
+    if found is None:
+        return llvm_mend()
+    return (
+        "import mitsuba after eyerender.rendering.backend.choose_backend() has run, "
+        f"or set {ENVIRONMENT}={found.path} before Python starts"
+    )
+
+
+def _mapped(version: tuple[int, ...]) -> Path | None:
+    """The file of the libLLVM in this process that has this version; other packages may have loaded others."""
+    try:
+        lines = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return None
+    paths = {Path(line.split(None, 5)[5]) for line in lines if "libLLVM" in line}
+    fitting = sorted(p for p in paths if version_of(p)[:1] == version[:1])
+    return next(iter(fitting or sorted(paths)), None)
+
+
+def _order(path: Path) -> tuple[bool, list[int], str]:
+    """Newest first; those whose name tells no version after them; those too old for Mitsuba 3.9 last."""
+    version = version_of(path.resolve()) or version_of(path)
+    return bool(version) and version[0] < 17, [-part for part in version] or [0], str(path)
+
+
+def _named() -> list[Path]:
+    given = os.environ.get(ENVIRONMENT)
+    return [Path(given)] if given else []
+
+
+def _stored() -> list[Path]:
+    return _libraries(list(stored_folders()))
+
+
+def _installed() -> list[Path]:
+    prefixes = [Path(p) for p in (sys.prefix, sys.base_prefix, os.environ.get("CONDA_PREFIX")) if p]
+    folders = [prefix / ("Library/bin" if sys.platform == "win32" else "lib") for prefix in prefixes]
+    found: list[Path] = []
+    if sys.platform == "darwin":
+        for brew in ("/opt/homebrew", "/usr/local"):
+            folders += sorted(Path(brew).glob("opt/llvm*/lib"))
+    elif sys.platform == "win32":
+        folders += [Path(p) for p in os.environ.get("PATH", "").split(os.pathsep) if p]
+        folders.append(Path(os.environ.get("PROGRAMFILES", "C:/Program Files")) / "LLVM" / "bin")
+    else:
+        folders += [Path(p) for p in os.environ.get("LD_LIBRARY_PATH", "").split(":") if os.path.isabs(p)]
+        triplet = sysconfig.get_config_var("MULTIARCH")
+        roots = [f"/usr/lib/{triplet}"] if triplet else []
+        folders += [Path(p) for p in (*roots, "/usr/lib64", "/usr/lib", "/usr/local/lib64", "/usr/local/lib")]
+        for pattern in ("lib/llvm-*/lib", "lib/llvm/*/lib*", "lib64/llvm*/lib*"):
+            folders += sorted(Path("/usr").glob(pattern))
+        folders += sorted(Path("/home/linuxbrew/.linuxbrew/opt").glob("llvm*/lib"))
+        found = _loader_cache()
+    return _libraries(folders) + found
+
+
+def _libraries(folders: list[Path]) -> list[Path]:
+    patterns = ("libLLVM-*.so*", "libLLVM.so*", "libLLVM*.dylib", "LLVM-C.dll")
+    return [path for folder in folders for pattern in patterns for path in folder.glob(pattern)]
+
+
+def _loader_cache() -> list[Path]:
+    for tool in ("/sbin/ldconfig", "/usr/sbin/ldconfig", "ldconfig"):
+        try:
+            listed = subprocess.run([tool, "-p"], capture_output=True, text=True, timeout=20, check=False).stdout
+        except (OSError, subprocess.TimeoutExpired):
+            continue
+        return [Path(line.partition("=> ")[2].strip()) for line in listed.splitlines() if "libLLVM" in line]
+    return []

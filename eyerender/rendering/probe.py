@@ -1,0 +1,246 @@
+"""Whether a backend renders, found out in a process of its own, because a wrong libLLVM ends the process it is used in.
+
+`python -m eyerender.rendering.probe VARIANT [LIBRARY]` is that process; `run_probe` starts it, `probe` also remembers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import hashlib
+import json
+import math
+import os
+import platform
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from .libraries import cache_folder, library_folders, load_library, load_runtime
+
+TIMEOUT_S = 180.0
+REFUSAL_AGE_S = 86400.0  # a GPU may have been busy, memory short: a refusal is looked into again after a day
+_MARK = "eyerender-probe: "
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Outcome of a probe.
+
+    `detail` says why not, or what was found (LLVM's version, the GPU's name). `lasting` is false for what may change
+    without the library changing: a dependency that is missing, a time-out.
+    """
+
+    ok: bool
+    detail: str
+    lasting: bool = True
+
+
+def package_version(name: str) -> str:
+    """Installed version of a distribution, "none" where it is not installed."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "none"
+
+
+def cpu_name() -> str:
+    """The processor's name as its maker writes it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
+            for line in lines:
+                if line.startswith("model name"):
+                    return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def probe(variant: str, library: Path | None = None, *, context: str = "", refresh: bool = False) -> Verdict:
+    """`run_probe`, remembered on disk for this library, interpreter, processor and these versions.
+
+    Parameters
+    ----------
+    variant
+        Mitsuba's variant, "llvm_ad_mono" or "cuda_ad_mono".
+    library
+        The libLLVM to use; None leaves the choice to Dr.Jit.
+    context
+        Whatever else the verdict depends on (the GPU's driver).
+    refresh
+        Probe even where a verdict is remembered.
+    """
+    key: dict[str, Any] = {
+        "variant": variant,
+        "library": _identity(library),
+        "context": context,
+        "versions": [package_version("mitsuba"), package_version("drjit"), sys.version, sys.executable],
+        "machine": [platform.machine(), cpu_name()],
+    }
+    folder = cache_folder()
+    digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:32]
+    file = folder / "verdicts" / f"{digest}.json" if folder else None
+    if file is not None and not refresh:
+        known = _read_verdict(file)
+        if known is not None:
+            return known
+    verdict = run_probe(variant, library)
+    if file is not None and verdict.lasting:
+        _write_verdict(file, key, verdict)
+    return verdict
+
+
+def run_probe(variant: str, library: Path | None = None, timeout_s: float = TIMEOUT_S) -> Verdict:
+    """Render a small picture with `variant` in a new process and say whether it came out right."""
+    with tempfile.TemporaryDirectory(prefix="eyerender-probe-") as home:
+        environment = dict(os.environ)
+        # An own HOME: Dr.Jit keeps compiled kernels there, and one that another libLLVM compiled would be taken.
+        environment["HOME"] = home
+        environment["PYTHONPATH"] = os.pathsep.join(os.path.abspath(p) for p in sys.path)
+        if library is not None:
+            environment["DRJIT_LIBLLVM_PATH"] = str(library)
+        command = [sys.executable, "-P", "-m", "eyerender.rendering.probe", variant]
+        command += [str(library)] if library is not None else []
+        try:
+            done = subprocess.run(
+                command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return Verdict(False, f"no answer within {timeout_s:.0f} s", lasting=False)
+        except OSError as error:
+            return Verdict(False, f"cannot start {sys.executable or 'Python'}: {error.strerror}", lasting=False)
+    return _judge(done.returncode, done.stdout.decode(errors="replace"), done.stderr.decode(errors="replace"))
+
+
+def _judge(status: int, out: str, err: str) -> Verdict:
+    for line in out.splitlines():
+        if line.startswith(_MARK):
+            answer = json.loads(line.removeprefix(_MARK))
+            if not answer["ok"] and (refusal := re.search(r"LLVM version \((\d+)\) is too old", err)):
+                return Verdict(False, f"LLVM {refusal[1]} is too old for Dr.Jit")
+            if status == 0 or not answer["ok"]:
+                return Verdict(answer["ok"], answer["detail"], answer["lasting"])
+    if status < 0:
+        name = signal.Signals(-status).name if -status in set(signal.Signals) else f"signal {-status}"
+        # A kill comes from outside (memory, a person) and says nothing about the library.
+        return Verdict(False, f"rendering with it ends the process ({name})", lasting=name != "SIGKILL")
+    return Verdict(False, (err.strip().splitlines() or [f"exit status {status}"])[-1], lasting=False)
+
+
+def _identity(library: Path | None) -> Sequence[Any]:
+    if library is None:
+        return [os.environ.get("DRJIT_LIBLLVM_PATH", ""), os.environ.get("LD_LIBRARY_PATH", "")]
+    try:
+        status = library.stat()
+    except OSError:
+        return [str(library)]
+    return [str(library), status.st_size, status.st_mtime_ns]
+
+
+def _read_verdict(file: Path) -> Verdict | None:
+    try:
+        stored = json.loads(file.read_text(encoding="utf-8"))["verdict"]
+        verdict = Verdict(bool(stored["ok"]), str(stored["detail"]))
+        return verdict if verdict.ok or time.time() - file.stat().st_mtime < REFUSAL_AGE_S else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _write_verdict(file: Path, key: Mapping[str, Any], verdict: Verdict) -> None:
+    """Written beside and renamed: no reader meets half a file. A cache that cannot be written is done without."""
+    beside = file.with_suffix(f".{os.getpid()}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        beside.write_text(json.dumps({"key": key, "verdict": asdict(verdict)}, indent=1), encoding="utf-8")
+        beside.replace(file)
+    except OSError:
+        with contextlib.suppress(OSError):
+            beside.unlink()
+
+
+def _work(variant: str) -> str:
+    """What the process does: arithmetic that wrong versions die of, then a ray-traced picture. Returns the detail."""
+    import drjit as dr
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    if variant.startswith("llvm"):
+        dr.set_thread_count(2)
+    # A literal no kernel was ever compiled for: this compiles here and now.
+    offset = float(time.time_ns() % 65521) / 64
+    x = dr.arange(mi.Float, 64) + offset
+    y = dr.minimum(x, offset + 31.5) - offset
+    total = dr.sum(dr.if_stmt((x, y), y > 8, lambda x, y: dr.maximum(y, 0) ** 2, lambda x, y: y * y))[0]
+    expected = sum(min(i, 31.5) ** 2 for i in range(64))
+    if not math.isclose(total, expected, rel_tol=1e-3):
+        raise ArithmeticError(f"wrong arithmetic: {total} for {expected}")
+
+    # A unit sphere seen and lit from distance 5: on the axis the radiance is albedo / pi * I / d^2 = 0.5 / pi.
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct"},
+            "sensor": {
+                "type": "perspective",
+                "fov": 1,
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "luminance"},
+            },
+            "ball": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 0.5}},
+            "light": {"type": "point", "position": [0, 0, 5], "intensity": 16.0},
+        }
+    )
+    radiance = dr.mean(mi.render(scene, spp=4).array)[0]
+    if not math.isclose(radiance, 0.5 / math.pi, rel_tol=0.02):
+        raise ArithmeticError(f"wrong picture: {radiance} for {0.5 / math.pi}")
+    if variant.startswith("llvm"):
+        return "LLVM " + ".".join(map(str, dr.detail.llvm_version()))
+    return _gpu_name()
+
+
+def _gpu_name() -> str:
+    """The first GPU's name, from the driver that the process has just rendered with."""
+    driver = ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")
+    device, name = ctypes.c_int(), ctypes.create_string_buffer(128)
+    if driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0) or driver.cuDeviceGetName(name, 128, device):
+        return "GPU"
+    return name.value.decode(errors="replace")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of the probing process: one line of JSON on stdout, exit status 0 where the variant renders."""
+    lasting = True
+    try:
+        if sys.platform != "win32":
+            import resource
+
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        library = Path(arguments[1]) if len(arguments) > 1 else None
+        folders = library_folders(library) if library else ()
+        lasting = False  # a library that does not load lacks something, which an installation may bring
+        load_runtime(folders)
+        if library:
+            load_library(library, folders)
+            os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
+        lasting = True
+        answer = {"ok": True, "detail": _work(arguments[0]), "lasting": True}
+    except Exception as error:
+        answer = {"ok": False, "detail": _line(error), "lasting": lasting}
+    print(_MARK + json.dumps(answer), flush=True)
+    return 0 if answer["ok"] else 1
+
+
+def _line(error: Exception) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,236 @@
+"""The renderer: jobs in, windows of the sensor out; NumPy on both sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import ArrayValue, Bools, Floats, frozen
+from . import psf, sensor
+from .frame import RenderJob, camera_numbers, eye_numbers, kinds, light_table, look_numbers, pose_numbers
+from .glints import GlintScene, GlintTable, glint_table
+from .integrator import Textures, integrator_class, lamps, look
+from .sampling import Sampler, camera_ray
+from .surround import Obstacle, Surround
+from .values import Lights, Structure, Values
+
+if TYPE_CHECKING:
+    from .backend import Backend
+
+_LANES = 2**24  # samples in flight; more are rendered in several passes
+BACKGROUND, SCLERA, IRIS, PUPIL = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartLabels(ArrayValue):
+    """What each pixel's centre shows, seen through the cornea; arrays (height, width).
+
+    `part` and `amodal` hold 0 background or skin, 1 sclera, 2 iris, 3 pupil; `amodal` as if the eye stood alone.
+    `depth_mm` is the distance from the nodal point to the first surface, infinite where there is none. The visible
+    fractions are of the part of the amodal pupil and iris that lies in the window, NaN where none does.
+    """
+
+    part: NDArray[np.uint8]
+    amodal: NDArray[np.uint8]
+    depth_mm: NDArray[np.float32]
+
+    def visible_fraction(self, part: int) -> float:
+        """Share of the amodal pixels of a part that are visible."""
+        whole = int(np.count_nonzero(self.amodal == part))
+        both = int(np.count_nonzero((self.amodal == part) & (self.part == part)))
+        return both / whole if whole else float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedWindow(ArrayValue):
+    """A rendered window: `irradiance` (height, width) W/m^2 of the sensor, `dn` after the sensor, labels, glints.
+
+    `failed_paths` counts light paths that did not converge (they are missing from the irradiance).
+    """
+
+    window: tuple[int, int, int, int]
+    irradiance: NDArray[np.float32]
+    dn: NDArray[np.uint16]
+    bit_depth: int
+    labels: PartLabels | None
+    glints: GlintTable
+    failed_paths: int
+
+
+class Renderer:
+    """Renders jobs on one backend, which `choose_backend` must have set up before this module is imported.
+
+    Kernels are compiled once per kind of eye; every number may change between jobs. `obstacles` stand in the scene's
+    frame: they hide and shade the eye.
+    """
+
+    def __init__(self, backend: Backend, *, spp: int = 16, obstacles: Sequence[Obstacle] = ()) -> None:
+        self.backend = backend
+        self.spp = spp
+        self._integrator = integrator_class()()
+        self._surround = Surround(obstacles)
+        self._textures: dict[int, Textures] = {}
+
+    def render(self, job: RenderJob, *, spp: int | None = None) -> RenderedWindow:
+        """Render one window."""
+        values, lights = self._bind(job)
+        pad = psf.margin(job.sensor.psf_sigma_px)
+        x0, y0, width, height = job.window
+        radiance, failed = self._radiance(
+            values, lights, (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad), spp or self.spp, job.seed
+        )
+        blurred = psf.blur(radiance, job.sensor.psf_sigma_px).copy()
+        glints = self._add_glints(job, blurred)
+        irradiance = blurred * sensor.radiance_to_irradiance(job.sensor)
+        dn = sensor.expose(job.sensor, irradiance, job.wavelength_nm, job.seed)
+        labels = self._labels(values, job.window) if job.labels else None
+        return RenderedWindow(
+            job.window,
+            frozen(irradiance, np.float32),
+            frozen(dn, np.uint16),
+            job.sensor.bit_depth,
+            labels,
+            glints,
+            failed,
+        )
+
+    def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
+        """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), before lens and glints."""
+        values, lights = self._bind(job)
+        return self._radiance(values, lights, job.window, spp or self.spp, job.seed)[0]
+
+    def iris_irradiance(self, job: RenderJob, points_mm: Floats) -> Floats:
+        """Irradiance (n,) mW/mm^2 that points (n, 3) of the iris' plane (eye frame, mm) get from all lamps.
+
+        A lamp of finite size is represented by its centre.
+        """
+        values, lights = self._bind(job)
+        x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
+        no, yes = mi.Bool(False), dr.full(mi.Bool, True, len(points_mm))
+        corner = mi.Float(0)  # of the unit square: the disc's centre
+        _, bent, _ = lamps(
+            values, lights, self._surround.scene, mi.Vector3f(0), mi.Vector3f(1, 0, 0), no, no, x, yes, corner, corner
+        )
+        return np.asarray(bent.numpy(), dtype=float)
+
+    def labels(self, job: RenderJob) -> PartLabels:
+        """The labels of a window alone."""
+        return self._labels(self._bind(job)[0], job.window)
+
+    def _bind(self, job: RenderJob) -> tuple[Values, Lights]:
+        structure = Structure(kinds(job.eye), bool(np.any(job.camera.distortion)))
+        anchor = job.anchor_mm
+        numbers = {
+            **eye_numbers(job.eye),
+            **look_numbers(job.look),
+            **pose_numbers(job.M, job.t, anchor),
+            **camera_numbers(job.camera, anchor),
+        }
+        values = Values(structure, structure.pack(numbers))
+        lights = Lights(light_table(job.lights, job.M, job.t))
+        self._surround.show(job.look)
+        self._integrator.bind(values, lights, self._textures_of(job))
+        return values, lights
+
+    def _textures_of(self, job: RenderJob) -> Textures:
+        seed = job.look.iris_seed
+        if seed not in self._textures:
+            if len(self._textures) >= 8:
+                self._textures.pop(next(iter(self._textures)))
+            self._textures[seed] = Textures.of_seed(seed)
+        return self._textures[seed]
+
+    def _radiance(
+        self, values: Values, lights: Lights, window: tuple[int, int, int, int], spp: int, seed: int
+    ) -> tuple[Floats, int]:
+        width, height = window[2:]
+        pixels = width * height
+        each = max(1, min(spp, _LANES // pixels))
+        total = np.zeros(pixels)
+        failed = 0
+        hashed = _hash(seed)
+        for first in range(0, spp, each):
+            count = min(each, spp - first)
+            index = dr.arange(mi.UInt32, pixels * count)
+            n = dr.opaque(mi.UInt32, count)
+            pixel = index // n
+            u, v = _pixels(pixel, window)
+            # A pixel's place on the whole sensor, so that a window shows the same samples wherever it lies.
+            place = (u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16))
+            sampler = Sampler(
+                place, index - pixel * n + dr.opaque(mi.UInt32, first), dr.opaque(mi.UInt32, hashed)
+            )
+            spot = sampler.in_pixel()
+            o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
+            ray = mi.Ray3f(mi.Point3f(o), d)
+            seen, _, _ = self._integrator.sample(self._surround.scene, sampler, ray)
+            cosine = cosine * cosine
+            image = dr.block_sum(seen[0] * cosine * cosine, count)
+            failures = dr.sum(self._integrator.failures)
+            dr.eval(image, failures)
+            total += image.numpy()
+            failed += int(failures.numpy()[0])
+        return (total / spp).reshape(height, width), failed
+
+    def _labels(self, values: Values, window: tuple[int, int, int, int]) -> PartLabels:
+        width, height = window[2:]
+        u, v = _pixels(dr.arange(mi.UInt32, width * height), window)
+        o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
+        view = look(values, self._surround.scene, o, d, True)
+        clear = view.amodal_cornea & (view.opacity < 0.5)
+        amodal = dr.select(
+            view.amodal_cornea | view.amodal_sclera,
+            dr.select(clear, dr.select(view.pupil, mi.UInt32(PUPIL), mi.UInt32(IRIS)), mi.UInt32(SCLERA)),
+            mi.UInt32(BACKGROUND),
+        )
+        eye = view.cornea | view.sclera
+        part = dr.select(eye, amodal, mi.UInt32(BACKGROUND))
+        depth = dr.select(eye | view.other, view.distance, dr.inf)
+        dr.eval(amodal, part, depth)
+        shape = (height, width)
+        return PartLabels(
+            frozen(part.numpy().reshape(shape), np.uint8),
+            frozen(amodal.numpy().reshape(shape), np.uint8),
+            frozen(depth.numpy().reshape(shape), np.float32),
+        )
+
+    def _add_glints(self, job: RenderJob, image: Floats) -> GlintTable:
+        eye, anchor = job.eye, job.anchor_mm
+
+        def clear(a: Floats, b: Floats) -> Bools:
+            return self._surround.clear(a - anchor, b - anchor)
+
+        scene = GlintScene(
+            eye.front[0], float(eye.front_indices[0]), eye.limbus_radius_mm, np.asarray(eye.sclera.centre_mm),
+            eye.sclera.radius_mm, job.M, job.t, job.camera, clear,
+        )  # fmt: skip
+        table, images = glint_table(scene, job.lights, job.sensor.psf_sigma_px)
+        for spots in images:
+            if len(spots.energy):
+                direction = job.camera.rays(spots.xy_px) @ job.camera.axis
+                patch, rows, columns = psf.splat(
+                    spots.xy_px, spots.energy * direction**4, job.sensor.psf_sigma_px, job.window
+                )
+                image[rows, columns] += patch
+        return table
+
+
+def _pixels(pixel: Any, window: tuple[int, int, int, int]) -> tuple[Any, Any]:
+    """Full-sensor pixel coordinates, as signed integers, of the window's pixels in row order."""
+    width = dr.opaque(mi.UInt32, window[2])
+    row = pixel // width
+    column = pixel - row * width
+    u = mi.Int32(column) + dr.opaque(mi.Int32, window[0])
+    v = mi.Int32(row) + dr.opaque(mi.Int32, window[1])
+    return u, v
+
+
+def _hash(seed: int) -> int:
+    """A seed of any size folded into 32 bits."""
+    return int(np.random.SeedSequence(seed).generate_state(1)[0])

@@ -1,0 +1,97 @@
+"""Everything in the scene that is not the eye: the matte surround and whatever else stands in the way.
+
+It keeps still in the scene's frame (the world's axes, origin at the apex of the unrotated eye), so neither a pose nor a
+camera rebuilds it. The surround is a plane of matte skin behind the apex, the globe protrudes through it: honest, since
+lids and brow are not modelled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..arrays import ArrayValue, Bools, Floats
+from ..region.look import LookSpec
+from ..region.texture import skin_texture
+
+_HALF_MM = 500.0
+_TILE_MM = 60.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Obstacle(ArrayValue):
+    """A matte body in the scene's frame: vertices (n, 3) mm, faces (m, 3), albedo."""
+
+    vertices_mm: Floats
+    faces: Any
+    albedo: float = 0.3
+
+
+class Surround:
+    """The Mitsuba scene of the surround; `show` changes its look in place."""
+
+    def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
+        parts: dict[str, Any] = {"type": "scene", "backdrop": self._backdrop()}
+        for i, body in enumerate(obstacles):
+            material = {"type": "twosided", "bsdf": _matte(mi.TensorXf(np.full((1, 1, 1), body.albedo, np.float32)))}
+            parts[f"obstacle{i}"] = _mesh(f"obstacle{i}", body.vertices_mm, body.faces, None, material)
+        self.scene = mi.load_dict(parts)
+        self._params = mi.traverse(self.scene)
+        self._shown: tuple[float, float, float] | None = None
+
+    def show(self, look: LookSpec) -> None:
+        """Bring the surround to a look: its plane, albedo and unevenness."""
+        wanted = (look.backdrop_distance_mm, look.backdrop_albedo, look.backdrop_contrast)
+        if wanted == self._shown:
+            return
+        if self._shown is None or self._shown[0] != wanted[0]:
+            self._params["backdrop.vertex_positions"] = mi.Float(_corners(wanted[0]).ravel())
+        tile = wanted[1] * (1 + wanted[2] * (skin_texture(1) - 1))
+        (key,) = (k for k in self._params.keys() if k.startswith("backdrop") and k.endswith("reflectance.data"))
+        self._params[key] = mi.TensorXf(np.clip(tile, 0.0, 0.98).astype(np.float32)[..., None])
+        self._params.update()
+        self._shown = wanted
+
+    def clear(self, a: Floats, b: Floats) -> Bools:
+        """Whether nothing of the surround stands between points (n, 3) of the scene's frame; ends not included."""
+        length = np.linalg.norm(b - a, axis=-1)
+        d = (b - a) / length[:, None]
+        margin = 1e-3
+        start = a + margin * d
+        ray = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*d.T.astype(np.float32)))
+        ray.maxt = mi.Float((length - 2 * margin).astype(np.float32))
+        return ~np.asarray(self.scene.ray_test(ray).numpy(), dtype=bool)
+
+    @staticmethod
+    def _backdrop() -> Any:
+        uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (2 * _HALF_MM / _TILE_MM)
+        material = {"type": "twosided", "bsdf": _matte(mi.TensorXf(np.full((2, 2, 1), 0.4, np.float32)))}
+        return _mesh("backdrop", _corners(10.0), np.array([[0, 1, 2], [0, 2, 3]]), uv, material)
+
+
+def _corners(distance_mm: float) -> Floats:
+    h = _HALF_MM
+    return np.array([[-distance_mm, y, z] for y, z in ((-h, -h), (h, -h), (h, h), (-h, h))])
+
+
+def _matte(data: Any) -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "repeat"}}
+
+
+def _mesh(name: str, vertices: Floats, faces: Any, uv: Floats | None, material: dict[str, Any]) -> Any:
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(material)
+    mesh = mi.Mesh(name, len(vertices), len(faces), props=props, has_vertex_texcoords=uv is not None)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = mi.Float(np.asarray(vertices, dtype=np.float32).ravel())
+    params["faces"] = mi.UInt32(np.asarray(faces, dtype=np.uint32).ravel())
+    if uv is not None:
+        params["vertex_texcoords"] = mi.Float(np.asarray(uv, dtype=np.float32).ravel())
+    params.update()
+    dr.eval()
+    return mesh

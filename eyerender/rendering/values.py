@@ -1,0 +1,161 @@
+"""The numbers of a frame, packed on the host and laid out as opaque Dr.Jit arrays of size one.
+
+A literal that changes between frames would be compiled into the kernel; everything that can change goes through here.
+What shapes the kernel (the kinds of surfaces, whether the lens distorts) is the `Structure`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .surfaces import Surface
+
+LIGHT_WIDTH = 10  # position 3, axis 3, radius, intensity, lobe exponent, inner radius
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """What a kernel is compiled for: (biconic, tilted) of each surface, and whether the camera's lens distorts."""
+
+    surfaces: tuple[tuple[bool, bool], ...]
+    distorted: bool = False
+
+    @property
+    def layout(self) -> tuple[tuple[str, int], ...]:
+        """Names and sizes of the packed numbers."""
+        rows: list[tuple[str, int]] = []
+        for i, (_, tilted) in enumerate(self.surfaces):
+            rows += [(f"s{i}.origin", 3), (f"s{i}.shape", 5), (f"s{i}.eta", 1)]
+            if tilted:
+                rows += [(f"s{i}.row{k}", 3) for k in range(3)]
+        rows += [
+            ("inner_index", 1),
+            ("stop.centre", 3),
+            ("stop.normal", 3),
+            ("stop.u", 3),
+            ("stop.v", 3),
+            ("stop.axes", 2),
+            ("iris_root", 1),
+            ("limbus_radius", 1),
+            ("limbus_floor", 1),
+            ("limbus_width", 1),
+            ("limbus_gain", 1),
+            ("sclera.centre", 3),
+            ("sclera.radius", 1),
+            ("image.scale", 1),
+            ("image.shift", 1),
+            ("pose.col0", 3),
+            ("pose.col1", 3),
+            ("pose.col2", 3),
+            ("pose.shift", 3),
+            ("camera.centre", 3),
+            ("camera.right", 3),
+            ("camera.down", 3),
+            ("camera.forward", 3),
+            ("camera.focal", 2),
+            ("camera.principal", 2),
+            ("camera.distortion", 5),
+            ("iris.albedo", 1),
+            ("iris.contrast", 1),
+            ("pupil.albedo", 1),
+            ("sclera.albedo", 1),
+            ("sclera.contrast", 1),
+            ("limbus.albedo", 1),
+        ]
+        return tuple(rows)
+
+    def pack(self, numbers: Mapping[str, ArrayLike]) -> np.ndarray[Any, np.dtype[np.float32]]:
+        """The numbers as one vector in the order of the layout."""
+        parts = []
+        for name, size in self.layout:
+            part = np.asarray(numbers[name], dtype=np.float64).reshape(-1)
+            if part.size != size:
+                raise ValueError(f"{name} has {part.size} numbers, not {size}")
+            parts.append(part)
+        return np.concatenate(parts).astype(np.float32)
+
+
+class Values:
+    """The packed numbers on the device: `values["stop.centre"]` is a Float, a Vector3f or a tuple of Floats."""
+
+    def __init__(self, structure: Structure, packed: np.ndarray[Any, np.dtype[np.float32]]) -> None:
+        buffer = mi.Float(packed)
+        scalars = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in range(packed.size)]
+        dr.eval(scalars)
+        self.structure = structure
+        self._items: dict[str, Any] = {}
+        at = 0
+        for name, size in structure.layout:
+            part = scalars[at : at + size]
+            at += size
+            self._items[name] = part[0] if size == 1 else mi.Vector3f(*part) if size == 3 else tuple(part)
+        self.surfaces = tuple(self._surface(i, *kind) for i, kind in enumerate(structure.surfaces))
+
+    def __getitem__(self, name: str) -> Any:
+        return self._items[name]
+
+    def _surface(self, i: int, biconic: bool, tilted: bool) -> Surface:
+        rows = (self[f"s{i}.row0"], self[f"s{i}.row1"], self[f"s{i}.row2"]) if tilted else None
+        return Surface(self[f"s{i}.origin"], rows, self[f"s{i}.shape"], self[f"s{i}.eta"], biconic)
+
+    def point_to_eye(self, x: Any) -> Any:
+        """A point of the scene's frame in the eye frame: M^T (x - t)."""
+        return self.vector_to_eye(x - self["pose.shift"])
+
+    def vector_to_eye(self, v: Any) -> Any:
+        """A direction of the scene's frame in the eye frame: M^T v."""
+        return mi.Vector3f(*(dr.dot(self[f"pose.col{k}"], v) for k in range(3)))
+
+    def vector_to_scene(self, v: Any) -> Any:
+        """A direction of the eye frame in the scene's frame: M v."""
+        return self["pose.col0"] * v.x + self["pose.col1"] * v.y + self["pose.col2"] * v.z
+
+    def point_to_scene(self, x: Any) -> Any:
+        """A point of the eye frame in the scene's frame: M x + t."""
+        return self.vector_to_scene(x) + self["pose.shift"]
+
+
+class Lights:
+    """The lamps in the eye frame, (n, 10) numbers in one buffer; kernels do not depend on their number."""
+
+    def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
+        self.count = dr.opaque(mi.UInt32, len(table))
+        self._buffer = mi.Float(np.ascontiguousarray(table, dtype=np.float32).reshape(-1))
+
+    def __getitem__(self, i: Any) -> Any:
+        base = i * LIGHT_WIDTH
+        row = [dr.gather(mi.Float, self._buffer, base + k) for k in range(LIGHT_WIDTH)]
+        return Lamp(mi.Vector3f(*row[0:3]), mi.Vector3f(*row[3:6]), *row[6:10])
+
+
+@dataclass(frozen=True, slots=True)
+class Lamp:
+    """One LED on the device: I(w) = intensity * max(0, cos)^exponent, from an annulus of points across its axis."""
+
+    position: Any
+    axis: Any
+    radius: Any
+    intensity: Any
+    exponent: Any
+    inner_radius: Any
+
+    def point(self, u: Any, v: Any) -> Any:
+        """A point of the emitting disc or ring, uniform by area."""
+        e1, e2 = mi.coordinate_system(self.axis)
+        inner = self.inner_radius * self.inner_radius
+        r = dr.sqrt(inner + u * (self.radius * self.radius - inner))
+        s, c = dr.sincos(v * (2 * dr.pi))
+        return self.position + r * (c * e1 + s * e2)
+
+    def radiant_intensity(self, direction: Any) -> Any:
+        """Radiant intensity (mW/sr) into a unit direction that leaves the lamp."""
+        c = dr.dot(direction, self.axis)
+        lobe = dr.select(self.exponent == 0, 1, dr.power(dr.maximum(c, 1e-6), self.exponent))
+        return dr.select((c > 0) | (self.exponent == 0), self.intensity * lobe, 0)

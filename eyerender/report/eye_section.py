@@ -1,0 +1,112 @@
+"""An eye's section, drawn: surfaces, stop, fovea, axes and centres of rotation (as the comparative study's Figure 1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from ..eye.model import Eye
+from ..geometry.surfaces import Surface
+from .style import ANALYTIC, IMAGE, TARGET, figure
+
+_SCLERA, _CORNEA, _LENS, _RETINA, _IRIS = "#9a9a9a", ANALYTIC, "#009E73", IMAGE, "#8c564b"
+_GRID = 900
+
+
+def eye_section(eye: Eye, title: str = "") -> Any:
+    """A matplotlib figure with the horizontal section (from above) and the vertical one (from the temporal side)."""
+    with figure(11.0, 5.6, 2) as (fig, axes):
+        _draw(axes[0], eye, 1)
+        _draw(axes[1], eye, 2)
+        axes[0].set(title="horizontal section, from above", ylabel="y, nasal (mm)")
+        if eye.side == "left":
+            axes[0].set(ylabel="y, temporal (mm)")
+        axes[1].set(title="vertical section", ylabel="z, up (mm)")
+        handles, labels = axes[0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+        fig.suptitle(title or f"{eye.name}, {eye.side} eye, {eye.wavelength_nm:g} nm")
+        return fig
+
+
+def _draw(ax: Any, eye: Eye, across: int) -> None:
+    """One section: the plane of x and the coordinate `across` (1: y, 2: z)."""
+    centre, radius = np.asarray(eye.sclera.centre_mm), eye.sclera.radius_mm
+    low = float(min(centre[0] - radius, eye.fovea_mm[0])) - 1.2
+    x, s = np.meshgrid(np.linspace(low, 1.0, _GRID), np.linspace(-radius - 0.8, radius + 0.8, _GRID))
+    for k, surface in enumerate(eye.front):
+        rim = _axis_distance(surface, x, s, across) <= eye.limbus_radius_mm
+        _curve(ax, surface, x, s, across, rim, _CORNEA, 1.8, "cornea" if k == 0 else None)
+    shells = len(eye.back) > 2
+    for k, (surface, rim_mm) in enumerate(zip(eye.back, eye.back_rims_mm, strict=True)):
+        outer = k in (0, len(eye.back) - 1)
+        inside = _axis_distance(surface, x, s, across) <= float(np.asarray(rim_mm))
+        name = "lens" if k == 0 else None
+        _curve(ax, surface, x, s, across, inside, _LENS, 1.6 if outer or not shells else 0.35, name)
+    _curve(ax, eye.retina, x, s, across, x < -8.0, _RETINA, 1.6, "retina (optical)")
+    outside = np.hypot(x - centre[0], s - centre[across]) - radius
+    sclera = np.where(x < _limbus_x(eye), outside, np.nan)
+    ax.contour(x, s, sclera, levels=[0.0], colors=[_SCLERA], linewidths=2.4)
+    ax.plot([], [], color=_SCLERA, lw=2.4, label="sclera")
+    _iris(ax, eye, across)
+    ax.axhline(0, color="#444444", lw=0.9, ls=(0, (6, 4)), label="optic axis")
+    fovea, los = eye.fovea_mm, eye.chief_ray
+    path = np.stack([fovea, eye.stop.centre_mm, los.point_mm, los.point_mm + 5.0 * np.asarray(los.direction)])
+    ax.plot(path[:, 0], path[:, across], color="#CC79A7", lw=1.3, label="line of sight")
+    ax.plot(fovea[0], fovea[across], "s", color=_RETINA, ms=7, label="fovea")
+    turn = eye.rotation
+    for point, marker, name in (
+        (turn.azimuth_centre_mm, "*", "azimuth centre"),
+        (turn.elevation_centre_mm, "o", "elevation centre"),
+    ):
+        ax.plot(
+            point[0],
+            point[across],
+            marker,
+            color=TARGET,
+            mfc="none" if marker == "o" else TARGET,
+            ms=11 if marker == "*" else 9,
+            ls="none",
+            label=f"{name}",
+        )
+    ax.set(aspect="equal", xlabel="x, along the optic axis (mm)", xlim=(low, 3.0))
+
+
+def _curve(
+    ax: Any, surface: Surface, x: Floats, s: Floats, across: int, keep: Any, colour: str, width: float, name: str | None
+) -> None:
+    points = _points(x, s, across)
+    facing = surface.gradient(points) @ np.asarray(surface.rotation)[:, 0] > 0
+    values = np.where(facing & keep, surface.implicit(points), np.nan)
+    if np.nanmin(values, initial=np.inf) <= 0 <= np.nanmax(values, initial=-np.inf):
+        ax.contour(x, s, values, levels=[0.0], colors=[colour], linewidths=width)
+    if name:
+        ax.plot([], [], color=colour, lw=width, label=name)
+
+
+def _points(x: Floats, s: Floats, across: int) -> Floats:
+    zero = np.zeros_like(x)
+    return np.stack([x, s, zero] if across == 1 else [x, zero, s], axis=-1)
+
+
+def _axis_distance(surface: Surface, x: Floats, s: Floats, across: int) -> Floats:
+    local = surface.to_local(_points(x, s, across))
+    return np.hypot(local[..., 1], local[..., 2])
+
+
+def _limbus_x(eye: Eye) -> float:
+    """x of the plane of the limbus circle."""
+    front = eye.front[0]
+    rim = np.asarray(front.sag(np.array([eye.limbus_radius_mm]), np.array([0.0])))
+    return float(np.asarray(front.to_eye(np.array([[rim[0], eye.limbus_radius_mm, 0.0]])))[0, 0])
+
+
+def _iris(ax: Any, eye: Eye, across: int) -> None:
+    """The iris and the gap of the pupil, in the section's plane."""
+    stop = eye.stop
+    axis = np.asarray(stop.rotation)[:, across]
+    edge = float(stop.semi_axes_mm[across - 1])
+    for sign in (-1, 1):
+        line = np.stack([stop.centre_mm + sign * r * axis for r in (edge, eye.iris_root_radius_mm)])
+        ax.plot(line[:, 0], line[:, across], color=_IRIS, lw=3, solid_capstyle="butt", label="iris" if sign > 0 else None)

@@ -1,0 +1,93 @@
+"""Pictures of an eye with the features of both observers drawn over them, as SVG around an embedded PNG."""
+
+from __future__ import annotations
+
+import base64
+import io
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from ..arrays import Floats
+from ..imagefile import preview
+from ..observation import Observations
+from .style import ANALYTIC_ON_DARK, IMAGE_ON_DARK
+
+
+def eye_picture(
+    image: NDArray[Any],
+    origin_px: tuple[int, int],
+    full_scale: float,
+    truth: Observations,
+    found: Observations,
+    row: int,
+    *,
+    crop_px: tuple[int, int] = (128, 96),
+    scale: int = 4,
+    title: str = "",
+) -> str:
+    """An <svg> of the eye, enlarged, with analytic (blue) and image-derived (orange) pupil and glints.
+
+    Args:
+        image: (h, w) linear counts of a window.
+        origin_px: the window's first pixel on the full sensor.
+        full_scale: the counts that become white.
+        truth, found: what the two observers report; `row` is this image's row in both.
+        crop_px: width and height that are shown, centred on the iris (or the window).
+        scale: screen pixels per sensor pixel.
+        title: text alternative.
+    """
+    h, w = image.shape
+    cw, ch = min(crop_px[0], w), min(crop_px[1], h)
+    centre = np.array([(w - 1) / 2, (h - 1) / 2]) + origin_px
+    if truth.pupil.ok[row] and truth.pupil.in_image[row]:
+        centre = truth.pupil.centre_px[row]
+    x0 = int(np.clip(round(centre[0] - origin_px[0] - (cw - 1) / 2), 0, w - cw))
+    y0 = int(np.clip(round(centre[1] - origin_px[1] - (ch - 1) / 2), 0, h - ch))
+    shown = preview(image[y0 : y0 + ch, x0 : x0 + cw], full_scale)
+    shift = np.array([x0 + origin_px[0] - 0.5, y0 + origin_px[1] - 0.5])  # pixel i covers [i, i + 1) in the drawing
+    parts = [
+        f'<svg class="eye" viewBox="0 0 {cw} {ch}" width="{cw * scale}" height="{ch * scale}" role="img" '
+        f'xmlns="http://www.w3.org/2000/svg"><title>{title}</title>',
+        f'<image width="{cw}" height="{ch}" style="image-rendering:pixelated" '
+        f'href="data:image/png;base64,{_png(shown)}"/>',
+    ]
+    for name, colour, seen in (("analytic", ANALYTIC_ON_DARK, truth), ("found", IMAGE_ON_DARK, found)):
+        parts.append(f'<g class="{name}" fill="none" stroke="{colour}" vector-effect="non-scaling-stroke">')
+        if seen.pupil.ok[row]:
+            cx, cy = seen.pupil.centre_px[row] - shift
+            a, b = seen.pupil.semi_axes_px[row]
+            turn = np.degrees(seen.pupil.angle_rad[row])
+            dash = "" if name == "analytic" else ' stroke-dasharray="1.6 1.2"'
+            parts.append(
+                f'<ellipse cx="{cx:.3f}" cy="{cy:.3f}" rx="{a:.3f}" ry="{b:.3f}" '
+                f'transform="rotate({turn:.3f} {cx:.3f} {cy:.3f})" stroke-width=".45"{dash}/>'
+            )
+            parts.append(_cross(seen.pupil.centre_px[row] - shift, 2.2, diagonal=name == "found"))
+        for j in np.flatnonzero(seen.glints.ok[row]):
+            parts.append(_cross(seen.glints.xy_px[row, j] - shift, 3.2, diagonal=name == "found"))
+        parts.append("</g>")
+    parts.append("</svg>")
+    return "".join(parts)
+
+
+def _cross(at: Floats, size: float, *, diagonal: bool) -> str:
+    """A cross that leaves its centre open, so that what it marks stays visible."""
+    x, y = at
+    arms = [(1, 0), (-1, 0), (0, 1), (0, -1)]
+    if diagonal:
+        arms = [(0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)]
+    inner = 0.35
+    path = "".join(
+        f"M{x + dx * size * inner:.3f} {y + dy * size * inner:.3f}L{x + dx * size:.3f} {y + dy * size:.3f}"
+        for dx, dy in arms
+    )
+    return f'<path d="{path}" stroke-width=".5"/>'
+
+
+def _png(image: NDArray[np.uint8]) -> str:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="PNG", optimize=True)
+    return base64.b64encode(buffer.getvalue()).decode()

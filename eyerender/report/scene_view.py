@@ -1,0 +1,108 @@
+"""A scene's rig in three dimensions, with the traced rays of one fixation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..analytic.observer import observe
+from ..arrays import Floats
+from ..observation import EYES, Observations
+from ..scene import Scene
+from .style import ANALYTIC, IMAGE, TARGET, figure
+
+_LIGHT, _SIGHT, _SCREEN = "#E69F00", "#CC79A7", "#777777"
+
+
+def scene_view(scene: Scene) -> Any:
+    """A matplotlib figure: eyes, screen with targets, cameras, lights; and for the first fixation of the first head
+    position the lines of sight, and the rays of glint and pupil centre to each camera."""
+    with figure(9.5, 7.5, 1) as (fig, flat):
+        flat.remove()
+        ax = fig.add_subplot(projection="3d")
+        seen = observe(scene)
+        rows = np.flatnonzero((seen.index.head == 0) & (seen.index.fixation == seen.index.fixation[0]))
+        _screen(ax, scene)
+        for k, camera in enumerate(scene.rig.cameras):
+            _camera(ax, scene, k)
+            del camera
+        lights = np.array([light.position_mm for light in scene.rig.lights])
+        ax.scatter(*lights.T, color=_LIGHT, s=40, depthshade=False, label="infrared LED")
+        for n, row in enumerate(rows):
+            _eye(ax, scene, seen, int(row), first=n == 0)
+        _equal(ax)
+        ax.set(xlabel="x, to the screen (mm)", ylabel="y, to the subject's left (mm)", zlabel="z, up (mm)")
+        ax.view_init(elev=22, azim=-128)
+        fig.legend(loc="outside lower center", ncols=4, frameon=False)
+        fig.suptitle(scene.name)
+        return fig
+
+
+def _screen(ax: Any, scene: Scene) -> None:
+    screen = scene.rig.screen
+    targets = scene.targets_mm
+    if screen is not None:
+        w, h = screen.size_mm
+        corners = screen.world(np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * [w / 2, h / 2])
+        ax.plot(*corners.T, color=_SCREEN, lw=1.6, label="screen")
+    if targets is not None:
+        ax.scatter(*targets.T, color=TARGET, s=9, marker="+", depthshade=False, label="target")
+
+
+def _camera(ax: Any, scene: Scene, number: int) -> None:
+    """The pyramid of a camera's field, to an eighth of its distance to the eyes."""
+    camera = scene.rig.cameras[number]
+    w, h = camera.resolution_px
+    edge = np.array([[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]])
+    origin = camera.nodal_point_mm
+    rays = camera.rays(edge)
+    depth = float(np.linalg.norm(origin)) / 8
+    ends = origin + depth * rays / (rays @ camera.axis)[:, None]
+    ax.plot(*np.vstack([ends, ends[:1]]).T, color=ANALYTIC, lw=1.0)
+    for end in ends:
+        ax.plot(*np.stack([origin, end]).T, color=ANALYTIC, lw=1.0)
+    ax.scatter(*origin, color=ANALYTIC, s=36, depthshade=False, label="camera" if number == 0 else None)
+
+
+def _eye(ax: Any, scene: Scene, seen: Observations, row: int, *, first: bool) -> None:
+    """Globe, line of sight, and the rays from the cornea to the camera: exactly those of the image points."""
+    index = seen.index
+    side = EYES[index.eye[row]]
+    eye = scene.eye(side)
+    apex = index.eye_position_mm[row] + index.head_mm[row]
+    centre = apex + eye.sclera.centre_mm
+    u, v = np.mgrid[0 : 2 * np.pi : 25j, 0 : np.pi : 13j]
+    globe = centre[:, None, None] + eye.sclera.radius_mm * np.stack([np.cos(v), np.sin(v) * np.cos(u), np.sin(v) * np.sin(u)])
+    ax.plot_wireframe(*globe, color="#bbbbbb", lw=0.35)
+    target = index.target_mm[row]
+    if np.isfinite(target).all():
+        ax.plot(*np.stack([apex, target]).T, color=_SIGHT, lw=1.4, label="line of sight" if first else None)
+    camera = scene.rig.cameras[int(index.camera[row])]
+    if seen.pupil.ok[row]:
+        _ray(ax, camera.nodal_point_mm, camera.rays(seen.pupil.centre_px[row]), apex, "-", ANALYTIC, "pupil's ray" if first else None)
+    for j in np.flatnonzero(seen.glints.ok[row]):
+        hit = _ray(
+            ax,
+            camera.nodal_point_mm,
+            camera.rays(seen.glints.xy_px[row, j]),
+            apex,
+            "--",
+            IMAGE,
+            "light to glint to camera" if first and j == 0 else None,
+        )
+        light = scene.rig.lights[int(seen.glints.light[row, j])].position_mm
+        ax.plot(*np.stack([light, hit]).T, color=IMAGE, lw=1.0, ls="--")
+
+
+def _ray(ax: Any, origin: Floats, direction: Floats, apex: Floats, style: str, colour: str, name: str | None) -> Floats:
+    """A camera's ray up to the plane of the eye's apex across it; returns its end."""
+    end = origin + direction * float((apex - origin) @ direction)
+    ax.plot(*np.stack([origin, end]).T, color=colour, lw=1.0, ls=style, label=name)
+    return np.asarray(end)
+
+
+def _equal(ax: Any) -> None:
+    """The same scale along all three axes."""
+    spans = np.array([ax.get_xlim3d(), ax.get_ylim3d(), ax.get_zlim3d()])
+    ax.set_box_aspect(np.maximum(spans[:, 1] - spans[:, 0], 1.0))

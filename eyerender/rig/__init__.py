@@ -1,0 +1,1 @@
+"""The eye tracker's hardware: cameras, lights, screen, sensor."""

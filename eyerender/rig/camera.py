@@ -1,0 +1,262 @@
+"""Pinhole cameras in OpenCV's convention, with lens distortion.
+
+    x_cam = R x_world + t,   x' = x/z, y' = y/z,   (x'', y'') = distorted (x', y'),   u = fx x'' + cx, v = fy y'' + cy
+
+z forward, x right, y down; pixel centres at integers. At rest (no pan, tilt, roll) a camera looks along -x, towards the
+subject, with +z up in the image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field, model_validator
+
+from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..spec import Positive, Spec, Vec2, Vec3
+
+Matrix3 = tuple[Vec3, Vec3, Vec3]
+Distortion = tuple[float, float, float, float, float]
+Pixels = Annotated[int, Field(gt=0, le=65536)]
+
+# Columns: the camera's right, down and forward axes at rest, in the world (x to the screen, y to the left, z up).
+_REST = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+class CalibrationSpec(Spec):
+    """A camera as OpenCV calibrates it: x_cam = R x_world + t."""
+
+    K: Matrix3 = Field(description="camera matrix, px")
+    R: Matrix3 = Field(description="rotation, world to camera")
+    t_mm: Vec3 = Field(description="translation, world to camera")
+    distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description="k1, k2, p1, p2, k3")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        R = np.array(self.R)
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+            raise ValueError("R must be a rotation matrix")
+        K = np.array(self.K)
+        if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or K[2, 2] != 1 or K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise ValueError("K must be upper triangular with positive focal lengths and K[2][2] = 1")
+        if K[0, 1] != 0:
+            raise ValueError("K has a skew term, which OpenCV's camera model does not know")
+        return self
+
+
+class CameraSpec(Spec):
+    """A camera: by place, direction and focal length, or by `calibration`."""
+
+    name: str = "camera"
+    resolution_px: tuple[Pixels, Pixels] = Field(description="sensor width and height")
+    position_mm: Vec3 | None = Field(default=None, description="nodal point in the world")
+    look_at_mm: Vec3 | None = Field(default=None, description="world point on the optical axis")
+    pan_deg: float | None = Field(default=None, description="to the subject's left of -x")
+    tilt_deg: float | None = Field(default=None, description="upwards from -x")
+    roll_deg: float = Field(default=0.0, description="the image's content turns counter-clockwise for positive roll")
+    focal_length_px: Positive | None = None
+    focal_length_mm: Positive | None = None
+    sensor_mm: tuple[Positive, Positive] | None = Field(default=None, description="sensor width and height")
+    principal_point_px: Vec2 | None = Field(default=None, description="default: the centre of the sensor")
+    distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description="k1, k2, p1, p2, k3 (OpenCV)")
+    calibration: CalibrationSpec | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        placed = {
+            k
+            for k in (
+                "position_mm",
+                "look_at_mm",
+                "pan_deg",
+                "tilt_deg",
+                "focal_length_px",
+                "focal_length_mm",
+                "sensor_mm",
+                "principal_point_px",
+            )
+            if getattr(self, k) is not None
+        }
+        if self.calibration is not None:
+            if placed or self.roll_deg != 0 or any(self.distortion):
+                raise ValueError("calibration gives place, direction and lens; leave out the other keys")
+            return self
+        if self.position_mm is None:
+            raise ValueError("give position_mm (or a calibration)")
+        if self.look_at_mm is not None and (self.pan_deg is not None or self.tilt_deg is not None):
+            raise ValueError("give look_at_mm or pan_deg and tilt_deg, not both")
+        if self.look_at_mm is not None and np.allclose(self.look_at_mm, self.position_mm, atol=1e-6):
+            raise ValueError("look_at_mm is the camera's own position")
+        if (self.focal_length_px is None) == (self.focal_length_mm is None):
+            raise ValueError("give either focal_length_px or focal_length_mm with sensor_mm")
+        if (self.focal_length_mm is None) != (self.sensor_mm is None):
+            raise ValueError("focal_length_mm and sensor_mm belong together")
+        return self
+
+    def build(self) -> Camera:
+        """The numeric camera."""
+        if self.calibration is not None:
+            c = self.calibration
+            return Camera.of(c.K, c.R, c.t_mm, self.resolution_px, c.distortion, self.name)
+        width, height = self.resolution_px
+        if self.focal_length_px is not None:
+            fx = fy = self.focal_length_px
+        else:
+            assert self.focal_length_mm is not None and self.sensor_mm is not None
+            fx = self.focal_length_mm * width / self.sensor_mm[0]
+            fy = self.focal_length_mm * height / self.sensor_mm[1]
+        cx, cy = self.principal_point_px or ((width - 1) / 2, (height - 1) / 2)
+        position = np.array(self.position_mm, dtype=float)
+        if self.look_at_mm is not None:
+            axes = _facing(np.array(self.look_at_mm, dtype=float) - position)
+        else:
+            axes = _turned(np.radians(self.pan_deg or 0.0), np.radians(self.tilt_deg or 0.0))
+        roll = np.radians(self.roll_deg)
+        turn = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1.0]])
+        R = (axes @ turn).T
+        K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+        return Camera.of(K, R, -R @ position, self.resolution_px, self.distortion, self.name)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera(ArrayValue):
+    """A pinhole camera: K (3, 3) px, R (3, 3), t (3,) mm, distortion (k1, k2, p1, p2, k3), resolution (w, h) px."""
+
+    K: Floats
+    R: Floats
+    t: Floats
+    distortion: Floats
+    resolution_px: tuple[int, int]
+    name: str
+
+    @classmethod
+    def of(
+        cls,
+        K: ArrayLike,
+        R: ArrayLike,
+        t: ArrayLike,
+        resolution_px: tuple[int, int],
+        distortion: ArrayLike = (0, 0, 0, 0, 0),
+        name: str = "camera",
+    ) -> Camera:
+        """A camera from anything array-like."""
+        return cls(frozen(K), frozen(R), frozen(t), frozen(distortion), resolution_px, name)
+
+    @property
+    def nodal_point_mm(self) -> Floats:
+        """The centre of projection in the world, (3,) mm: -R^T t."""
+        return -self.R.T @ self.t
+
+    @property
+    def axis(self) -> Floats:
+        """The optical axis, a unit vector (3,) in the world."""
+        return self.R[2].copy()
+
+    def project(self, points_mm: ArrayLike) -> tuple[Floats, Bools]:
+        """Image points of world points.
+
+        Args:
+            points_mm: (..., 3) mm, world.
+
+        Returns:
+            pixels (..., 2), NaN behind the camera; and whether the point lies in front of it (...).
+        """
+        cam = np.asarray(points_mm, dtype=float) @ self.R.T + self.t
+        front = cam[..., 2] > 0
+        z = np.where(front, cam[..., 2], np.nan)
+        return self.pixels_of(cam[..., 0] / z, cam[..., 1] / z), front
+
+    def pixels_of(self, x: Floats, y: Floats) -> Floats:
+        """Pixels (..., 2) of undistorted normalised coordinates x = X/Z, y = Y/Z."""
+        if np.any(self.distortion):
+            x, y = distort(x, y, self.distortion)
+        return np.stack([self.K[0, 0] * x + self.K[0, 2], self.K[1, 1] * y + self.K[1, 2]], axis=-1)
+
+    def scale_at(self, point_mm: ArrayLike) -> float:
+        """Pixels per mm across the line of sight at a world point (3,): focal length over distance."""
+        distance = float(np.linalg.norm(np.asarray(point_mm, dtype=float) - self.nodal_point_mm))
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1])) / distance
+
+    def rays(self, pixels: ArrayLike) -> Floats:
+        """Unit directions (..., 3) in the world in which the camera sees the pixels (..., 2)."""
+        p = np.asarray(pixels, dtype=float)
+        x = (p[..., 0] - self.K[0, 2]) / self.K[0, 0]
+        y = (p[..., 1] - self.K[1, 2]) / self.K[1, 1]
+        if np.any(self.distortion):
+            x, y = undistort(x, y, self.distortion)
+        d = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.R
+        return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
+
+    def ideal(self, pixels: ArrayLike) -> Floats:
+        """Where pixels (..., 2) would lie without lens distortion."""
+        p = np.asarray(pixels, dtype=float)
+        if not np.any(self.distortion):
+            return p
+        (cx, cy), (fx, fy) = self.K[:2, 2], (self.K[0, 0], self.K[1, 1])
+        x, y = undistort((p[..., 0] - cx) / fx, (p[..., 1] - cy) / fy, self.distortion)
+        return np.stack([fx * x + cx, fy * y + cy], axis=-1)
+
+    def in_image(self, pixels: ArrayLike) -> Bools:
+        """Whether pixels (..., 2) lie on the sensor, whose outer pixels' far edges are at -0.5 and W - 0.5."""
+        p = np.asarray(pixels, dtype=float)
+        w, h = self.resolution_px
+        return np.asarray((p[..., 0] >= -0.5) & (p[..., 0] <= w - 0.5) & (p[..., 1] >= -0.5) & (p[..., 1] <= h - 0.5))
+
+
+def distort(x: Floats, y: Floats, k: Floats) -> tuple[Floats, Floats]:
+    """Brown & Conrady's distortion as OpenCV writes it, in float64.
+
+    x'' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and alike for y
+    """
+    k1, k2, p1, p2, k3 = k
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def undistort(xd: Floats, yd: Floats, k: Floats, iterations: int = 50) -> tuple[Floats, Floats]:
+    """The inverse of `distort` by Newton's method on its exact Jacobian; NaN where it does not converge."""
+    k1, k2, p1, p2, k3 = k
+    x, y = xd.copy(), yd.copy()
+    for _ in range(iterations):
+        fx, fy = distort(x, y, k)
+        ex, ey = fx - xd, fy - yd
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
+        a = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+        b = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+        d = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+        det = a * d - b * b
+        dx, dy = (d * ex - b * ey) / det, (a * ey - b * ex) / det
+        x, y = x - dx, y - dy
+        if np.nanmax(np.hypot(dx, dy), initial=0.0) < 1e-15:
+            break
+    fx, fy = distort(x, y, k)
+    bad = ~(np.hypot(fx - xd, fy - yd) < 1e-12)
+    return np.where(bad, np.nan, x), np.where(bad, np.nan, y)
+
+
+def _turned(pan: float, tilt: float) -> Floats:
+    """Camera axes as columns: tilted up about its right axis, then panned about the world's vertical."""
+    ct, st, cp, sp = np.cos(tilt), np.sin(tilt), np.cos(pan), np.sin(pan)
+    about_right = np.array([[1.0, 0, 0], [0, ct, -st], [0, st, ct]])
+    # The rest direction is -x; to the subject's left (+y) of it is a negative turn about +z.
+    about_up = np.array([[cp, sp, 0], [-sp, cp, 0], [0, 0, 1.0]])
+    return np.asarray(about_up @ _REST @ about_right)
+
+
+def _facing(direction: Floats) -> Floats:
+    """Camera axes as columns, looking along `direction` with the world's z upright (the world's y, looking along z)."""
+    forward = direction / np.linalg.norm(direction)
+    up = np.array([0.0, 0, 1.0]) if abs(forward[2]) < 1 - 1e-9 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    return np.stack([right, down, forward], axis=1)

@@ -1,0 +1,79 @@
+"""Infrared LEDs: where they stand, how large they are and how they radiate.
+
+Radiant intensity in direction w: I(w) = I0 max(0, cos(angle to the axis))^m (m = 0: the same everywhere).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from ..arrays import ArrayValue, Floats, frozen
+from ..spec import NonNegative, Positive, Spec, Vec3
+from .camera import Camera
+
+
+class RingSpec(Spec):
+    """LEDs evenly spaced on a circle about a camera's axis, in the plane of its nodal point."""
+
+    camera: Annotated[int, Field(ge=0)] = Field(default=0, description="which camera the ring surrounds")
+    radius_mm: Positive = Field(description="radius of the circle")
+    count: Annotated[int, Field(ge=1, le=1000)]
+    phase_deg: float = Field(default=0.0, description="of the first LED, from the image's right towards its bottom")
+
+
+class LightSpec(Spec):
+    """One LED at `position_mm`, or a `ring` of equal ones."""
+
+    position_mm: Vec3 | None = None
+    ring: RingSpec | None = None
+    radius_mm: NonNegative = Field(default=0.0, description="radius of the emitting disc; 0 is a point")
+    aim_mm: Vec3 = Field(default=(0, 0, 0), description="world point its axis goes through")
+    intensity_mw_sr: Positive = Field(default=20.0, description="radiant intensity on the axis")
+    lobe_exponent: NonNegative = Field(default=1.0, description="m of cos^m; 1 is Lambertian, 0 isotropic")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.position_mm is None) == (self.ring is None):
+            raise ValueError("give either position_mm or ring")
+        if self.position_mm is not None and np.allclose(self.position_mm, self.aim_mm, atol=1e-6):
+            raise ValueError("aim_mm is the light's own position")
+        return self
+
+    def build(self, cameras: tuple[Camera, ...]) -> tuple[Light, ...]:
+        """The numeric lights of this entry."""
+        if self.position_mm is not None:
+            places = [np.array(self.position_mm, dtype=float)]
+        else:
+            assert self.ring is not None
+            camera = cameras[self.ring.camera]
+            angles = np.radians(self.ring.phase_deg) + 2 * np.pi * np.arange(self.ring.count) / self.ring.count
+            places = [
+                camera.nodal_point_mm + self.ring.radius_mm * (np.cos(a) * camera.R[0] + np.sin(a) * camera.R[1])
+                for a in angles
+            ]
+        aim = np.array(self.aim_mm, dtype=float)
+        return tuple(
+            Light(
+                frozen(p),
+                frozen((aim - p) / np.linalg.norm(aim - p)),
+                self.radius_mm,
+                self.intensity_mw_sr,
+                self.lobe_exponent,
+            )
+            for p in places
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Light(ArrayValue):
+    """An LED: position (3,) mm and axis (3,), a unit vector, in the world."""
+
+    position_mm: Floats
+    axis: Floats
+    radius_mm: float
+    intensity_mw_sr: float
+    lobe_exponent: float

@@ -1,0 +1,44 @@
+"""The rig: cameras, lights and screen together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from ..arrays import ArrayValue
+from ..spec import Spec
+from .camera import Camera, CameraSpec
+from .light import Light, LightSpec
+from .screen import Screen, ScreenSpec
+
+
+class RigSpec(Spec):
+    """What stands before the subject; it does not move with the head."""
+
+    cameras: Annotated[tuple[CameraSpec, ...], Field(min_length=1)]
+    lights: Annotated[tuple[LightSpec, ...], Field(min_length=1)]
+    screen: ScreenSpec | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for i, light in enumerate(self.lights):
+            if light.ring is not None and light.ring.camera >= len(self.cameras):
+                raise ValueError(f"lights.{i}.ring.camera: there is no camera {light.ring.camera}")
+        return self
+
+    def build(self) -> Rig:
+        """The numeric rig."""
+        cameras = tuple(camera.build() for camera in self.cameras)
+        lights = tuple(light for spec in self.lights for light in spec.build(cameras))
+        return Rig(cameras, lights, self.screen.build() if self.screen else None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rig(ArrayValue):
+    """Cameras, lights and, where there is one, the screen."""
+
+    cameras: tuple[Camera, ...]
+    lights: tuple[Light, ...]
+    screen: Screen | None

@@ -1,0 +1,68 @@
+"""The screen the subject looks at: a rectangle facing the subject."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..spec import Positive, Spec, Vec3
+
+
+class ScreenSpec(Spec):
+    """A screen by its centre and size."""
+
+    centre_mm: Vec3
+    size_mm: tuple[Positive, Positive] = Field(description="width and height")
+    tilt_deg: float = Field(default=0.0, gt=-90, lt=90, description="its face turned upwards from facing -x")
+
+    def build(self) -> Screen:
+        """The numeric screen."""
+        a = np.radians(self.tilt_deg)
+        return Screen(
+            frozen(self.centre_mm),
+            # As the subject sees it: +y is to the left, so the screen's right is -y.
+            frozen([0.0, -1.0, 0.0]),
+            frozen([np.sin(a), 0.0, np.cos(a)]),
+            self.size_mm,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Screen(ArrayValue):
+    """Centre (3,) mm, unit vectors to the subject's right and up along the screen, size (w, h) mm."""
+
+    centre_mm: Floats
+    right: Floats
+    up: Floats
+    size_mm: tuple[float, float]
+
+    @property
+    def normal(self) -> Floats:
+        """Unit vector (3,) from the screen towards the subject."""
+        return np.cross(self.up, self.right) * -1.0
+
+    def world(self, on_screen_mm: ArrayLike) -> Floats:
+        """World points (..., 3) of screen points (..., 2): mm to the subject's right of and above the centre."""
+        p = np.asarray(on_screen_mm, dtype=float)
+        return np.asarray(self.centre_mm + p[..., :1] * self.right + p[..., 1:] * self.up)
+
+    def grid(self, columns: int, rows: int) -> Floats:
+        """Targets (columns * rows, 3) out to the screen's edges, from the subject's left, each column from the top."""
+        w, h = self.size_mm
+        u = np.linspace(-w / 2, w / 2, columns) if columns > 1 else np.zeros(1)
+        v = np.linspace(h / 2, -h / 2, rows) if rows > 1 else np.zeros(1)
+        return self.world(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
+
+    def intersect(self, origin_mm: ArrayLike, direction: ArrayLike) -> tuple[Floats, Bools]:
+        """Where rays meet the screen's plane: screen points (..., 2) mm, and whether they do so forwards (...)."""
+        o, d = np.asarray(origin_mm, dtype=float), np.asarray(direction, dtype=float)
+        along = d @ self.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = ((self.centre_mm - o) @ self.normal) / along
+            p = o + t[..., None] * d - self.centre_mm
+        ok = np.isfinite(t) & (t > 0)
+        return np.where(ok[..., None], np.stack([p @ self.right, p @ self.up], axis=-1), np.nan), ok

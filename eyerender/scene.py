@@ -1,0 +1,327 @@
+"""A scene: one subject, one rig, what is looked at; and the frames that come of it.
+
+Frames are ordered by head position, then fixation, then camera; within a frame the right eye comes first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from .arrays import ArrayValue, Floats, Ints, frozen
+from .errors import InputError
+from .eye.catalogue import load_eye
+from .eye.model import Eye
+from .eye.spec import EyeSpec
+from .observation import EYES, Index
+from .region.look import LookSpec
+from .rig.rig import Rig, RigSpec
+from .rig.sensor import SensorSpec
+from .spec import FileSpec, NonNegative, Positive, Spec, Vec2, Vec3
+
+Count = Annotated[int, Field(ge=1, le=1000)]
+
+
+class EyeChoiceSpec(Spec):
+    """Which eye looks, and how."""
+
+    model: str = Field(default="E2", description="a name of the catalogue, or an eye file (relative to the scene)")
+    pupil_diameter_mm: Positive | None = Field(default=None, description="of the anatomical pupil; default: the eye's")
+    line_of_sight: Literal["chief_ray", "entrance_window"] = "chief_ray"
+
+
+class SubjectSpec(Spec):
+    """Which eyes are there, how far apart, and where the head stands."""
+
+    eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = ("right", "left")
+    ipd_mm: Positive = Field(default=63.0, description="interpupillary distance")
+    head_positions_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] = ((0.0, 0.0, 0.0),)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(set(self.eyes)) != len(self.eyes):
+            raise ValueError("eyes: each eye once")
+        return self
+
+
+class TargetsSpec(Spec):
+    """What is fixated: a grid out to the screen's edges, points on the screen, or points in the world."""
+
+    grid: tuple[Count, Count] | None = Field(default=None, description="columns and rows")
+    screen_mm: Annotated[tuple[Vec2, ...], Field(min_length=1)] | None = Field(
+        default=None, description="points to the subject's right of and above the screen's centre"
+    )
+    world_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if sum(v is not None for v in (self.grid, self.screen_mm, self.world_mm)) != 1:
+            raise ValueError("give exactly one of grid, screen_mm, world_mm")
+        return self
+
+
+class PoseSpec(Spec):
+    """An eye's direction without a target: of the optic axis; torsion follows Listing's law."""
+
+    azimuth_deg: Annotated[float, Field(gt=-90, lt=90)]
+    elevation_deg: Annotated[float, Field(gt=-90, lt=90)]
+
+
+class ImageSpec(Spec):
+    """What part of the sensor is rendered, and how finely."""
+
+    window_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = Field(
+        default=None, description="width and height of one window per eye, centred on it; default: the whole sensor"
+    )
+    spp: Annotated[int, Field(ge=1, le=65536)] = Field(default=16, description="samples per pixel")
+
+
+class SceneSpec(FileSpec):
+    """A scene file."""
+
+    name: Annotated[str, Field(min_length=1)]
+    description: str = ""
+    eye: EyeChoiceSpec = EyeChoiceSpec()
+    subject: SubjectSpec = SubjectSpec()
+    rig: RigSpec
+    targets: TargetsSpec | None = None
+    poses: Annotated[tuple[PoseSpec, ...], Field(min_length=1)] | None = None
+    wavelength_nm: Annotated[float, Field(ge=350, le=1100)] = 850.0
+    image: ImageSpec = ImageSpec()
+    sensor: SensorSpec = SensorSpec()
+    look: LookSpec = LookSpec()
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.targets is None) == (self.poses is None):
+            raise ValueError("give either targets or poses")
+        if self.targets is not None and self.targets.world_mm is None and self.rig.screen is None:
+            raise ValueError("targets on a screen need rig.screen")
+        if self.image.window_px is not None:
+            for i, camera in enumerate(self.rig.cameras):
+                if any(w > r for w, r in zip(self.image.window_px, camera.resolution_px, strict=True)):
+                    raise ValueError(f"image.window_px: is larger than the sensor of rig.cameras.{i}")
+        return self
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames(ArrayValue):
+    """The observations that a scene asks for: `index` (n), and the wanted poses where there are no targets.
+
+    `direction_rad` (n, 2): azimuth and elevation of the optic axis, NaN where a target is fixated.
+    """
+
+    index: Index
+    direction_rad: Floats
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A scene ready to be observed: the spec, the eye's spec and the numeric rig."""
+
+    spec: SceneSpec
+    eye_spec: EyeSpec
+    rig: Rig
+
+    @classmethod
+    def of(cls, spec: SceneSpec, *, base: Path | None = None, eye: str | None = None, source: str = "") -> Scene:
+        """Compile a spec. `base` is the folder that eye files are relative to, `eye` replaces the scene's model."""
+        name = eye if eye is not None else spec.eye.model
+        if eye is None and base is not None and name.endswith((".yaml", ".yml")):
+            name = str(base / name)
+        if eye is not None:
+            spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": eye})})
+        eye_spec = load_eye(name)
+        scene = cls(spec, eye_spec, spec.rig.build())
+        try:
+            scene.eye("right")
+        except InputError as error:
+            raise InputError(error.reason, source=error.source or source, path=error.path) from None
+        return scene
+
+    @property
+    def name(self) -> str:
+        """The scene's name."""
+        return self.spec.name
+
+    @property
+    def pupil_diameter_mm(self) -> float:
+        """Diameter of the anatomical pupil: the scene's, or the eye's own."""
+        return float(2 * self.eye("right").stop.semi_axes_mm[0])
+
+    def digest(self) -> str:
+        """SHA-256 of everything the scene's images depend on, the eye file's content included."""
+        both = self.spec.digest() + self.eye_spec.digest()
+        return hashlib.sha256(both.encode()).hexdigest()
+
+    def eye(self, side: Literal["right", "left"] | str) -> Eye:
+        """The numeric eye of one side at the scene's wavelength and pupil size."""
+        return self.eye_spec.build(
+            eye="left" if side == "left" else "right",
+            wavelength_nm=self.spec.wavelength_nm,
+            pupil_diameter_mm=self.spec.eye.pupil_diameter_mm,
+        )
+
+    def eye_position_mm(self, side: str) -> Floats:
+        """Apex of the unrotated eye in the world, (3,) mm, head at its reference position."""
+        return np.array([0.0, self.spec.subject.ipd_mm / 2 * (1 if side == "left" else -1), 0.0])
+
+    @property
+    def targets_mm(self) -> Floats | None:
+        """Targets (f, 3) in the world, in fixation order; None where the scene gives poses."""
+        targets, screen = self.spec.targets, self.rig.screen
+        if targets is None:
+            return None
+        if targets.world_mm is not None:
+            return np.array(targets.world_mm, dtype=float)
+        if screen is None:
+            raise InputError("targets on a screen need rig.screen")
+        if targets.grid is not None:
+            return screen.grid(*targets.grid)
+        return screen.world(np.array(targets.screen_mm, dtype=float))
+
+    def frames(self) -> Frames:
+        """Every (frame, eye) of the scene."""
+        spec = self.spec
+        targets = self.targets_mm
+        fixations = len(targets) if targets is not None else len(spec.poses or ())
+        heads = np.array(spec.subject.head_positions_mm, dtype=float)
+        sides = np.array(sorted(EYES.index(e) for e in spec.subject.eyes))
+        cameras = len(self.rig.cameras)
+        head, fixation, camera, side = (
+            a.ravel()
+            for a in np.meshgrid(
+                np.arange(len(heads)), np.arange(fixations), np.arange(cameras), np.arange(len(sides)), indexing="ij"
+            )
+        )
+        n = len(head)
+        eye = sides[side]
+        directions = np.full((n, 2), np.nan)
+        if targets is None:
+            wanted = np.radians([[p.azimuth_deg, p.elevation_deg] for p in spec.poses or ()])
+            directions = wanted[fixation]
+        model = np.empty(n, dtype=object)
+        model[:] = self.eye_spec.name
+        index = Index(
+            frozen((head * fixations + fixation) * cameras + camera, np.int64),
+            frozen(fixation, np.int64),
+            frozen(camera, np.int64),
+            frozen(head, np.int64),
+            frozen(eye, np.int64),
+            frozen(model, object),
+            frozen(targets[fixation] if targets is not None else np.full((n, 3), np.nan)),
+            frozen(heads[head]),
+            frozen(np.stack([self.eye_position_mm(EYES[e]) for e in (0, 1)])[eye]),
+        )
+        return Frames(index, frozen(directions))
+
+    def windows(self) -> dict[tuple[int, int, int], tuple[int, int, int, int]]:
+        """The rendered window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.
+
+        A window is centred on the image of the unrotated eye's apex, so it does not move with the gaze; it is kept on
+        the sensor. Without `image.window_px` it is the whole sensor.
+        """
+        out = {}
+        for c, camera in enumerate(self.rig.cameras):
+            w, h = camera.resolution_px
+            for k, head in enumerate(self.spec.subject.head_positions_mm):
+                for side in self.spec.subject.eyes:
+                    out[c, k, EYES.index(side)] = (0, 0, w, h)
+                    if self.spec.image.window_px is None:
+                        continue
+                    (u, v), front = camera.project(self.eye_position_mm(side) + np.array(head))
+                    ww, wh = self.spec.image.window_px
+                    x0 = int(np.floor((u if front else (w - 1) / 2) - (ww - 1) / 2 + 0.5))
+                    y0 = int(np.floor((v if front else (h - 1) / 2) - (wh - 1) / 2 + 0.5))
+                    out[c, k, EYES.index(side)] = (min(max(x0, 0), w - ww), min(max(y0, 0), h - wh), ww, wh)
+        return out
+
+    def rig_mapping(self) -> dict[str, Any]:
+        """The rig as `features --json` writes it (CONTRACTS)."""
+        screen = self.rig.screen
+        return {
+            "cameras": [
+                {
+                    "K": c.K.tolist(),
+                    "R": c.R.tolist(),
+                    "t": c.t.tolist(),
+                    "distortion": c.distortion.tolist(),
+                    "resolution_px": list(c.resolution_px),
+                }
+                for c in self.rig.cameras
+            ],
+            "lights_mm": [light.position_mm.tolist() for light in self.rig.lights],
+            "screen": None
+            if screen is None
+            else {
+                "centre_mm": screen.centre_mm.tolist(),
+                "size_mm": list(screen.size_mm),
+                "right": screen.right.tolist(),
+                "up": screen.up.tolist(),
+            },
+        }
+
+
+def shipped_scenes() -> dict[str, Path]:
+    """Name -> file of the scenes that come with the package."""
+    package = Path(__file__).resolve().parent
+    for folder in (package / "data" / "scenes", package.parent / "scenes"):
+        if folder.is_dir():
+            return {p.stem: p for p in sorted(folder.glob("*.yaml"))}
+    return {}
+
+
+def load_scene(
+    scene: str | Path, *, eye: str | None = None, spp: int | None = None, seed: int | None = None
+) -> Scene:
+    """A scene from a file, or by the bare name of a shipped one.
+
+    Args:
+        scene: path of a YAML file, or a shipped scene's name.
+        eye: replaces the scene's eye model (a catalogue name or an eye file).
+        spp: replaces the samples per pixel.
+        seed: replaces the seed.
+
+    Raises:
+        InputError: one line that names the file and the key.
+    """
+    path = Path(scene)
+    shipped = shipped_scenes()
+    if str(scene) in shipped and not path.is_file():
+        path = shipped[str(scene)]
+    elif path.suffix not in (".yaml", ".yml") and not path.exists():
+        raise InputError(f"no such scene file; shipped scenes: {', '.join(shipped)}", source=str(scene))
+    spec = SceneSpec.load(path)
+    if spp is not None or seed is not None:
+        data = spec.to_mapping()
+        if spp is not None:
+            data["image"]["spp"] = spp
+        if seed is not None:
+            data["seed"] = seed
+        spec = SceneSpec.from_mapping(data, source=str(path))
+    return Scene.of(spec, base=path.parent, eye=eye, source=str(path))
+
+
+def eye_of(index: Index, row: int) -> str:
+    """'right' or 'left' of one observation."""
+    return EYES[int(index.eye[row])]
+
+
+def observations_by_view(index: Index) -> dict[tuple[int, int], Ints]:
+    """Rows of each (camera, eye): what can be computed in one call."""
+    out: dict[tuple[int, int], Ints] = {}
+    for camera in np.unique(index.camera):
+        for eye in np.unique(index.eye):
+            rows = np.flatnonzero((index.camera == camera) & (index.eye == eye))
+            if len(rows):
+                out[int(camera), int(eye)] = rows
+    return out

@@ -1,0 +1,169 @@
+"""The strict, frozen base of everything a person writes: load, dump, digest, JSON Schema.
+
+A file carries `format: 1`. Unknown keys, wrong types and non-finite numbers are refused with the dotted path of the key
+(`lights.1.radius_mm: must be > 0`). YAML is loaded by the safe loader; nothing in a spec is executed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from .errors import InputError
+
+FORMAT = 1
+
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+
+
+class Spec(BaseModel):
+    """Base of every authored record: frozen, strict, unknown keys and non-finite numbers refused."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+    @classmethod
+    def from_mapping(cls, data: object, *, source: str = "") -> Self:
+        """Validate a plain mapping; raises `InputError` naming `source` and the path of the first bad key."""
+        if not isinstance(data, Mapping):
+            raise InputError("must be a mapping of keys to values", source=source)
+        try:
+            # Through JSON, because pydantic's strict mode takes a list for a tuple there and nowhere else.
+            return cls.model_validate_json(json.dumps(data))
+        except (TypeError, ValueError) as error:
+            if not isinstance(error, ValidationError):
+                raise InputError(f"holds a value that is no number, text or list ({error})", source=source) from None
+            path, reason = _first_problem(error)
+            raise InputError(reason, source=source, path=path) from None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The plain mapping that `from_mapping` reads back as an equal object."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    def digest(self) -> str:
+        """SHA-256 of the canonical JSON: equal specs have equal digests on every machine."""
+        text = json.dumps(self.to_mapping(), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @classmethod
+    def json_schema(cls) -> dict[str, Any]:
+        """JSON Schema (2020-12) for editors."""
+        schema = cls.model_json_schema()
+        return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+class FileSpec(Spec):
+    """A spec that is a YAML file of its own, with `format: 1`."""
+
+    format: int = Field(default=FORMAT, description="version of this file format")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a YAML file; raises `InputError` with one line for anything that is wrong with it."""
+        data = read_yaml(path)
+        if "format" not in data:
+            raise InputError(f"missing; write 'format: {FORMAT}'", source=str(path), path="format")
+        if data["format"] != FORMAT or isinstance(data["format"], bool):
+            raise InputError(
+                f"is {data['format']!r}; this version reads format {FORMAT}", source=str(path), path="format"
+            )
+        return cls.from_mapping(data, source=str(path))
+
+    def dump(self, path: str | Path) -> None:
+        """Write as YAML that `load` reads back as an equal object."""
+        Path(path).write_text(self.to_yaml(), encoding="utf-8")
+
+    def to_yaml(self) -> str:
+        """The YAML text of this spec."""
+        return yaml.safe_dump(self.to_mapping(), sort_keys=False, allow_unicode=True, width=100)
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """A YAML file as a mapping, safely loaded; raises `InputError`."""
+    source = str(path)
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError("no such file", source=source) from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise InputError(f"cannot be read ({reason})", source=source) from None
+    try:
+        data = yaml.load(text, Loader=_UniqueKeyLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"line {mark.line + 1}" if mark is not None else ""
+        problem = getattr(error, "problem", None) or str(error).split("\n", 1)[0]
+        raise InputError(f"not valid YAML: {problem}", source=source, path=where) from None
+    except RecursionError:
+        raise InputError("not valid YAML: nested too deeply", source=source) from None
+    if not isinstance(data, dict):
+        raise InputError("must be a YAML mapping of keys to values", source=source)
+    return data
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """The safe loader, but a key written twice is an error instead of a silent override."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            key = (key_node.tag, str(key_node.value))
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key_node.value!r} stands twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+# YAML 1.1 reads 1e-3 as text; everybody means the number.
+_UniqueKeyLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(?:[0-9][0-9_]*)(?:\.[0-9_]*)?[eE][-+]?[0-9]+$"),
+    list("-+0123456789"),
+)
+
+
+def _first_problem(error: ValidationError) -> tuple[str, str]:
+    """(dotted path, reason) of the first problem, in the words of CONTRACTS."""
+    problems = error.errors(include_url=False)
+    # The one deepest in the data tells most: what stands above it is often only its consequence.
+    first = max(problems, key=lambda p: (len(p["loc"]), p["type"] != "missing"))
+    path = ".".join(str(part) for part in first["loc"] if not _is_branch(part))
+    context = first.get("ctx", {})
+    kind = first["type"]
+    if kind == "extra_forbidden":
+        return path, "unknown key"
+    if kind == "missing":
+        return path, "missing"
+    if kind in ("greater_than", "less_than", "greater_than_equal", "less_than_equal"):
+        sign = {"greater_than": ">", "less_than": "<", "greater_than_equal": ">=", "less_than_equal": "<="}[kind]
+        return path, f"must be {sign} {next(iter(context.values())):g}"
+    if kind in ("too_short", "too_long"):
+        bound = context.get("min_length", context.get("max_length"))
+        return path, f"needs at {'least' if kind == 'too_short' else 'most'} {bound} entries"
+    if kind == "finite_number":
+        return path, "must be a finite number"
+    if kind == "value_error":
+        return path, str(context.get("error", first["msg"]))
+    message = first["msg"]
+    message = message.replace("Input should be", "must be")
+    value = first.get("input")
+    if isinstance(value, str | int | float | bool):
+        message += f", not {value!r}"
+    return path, message
+
+
+def _is_branch(part: object) -> bool:
+    """Whether a part of pydantic's location names a union's branch rather than a key of the user's file."""
+    return isinstance(part, str) and ("[" in part or part.endswith("Spec"))

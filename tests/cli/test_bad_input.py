@@ -1,0 +1,179 @@
+"""One table of bad inputs over all commands: each has its exit code and one line, and leaves nothing half-written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from eyerender.cli.app import run
+from eyerender.imagefile import write_png
+from eyerender.scene import shipped_scenes
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder with one of each bad thing, as the current folder."""
+    monkeypatch.chdir(tmp_path)
+    data = yaml.safe_load(shipped_scenes()["quickstart"].read_text(encoding="utf-8"))
+
+    def scene(name, path, value):
+        copy = yaml.safe_load(yaml.safe_dump(data))
+        node = copy
+        *parents, last = path.split(".")
+        for key in parents:
+            node = node[int(key) if key.isdigit() else key]
+        node[last] = value
+        Path(name).write_text(yaml.safe_dump(copy), encoding="utf-8")
+
+    scene("key.yaml", "rig.lights.0.colour", 1)
+    scene("type.yaml", "subject.ipd_mm", "wide")
+    scene("eye.yaml", "eye.model", "E9")
+    scene("pupil.yaml", "eye.pupil_diameter_mm", 14)
+    scene("target.yaml", "targets", {"world_mm": [[-500, 0, 0]]})
+    Path("text.yaml").write_text("format: 1\nname: [", encoding="utf-8")
+    Path("binary.yaml").write_bytes(bytes(range(256)))
+    Path("empty.png").write_bytes(b"")
+    Path("noise.png").write_bytes(np.random.default_rng(0).bytes(400))
+    colour = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    Image.fromarray(colour).save("colour.png")
+    write_png("good.png", np.zeros((64, 64), dtype=np.uint8))
+    Path("hollow").mkdir()
+    Path("taken").mkdir()
+    (Path("taken") / "thesis.txt").write_text("years of work")
+    (Path("file")).write_text("x")
+    return tmp_path
+
+
+TABLE = [
+    # command, exit code, words on stderr
+    (["frobnicate"], 2, 'Unknown command "frobnicate"'),
+    (["features"], 2, "SCENE"),
+    (["features", "nonsense"], 2, "nonsense: no such scene file; shipped scenes: blignaut2014"),
+    (["features", "missing.yaml"], 2, "missing.yaml: no such file"),
+    (["features", "key.yaml"], 2, "key.yaml: rig.lights.0.colour: unknown key"),
+    (["features", "type.yaml"], 2, "type.yaml: subject.ipd_mm: must be a valid number, not 'wide'"),
+    (["features", "eye.yaml"], 2, "E9"),
+    (["features", "pupil.yaml"], 2, "pupil"),
+    (["features", "target.yaml"], 2, "target"),
+    (["features", "text.yaml"], 2, "text.yaml: line 2: not valid YAML"),
+    (["features", "binary.yaml"], 2, "binary.yaml: "),
+    (["features", "."], 2, ".: cannot be read"),
+    (["features", "quickstart", "--eye", "E9"], 2, "E9"),
+    (["features", "quickstart", "--eye", "missing.yaml"], 2, "missing.yaml"),
+    (["features", "quickstart", "--points", "3"], 2, "--points: must be >= 6"),
+    (["features", "quickstart", "--points", "many"], 2, "--points"),
+    (["features", "quickstart", "--json", "no/such/folder/f.json"], 1, "no/such/folder/f.json: cannot be written"),
+    (["features", "quickstart", "--nonsense"], 2, "--nonsense"),
+    (["render", "quickstart"], 2, "--output"),
+    (["render", "missing.yaml", "-o", "out"], 2, "missing.yaml: no such file"),
+    (["render", "quickstart", "-o", "taken"], 2, "taken: is not empty; give another folder or --overwrite"),
+    (["render", "quickstart", "-o", "file"], 2, "file: exists and is not a folder"),
+    (["render", "quickstart", "-o", "out", "--spp", "0"], 2, "image.spp: must be >= 1"),
+    (["render", "quickstart", "-o", "out", "--seed", "-1"], 2, "seed: must be >= 0"),
+    (["render", "quickstart", "-o", "out", "--backend", "opengl"], 2, "--backend"),
+    (["render", "quickstart", "-o", "out", "--threads", "0"], 2, "threads: must be >= 1"),
+    (["quickstart"], 2, "DIR"),
+    (["quickstart", "taken"], 2, "taken: is not empty; give another folder or --overwrite"),
+    (["extract"], 2, "give at least one image"),
+    (["extract", "missing.png"], 2, "missing.png: no such file"),
+    (["extract", "empty.png"], 2, "empty.png: is empty"),
+    (["extract", "noise.png"], 2, "noise.png: is not a readable image"),
+    (["extract", "colour.png"], 2, "colour.png: has colour channels"),
+    (["extract", "hollow"], 2, "hollow: holds no metadata.jsonl"),
+    (["extract", "good.png", "--gamma", "0"], 2, "--gamma: must be between 0.1 and 10"),
+    (["extract", "good.png", "--scene", "nonsense"], 2, "nonsense: no such scene file"),
+    (["extract", "good.png", "missing.png"], 2, "missing.png: no such file"),
+    (["compare", "hollow"], 2, "hollow: holds no metadata.jsonl"),
+    (["compare", "nowhere"], 2, "nowhere: no such folder"),
+    (["compare"], 2, "DIR"),
+    (["schema", "car"], 2, "car"),
+    (["doctor", "extra"], 2, "extra"),
+]
+
+
+@pytest.mark.parametrize(("argv", "code", "words"), TABLE, ids=lambda v: " ".join(v) if isinstance(v, list) else None)
+def test_bad_input(place, capsys, argv, code, words):
+    before = sorted(str(p) for p in place.rglob("*"))
+    assert run(argv) == code
+    out, err = capsys.readouterr()
+    lines = [line for line in err.splitlines() if not line.startswith(("extracting:", "rendering:"))]
+    assert len(lines) == 1, err
+    assert lines[0].startswith("error: ")
+    assert words in lines[0]
+    assert out == ""
+    assert sorted(str(p) for p in place.rglob("*")) == before
+
+
+def test_a_pupil_that_is_not_found_is_a_result(place, capsys):
+    assert run(["extract", "good.png"]) == 0
+    assert "missing" in capsys.readouterr().out
+
+
+def test_debug_shows_the_traceback(place):
+    with pytest.raises(Exception, match="no such scene"):
+        run(["features", "nonsense", "--debug"])
+
+
+def command(*argv, **keys):
+    return subprocess.Popen(
+        [sys.executable, "-m", "eyerender", *argv],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        **keys,
+    )
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_says_so_and_leaves_nothing(place, number):
+    process = command("render", "blignaut2014", "-o", "out")
+    assert process.stderr is not None
+    line = process.stderr.readline()  # the first line of progress: it is at work
+    assert "rendering" in line
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err.splitlines()[-1] == "interrupted"
+    assert "Traceback" not in err
+    assert not Path("out").exists()
+
+
+@pytest.mark.render
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="mounting a tmpfs needs root")
+def test_a_full_disk_ends_with_one_line_and_nothing_written(place):
+    small = place / "small"
+    small.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", small], capture_output=True).returncode != 0:
+        pytest.skip("this machine does not let a tmpfs be mounted")
+    try:
+        process = command("render", "quickstart", "-o", str(small / "out"))
+        out, err = process.communicate(timeout=120)
+        assert process.returncode == 1
+        assert out == ""
+        errors = [line for line in err.splitlines() if line.startswith("error: ")]
+        assert len(errors) == 1
+        assert "No space left on device" in errors[0]
+        assert list(small.iterdir()) == []
+    finally:
+        subprocess.run(["umount", small], check=True)
+
+
+def test_a_closed_pipe_is_no_error():
+    process = command("features", "blignaut2014")
+    assert process.stdout is not None
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.wait(timeout=60) == 0
+    assert process.stderr is not None
+    assert process.stderr.read() == ""

@@ -1,0 +1,28 @@
+"""A renderer for the session."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from eyerender.errors import BackendError
+from eyerender.rendering.backend import choose_backend
+
+if TYPE_CHECKING:
+    from eyerender.rendering.renderer import Renderer
+
+
+@pytest.fixture(scope="session")
+def backend() -> Any:
+    try:
+        return choose_backend("llvm", threads=1)
+    except BackendError as error:
+        pytest.skip(f"nothing to render with: {error}")
+
+
+@pytest.fixture(scope="session")
+def renderer(backend: Any) -> Renderer:
+    from eyerender.rendering.renderer import Renderer
+
+    return Renderer(backend, spp=16)

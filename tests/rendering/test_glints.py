@@ -1,0 +1,143 @@
+"""Glints in rendered images, against solvers and tracers of another kind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from render_rigs import BLACK, MODELS, RIGS, eye_of, head_rig, job_of, remote_rig
+from scipy.optimize import least_squares
+
+from eyerender.rendering.surround import Obstacle
+from eyerender.rig.sensor import SensorSpec
+
+
+def centroid(image: np.ndarray, window: tuple[int, int, int, int]) -> np.ndarray:
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    total = image.sum(dtype=float)
+    return np.array([(image * u).sum(dtype=float) / total + window[0], (image * v).sum(dtype=float) / total + window[1]])
+
+
+def mirror_pixel(eye, job, lamp_mm) -> np.ndarray:
+    """Fermat's principle in float64: the mirror point makes lamp - cornea - nodal point stationary."""
+    surface = eye.front[0]
+    lamp, node = job.M.T @ (lamp_mm - job.t), job.M.T @ (job.camera.nodal_point_mm - job.t)
+
+    def point(q):
+        local = np.array([float(surface.sag(q[0], q[1])), q[0], q[1]])
+        return surface.rotation @ local + surface.origin_mm
+
+    def slope(q):
+        y = point(q)
+        N = surface.normal(y[None])[0]
+        pull = (y - lamp) / np.linalg.norm(y - lamp) + (y - node) / np.linalg.norm(y - node)
+        return pull - (pull @ N) * N
+
+    q = least_squares(slope, [0.5, 0.5], xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    y = point(q)
+    assert np.linalg.norm(slope(q)) < 1e-10
+    return job.camera.project(job.M @ y + job.t)[0], float(np.hypot(*q))
+
+
+@pytest.mark.parametrize("rig_name", RIGS)
+@pytest.mark.parametrize("model", MODELS)
+def test_glint_centroids_of_point_lamps_against_fermat(renderer, model, rig_name):
+    # Pixels are stored in float32: 3e-8 of a spot that is spread over some 40 pixels moves the centroid by < 1e-5 px.
+    rng = np.random.default_rng(len(rig_name) + 10 * MODELS.index(model))
+    rig = RIGS[rig_name](radius_mm=0.0)
+    eye = eye_of(model)
+    checked = 0
+    while checked < 4:
+        pose = (rng.uniform(-25, 25), rng.uniform(-20, 20))
+        lamp = rig.lights[rng.integers(len(rig.lights))]
+        job = job_of(eye, rig, rig.window(32, 32), pose, look=BLACK, lights=(lamp,), labels=False)
+        xy, rho = mirror_pixel(eye, job, lamp.position_mm)
+        if rho > 5.8:
+            continue
+        job = replace(job, window=rig.window(32, 32, np.round(xy)))
+        done = renderer.render(job, spp=1)
+        assert np.linalg.norm(centroid(done.irradiance, job.window) - xy) < 1e-4
+        assert np.linalg.norm(done.glints.xy_px[0] - xy) < 1e-6
+        checked += 1
+
+
+@pytest.mark.parametrize(("rig_name", "radius_mm"), [("remote", 60.0), ("head", 3.0)])
+def test_flux_and_place_of_a_large_disc_against_backward_tracing(renderer, rig_name, radius_mm):
+    # Camera rays are mirrored at the cornea and counted where they end on the disc; 24 x 24 rays a pixel leave .1 %.
+    rig = RIGS[rig_name](radius_mm=radius_mm)
+    eye, lamp = eye_of("E2"), RIGS[rig_name](radius_mm=radius_mm).lights[0]
+    job = job_of(eye, rig, (0, 0, 1, 1), (4.0, -3.0), look=BLACK, lights=(lamp,), labels=False)
+    xy, _ = mirror_pixel(eye, job, lamp.position_mm)
+    window = rig.window(64, 64, np.round(xy))
+    job = replace(job, window=window)
+    done = renderer.render(job, spp=1)
+
+    k = 24
+    sub = (np.arange(k) + 0.5) / k - 0.5
+    u = (window[0] + np.arange(64)[:, None] + sub).ravel()
+    v = (window[1] + np.arange(64)[:, None] + sub).ravel()
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    world = job.camera.rays(pixels)
+    d = world @ job.M
+    o = np.broadcast_to(job.M.T @ (job.camera.nodal_point_mm - job.t), d.shape)
+    surface = eye.front[0]
+    hit = surface.hit(tuple(o.T), tuple(d.T), True)
+    y = np.stack(hit.point, axis=-1)
+    N = surface.normal(y)
+    c = -np.sum(N * d, axis=1)
+    w = (d + 2 * c[:, None] * N) @ job.M.T
+    y = y @ job.M.T + job.t
+    s = ((lamp.position_mm - y) @ lamp.axis) / (w @ lamp.axis)
+    on = (np.linalg.norm(y + s[:, None] * w - lamp.position_mm, axis=1) < radius_mm) & (s > 0) & hit.ok
+    i = np.arccos(c)
+    t = np.arcsin(np.sin(i) / float(eye.front_indices[0]))
+    F = 0.5 * ((np.sin(i - t) / np.sin(i + t)) ** 2 + (np.tan(i - t) / np.tan(i + t)) ** 2)
+    cos4 = (world @ job.camera.axis) ** 4
+    L = np.where(on, lamp.intensity_mw_sr / (np.pi * radius_mm**2) * F * cos4, 0.0)  # Lambertian: L = I / area
+    truth = (L[:, None] * pixels).sum(axis=0) / L.sum()
+    scale = 1e3 * np.pi * job.sensor.lens_transmission / (4 * job.sensor.f_number**2)
+    assert done.irradiance.sum(dtype=float) == pytest.approx(L.sum() / k**2 * scale, rel=3e-3)
+    assert np.linalg.norm(centroid(done.irradiance, window) - truth) < 3e-3
+    assert np.linalg.norm(done.glints.xy_px[0] - truth) < 3e-3
+
+
+def test_energy_does_not_depend_on_the_point_spread_function(renderer):
+    rig = remote_rig()
+    xy = renderer.render(job_of(eye_of("E2"), rig, rig.window(64, 64), look=BLACK), spp=1).glints.xy_px[0]
+    sums = [
+        renderer.render(
+            job_of(
+                eye_of("E2"), rig, rig.window(64, 64, xy), look=BLACK, sensor=SensorSpec(psf_sigma_px=s, noise=False)
+            ),
+            spp=1,
+        ).irradiance.sum(dtype=float)
+        for s in (0.0, 0.5, 1.0, 2.5)
+    ]
+    np.testing.assert_allclose(sums, sums[0], rtol=1e-5)  # float32 pixels
+
+
+def test_an_obstacle_before_the_lamp_takes_the_glint_and_its_light_away(renderer):
+    from eyerender.rendering.renderer import Renderer
+
+    rig = head_rig()
+    eye = eye_of("E2")
+    lamp = rig.lights[0].position_mm
+    card = 0.8 * lamp + 1.5 * np.array([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1.0]])
+    shaded = Renderer(renderer.backend, spp=4, obstacles=[Obstacle(card, np.array([[0, 1, 2], [0, 2, 3]]))])
+    job = job_of(eye, rig, (0, 0, 640, 480))
+    open_, hidden = renderer.render(job, spp=4), shaded.render(job)
+    assert open_.glints.visible.all()
+    assert hidden.glints.visible.tolist() == [False] + [True] * 5
+    np.testing.assert_allclose(hidden.glints.energy[1:], open_.glints.energy[1:])
+    iris = (open_.labels.part == 2) & (hidden.labels.part == 2)
+    share = hidden.irradiance[iris].sum() / open_.irradiance[iris].sum()
+    assert 0.75 < share < 0.9  # one of six lamps is gone
+
+
+def test_glints_end_at_the_limbus(renderer):
+    rig = remote_rig()
+    table = renderer.render(job_of(eye_of("E2"), rig, rig.window(16, 16), (0.0, 60.0)), spp=1).glints
+    assert not table.visible[0]
+    assert np.isnan(table.xy_px[0]).all()
+    assert table.energy[0] == 0.0

@@ -1,0 +1,378 @@
+"""Finding, probing and fetching libLLVM: real libraries, real processes, and a package archive made on the spot."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from eyerender.errors import BackendError
+from eyerender.rendering import apt as apt_module
+from eyerender.rendering.apt import Apt
+from eyerender.rendering.libraries import cache_folder, library_folders, load_library, load_runtime
+from eyerender.rendering.llvm import ENVIRONMENT, VARIANT, candidates, find_llvm, version_of
+from eyerender.rendering.llvm_setup import setup_llvm
+from eyerender.rendering.mend import has_archive, llvm_command
+from eyerender.rendering.probe import REFUSAL_AGE_S, Verdict, probe, run_probe
+
+COMPILER = shutil.which("cc")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
+needs_archive = pytest.mark.skipif(not has_archive(), reason="no apt here")
+
+
+@pytest.fixture(scope="module")
+def good() -> Path:
+    """A libLLVM that renders."""
+    found = find_llvm()
+    if found is None or found.path is None:
+        pytest.skip("no libLLVM here renders")
+    return found.path
+
+
+def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a new interpreter, as a user's program would run."""
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def build(folder: Path, name: str, source: str, *flags: str) -> Path:
+    """Compile a shared library."""
+    code = folder / f"{name}.c"
+    code.write_text(source)
+    assert COMPILER is not None
+    subprocess.run([COMPILER, "-shared", "-fPIC", "-o", str(folder / name), str(code), *flags], check=True)
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM-19.so", (19,)),
+        ("libLLVM-15.so.1", (15,)),
+        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
+        ("libLLVM.so.19.1", (19, 1)),
+        ("libLLVM.19.1.dylib", (19, 1)),
+        ("libLLVM.so", ()),
+        ("LLVM-C.dll", ()),
+    ],
+)
+def test_version_is_read_from_the_name(name: str, version: tuple[int, ...]) -> None:
+    assert version_of(Path("/x") / name) == version
+
+
+def test_candidates_are_named_then_own_then_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    named = tmp_path / "named" / "libLLVM-15.so"
+    own = tmp_path / "cache" / "eyerender" / "llvm" / "libllvm18" / "usr" / "lib" / "triplet" / "libLLVM.so.18.1"
+    loader = tmp_path / "loader"
+    others = [loader / name for name in ("libLLVM.so.21.1", "libLLVM-17.so.1", "libLLVM-16.so.1", "libLLVM-14.so.1")]
+    for file in (named, own, *others):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    (loader / "libLLVM-21.so").symlink_to("libLLVM.so.21.1")  # the same file must come once
+    monkeypatch.setenv(ENVIRONMENT, str(named))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("LD_LIBRARY_PATH", str(loader))
+    ours = [path for path in candidates() if tmp_path.resolve() in path.parents]
+    assert ours == [path.resolve() for path in (named, own, *others)]
+
+
+def test_cache_folder_follows_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "eyerender"
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # the standard says to ignore it
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / ".cache" / "eyerender"
+    monkeypatch.setenv("HOME", "/")  # accounts of services: nothing is written to the root of the disk
+    assert cache_folder() is None
+
+
+@needs_compiler
+def test_library_finds_dependencies_unpacked_beside_it(tmp_path: Path) -> None:
+    """top needs middle needs bottom; none is where the loader looks, and bottom lies in the tree's other lib folder."""
+    first, second = tmp_path / "usr" / "lib" / "triplet", tmp_path / "lib" / "triplet"
+    first.mkdir(parents=True)
+    second.mkdir(parents=True)
+    build(second, "libeyerenderbottom.so", "int bottom(void) { return 7; }", "-Wl,-soname,libeyerenderbottom.so")
+    build(
+        first,
+        "libeyerendermiddle.so",
+        "int bottom(void); int middle(void) { return bottom(); }",
+        "-Wl,-soname,libeyerendermiddle.so",
+        f"-L{second}",
+        "-leyerenderbottom",
+    )
+    top = build(
+        first,
+        "libeyerendertop.so",
+        "int middle(void); int top(void) { return middle(); }",
+        f"-L{first}",
+        "-leyerendermiddle",
+        f"-Wl,-rpath-link,{second}",
+    )
+    with pytest.raises(OSError, match=r"libeyerendermiddle\.so"):
+        load_library(top)
+    load_library(top, library_folders(top))
+
+    import ctypes
+
+    assert ctypes.CDLL(str(top)).top() == 7
+
+
+def test_missing_library_is_an_error_that_names_it(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match=r"nothing\.so"):
+        load_library(tmp_path / "nothing.so", (tmp_path,))
+
+
+def test_good_library_passes_its_probe(good: Path) -> None:
+    verdict = run_probe(VARIANT, good)
+    assert verdict.ok
+    assert verdict.detail.startswith("LLVM ")
+
+
+def test_verdict_is_remembered_until_the_library_changes(
+    good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = probe(VARIANT, good)
+    (file,) = (tmp_path / "eyerender" / "verdicts").iterdir()
+    # What the file says is believed: no process is started any more.
+    stored = json.loads(file.read_text())
+    stored["verdict"]["detail"] = "LLVM remembered"
+    file.write_text(json.dumps(stored))
+    assert first.ok
+    assert probe(VARIANT, good) == Verdict(True, "LLVM remembered")
+    assert probe(VARIANT, good, context="another machine").detail == first.detail
+    file.write_text("{")  # a torn file counts as none
+    assert probe(VARIANT, good) == first
+
+
+def test_refusal_is_looked_into_again_after_a_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A refusal may have had a passing cause. libc loads well and is no LLVM: Dr.Jit refuses it."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    libc = next((p for p in map(Path, _mapped_files()) if p.name.startswith("libc.so")), None)
+    if libc is None:
+        pytest.skip("no libc.so to pass for a libLLVM here")
+    assert not probe(VARIANT, libc).ok
+    (file,) = (tmp_path / "eyerender" / "verdicts").iterdir()
+    stored = json.loads(file.read_text())
+    stored["verdict"]["detail"] = "remembered"
+    file.write_text(json.dumps(stored))
+    assert probe(VARIANT, libc).detail == "remembered"
+    old = time.time() - REFUSAL_AGE_S - 60
+    os.utime(file, (old, old))
+    assert probe(VARIANT, libc).detail != "remembered"
+
+
+def test_library_that_does_not_load_is_refused_but_not_for_good(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    broken = tmp_path / "libLLVM-19.so"
+    broken.write_text("not a library")
+    verdict = probe(VARIANT, broken)
+    assert not verdict.ok
+    assert not verdict.lasting
+    assert "libLLVM-19.so" in verdict.detail
+    assert not list((tmp_path / "cache").rglob("*.json"))
+
+
+def test_cache_that_cannot_be_written_is_done_without(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    assert probe(VARIANT, good).ok
+
+
+@needs_compiler
+def test_library_that_ends_the_process_is_survived(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    source = "#include <stdlib.h>\n__attribute__((constructor)) static void die(void) { abort(); }"
+    verdict = probe(VARIANT, build(tmp_path, "libLLVM-16.so", source))
+    assert verdict == Verdict(False, "rendering with it ends the process (SIGABRT)")
+
+
+def test_bad_library_that_the_user_names_is_passed_over(good: Path, tmp_path: Path) -> None:
+    """Versions that this machine has and that do not render stand for those a user may name."""
+    bad = [path for path in candidates() if path != good and not probe(VARIANT, path).ok]
+    named = bad[0] if bad else tmp_path / "libLLVM-15.so"
+    done = python(
+        """
+        from eyerender.rendering.llvm import ensure_llvm
+        print(ensure_llvm().path)
+        import mitsuba as mi, drjit as dr
+        mi.set_variant("llvm_ad_mono")
+        print(dr.minimum(mi.Float(1, 2), 1.5))
+        """,
+        **{ENVIRONMENT: str(named)},
+    )
+    assert done.returncode == 0, done.stderr
+    path, result = done.stdout.splitlines()
+    assert path != str(named)
+    assert result == "[1, 1.5]"
+
+
+def test_mitsuba_imported_before_with_a_good_library_works(good: Path) -> None:
+    load_runtime()
+    preload = f"""
+        from pathlib import Path
+        from eyerender.rendering.libraries import *
+        load_runtime(); load_library(Path({str(good)!r}), library_folders(Path({str(good)!r})))
+        import mitsuba
+        from eyerender.rendering.backend import choose_backend
+        print(choose_backend("llvm").library)
+        """
+    done = python(preload, **{ENVIRONMENT: str(good)})
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.strip()).resolve() == good
+
+
+def test_mitsuba_imported_before_without_a_library_is_a_clear_error(good: Path) -> None:
+    done = python(
+        """
+        from eyerender.rendering.libraries import load_runtime
+        load_runtime()
+        import mitsuba
+        from eyerender.errors import BackendError
+        from eyerender.rendering.backend import choose_backend
+        try:
+            choose_backend("llvm")
+        except BackendError as error:
+            print(error.exit_code, error)
+        """,
+        **{ENVIRONMENT: "/nonexistent/libLLVM.so"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("3 mitsuba was imported earlier")
+    assert f"{ENVIRONMENT}={good}" in done.stdout
+
+
+def test_importing_the_room_loads_no_mitsuba() -> None:
+    done = python(
+        "import sys, eyerender.rendering.backend, eyerender.rendering.llvm_setup\n"
+        "print([name for name in ('mitsuba', 'drjit', 'cv2') if name in sys.modules])"
+    )
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_without_an_archive_the_command_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("eyerender.rendering.llvm.candidates", lambda: iter(()))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(BackendError, match="no libLLVM here renders") as caught:
+        setup_llvm()
+    assert llvm_command() in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_conda_users_are_told_condas_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CONDA_PREFIX", str(tmp_path))
+    assert llvm_command() == "run: conda install -c conda-forge libllvm19"
+
+
+@pytest.fixture
+def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package archive on disk: libllvm16, libllvm19 (needs libz3-4 and libc6), libllvm99, libz3-4, libatomic1."""
+    architecture = subprocess.run(["dpkg", "--print-architecture"], capture_output=True, text=True, check=True)
+    folder = tmp_path / "archive"
+    folder.mkdir()
+    entries = []
+    for name, depends in (
+        ("libllvm16", ""),
+        ("libllvm19", "libz3-4 (>= 1), libc6"),
+        ("libllvm99", ""),
+        ("libz3-4", "libc6"),
+        ("libc6", ""),
+        ("libllvm19-dev", ""),
+    ):
+        tree = tmp_path / "build" / name
+        (tree / "DEBIAN").mkdir(parents=True)
+        (tree / "usr" / "lib").mkdir(parents=True)
+        (tree / "usr" / "lib" / f"{name}.so").write_text(name)
+        control = f"Package: {name}\nVersion: 1.0\nArchitecture: {architecture.stdout.strip()}\n"
+        control += f"Maintainer: nobody\nDescription: {name}\n" + (f"Depends: {depends}\n" if depends else "")
+        (tree / "DEBIAN" / "control").write_text(control)
+        deb = folder / f"{name}_1.0.deb"
+        subprocess.run(["dpkg-deb", "-b", str(tree), str(deb)], check=True, capture_output=True)
+        data = deb.read_bytes()
+        entries.append(
+            f"{control}Filename: ./{deb.name}\nSize: {len(data)}\nSHA256: {hashlib.sha256(data).hexdigest()}\n"
+        )
+    (folder / "Packages.gz").write_bytes(gzip.compress("\n".join(entries).encode()))
+    point_apt_at(f"deb [trusted=yes] file:{folder} ./", tmp_path, monkeypatch)
+    return folder
+
+
+def point_apt_at(source: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Settings as an administrator could make them: this one source and no other."""
+    (folder / "sources.list").write_text(source + "\n")
+    settings = folder / "machine.conf"
+    settings.write_text(f'Dir::Etc::SourceList "{folder / "sources.list"}";\nDir::Etc::SourceParts "/dev/null";\n')
+    monkeypatch.setenv("APT_CONFIG", str(settings))
+    monkeypatch.setattr(apt_module, "PAUSES_S", (0.0, 0.0))
+
+
+@needs_archive
+def test_archive_is_read_preferred_version_first(archive: Path, tmp_path: Path) -> None:
+    assert Apt(tmp_path / "apt").llvm_packages() == ["libllvm19", "libllvm99"]
+
+
+@needs_archive
+def test_package_is_unpacked_with_its_dependencies_but_not_libc(archive: Path, tmp_path: Path) -> None:
+    apt = Apt(tmp_path / "apt")
+    apt.llvm_packages()
+    assert apt.unpack(["libllvm19"], tmp_path / "tree")
+    assert sorted(p.name for p in (tmp_path / "tree" / "usr" / "lib").iterdir()) == ["libllvm19.so", "libz3-4.so"]
+
+
+@needs_archive
+def test_package_that_cannot_be_fetched_is_told(archive: Path, tmp_path: Path) -> None:
+    apt = Apt(tmp_path / "apt")
+    apt.llvm_packages()
+    (archive / "libz3-4_1.0.deb").unlink()
+    assert not apt.unpack(["libllvm19"], tmp_path / "tree")
+    assert apt.complaint
+
+
+@needs_archive
+def test_archive_without_a_fitting_library_leaves_nothing(
+    archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The made-up packages hold no LLVM: each is refused, in one line, and the store stays as empty as it was."""
+    monkeypatch.setattr("eyerender.rendering.llvm.candidates", lambda: iter(()))
+    monkeypatch.setattr("eyerender.rendering.llvm_setup.RUNTIME", {})
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    said: list[str] = []
+    with pytest.raises(BackendError, match="libllvm99 does not render"):
+        setup_llvm(say=said.append)
+    assert [p.name for p in (tmp_path / "cache" / "eyerender" / "llvm").iterdir()] == ["lock"]
+    assert len(said) == 3
+
+
+@needs_archive
+def test_archive_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    point_apt_at(f"deb [trusted=yes] file:{tmp_path}/nowhere ./", tmp_path, monkeypatch)
+    monkeypatch.setattr("eyerender.rendering.llvm.candidates", lambda: iter(()))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with pytest.raises(BackendError, match="the package archive offers no libLLVM") as caught:
+        setup_llvm()
+    assert "\n" not in str(caught.value)
+
+
+def _mapped_files() -> list[str]:
+    try:
+        lines = Path("/proc/self/maps").read_text().splitlines()
+    except OSError:
+        return []
+    return sorted({line.split(None, 5)[5] for line in lines if line.count(" ") > 5 and "/" in line})

@@ -1,0 +1,124 @@
+"""The layout's rules: imports point down, one room each for mitsuba and cv2, `import eyerender` is light."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import eyerender
+
+PACKAGE = Path(eyerender.__file__).resolve().parent
+
+# Lower floors know nothing of higher ones; rooms (folders) on one floor do not import each other.
+FLOORS = {
+    "errors": 0,
+    "arrays": 0,
+    "spec": 0,
+    "geometry": 1,
+    "optics": 2,
+    "eye": 3,
+    "region": 3,
+    "rig": 3,
+    "scene": 4,
+    "observation": 4,
+    "imagefile": 4,
+    "imagefolder": 4,
+    "analytic": 5,
+    "rendering": 5,
+    "extraction": 5,
+    "gaze": 5,
+    "capture": 6,
+    "observers": 6,
+    "comparison": 6,
+    "report": 7,
+    "quickstart": 8,
+    "cli": 9,
+    "__init__": 10,
+    "__main__": 10,
+}
+# The order of the single modules that share a floor: each may import those before it.
+ORDER = ["errors", "arrays", "spec", "observation", "imagefile", "imagefolder", "scene", "comparison", "capture", "observers"]
+
+
+def modules():
+    return sorted(p for p in PACKAGE.rglob("*.py") if "data" not in p.relative_to(PACKAGE).parts)
+
+
+def room(path: Path) -> str:
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return parts[0]
+
+
+def imports(path: Path):
+    """(level-resolved dotted module, line) of every import, inside functions and TYPE_CHECKING too."""
+    inside = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    package = inside if path.name == "__init__.py" else inside[:-1]
+    if path.name == "__init__.py":
+        package = inside[:-1]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, node.lineno
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            stem = ".".join((*base, *((node.module or "").split(".") if node.module else ())))
+            if node.module is None or stem == "eyerender":
+                for alias in node.names:
+                    yield f"{stem}.{alias.name}", node.lineno
+            else:
+                yield stem, node.lineno
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_point_down(path):
+    here = room(path)
+    assert here in FLOORS, f"{here} has no floor"
+    for name, line in imports(path):
+        parts = name.split(".")
+        if parts[0] != "eyerender" or len(parts) < 2 or parts[1] == here or here == "__init__":
+            continue
+        there = parts[1]
+        if there == "__version__":
+            continue
+        assert there in FLOORS, f"{path.name}:{line}: {name} has no floor"
+        if FLOORS[there] == FLOORS[here]:
+            assert here in ORDER, f"{path.name}:{line}: {here} imports its neighbour {there}"
+            assert there in ORDER, f"{path.name}:{line}: {here} imports its neighbour {there}"
+            assert ORDER.index(there) < ORDER.index(here), f"{path.name}:{line}: {here} imports {there}"
+        else:
+            assert FLOORS[there] < FLOORS[here], f"{path.name}:{line}: {here} imports {there}, which is above it"
+
+
+@pytest.mark.parametrize(
+    ("libraries", "home"),
+    [(("mitsuba", "drjit"), "rendering"), (("cv2", "skimage"), "extraction")],
+)
+def test_one_room_for_each_heavy_library(libraries, home):
+    users = {room(p) for p in modules() for name, _ in imports(p) if name.split(".")[0] in libraries}
+    assert users == {home}
+
+
+def test_import_is_light():
+    code = "import sys, eyerender; print([m for m in ('mitsuba', 'drjit', 'cv2', 'skimage', 'matplotlib') if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_public_names_are_pinned():
+    assert eyerender.__all__ == [
+        "AnalyticObserver", "BackendError", "Comparison", "Eye", "EyeSpec", "EyerenderError", "GazeErrors", "ImageFolder",
+        "ImageObserver", "InputError", "Observations", "PupilGlintRegression", "Rig", "Scene", "SceneSpec", "__version__",
+        "compare", "leave_one_target_out", "load_eye", "load_scene", "render_folder", "render_windows", "shipped_scenes",
+        "write_report",
+    ]  # fmt: skip
+    for name in eyerender.__all__:
+        assert getattr(eyerender, name) is not None
+
+
+def test_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = eyerender.no_such_name

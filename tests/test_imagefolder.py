@@ -1,0 +1,164 @@
+"""Folders of images: staged, complete or not there at all, refused when taken."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from eyerender.errors import EyerenderError, InputError
+from eyerender.imagefile import preview, read_image, write_png
+from eyerender.imagefolder import ImageFolder, refuse_non_empty, same_run, staged, write_dataset
+
+
+def test_png_keeps_every_bit(tmp_path):
+    rng = np.random.default_rng(0)
+    for dtype, depth in ((np.uint8, 8), (np.uint16, 16)):
+        image = rng.integers(0, 2**depth, (40, 50), dtype=dtype)
+        write_png(tmp_path / "a.png", image)
+        back, bits = read_image(tmp_path / "a.png")
+        assert bits == depth
+        assert back.dtype == dtype
+        np.testing.assert_array_equal(back, image)
+
+
+def test_grey_stored_as_colour_is_read_and_real_colour_is_refused(tmp_path):
+    grey = np.random.default_rng(1).integers(0, 256, (20, 30), dtype=np.uint8)
+    Image.fromarray(np.stack([grey] * 3, axis=-1)).save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png")[0], grey)
+    Image.fromarray(np.stack([grey, grey, 255 - grey], axis=-1)).save(tmp_path / "colour.png")
+    with pytest.raises(InputError, match="has colour channels"):
+        read_image(tmp_path / "colour.png")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(None, "no such file"), (b"", "is empty"), (b"hello", "is not a readable image"), ("folder", "is a folder")],
+)
+def test_unreadable_images_are_named(tmp_path, content, words):
+    path = tmp_path / "x.png"
+    if content == "folder":
+        path.mkdir()
+    elif content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=words) as caught:
+        read_image(path)
+    assert str(path) in str(caught.value)
+
+
+def test_truncated_png_is_refused(tmp_path):
+    write_png(tmp_path / "a.png", np.random.default_rng(2).integers(0, 65536, (60, 60)).astype(np.uint16))
+    data = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "b.png").write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match="not a readable image"):
+        read_image(tmp_path / "b.png")
+
+
+def test_preview_is_gamma_encoded():
+    out = preview(np.array([[0.0, 0.5, 1.0, 2.0]]), 1.0)
+    assert out.tolist() == [[0, round(255 * 0.5 ** (1 / 2.2)), 255, 255]]
+
+
+def line(name="a"):
+    return {
+        "file_name": f"images/{name}.png",
+        "window_px": {"x0": 3, "y0": 4, "width": 5, "height": 6},
+        "records": [],
+    }
+
+
+def test_staged_folder_appears_complete(tmp_path):
+    out = tmp_path / "deep" / "out"
+    with staged(out) as folder:
+        (folder / "images").mkdir()
+        write_dataset(folder, [line()], spec={"a": 1}, digest="d")
+        assert not (out / "dataset.json").exists()
+    read = ImageFolder.load(out)
+    assert read.entries[0].window == (3, 4, 5, 6)
+    assert sorted(p.name for p in out.iterdir()) == ["dataset.json", "images", "metadata.jsonl"]
+    assert same_run(out, "d")
+    assert not same_run(out, "e")
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, OSError])
+def test_a_failed_run_leaves_nothing(tmp_path, error):
+    out = tmp_path / "out"
+    with pytest.raises((error, EyerenderError)), staged(out) as folder:
+        (folder / "half").write_text("x")
+        raise error
+    assert not out.exists()
+
+
+def test_a_failed_overwrite_keeps_what_was_there(tmp_path):
+    (tmp_path / "keep").write_text("x")
+    with pytest.raises(RuntimeError), staged(tmp_path, overwrite=True) as folder:
+        (folder / "half").write_text("x")
+        raise RuntimeError
+    assert [p.name for p in tmp_path.iterdir()] == ["keep"]
+
+
+def test_overwrite_replaces_all_of_it(tmp_path):
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "file").write_text("x")
+    with staged(tmp_path, overwrite=True) as folder:
+        write_dataset(folder, [line()], spec={}, digest="d")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["dataset.json", "metadata.jsonl"]
+
+
+def test_leftovers_of_a_killed_run_do_not_block_the_next(tmp_path):
+    (tmp_path / ".partial-99").mkdir()
+    refuse_non_empty(tmp_path, overwrite=False)
+    with staged(tmp_path) as folder:
+        write_dataset(folder, [line()], spec={}, digest="d")
+    assert not (tmp_path / ".partial-99").exists()
+
+
+def test_taken_places_are_refused(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="is not empty; give another folder or --overwrite"):
+        refuse_non_empty(tmp_path, overwrite=False)
+    with pytest.raises(InputError, match="exists and is not a folder"):
+        refuse_non_empty(tmp_path / "file", overwrite=True)
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="mounting a tmpfs needs root")
+def test_a_full_disk_is_one_error_and_leaves_nothing(tmp_path):
+    small = tmp_path / "small"
+    small.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", small], capture_output=True)
+    if mounted.returncode != 0:
+        pytest.skip("this machine does not let a tmpfs be mounted")
+    try:
+        with pytest.raises(EyerenderError, match="No space left on device"), staged(small / "out") as folder:
+            write_png(folder / "a.png", np.random.default_rng(3).integers(0, 65536, (400, 400)).astype(np.uint16))
+        assert list(small.iterdir()) == []
+    finally:
+        subprocess.run(["umount", small], check=True)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words"),
+    [
+        ("metadata.jsonl", None, "holds no metadata.jsonl"),
+        ("metadata.jsonl", "", "holds no images"),
+        ("metadata.jsonl", "{}\n", "line 1: is no image record"),
+        ("metadata.jsonl", json.dumps({"schema": "eyerender/image/1", **line(), "file_name": "../x"}), "inside the folder"),
+        ("dataset.json", None, "dataset.json: no such file"),
+        ("dataset.json", "[", "is not valid JSON"),
+        ("dataset.json", '{"schema": "eyerender/dataset/9"}', "schema: is 'eyerender/dataset/9'"),
+    ],
+)
+def test_damaged_folders_are_refused(tmp_path, file, content, words):
+    out = tmp_path / "out"
+    with staged(out) as folder:
+        write_dataset(folder, [line()], spec={}, digest="d")
+    (out / file).unlink()
+    if content is not None:
+        (out / file).write_text(content)
+    with pytest.raises(InputError, match=words):
+        ImageFolder.load(out)

@@ -1,0 +1,158 @@
+"""Observations and their record: nothing is lost on the way to JSON and back."""
+
+from __future__ import annotations
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+from eyerender.arrays import frozen
+from eyerender.errors import InputError
+from eyerender.observation import (
+    GlintFeatures,
+    Index,
+    Observations,
+    PoseTruth,
+    PupilFeatures,
+    concatenate,
+)
+
+
+def observations(n: int = 4, seed: int = 0, points: int = 6, lights: int = 2) -> Observations:
+    """A batch with a missing pupil (row 1), a missing glint (row 2) and an entry that is not there (row 3)."""
+    rng = np.random.default_rng(seed)
+
+    def objects(values):
+        out = np.empty(np.shape(values), dtype=object)
+        out[...] = values
+        return frozen(out, object)
+
+    status = np.full(n, "ok", dtype=object)
+    reason = np.full(n, None, dtype=object)
+    centre, axes, angle = rng.uniform(0, 900, (n, 2)), np.sort(rng.uniform(5, 9, (n, 2)))[:, ::-1], rng.uniform(0, 3, n)
+    anatomical, boundary, cov = rng.uniform(0, 900, (n, 2)), rng.uniform(0, 900, (n, points, 2)), rng.random((n, 5, 5))
+    status[1], reason[1] = "missing", "coarse search: no dark blob"
+    for a in (centre, axes, angle, anatomical, boundary, cov):
+        a[1] = np.nan
+    g_status, g_reason = np.full((n, lights), "ok", dtype=object), np.full((n, lights), None, dtype=object)
+    xy, g_cov = rng.uniform(0, 900, (n, lights, 2)), rng.random((n, lights, 2, 2))
+    light = np.tile(np.arange(lights), (n, 1))
+    g_status[2, 0], g_reason[2, 0], xy[2, 0], g_cov[2, 0] = "missing", "outside the limbus", np.nan, np.nan
+    g_status[3, 1], xy[3, 1], g_cov[3, 1], light[3, 1] = "", np.nan, np.nan, -1
+    inside = g_status == "ok"
+    return Observations(
+        Index(
+            frozen(np.arange(n) // 2, np.int64),
+            frozen(np.arange(n) // 2, np.int64),
+            frozen(np.zeros(n), np.int64),
+            frozen(np.zeros(n), np.int64),
+            frozen(np.arange(n) % 2, np.int64),
+            objects(["E2"] * n),
+            frozen(rng.uniform(-300, 300, (n, 3))),
+            frozen(np.zeros((n, 3))),
+            frozen(np.array([[0, -31.5, 0], [0, 31.5, 0]])[np.arange(n) % 2]),
+        ),
+        PoseTruth(*(frozen(np.radians(rng.uniform(-20, 20, n))) for _ in range(3)), frozen(rng.random(n) * 1e-9)),
+        PupilFeatures(
+            frozen(status, object),
+            frozen(reason, object),
+            frozen(status == "ok", bool),
+            frozen(centre),
+            frozen(axes),
+            frozen(angle),
+            frozen(anatomical),
+            frozen(boundary),
+            frozen(cov),
+        ),
+        GlintFeatures(
+            frozen(light, np.int64),
+            frozen(g_status, object),
+            frozen(g_reason, object),
+            frozen(inside, bool),
+            frozen(xy),
+            frozen(g_cov),
+        ),
+    )
+
+
+def assert_same(a: Observations, b: Observations) -> None:
+    """Equal up to the last bits that degrees and radians cost."""
+    np.testing.assert_allclose(a.pose.azimuth_rad, b.pose.azimuth_rad, rtol=1e-14)
+    np.testing.assert_allclose(a.pose.elevation_rad, b.pose.elevation_rad, rtol=1e-14)
+    np.testing.assert_allclose(a.pose.torsion_rad, b.pose.torsion_rad, rtol=1e-14)
+    assert (a.index, a.pupil, a.glints) == (b.index, b.pupil, b.glints)
+
+
+def test_records_come_back_through_json():
+    before = observations()
+    after = Observations.from_records(json.loads(json.dumps(list(before.records()), allow_nan=False)))
+    assert_same(before, after)
+
+
+def test_record_has_every_key_and_null_where_it_does_not_apply():
+    records = list(observations().records())
+    for record in records:
+        assert list(record) == [
+            "schema", "frame", "fixation", "camera", "eye", "eye_model", "target_mm", "head_mm", "eye_position_mm",
+            "pose", "pupil", "glints",
+        ]  # fmt: skip
+        assert list(record["pose"]) == ["azimuth_deg", "elevation_deg", "torsion_deg", "residual_mm"]
+        assert list(record["pupil"]) == [
+            "status", "reason", "in_image", "centre_px", "semi_axes_px", "angle_rad", "anatomical_centre_px",
+            "points_px", "covariance",
+        ]  # fmt: skip
+        for glint in record["glints"]:
+            assert list(glint) == ["light", "status", "reason", "in_image", "xy_px", "covariance"]
+    assert records[1]["pupil"]["centre_px"] is None
+    assert records[1]["pupil"]["reason"].startswith("coarse search")
+    assert records[2]["glints"][0]["xy_px"] is None
+    assert len(records[3]["glints"]) == 1
+
+
+def test_equality_hash_pickle_and_read_only():
+    a, b, c = observations(seed=1), observations(seed=1), observations(seed=2)
+    assert a == b
+    assert hash(a) == hash(b)
+    assert a != c
+    assert pickle.loads(pickle.dumps(a)) == a
+    with pytest.raises(ValueError, match="read-only"):
+        a.pupil.centre_px[0, 0] = 1.0
+
+
+def test_take_and_concatenate_are_inverse():
+    a = observations(6)
+    assert concatenate([a.take(slice(0, 2)), a.take(np.arange(6) >= 2)]) == a
+
+
+def test_concatenate_fills_up_to_the_widest():
+    both = concatenate([observations(4, lights=2).take(slice(0, 2)), observations(4, lights=3)])
+    assert both.glints.status.shape == (6, 3)
+    assert [len(r["glints"]) for r in both.records()] == [2, 2, 3, 3, 3, 2]
+
+
+def test_glint_of_light():
+    a = observations()
+    xy, found = a.glints.of_light(0)
+    assert found.tolist() == [True, True, False, True]
+    np.testing.assert_array_equal(xy[0], a.glints.xy_px[0, 0])
+    assert np.isnan(xy[2]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda r: r.update(schema="other/1"), "records.0.schema: is 'other/1'"),
+        (lambda r: r.pop("pose"), "records.0.pose.azimuth_deg: missing"),
+        (lambda r: r.update(eye="both"), "records.0.eye: must be 'right' or 'left'"),
+        (lambda r: r["pupil"].update(centre_px=[1, 2, 3]), "records.0.pupil.centre_px: must be null or 2 number"),
+        (lambda r: r.update(frame="x"), "records.0.frame: must be a whole number"),
+        (lambda r: r.update(glints=None), "records.0.glints: must be a list"),
+    ],
+)
+def test_bad_records_are_named(change, words):
+    records = json.loads(json.dumps(list(observations().records())))
+    change(records[0])
+    with pytest.raises(InputError, match=words):
+        Observations.from_records(records)

@@ -1,0 +1,124 @@
+"""Specs: strict, frozen, loadable, and every refusal one line with the path of the key."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import yaml
+
+from eyerender.errors import InputError
+from eyerender.scene import SceneSpec, load_scene, shipped_scenes
+
+
+def quickstart():
+    return yaml.safe_load(shipped_scenes()["quickstart"].read_text(encoding="utf-8"))
+
+
+def test_shipped_scenes_load_and_come_back_from_their_own_yaml(tmp_path):
+    assert sorted(shipped_scenes()) == ["blignaut2014", "guestrin2006", "head_mounted", "quickstart"]
+    for path in shipped_scenes().values():
+        spec = SceneSpec.load(path)
+        spec.dump(tmp_path / "copy.yaml")
+        again = SceneSpec.load(tmp_path / "copy.yaml")
+        assert again == spec
+        assert again.digest() == spec.digest()
+        assert hash(again) == hash(spec)
+        assert pickle.loads(pickle.dumps(spec)) == spec
+
+
+def test_spec_is_frozen():
+    spec = SceneSpec.load(shipped_scenes()["quickstart"])
+    with pytest.raises(Exception, match="frozen"):
+        spec.seed = 3
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("colour", 1, "colour: unknown key"),
+        ("rig.lights.0.radius_mm", -1, "rig.lights.0.radius_mm: must be >= 0"),
+        ("rig.lights.0.radius_mm", "2", "rig.lights.0.radius_mm: must be a valid number, not '2'"),
+        ("rig.cameras.0.resolution_px", [1600], "rig.cameras.0.resolution_px.1: missing"),
+        ("rig.cameras.0.resolution_px", [1600.5, 1200], "rig.cameras.0.resolution_px.0: must be a valid integer"),
+        ("rig.cameras.0.focal_length_px", 3, "rig.cameras.0: give either focal_length_px or focal_length_mm"),
+        ("subject.ipd_mm", float("nan"), "subject.ipd_mm: must be a finite number"),
+        ("subject.eyes", ["right", "right"], "subject: eyes: each eye once"),
+        ("subject.eyes", [], "subject.eyes: needs at least 1 entries"),
+        ("eye.line_of_sight", "pupil", "eye.line_of_sight: must be 'chief_ray' or 'entrance_window', not 'pupil'"),
+        ("targets", {"grid": [3, 0]}, "targets.grid.1: must be >= 1"),
+        ("targets", {"grid": [3, 3], "world_mm": [[1, 2, 3]]}, "targets: give exactly one of"),
+        ("targets", None, "give either targets or poses"),
+        ("rig.screen", None, "targets on a screen need rig.screen"),
+        ("image.spp", 0, "image.spp: must be >= 1"),
+        ("image.window_px", [4000, 240], "image.window_px: is larger than the sensor of rig.cameras.0"),
+        ("wavelength_nm", 20, "wavelength_nm: must be >= 350"),
+        ("seed", -1, "seed: must be >= 0"),
+        ("seed", True, "seed: must be a valid integer"),
+        ("format", 2, "format: is 2; this version reads format 1"),
+        ("format", True, "format: is True"),
+    ],
+)
+def test_bad_keys_are_refused_with_their_path(tmp_path, path, value, words):
+    data = quickstart()
+    at, *rest = path.split(".")
+    node = data
+    for key in rest:
+        node = node[int(at) if at.isdigit() else at]
+        at = key
+    node[int(at) if at.isdigit() else at] = value
+    file = tmp_path / "bad.yaml"
+    file.write_text(yaml.safe_dump(data), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        SceneSpec.load(file)
+    message = str(caught.value)
+    assert message.startswith(f"{file}: ")
+    assert words in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "must be a YAML mapping"),
+        ("- 1", "must be a YAML mapping"),
+        ("name: [", "not valid YAML"),
+        ("name: a\nname: b", "'name' stands twice"),
+        ("name: !!python/object/apply:os.system ['true']", "not valid YAML"),
+        ("name: x", "format: missing"),
+        ("format: 1\nname: 2001-01-01", "no number, text or list"),
+    ],
+)
+def test_bad_files_are_refused(tmp_path, text, words):
+    file = tmp_path / "bad.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=words) as caught:
+        SceneSpec.load(file)
+    assert "\n" not in str(caught.value)
+
+
+def test_numbers_written_as_1e_3_are_numbers(tmp_path):
+    text = shipped_scenes()["quickstart"].read_text(encoding="utf-8").replace("radius_mm: 2.5", "radius_mm: 25e-1")
+    (tmp_path / "a.yaml").write_text(text, encoding="utf-8")
+    assert SceneSpec.load(tmp_path / "a.yaml").rig.lights[0].radius_mm == 2.5
+
+
+def test_unknown_scene_names_the_shipped_ones():
+    with pytest.raises(InputError, match=r"nonsense: no such scene file; shipped scenes: blignaut2014, guestrin2006"):
+        load_scene("nonsense")
+
+
+def test_changes_make_another_digest():
+    assert load_scene("quickstart").digest() != load_scene("quickstart", spp=4).digest()
+    assert load_scene("quickstart").digest() != load_scene("quickstart", eye="E1").digest()
+    assert load_scene("quickstart").digest() == load_scene("quickstart").digest()
+
+
+def test_schema_describes_the_files_it_is_for():
+    jsonschema = pytest.importorskip("jsonschema")
+    validator = jsonschema.Draft202012Validator(SceneSpec.json_schema())
+    for path in shipped_scenes().values():
+        validator.validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+    bad = quickstart()
+    bad["image"]["spp"] = 0
+    assert not validator.is_valid(bad)
