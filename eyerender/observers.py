@@ -61,10 +61,13 @@ class ImageObserver:
         *,
         backend: Literal["auto", "cuda", "llvm"] = "auto",
         threads: int | None = None,
+        only: Sequence[int] | None = None,
         progress: Progress | None = None,
     ) -> Observations:
-        """Render a scene's windows in memory and extract their features."""
+        """Render a scene's windows in memory and extract their features; `only` some of its observations."""
         truth = observe(scene)
+        if only is not None:
+            truth = truth.take(np.asarray(only))
         images = render_windows(scene, truth, backend=backend, threads=threads, progress=progress)
         parts = [
             self._observe_rows(image.dn, scene.spec.sensor.bit_depth, image.window[:2], truth.index, np.array([image.row]), scene)

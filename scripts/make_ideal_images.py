@@ -75,7 +75,7 @@ CONDITIONS: dict[str, Condition] = {
     ),
     # Wide: what a calibrated confidence has to stand; about one image in five is beyond any extractor.
     "mixed": Condition(
-        size=(320, 240), semi_axis=(9, 45), aspect=(0.5, 1.0), noise=(0.5, 30), blur=(0.7, 4.0), pupil_level=(8, 45),
+        size=(320, 240), semi_axis=(13, 45), aspect=(0.6, 1.0), noise=(0.5, 30), blur=(0.7, 4.0), pupil_level=(8, 45),
         step=(12, 75), texture=(0, 12), lid=(-1.5, 1.0), glints="scatter", glint_peak=240.0, glint_sigma=(0.8, 2.5),
     ),
 }  # fmt: skip

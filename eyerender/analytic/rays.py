@@ -8,7 +8,7 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..eye.model import Eye
 from ..geometry.surfaces import Xyz, components, join
-from ..optics.solve import apparent_points, mirror_points, purkinje_points
+from ..optics.solve import mirrored_rays, purkinje_points, refracted_rays
 from ..optics.trace import RayStatus
 
 Statuses = npt.NDArray[np.int8]
@@ -17,42 +17,42 @@ Statuses = npt.NDArray[np.int8]
 def pupil_exits(eye: Eye, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
     """Where the rays from `count` points of the stop's margin, and last from its centre, leave the cornea.
 
-    camera_mm : nodal points (n,) in the eye frame. Returns exit points as three arrays (n, count + 1), residuals, status.
+    camera_mm : nodal points (n,) in the eye frame. Returns exit points as three arrays (n, count + 1), residuals,
+    status.
     """
-    margin = eye.stop.boundary(count)
-    points = np.concatenate([margin, eye.stop.centre_mm[..., None, :]], axis=-2)
-    found = apparent_points(
-        eye.front, eye.front_indices, points, join(camera_mm)[:, None, :], rim_mm=eye.limbus_radius_mm
-    )
-    status = found.status.copy()
-    status[_behind_stop(eye, camera_mm)] = RayStatus.BEHIND_IRIS
-    return components(found.exit_points_mm), found.residual_mm, status
+    points = np.concatenate([eye.stop.boundary(count), eye.stop.centre_mm[..., None, :]], axis=-2)
+    target, viewpoint = components(points), (camera_mm[0][:, None], camera_mm[1][:, None], camera_mm[2][:, None])
+    if points.ndim == 2:
+        target = (target[0][None], target[1][None], target[2][None])
+    found = refracted_rays(eye.front, eye.front_indices, target, viewpoint, rim_mm=eye.limbus_radius_mm)
+    found.status[_behind_stop(eye, camera_mm)] = RayStatus.BEHIND_IRIS
+    return found.exit, found.residual_mm, found.status
 
 
 def glint_exits(eye: Eye, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
-    """Where the light of m lights (n, m) leaves the cornea for the camera, reflected at the surface of Purkinje's `order`.
+    """Where the light of m lights (n, m) leaves the cornea for the camera, reflected at the surface of Purkinje's
+    `order`.
 
     Returns exit points as three arrays (n, m), residuals, status.
     """
-    viewpoint = join(camera_mm)[:, None, :]
-    lights = join(lights_mm)
     if order not in eye.purkinje_orders:
-        nothing = np.full(lights.shape[:-1], np.nan)
+        nothing = np.full(lights_mm[0].shape, np.nan)
         status = np.full(nothing.shape, RayStatus.MISSED, dtype=np.int8)
         return (nothing, nothing, nothing), nothing, status
     if order == 1:
-        found = mirror_points(eye.front[0], lights, viewpoint, rim_mm=eye.limbus_radius_mm)
-    else:
-        corneal = len(eye.front)
-        depth = {2: 2, 3: corneal + 1, 4: corneal + len(eye.back)}[order]
-        found = purkinje_points(
-            (eye.front + eye.back)[:depth],
-            (eye.front_indices + eye.back_indices)[:depth],
-            ((eye.limbus_radius_mm, *(np.inf for _ in eye.front[1:])) + eye.back_rims_mm)[:depth],
-            ((False,) * corneal + eye.back_passing)[:depth],
-            lights,
-            viewpoint,
-        )
+        place = (camera_mm[0][:, None], camera_mm[1][:, None], camera_mm[2][:, None])
+        rays = mirrored_rays(eye.front[0], lights_mm, place, rim_mm=eye.limbus_radius_mm)
+        return rays.exit, rays.residual_mm, rays.status
+    corneal = len(eye.front)
+    depth = {2: 2, 3: corneal + 1, 4: corneal + len(eye.back)}[order]
+    found = purkinje_points(
+        (eye.front + eye.back)[:depth],
+        (eye.front_indices + eye.back_indices)[:depth],
+        (eye.limbus_radius_mm, *(np.inf for _ in eye.front[1:]), *eye.back_rims_mm)[:depth],
+        ((False,) * corneal + eye.back_passing)[:depth],
+        join(lights_mm),
+        join(camera_mm)[:, None, :],
+    )
     return components(found.exit_points_mm), found.residual_mm, found.status
 
 
@@ -61,5 +61,3 @@ def _behind_stop(eye: Eye, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
     normal, centre = eye.stop.normal, eye.stop.centre_mm
     depth = sum((camera_mm[i] - centre[..., i]) * normal[..., i] for i in range(3))
     return np.asarray(~(np.asarray(depth) > 0.0))
-
-

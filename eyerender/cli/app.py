@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from types import FrameType
 from typing import Any
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Parameter
 
 from ..errors import EyerenderError, InputError
 
@@ -23,6 +23,7 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
     help_format="plaintext",
+    default_parameter=Parameter(negative=()),
 )
 
 
@@ -43,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
-    from . import environment, images, observe  # noqa: F401  (they register their commands)
+    from . import environment, eyes, images, observe  # noqa: F401  (they register their commands)
 
     tokens = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in tokens

@@ -1,8 +1,8 @@
 """Which glint belongs to which light, from the geometry of the rig; nothing is known of the true gaze.
 
 The lights are mirrored in a sphere (the cornea) whose centre follows from the image of the pupil and a rough position
-of the eye. That layout may be off by a shift (where exactly the eye is) and a scale (corneal radius, distance); the glints
-are matched to it with both left free within what those can do, missing and surplus glints allowed.
+of the eye. That layout may be off by a shift (where exactly the eye is) and a scale (corneal radius, distance); the
+glints are matched to it with both left free within what those can do, missing and surplus glints allowed.
 """
 
 from __future__ import annotations

@@ -87,14 +87,25 @@ def _sweep(small: Image, factor: int, settings: ExtractionSettings) -> list[tupl
             if parent >= 0 or not 3.0 * least < contour.shape[0] < 15.0 * most:
                 continue
             x, y, w, h = cv2.boundingRect(contour)
-            # A lid may leave a low segment of the pupil; a backdrop touches two sides or more.
+            # A backdrop touches two sides or more, a lid one along its width.
             sides = (x == 0) + (y == 0) + (x + w == width) + (y + h == height)
-            if sides >= 2 or min(w, h) < 1.2 * least or max(w, h) > 2.2 * most:
+            if (
+                sides >= 2
+                or (sides == 1 and _on_border(contour, width, height) > 0.15)
+                or min(w, h) < 1.2 * least
+                or max(w, h) > 2.2 * most
+            ):
                 continue
             blob = _blob_ellipse(cv2.moments(contour), least, most, settings)
             if blob is not None:
                 blobs.append(blob)
     return blobs
+
+
+def _on_border(contour: NDArray[np.int32], width: int, height: int) -> float:
+    """Share of a contour that runs along the frame: more than a little is a lid or backdrop, not a pupil cut off."""
+    x, y = contour[:, 0, 0], contour[:, 0, 1]
+    return float(np.mean((x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)))
 
 
 def _blob_ellipse(

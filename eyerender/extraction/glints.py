@@ -78,11 +78,12 @@ def _widths(hat: Image, xy: Array, height: Array, size: int) -> Array:
     """sigma = sqrt(area above half height / (2 pi ln 2)), counted in a window of the opening's size."""
     half = size // 2
     out = np.empty(height.size)
-    for i, (x, y) in enumerate(xy.astype(int)):
+    for i, (x, y) in enumerate(xy.astype(int).tolist()):
         window = hat[max(0, y - half) : y + half + 1, max(0, x - half) : x + half + 1]
-        area = np.count_nonzero(window > 0.5 * height[i])
-        out[i] = math.sqrt(max(area, 1) / (2.0 * math.pi * math.log(2.0)))
-    return np.asarray(np.clip(np.sqrt(np.maximum(out**2 - SMOOTH_PX**2, 0.3)), 0.5, MAX_SIGMA_PX))
+        area = np.count_nonzero(window > 0.5 * float(height[i]))
+        out[i] = math.sqrt(max(int(area), 1) / (2.0 * math.pi * math.log(2.0)))
+    sharp: Array = np.sqrt(np.maximum(out**2 - SMOOTH_PX**2, 0.3))
+    return np.clip(sharp, 0.5, MAX_SIGMA_PX)
 
 
 def judge_spots(

@@ -82,19 +82,18 @@ def _search(work: Prepared, settings: ExtractionSettings) -> _Found | PupilResul
 
 def _first_good(work: Prepared, candidates: list[Candidate], settings: ExtractionSettings) -> tuple[_Found | None, str]:
     """The first candidate with a well-seen rim, else the best-seen one; and the first one's objection."""
-    best: _Found | None = None
+    poor: list[_Found] = []
     reason = ""
     for candidate in candidates:
         found = _rim(work, candidate, settings)
         if isinstance(found, str):
             reason = reason or found
             continue
-        if best is None or found.quality > best.quality:
-            best = found
         # The ranking knows what lies inside what; a later candidate must only stand in for a failed one.
         if found.rim.support > 0.45:
-            return (best if _holds(found, best) else found), reason
-    return best, reason
+            return next((earlier for earlier in poor if _holds(found, earlier)), found), reason
+        poor.append(found)
+    return max(poor, key=lambda one: one.quality, default=None), reason
 
 
 def _holds(outer: _Found, inner: _Found) -> bool:
@@ -108,7 +107,7 @@ def _without_core(work: Prepared, found: _Found, settings: ExtractionSettings) -
     """The same rim if its inside is even; what lies inside it if there is a darker core, as an iris has."""
     for _ in range(2):
         darker, error = core_darkness(work.linear, found.rim.ellipse, _edge_model(found).sigma_px, work.noise_dn)
-        if darker < max(4.0 * error, 0.08 * found.candidate.step_dn):
+        if darker < max(4.0 * error, 0.15 * found.candidate.step_dn):
             return found
         inner, _ = _first_good(work, find_inside(work, found.rim.ellipse, settings), settings)
         if inner is None or inner.rim.ellipse.area_px2 > 0.8 * found.rim.ellipse.area_px2:

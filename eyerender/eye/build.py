@@ -54,9 +54,7 @@ def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm
 def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> Eye:
     """The right eye without its landmarks (fovea, node, chief ray: zeros): enough to trace with."""
     front = tuple(surface_of(s) for s in spec.cornea)
-    front_indices = tuple(
-        index_at(s.medium, wavelength_nm, f"cornea.{k}.medium") for k, s in enumerate(spec.cornea)
-    )
+    front_indices = tuple(index_at(s.medium, wavelength_nm, f"cornea.{k}.medium") for k, s in enumerate(spec.cornea))
     back: tuple[Surface, ...] = ()
     back_indices: tuple[Number, ...] = ()
     rims: tuple[Number, ...] = ()
@@ -244,9 +242,7 @@ def mirrored_eye(eye: Eye) -> Eye:
         ),
         fovea_mm=read_only(flip_y(eye.fovea_mm)),
         incident_node_mm=read_only(flip_y(eye.incident_node_mm)),
-        chief_ray=LineOfSight(
-            read_only(flip_y(eye.chief_ray.point_mm)), read_only(flip_y(eye.chief_ray.direction))
-        ),
+        chief_ray=LineOfSight(read_only(flip_y(eye.chief_ray.point_mm)), read_only(flip_y(eye.chief_ray.direction))),
     )
 
 

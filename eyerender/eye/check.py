@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.surfaces import Surface
+from ..geometry.surfaces import Mask, Surface, components
 from ..geometry.transforms import Array
 from .spec import (
     BiconicSpec,
@@ -20,6 +22,8 @@ from .spec import (
 )
 
 _TOUCH_MM = 1e-6
+_BULGE_MM = 0.5
+_FAR_MM = 60.0
 
 
 def check_eye(spec: EyeSpec, *, source: str = "") -> None:
@@ -65,7 +69,7 @@ def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:
     if not np.isfinite(front).all():
         reach = np.min(np.linalg.norm(wide[~np.isfinite(front)], axis=1))
         refuse("limbus_radius_mm", f"the front cornea ends {reach:.3g} mm from the axis")
-    for (path_before, before), (path, surface) in zip(cornea[:-1], cornea[1:], strict=True):
+    for (path_before, before), (path, surface) in pairwise(cornea):
         ahead, depth = _depth(before, wide), _depth(surface, wide)
         # Behind the plane of the iris the inner cornea is not there any more.
         counts = np.isfinite(ahead) & np.isfinite(depth) & (ahead > depth_wide)
@@ -97,12 +101,9 @@ def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:
 
 def _depth(surface: Surface, grid: Array) -> Array:
     """x (mm, eye frame) of the surface over points (y, z), (m, 2) -> (m,); NaN where it is not met."""
-    start = np.column_stack([np.full(len(grid), 60.0), grid])
-    way = np.array([-1.0, 0.0, 0.0])
-    hit = surface.hit(
-        (start[:, 0], start[:, 1], start[:, 2]), tuple(np.full(len(grid), v) for v in way), True  # type: ignore[arg-type]
-    )
-    return np.where(hit.ok, 60.0 - hit.distance, np.nan)
+    start = np.column_stack([np.full(len(grid), _FAR_MM), grid])
+    hit = surface.hit(components(start), components(np.broadcast_to([-1.0, 0.0, 0.0], start.shape)), inward=True)
+    return np.where(hit.ok, _FAR_MM - hit.distance, np.nan)
 
 
 def _stop_depth(centre: Array, normal: Array, grid: Array) -> Array:
@@ -116,8 +117,8 @@ def _disc(radius_mm: float, centre: Array) -> Array:
     return centre + np.column_stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()])
 
 
-def _where(grid: Array, mask: Array) -> str:
-    return f"{np.min(np.linalg.norm(grid[mask.astype(bool)], axis=1)):.3g} mm from the axis"
+def _where(grid: Array, mask: Mask) -> str:
+    return f"{np.min(np.linalg.norm(grid[mask], axis=1)):.3g} mm from the axis"
 
 
 def _placed(spec: EyeSpec) -> list[tuple[str, PlacedSpec]]:
@@ -154,6 +155,3 @@ def _shape_problem(placed: PlacedSpec) -> tuple[str, str] | None:
         if not isinstance(shape, SphereSpec | ConicSpec | EllipsoidSpec):
             return "placed_by", f"a {shape.kind} is placed by its apex"
     return None
-
-
-_BULGE_MM = 0.5

@@ -2,14 +2,15 @@
 
 Two readings of the line of sight:
 
-`chief_ray` : the ray from the target that passes the centre of the stop and ends on the fovea. Its course in the eye does
-not depend on the target, so outside it is one line fixed in the eye, and the pose is the one that turns this line through
-the target: two equations in azimuth and elevation, solved by Newton with exact derivatives.
+`chief_ray` : the ray from the target that passes the centre of the stop and ends on the fovea. Its course in the eye
+does not depend on the target, so outside it is one line fixed in the eye, and the pose is the one that turns this line
+through the target: two equations in azimuth and elevation, solved by Newton with exact derivatives.
 
 `entrance_window` : six points evenly spaced on the stop's margin are each joined to the target by a refracted ray; the
-six exit rays, run backwards, are cut at one common length, chosen so that the mean of the six points comes closest to the
-optic axis. That mean is the window's centre; the line of sight starts from the target towards it and must end on the
-fovea. (gkaModelEye's definition, Aguirre 2019, "A model of the entrance pupil of the human eye", Sci. Rep. 9, 9360.)
+six exit rays, run backwards, are cut at one common length, chosen so that the mean of the six points comes closest to
+the optic axis. That mean is the window's centre; the line of sight starts from the target towards it and must end on
+the fovea. (gkaModelEye's definition, Aguirre 2019, "A model of the entrance pupil of the human eye", Sci. Rep. 9,
+9360.)
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from ..optics.solve import apparent_points
 from ..optics.trace import RayStatus, trace
 from .landmarks import path_to_retina
 from .model import Eye
-from .pose import Poses, Turning, into_eye, listing_torsion
+from .pose import Poses, Turning, into_eye
 
 LineOfSightKind = Literal["chief_ray", "entrance_window"]
 
@@ -71,8 +72,8 @@ class Fixations(ArrayValue):
     """A batch of fixations, leading axis n.
 
     poses; residual_mm (n,): by how much the line of sight misses (chief ray: the target; entrance window: the fovea);
-    status (n,) of `FixationStatus`; line_of_sight_mm (n, 3): the point of the unturned eye where the line of sight meets
-    the cornea; line_of_sight_direction (n, 3): unit, from there to the target, in the eye-fixed frame.
+    status (n,) of `FixationStatus`; line_of_sight_mm (n, 3): the point of the unturned eye where the line of sight
+    meets the cornea; line_of_sight_direction (n, 3): unit, from there to the target, in the eye-fixed frame.
     """
 
     poses: Poses
@@ -105,7 +106,9 @@ def fixate(eye: Eye, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKind = 
 
 
 def _by_chief_ray(eye: Eye, target_mm: Array) -> Fixations:
-    """Turn the fixed line p + s u through the target: e1.(q - p) = e2.(q - p) = 0, q the target seen by the turned eye."""
+    """Turn the fixed line p + s u through the target: e1.(q - p) = e2.(q - p) = 0, q the target seen by the turned
+    eye.
+    """
     point, direction = eye.chief_ray.point_mm, eye.chief_ray.direction
     azimuth, elevation, miss, ahead = _turn_line(eye, components(target_mm), _split(point), _split(direction))
     status = _status(target_mm, azimuth, elevation, miss)
@@ -153,9 +156,13 @@ def _turn_line(eye: Eye, target: Xyz, point: Xyz, direction: Xyz) -> tuple[Array
 
 
 def _seen(eye: Eye, target: Xyz, azimuth: Array, elevation: Array) -> tuple[Xyz, Xyz, Xyz]:
-    """The target as the turned eye has it, with its derivatives by azimuth and elevation (Listing's torsion included)."""
+    """The target as the turned eye has it, with its derivatives by azimuth and elevation (Listing's torsion
+    included).
+    """
     rotation = eye.rotation
-    ca, ce, ct = (_split(c) for c in (rotation.azimuth_centre_mm, rotation.elevation_centre_mm, rotation.torsion_centre_mm))
+    ca, ce, ct = (
+        _split(c) for c in (rotation.azimuth_centre_mm, rotation.elevation_centre_mm, rotation.torsion_centre_mm)
+    )
     cos_a, sin_a, cos_e, sin_e = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     whole = 1.0 + cos_a * cos_e
     sin_t = -sin_a * sin_e / whole

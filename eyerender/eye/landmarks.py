@@ -26,16 +26,14 @@ def path_to_retina(eye: Eye) -> tuple[Crossing, ...]:
     lens = zip(eye.back, eye.back_indices, eye.back_rims_mm, eye.back_passing, strict=True)
     return (
         *(Crossing(s, n) for s, n in zip(eye.front, eye.front_indices, strict=True)),
-        *(
-            Crossing(s, n, rim_mm=rim, beyond_rim=None if passing else RayStatus.MISSED)
-            for s, n, rim, passing in lens
-        ),
+        *(Crossing(s, n, rim_mm=rim, beyond_rim=None if passing else RayStatus.MISSED) for s, n, rim, passing in lens),
         Crossing(eye.retina, last),
     )
 
 
 def nodal_rays(eye: Eye, objects_mm: Array, guess_mm: Array) -> tuple[Array, Array]:
-    """The rays from objects (m, 3) that reach the retina parallel to themselves: directions (m, 3), retina points (m, 3).
+    """The rays from objects (m, 3) that reach the retina parallel to themselves: directions (m, 3), retina points (m,
+    3).
 
     Raises `InputError` where there is none.
     """
@@ -83,9 +81,10 @@ def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
 def incident_node(eye: Eye) -> Array:
     """The waist of a ring of nodal rays on the optic axis (3,).
 
-    16 nodal rays from (h, v) = 14.3 deg (sin f, cos f), objects 1500 mm from the apex; the node is the mean of the points
-    of closest approach of all pairs, on the axis. (Harris 2010, "Nodes and nodal points and lines in eyes and other optical
-    systems", Ophthalmic Physiol. Opt. 30, 24-42: an aspheric or tilted eye has no nodal point, but a waist.)
+    16 nodal rays from (h, v) = 14.3 deg (sin f, cos f), objects 1500 mm from the apex; the node is the mean of the
+    points of closest approach of all pairs, on the axis. (Harris 2010, "Nodes and nodal points and lines in eyes and
+    other optical systems", Ophthalmic Physiol. Opt. 30, 24-42: an aspheric or tilted eye has no nodal point, but a
+    waist.)
     """
     angle = 2.0 * np.pi * np.arange(NODE_RAYS) / NODE_RAYS
     ring = np.radians(NODE_RING_DEG) * np.stack([np.sin(angle), np.cos(angle)], axis=-1)

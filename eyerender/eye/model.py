@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
@@ -75,7 +76,9 @@ class RotationCentres(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineOfSight(ArrayValue):
-    """The chief ray to the fovea, in air: `point_mm` where it leaves the cornea, unit `direction` outward, (3,) each."""
+    """The chief ray to the fovea, in air: `point_mm` where it leaves the cornea, unit `direction` outward, (3,)
+    each.
+    """
 
     point_mm: Array
     direction: Array

@@ -1,7 +1,7 @@
 """Pose: how an eye stands, and how its points move with it.
 
-M = Rz(azimuth) Ry(-elevation) Rx(torsion), right-handed; azimuth > 0 turns to the subject's left for both eyes, elevation > 0
-up. Listing's law sets the torsion:
+M = Rz(azimuth) Ry(-elevation) Rx(torsion), right-handed; azimuth > 0 turns to the subject's left for both eyes,
+elevation > 0 up. Listing's law sets the torsion:
 
     tau = -asin(sin az sin el / (1 + cos az cos el)),
 
@@ -54,16 +54,12 @@ class Poses(ArrayValue):
 def listing_torsion(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Array:
     """tau = -asin(sin az sin el / (1 + cos az cos el))."""
     azimuth, elevation = np.asarray(azimuth_rad), np.asarray(elevation_rad)
-    return np.asarray(
-        -np.arcsin(np.sin(azimuth) * np.sin(elevation) / (1.0 + np.cos(azimuth) * np.cos(elevation)))
-    )
+    return np.asarray(-np.arcsin(np.sin(azimuth) * np.sin(elevation) / (1.0 + np.cos(azimuth) * np.cos(elevation))))
 
 
 def rotation_matrices(poses: Poses) -> Array:
     """M, (n, 3, 3)."""
-    return np.asarray(
-        rotation_z(poses.azimuth_rad) @ rotation_y(-poses.elevation_rad) @ rotation_x(poses.torsion_rad)
-    )
+    return np.asarray(rotation_z(poses.azimuth_rad) @ rotation_y(-poses.elevation_rad) @ rotation_x(poses.torsion_rad))
 
 
 def rigid_motion(poses: Poses, eye: Eye) -> tuple[Array, Array]:

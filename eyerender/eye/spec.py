@@ -1,7 +1,8 @@
 """The eye file: what a person writes about a right eye.
 
-Eye frame (mm): origin at the front corneal apex of the unrotated eye, +x outward along the optic axis, +y nasal, +z up. A
-left eye is the mirror image y -> -y. Lists of surfaces run from outside in; a medium is the one BEHIND its surface.
+Eye frame (mm): origin at the front corneal apex of the unrotated eye, +x outward along the optic axis, +y nasal, +z
+up. A left eye is the mirror image y -> -y. Lists of surfaces run from outside in; a medium is the one BEHIND its
+surface.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import Discriminator, Field, Tag
 
 from ..geometry.transforms import TiltOrder
-from ..spec import FileSpec, NonNegative, Positive, Spec, Vec2, Vec3
+from ..spec import FileSpec, Positive, Spec, Vec2, Vec3
 
 if TYPE_CHECKING:
     from .model import Eye
@@ -123,11 +124,11 @@ class SurfaceLensSpec(Spec):
 class GradientLensSpec(Spec):
     """A gradient-index lens as iso-indicial shells.
 
-    The shell of relative size p in (0, 1] is the outer surface scaled by p about the lens' centre, which lies on the line
-    between the two apexes at `centre_fraction` of it, counted from the front; n(p) = n_core - (n_core - n_edge) p^2.
-    `shells` shells a half stand at evenly spaced n_k from edge to core; the medium inside shell k has the mid index
-    between n_k and n_(k+1). `index_rate` 2 reproduces software that steps the index twice as fast as the shells: shell k
-    stands where n has gone half as far as the index inside it says.
+    The shell of relative size p in (0, 1] is the outer surface scaled by p about the lens' centre, which lies on the
+    line between the two apexes at `centre_fraction` of it, counted from the front; n(p) = n_core - (n_core - n_edge)
+    p^2. `shells` shells a half stand at evenly spaced n_k from edge to core; the medium inside shell k has the mid
+    index between n_k and n_(k+1). `index_rate` 2 reproduces software that steps the index twice as fast as the shells:
+    shell k stands where n has gone half as far as the index inside it says.
     """
 
     kind: Literal["gradient"]
@@ -159,8 +160,9 @@ LensSpec = Annotated[
 class StopSpec(Spec):
     """The anatomical pupil: an ellipse in a plane.
 
-    `ellipticity` = 1 - b/a at the area of the circle of `diameter_mm`; the long axis lies `axis_deg` from nasal towards up.
-    A pupil of another diameter d is centred at position_mm + (0, s_y, s_z) (d - diameter_mm), s = `shift_mm_per_mm`.
+    `ellipticity` = 1 - b/a at the area of the circle of `diameter_mm`; the long axis lies `axis_deg` from nasal
+    towards up. A pupil of another diameter d is centred at position_mm + (0, s_y, s_z) (d - diameter_mm), s =
+    `shift_mm_per_mm`.
     """
 
     diameter_mm: Positive

@@ -2,9 +2,11 @@
 
 The cornea is a spherical mirror (centre c, radius R) in front of an eye that refracts once (index n):
 
-    q_i = O + k_i u_i,   c = q_i - R unit(unit(L_i - q_i) + unit(O - q_i))            Guestrin & Eizenman 2006, (1)-(3)
+    q_i = O + k_i u_i,     c = q_i - R unit(unit(L_i - q_i) + unit(O - q_i))
 
-Source: Guestrin & Eizenman, IEEE TBME 53(6), 2006. Leading axes broadcast, so that many sets of parameters are one batch.
+the mirror point on the ray of glint i, and the law of reflection there. Source: Guestrin & Eizenman, IEEE TBME 53(6),
+2006, section II; in Guestrin's thesis (Toronto, 2010) the ray is (3.2) and its meeting with a sphere (3.29). Leading
+axes broadcast, so that many sets of parameters are one batch.
 """
 
 from __future__ import annotations
@@ -51,7 +53,9 @@ def from_all_glints(
         start_mm: (..., m) distances to start from; default: the best of a coarse search.
     """
     m = glints.shape[-2]
-    radius = np.broadcast_to(np.asarray(radius_mm, dtype=float), np.broadcast_shapes(np.shape(radius_mm), glints.shape[:-2]))
+    radius = np.broadcast_to(
+        np.asarray(radius_mm, dtype=float), np.broadcast_shapes(np.shape(radius_mm), glints.shape[:-2])
+    )
     origin = origin_mm[..., None, :]
     k = _coarse(origin, glints, light_mm, radius) if start_mm is None else np.array(start_mm, dtype=float)
     k = np.broadcast_to(k, (*radius.shape, m)).copy()
@@ -70,7 +74,7 @@ def from_all_glints(
         c_new, slope_new = _mirror_centres(origin, glints, light_mm, radius, trial)
         deviation_new = c_new - c_new.mean(axis=-2, keepdims=True)
         cost_new = (deviation_new * deviation_new).sum(axis=(-1, -2))
-        better = (cost_new <= cost) & (trial > 0).all(axis=-1)
+        better: Bools = np.asarray((cost_new <= cost) & (trial > 0).all(axis=-1))
         pick = better[..., None, None]
         k = np.where(better[..., None], trial, k)
         c, slope = np.where(pick, c_new, c), np.where(pick, slope_new, slope)
@@ -90,8 +94,8 @@ def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple
     """Unit direction (..., 3) from the camera to the cornea's centre, without any eye parameter, and whether it exists.
 
     Each plane of camera, light and glint holds the centre: b is normal to all (L_i - O) x u_i. With two lights
-    b = unit[((L_1 - O) x u_1) x ((L_2 - O) x u_2)] (Guestrin & Eizenman 2006, (18); Shih, Wu & Liu 2000); with more the
-    right singular vector of the smallest singular value. There is none where camera, lights and centre are coplanar.
+    b = unit[((L_1 - O) x u_1) x ((L_2 - O) x u_2)] (Guestrin & Eizenman 2006; Shih, Wu & Liu 2000); with more the right
+    singular vector of the smallest singular value. There is none where camera, lights and centre are coplanar.
     """
     normals = unit(np.cross(light_mm - origin_mm[..., None, :], glints))
     if glints.shape[-2] == 2:
@@ -116,7 +120,7 @@ def from_plane(
     solved by Newton's method for the distance k of the mirror point. The arguments are those of `from_all_glints`.
     """
     b, ok = line_to_centre(origin_mm, glints, light_mm)
-    radius = np.broadcast_to(np.asarray(radius_mm, dtype=float), np.broadcast_shapes(np.shape(radius_mm), b.shape[:-1]))
+    radius = _radii(radius_mm, b.shape[:-1])
     u, light = glints[..., mirror, :], light_mm[mirror]
     e = unit(u - (u * b).sum(axis=-1, keepdims=True) * b)
     side = (u * e).sum(axis=-1)
@@ -149,16 +153,16 @@ def optic_axis(
     """The optic axis w (..., 3): from the cornea's centre through the pupil centre.
 
     r = near intersection of the pupil ray with sphere(c, R), refracted (1 -> n) into t; p = r + k_p t on sphere(c, K);
-    w = unit(p - c)                                                            Guestrin & Eizenman 2006, (4)-(7), (10)
+    w = unit(p - c)                                                               (Guestrin & Eizenman 2006, section II)
 
     Args:
         origin_mm, pupil: (..., 3) nodal point and unit ray to the pupil centre. centre_mm: (..., 3).
         radius_mm, distance_mm, index: (...) R, K and n.
 
     Returns:
-        w; whether the ray meets the cornea (...); whether the refracted ray meets the sphere of radius K (...). Where the
-        ray misses the cornea w is that of the nearest point, where it misses the inner sphere that of its nearest point,
-        so that a search for parameters sees no step.
+        w; whether the ray meets the cornea (...); whether the refracted ray meets the sphere of radius K (...). Where
+        the ray misses the cornea w is that of the nearest point, where it misses the inner sphere that of its nearest
+        point, so that a search for parameters sees no step.
     """
     R, K, n = (np.asarray(v, dtype=float)[..., None] for v in (radius_mm, distance_mm, index))
     r, meets = _near_intersection(origin_mm, pupil, centre_mm, R)
@@ -168,6 +172,11 @@ def optic_axis(
     t = eta * pupil + (eta * cosine - np.sqrt(np.maximum(1 - eta**2 * (1 - cosine**2), 0.0))) * normal
     p, inside = _near_intersection(r, t, centre_mm, K)
     return unit(p - centre_mm), meets, inside
+
+
+def _radii(radius_mm: Floats, shape: tuple[int, ...]) -> Floats:
+    radius = np.asarray(radius_mm, dtype=float)
+    return np.broadcast_to(radius, np.broadcast_shapes(radius.shape, shape))
 
 
 def _near_intersection(origin: Floats, ray: Floats, centre: Floats, radius: Floats) -> tuple[Floats, Bools]:
@@ -199,7 +208,9 @@ def _coarse(origin: Floats, glints: Floats, light_mm: Floats, radius: Floats) ->
     """The equal distances, of some, whose centres disagree least, (..., m)."""
     m = glints.shape[-2]
     k = _START.reshape(-1, *([1] * radius.ndim)) * radius
-    c, _ = _mirror_centres(origin, glints, light_mm, np.broadcast_to(radius, k.shape), np.repeat(k[..., None], m, axis=-1))
+    c, _ = _mirror_centres(
+        origin, glints, light_mm, np.broadcast_to(radius, k.shape), np.repeat(k[..., None], m, axis=-1)
+    )
     spread = ((c - c.mean(axis=-2, keepdims=True)) ** 2).sum(axis=(-1, -2))
     best = np.argmin(np.where(np.isfinite(spread), spread, np.inf), axis=0)
     return np.repeat(np.take_along_axis(k, best[None], axis=0)[0][..., None], m, axis=-1)
@@ -211,7 +222,10 @@ def _solved(system: Floats, right: Floats) -> Floats:
         a, b, d = system[..., 0, 0], system[..., 0, 1], system[..., 1, 1]
         with np.errstate(invalid="ignore", divide="ignore"):
             det = a * d - b * b
-            return np.stack([d * right[..., 0] - b * right[..., 1], a * right[..., 1] - b * right[..., 0]], -1) / det[..., None]
+            return (
+                np.stack([d * right[..., 0] - b * right[..., 1], a * right[..., 1] - b * right[..., 0]], -1)
+                / det[..., None]
+            )
     finite = np.isfinite(system).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
     safe = np.where(finite[..., None, None], system, np.eye(system.shape[-1]))
     out = np.linalg.solve(safe, np.where(finite[..., None], right, 0.0)[..., None])[..., 0]

@@ -35,6 +35,23 @@ class GazePoints(ArrayValue):
         return np.asarray(self.status == OK)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class GazeRays(ArrayValue):
+    """Rays of gaze: origin (n, 3) mm and unit direction (n, 3), NaN where `reason` (n,) says why there is none."""
+
+    origin_mm: Floats
+    direction: Floats
+    reason: Objects
+
+    @classmethod
+    def of(cls, origin_mm: Floats, direction: Floats, reason: Objects) -> GazeRays:
+        """Rays, with NaN wherever there is a reason."""
+        ok = np.array([r is None for r in reason], dtype=bool)[:, None]
+        return cls(
+            frozen(np.where(ok, origin_mm, np.nan)), frozen(np.where(ok, direction, np.nan)), frozen(reason, object)
+        )
+
+
 class Estimator(Protocol):
     """A gaze estimator; `fit` returns a fitted copy."""
 
@@ -59,18 +76,16 @@ def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Obs
 
     A frame in which either eye is missing has no binocular estimate: the mean of one eye would be biased towards it.
     """
-    frames, first = np.unique(observations.index.frame, return_index=True)
-    points = np.full((len(frames), 3), np.nan)
+    frames, first, which = np.unique(observations.index.frame, return_index=True, return_inverse=True)
     reason = np.full(len(frames), None, dtype=object)
     eyes = len(np.unique(observations.index.eye))
-    for k, frame in enumerate(frames):
-        rows = np.flatnonzero(observations.index.frame == frame)
-        bad = [r for r in rows if not gaze.ok[r]]
-        if bad or len(rows) < eyes:
-            reason[k] = gaze.reason[bad[0]] if bad else "one eye has no observation"
-        else:
-            points[k] = gaze.point_mm[rows].mean(axis=0)
-    return observations.take(first), gaze_points(points, reason)
+    count = np.bincount(which, minlength=len(frames))
+    reason[count < eyes] = "one eye has no observation"
+    for row in np.flatnonzero(~gaze.ok)[::-1]:
+        reason[which[row]] = gaze.reason[row]
+    points = np.zeros((len(frames), 3))
+    np.add.at(points, which, gaze.point_mm)
+    return observations.take(first), gaze_points(points / count[:, None], reason)
 
 
 def angular_error_deg(point_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> Floats:

@@ -1,6 +1,6 @@
 """From features to rays: what the model-based estimators work on.
 
-    u = direction in which the camera sees a feature;  O = its nodal point;  L = a light.
+u = direction in which the camera sees a feature;  O = its nodal point;  L = a light.
 """
 
 from __future__ import annotations

@@ -2,23 +2,24 @@
 
     v = (pupil - glint) / |pupil_right - pupil_left|,   x = sum_k a_k m_k(v),   y = sum_k b_k m_k(v)
 
-with monomials m_k from Table 2 of the comparative study, fitted by least squares for each eye.
+with monomials m_k from Table 2 of the comparative study, fitted by least squares for each eye. Without the division the
+vector is that of one eye alone (Morimoto & Mimica, CVIU 98, 2005).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Bools, Floats, Objects
+from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError
 from ..observation import Observations
 from ..rig.rig import Rig
-from ..rig.screen import Screen
 from .estimate import GazePoints, gaze_points
+from .rays import screen_of
 
 Terms = tuple[tuple[int, int], ...]  # exponents (i, j) of x^i y^j
 
@@ -83,11 +84,13 @@ class PupilGlintRegression:
         function: R1 to R12 of Table 2, or the terms of x and y, as ("x + y + 1", "x + y2 + 1").
         light: which light's glint the vector runs from.
         minimum_norm: allow fewer targets than terms and take the minimum-norm solution, as the study's authors did.
+        normalised: divide by the distance of the two pupils; False takes the vector in pixels, of one eye alone.
     """
 
     function: str | tuple[str, str] = "R3"
     light: int = 0
     minimum_norm: bool = False
+    normalised: bool = True
     _fits: dict[int, _Fit] = field(default_factory=dict, repr=False)
 
     @property
@@ -103,10 +106,10 @@ class PupilGlintRegression:
 
     def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
         """Calibrate each eye; raises `InputError` for too few usable targets or targets that do not determine it."""
-        screen = _screen(rig)
+        screen = screen_of(rig)
         targets = np.asarray(targets_mm, dtype=float) - screen.centre_mm
         wanted = np.stack([targets @ screen.right, targets @ screen.up], axis=-1)
-        v, reason = pupil_glint_vectors(observations, self.light)
+        v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
         usable = np.array([r is None for r in reason], dtype=bool) & np.isfinite(wanted).all(axis=1)
         x_terms, y_terms = self.terms
         fits = {}
@@ -133,8 +136,8 @@ class PupilGlintRegression:
         """Gaze points on the screen's plane."""
         if not self._fits:
             raise InputError("the estimator is not calibrated; call fit first")
-        screen = _screen(rig)
-        v, reason = pupil_glint_vectors(observations, self.light)
+        screen = screen_of(rig)
+        v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
         reason = reason.copy()
         x_terms, y_terms = self.terms
         on_screen = np.full((len(observations), 2), np.nan)
@@ -155,10 +158,10 @@ class PupilGlintRegression:
         return np.asarray(solution)
 
 
-def pupil_glint_vectors(observations: Observations, light: int = 0) -> tuple[Floats, Objects]:
-    """The normalised pupil-glint vector (n, 2) and why there is none (n,), None where there is.
+def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: bool = True) -> tuple[Floats, Objects]:
+    """The pupil-glint vector (n, 2) and why there is none (n,), None where there is.
 
-    Both eyes of one frame are needed: the distance of their pupils is the unit.
+    Normalised, both eyes of one frame are needed: the distance of their pupils is the unit. Otherwise it is in pixels.
     """
     index, pupil = observations.index, observations.pupil
     n = len(observations)
@@ -166,6 +169,9 @@ def pupil_glint_vectors(observations: Observations, light: int = 0) -> tuple[Flo
     reason = np.full(n, None, dtype=object)
     reason[~pupil.ok] = "no pupil"
     reason[pupil.ok & ~found] = f"no glint of light {light}"
+    if not normalised:
+        good = pupil.ok & found
+        return np.where(good[:, None], pupil.centre_px - glint, np.nan), reason
     partner = _partners(index.frame, index.eye)
     lone = (partner < 0) & (reason == None)  # noqa: E711  (element by element)
     reason[lone] = "the frame shows one eye; the vector is normalised by the distance of two pupils"
@@ -178,20 +184,15 @@ def pupil_glint_vectors(observations: Observations, light: int = 0) -> tuple[Flo
     return np.where(good[:, None], v, np.nan), reason
 
 
-def _partners(frame: Any, eye: Any) -> Any:
+def _partners(frame: Ints, eye: Ints) -> Ints:
     """Row of the other eye of the same frame, -1 where there is none."""
-    out = np.full(len(frame), -1)
-    where = {(int(f), int(e)): k for k, (f, e) in enumerate(zip(frame, eye, strict=True))}
-    for (f, e), k in where.items():
-        out[k] = where.get((f, 1 - e), -1)
-    return out
+    # One number for each (frame, eye) whose partner's is its neighbour; eyes of unknown side have none.
+    key = 2 * frame + eye
+    order = np.argsort(key, kind="stable")
+    at = np.minimum(np.searchsorted(key[order], key ^ 1), len(key) - 1)
+    found = (key[order][at] == (key ^ 1)) & (eye >= 0)
+    return np.where(found, order[at], -1)
 
 
 def _monomials(v: Floats, terms: Terms) -> Floats:
     return np.stack([v[:, 0] ** i * v[:, 1] ** j for i, j in terms], axis=1)
-
-
-def _screen(rig: Rig) -> Screen:
-    if rig.screen is None:
-        raise InputError("interpolation-based gaze estimation needs a screen in the rig")
-    return rig.screen

@@ -139,5 +139,3 @@ def graphs_of(surfaces: Sequence[Surface], ndim: int) -> tuple[list[Graph], Arra
         else:
             return None
     return graphs, origin, rotation
-
-

@@ -1,9 +1,10 @@
 """Refracting and reflecting surfaces: the interface every kind of surface has, and points as components.
 
-A surface is the zero set of an implicit function F, oriented so that its half gradient g = grad F / 2 points to +x of the
-surface's local frame (the optic axis outward, towards the air) everywhere on the sheet that counts. A line parallel to
-the local x axis therefore meets the sheet at most once, and the sign of d.g tells a ray going into the eye (d.g < 0)
-from one coming out, which makes the choice of the root unambiguous for spheres, ellipsoids and hyperboloids alike.
+A surface is the zero set of an implicit function F, oriented so that its half gradient g = grad F / 2 points to +x of
+the surface's local frame (the optic axis outward, towards the air) everywhere on the sheet that counts. A line
+parallel to the local x axis therefore meets the sheet at most once, and the sign of d.g tells a ray going into the eye
+(d.g < 0) from one coming out, which makes the choice of the root unambiguous for spheres, ellipsoids and hyperboloids
+alike.
 
 Points travel as one array per coordinate (`Xyz`): chunks of such arrays stay in the cache. Parameters of a surface are
 numbers, or arrays with one leading batch axis (one surface an eye); points then have that axis first.
@@ -24,7 +25,9 @@ Xyz = tuple[Array, Array, Array]
 
 
 class Hit(NamedTuple):
-    """Where rays meet a surface: `distance` along the unit direction (mm), `point`, half `gradient`, `ok` (it exists)."""
+    """Where rays meet a surface: `distance` along the unit direction (mm), `point`, half `gradient`, `ok` (it
+    exists).
+    """
 
     distance: Array
     point: Xyz
@@ -112,7 +115,9 @@ class Surface(ABC):
         """Single surfaces of this kind as one batch."""
 
     def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and all(np.array_equal(a, b) for a, b in zip(self._key(), other._key(), strict=True))
+        return type(other) is type(self) and all(
+            np.array_equal(a, b) for a, b in zip(self._key(), other._key(), strict=True)
+        )
 
     def __hash__(self) -> int:
         return hash((type(self), *((a + 0.0).tobytes() for a in self._key())))
@@ -134,7 +139,8 @@ class Surface(ABC):
     def normal(self, points: npt.ArrayLike) -> Array:
         """Unit normal g/|g| at points (..., 3), pointing to the air side (+x of the local frame)."""
         gradient = join(self.gradient_at(components(points)))
-        return gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
+        unit: Array = gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
+        return unit
 
     def sag(self, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike) -> Array:
         """x (mm, local frame) of the sheet over local y and z; NaN where it does not reach."""

@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from .surfaces import Hit, Surface, SymmetricMatrix, Xyz, fit, shift, turn, turn_back
+from .surfaces import Hit, Mask, Surface, SymmetricMatrix, Xyz, fit, shift, turn, turn_back
 from .transforms import Array, flip_y, mirror_rotation, read_only
 
 
@@ -21,12 +21,13 @@ class _Sag(NamedTuple):
     yy: Array
     yz: Array
     zz: Array
-    inside: Array
+    inside: Mask
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Biconic(Surface):
-    """x = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - (1 + Q_y) c_y^2 y^2 - (1 + Q_z) c_z^2 z^2)), c = 1/R, apex at the origin.
+    """x = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - (1 + Q_y) c_y^2 y^2 - (1 + Q_z) c_z^2 z^2)), c = 1/R, apex at the
+    origin.
 
     radii_mm : (R_y, R_z) > 0: opens to -x; < 0: to +x, (..., 2)
     conic_constants : (Q_y, Q_z), (..., 2)
@@ -120,7 +121,7 @@ class Biconic(Surface):
         """
         cy, cz, ky, kz = self._constants(max(y.ndim, z.ndim))
         square = 1.0 - ky * y * y - kz * z * z
-        inside = square > 0.0
+        inside = np.asarray(square > 0.0)
         w = np.sqrt(np.where(inside, square, 1.0))
         d = 1.0 / (1.0 + w)
         x = -(cy * y * y + cz * z * z) * d
@@ -141,9 +142,7 @@ class Biconic(Surface):
 
     def mirrored(self) -> Self:
         # The sag is even in y, so only the placement is mirrored.
-        return type(self)(
-            flip_y(self.origin_mm), mirror_rotation(self.rotation), self.radii_mm, self.conic_constants
-        )
+        return type(self)(flip_y(self.origin_mm), mirror_rotation(self.rotation), self.radii_mm, self.conic_constants)
 
     def _key(self) -> tuple[Array, ...]:
         return self.origin_mm, self.rotation, self.radii_mm, self.conic_constants
@@ -158,11 +157,11 @@ class Biconic(Surface):
         parts = (curvature[..., 0], curvature[..., 1], shape[..., 0], shape[..., 1])
         return tuple(fit(part, ndim) for part in parts)
 
-    def _first_order(self, y: Array, z: Array) -> tuple[Array, Array, Array, Array]:
+    def _first_order(self, y: Array, z: Array) -> tuple[Array, Array, Array, Mask]:
         cy, cz, ky, kz = self._constants(max(y.ndim, z.ndim))
         y_square, z_square = y * y, z * z
         square = 1.0 - ky * y_square - kz * z_square
-        inside = square > 0.0
+        inside = np.asarray(square > 0.0)
         w = np.sqrt(np.where(inside, square, 1.0))
         d = 1.0 / (1.0 + w)
         x = -(cy * y_square + cz * z_square) * d

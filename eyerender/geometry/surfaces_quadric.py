@@ -182,9 +182,7 @@ class Quadric(Surface):
         """The root of A_xx x^2 + 2 (A_xy y + A_xz z + b_x) x + F(0, y, z) = 0 on the sheet."""
         m, v = self.matrix, self.vector
         ndim = max(y.ndim, z.ndim)
-        xx, yy, zz, xy, xz, yz = (
-            fit(m[..., i, j], ndim) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-        )
+        xx, yy, zz, xy, xz, yz = (fit(m[..., i, j], ndim) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
         bx, by, bz, c = (fit(e, ndim) for e in (v[..., 0], v[..., 1], v[..., 2], self.constant))
         half = xy * y + xz * z + bx
         rest = yy * y * y + zz * z * z + 2.0 * (yz * y * z + by * y + bz * z) + c

@@ -44,23 +44,27 @@ def tilt_rotation(tilt_rad: npt.ArrayLike, order: TiltOrder = "zyx") -> Array:
     """Rz(t_z) Ry(t_y) Rx(t_x), or Rx Ry Rz for order 'xyz'; `tilt_rad` about (x, y, z), shape (..., 3)."""
     tilt = np.asarray(tilt_rad, dtype=np.float64)
     about_x, about_y, about_z = rotation_x(tilt[..., 0]), rotation_y(tilt[..., 1]), rotation_z(tilt[..., 2])
-    return about_z @ about_y @ about_x if order == "zyx" else about_x @ about_y @ about_z
+    whole: Array = about_z @ about_y @ about_x if order == "zyx" else about_x @ about_y @ about_z
+    return whole
 
 
 def flip_y(points: npt.ArrayLike) -> Array:
     """(x, y, z) -> (x, -y, z), shape (..., 3)."""
-    return np.asarray(points, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
+    flipped: Array = np.asarray(points, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
+    return flipped
 
 
 def mirror_rotation(rotation: npt.ArrayLike) -> Array:
     """S R S with S the mirroring of y: the same rotation seen in the mirror; shape (..., 3, 3)."""
-    return MIRROR @ np.asarray(rotation, dtype=np.float64) @ MIRROR
+    mirrored: Array = MIRROR @ np.asarray(rotation, dtype=np.float64) @ MIRROR
+    return mirrored
 
 
 def normalize(vectors: npt.ArrayLike) -> Array:
     """v / |v| along the last axis."""
     array = np.asarray(vectors, dtype=np.float64)
-    return array / np.linalg.norm(array, axis=-1, keepdims=True)
+    unit: Array = array / np.linalg.norm(array, axis=-1, keepdims=True)
+    return unit
 
 
 def _plane_rotation(angle_rad: npt.ArrayLike, first: int, second: int) -> Array:

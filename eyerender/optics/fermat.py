@@ -1,17 +1,18 @@
 """The two-point problem by Fermat's principle: paths of stationary optical length across graphs of surfaces.
 
-A path from a viewpoint X_0 over the points X_i = (h_i(y_i, z_i), y_i, z_i) of m surfaces to an object X_{m+1} has the optical
-length S = sum_j n_j |X_{j+1} - X_j|. It is a ray where dS = 0. With e_j the unit vectors along the segments, the tangents
-t_y = (h_y, 1, 0), t_z = (h_z, 0, 1), q_i = n_{i-1} e_{i-1} - n_i e_i and the projection A_j = (1 - e_j e_j^T) n_j / L_j,
+A path from a viewpoint X_0 over the points X_i = (h_i(y_i, z_i), y_i, z_i) of m surfaces to an object X_{m+1} has the
+optical length S = sum_j n_j |X_{j+1} - X_j|. It is a ray where dS = 0. With e_j the unit vectors along the segments,
+the tangents t_y = (h_y, 1, 0), t_z = (h_z, 0, 1), q_i = n_{i-1} e_{i-1} - n_i e_i and the projection A_j = (1 - e_j
+e_j^T) n_j / L_j,
 
     gradient            G_i = t_i . q_i
     Hessian, diagonal   t_i.(A_{i-1} + A_i) t_i + (q_i)_x h_i''
     Hessian, next       -t_i . A_i t_{i+1}
 
-(Born & Wolf 1999, 3.3.2; the Hessian is that of Walter et al. 2009, "Single scattering in refractive media with triangle
-mesh boundaries", eq. 6, for any number of surfaces.) Newton needs no intersections, so a biconic costs as much as a
-sphere. A mirror point is the same with m = 1, equal indices and the object outside. This is the fast way for the many;
-`shooting` is the sure one, and takes what is left over here.
+(Born & Wolf 1999, 3.3.2; the Hessian is that of Walter et al. 2009, "Single scattering in refractive media with
+triangle mesh boundaries", eq. 6, for any number of surfaces.) Newton needs no intersections, so a biconic costs as
+much as a sphere. A mirror point is the same with m = 1, equal indices and the object outside. This is the fast way for
+the many; `shooting` is the sure one, and takes what is left over here.
 """
 
 from __future__ import annotations
@@ -39,7 +40,11 @@ class Stationary(NamedTuple):
 
 
 def stationary_path(
-    graphs: Sequence[Graph], indices: Sequence[Number], viewpoint: Xyz, target: Xyz, start: Sequence[tuple[Array, Array]]
+    graphs: Sequence[Graph],
+    indices: Sequence[Number],
+    viewpoint: Xyz,
+    target: Xyz,
+    start: Sequence[tuple[Array, Array]],
 ) -> Stationary:
     """Newton on dS = 0 from `start` (y, z) on each surface; all in the frame of the graphs.
 
@@ -77,6 +82,7 @@ def _newton(
     blocks: list[_Block] = []
     couplings: list[tuple[Array, Array, Array, Array]] = []
     last = len(graphs)
+    carried: tuple[Array, ...] = ()
     for j, n in enumerate(indices):
         (x0, y0, z0), (x1, y1, z1) = nodes[j], nodes[j + 1]
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0

@@ -1,7 +1,7 @@
 """The two-point problem by shooting: the ray that leaves one point, passes a path of crossings and meets another point.
 
-Newton on the direction at the source with ray differentials. A unit direction d is varied along e1, e2 orthogonal to it;
-each crossing carries the differentials dy of the point and dw of the direction along (Igehy 1999, "Tracing ray
+Newton on the direction at the source with ray differentials. A unit direction d is varied along e1, e2 orthogonal to
+it; each crossing carries the differentials dy of the point and dw of the direction along (Igehy 1999, "Tracing ray
 differentials", eq. 8-19):
 
     transfer    dt = -N.(dy + t dw) / (N.w),  dy <- dy + t dw + dt w,   dN = (H dy - N (N.H dy)) / |g|
@@ -9,8 +9,8 @@ differentials", eq. 8-19):
     reflection  w = d + 2 c N:                    dw = dd + 2 (dc N + c dN)
 
 with c = -d.N and dc = -(dd.N + d.dN). In the last medium the ray passes the target at y + s w, missing it by r; with
-a_i = dy_i + s dw_i the step is d <- d + e1 w.(r x a2)/det + e2 w.(a1 x r)/det, det = w.(a1 x a2). |det| is also the ratio
-of the ray tube's cross section at the target to its solid angle at the source (mm^2/sr).
+a_i = dy_i + s dw_i the step is d <- d + e1 w.(r x a2)/det + e2 w.(a1 x r)/det, det = w.(a1 x a2). |det| is also the
+ratio of the ray tube's cross section at the target to its solid angle at the source (mm^2/sr).
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ def _rescue(
     """Guarded Newton for the rays that the undamped one left over; the rest are handed on unchanged."""
     index = np.nonzero(left)
     frame = index[0] if left.ndim else np.zeros(1, dtype=np.intp)
-    few_path = [_taken(crossing, frame) for crossing in path]
+    few_path = [taken(crossing, frame) for crossing in path]
     few_start = n_start if isinstance(n_start, float) or np.ndim(n_start) == 0 else np.asarray(n_start)[frame]
     few_source, few_target, few_aim = _pick(source, index), _pick(target, index), _pick(aim, index)
     best_way = _pick(direction, index)
@@ -262,7 +262,7 @@ def _better(trial: _Shot, best: _Shot) -> Mask:
     return np.asarray((ok & ~held) | ((ok == held) & (trial.residual_mm < best.residual_mm)))
 
 
-def _taken(crossing: Crossing, frame: npt.NDArray[np.intp]) -> Crossing:
+def taken(crossing: Crossing, frame: npt.NDArray[np.intp]) -> Crossing:
     """The crossing with its per-eye parameters gathered for single rays."""
     n_after, rim = crossing.n_after, crossing.rim_mm
     return Crossing(
@@ -367,7 +367,5 @@ def _moved(point: Xyz, way: Xyz, distance: Array | float) -> Xyz:
 def _triple(a: Xyz, b: Xyz, c: Xyz) -> Array:
     """a.(b x c)"""
     return np.asarray(
-        a[0] * (b[1] * c[2] - b[2] * c[1])
-        + a[1] * (b[2] * c[0] - b[0] * c[2])
-        + a[2] * (b[0] * c[1] - b[1] * c[0])
+        a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
     )

@@ -1,23 +1,31 @@
 """Apparent points (refraction), mirror points (reflection) and Purkinje images: the rays that join two points.
 
-All are found by Newton with ray differentials (`shooting`) and carry the residual: by how much the ray, traced from the
-viewpoint through the surfaces, misses the other point.
+The many are found by Newton on the optical length (`fermat`), from a paraxial start. Every path found is then traced,
+from the viewpoint through the surfaces; what the traced ray misses the other point by is the residual. A path that
+misses by more than rounding is searched again by shooting with ray differentials and guarded steps (`shooting`), which
+also serves surfaces that have no common graph and all paths with several reflections or shells.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import ArrayValue
-from ..geometry.surfaces import Surface, Xyz, components, fit, join, shift
+from ..geometry.graphs import Graph, graphs_of
+from ..geometry.surfaces import Mask, Surface, Xyz, components, fit, join, shift, turn, turn_back
 from ..geometry.transforms import Array
+from .fermat import stationary_path
 from .interface import Number, dot
-from .shooting import Connection, connect
-from .trace import Crossing, RayStatus, Status
+from .shooting import Connection, connect, taken
+from .trace import Crossing, RayStatus, Status, cross, inside_rim, mark
+
+SURE_MM = 1e-11
+"""A path that its traced ray confirms to this is taken as found; rounding stays well below."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,15 +33,13 @@ class ApparentPoints(ArrayValue):
     """Where the rays from object points to a viewpoint leave the outermost surface.
 
     exit_points_mm (..., 3); directions (..., 3): unit, from the exit point to the viewpoint; inner_directions (..., 3):
-    unit, from the object to the innermost surface; residual_mm (...,); tube_mm2_sr (...,): the cross section at the
-    object of a ray tube of one steradian at the viewpoint; status (...,).
+    unit, from the object to the innermost surface; residual_mm (...,); status (...,).
     """
 
     exit_points_mm: Array
     directions: Array
     inner_directions: Array
     residual_mm: Array
-    tube_mm2_sr: Array
     status: Status
 
 
@@ -42,16 +48,28 @@ class MirrorPoints(ArrayValue):
     """Where light from a source is thrown back to a viewpoint.
 
     points_mm (..., 3): the mirror point itself (for a Purkinje image from inside: on the reflecting surface);
-    exit_points_mm (..., 3): where the ray meets the outermost surface on its way to the viewpoint (the same for the first
-    Purkinje image); directions (..., 3): unit, from the exit point to the viewpoint; residual_mm, tube_mm2_sr, status
-    (...,).
+    exit_points_mm (..., 3): where the ray meets the outermost surface on its way to the viewpoint (the same for the
+    first Purkinje image); directions (..., 3): unit, from the exit point to the viewpoint; residual_mm, status (...,).
     """
 
     points_mm: Array
     exit_points_mm: Array
     directions: Array
     residual_mm: Array
-    tube_mm2_sr: Array
+    status: Status
+
+
+class Rays(NamedTuple):
+    """Rays from a viewpoint to a point through surfaces, one array per coordinate.
+
+    exit : the point on the outermost surface; way : unit direction from the viewpoint to it; end : unit direction in
+    the last medium; residual_mm, status.
+    """
+
+    exit: Xyz
+    way: Xyz
+    end: Xyz
+    residual_mm: Array
     status: Status
 
 
@@ -68,29 +86,19 @@ def apparent_points(
 
     surfaces : outside in; indices : the index behind each; rim_mm : where the outermost surface ends (the limbus).
     """
-    path = [
-        Crossing(surface, index, rim_mm=rim_mm if k == 0 else np.inf, beyond_rim=RayStatus.OUTSIDE_LIMBUS)
-        for k, (surface, index) in enumerate(zip(surfaces, indices, strict=True))
-    ]
-    target = components(object_points_mm)
-    found = connect(path, n_outside, components(viewpoint_mm), target, target)
-    return ApparentPoints(
-        join(found.first),
-        -join(found.start),
-        -join(found.end),
-        found.residual_mm,
-        found.tube_mm2_sr,
-        found.status,
+    rays = refracted_rays(
+        surfaces, indices, components(object_points_mm), components(viewpoint_mm), rim_mm=rim_mm, n_outside=n_outside
     )
+    return ApparentPoints(join(rays.exit), -join(rays.way), -join(rays.end), rays.residual_mm, rays.status)
 
 
 def mirror_points(
     surface: Surface, source_mm: npt.ArrayLike, viewpoint_mm: npt.ArrayLike, *, rim_mm: Number = np.inf
 ) -> MirrorPoints:
     """Reflection of a source (..., 3) to a viewpoint (..., 3) at the outside of `surface`: the first Purkinje image."""
-    path = (Crossing(surface, 1.0, reflects=True, rim_mm=rim_mm, beyond_rim=RayStatus.OUTSIDE_LIMBUS),)
-    viewpoint, source = components(viewpoint_mm), components(source_mm)
-    return _mirror(connect(path, 1.0, viewpoint, source, mirror_start(surface, source, viewpoint)))
+    rays = mirrored_rays(surface, components(source_mm), components(viewpoint_mm), rim_mm=rim_mm)
+    points = join(rays.exit)
+    return MirrorPoints(points, points, -join(rays.way), rays.residual_mm, rays.status)
 
 
 def purkinje_points(
@@ -120,7 +128,149 @@ def purkinje_points(
         *(crossing(k, before[k], False) for k in reversed(range(last))),
     ]
     viewpoint, source = components(viewpoint_mm), components(source_mm)
-    return _mirror(connect(path, n_outside, viewpoint, source, mirror_start(surfaces[last], source, viewpoint)))
+    found = connect(path, n_outside, viewpoint, source, mirror_start(surfaces[last], source, viewpoint))
+    return MirrorPoints(join(found.turning), join(found.first), -join(found.start), found.residual_mm, found.status)
+
+
+def refracted_rays(
+    surfaces: Sequence[Surface],
+    indices: Sequence[Number],
+    target: Xyz,
+    viewpoint: Xyz,
+    *,
+    rim_mm: Number = np.inf,
+    n_outside: float = 1.0,
+) -> Rays:
+    """`apparent_points` on components."""
+    path = [
+        Crossing(surface, index, rim_mm=rim_mm if k == 0 else np.inf, beyond_rim=RayStatus.OUTSIDE_LIMBUS)
+        for k, (surface, index) in enumerate(zip(surfaces, indices, strict=True))
+    ]
+    ndim = max(target[0].ndim, viewpoint[0].ndim)
+    frame = graphs_of(surfaces, ndim)
+    if frame is None:
+        return _from_connection(connect(path, n_outside, viewpoint, target, target))
+    graphs, origin, rotation = frame
+    plain = not np.any(origin) and np.array_equal(rotation, np.broadcast_to(np.eye(3), rotation.shape))
+    inner = target if plain else turn_back(rotation, shift(target, origin, -1.0))
+    outer = viewpoint if plain else turn_back(rotation, shift(viewpoint, origin, -1.0))
+    ladder = [n_outside, *(_spread_index(n, ndim) for n in indices)]
+    points = stationary_path(graphs, ladder, outer, inner, _paraxial_start(graphs, ladder, outer, inner)).points
+    first = points[0] if plain else shift(turn(rotation, points[0]), origin, 1.0)
+    return _confirmed(path, n_outside, viewpoint, target, first, target)
+
+
+def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Number = np.inf) -> Rays:
+    """`mirror_points` on components."""
+    path = (Crossing(surface, 1.0, reflects=True, rim_mm=rim_mm, beyond_rim=RayStatus.OUTSIDE_LIMBUS),)
+    guess = mirror_start(surface, source, viewpoint)
+    frame = graphs_of([surface], guess[0].ndim)
+    if frame is None:
+        return _from_connection(connect(path, 1.0, viewpoint, source, guess))
+    graphs, origin, rotation = frame
+    outer, other, start = (turn_back(rotation, shift(p, origin, -1.0)) for p in (viewpoint, source, guess))
+    points = stationary_path(graphs, [1.0, 1.0], outer, other, [(start[1], start[2])]).points
+    return _confirmed(path, 1.0, viewpoint, source, shift(turn(rotation, points[0]), origin, 1.0), guess)
+
+
+def _confirmed(path: Sequence[Crossing], n_start: Number, viewpoint: Xyz, target: Xyz, first: Xyz, aim: Xyz) -> Rays:
+    """Trace from the viewpoint over the points `first` of the first surface; search again what misses the target."""
+    with np.errstate(all="ignore"):
+        way = _unit((first[0] - viewpoint[0], first[1] - viewpoint[1], first[2] - viewpoint[2]))
+        gradient = path[0].surface.gradient_at(first)
+        found = np.asarray(dot(gradient, way) < 0.0)
+        index, end, passes = cross(path[0], gradient, way, n_start)
+        found &= passes
+        point = first
+        for crossing in path[1:]:
+            hit = crossing.surface.hit(point, end, crossing.inward)
+            index, end, passes = cross(crossing, hit.gradient, end, index)
+            found &= hit.ok & passes
+            point = hit.point
+        gap = (target[0] - point[0], target[1] - point[1], target[2] - point[2])
+        along = dot(gap, end)
+        miss = (gap[0] - along * end[0], gap[1] - along * end[1], gap[2] - along * end[2])
+        residual = np.sqrt(dot(miss, miss))
+        # A far mirrored source magnifies the rounding of the direction.
+        reach = SURE_MM + 1e-15 * along * along if path[0].reflects else SURE_MM
+        found &= (residual <= reach) & (along > 0.0)
+    status = np.zeros(residual.shape, dtype=np.int8)
+    mark(status, ~inside_rim(path[0], first), path[0].beyond_rim or RayStatus.MISSED)
+    rays = Rays(first, way, end, residual, status)
+    return rays if found.all() else _searched(path, n_start, viewpoint, target, aim, rays, ~found)
+
+
+def _searched(
+    path: Sequence[Crossing], n_start: Number, viewpoint: Xyz, target: Xyz, aim: Xyz, rays: Rays, left: Mask
+) -> Rays:
+    """The rays with those at `left` found by shooting."""
+    rows = np.nonzero(left) if left.ndim else (np.zeros(1, dtype=np.intp),)
+    shape = left.shape or (1,)
+
+    def pick(point: Xyz) -> Xyz:
+        x, y, z = (np.broadcast_to(axis, shape)[rows] for axis in point)
+        return x, y, z
+
+    few = [taken(crossing, rows[0]) for crossing in path]
+    start = n_start if np.ndim(n_start) == 0 else np.asarray(n_start)[rows[0]]
+    found = _from_connection(connect(few, start, pick(viewpoint), pick(target), pick(aim)))
+
+    def put(whole: Array, part: Array) -> Array:
+        out = np.array(np.broadcast_to(whole, shape))
+        out[rows] = part
+        return out.reshape(left.shape)
+
+    def put_all(whole: Xyz, part: Xyz) -> Xyz:
+        return put(whole[0], part[0]), put(whole[1], part[1]), put(whole[2], part[2])
+
+    return Rays(
+        put_all(rays.exit, found.exit),
+        put_all(rays.way, found.way),
+        put_all(rays.end, found.end),
+        put(rays.residual_mm, found.residual_mm),
+        np.asarray(put(rays.status, found.status), dtype=np.int8),  # type: ignore[arg-type]
+    )
+
+
+def _from_connection(found: Connection) -> Rays:
+    return Rays(found.first, found.start, found.end, found.residual_mm, found.status)
+
+
+def _paraxial_start(
+    graphs: Sequence[Graph], ladder: Sequence[Number], viewpoint: Xyz, target: Xyz
+) -> list[tuple[Array, Array]]:
+    """First guesses (y, z) on each surface, outside in.
+
+    On the outermost one: the straight line's point, drawn away by m = 1 / (1 - d (n - 1) / (n R)) from the line that
+    joins the viewpoint and the centre of curvature, which passes unbroken; d is the object's depth, n its index. On the
+    others: on the straight line from there to the object.
+    """
+    zero = np.zeros((1,) * target[0].ndim)
+    with np.errstate(all="ignore"):
+        apex = graphs[0].jet(zero, zero)
+        radius = -1.0 / apex.yy
+        centre = apex.x - radius
+        n = ladder[-1] / ladder[0]
+        bend = (n - 1.0) / (n * radius)
+        above = 1.0 / (viewpoint[0] - centre)
+        beyond = 1.0 / (viewpoint[0] - target[0])
+        y, z = target[1], target[2]
+        for _ in range(2):
+            height = graphs[0].height(y, z)
+            height = np.where(np.isfinite(height), height, apex.x)
+            depth = height - target[0]
+            draw = 1.0 / (1.0 - depth * bend)
+            share = depth * beyond
+            # y = (1 - draw) y_line + draw (y_t + share (y_v - y_t)), gathered.
+            far = (1.0 - draw) * (height - centre) * above + draw * share
+            near = draw - draw * share
+            y, z = far * viewpoint[1] + near * target[1], far * viewpoint[2] + near * target[2]
+        out = [(y, z)]
+        for graph in graphs[1:]:
+            inner = graph.height(y, z)
+            part = (height - np.where(np.isfinite(inner), inner, height)) / depth
+            out.append((y + part * (target[1] - y), z + part * (target[2] - z)))
+    return out
 
 
 def mirror_start(surface: Surface, source: Xyz, viewpoint: Xyz) -> Xyz:
@@ -131,15 +281,14 @@ def mirror_start(surface: Surface, source: Xyz, viewpoint: Xyz) -> Xyz:
     ndim = max(source[0].ndim, viewpoint[0].ndim)
     shape = np.broadcast_shapes(source[0].shape, viewpoint[0].shape)
     apex = components(surface.to_eye(_apex(surface)))
-    normal = components(surface.normal(join(apex)))
     gradient, hessian = surface.gradient_at(apex), surface.hessian_at(apex)
-    bend = dot(normal, normal) * (np.asarray(hessian.xx) + np.asarray(hessian.yy) + np.asarray(hessian.zz))
-    bend = bend - dot(normal, hessian.times(normal))
-    radius = 2.0 * np.sqrt(dot(gradient, gradient)) / bend
+    size = np.sqrt(dot(gradient, gradient))
+    normal = (gradient[0] / size, gradient[1] / size, gradient[2] / size)
+    trace = np.asarray(hessian.xx) + np.asarray(hessian.yy) + np.asarray(hessian.zz)
+    radius = 2.0 * size / (trace - dot(normal, hessian.times(normal)))
     centre = join((apex[0] - radius * normal[0], apex[1] - radius * normal[1], apex[2] - radius * normal[2]))
-    rays = [shift(point, centre, -1.0) for point in (source, viewpoint)]
-    units = [tuple(axis / np.sqrt(dot(ray, ray)) for axis in ray) for ray in rays]
-    bisector = (units[0][0] + units[1][0], units[0][1] + units[1][1], units[0][2] + units[1][2])
+    to_source, to_viewpoint = _unit(shift(source, centre, -1.0)), _unit(shift(viewpoint, centre, -1.0))
+    bisector = (to_source[0] + to_viewpoint[0], to_source[1] + to_viewpoint[1], to_source[2] + to_viewpoint[2])
     reach = fit(np.asarray(radius), ndim) / np.sqrt(np.maximum(dot(bisector, bisector), 1e-300))
     guess = shift((reach * bisector[0], reach * bisector[1], reach * bisector[2]), centre, 1.0)
     return (
@@ -155,12 +304,10 @@ def _apex(surface: Surface) -> Array:
     return np.stack([surface.sag(zero, zero), zero, zero], axis=-1)
 
 
-def _mirror(found: Connection) -> MirrorPoints:
-    return MirrorPoints(
-        join(found.turning),
-        join(found.first),
-        -join(found.start),
-        found.residual_mm,
-        found.tube_mm2_sr,
-        found.status,
-    )
+def _spread_index(n: Number, ndim: int) -> Number:
+    return n if isinstance(n, float) else fit(np.asarray(n, dtype=np.float64), ndim)
+
+
+def _unit(vector: Xyz) -> Xyz:
+    scale = 1.0 / np.sqrt(dot(vector, vector))
+    return vector[0] * scale, vector[1] * scale, vector[2] * scale

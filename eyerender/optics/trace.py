@@ -90,9 +90,7 @@ def outward_path(
     return tuple(Crossing(s, n, inward=False) for s, n in zip(reversed(surfaces), reversed(behind), strict=True))
 
 
-def trace(
-    path: Sequence[Crossing], n_start: Number, origins_mm: npt.ArrayLike, directions: npt.ArrayLike
-) -> Traced:
+def trace(path: Sequence[Crossing], n_start: Number, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> Traced:
     """Trace rays (origins and unit directions (..., 3)) through `path`, starting in a medium of index `n_start`."""
     point, direction = components(origins_mm), components(directions)
     ndim = max(point[0].ndim, direction[0].ndim)

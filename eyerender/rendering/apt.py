@@ -54,6 +54,8 @@ class Apt:
             names = self._run("apt-cache", "pkgnames", "libllvm").stdout.split()
             if names:
                 break
+        else:
+            self._complaint = self._complaint or "it does not answer; check the network"
         versions = {name: int(match[1]) for name in names if (match := re.fullmatch(r"libllvm(\d+)(?:t64)?", name))}
         fitting = [name for name, number in versions.items() if number >= min(_PREFERRED)]
 

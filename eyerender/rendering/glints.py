@@ -48,6 +48,16 @@ class Spots(ArrayValue):
     energy: Floats
 
 
+@dataclass(frozen=True, slots=True)
+class Image:
+    """A lamp's points, their mirror points in the world, pixels, and energies (0 where there is no glint)."""
+
+    source_mm: Floats
+    mirror_mm: Floats
+    xy_px: Floats
+    energy: Floats
+
+
 def mirror_paths(surface: Surface, sources: Floats, eyepoint: Floats) -> tuple[Floats, Floats, Floats, Floats, Bools]:
     """Rays from points through the mirror of `surface` to one point, all in the eye frame.
 
@@ -124,46 +134,38 @@ class GlintScene:
     camera: Camera
     clear: Visibility  # (n, 3) and (n, 3) world points -> nothing of the scene stands between them
 
-    def spots(self, light: Light, sigma_px: float) -> tuple[Spots, float]:
-        """The image of one lamp as points, and the share of it that is visible (by energy)."""
-        disc = _disc(light, *_nodes(1, 4)) if light.radius_mm > 0 else (light.position_mm[None, :], np.ones(1))
-        spots, share, extent = self._image(light, *disc)
-        if light.radius_mm > 0 and extent > 0:
-            # The integrand, a Gaussian over the lamp's image, is smooth on the scale of sigma (and of the pixel).
-            ratio = extent / np.hypot(sigma_px, 0.29)
-            radial = int(np.clip(np.ceil(1.5 + 1.5 * ratio), 2, 64))
-            spots, share, _ = self._image(light, *_disc(light, *_nodes(radial, 4 * radial + 2)))
-        return spots, share
+    def image(self, light: Light, sigma_px: float) -> Image:
+        """The image of one lamp, as finely as its size and the point-spread function ask for."""
+        if light.radius_mm == 0:
+            return self._trace(light, light.position_mm[None, :], np.ones(1))
+        rough = self._trace(light, *_disc(light, *_nodes(1, 4)))
+        if not np.any(rough.energy > 0):
+            return self._trace(light, *_disc(light, *_nodes(4, 18)))
+        # The integrand, a Gaussian over the lamp's image, is smooth on the scale of sigma (and of the pixel).
+        xy = rough.xy_px[rough.energy > 0]
+        extent = float(np.max(np.linalg.norm(xy - xy.mean(axis=0), axis=-1)))
+        radial = int(np.clip(np.ceil(1.5 + 1.5 * extent / np.hypot(sigma_px, 0.29)), 2, 64))
+        return self._trace(light, *_disc(light, *_nodes(radial, 4 * radial + 2)))
 
-    def _image(self, light: Light, points: Floats, weights: Floats) -> tuple[Spots, float, float]:
+    def _trace(self, light: Light, points: Floats, weights: Floats) -> Image:
         camera = self.camera
         eyepoint = self.M.T @ (camera.nodal_point_mm - self.t)
         sources = (points - self.t) @ self.M
         y, d, w, J, found = mirror_paths(self.surface, sources, eyepoint)
         found &= self.surface.axis_distance(_xyz(y)) < self.limbus_radius_mm
-        if not np.any(found):
-            return Spots(frozen(np.zeros((0, 2))), frozen(np.zeros(0))), 0.0, 0.0
+        y, d, w, J = (np.where(found.reshape(-1, *[1] * (a.ndim - 1)), a, 1.0) for a in (y, d, w, J))
         N = self.surface.normal(y)
         F = reflectance(np.clip(-np.sum(N * d, axis=-1), 0, 1), self.index)
         leaving = np.clip(d @ (self.M.T @ light.axis), 0, 1)
         intensity = light.intensity_mw_sr * (leaving**light.lobe_exponent if light.lobe_exponent else 1.0)
         cam = -(w @ self.M.T) @ camera.R.T
-        seen = cam[:, 2] > 0
-        z = np.where(seen, cam[:, 2], 1.0)
+        found &= cam[:, 2] > 0
+        z = np.where(found, cam[:, 2], 1.0)
         x, v = cam[:, 0] / z, cam[:, 1] / z
-        xy = camera.pixels_of(x, v)
         scale = camera.K[0, 0] * camera.K[1, 1] * _distortion_determinant(camera, x, v) / z**3
-        energy = np.where(found & seen, weights * intensity * F / J * scale, 0.0)
-        world = y @ self.M.T + self.t
-        open_ = self.clear(points, world) & self.clear(world, np.broadcast_to(camera.nodal_point_mm, world.shape))
-        open_ &= ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, eyepoint - y)
-        reaching = np.where(open_, energy, 0.0)
-        total = float(energy.sum())
-        kept = energy > 0
-        extent = float(np.max(np.linalg.norm(xy[kept] - xy[kept].mean(axis=0), axis=-1))) if np.any(kept) else 0.0
-        lit = reaching > 0
-        spots = Spots(frozen(xy[lit]), frozen(reaching[lit]))
-        return spots, float(reaching.sum()) / total if total > 0 else 0.0, extent
+        found &= ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, eyepoint - y)
+        energy = np.where(found, weights * intensity * F / J * scale, 0.0)
+        return Image(points, y @ self.M.T + self.t, camera.pixels_of(x, v), energy)
 
     def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
         """Whether the way from points of the cornea is barred by the sclera's sphere (eye frame)."""
@@ -176,18 +178,24 @@ class GlintScene:
 
 def glint_table(scene: GlintScene, lights: Sequence[Light], sigma_px: float) -> tuple[GlintTable, list[Spots]]:
     """The glints of all lamps, and the points that each is made of."""
-    images = [scene.spots(light, sigma_px) for light in lights]
-    place = [
-        np.average(s.xy_px, axis=0, weights=s.energy) if len(s.energy) else np.full(2, np.nan) for s, _ in images
-    ]
-    energy = np.array([s.energy.sum() for s, _ in images])
+    images = [scene.image(light, sigma_px) for light in lights]
+    sources, mirrors = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "mirror_mm"))
+    node = np.broadcast_to(scene.camera.nodal_point_mm, mirrors.shape)
+    both = scene.clear(np.concatenate([sources, node]), np.concatenate([mirrors, mirrors]))
+    clear = np.split(both[: len(sources)] & both[len(sources) :], np.cumsum([len(i.energy) for i in images])[:-1])
+    spots, place, share = [], [], []
+    for image, open_ in zip(images, clear, strict=True):
+        lit = open_ & (image.energy > 0)
+        xy, energy = image.xy_px[lit], image.energy[lit]
+        spots.append(Spots(frozen(xy), frozen(energy)))
+        place.append(np.average(xy, axis=0, weights=energy) if len(energy) else np.full(2, np.nan))
+        total = image.energy.sum()
+        share.append(energy.sum() / total if total > 0 else 0.0)
+    energies = np.array([s.energy.sum() for s in spots])
     table = GlintTable(
-        frozen(np.reshape(place, (-1, 2))),
-        frozen(energy),
-        frozen([share for _, share in images]),
-        frozen(energy > 0, np.bool_),
+        frozen(np.reshape(place, (-1, 2))), frozen(energies), frozen(share), frozen(energies > 0, np.bool_)
     )
-    return table, [s for s, _ in images]
+    return table, spots
 
 
 def _nodes(radial: int, angular: int) -> tuple[Floats, Floats, Floats]:

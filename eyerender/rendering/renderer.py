@@ -154,7 +154,6 @@ class Renderer:
         each = max(1, min(spp, _LANES // pixels))
         total = np.zeros(pixels)
         failed = 0
-        hashed = _hash(seed)
         for first in range(0, spp, each):
             count = min(each, spp - first)
             index = dr.arange(mi.UInt32, pixels * count)
@@ -163,19 +162,16 @@ class Renderer:
             u, v = _pixels(pixel, window)
             # A pixel's place on the whole sensor, so that a window shows the same samples wherever it lies.
             place = (u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16))
-            sampler = Sampler(
-                place, index - pixel * n + dr.opaque(mi.UInt32, first), dr.opaque(mi.UInt32, hashed)
-            )
+            sampler = Sampler(place, index - pixel * n + dr.opaque(mi.UInt32, first), spp, seed)
             spot = sampler.in_pixel()
             o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
             ray = mi.Ray3f(mi.Point3f(o), d)
             seen, _, _ = self._integrator.sample(self._surround.scene, sampler, ray)
             cosine = cosine * cosine
-            image = dr.block_sum(seen[0] * cosine * cosine, count)
-            failures = dr.sum(self._integrator.failures)
-            dr.eval(image, failures)
-            total += image.numpy()
-            failed += int(failures.numpy()[0])
+            samples, failures = seen[0] * cosine * cosine, self._integrator.failures
+            dr.eval(samples, failures)  # together: a reduction of its own would trace everything anew
+            total += dr.block_sum(samples, count).numpy()
+            failed += int(dr.sum(failures).numpy()[0])
         return (total / spp).reshape(height, width), failed
 
     def _labels(self, values: Values, window: tuple[int, int, int, int]) -> PartLabels:
@@ -230,7 +226,3 @@ def _pixels(pixel: Any, window: tuple[int, int, int, int]) -> tuple[Any, Any]:
     v = mi.Int32(row) + dr.opaque(mi.Int32, window[1])
     return u, v
 
-
-def _hash(seed: int) -> int:
-    """A seed of any size folded into 32 bits."""
-    return int(np.random.SeedSequence(seed).generate_state(1)[0])

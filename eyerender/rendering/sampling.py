@@ -1,45 +1,74 @@
 """Camera rays and sample points of a window of the sensor, on Dr.Jit arrays.
 
-Sample k of a pixel lies at frac(shift + k alpha), alpha = (phi^-1, ..., phi^-4), phi^5 = phi + 1, the additive
-recurrence of least discrepancy in four dimensions; the shift is a hash of the pixel's place on the whole sensor and the
-seed. Nothing depends on threads, on the window or on what was rendered before.
-Source: Tea hash, Zafar, Olano and Curtis (2010); the recurrence, Roberts (2018), 'The unreasonable effectiveness of
-quasirandom sequences'.
+Places in the pixel: a rank-1 lattice, x = k / N, y = frac(k a / N), with the a of the largest smallest distance, tiled
+over the sensor without a shift of its own per pixel. The edges of one frame are thus sampled by one regular lattice, which
+places a contour far better than independent samples of the same number would (Sloan and Joe 1994, chapter 4).
+
+Places on the lamps: sample k at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018), the shift
+a hash of the pixel's place on the whole sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft shadows
+show noise and no bands. Nothing depends on threads, on the window, or on what was rendered before.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .values import Values
 
-_PHI = 1.1673039782614187
-_ALPHA = tuple(round(_PHI ** -(k + 1) * 2**32) for k in range(4))
+_PHI = 1.324717957244746
+_ALPHA = tuple(round(_PHI ** -(k + 1) * 2**32) for k in range(2))
 _UNDISTORT_STEPS = 8
 
 
-class Sampler:
-    """The four numbers of each sample: two for its place in the pixel, two for the place on the lamp."""
+@lru_cache(maxsize=64)
+def lattice_generator(count: int) -> int:
+    """The a, prime to `count`, whose lattice {(k, k a mod N)} / N has the largest smallest distance on the torus."""
+    if count <= 2:
+        return 1
+    # Long lattices: near the golden section every a is good, and the best of a few is found at once.
+    golden = round(count * 0.6180339887498949)
+    choice = range(1, count) if count <= 1024 else range(max(1, golden - 64), min(count, golden + 64))
+    k = np.arange(1, count)
+    best, found = -1, 1
+    for a in choice:
+        if np.gcd(a, count) != 1:
+            continue
+        y = k * a % count
+        x, y = np.minimum(k, count - k), np.minimum(y, count - y)
+        distance = int(np.min(x * x + y * y))
+        if distance > best:
+            best, found = distance, a
+    return found
 
-    def __init__(self, pixel: Any, sample: Any, seed: Any) -> None:
-        a, b = mi.sample_tea_32(pixel, seed)
-        c, d = mi.sample_tea_32(pixel, seed ^ mi.UInt32(0x9E3779B9))
-        self._numbers = [
-            mi.Float((shift + sample * mi.UInt32(alpha)) >> 8) * (2.0**-24)
-            for shift, alpha in zip((a, b, c, d), _ALPHA, strict=True)
-        ]
+
+class Sampler:
+    """Sample `k` of `count` in a pixel: its place in the pixel, and its place on the lamps."""
+
+    def __init__(self, pixel: Any, k: Any, count: int, seed: int) -> None:
+        n, a = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, lattice_generator(count))
+        shift = np.random.default_rng(seed).uniform(size=2)
+        x = mi.Float(k) / mi.Float(n) + dr.opaque(mi.Float, float(shift[0]))
+        y = mi.Float((k * a) % n) / mi.Float(n) + dr.opaque(mi.Float, float(shift[1]))
+        self._place = mi.Point2f(x - dr.floor(x), y - dr.floor(y))
+        folded = int(np.random.SeedSequence(seed).generate_state(1)[0])
+        u, v = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, folded))
+        self._lamp = mi.Point2f(
+            *(mi.Float((h + k * mi.UInt32(alpha)) >> 8) * (2.0**-24) for h, alpha in zip((u, v), _ALPHA, strict=True))
+        )
 
     def in_pixel(self) -> Any:
         """Place in the pixel, [0, 1)^2."""
-        return mi.Point2f(self._numbers[0], self._numbers[1])
+        return self._place
 
     def next_2d(self, active: Any = True) -> Any:
         """Place on the lamp, [0, 1)^2."""
         del active
-        return mi.Point2f(self._numbers[2], self._numbers[3])
+        return self._lamp
 
 
 def camera_ray(values: Values, u: Any, v: Any) -> tuple[Any, Any, Any]:

@@ -62,9 +62,12 @@ class Surround:
         length = np.linalg.norm(b - a, axis=-1)
         d = (b - a) / length[:, None]
         margin = 1e-3
-        start = a + margin * d
-        ray = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*d.T.astype(np.float32)))
-        ray.maxt = mi.Float((length - 2 * margin).astype(np.float32))
+        table = np.column_stack([a + margin * d, d, length - 2 * margin]).astype(np.float32)
+        # Gathered from one buffer: the kernel would depend on the alignment of every array that NumPy owns.
+        buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 7
+        o = [dr.gather(mi.Float, buffer, row + k) for k in range(7)]
+        ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:6]))
+        ray.maxt = o[6]
         return ~np.asarray(self.scene.ray_test(ray).numpy(), dtype=bool)
 
     @staticmethod

@@ -41,7 +41,8 @@ def write_report(
         data=comparison.to_mapping(),
         rows=_rows(comparison),
         pictures=_pictures(scene, comparison, entries),
-        columns=scene.spec.targets.grid[0] if scene.spec.targets and scene.spec.targets.grid else 3,
+        # A grid of targets comes column by column; other lists are filled row by row.
+        grid=scene.spec.targets.grid if scene.spec.targets and scene.spec.targets.grid else (3, None),
         feature_figure=feature_figure(comparison),
         gaze_figure=gaze_figure(scene, comparison),
         timings=timings,
@@ -117,7 +118,8 @@ def gaze_figure(scene: Scene, comparison: Comparison) -> str | None:
 
 def _pictures(scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry]) -> dict[str, list[dict[str, Any]]]:
     out: dict[str, list[dict[str, Any]]] = {}
-    full = float(scene.spec.sensor.full_scale_dn)
+    # Matte parts stay below half of full scale, so that glints have room; for people half is white enough.
+    full = scene.spec.sensor.full_scale_dn / 2
     truth, found = comparison.truth, comparison.found
     for row, entry in enumerate(entries):
         image, _ = read_image(entry.path)

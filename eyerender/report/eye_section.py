@@ -13,20 +13,22 @@ from .style import ANALYTIC, IMAGE, TARGET, figure
 
 _SCLERA, _CORNEA, _LENS, _RETINA, _IRIS = "#9a9a9a", ANALYTIC, "#009E73", IMAGE, "#8c564b"
 _GRID = 900
+# Lenses of adults are 9 to 10 mm wide; their optical surfaces meet farther out than they do.
+_LENS_MM = 4.8
 
 
 def eye_section(eye: Eye, title: str = "") -> Any:
     """A matplotlib figure with the horizontal section (from above) and the vertical one (from the temporal side)."""
-    with figure(11.0, 5.6, 2) as (fig, axes):
+    with figure(13.0, 5.4, 2) as (fig, axes):
         _draw(axes[0], eye, 1)
         _draw(axes[1], eye, 2)
-        axes[0].set(title="horizontal section, from above", ylabel="y, nasal (mm)")
+        name = title or f"{eye.name}, {eye.side} eye, {eye.wavelength_nm:g} nm"
+        axes[0].set(title=f"{name}: horizontal section, from above", ylabel="y, nasal (mm)")
         if eye.side == "left":
             axes[0].set(ylabel="y, temporal (mm)")
         axes[1].set(title="vertical section", ylabel="z, up (mm)")
         handles, labels = axes[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-        fig.suptitle(title or f"{eye.name}, {eye.side} eye, {eye.wavelength_nm:g} nm")
+        fig.legend(handles, labels, loc="outside right center", frameon=False)
         return fig
 
 
@@ -37,16 +39,19 @@ def _draw(ax: Any, eye: Eye, across: int) -> None:
     x, s = np.meshgrid(np.linspace(low, 1.0, _GRID), np.linspace(-radius - 0.8, radius + 0.8, _GRID))
     for k, surface in enumerate(eye.front):
         rim = _axis_distance(surface, x, s, across) <= eye.limbus_radius_mm
+        if k:  # the back of the cornea ends at the iris
+            rim &= x >= _iris_x(eye, s, across)
         _curve(ax, surface, x, s, across, rim, _CORNEA, 1.8, "cornea" if k == 0 else None)
     shells = len(eye.back) > 2
     for k, (surface, rim_mm) in enumerate(zip(eye.back, eye.back_rims_mm, strict=True)):
         outer = k in (0, len(eye.back) - 1)
-        inside = _axis_distance(surface, x, s, across) <= float(np.asarray(rim_mm))
+        inside = _axis_distance(surface, x, s, across) <= min(float(np.asarray(rim_mm)), _LENS_MM)
         name = "lens" if k == 0 else None
         _curve(ax, surface, x, s, across, inside, _LENS, 1.6 if outer or not shells else 0.35, name)
     _curve(ax, eye.retina, x, s, across, x < -8.0, _RETINA, 1.6, "retina (optical)")
     outside = np.hypot(x - centre[0], s - centre[across]) - radius
-    sclera = np.where(x < _limbus_x(eye), outside, np.nan)
+    beside = (_axis_distance(eye.front[0], x, s, across) >= eye.limbus_radius_mm) | (x < -8.0)
+    sclera = np.where(beside, outside, np.nan)
     ax.contour(x, s, sclera, levels=[0.0], colors=[_SCLERA], linewidths=2.4)
     ax.plot([], [], color=_SCLERA, lw=2.4, label="sclera")
     _iris(ax, eye, across)
@@ -95,11 +100,10 @@ def _axis_distance(surface: Surface, x: Floats, s: Floats, across: int) -> Float
     return np.hypot(local[..., 1], local[..., 2])
 
 
-def _limbus_x(eye: Eye) -> float:
-    """x of the plane of the limbus circle."""
-    front = eye.front[0]
-    rim = np.asarray(front.sag(np.array([eye.limbus_radius_mm]), np.array([0.0])))
-    return float(np.asarray(front.to_eye(np.array([[rim[0], eye.limbus_radius_mm, 0.0]])))[0, 0])
+def _iris_x(eye: Eye, s: Floats, across: int) -> Floats:
+    """x of the iris' plane over the coordinate across."""
+    normal, centre = eye.stop.normal, eye.stop.centre_mm
+    return np.asarray(centre[0] - (s - centre[across]) * normal[across] / normal[0])
 
 
 def _iris(ax: Any, eye: Eye, across: int) -> None:

@@ -22,7 +22,6 @@ _RC = {
     "axes.axisbelow": True,
     "svg.fonttype": "path",
     "svg.hashsalt": "eyerender",
-    "figure.constrained_layout.use": True,
 }
 
 
@@ -34,7 +33,7 @@ def figure(width: float, height: float, columns: int = 1) -> Iterator[tuple[Any,
     from matplotlib.figure import Figure
 
     with mpl.rc_context(_RC):
-        fig = Figure(figsize=(width, height))
+        fig = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasSVG(fig)
         yield fig, fig.subplots(1, columns)
 

@@ -365,7 +365,7 @@ def test_archive_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: p
     point_apt_at(f"deb [trusted=yes] file:{tmp_path}/nowhere ./", tmp_path, monkeypatch)
     monkeypatch.setattr("eyerender.rendering.llvm.candidates", lambda: iter(()))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    with pytest.raises(BackendError, match="the package archive offers no libLLVM") as caught:
+    with pytest.raises(BackendError, match=r"it does not answer|nowhere") as caught:
         setup_llvm()
     assert "\n" not in str(caught.value)
 

@@ -1,0 +1,96 @@
+"""Gaze by the cross ratio (Yoo & Chung, CVIU 98, 2005): four lights at the screen's corners and one at the camera.
+
+    u_v,i = u_c + alpha_i (u_r,i - u_c),     alpha_i = |u_p - u_c| / |u_r,i - u_c| when the eye looks at corner i
+
+u_c is the glint of the light at the camera, u_r,i that of corner i, u_p the pupil centre. The virtual points u_v and
+the pupil centre are the image, through one projective plane, of the corners and the gaze point, so that the cross
+ratios of the two figures agree; that is the same as mapping the pupil centre by the homography u_v,i -> corner i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..observation import EYES, Observations
+from ..rig.rig import Rig
+from .estimate import GazePoints, gaze_points
+from .homography import glints_of, homography, transformed
+from .rays import chosen_lights, screen_of
+
+
+@dataclass(frozen=True, slots=True)
+class CrossRatio:
+    """Cross-ratio estimator.
+
+    Args:
+        corners: the four lights at the screen's corners, in order around it.
+        at_camera: the light at the camera.
+        tolerance: how far a calibration target may lie from its corner light, as a share of the corners' diagonal.
+        alphas: by eye (0 right, 1 left), four each; `fit` fills it in.
+    """
+
+    corners: tuple[int, int, int, int] = (0, 1, 2, 3)
+    at_camera: int = 4
+    tolerance: float = 0.05
+    alphas: Mapping[int, Floats] = field(default_factory=dict)
+
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+        """Calibrate alpha_i of each eye on its fixations of the four corner lights (averaged, where repeated).
+
+        Raises:
+            InputError: no usable observation of an eye looks at one of the corner lights.
+        """
+        targets = np.asarray(targets_mm, dtype=float)
+        corners = self._corners_mm(rig)
+        glints, reason = glints_of(observations, (*self.corners, self.at_camera))
+        p, u_c = observations.pupil.centre_px, glints[:, 4]
+        near = self.tolerance * float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
+        found = {}
+        for eye in np.unique(observations.index.eye):
+            usable = (reason == None) & (observations.index.eye == eye)  # noqa: E711
+            alpha = np.empty(4)
+            for i in range(4):
+                rows = usable & (np.linalg.norm(targets - corners[i], axis=1) <= near)
+                if not rows.any():
+                    name = EYES[int(eye)] if eye >= 0 else "unknown"
+                    raise InputError(f"{name} eye: no usable calibration target at the corner light {self.corners[i]}")
+                length = np.linalg.norm(glints[rows, i] - u_c[rows], axis=1)
+                alpha[i] = float(np.mean(np.linalg.norm(p[rows] - u_c[rows], axis=1) / length))
+            found[int(eye)] = alpha
+        return replace(self, alphas=found)
+
+    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+        """Gaze points on the screen's plane."""
+        if not self.alphas:
+            raise InputError("the estimator is not calibrated; call fit first")
+        screen = screen_of(rig)
+        corners = self._corners_mm(rig) - screen.centre_mm
+        flat = np.stack([corners @ screen.right, corners @ screen.up], axis=-1)
+        glints, reason = glints_of(observations, (*self.corners, self.at_camera))
+        on_screen = np.full((len(observations), 2), np.nan)
+        for eye in np.unique(observations.index.eye):
+            rows = np.flatnonzero((observations.index.eye == eye) & (reason == None))  # noqa: E711
+            alpha = self.alphas.get(int(eye))
+            if alpha is None:
+                reason[rows] = "this eye is not calibrated"
+                continue
+            u_c = glints[rows, 4:5]
+            virtual = u_c + alpha[:, None] * (glints[rows, :4] - u_c)
+            H, ok = homography(virtual, np.broadcast_to(flat, virtual.shape), conditioned=True)
+            on_screen[rows], finite = transformed(H, observations.pupil.centre_px[rows])
+            reason[rows[~finite]] = "the gaze point lies at infinity"
+            reason[rows[~ok]] = "three of the glints lie on a line"
+        return gaze_points(screen.world(on_screen), reason)
+
+    def _corners_mm(self, rig: Rig) -> Floats:
+        if len(set(self.corners)) != 4 or self.at_camera in self.corners:
+            raise InputError("the cross ratio needs four corner lights and another one at the camera")
+        chosen_lights(rig, (*self.corners, self.at_camera), 5)
+        return np.array([rig.lights[k].position_mm for k in self.corners])

@@ -1,0 +1,282 @@
+"""Model-based gaze estimation with one camera and two or more lights (Guestrin & Eizenman 2006).
+
+    c from the glints (cornea.py), w = unit(p - c) from the pupil,
+    theta = atan2(w_y, w_x),  phi = asin(w_z),  v = direction(theta + alpha, phi + beta),
+    gaze point = c + k_g v on the screen
+
+Source: Guestrin & Eizenman, IEEE TBME 53(6), 2006, sections II and III; the angles are (A.19) and (A.20) of Guestrin's
+thesis (Toronto, 2010). The torsion term is left out (kappa = 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
+
+from ..arrays import Bools, Floats, Objects
+from ..errors import InputError
+from ..observation import EYES, Observations
+from ..rig.rig import Rig
+from ..rig.screen import Screen
+from .cornea import CorneaCentres, from_all_glints, from_plane, optic_axis
+from .estimate import GazePoints, GazeRays, gaze_points
+from .parameters import HUMAN_BOUNDS, INDEX, MEAN_EYE, NAMES, Calibration, EyeParameters, ParameterBounds
+from .rays import FeatureRays, feature_rays, nasal_sign, screen_of
+
+_OFF_SCREEN_MM = 1e4  # the miss of a visual axis that never meets the screen's plane, in a search
+_SCALE = np.array([1.0, 1.0, 0.05, 1.0, 1.0])  # what a parameter changes by, for the search's trust region
+
+
+@dataclass(frozen=True, slots=True)
+class GuestrinEizenman:
+    """Corneal centre from the glints, optic axis from the pupil, visual axis by two angles.
+
+    Args:
+        lights: which lights' glints to use; None: all of the rig's.
+        centre: "all_glints" (method A, the source's own) or "plane" (method B, the first light's mirror condition).
+        start: parameters to start the calibration from; its index is kept unless `free_index`.
+        bounds: where the parameters may lie.
+        free_index: calibrate the index too.
+        visual_axis: "angles" adds alpha and beta to azimuth and elevation; "rotation" turns the optic axis by a
+        rotation
+            that is fixed in the world (beta about y, then alpha about z).
+        objective: "least_squares" of the distances on the screen, or "sum_of_errors": their plain sum, as angles
+            atan(d / viewing_distance_mm) where that is given.
+        tolerance: relative change of cost and parameters at which the search ends.
+        calibrations: by eye (0 right, 1 left); `fit` fills it in.
+    """
+
+    lights: tuple[int, ...] | None = None
+    centre: Literal["all_glints", "plane"] = "all_glints"
+    start: EyeParameters = MEAN_EYE
+    bounds: ParameterBounds = HUMAN_BOUNDS
+    free_index: bool = False
+    visual_axis: Literal["angles", "rotation"] = "angles"
+    objective: Literal["least_squares", "sum_of_errors"] = "least_squares"
+    viewing_distance_mm: float | None = None
+    tolerance: float = 1e-12
+    calibrations: Mapping[int, Calibration] = field(default_factory=dict)
+
+    def with_parameters(self, parameters: Mapping[int, EyeParameters]) -> Self:
+        """An estimator with given parameters by eye (0 right, 1 left), without a calibration."""
+        known = {k: Calibration(p, p, 0.0, "given", 0, True, "given", ()) for k, p in parameters.items()}
+        return replace(self, calibrations=known)
+
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+        """Calibrate R, K, alpha, beta (and n) of each eye by bounded nonlinear least squares.
+
+        Raises:
+            InputError: fewer usable targets than determine the parameters.
+        """
+        found = {}
+        for eye, problem in self._problems(observations, targets_mm, rig).items():
+            found[eye] = problem.solve(self.start)
+        return replace(self, calibrations=found)
+
+    def restarts(
+        self, observations: Observations, targets_mm: ArrayLike, rig: Rig, starts: Sequence[EyeParameters]
+    ) -> dict[int, list[Calibration]]:
+        """Calibrations of each eye from several starts, to see whether the search finds one minimum."""
+        problems = self._problems(observations, targets_mm, rig)
+        return {eye: [p.solve(start) for start in starts] for eye, p in problems.items()}
+
+    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+        """Gaze points on the screen's plane."""
+        screen = screen_of(rig)
+        rays = self.visual_axes(observations, rig)
+        on_screen, hits = screen.intersect(rays.origin_mm, rays.direction)
+        reason = rays.reason.copy()
+        reason[(reason == None) & ~hits] = "the visual axis does not meet the screen"  # noqa: E711
+        return gaze_points(screen.world(on_screen), reason)
+
+    def visual_axes(self, observations: Observations, rig: Rig) -> GazeRays:
+        """Visual axes: from the centre of corneal curvature, in the direction of gaze."""
+        optic = self.optic_axes(observations, rig)
+        direction = np.full((len(observations), 3), np.nan)
+        for eye, calibration in self.calibrations.items():
+            rows = observations.index.eye == eye
+            p = calibration.parameters.vector()
+            sign = nasal_sign(observations.index.eye[rows])
+            direction[rows] = self._turned(optic.direction[rows], np.radians(p[3]) * sign, np.radians(p[4]))
+        return GazeRays.of(optic.origin_mm, direction, optic.reason)
+
+    def optic_axes(self, observations: Observations, rig: Rig) -> GazeRays:
+        """Optic axes: from the centre of corneal curvature through the pupil centre."""
+        if not self.calibrations:
+            raise InputError("the estimator is not calibrated; call fit first")
+        rays = feature_rays(observations, rig, self.lights, least=2)
+        reason = rays.reason.copy()
+        n = len(observations)
+        centre, axis = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+        for eye in np.unique(observations.index.eye):
+            rows = np.flatnonzero((observations.index.eye == eye) & (reason == None))  # noqa: E711
+            calibration = self.calibrations.get(int(eye))
+            if calibration is None:
+                reason[rows] = "this eye is not calibrated"
+                continue
+            R, K, index, _, _ = calibration.parameters.vector()
+            found = self._centres(rays, rows, np.full(len(rows), R))
+            w, meets, inside = optic_axis(
+                rays.origin_mm[rows], rays.pupil[rows], found.centre_mm, *(np.full(len(rows), v) for v in (R, K, index))
+            )
+            reason[rows] = _why(found, meets, inside)
+            centre[rows], axis[rows] = found.centre_mm, w
+        return GazeRays.of(centre, axis, reason)
+
+    def _centres(self, rays: FeatureRays, rows: Any, radius: Floats, start: Floats | None = None) -> CorneaCentres:
+        origin, glints = rays.origin_mm[rows], rays.glints[rows]
+        if self.centre == "plane":
+            return from_plane(origin, glints, rays.light_mm, radius)
+        return from_all_glints(origin, glints, rays.light_mm, radius, start)
+
+    def _turned(self, w: Floats, alpha: Any, beta: Any) -> Floats:
+        """The visual axis of optic axes w (..., 3); alpha towards +y and beta upwards, in radians."""
+        if self.visual_axis == "angles":
+            theta = np.arctan2(w[..., 1], w[..., 0]) + alpha
+            phi = np.arcsin(np.clip(w[..., 2], -1.0, 1.0)) + beta
+            return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
+        ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
+        x, z = cb * w[..., 0] - sb * w[..., 2], sb * w[..., 0] + cb * w[..., 2]
+        return np.stack([ca * x - sa * w[..., 1], sa * x + ca * w[..., 1], z], axis=-1)
+
+    def _problems(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> dict[int, _Problem]:
+        screen = screen_of(rig)
+        targets = np.asarray(targets_mm, dtype=float) - screen.centre_mm
+        wanted = np.stack([targets @ screen.right, targets @ screen.up], axis=-1)
+        rays = feature_rays(observations, rig, self.lights, least=2)
+        usable = (rays.reason == None) & np.isfinite(wanted).all(axis=1)  # noqa: E711
+        free = np.array([self.free_index or k != INDEX for k in range(len(NAMES))])
+        out = {}
+        for eye in np.unique(observations.index.eye):
+            rows = np.flatnonzero(usable & (observations.index.eye == eye))
+            # Each target gives two numbers.
+            need = int(np.ceil(free.sum() / 2))
+            if len(np.unique(np.round(wanted[rows], 9), axis=0)) < need:
+                name = EYES[int(eye)] if eye >= 0 else "unknown"
+                raise InputError(
+                    f"{name} eye: {len(rows)} usable calibration targets, but {int(free.sum())} parameters need {need}"
+                )
+            sign = float(nasal_sign(np.array(eye)))
+            out[int(eye)] = _Problem(self, rays, rows, wanted[rows], screen, free, sign)
+        return out
+
+
+class _Problem:
+    """One eye's calibration: the model at many sets of parameters at once, and the search."""
+
+    def __init__(
+        self,
+        estimator: GuestrinEizenman,
+        rays: FeatureRays,
+        rows: Any,
+        wanted: Floats,
+        screen: Screen,
+        free: Bools,
+        sign: float,
+    ) -> None:
+        self.estimator, self.rays, self.rows, self.wanted = estimator, rays, rows, wanted
+        self.screen, self.free, self.sign = screen, free, sign
+        # The mirror points hardly move with R, so those of one solution are where all others start.
+        self._distance: Floats | None = None
+        if estimator.centre == "all_glints":
+            R = np.full(len(rows), estimator.start.cornea_radius_mm)
+            self._distance = estimator._centres(rays, rows, R).distance_mm
+
+    def misses(self, parameters: Floats) -> Floats:
+        """Misses on the screen (P, n, 2) mm at P sets of parameters (P, 5)."""
+        p = parameters[:, :, None]
+        shape = (len(parameters), len(self.rows))
+        # The centre depends on R alone: sets that share it share the solution.
+        radii, which = np.unique(parameters[:, 0], return_inverse=True)
+        found = self.estimator._centres(
+            self.rays, self.rows, np.broadcast_to(radii[:, None], (len(radii), shape[1])), self._distance
+        )
+        centre = found.centre_mm[which]
+        R, K, index = (np.broadcast_to(p[:, k], shape) for k in range(3))
+        w, _, _ = optic_axis(self.rays.origin_mm[self.rows], self.rays.pupil[self.rows], centre, R, K, index)
+        v = self.estimator._turned(w, np.radians(p[:, 3]) * self.sign, np.radians(p[:, 4]))
+        point, hits = self.screen.intersect(centre, v)
+        return np.where(hits[..., None], point - self.wanted, _OFF_SCREEN_MM)
+
+    def residuals(self, parameters: Floats) -> Floats:
+        """What the search squares and sums: (P, r)."""
+        miss = self.misses(parameters)
+        if self.estimator.objective == "least_squares":
+            return np.asarray(miss.reshape(len(miss), -1))
+        d = np.sqrt((miss * miss).sum(axis=-1))
+        if self.estimator.viewing_distance_mm is not None:
+            d = np.degrees(np.arctan(d / self.estimator.viewing_distance_mm))
+        # The squares of the roots sum to the sum of the errors itself.
+        return np.asarray(np.sqrt(d))
+
+    def solve(self, start: EyeParameters) -> Calibration:
+        free, bounds = self.free, self.estimator.bounds
+        fixed = start.vector()
+        fixed[~free] = self.estimator.start.vector()[~free]
+        low, high = bounds.lower.vector(), bounds.upper.vector()
+        if not ((fixed[free] >= low[free]) & (fixed[free] <= high[free])).all():
+            raise InputError("the calibration's start lies outside its bounds")
+        count = 0
+
+        def full(x: Floats) -> Floats:
+            out = np.repeat(fixed[None], len(x), axis=0)
+            out[:, free] = x
+            return out
+
+        def value(x: Floats) -> Floats:
+            nonlocal count
+            count += 1
+            return np.asarray(self.residuals(full(x[None]))[0])
+
+        def jacobian(x: Floats) -> Floats:
+            nonlocal count
+            count += 1
+            # Central differences; a step must not leave the bounds, where the model may not exist.
+            step = 1e-5 * _SCALE[free]
+            up, down = np.minimum(x + step, high[free]), np.maximum(x - step, low[free])
+            k = len(x)
+            points = np.repeat(x[None], 2 * k, axis=0)
+            points[np.arange(k), np.arange(k)] = up
+            points[k + np.arange(k), np.arange(k)] = down
+            r = self.residuals(full(points))
+            return np.asarray(((r[:k] - r[k:]) / (up - down)[:, None]).T)
+
+        inside = np.clip(fixed[free], low[free] + 1e-9, high[free] - 1e-9)
+        done = least_squares(
+            value,
+            inside,
+            jac=jacobian,
+            bounds=(low[free], high[free]),
+            x_scale=_SCALE[free],
+            method="trf",
+            xtol=self.estimator.tolerance,
+            ftol=self.estimator.tolerance,
+            gtol=self.estimator.tolerance,
+            max_nfev=400,
+        )
+        values = full(done.x[None])[0]
+        near = (np.abs(values - low) < 1e-4 * (high - low)) | (np.abs(values - high) < 1e-4 * (high - low))
+        return Calibration(
+            EyeParameters.of(values),
+            EyeParameters.of(fixed),
+            float(2 * done.cost),
+            self.estimator.objective,
+            count,
+            bool(done.status > 0),
+            str(done.message),
+            tuple(name for k, name in enumerate(NAMES) if near[k] and free[k]),
+        )
+
+
+def _why(found: CorneaCentres, meets: Bools, inside: Bools) -> Objects:
+    """Why an observation has no optic axis; None where it has."""
+    out = np.full(len(meets), None, dtype=object)
+    out[~inside] = "the refracted pupil ray misses the sphere that holds the pupil"
+    out[~meets] = "the pupil ray misses the cornea"
+    out[~found.ok] = "the glints determine no centre of corneal curvature (camera, lights and eye are coplanar)"
+    return out

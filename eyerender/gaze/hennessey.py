@@ -1,0 +1,54 @@
+"""Model-based gaze estimation with population parameters (Hennessey, Noureddin & Lawrence, ETRA 2006).
+
+One camera and two lights give the centre of corneal curvature c for an assumed radius R; the pupil ray, refracted
+into the eye (index n), gives the pupil at distance K from c; the optic axis meets the screen. What the assumed eye
+and the angle to the visual axis leave wrong is taken up by a polynomial (recalibration.py). The source solves for c
+in planes of its own; the conditions are those of `cornea.from_all_glints`, and so is the least-squares solution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..observation import Observations
+from ..rig.rig import Rig
+from .estimate import GazePoints, GazeRays
+from .guestrin import GuestrinEizenman
+from .parameters import MEAN_EYE, EyeParameters
+from .recalibration import Kind, Recalibration
+
+
+@dataclass(frozen=True, slots=True)
+class Hennessey:
+    """Optic axis of an assumed eye, corrected by a polynomial.
+
+    Args:
+        parameters: the assumed eye; its alpha and beta are not used.
+        recalibration: "angle", "screen" or "none".
+        lights: which lights' glints to use; None: all of the rig's.
+    """
+
+    parameters: EyeParameters = MEAN_EYE
+    recalibration: Kind = "angle"
+    lights: tuple[int, ...] | None = None
+    correction: Recalibration | None = field(default=None, repr=False)
+
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+        """Calibrate the correction of each eye; raises `InputError` for fewer than six usable targets."""
+        rays = self.optic_axes(observations, rig)
+        targets = np.asarray(targets_mm, dtype=float)
+        return replace(self, correction=Recalibration(self.recalibration).fit(observations, rays, targets, rig))
+
+    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+        """Gaze points on the screen's plane."""
+        correction = self.correction or Recalibration(self.recalibration)
+        return correction.apply(observations, self.optic_axes(observations, rig), rig)
+
+    def optic_axes(self, observations: Observations, rig: Rig) -> GazeRays:
+        """Optic axes of the assumed eye, from the centre of corneal curvature."""
+        eyes = {int(e): self.parameters for e in np.unique(observations.index.eye)}
+        return GuestrinEizenman(lights=self.lights).with_parameters(eyes).optic_axes(observations, rig)

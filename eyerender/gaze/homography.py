@@ -1,0 +1,181 @@
+"""Homography normalisation (Hansen, Agustin & Villanueva, ETRA 2010), and the homographies it is made of.
+
+    s = H_n(glints -> unit square) pupil,   gaze = H_c s
+
+H_n is found anew in every image, so it takes up head movement; H_c is calibrated. Each homography comes from the direct
+linear transform: the null vector of
+
+    [x y 1 0 0 0 -ux -uy -u; 0 0 0 x y 1 -vx -vy -v]       (Hartley & Zisserman, Multiple View Geometry, 4.1)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import Bools, Floats, Objects
+from ..errors import InputError
+from ..observation import EYES, Observations
+from ..rig.rig import Rig
+from .estimate import GazePoints, gaze_points
+from .rays import chosen_lights, screen_of
+
+# The four lights' images: top left, top right, bottom right, bottom left of the square, u to the right and v up.
+SQUARE = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
+_DEGENERATE = 1e-10  # ratio of singular values below which points determine no homography
+
+
+@dataclass(frozen=True, slots=True)
+class HomographyNormalisation:
+    """Pupil centre normalised by four glints, mapped to the screen.
+
+    Args:
+        lights: the four lights in the order top left, top right, bottom right, bottom left.
+        conditioned: scale and centre the points before the calibration's transform is solved (Hartley 1997); False is
+        the
+            plain algebraic least squares, whose result depends on the targets' unit and origin.
+    """
+
+    lights: tuple[int, int, int, int] = (0, 1, 2, 3)
+    conditioned: bool = True
+    homographies: Mapping[int, Floats] = field(default_factory=dict)
+
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+        """Calibrate H_c of each eye; raises `InputError` for fewer than four targets or collinear ones."""
+        screen = screen_of(rig)
+        targets = np.asarray(targets_mm, dtype=float) - screen.centre_mm
+        wanted = np.stack([targets @ screen.right, targets @ screen.up], axis=-1)
+        s, reason = self.normalised(observations, rig)
+        usable = (reason == None) & np.isfinite(wanted).all(axis=1)  # noqa: E711
+        found = {}
+        for eye in np.unique(observations.index.eye):
+            rows = usable & (observations.index.eye == eye)
+            name = EYES[int(eye)] if eye >= 0 else "unknown"
+            if rows.sum() < 4:
+                raise InputError(f"{name} eye: {rows.sum()} usable calibration targets, a homography needs 4")
+            H, ok = homography(s[rows], wanted[rows], conditioned=self.conditioned)
+            if not ok:
+                raise InputError(f"{name} eye: the calibration targets do not determine a homography")
+            found[int(eye)] = H
+        return replace(self, homographies=found)
+
+    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+        """Gaze points on the screen's plane."""
+        if not self.homographies:
+            raise InputError("the estimator is not calibrated; call fit first")
+        screen = screen_of(rig)
+        s, reason = self.normalised(observations, rig)
+        on_screen = np.full((len(observations), 2), np.nan)
+        for eye in np.unique(observations.index.eye):
+            rows = observations.index.eye == eye
+            H = self.homographies.get(int(eye))
+            if H is None:
+                reason[rows & (reason == None)] = "this eye is not calibrated"  # noqa: E711
+                continue
+            on_screen[rows], finite = transformed(H, s[rows])
+            at_infinity = np.zeros(len(observations), dtype=bool)
+            at_infinity[rows] = ~finite
+            reason[at_infinity & (reason == None)] = "the gaze point lies at infinity"  # noqa: E711
+        return gaze_points(screen.world(on_screen), reason)
+
+    def normalised(self, observations: Observations, rig: Rig) -> tuple[Floats, Objects]:
+        """The pupil centre in the unit square of the glints (n, 2), and why there is none (n,)."""
+        chosen_lights(rig, self.lights, 4)
+        glints, reason = glints_of(observations, self.lights)
+        H, ok = homography(glints, np.broadcast_to(SQUARE, glints.shape))
+        reason[~ok & (reason == None)] = "three of the glints lie on a line"  # noqa: E711
+        s, finite = transformed(H, observations.pupil.centre_px)
+        reason[~finite & (reason == None)] = "the normalised pupil centre lies at infinity"  # noqa: E711
+        good = np.asarray(reason == None)  # noqa: E711
+        return np.where(good[:, None], s, np.nan), reason
+
+
+def homography(source: ArrayLike, target: ArrayLike, *, conditioned: bool = False) -> tuple[Floats, Bools]:
+    """Homographies (..., 3, 3) of unit norm from points (..., k, 2) to (..., k, 2), k >= 4, and whether there is one.
+
+    Four points give it exactly; more by least squares of the algebraic error. False where the points do not determine
+    it (NaN among them, three of four on a line).
+    """
+    p, q = np.asarray(source, dtype=float), np.asarray(target, dtype=float)
+    if conditioned:
+        T, U = _conditioning(p), _conditioning(q)
+        H, ok = homography(transformed(T, p)[0], transformed(U, q)[0])
+        safe = np.where(np.isfinite(U), U, np.eye(3))
+        H = np.linalg.inv(safe) @ H @ T
+        with np.errstate(invalid="ignore"):
+            return H / np.linalg.norm(H, axis=(-1, -2), keepdims=True), ok
+    x, y, u, v = p[..., 0], p[..., 1], q[..., 0], q[..., 1]
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    first = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=-1)
+    second = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=-1)
+    design = np.concatenate([first, second], axis=-2)
+    finite = np.isfinite(design).all(axis=(-1, -2))
+    _, values, vt = np.linalg.svd(np.where(finite[..., None, None], design, 0.0))
+    # Without these scales the columns' units, px against 1, would decide what counts as degenerate.
+    ok = finite & (_spread(p) > 1e-6) & (_spread(q) > 1e-6)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ok &= values[..., 7] / values[..., 0] > _DEGENERATE**2
+    H = vt[..., 8, :].reshape(*vt.shape[:-2], 3, 3)
+    return np.where(ok[..., None, None], H, np.nan), np.asarray(ok)
+
+
+def transformed(H: Floats, points: ArrayLike) -> tuple[Floats, Bools]:
+    """H (..., 3, 3) applied to points (..., 2) or (..., k, 2), and whether the result is finite."""
+    p = np.asarray(points, dtype=float)
+    many = p.ndim > H.ndim - 1 or H.ndim == 2
+    h = np.concatenate([p, np.ones((*p.shape[:-1], 1))], axis=-1)
+    out = h @ np.swapaxes(H, -1, -2) if many else (H @ h[..., None])[..., 0]
+    scale = np.abs(H[..., 2, :]).max(axis=-1)
+    scale = scale[..., None] if many and H.ndim > 2 else scale
+    size = np.maximum(np.abs(h).max(axis=-1), 1.0) * scale
+    with np.errstate(invalid="ignore", divide="ignore"):
+        finite = np.abs(out[..., 2]) > 1e-12 * size
+        return np.where(finite[..., None], out[..., :2] / out[..., 2:], np.nan), np.asarray(finite)
+
+
+def glints_of(observations: Observations, lights: tuple[int, ...]) -> tuple[Floats, Objects]:
+    """Glints (n, m, 2) px of the lights in their order, and why an observation lacks pupil or glint (n,)."""
+    reason = np.full(len(observations), None, dtype=object)
+    reason[~observations.pupil.ok] = "no pupil"
+    places = np.full((len(observations), len(lights), 2), np.nan)
+    for j, light in enumerate(lights):
+        places[:, j], found = observations.glints.of_light(light)
+        reason[(reason == None) & ~found] = f"no glint of light {light}"  # noqa: E711
+    return places, reason
+
+
+def _conditioning(points: Floats) -> Floats:
+    """The similarity (..., 3, 3) that brings points (..., k, 2) to zero mean and mean distance sqrt(2)."""
+    mean = points.mean(axis=-2)
+    size = np.linalg.norm(points - mean[..., None, :], axis=-1).mean(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        s = np.sqrt(2) / size
+    out = np.zeros((*mean.shape[:-1], 3, 3))
+    out[..., 0, 0] = out[..., 1, 1] = s
+    out[..., :2, 2] = -s[..., None] * mean
+    out[..., 2, 2] = 1.0
+    return out
+
+
+def _spread(points: Floats) -> Floats:
+    """How far k >= 4 points (..., k, 2) are from having no four in general position; relative, 0 where they have none.
+
+    With four, the smallest triangle's area over the square of their extent; with more, the second of the two extents
+    over the first.
+    """
+    d = points - points.mean(axis=-2, keepdims=True)
+    size = (d * d).sum(axis=(-1, -2))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if points.shape[-2] == 4:
+            areas = []
+            for skip in range(4):
+                a, b, c = (points[..., k, :] for k in range(4) if k != skip)
+                e, f = b - a, c - a
+                areas.append(np.abs(e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0]))
+            return np.asarray(np.nan_to_num(np.min(areas, axis=0) / size))
+        xx, yy, xy = (d[..., 0] ** 2).sum(-1), (d[..., 1] ** 2).sum(-1), (d[..., 0] * d[..., 1]).sum(-1)
+        return np.asarray(np.nan_to_num(np.sqrt(np.maximum(xx * yy - xy * xy, 0)) / size))

@@ -1,0 +1,111 @@
+"""Corrections of a model-based estimate by a polynomial (Hennessey, Noureddin & Lawrence, ETRA 2006).
+
+    on the screen:  (x, y) = A m(x0, y0);      on the angles:  (theta, phi) = A m(theta0, phi0)
+
+with m(a, b) = (1, a, b, ab, a^2, b^2), theta = atan2(d_y, d_x) and phi = asin(d_z) of the gaze ray's direction;
+fitted by least squares for each eye.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..observation import EYES, Observations
+from ..rig.rig import Rig
+from .estimate import GazePoints, GazeRays, gaze_points
+from .rays import screen_of
+
+Kind = Literal["none", "screen", "angle"]
+TERMS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Recalibration:
+    """A correction of gaze rays by eye; `coefficients` (2, 6) by eye, empty before the calibration."""
+
+    kind: Kind = "angle"
+    coefficients: Mapping[int, Floats] = field(default_factory=dict)
+
+    def fit(self, observations: Observations, rays: GazeRays, targets_mm: Floats, rig: Rig) -> Recalibration:
+        """Calibrate on rays (n) of observations (n) of targets (n, 3) mm.
+
+        Raises:
+            InputError: fewer than six usable targets, or targets that do not determine the polynomial.
+        """
+        if self.kind == "none":
+            return self
+        screen = screen_of(rig)
+        usable = np.array([r is None for r in rays.reason]) & np.isfinite(targets_mm).all(axis=1)
+        if self.kind == "angle":
+            measured, wanted = angles_of(rays.direction), angles_of(targets_mm - rays.origin_mm)
+        else:
+            measured, hits = screen.intersect(rays.origin_mm, rays.direction)
+            usable &= hits
+            flat = targets_mm - screen.centre_mm
+            wanted = np.stack([flat @ screen.right, flat @ screen.up], axis=-1)
+        out = {}
+        for eye in np.unique(observations.index.eye):
+            rows = usable & (observations.index.eye == eye)
+            name = EYES[int(eye)] if eye >= 0 else "unknown"
+            if rows.sum() < TERMS:
+                raise InputError(
+                    f"{name} eye: {rows.sum()} usable calibration targets, the correction has {TERMS} terms"
+                )
+            # Scaled columns, so that the rank does not depend on the unit.
+            design = monomials(measured[rows])
+            scale = np.abs(design).max(axis=0)
+            solution, _, rank, _ = np.linalg.lstsq(design / scale, wanted[rows], rcond=1e-10)
+            if rank < TERMS:
+                raise InputError(f"{name} eye: the calibration targets do not determine the correction (rank {rank})")
+            out[int(eye)] = (solution / scale[:, None]).T
+        return Recalibration(self.kind, out)
+
+    def apply(self, observations: Observations, rays: GazeRays, rig: Rig) -> GazePoints:
+        """Corrected gaze points on the screen's plane."""
+        screen = screen_of(rig)
+        reason = rays.reason.copy()
+        direction, on_screen = rays.direction.copy(), np.full((len(observations), 2), np.nan)
+        if self.kind != "none":
+            if not self.coefficients:
+                raise InputError("the estimator is not calibrated; call fit first")
+            for eye in np.unique(observations.index.eye):
+                rows = observations.index.eye == eye
+                A = self.coefficients.get(int(eye))
+                if A is None:
+                    reason[rows & (reason == None)] = "this eye is not calibrated"  # noqa: E711
+                elif self.kind == "angle":
+                    direction[rows] = direction_of(monomials(angles_of(direction[rows])) @ A.T)
+        on_screen, hits = screen.intersect(rays.origin_mm, direction)
+        reason[(reason == None) & ~hits] = "the gaze ray does not meet the screen"  # noqa: E711
+        if self.kind == "screen":
+            for eye, A in self.coefficients.items():
+                rows = observations.index.eye == eye
+                on_screen[rows] = monomials(on_screen[rows]) @ A.T
+        return gaze_points(screen.world(on_screen), reason)
+
+
+def angles_of(direction: Floats) -> Floats:
+    """Azimuth and elevation (..., 2) rad of directions (..., 3)."""
+    size = np.sqrt((direction * direction).sum(axis=-1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.stack(
+            [np.arctan2(direction[..., 1], direction[..., 0]), np.arcsin(direction[..., 2] / size)], axis=-1
+        )
+
+
+def direction_of(angles: Floats) -> Floats:
+    """Unit directions (..., 3) of azimuth and elevation (..., 2) rad."""
+    theta, phi = angles[..., 0], angles[..., 1]
+    return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
+
+
+def monomials(v: Floats) -> Floats:
+    """(1, a, b, ab, a^2, b^2) of (..., 2)."""
+    a, b = v[..., 0], v[..., 1]
+    return np.stack([np.ones_like(a), a, b, a * b, a * a, b * b], axis=-1)

@@ -1,0 +1,95 @@
+"""Observations and rigs out of plain numbers, and the conversions of the reference vectors' conventions.
+
+`ets` vectors are in metres, in a world whose screen is the plane y = 0 (x to the user's left, z up, the user at y > 0); their
+cameras look along -z of their own frame, x right and y up, with the principal point at (0, 0). Here that world becomes
+(x, y, z) -> (-y, x, z), lengths stay in metres (estimators do not mind the unit), and images are turned y down.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from eyerender.arrays import frozen
+from eyerender.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
+from eyerender.rig.camera import Camera
+from eyerender.rig.light import Light
+from eyerender.rig.rig import Rig
+from eyerender.rig.screen import Screen
+
+DATA = Path(__file__).parents[1] / "data"
+ETS_TO_WORLD = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+# (z away from the user, x to the user's right, y up), the user at z = +658: the one-camera vectors.
+PLANE_TO_WORLD = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def load(name):
+    return json.loads((DATA / name).read_text(encoding="utf-8"))
+
+
+def observations(pupil, glints, targets=None, *, eye=None, camera=None, fixation=None, frame=None, head=None):
+    """A batch of observations: pupil (n, 2), glints (n, m, 2) with NaN where missing, targets (n, 3)."""
+    pupil, glints = np.asarray(pupil, dtype=float), np.asarray(glints, dtype=float)
+    n, m = glints.shape[:2]
+    count = np.arange(n)
+    nan, none, model = np.full(n, np.nan), np.full(n, None, dtype=object), np.full(n, "model", dtype=object)
+    pupil_ok, glint_ok = np.isfinite(pupil).all(axis=1), np.isfinite(glints).all(axis=2)
+
+    def ints(values, default):
+        return frozen(default if values is None else values, np.int64)
+
+    return Observations(
+        Index(
+            ints(frame, count), ints(fixation, count), ints(camera, 0 * count), frozen(0 * count, np.int64),
+            ints(eye, 0 * count), frozen(model, object),
+            frozen(np.full((n, 3), np.nan) if targets is None else targets),
+            frozen(np.zeros((n, 3)) if head is None else head), frozen(np.zeros((n, 3))),
+        ),
+        PoseTruth(frozen(nan), frozen(nan), frozen(nan), frozen(nan)),
+        PupilFeatures(
+            frozen(np.where(pupil_ok, "ok", "missing").astype(object), object), frozen(none, object), frozen(pupil_ok, bool),
+            frozen(pupil), frozen(np.full((n, 2), 13.0)), frozen(nan), frozen(pupil), frozen(np.zeros((n, 0, 2))),
+            frozen(np.full((n, 5, 5), np.nan)),
+        ),
+        GlintFeatures(
+            frozen(np.broadcast_to(np.arange(m), (n, m)), np.int64),
+            frozen(np.where(glint_ok, "ok", "missing").astype(object), object),
+            frozen(np.full((n, m), None, dtype=object), object), frozen(glint_ok, bool), frozen(glints),
+            frozen(np.full((n, m, 2, 2), np.nan)),
+        ),
+    )  # fmt: skip
+
+
+def rig(cameras, lights, screen_centre, size=(400.0, 300.0)):
+    lamps = tuple(Light(frozen(p), frozen([1.0, 0, 0]), 0.0, 1.0, 1.0) for p in np.asarray(lights, dtype=float))
+    screen = Screen(frozen(screen_centre), frozen([0.0, -1.0, 0.0]), frozen([0.0, 0.0, 1.0]), size)
+    return Rig(tuple(cameras), lamps, screen)
+
+
+def camera_of(trans, focal_px, to_world):
+    """A camera of the vectors' convention (4x4 pose, looking along -z, image y up) in this package's."""
+    trans = np.asarray(trans, dtype=float)
+    R = (to_world @ trans[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
+    return Camera.of([[focal_px, 0, 0], [0, focal_px, 0], [0, 0, 1]], R, -R @ to_world @ trans[:3, 3], (1280, 1024))
+
+
+def ets_rig(data):
+    cameras = [camera_of(c["trans"], c["focal_length_px"], ETS_TO_WORLD) for c in data["cameras"]]
+    return rig(cameras, np.array(data["lights"], dtype=float) @ ETS_TO_WORLD.T, (0, 0, 0))
+
+
+def ets_observations(frames):
+    """One observation a frame of the first camera; targets on the screen."""
+    images = [f["images"][0] for f in frames]
+    down = np.array([1.0, -1.0])
+    pupil = np.array([i["pupil_center_px"] for i in images]) * down
+    glints = np.array([i["glints_px"] for i in images]) * down
+    return observations(pupil, glints, on_plane([f["target"] for f in frames]))
+
+
+def on_plane(points):
+    """Screen points (x, z) of the vectors in this package's world."""
+    p = np.asarray(points, dtype=float)
+    return np.stack([0 * p[:, 0], p[:, 0], p[:, 1]], axis=-1)

@@ -1,0 +1,85 @@
+"""The sensor model (EMVA 1288) and the point-spread function."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from eyerender.rendering import psf
+from eyerender.rendering.sensor import electrons, expose, radiance_to_irradiance
+from eyerender.rig.sensor import SensorSpec
+
+
+def test_electrons_by_counting_photons():
+    # 1 W/m^2 at 850 nm on (5 um)^2 for 2 ms: energy 5e-14 J over hc/lambda = 2.33699e-19 J is 213950 photons.
+    sensor = SensorSpec(pixel_pitch_um=5.0, exposure_ms=2.0, quantum_efficiency=0.5)
+    assert float(electrons(sensor, np.array(1.0), 850.0)) == pytest.approx(0.5 * 5e-14 / 2.336989e-19, rel=1e-5)
+
+
+def test_an_aperture_collects_its_solid_angle():
+    # A lens of diameter D at image distance v sends L (pi/4) (D/v)^2 on to the axis, for D small against v.
+    assert radiance_to_irradiance(SensorSpec(f_number=8.0, lens_transmission=1.0)) == pytest.approx(
+        1e3 * np.pi / 4 / 64
+    )
+
+
+@pytest.mark.parametrize(("bits", "well"), [(8, 1000.0), (10, 5000.0), (12, 20000.0), (16, 20000.0)])
+def test_photon_transfer(bits, well):
+    # Variance of DN against mean: K^2 (read^2 + electrons) + 1/12 of rounding; 250 k pixels give .3 %.
+    sensor = SensorSpec(bit_depth=bits, full_well_e=well, read_noise_e=8.0, black_level_dn=0.05 * (2**bits - 1))
+    scale = float(electrons(sensor, np.array(1.0), 850.0))
+    for wanted in (0.01 * well, 0.1 * well, 0.6 * well):
+        dn = expose(sensor, np.full((500, 500), wanted / scale), 850.0, 3).astype(float)
+        assert dn.mean() == pytest.approx(sensor.black_dn + sensor.gain * wanted, rel=2e-3)
+        variance = sensor.gain**2 * (sensor.read_noise_e**2 + wanted) + 1 / 12
+        assert dn.var() == pytest.approx(variance, rel=0.02)
+
+
+def test_full_well_and_range_clip():
+    sensor = SensorSpec(bit_depth=10, noise=False)
+    dn = expose(sensor, np.array([[0.0, 1e9]]), 850.0, 0)
+    assert dn.tolist() == [[round(sensor.black_dn), 1023]]
+
+
+def test_noise_belongs_to_the_seed():
+    sensor = SensorSpec()
+    image = np.full((20, 20), 0.01)
+    assert np.array_equal(expose(sensor, image, 850.0, 5), expose(sensor, image, 850.0, 5))
+    assert not np.array_equal(expose(sensor, image, 850.0, 5), expose(sensor, image, 850.0, 6))
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.7, 1.5, 4.0])
+def test_the_kernel_has_the_variance_it_says(sigma):
+    k = psf.kernel(sigma)
+    n = np.arange(len(k)) - psf.margin(sigma)
+    assert k.sum() == pytest.approx(1.0)
+    assert (k * n**2).sum() == pytest.approx(sigma**2, rel=2e-3)  # the tails beyond 4 sigma are cut
+
+
+def test_blur_takes_the_border_and_keeps_the_rest():
+    image = np.random.default_rng(0).uniform(size=(40, 50))
+    m = psf.margin(1.0)
+    out = psf.blur(image, 1.0)
+    assert out.shape == (40 - 2 * m, 50 - 2 * m)
+    expected = ndimage.convolve(image, np.outer(psf.kernel(1.0), psf.kernel(1.0)))[m:-m, m:-m]
+    np.testing.assert_allclose(out, expected, rtol=1e-12)
+
+
+def test_splats_are_pixel_integrals():
+    xy, energy = np.array([[10.3, 8.7], [12.0, 9.0]]), np.array([2.0, 3.0])
+    patch, rows, columns = psf.splat(xy, energy, 0.8, (0, 0, 24, 20))
+    image = np.zeros((20, 24))
+    image[rows, columns] = patch
+    v, u = np.meshgrid((np.arange(20 * 50) + 0.5) / 50 - 0.5, (np.arange(24 * 50) + 0.5) / 50 - 0.5, indexing="ij")
+    brute = sum(
+        e / (2 * np.pi * 0.64) * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 1.28) for (x, y), e in zip(xy, energy, strict=True)
+    )
+    brute = brute.reshape(20, 50, 24, 50).sum(axis=(1, 3)) / 2500
+    np.testing.assert_allclose(image, brute, atol=5e-5)  # the midpoint rule
+
+
+def test_a_splat_outside_the_window_adds_nothing():
+    patch, rows, columns = psf.splat(np.array([[500.0, 5.0]]), np.ones(1), 1.0, (0, 0, 24, 20))
+    assert patch.size == 0
+    assert (rows, columns) == (slice(0, 0), slice(0, 0))

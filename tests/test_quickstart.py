@@ -1,0 +1,145 @@
+"""The main job, for real: rendered, extracted, calibrated, compared, reported; from the command line and from Python."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eyerender.analytic.observer import observe
+from eyerender.cli.app import run
+from eyerender.imagefile import read_image
+from eyerender.imagefolder import ImageFolder
+from eyerender.scene import load_scene
+
+pytestmark = pytest.mark.render
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The quickstart's folder, made once."""
+    out = tmp_path_factory.mktemp("job") / "quickstart"
+    assert run(["quickstart", str(out), "--json", str(out.parent / "result.json")]) == 0
+    return out
+
+
+def test_folder_is_what_the_contract_says(folder):
+    images = ImageFolder.load(folder)
+    assert len(images.entries) == 18
+    assert images.dataset["schema"] == "eyerender/dataset/1"
+    for entry in images.entries:
+        image, depth = read_image(entry.path)
+        mask, _ = read_image(entry.mask_path)
+        assert (image.shape, mask.shape, depth) == ((240, 320), (240, 320), 16)
+        assert entry.window[2:] == (320, 240)
+        assert set(np.unique(mask)) == {0, 1, 2, 3}
+        assert entry.line["labels"]["failed_paths"] == 0
+    fresh = observe(load_scene("quickstart"))
+    np.testing.assert_array_equal(images.truth().pupil.centre_px, fresh.pupil.centre_px)
+    np.testing.assert_array_equal(images.truth().glints.xy_px, fresh.glints.xy_px)
+
+
+def test_labels_agree_with_the_pixels(folder):
+    # The mask's pupil and the analytic ellipse are made by two programs: rays of the renderer, and Newton's method.
+    images = ImageFolder.load(folder)
+    truth = images.truth()
+    for row, entry in enumerate(images.entries):
+        mask, _ = read_image(entry.mask_path)
+        ys, xs = np.nonzero(mask == 3)
+        centre = np.array([xs.mean(), ys.mean()]) + entry.window[:2]
+        a, b = truth.pupil.semi_axes_px[row]
+        # A mask of about 500 pixels has a centroid good to about .05 px, an area good to its outline's pixels.
+        np.testing.assert_allclose(centre, truth.pupil.centre_px[row], atol=0.1)
+        assert len(xs) == pytest.approx(np.pi * a * b, rel=0.03)
+
+
+def test_both_observers_agree_within_a_fraction_of_a_pixel(folder):
+    data = json.loads((folder.parent / "result.json").read_text())
+    assert data["schema"] == "eyerender/compare/1"
+    features, gaze = data["features"], data["gaze"]
+    assert features["pupils"] == {"expected": 18, "found": 18}
+    assert features["glints"] == {"expected": 18, "found": 18}
+    # Bars an extractor with a half-pixel convention error or a lost calibration would miss.
+    assert features["pupil_centre_px"]["median"] < 0.1
+    assert features["glint_px"]["median"] < 0.1
+    assert 0 < gaze["analytic"]["mean_deg"] < 0.5
+    assert gaze["analytic"]["mean_deg"] != gaze["image"]["mean_deg"]
+    assert gaze["image"]["mean_deg"] < 1.0
+
+
+def test_repeating_renders_nothing_again_and_another_job_is_refused(folder, capsys):
+    before = (folder / "images" / "000000_right.png").stat().st_mtime_ns
+    assert run(["quickstart", str(folder)]) == 0
+    assert (folder / "images" / "000000_right.png").stat().st_mtime_ns == before
+    capsys.readouterr()
+    assert run(["quickstart", str(folder), "--eye", "E1"]) == 2
+    assert "is not empty" in capsys.readouterr().err
+
+
+def test_compare_reads_the_folder_back(folder, capsys):
+    assert run(["compare", str(folder), "--json", "-"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again == json.loads((folder.parent / "result.json").read_text())
+
+
+def test_extract_of_the_folder_gives_records(folder, capsys):
+    assert run(["extract", str(folder), "--json", "-"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert len(data["records"]) == 18
+    first = data["records"][0]
+    assert first["pupil"]["status"] == "ok"
+    assert first["pose"]["azimuth_deg"] is None  # the image observer does not know the truth
+    assert [g["light"] for g in first["glints"] if g["status"] == "ok"] == [0]
+
+
+class Page(HTMLParser):
+    """Tags that refer to something outside the page."""
+
+    def __init__(self):
+        super().__init__()
+        self.outside, self.count = [], {}
+
+    def handle_starttag(self, tag, attributes):
+        self.count[tag] = self.count.get(tag, 0) + 1
+        for name, value in attributes:
+            if name in ("src", "href", "xlink:href") and value and not value.startswith(("data:", "#")):
+                self.outside.append(value)
+
+
+def test_report_is_self_contained_and_shows_every_image(folder):
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    page = Page()
+    page.feed(text)
+    assert page.outside == []
+    assert page.count["image"] >= 18
+    assert "url(http" not in text
+    assert len(re.findall(r'<g class="found"', text)) == 18
+    data = json.loads((folder.parent / "result.json").read_text())
+    assert f"{data['features']['pupil_centre_px']['median']:.3f} px" in text
+    assert f"{data['gaze']['image']['mean_deg']:.3f}°" in text
+
+
+def test_python_twin_prints_the_same_numbers(folder, tmp_path):
+    script = ROOT / "scripts" / "quickstart.py"
+    if not script.is_file():
+        pytest.skip("no checkout")
+    source = script.read_text(encoding="utf-8")
+    assert len(source.splitlines()) < 30
+    assert source in (ROOT / "README.md").read_text(encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, str(script), str(tmp_path / "twin")], capture_output=True, text=True, timeout=200
+    )
+    assert done.returncode == 0, done.stderr
+    data = json.loads((folder.parent / "result.json").read_text())
+    assert f"{data['features']['pupil_centre_px']['median']:.3f} px" in done.stdout
+    assert f"{data['gaze']['image']['mean_deg']:.3f} deg" in done.stdout
+    assert (tmp_path / "twin" / "report.html").is_file()
+    for name in ("metadata.jsonl", "images/000004_left.png"):
+        assert (tmp_path / "twin" / name).read_bytes() == (folder / name).read_bytes()
