@@ -67,7 +67,7 @@ def render_windows(
 
     renderer = Renderer(chosen, spp=scene.spec.image.spp)
     index, windows = observations.index, scene.windows()
-    eyes = {side: scene.eye(side) for side in scene.spec.subject.eyes}
+    eyes: dict[str, Eye] = {side: scene.eye(side) for side in scene.spec.subject.eyes}
     for row in range(len(observations)):
         side, camera, head = EYES[index.eye[row]], int(index.camera[row]), int(index.head[row])
         M, t = _motion(eyes[side], observations, row)

@@ -1,4 +1,4 @@
-"""The two observers side by side: errors of image-derived features against the analytic ones, and what gaze they give."""
+"""The two observers side by side: errors of image-derived features against the analytic ones, and the gaze of both."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SCHEMA = "eyerender/compare/1"
 class FeatureErrors(ArrayValue):
     """Image-derived minus analytic features, NaN where one of the two has none.
 
-    `centre_px` (n, 2), `semi_axes_px` (n, 2), `glint_px` (n, m, 2) by the analytic glint's entry; the flags count what the
-    analytic observer sees on the sensor and what of it was found.
+    `centre_px` (n, 2), `semi_axes_px` (n, 2), `glint_px` (n, m, 2) by the analytic glint's entry; the flags count what
+    the analytic observer sees on the sensor and what of it was found.
     """
 
     centre_px: Floats
@@ -77,7 +77,7 @@ class Comparison:
 
 
 def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
-    """Errors of `found` against `truth`, row by row; raises `InputError` unless both are of the same frames and eyes."""
+    """Errors of `found` against `truth`, row by row; `InputError` unless both are of the same frames and eyes."""
     same = len(truth) == len(found) and np.array_equal(truth.index.frame, found.index.frame)
     if not same or not np.array_equal(truth.index.eye, found.index.eye):
         raise InputError("the two sets of observations are not of the same frames and eyes")

@@ -45,7 +45,7 @@ class ImageEntry:
     @property
     def path(self) -> Path:
         """The image file."""
-        return self.folder / self.line["file_name"]
+        return self.folder / str(self.line["file_name"])
 
     @property
     def mask_path(self) -> Path | None:

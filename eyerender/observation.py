@@ -27,8 +27,8 @@ class Index(ArrayValue):
     """Which observation is which; all arrays (n,).
 
     `eye` is 0 for the right and 1 for the left eye; `fixation`, `camera`, `head` count from 0 in the scene's order and
-    are -1 where unknown. `target_mm` (n, 3) is NaN where there is no target; `eye_position_mm` (n, 3) is the apex of the
-    unrotated eye in the world, without `head_mm` (n, 3).
+    are -1 where unknown. `target_mm` (n, 3) is NaN where there is no target; `eye_position_mm` (n, 3) is the apex of
+    the unrotated eye in the world, without `head_mm` (n, 3).
     """
 
     frame: Ints

@@ -70,21 +70,23 @@ class ImageObserver:
             truth = truth.take(np.asarray(only))
         images = render_windows(scene, truth, backend=backend, threads=threads, progress=progress)
         parts = [
-            self._observe_rows(image.dn, scene.spec.sensor.bit_depth, image.window[:2], truth.index, np.array([image.row]), scene)
+            self._observe_rows(
+                image.dn, scene.spec.sensor.bit_depth, image.window[:2], truth.index, np.array([image.row]), scene
+            )
             for image in images
         ]
         return concatenate(parts)
 
-    def observe_folder(
-        self, folder: ImageFolder, scene: Scene, *, progress: Progress | None = None
-    ) -> Observations:
+    def observe_folder(self, folder: ImageFolder, scene: Scene, *, progress: Progress | None = None) -> Observations:
         """Extract the features of a folder's images, row by row as its records."""
         index = folder.truth().index
         parts, row = [], 0
         for k, entry in enumerate(folder.entries):
             image, stored = read_image(entry.path)
             if image.shape != (entry.window[3], entry.window[2]):
-                raise InputError(f"is {image.shape[1]} x {image.shape[0]} px, its window is not", source=str(entry.path))
+                raise InputError(
+                    f"is {image.shape[1]} x {image.shape[0]} px, its window is not", source=str(entry.path)
+                )
             rows = np.arange(row, row + len(entry.line["records"]))
             depth = int(entry.line.get("bit_depth") or stored)
             parts.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene))
@@ -156,14 +158,12 @@ def scene_of(folder: ImageFolder) -> Scene:
     return Scene.of(SceneSpec.from_mapping(spec, source=source), source=source)
 
 
-def _around(
-    image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: float
-) -> tuple[NDArray[Any], Floats]:
+def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: float) -> tuple[NDArray[Any], Floats]:
     """The part of an image within `half_px` of a full-sensor point, and its own first pixel on the sensor."""
     h, w = image.shape
     x0, y0 = np.clip(np.floor(centre_px - corner - half_px), 0, [w - 16, h - 16]).astype(int)
     x1, y1 = np.clip(np.ceil(centre_px - corner + half_px), [x0 + 16, y0 + 16], [w, h]).astype(int)
-    return image[y0:y1, x0:x1], corner + [x0, y0]
+    return image[y0:y1, x0:x1], corner + np.array([x0, y0])
 
 
 def _one(index: Index, row: int) -> Index:
@@ -175,7 +175,15 @@ def _anonymous(frame: int) -> Index:
     unknown = frozen([-1], np.int64)
     nothing = frozen(np.full((1, 3), np.nan))
     return Index(
-        frozen([frame], np.int64), unknown, unknown, unknown, unknown, frozen([None], object), nothing, nothing, nothing
+        frozen([frame], np.int64),
+        unknown,
+        unknown,
+        unknown,
+        unknown,
+        frozen(_texts([None]), object),
+        nothing,
+        nothing,
+        nothing,
     )
 
 
@@ -221,7 +229,7 @@ def _observation(
         PoseTruth(nan, nan, nan, nan),
         PupilFeatures(
             frozen([OK if ok else MISSING], object),
-            frozen([pupil.reason], object),
+            frozen(_texts([pupil.reason]), object),
             frozen([ok], bool),
             frozen(centre),
             frozen(axes),

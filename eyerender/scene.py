@@ -22,7 +22,7 @@ from .observation import EYES, Index
 from .region.look import LookSpec
 from .rig.rig import Rig, RigSpec
 from .rig.sensor import SensorSpec
-from .spec import FileSpec, NonNegative, Positive, Spec, Vec2, Vec3
+from .spec import FileSpec, Positive, Spec, Vec2, Vec3
 
 Count = Annotated[int, Field(ge=1, le=1000)]
 
@@ -280,9 +280,7 @@ def shipped_scenes() -> dict[str, Path]:
     return {}
 
 
-def load_scene(
-    scene: str | Path, *, eye: str | None = None, spp: int | None = None, seed: int | None = None
-) -> Scene:
+def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = None, seed: int | None = None) -> Scene:
     """A scene from a file, or by the bare name of a shipped one.
 
     Args:

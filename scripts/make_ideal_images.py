@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
 CELLS = 4  # cells a pixel, each way
@@ -193,6 +193,46 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
         "pupil_contrast_to_noise": abs(step) / max(noise, 1e-9), "polarity": "bright" if c.bright_pupil else "dark",
     }  # fmt: skip
     return Drawing(np.clip(np.rint(data), 0, full).astype(dtype), record, parameters)
+
+
+def draw_no_eye(seed: int, size: tuple[int, int] = (320, 240)) -> NDArray[np.uint8]:
+    """An 8-bit image without an eye: 1/f fields, rectangles, letters, lines, discs with holes, checks, noise, ramps."""
+    rng = np.random.default_rng([seed, zlib.crc32(b"no eye")])
+    width, height = size
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    kind = rng.choice(["field", "field", "rectangles", "letters", "lines", "checks", "noise", "ramp"])
+    canvas = Image.new("L", size, int(rng.integers(90, 230)))
+    pen = ImageDraw.Draw(canvas)
+    grey = lambda: int(rng.integers(0, 255))  # noqa: E731
+    if kind == "field":
+        power = np.fft.fftfreq(height)[:, None] ** 2 + np.fft.fftfreq(width)[None, :] ** 2
+        power[0, 0] = 1.0
+        white = np.fft.fft2(rng.normal(size=(height, width)))
+        field = np.fft.ifft2(white / power ** rng.uniform(0.4, 1.1)).real
+        image = 128.0 + 40.0 * field / field.std()
+    elif kind == "checks":
+        side = rng.integers(8, 50)
+        image = 40.0 + 150.0 * ((x // side + y // side) % 2)
+    elif kind == "noise":
+        image = np.full((height, width), 120.0) + rng.normal(0.0, 20.0, (height, width))
+    elif kind == "ramp":
+        image = 128.0 + rng.uniform(-0.4, 0.4) * x + rng.uniform(-0.4, 0.4) * y
+    else:
+        for _ in range(int(rng.integers(2, 20))):
+            left, top = (int(v) for v in rng.integers(-20, (width, height)))
+            if kind == "rectangles":
+                pen.rectangle([left, top, left + int(rng.integers(5, 90)), top + int(rng.integers(5, 90))], fill=grey())
+            elif kind == "lines":
+                end = [int(v) for v in rng.integers(0, (width, height))]
+                pen.line([left, top, *end], fill=grey(), width=int(rng.integers(1, 20)))
+            else:
+                text = "".join(rng.choice(list("ABCDGOQSaegos0689"), 5))
+                pen.text((left, top), text, fill=grey(), font=ImageFont.load_default(size=int(rng.integers(12, 110))))
+        image = np.asarray(canvas, dtype=np.float64)
+    image = ndimage.gaussian_filter(image, rng.uniform(0.5, 2.0)) + rng.normal(0.0, 1.0, image.shape) * rng.uniform(
+        0.5, 8.0
+    )
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
 def _iris_texture(iris: _Conic, sigma: float, x: Array, y: Array, rng: np.random.Generator) -> Array | float:

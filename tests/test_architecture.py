@@ -41,7 +41,18 @@ FLOORS = {
     "__main__": 10,
 }
 # The order of the single modules that share a floor: each may import those before it.
-ORDER = ["errors", "arrays", "spec", "observation", "imagefile", "imagefolder", "scene", "comparison", "capture", "observers"]
+ORDER = [
+    "errors",
+    "arrays",
+    "spec",
+    "observation",
+    "imagefile",
+    "imagefolder",
+    "scene",
+    "comparison",
+    "capture",
+    "observers",
+]
 
 
 def modules():
@@ -103,17 +114,18 @@ def test_one_room_for_each_heavy_library(libraries, home):
 
 
 def test_import_is_light():
-    code = "import sys, eyerender; print([m for m in ('mitsuba', 'drjit', 'cv2', 'skimage', 'matplotlib') if m in sys.modules])"
+    heavy = ("mitsuba", "drjit", "cv2", "skimage", "matplotlib")
+    code = f"import sys, eyerender; print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
 
 
 def test_public_names_are_pinned():
     assert eyerender.__all__ == [
-        "AnalyticObserver", "BackendError", "Comparison", "Eye", "EyeSpec", "EyerenderError", "GazeErrors", "ImageFolder",
-        "ImageObserver", "InputError", "Observations", "PupilGlintRegression", "Rig", "Scene", "SceneSpec", "__version__",
-        "compare", "leave_one_target_out", "load_eye", "load_scene", "render_folder", "render_windows", "shipped_scenes",
-        "write_report",
+        "AnalyticObserver", "BackendError", "Comparison", "Eye", "EyeSpec", "EyerenderError", "GazeErrors",
+        "ImageFolder", "ImageObserver", "InputError", "Observations", "PupilGlintRegression", "Rig", "Scene",
+        "SceneSpec", "__version__", "compare", "leave_one_target_out", "load_eye", "load_scene", "render_folder",
+        "render_windows", "shipped_scenes", "write_report",
     ]  # fmt: skip
     for name in eyerender.__all__:
         assert getattr(eyerender, name) is not None

@@ -88,7 +88,7 @@ def test_staged_folder_appears_complete(tmp_path):
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, OSError])
 def test_a_failed_run_leaves_nothing(tmp_path, error):
     out = tmp_path / "out"
-    with pytest.raises((error, EyerenderError)), staged(out) as folder:
+    with pytest.raises((error, EyerenderError)), staged(out) as folder:  # noqa: PT012
         (folder / "half").write_text("x")
         raise error
     assert not out.exists()
@@ -96,7 +96,7 @@ def test_a_failed_run_leaves_nothing(tmp_path, error):
 
 def test_a_failed_overwrite_keeps_what_was_there(tmp_path):
     (tmp_path / "keep").write_text("x")
-    with pytest.raises(RuntimeError), staged(tmp_path, overwrite=True) as folder:
+    with pytest.raises(RuntimeError), staged(tmp_path, overwrite=True) as folder:  # noqa: PT012
         (folder / "half").write_text("x")
         raise RuntimeError
     assert [p.name for p in tmp_path.iterdir()] == ["keep"]
@@ -147,7 +147,11 @@ def test_a_full_disk_is_one_error_and_leaves_nothing(tmp_path):
         ("metadata.jsonl", None, "holds no metadata.jsonl"),
         ("metadata.jsonl", "", "holds no images"),
         ("metadata.jsonl", "{}\n", "line 1: is no image record"),
-        ("metadata.jsonl", json.dumps({"schema": "eyerender/image/1", **line(), "file_name": "../x"}), "inside the folder"),
+        (
+            "metadata.jsonl",
+            json.dumps({"schema": "eyerender/image/1", **line(), "file_name": "../x"}),
+            "inside the folder",
+        ),
         ("dataset.json", None, "dataset.json: no such file"),
         ("dataset.json", "[", "is not valid JSON"),
         ("dataset.json", '{"schema": "eyerender/dataset/9"}', "schema: is 'eyerender/dataset/9'"),

@@ -1,4 +1,4 @@
-"""The main job, for real: rendered, extracted, calibrated, compared, reported; from the command line and from Python."""
+"""The main job, for real: rendered, extracted, calibrated, compared, reported; by command and from Python."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The application and its error policy: one line on stderr, the exit codes of CONTRACTS, no traceback without --debug."""
+"""The application and its error policy: one line on stderr, an exit code, no traceback without --debug."""
 
 from __future__ import annotations
 

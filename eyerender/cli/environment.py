@@ -27,7 +27,9 @@ def doctor(*, json: Json = None) -> int:
         lines.append(f"{state.name:<5} {'works' if state.ok else 'does not work'}: {state.detail}")
         if not state.ok:
             lines.append(f"      mend: {state.mend}")
-    lines.append(f"rendering uses {report.chosen}" if report.chosen else "nothing renders here; analysis and extraction do")
+    lines.append(
+        f"rendering uses {report.chosen}" if report.chosen else "nothing renders here; analysis and extraction do"
+    )
     lines += [f"python   {report.python}", f"platform {report.platform}", f"cpu      {report.cpu}"]
     lines += [f"{name} {version}" for name, version in report.packages]
     lines.append(f"cache    {report.cache}")

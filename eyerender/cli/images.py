@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from .app import app
 from .observe import comparison_text
-from .output import BackendName, Json, emit, progress, say
+from .output import BackendName, Json, emit, progress
 
 
 @app.command(name="render")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +11,7 @@ from cyclopts import Parameter
 from ..errors import InputError
 from ..observation import EYES, Observations
 from .app import app
-from .output import Json, emit, progress, say
+from .output import Json, emit, progress
 
 
 @app.command(name="features")

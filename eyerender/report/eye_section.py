@@ -1,4 +1,4 @@
-"""An eye's section, drawn: surfaces, stop, fovea, axes and centres of rotation (as the comparative study's Figure 1)."""
+"""An eye's section, drawn: surfaces, stop, fovea, axes and centres of rotation (as the study's Figure 1)."""
 
 from __future__ import annotations
 
@@ -113,4 +113,6 @@ def _iris(ax: Any, eye: Eye, across: int) -> None:
     edge = float(stop.semi_axes_mm[across - 1])
     for sign in (-1, 1):
         line = np.stack([stop.centre_mm + sign * r * axis for r in (edge, eye.iris_root_radius_mm)])
-        ax.plot(line[:, 0], line[:, across], color=_IRIS, lw=3, solid_capstyle="butt", label="iris" if sign > 0 else None)
+        ax.plot(
+            line[:, 0], line[:, across], color=_IRIS, lw=3, solid_capstyle="butt", label="iris" if sign > 0 else None
+        )

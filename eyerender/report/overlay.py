@@ -76,7 +76,7 @@ def eye_picture(
 def _cross(at: Floats, size: float, *, diagonal: bool) -> str:
     """A cross that leaves its centre open, so that what it marks stays visible."""
     x, y = at
-    arms = [(1, 0), (-1, 0), (0, 1), (0, -1)]
+    arms = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
     if diagonal:
         arms = [(0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)]
     inner = 0.35

@@ -73,14 +73,24 @@ def _eye(ax: Any, scene: Scene, seen: Observations, row: int, *, first: bool) ->
     apex = index.eye_position_mm[row] + index.head_mm[row]
     centre = apex + eye.sclera.centre_mm
     u, v = np.mgrid[0 : 2 * np.pi : 25j, 0 : np.pi : 13j]
-    globe = centre[:, None, None] + eye.sclera.radius_mm * np.stack([np.cos(v), np.sin(v) * np.cos(u), np.sin(v) * np.sin(u)])
+    globe = centre[:, None, None] + eye.sclera.radius_mm * np.stack(
+        [np.cos(v), np.sin(v) * np.cos(u), np.sin(v) * np.sin(u)]
+    )
     ax.plot_wireframe(*globe, color="#bbbbbb", lw=0.35)
     target = index.target_mm[row]
     if np.isfinite(target).all():
         ax.plot(*np.stack([apex, target]).T, color=_SIGHT, lw=1.4, label="line of sight" if first else None)
     camera = scene.rig.cameras[int(index.camera[row])]
     if seen.pupil.ok[row]:
-        _ray(ax, camera.nodal_point_mm, camera.rays(seen.pupil.centre_px[row]), apex, "-", ANALYTIC, "pupil's ray" if first else None)
+        _ray(
+            ax,
+            camera.nodal_point_mm,
+            camera.rays(seen.pupil.centre_px[row]),
+            apex,
+            "-",
+            ANALYTIC,
+            "pupil's ray" if first else None,
+        )
     for j in np.flatnonzero(seen.glints.ok[row]):
         hit = _ray(
             ax,

@@ -11,7 +11,7 @@ ANALYTIC, IMAGE, TARGET = "#0072B2", "#D55E00", "#222222"
 # On dark pictures the same two hues, light enough to be seen.
 ANALYTIC_ON_DARK, IMAGE_ON_DARK = "#56B4E9", "#FF9F1C"
 
-_RC = {
+_RC: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 10,
     "axes.spines.top": False,

@@ -105,7 +105,8 @@ class CameraSpec(Spec):
         if self.focal_length_px is not None:
             fx = fy = self.focal_length_px
         else:
-            assert self.focal_length_mm is not None and self.sensor_mm is not None
+            assert self.focal_length_mm is not None
+            assert self.sensor_mm is not None
             fx = self.focal_length_mm * width / self.sensor_mm[0]
             fy = self.focal_length_mm * height / self.sensor_mm[1]
         cx, cy = self.principal_point_px or ((width - 1) / 2, (height - 1) / 2)
@@ -117,7 +118,7 @@ class CameraSpec(Spec):
         roll = np.radians(self.roll_deg)
         turn = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1.0]])
         R = (axes @ turn).T
-        K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         return Camera.of(K, R, -R @ position, self.resolution_px, self.distortion, self.name)
 
 
@@ -148,7 +149,7 @@ class Camera(ArrayValue):
     @property
     def nodal_point_mm(self) -> Floats:
         """The centre of projection in the world, (3,) mm: -R^T t."""
-        return -self.R.T @ self.t
+        return np.asarray(-self.R.T @ self.t)
 
     @property
     def axis(self) -> Floats:
