@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from .imagefolder import refuse_non_empty, staged, write_dataset
 from .observation import EYES, Observations
 from .scene import Scene
 
+if TYPE_CHECKING:
+    from .rendering.renderer import RenderedWindow, Renderer
+
 Progress = Callable[[int, int, str], None]
 BackendName = Literal["auto", "cuda", "llvm"]
 
@@ -30,7 +33,7 @@ class WindowImage:
 
     `row` is the observation it shows; `window` is (x0, y0, width, height) in full-sensor pixels; `dn` (h, w) the
     sensor's counts; `irradiance` (h, w) before its noise and quantisation; `mask` (h, w) the part seen at each
-    pixel's centre.
+    pixel's centre. `eye` moves by x_world = M x + t; `rendered` is all that the renderer gave.
     """
 
     name: str
@@ -41,6 +44,10 @@ class WindowImage:
     irradiance: NDArray[np.float32]
     mask: NDArray[np.uint8]
     labels: dict[str, Any]
+    eye: Eye
+    M: Floats
+    t: Floats
+    rendered: RenderedWindow
 
 
 def render_windows(
@@ -49,32 +56,31 @@ def render_windows(
     *,
     backend: BackendName = "auto",
     threads: int | None = None,
+    renderer: Renderer | None = None,
     progress: Progress | None = None,
 ) -> Iterator[WindowImage]:
     """Render every window of a scene, in frame order, at the poses of its analytic observations.
 
+    A `renderer` made before is used again (see `make_renderer`), else one is made for `backend` and `threads`.
+
     Raises:
         BackendError: there is nothing to render with; the message names the mend.
     """
-    if scene.spec.image.window_px is None and len(scene.spec.subject.eyes) > 1:
-        raise InputError("missing; both eyes are rendered in a window each", path="image.window_px")
-    from .rendering.backend import choose_backend
-
-    chosen = choose_backend(backend, threads)
-    # Only now: importing the renderer imports mitsuba, which must find its backend ready.
+    check_windows(scene)
+    if renderer is None:
+        renderer = make_renderer(backend, threads)
     from .rendering.frame import RenderJob
-    from .rendering.renderer import Renderer
 
-    renderer = Renderer(chosen, spp=scene.spec.image.spp)
     index, windows = observations.index, scene.windows()
     eyes: dict[str, Eye] = {side: scene.eye(side) for side in scene.spec.subject.eyes}
     for row in range(len(observations)):
         side, camera, head = EYES[index.eye[row]], int(index.camera[row]), int(index.head[row])
         M, t = _motion(eyes[side], observations, row)
+        t = t + index.eye_position_mm[row] + index.head_mm[row]
         job = RenderJob(
             eye=eyes[side],
             M=M,
-            t=t + index.eye_position_mm[row] + index.head_mm[row],
+            t=t,
             camera=scene.rig.cameras[camera],
             window=windows[camera, head, int(index.eye[row])],
             lights=scene.rig.lights,
@@ -84,7 +90,7 @@ def render_windows(
             seed=image_seed(scene.spec.seed, int(index.frame[row]), int(index.eye[row])),
             apex_mm=index.eye_position_mm[row] + index.head_mm[row],
         )
-        done = renderer.render(job)
+        done = renderer.render(job, spp=scene.spec.image.spp)
         labels = done.labels
         assert labels is not None
         yield WindowImage(
@@ -100,9 +106,30 @@ def render_windows(
                 "iris_visible_fraction": _share(labels.visible_fraction(2)),
                 "failed_paths": done.failed_paths,
             },
+            eyes[side],
+            M,
+            t,
+            done,
         )
         if progress is not None:
             progress(row + 1, len(observations), "")
+
+
+def check_windows(scene: Scene) -> None:
+    """Raise `InputError` for a scene whose eyes cannot be rendered."""
+    if scene.spec.image.window_px is None and len(scene.spec.subject.eyes) > 1:
+        raise InputError("missing; both eyes are rendered in a window each", path="image.window_px")
+
+
+def make_renderer(backend: BackendName = "auto", threads: int | None = None) -> Renderer:
+    """A renderer on a backend that works; raises `BackendError` with the mend where there is none."""
+    from .rendering.backend import choose_backend
+
+    chosen = choose_backend(backend, threads)
+    # Only now: importing the renderer imports mitsuba, which must find its backend ready.
+    from .rendering.renderer import Renderer
+
+    return Renderer(chosen)
 
 
 def image_seed(seed: int, frame: int, eye: int) -> int:

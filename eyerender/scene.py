@@ -273,11 +273,24 @@ class Scene:
 
 def shipped_scenes() -> dict[str, Path]:
     """Name -> file of the scenes that come with the package."""
+    return {name: path for name, path in shipped_files().items() if not is_dataset(path)}
+
+
+def shipped_files() -> dict[str, Path]:
+    """Name -> file of the scenes and dataset specs that come with the package."""
     package = Path(__file__).resolve().parent
     for folder in (package / "data" / "scenes", package.parent / "scenes"):
         if folder.is_dir():
             return {p.stem: p for p in sorted(folder.glob("*.yaml"))}
     return {}
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a YAML file says that it is no scene but the spec of a dataset (`kind: dataset`)."""
+    try:
+        return "\nkind: dataset" in "\n" + path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = None, seed: int | None = None) -> Scene:

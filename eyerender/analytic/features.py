@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -131,22 +132,24 @@ def features(
     for group, rows in _groups(eyes, which):
         for number in np.unique(cams[rows]):
             camera = cameras[number]
-            for part, local in _chunks(group, rows[cams[rows] == number], max(1, CHUNK_POINTS // boundary_points)):
-                view = _View.of(local, _pose_rows(poses, part), position[part], camera)
-                # The last point is the stop's centre.
-                exits, residual, status = pupil_exits(local, boundary_points, view.camera_mm)
-                pixels, status = view.project(exits, status)
-                points[part], anatomical[part] = pixels[:, :-1], pixels[:, -1]
-                point_status[part], point_residual[part] = status[:, :-1], residual[:, :-1]
-                fit = fit_ellipse_direct(pixels[:, :-1])
-                ellipse[part, :2], ellipse[part, 2:4] = fit.centre_px, fit.semi_axes_px
-                ellipse[part, 4], ellipse[part, 5] = fit.angle_rad, fit.residual_px
-                in_image[part] = camera.in_image(pixels[:, :-1]).all(axis=1)
-                for j, order in enumerate(purkinje):
-                    exits, residual, status = glint_exits(local, order, view.into_eye(lights), view.camera_mm)
+            for block, turned in _chunks(group, rows[cams[rows] == number], max(1, CHUNK_POINTS // max(m, 4))):
+                view = _View.of(turned, _pose_rows(poses, block), position[block], camera)
+                for j, order in enumerate(purkinje if m else ()):
+                    exits, residual, status = glint_exits(turned, order, view.into_eye(lights), view.camera_mm)
                     pixels, status = view.project(exits, status)
-                    glints[part, :, j], glint_status[part, :, j] = pixels, status
-                    glint_residual[part, :, j], glint_in_image[part, :, j] = residual, camera.in_image(pixels)
+                    glints[block, :, j], glint_status[block, :, j] = pixels, status
+                    glint_residual[block, :, j], glint_in_image[block, :, j] = residual, camera.in_image(pixels)
+                for inner in _slices(len(block), max(1, CHUNK_POINTS // boundary_points)):
+                    part, eye, near = block[inner], take_eyes(turned, np.arange(len(block))[inner]), view.rows(inner)
+                    # The last point is the stop's centre.
+                    exits, residual, status = pupil_exits(eye, boundary_points, near.camera_mm)
+                    pixels, status = near.project(exits, status)
+                    points[part], anatomical[part] = pixels[:, :-1], pixels[:, -1]
+                    point_status[part], point_residual[part] = status[:, :-1], residual[:, :-1]
+                    fit = fit_ellipse_direct(pixels[:, :-1])
+                    ellipse[part, :2], ellipse[part, 2:4] = fit.centre_px, fit.semi_axes_px
+                    ellipse[part, 4], ellipse[part, 5] = fit.angle_rad, fit.residual_px
+                    in_image[part] = camera.in_image(pixels[:, :-1]).all(axis=1)
     results: list[npt.NDArray[Any]] = [points, point_status, point_residual, ellipse, anatomical, in_image]
     results += [glints, glint_status, glint_residual, glint_in_image]
     for array in results:
@@ -192,6 +195,18 @@ class _View:
         # The nodal point in the eye frame: R^T (0 - t).
         at = -np.einsum("nij,ni->jn", rotation, translation)
         return cls(rotation, translation, (at[0], at[1], at[2]), (turn, whole), camera)
+
+    def rows(self, part: slice) -> _View:
+        """The view of some of the eyes."""
+        x, y, z = self.camera_mm
+        turn, shift = self.motion
+        return _View(
+            self.rotation[part],
+            self.translation[part],
+            (x[part], y[part], z[part]),
+            (turn[part], shift[part]),
+            self.camera,
+        )
 
     def into_eye(self, points_mm: Floats) -> Xyz:
         """World points (m, 3) in each eye's frame: three arrays (n, m)."""
@@ -240,8 +255,15 @@ def _chunks(
     group: tuple[Eye, npt.NDArray[np.intp] | None], rows: npt.NDArray[np.intp], size: int
 ) -> list[tuple[npt.NDArray[np.intp], Eye]]:
     eye, place = group
-    parts = [rows[k : k + size] for k in range(0, len(rows), size)]
+    parts = [rows[part] for part in _slices(len(rows), size)]
     return [(part, eye if place is None else take_eyes(eye, place[part])) for part in parts]
+
+
+def _slices(count: int, size: int) -> list[slice]:
+    """Equal pieces of at most `size`: a short rest would cost the interpreter as much as a full piece."""
+    pieces = max(1, -(-count // size))
+    edges = [count * k // pieces for k in range(pieces + 1)]
+    return [slice(low, high) for low, high in pairwise(edges)]
 
 
 def _pose_rows(poses: Poses, rows: npt.NDArray[np.intp]) -> Poses:

@@ -72,7 +72,7 @@ def pupil_features(seen: Features) -> PupilFeatures:
     """The apparent pupils of a batch; missing where a boundary point has no ray, or no ellipse fits."""
     status = seen.pupil_status
     ok = (status == 0) & np.isfinite(seen.ellipse_residual_px)
-    reasons = np.full(len(seen), "", dtype=object)
+    reasons = np.full(len(seen), None, dtype=object)
     for k in np.flatnonzero(~ok):
         lost = int(np.count_nonzero(seen.point_status[k]))
         reasons[k] = (
@@ -98,7 +98,7 @@ def glint_features(seen: Features) -> GlintFeatures:
     status, xy = seen.glint_status[:, :, 0], seen.glints_px[:, :, 0]
     n, m = status.shape
     ok = status == 0
-    reasons = np.full((n, m), "", dtype=object)
+    reasons = np.full((n, m), None, dtype=object)
     for i, j in np.argwhere(~ok):
         reasons[i, j] = reason_of(int(status[i, j]))
     return GlintFeatures(

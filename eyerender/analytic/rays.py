@@ -13,6 +13,8 @@ from ..optics.trace import RayStatus
 
 Statuses = npt.NDArray[np.int8]
 
+_AHEAD_MM = 500.0
+
 
 def pupil_exits(eye: Eye, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
     """Where the rays from `count` points of the stop's margin, and last from its centre, leave the cornea.
@@ -24,8 +26,15 @@ def pupil_exits(eye: Eye, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Stat
     target, viewpoint = components(points), (camera_mm[0][:, None], camera_mm[1][:, None], camera_mm[2][:, None])
     if points.ndim == 2:
         target = (target[0][None], target[1][None], target[2][None])
+    hidden = _behind_stop(eye, camera_mm)
+    if hidden.any():
+        # Nothing is to be found there: those rows look from straight ahead instead, and are struck out afterwards.
+        ahead = (_AHEAD_MM, 0.0, 0.0)
+        x, y, z = (np.where(hidden[:, None], ahead[i], viewpoint[i]) for i in range(3))
+        viewpoint = (x, y, z)
     found = refracted_rays(eye.front, eye.front_indices, target, viewpoint, rim_mm=eye.limbus_radius_mm)
-    found.status[_behind_stop(eye, camera_mm)] = RayStatus.BEHIND_IRIS
+    found.status[hidden] = RayStatus.BEHIND_IRIS
+    found.residual_mm[hidden] = np.nan
     return found.exit, found.residual_mm, found.status
 
 

@@ -29,13 +29,14 @@ def features(scene: str, /, *, eye: str | None = None, points: int = 30, json: J
     json
         Write the features as JSON to a file, or to stdout with '-'.
     """
-    from ..observers import AnalyticObserver
+    # Not through `observers`, which would load OpenCV for nothing.
+    from ..analytic.observer import observe
     from ..scene import load_scene
 
     if points < 6:
         raise InputError("must be >= 6", source="--points")
     loaded = load_scene(scene, eye=eye)
-    observed = AnalyticObserver(boundary_points=points).observe(loaded)
+    observed = observe(loaded, boundary_points=points)
     data = {"schema": "eyerender/features/1", "rig": loaded.rig_mapping(), "records": list(observed.records())}
     emit(data, _feature_table(observed), json)
     return 0

@@ -188,11 +188,22 @@ def _same(centre_1: Array, axes_1: Array, centre_2: Array, axes_2: Array) -> boo
     return near and 0.6 < ratio < 1.65
 
 
-def core_darkness(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: float) -> tuple[float, float]:
-    """How much darker the middle of an ellipse is than its outer part: (difference, its standard error), DN.
+@dataclass(frozen=True, slots=True)
+class Interior:
+    """What lies inside an ellipse. darker_dn: how much darker the middle is than the outer part; error_dn: the standard
+    error of that (infinite where the ellipse is too small to tell). spread_dn: scatter of the grey levels beyond the
+    image's noise."""
 
-    A pupil's interior is even; an iris taken for one has the pupil in its middle. The outer part ends where the rim's
-    blur begins. Medians, because of glints.
+    darker_dn: float
+    error_dn: float
+    spread_dn: float
+
+
+def inspect_interior(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: float) -> Interior:
+    """Levels inside an ellipse, up to where the rim's blur begins.
+
+    A pupil's interior is even; an iris taken for one has the pupil in its middle, and other things have structure.
+    Medians and quartiles, because of glints.
     """
     a, b = ellipse.semi_axes_px
     cx, cy = ellipse.centre_px
@@ -204,10 +215,15 @@ def core_darkness(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: flo
     crop = linear[y0:y1, x0:x1]
     end = min(0.85, 1.0 - 2.5 * blur_px / float(b))
     core, rim = crop[radius2 < 0.35**2], crop[(radius2 > (end - 0.25) ** 2) & (radius2 < end**2)]
+    inside = crop[radius2 < max(end, 0.5) ** 2]
+    spread = 0.0
+    if inside.size >= 8:
+        low, high = np.percentile(inside, (25.0, 75.0))
+        spread = math.sqrt(max((0.7413 * float(high - low)) ** 2 - noise_dn**2, 0.0))
     if end < 0.6 or core.size < 5 or rim.size < 5:
-        return 0.0, math.inf
+        return Interior(0.0, math.inf, spread)
     error = 1.2533 * noise_dn * math.sqrt(1.0 / core.size + 1.0 / rim.size)
-    return float(np.median(rim) - np.median(core)), error
+    return Interior(float(np.median(rim) - np.median(core)), error, spread)
 
 
 def find_inside(prepared: Prepared, ellipse: Ellipse, settings: ExtractionSettings) -> list[Candidate]:

@@ -32,7 +32,9 @@ class EdgePoints:
     filter_px: float
 
 
-def find_edges(linear: Image, candidate: Candidate, noise_dn: float, bright_dn: float, *, band: float) -> EdgePoints:
+def find_edges(
+    linear: Image, candidate: Candidate, noise_dn: float, bright_dn: float, filter_px: float, *, band: float
+) -> EdgePoints:
     """Edge points within `band` times the semi-axes of the candidate's outline (and at least 4 px).
 
     A gradient ridge is kept when it points outward (within 45 deg of the candidate's normal), stands out of the noise,
@@ -43,7 +45,7 @@ def find_edges(linear: Image, candidate: Candidate, noise_dn: float, bright_dn: 
     ellipse = candidate.ellipse
     b = float(ellipse.semi_axes_px[1])
     x0, y0, crop = _crop(linear, ellipse, 1.0 + band, 8.0)
-    sigma = filter_sigma(candidate.step_dn, noise_dn, b)
+    sigma = filter_px
     gx, gy = _gradient(crop, sigma)
     magnitude = as_image(cv2.magnitude(gx, gy))
     u, v, radius = _outward(crop.shape, ellipse, x0, y0)

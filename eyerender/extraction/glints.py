@@ -50,7 +50,7 @@ def detect_spots(
     # A top-hat of noise alone is near 3 sigma of the smoothed noise everywhere.
     noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * SMOOTH_PX)
     threshold = max(9.0 * noise, 0.45 * step_dn)
-    peak = (hat > threshold) & (smooth >= cv2.dilate(smooth, np.ones((5, 5), np.uint8)))
+    peak = (hat > threshold) & (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8)))
     row, column = np.nonzero(peak)
     if row.size == 0:
         return _no_spots()
@@ -58,11 +58,22 @@ def detect_spots(
     order = np.argsort(-height, kind="stable")[: 3 * max(settings.max_glints, 1)]
     xy = np.stack([column[order], row[order]], axis=-1).astype(np.float64)
     keep: list[int] = []
-    for i in range(order.size):  # flat tops of clipped spots give several maxima
-        if all(np.hypot(*(xy[i] - xy[j])) > 2.5 for j in keep):
+    for i in range(order.size):  # flat tops of clipped spots give several maxima, and so does noise on wide ones
+        if all(_parted(smooth, xy[i], xy[j], 4.0 * noise, size) for j in keep):
             keep.append(i)
     xy, height = xy[keep], height[order[keep]]
     return Spots(xy + np.array([x0, y0]), _widths(hat, xy, height, size), height)
+
+
+def _parted(smooth: Image, first: Array, second: Array, dip: float, size: int) -> bool:
+    """Whether the level between two maxima falls `dip` below the lower one; far apart they are two anyway."""
+    distance = float(np.hypot(*(first - second)))
+    if distance > size:
+        return True
+    t = np.linspace(0.0, 1.0, max(3, round(2.0 * distance)))[:, None]
+    x, y = np.rint(first + t * (second - first)).astype(np.intp).T
+    between = smooth[y, x]
+    return float(between.min()) < float(min(between[0], between[-1])) - dip
 
 
 def _no_spots() -> Spots:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..geometry.ellipse import signed_distance
 from .arcs import RimFit, curvature_at, fit_rim
-from .coarse import Candidate, core_darkness, find_candidates, find_inside
+from .coarse import Candidate, find_candidates, find_inside, inspect_interior
 from .confidence import confidence
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glints import Spots, detect_spots, judge_spots
@@ -19,7 +19,7 @@ from .refine import SECTORS, PixelFit, edge_covariance, refine, rim_deviation, s
 from .result import Extraction, GlintResult, Goodness, PupilResult, frozen
 from .rimmodel import Place, RimModel
 from .settings import ExtractionSettings
-from .spotfit import fit_spots
+from .spotfit import fit_spots, split_blends
 
 Array = NDArray[np.float64]
 
@@ -57,8 +57,11 @@ def extract(
         refined = refine(work.linear, model, _seen(found), masked, work.noise_dn)
         if isinstance(refined, PixelFit) and _agrees(refined, found):
             pixel_fit, model = refined, refined.model
+    pupil = _pupil(found, work, model, pixel_fit, settings)
+    if pupil.status == "missing":
+        return Extraction(pupil, (), (), noise, size)
     accepted, rejected = _glints(prepared, work, spots, model, settings)
-    return Extraction(_pupil(found, work, model, pixel_fit), accepted, rejected, noise, size)
+    return Extraction(pupil, accepted, rejected, noise, size)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,8 +109,8 @@ def _holds(outer: _Found, inner: _Found) -> bool:
 def _without_core(work: Prepared, found: _Found, settings: ExtractionSettings) -> _Found | PupilResult:
     """The same rim if its inside is even; what lies inside it if there is a darker core, as an iris has."""
     for _ in range(2):
-        darker, error = core_darkness(work.linear, found.rim.ellipse, _edge_model(found).sigma_px, work.noise_dn)
-        if darker < max(4.0 * error, 0.15 * found.candidate.step_dn):
+        inside = inspect_interior(work.linear, found.rim.ellipse, _edge_model(found).sigma_px, work.noise_dn)
+        if inside.darker_dn < max(4.0 * inside.error_dn, 0.15 * found.candidate.step_dn):
             return found
         inner, _ = _first_good(work, find_inside(work, found.rim.ellipse, settings), settings)
         if inner is None or inner.rim.ellipse.area_px2 > 0.8 * found.rim.ellipse.area_px2:
@@ -119,8 +122,13 @@ def _without_core(work: Prepared, found: _Found, settings: ExtractionSettings) -
 
 def _rim(work: Prepared, candidate: Candidate, settings: ExtractionSettings) -> _Found | str:
     bright = candidate.inside_dn + 4.0 * candidate.step_dn
-    edges = find_edges(work.linear, candidate, work.noise_dn, bright, band=0.4)
-    sigma = filter_sigma(candidate.step_dn, work.noise_dn, float(candidate.ellipse.semi_axes_px[1]))
+    b = float(candidate.ellipse.semi_axes_px[1])
+    sigma = filter_sigma(candidate.step_dn, work.noise_dn, b)
+    edges = find_edges(work.linear, candidate, work.noise_dn, bright, sigma, band=0.4)
+    blur = math.sqrt(max(edges.sigma_px**2 - sigma**2, 0.0))
+    if blur > 1.7 * sigma:  # a filter much sharper than the image only collects noise
+        sigma = min(blur, max(1.0, 0.2 * b))
+        edges = find_edges(work.linear, candidate, work.noise_dn, bright, sigma, band=0.4)
     expected = edge_noise_px(candidate.step_dn, work.noise_dn, sigma, edges.sigma_px)
     rim = fit_rim(edges, candidate, settings, expected)
     if isinstance(rim, str):
@@ -137,10 +145,11 @@ def _edge_model(found: _Found) -> RimModel:
 
 
 def _seen(found: _Found) -> NDArray[np.bool_]:
-    """Sectors of the outline with an edge point in them or beside them."""
+    """Sectors of the outline with an edge point in them, and gaps of up to two sectors between such."""
     place = Place.of(found.rim.ellipse, *found.edges.points_px[found.rim.inliers].T)
     hit = np.bincount(sector_of(place), minlength=SECTORS) > 0
-    return np.asarray(hit | np.roll(hit, 1) | np.roll(hit, -1))
+    grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
+    return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
 
 
 def _agrees(fit: PixelFit, found: _Found) -> bool:
@@ -165,10 +174,12 @@ def _spot_mask(prepared: Prepared, xy: Array, width: Array, height: Array) -> ND
     return mask
 
 
-def _pupil(found: _Found, work: Prepared, model: RimModel, fit: PixelFit | None) -> PupilResult:
+def _pupil(
+    found: _Found, work: Prepared, model: RimModel, fit: PixelFit | None, settings: ExtractionSettings
+) -> PupilResult:
     rim, ellipse = found.rim, model.ellipse
     covariance = edge_covariance(ellipse, rim.points_px, rim.residual_px) if fit is None else fit.covariance
-    darker, error = core_darkness(work.linear, ellipse, model.sigma_px, work.noise_dn)
+    inside = inspect_interior(work.linear, ellipse, model.sigma_px, work.noise_dn)
     goodness = Goodness(
         support=rim.support,
         gap=rim.gap,
@@ -178,12 +189,16 @@ def _pupil(found: _Found, work: Prepared, model: RimModel, fit: PixelFit | None)
         residual_px=rim.residual_px,
         reduced_chi2=0.0 if fit is None else fit.reduced_chi2,
         blur_px=model.sigma_px,
-        unevenness=darker / model.step_dn if math.isfinite(error) else 0.0,
+        unevenness=inside.darker_dn / model.step_dn,
+        spread=inside.spread_dn / model.step_dn,
         rim_sd_px=rim_deviation(ellipse, covariance),
         refined=fit is not None,
     )
+    sure = confidence(ellipse, goodness, settings.method)
+    if sure < settings.min_confidence:
+        return PupilResult.missing("fit", f"the ellipse found is the pupil with a probability of only {sure:.2f}")
     contour = frozen(found.edges.points_px[rim.inliers])
-    return PupilResult("ok", None, None, ellipse, frozen(covariance), confidence(ellipse, goodness), goodness, contour)
+    return PupilResult("ok", None, None, ellipse, frozen(covariance), sure, goodness, contour)
 
 
 def _glints(
@@ -195,8 +210,9 @@ def _glints(
         level = model.level(x, y)
         return -level if work.inverted else level  # up to a constant, which the fit has anyway
 
-    fit = fit_spots(
-        prepared.linear, known, spots.xy_px, spots.width_px, spots.height_dn,
-        prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * step),
-    )  # fmt: skip
+    starts = (spots.xy_px, spots.width_px, spots.height_dn)
+    limits = (prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * step))
+    fit = fit_spots(prepared.linear, known, *starts, *limits)
+    starts, fit = split_blends(prepared.linear, known, starts, fit, *limits)
+    spots = Spots(*starts)
     return judge_spots(spots, fit, prepared, step, settings)

@@ -18,6 +18,7 @@ Mask = NDArray[np.bool_]
 SECTORS = 48
 ORDERS = (0, 2, 4, 6, 8)  # Fourier orders of the outer level that are tried
 SHAPE = 5  # the first parameters: cx, cy, and the change of the shape matrix in the ellipse's axes (aa, bb, ab)
+SELECTION = 1.6  # edge points are selected by their residual, which understates the scatter (development images)
 OUTLIER = 5.0  # pixels beyond this many standard deviations do not count
 
 
@@ -53,7 +54,8 @@ def refine(linear: Image, start: RimModel, sectors: Mask, masked: Mask, noise_dn
     pixels = _band(linear, model, masked)
     use = np.ones(pixels.x.size, dtype=bool)
     result: tuple[RimModel, Array, Array, Place] | None = None
-    seen = sectors.copy()
+    # The order of the outer level must not be learnt from a lid.
+    seen = _clear_of_lids(sectors, start)
     order_settled = False
     for turn in range(4):
         place = Place.of(model.ellipse, pixels.x, pixels.y)
@@ -288,7 +290,7 @@ def edge_covariance(ellipse: Ellipse, points: Array, residual_px: float) -> Arra
     coarse = sector_of(place) // 3
     groups = max(np.unique(coarse).size, SHAPE + 1)
     excess = sector_excess(plain, inverse @ (slopes * place.distance[:, None]).T, coarse) * groups / (groups - SHAPE)
-    return to_axes(plain * max(excess, 1.0), ellipse)
+    return to_axes(plain * max(excess, 1.0) * SELECTION, ellipse)
 
 
 def to_axes(covariance: Array, ellipse: Ellipse) -> Array:

@@ -26,13 +26,14 @@ def frozen(values: object) -> Array:
 class Goodness:
     """How well the ellipse explains the image.
 
-    support: share of the outline with an edge on it, 0..1. gap: share of the longest stretch without. explained: share
-    of the outline whose pixels the refined model explains (the support where it was not fitted). contrast: step from
-    pupil to iris as a share of full scale. contrast_to_noise: that step over a pixel's noise. residual_px: root mean
-    square distance of the edge points. reduced_chi2: of the pixel model, 1 when noise alone explains the residual; 0
-    where it was not fitted. blur_px: sigma of the edge's blur. unevenness: how much darker the pupil's middle is than
-    its outer part, as a share of the step. rim_sd_px: standard deviation of the rim's position, averaged along it,
-    from the covariance. refined: whether the ellipse is the pixel model's.
+    support: share of the outline with an edge on it, 0..1. gap: share of the longest stretch without.
+    explained: share of the outline whose pixels the refined model explains (the support where it was not fitted).
+    contrast: step from pupil to iris as a share of full scale. contrast_to_noise: that step over a pixel's noise.
+    residual_px: root mean square distance of the edge points.
+    reduced_chi2: of the pixel model, 1 when noise alone explains the residual; 0 where it was not fitted.
+    blur_px: sigma of the edge's blur. unevenness: how much darker the pupil's middle is than its outer part, as a share
+    of the step. spread: scatter of its grey levels beyond the noise, likewise. rim_sd_px: standard deviation of the
+    rim's position, averaged along it, from the covariance. refined: whether the ellipse is the pixel model's.
     """
 
     support: float
@@ -44,6 +45,7 @@ class Goodness:
     reduced_chi2: float
     blur_px: float
     unevenness: float
+    spread: float
     rim_sd_px: float
     refined: bool
 

@@ -25,6 +25,9 @@ class ExtractionSettings(Spec):
     min_support: Annotated[float, Field(gt=0, le=1)] = Field(
         default=0.2, description="smallest share of the pupil's outline that must be seen"
     )
+    min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.25, description="pupils less likely than this to be right (IoU > 0.9) are reported as missing"
+    )
     max_glints: Annotated[int, Field(ge=0, le=64)] = Field(default=16, description="most glints reported")
     glint_reach: Positive = Field(
         default=4.0, description="how far from the pupil's centre glints are looked for, in semi-axes a"

@@ -46,6 +46,9 @@ def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm
     stop = stop_of(spec, diameter)
     if 2.0 * float(np.max(stop.semi_axes_mm)) >= widest:
         raise InputError(f"the pupil is wider than the iris or the cornea ({widest:g} mm)", path=path)
+    # Behind a surface its implicit function is negative.
+    if not (surface_of(spec.cornea[-1]).implicit(stop.boundary(32)) < 0.0).all():
+        raise InputError("the pupil reaches beyond the cornea", path=path)
     x, y, z = (float(v) for v in stop.centre_mm)
     eye = replace(_compiled(_Key(spec), float(wavelength_nm), (x, y, z)), stop=stop)
     return eye if side == "right" else mirrored_eye(eye)

@@ -53,41 +53,40 @@ def from_all_glints(
         start_mm: (..., m) distances to start from; default: the best of a coarse search.
     """
     m = glints.shape[-2]
-    radius = np.broadcast_to(
-        np.asarray(radius_mm, dtype=float), np.broadcast_shapes(np.shape(radius_mm), glints.shape[:-2])
-    )
+    radius = _radii(radius_mm, glints.shape[:-2])
     origin = origin_mm[..., None, :]
     k = _coarse(origin, glints, light_mm, radius) if start_mm is None else np.array(start_mm, dtype=float)
     k = np.broadcast_to(k, (*radius.shape, m)).copy()
     c, slope = _mirror_centres(origin, glints, light_mm, radius, k)
     deviation = c - c.mean(axis=-2, keepdims=True)
     cost = (deviation * deviation).sum(axis=(-1, -2))
-    shrink = np.eye(m) - 1.0 / m
+    one = np.eye(m)
+    shrink = one - 1.0 / m
     damping = np.full(radius.shape, 1e-12)
+    settled = np.full(radius.shape, np.inf)
     for _ in range(_ITERATIONS):
-        normal = np.matmul(slope, np.swapaxes(slope, -1, -2)) * shrink
-        gradient = (slope * deviation).sum(axis=-1)
         diagonal = (slope * slope).sum(axis=-1) * (1 - 1 / m)
-        system = normal + (damping[..., None] * diagonal)[..., None] * np.eye(m)
-        step = _solved(system, gradient)
+        system = (
+            np.matmul(slope, np.swapaxes(slope, -1, -2)) * shrink + (damping[..., None] * diagonal)[..., None] * one
+        )
+        step = _solved(system, (slope * deviation).sum(axis=-1))
         trial = k - step
         c_new, slope_new = _mirror_centres(origin, glints, light_mm, radius, trial)
         deviation_new = c_new - c_new.mean(axis=-2, keepdims=True)
         cost_new = (deviation_new * deviation_new).sum(axis=(-1, -2))
-        better: Bools = np.asarray((cost_new <= cost) & (trial > 0).all(axis=-1))
+        settled = np.abs(step).max(axis=-1) / np.abs(k).max(axis=-1)
+        better = np.array((cost_new <= cost) & (trial > 0).all(axis=-1), dtype=bool)
         pick = better[..., None, None]
         k = np.where(better[..., None], trial, k)
         c, slope = np.where(pick, c_new, c), np.where(pick, slope_new, slope)
         deviation, cost = np.where(pick, deviation_new, deviation), np.where(better, cost_new, cost)
         damping = np.where(better, np.maximum(damping * 0.1, 1e-14), np.maximum(damping * 30, 1e-10))
-        small = np.abs(step).max(axis=-1) <= 1e-13 * np.abs(k).max(axis=-1)
-        # A row that cannot be bettered by rounding-sized steps is as done as one whose step is small.
-        if bool(np.all(small | (damping > 1.0) | ~np.isfinite(cost))):
+        # Newton's steps square the error: after one of 1e-9 only rounding is left. A row that no step betters is done.
+        if bool(np.all((settled <= 1e-9) | (damping > 1.0) | ~np.isfinite(settled))):
             break
-    centre = c.mean(axis=-2)
-    residual = np.sqrt(cost / m)
-    ok = np.isfinite(centre).all(axis=-1)
-    return CorneaCentres(frozen(centre), frozen(k), frozen(residual), frozen(ok, bool))
+    ok = np.array(np.isfinite(c).all(axis=(-1, -2)) & (settled < 1e-5), dtype=bool)
+    centre = np.where(ok[..., None], c.mean(axis=-2), np.nan)
+    return CorneaCentres(frozen(centre), frozen(k), frozen(np.sqrt(cost / m)), frozen(ok, bool))
 
 
 def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple[Floats, Bools]:
@@ -106,7 +105,7 @@ def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple
         finite = np.isfinite(normals).all(axis=(-1, -2))
         _, values, vt = np.linalg.svd(np.where(finite[..., None, None], normals, 0.0))
         b, spread = vt[..., -1, :], np.where(finite, values[..., 1], 0.0)
-    ok = np.asarray(spread > COPLANAR)
+    ok = np.array(spread > COPLANAR, dtype=bool)
     towards = np.sign((b * glints[..., 0, :]).sum(axis=-1))
     return np.where(ok[..., None], b * towards[..., None], np.nan), ok
 
@@ -220,13 +219,10 @@ def _solved(system: Floats, right: Floats) -> Floats:
     """Solutions of small symmetric systems (..., m, m); by Cramer's rule for two, which is what most rigs have."""
     if system.shape[-1] == 2:
         a, b, d = system[..., 0, 0], system[..., 0, 1], system[..., 1, 1]
+        first, second = d * right[..., 0] - b * right[..., 1], a * right[..., 1] - b * right[..., 0]
         with np.errstate(invalid="ignore", divide="ignore"):
-            det = a * d - b * b
-            return (
-                np.stack([d * right[..., 0] - b * right[..., 1], a * right[..., 1] - b * right[..., 0]], -1)
-                / det[..., None]
-            )
-    finite = np.isfinite(system).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
+            return np.asarray(np.stack([first, second], axis=-1) / (a * d - b * b)[..., None])
+    finite = np.array(np.isfinite(system).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1), dtype=bool)
     safe = np.where(finite[..., None, None], system, np.eye(system.shape[-1]))
     out = np.linalg.solve(safe, np.where(finite[..., None], right, 0.0)[..., None])[..., 0]
     return np.where(finite[..., None], out, np.nan)

@@ -16,20 +16,19 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
-from ..arrays import Bools, Floats, Objects
+from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError
 from ..observation import EYES, Observations
 from ..rig.rig import Rig
 from ..rig.screen import Screen
 from .cornea import CorneaCentres, from_all_glints, from_plane, optic_axis
 from .estimate import GazePoints, GazeRays, gaze_points
-from .parameters import HUMAN_BOUNDS, INDEX, MEAN_EYE, NAMES, Calibration, EyeParameters, ParameterBounds
+from .parameters import HUMAN_BOUNDS, MEAN_EYE, NAMES, Calibration, EyeParameters, ParameterBounds
 from .rays import FeatureRays, feature_rays, nasal_sign, screen_of
+from .search import Objective, calibrate
 
 _OFF_SCREEN_MM = 1e4  # the miss of a visual axis that never meets the screen's plane, in a search
-_SCALE = np.array([1.0, 1.0, 0.05, 1.0, 1.0])  # what a parameter changes by, for the search's trust region
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,17 +72,15 @@ class GuestrinEizenman:
         Raises:
             InputError: fewer usable targets than determine the parameters.
         """
-        found = {}
-        for eye, problem in self._problems(observations, targets_mm, rig).items():
-            found[eye] = problem.solve(self.start)
-        return replace(self, calibrations=found)
+        models = self._models(observations, targets_mm, rig)
+        return replace(self, calibrations={eye: model.calibrate(self.start) for eye, model in models.items()})
 
     def restarts(
         self, observations: Observations, targets_mm: ArrayLike, rig: Rig, starts: Sequence[EyeParameters]
     ) -> dict[int, list[Calibration]]:
         """Calibrations of each eye from several starts, to see whether the search finds one minimum."""
-        problems = self._problems(observations, targets_mm, rig)
-        return {eye: [p.solve(start) for start in starts] for eye, p in problems.items()}
+        models = self._models(observations, targets_mm, rig)
+        return {eye: [model.calibrate(start) for start in starts] for eye, model in models.items()}
 
     def predict(self, observations: Observations, rig: Rig) -> GazePoints:
         """Gaze points on the screen's plane."""
@@ -144,43 +141,45 @@ class GuestrinEizenman:
         x, z = cb * w[..., 0] - sb * w[..., 2], sb * w[..., 0] + cb * w[..., 2]
         return np.stack([ca * x - sa * w[..., 1], sa * x + ca * w[..., 1], z], axis=-1)
 
-    def _problems(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> dict[int, _Problem]:
+    @property
+    def free(self) -> Bools:
+        """Which of the five parameters are calibrated."""
+        return np.array([self.free_index or name != "index" for name in NAMES])
+
+    def _models(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> dict[int, _Model]:
         screen = screen_of(rig)
-        targets = np.asarray(targets_mm, dtype=float) - screen.centre_mm
-        wanted = np.stack([targets @ screen.right, targets @ screen.up], axis=-1)
+        targets = np.asarray(targets_mm, dtype=float)
         rays = feature_rays(observations, rig, self.lights, least=2)
-        usable = (rays.reason == None) & np.isfinite(wanted).all(axis=1)  # noqa: E711
-        free = np.array([self.free_index or k != INDEX for k in range(len(NAMES))])
+        usable = (rays.reason == None) & np.isfinite(targets).all(axis=1)  # noqa: E711
+        count = int(self.free.sum())
+        need = -(-count // 2)  # each target gives two numbers
         out = {}
         for eye in np.unique(observations.index.eye):
             rows = np.flatnonzero(usable & (observations.index.eye == eye))
-            # Each target gives two numbers.
-            need = int(np.ceil(free.sum() / 2))
-            if len(np.unique(np.round(wanted[rows], 9), axis=0)) < need:
+            if len(np.unique(np.round(targets[rows], 6), axis=0)) < need:
                 name = EYES[int(eye)] if eye >= 0 else "unknown"
                 raise InputError(
-                    f"{name} eye: {len(rows)} usable calibration targets, but {int(free.sum())} parameters need {need}"
+                    f"{name} eye: {len(rows)} usable calibration targets; {count} parameters need {need} different ones"
                 )
-            sign = float(nasal_sign(np.array(eye)))
-            out[int(eye)] = _Problem(self, rays, rows, wanted[rows], screen, free, sign)
+            out[int(eye)] = _Model(self, rays, rows, targets[rows], screen, float(nasal_sign(np.array(eye))))
         return out
 
 
-class _Problem:
-    """One eye's calibration: the model at many sets of parameters at once, and the search."""
+class _Model:
+    """One eye's calibration data: the estimator at many sets of parameters at once."""
 
     def __init__(
         self,
         estimator: GuestrinEizenman,
         rays: FeatureRays,
-        rows: Any,
-        wanted: Floats,
+        rows: Ints,
+        targets_mm: Floats,
         screen: Screen,
-        free: Bools,
         sign: float,
     ) -> None:
-        self.estimator, self.rays, self.rows, self.wanted = estimator, rays, rows, wanted
-        self.screen, self.free, self.sign = screen, free, sign
+        self.estimator, self.rays, self.rows, self.screen, self.sign = estimator, rays, rows, screen, sign
+        to_target = targets_mm - screen.centre_mm
+        self.wanted = np.stack([to_target @ screen.right, to_target @ screen.up, to_target @ screen.normal], axis=-1)
         # The mirror points hardly move with R, so those of one solution are where all others start.
         self._distance: Floats | None = None
         if estimator.centre == "all_glints":
@@ -188,89 +187,28 @@ class _Problem:
             self._distance = estimator._centres(rays, rows, R).distance_mm
 
     def misses(self, parameters: Floats) -> Floats:
-        """Misses on the screen (P, n, 2) mm at P sets of parameters (P, 5)."""
-        p = parameters[:, :, None]
+        """Misses (P, n, 3) mm, along the screen's right, up and normal, at P sets of parameters (P, 5)."""
         shape = (len(parameters), len(self.rows))
         # The centre depends on R alone: sets that share it share the solution.
         radii, which = np.unique(parameters[:, 0], return_inverse=True)
-        found = self.estimator._centres(
-            self.rays, self.rows, np.broadcast_to(radii[:, None], (len(radii), shape[1])), self._distance
-        )
-        centre = found.centre_mm[which]
-        R, K, index = (np.broadcast_to(p[:, k], shape) for k in range(3))
+        radius = np.broadcast_to(radii[:, None], (len(radii), shape[1]))
+        centre = self.estimator._centres(self.rays, self.rows, radius, self._distance).centre_mm[which]
+        R, K, index = (np.broadcast_to(parameters[:, k, None], shape) for k in range(3))
         w, _, _ = optic_axis(self.rays.origin_mm[self.rows], self.rays.pupil[self.rows], centre, R, K, index)
-        v = self.estimator._turned(w, np.radians(p[:, 3]) * self.sign, np.radians(p[:, 4]))
+        v = self.estimator._turned(
+            w, np.radians(parameters[:, 3, None]) * self.sign, np.radians(parameters[:, 4, None])
+        )
         point, hits = self.screen.intersect(centre, v)
-        return np.where(hits[..., None], point - self.wanted, _OFF_SCREEN_MM)
+        flat = np.where(hits[..., None], point - self.wanted[:, :2], _OFF_SCREEN_MM)
+        normal = np.broadcast_to(-self.wanted[:, 2:], (*shape, 1))
+        return np.concatenate([flat, normal], axis=-1)
 
-    def residuals(self, parameters: Floats) -> Floats:
-        """What the search squares and sums: (P, r)."""
-        miss = self.misses(parameters)
-        if self.estimator.objective == "least_squares":
-            return np.asarray(miss.reshape(len(miss), -1))
-        d = np.sqrt((miss * miss).sum(axis=-1))
-        if self.estimator.viewing_distance_mm is not None:
-            d = np.degrees(np.arctan(d / self.estimator.viewing_distance_mm))
-        # The squares of the roots sum to the sum of the errors itself.
-        return np.asarray(np.sqrt(d))
-
-    def solve(self, start: EyeParameters) -> Calibration:
-        free, bounds = self.free, self.estimator.bounds
-        fixed = start.vector()
-        fixed[~free] = self.estimator.start.vector()[~free]
-        low, high = bounds.lower.vector(), bounds.upper.vector()
-        if not ((fixed[free] >= low[free]) & (fixed[free] <= high[free])).all():
-            raise InputError("the calibration's start lies outside its bounds")
-        count = 0
-
-        def full(x: Floats) -> Floats:
-            out = np.repeat(fixed[None], len(x), axis=0)
-            out[:, free] = x
-            return out
-
-        def value(x: Floats) -> Floats:
-            nonlocal count
-            count += 1
-            return np.asarray(self.residuals(full(x[None]))[0])
-
-        def jacobian(x: Floats) -> Floats:
-            nonlocal count
-            count += 1
-            # Central differences; a step must not leave the bounds, where the model may not exist.
-            step = 1e-5 * _SCALE[free]
-            up, down = np.minimum(x + step, high[free]), np.maximum(x - step, low[free])
-            k = len(x)
-            points = np.repeat(x[None], 2 * k, axis=0)
-            points[np.arange(k), np.arange(k)] = up
-            points[k + np.arange(k), np.arange(k)] = down
-            r = self.residuals(full(points))
-            return np.asarray(((r[:k] - r[k:]) / (up - down)[:, None]).T)
-
-        inside = np.clip(fixed[free], low[free] + 1e-9, high[free] - 1e-9)
-        done = least_squares(
-            value,
-            inside,
-            jac=jacobian,
-            bounds=(low[free], high[free]),
-            x_scale=_SCALE[free],
-            method="trf",
-            xtol=self.estimator.tolerance,
-            ftol=self.estimator.tolerance,
-            gtol=self.estimator.tolerance,
-            max_nfev=400,
-        )
-        values = full(done.x[None])[0]
-        near = (np.abs(values - low) < 1e-4 * (high - low)) | (np.abs(values - high) < 1e-4 * (high - low))
-        return Calibration(
-            EyeParameters.of(values),
-            EyeParameters.of(fixed),
-            float(2 * done.cost),
-            self.estimator.objective,
-            count,
-            bool(done.status > 0),
-            str(done.message),
-            tuple(name for k, name in enumerate(NAMES) if near[k] and free[k]),
-        )
+    def calibrate(self, start: EyeParameters) -> Calibration:
+        estimator = self.estimator
+        objective = Objective(estimator.objective, self.misses, estimator.viewing_distance_mm)
+        if not estimator.free_index:
+            start = replace(start, index=estimator.start.index)
+        return calibrate(objective, start, estimator.bounds, estimator.free, estimator.tolerance)
 
 
 def _why(found: CorneaCentres, meets: Bools, inside: Bools) -> Objects:

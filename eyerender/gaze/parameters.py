@@ -43,7 +43,6 @@ class EyeParameters:
 
 MEAN_EYE = EyeParameters()
 NAMES = tuple(f.name for f in fields(EyeParameters))
-INDEX = NAMES.index("index")
 
 
 _LOWER, _UPPER = EyeParameters(6.5, 3.0, 1.30, -10.0, -6.0), EyeParameters(9.5, 6.0, 1.45, 10.0, 6.0)
@@ -60,7 +59,7 @@ class ParameterBounds:
         low, high = self.lower.vector(), self.upper.vector()
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise InputError("each lower bound must be less than its upper bound")
-        if low[0] <= 0 or low[1] <= 0 or low[INDEX] < 1:
+        if low[0] <= 0 or low[1] <= 0 or low[2] < 1:
             raise InputError("radii must be > 0 and the index >= 1")
 
     def draw(self, count: int, seed: int) -> list[EyeParameters]:

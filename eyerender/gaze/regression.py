@@ -68,9 +68,8 @@ FUNCTIONS: dict[str, tuple[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Coefficients of one eye on the scaled vector (v - centre) / scale."""
+    """Coefficients of one eye on the scaled vector v / scale."""
 
-    centre: Floats
     scale: Floats
     a: Floats
     b: Floats
@@ -121,15 +120,13 @@ class PupilGlintRegression:
                 raise InputError(
                     f"{name} eye: {rows.sum()} usable calibration targets, but {self.function} has {need} terms"
                 )
-            centre = v[rows].mean(axis=0)
-            scale = np.maximum(np.abs(v[rows] - centre).max(axis=0), 1e-300)
-            u = (v[rows] - centre) / scale
-            if self.minimum_norm:
-                # The minimum norm depends on the variables; the study's is that of the unscaled polynomial.
-                centre, scale, u = np.zeros(2), np.ones(2), v[rows]
+            # Scaled, never centred: most functions of Table 2 lack terms that a shift of the origin would bring in. The
+            # minimum norm depends on the scale too; the study's is that of the unscaled polynomial.
+            scale = np.ones(2) if self.minimum_norm else np.maximum(np.abs(v[rows]).max(axis=0), 1e-300)
+            u = v[rows] / scale
             a = self._solve(_monomials(u, x_terms), wanted[rows, 0], name)
             b = self._solve(_monomials(u, y_terms), wanted[rows, 1], name)
-            fits[int(eye)] = _Fit(centre, scale, a, b)
+            fits[int(eye)] = _Fit(scale, a, b)
         return replace(self, _fits=fits)
 
     def predict(self, observations: Observations, rig: Rig) -> GazePoints:
@@ -147,7 +144,7 @@ class PupilGlintRegression:
             if fit is None:
                 reason[rows] = "this eye is not calibrated"
                 continue
-            u = (v[rows] - fit.centre) / fit.scale
+            u = v[rows] / fit.scale
             on_screen[rows] = np.stack([_monomials(u, x_terms) @ fit.a, _monomials(u, y_terms) @ fit.b], axis=-1)
         return gaze_points(screen.world(on_screen), reason)
 

@@ -46,14 +46,12 @@ class AxialGraph(NamedTuple):
 
     def height(self, y: Array, z: Array) -> Array:
         b = fit(self.b, self.ndim)
-        rest = y * y + z * z
-        rest += fit(self.c, self.ndim)
+        rest = y * y + z * z + fit(self.c, self.ndim)
         return np.asarray(-rest / (b + np.sqrt(b * b - fit(self.p, self.ndim) * rest)))
 
     def jet(self, y: Array, z: Array) -> Jet:
         p, b = fit(self.p, self.ndim), fit(self.b, self.ndim)
-        rest = y * y + z * z
-        rest += fit(self.c, self.ndim)
+        rest = y * y + z * z + fit(self.c, self.ndim)
         u = np.sqrt(b * b - p * rest)
         x = rest / (-b - u)
         inverse = -1.0 / u

@@ -150,8 +150,9 @@ class Quadric(Surface):
         with np.errstate(divide="ignore", invalid="ignore"):
             t = value / (root - b) if inward else value / (-root - b)
             point = (ox + t * dx, oy + t * dy, oz + t * dz)
-        gradient = self.gradient_at(point)
-        return Hit(t, point, gradient, (square >= 0.0) & np.isfinite(t) & self.on_sheet(gradient))
+            gradient = self.gradient_at(point)
+            ok = (square >= 0.0) & np.isfinite(t) & self.on_sheet(gradient)
+        return Hit(t, point, gradient, ok)
 
     def on_sheet(self, gradient: Xyz) -> Mask:
         """Whether a half gradient in the eye frame points to local +x."""

@@ -94,8 +94,18 @@ def connect(path: Sequence[Crossing], n_start: Number, source: Xyz, target: Xyz,
     for crossing, point in zip((path[0], path[-1]), (shot.first, shot.last), strict=True):
         if crossing.beyond_rim is not None:
             mark(status, ~inside_rim(crossing, point), crossing.beyond_rim)
+    tube = np.abs(shot.determinant)
+    if shape:
+        return Connection(direction, shot.first, shot.last, shot.turning, shot.end, shot.residual_mm, tube, status)
     return Connection(
-        direction, shot.first, shot.last, shot.turning, shot.end, shot.residual_mm, np.abs(shot.determinant), status
+        _single(direction),
+        _single(shot.first),
+        _single(shot.last),
+        _single(shot.turning),
+        _single(shot.end),
+        shot.residual_mm.reshape(()),
+        tube.reshape(()),
+        status.reshape(()),
     )
 
 
@@ -336,6 +346,10 @@ def _spread(point: Xyz, shape: tuple[int, ...]) -> Xyz:
     # One axis at least, so that rays can be picked out of the batch.
     full = shape or (1,)
     return np.broadcast_to(point[0], full), np.broadcast_to(point[1], full), np.broadcast_to(point[2], full)
+
+
+def _single(point: Xyz) -> Xyz:
+    return point[0].reshape(()), point[1].reshape(()), point[2].reshape(())
 
 
 def _basis(direction: Xyz) -> tuple[Xyz, Xyz]:

@@ -170,11 +170,34 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Numb
     graphs, origin, rotation = frame
     outer, other, start = (turn_back(rotation, shift(p, origin, -1.0)) for p in (viewpoint, source, guess))
     points = stationary_path(graphs, [1.0, 1.0], outer, other, [(start[1], start[2])]).points
-    return _confirmed(path, 1.0, viewpoint, source, shift(turn(rotation, points[0]), origin, 1.0), guess)
+    hopeless = _far_beyond(path[0], guess)
+    return _confirmed(path, 1.0, viewpoint, source, shift(turn(rotation, points[0]), origin, 1.0), guess, hopeless)
 
 
-def _confirmed(path: Sequence[Crossing], n_start: Number, viewpoint: Xyz, target: Xyz, first: Xyz, aim: Xyz) -> Rays:
-    """Trace from the viewpoint over the points `first` of the first surface; search again what misses the target."""
+def _far_beyond(crossing: Crossing, guess: Xyz) -> Mask:
+    """Where the first guess of a mirror point is so far outside the rim that the point cannot be on the surface."""
+    surface, rim, ndim = crossing.surface, crossing.rim_mm, guess[0].ndim
+    if isinstance(rim, float) and rim == np.inf:
+        return np.zeros(guess[0].shape, dtype=bool)
+    gradient = surface.gradient_at(guess)
+    facing = sum(fit(surface.rotation[..., i, 0], ndim) * gradient[i] for i in range(3))
+    limit = rim if isinstance(rim, float) else fit(np.asarray(rim), ndim)
+    return np.asarray((facing <= 0.0) | (surface.axis_distance(guess) > 1.25 * limit))
+
+
+def _confirmed(
+    path: Sequence[Crossing],
+    n_start: Number,
+    viewpoint: Xyz,
+    target: Xyz,
+    first: Xyz,
+    aim: Xyz,
+    hopeless: Mask | None = None,
+) -> Rays:
+    """Trace from the viewpoint over the points `first` of the first surface; search again what misses the target.
+
+    `hopeless` rays are not searched: they meet the surface beyond its rim, if at all.
+    """
     with np.errstate(all="ignore"):
         way = _unit((first[0] - viewpoint[0], first[1] - viewpoint[1], first[2] - viewpoint[2]))
         gradient = path[0].surface.gradient_at(first)
@@ -195,6 +218,9 @@ def _confirmed(path: Sequence[Crossing], n_start: Number, viewpoint: Xyz, target
         reach = SURE_MM + 1e-15 * along * along if path[0].reflects else SURE_MM
         found &= (residual <= reach) & (along > 0.0)
     status = np.zeros(residual.shape, dtype=np.int8)
+    if hopeless is not None:
+        status[hopeless & ~found] = path[0].beyond_rim or RayStatus.MISSED
+        found |= hopeless
     mark(status, ~inside_rim(path[0], first), path[0].beyond_rim or RayStatus.MISSED)
     rays = Rays(first, way, end, residual, status)
     return rays if found.all() else _searched(path, n_start, viewpoint, target, aim, rays, ~found)

@@ -1,9 +1,9 @@
 """How the eye and its surround look at 850 nm: diffuse albedos and the contrast of their textures.
 
-What is measured and what is chosen. Skin reflects about 0.4 to 0.65 of the light at 850 nm (Cooksey, Allen and Tsai
-2017, reference data set of human skin reflectance); the default stands at its dark end, because a surround without lids
-would otherwise outshine the eye. No measured diffuse albedo at 850 nm is at hand for iris, sclera and fundus: these three
-are chosen so that the grey levels stand to each other as in near-infrared photographs (apparent iris about half of the
+What is measured and what is chosen. Skin reflects roughly half of the light at 850 nm (Cooksey, Allen and Tsai 2017,
+J. Res. NIST 122, 26, a reference data set of human skin); the default is darker, because a surround without lids would
+otherwise outshine the eye. No measured diffuse albedo at 850 nm is at hand for iris, sclera and fundus: these are
+chosen so that the grey levels stand to each other as in near-infrared photographs (apparent iris about half of the
 sclera, pupil a few per cent). The cornea passes (1 - F)^2 / n^2, about 0.53, of an iris' albedo on to the camera.
 """
 
@@ -26,7 +26,8 @@ class LookSpec(Spec):
     iris_contrast: Contrast = Field(default=1.0, description="of fibres, collarette, crypts and furrows")
     iris_seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="which iris")
     pupil_albedo: Albedo = Field(
-        default=0.02, description="what lens and fundus send back off the light's axis, as a diffuse albedo in the pupil"
+        default=0.02,
+        description="what lens and fundus send back off the light's axis, as a diffuse albedo in the pupil",
     )
     sclera_albedo: Albedo = Field(default=0.42, description="chosen, see the module")
     sclera_contrast: Contrast = Field(default=1.0, description="of vessels and unevenness")
@@ -34,7 +35,7 @@ class LookSpec(Spec):
     limbus_width_mm: Annotated[float, Field(ge=0, le=3)] = Field(
         default=0.8, description="width over which the clear cornea turns opaque, inwards from the limbus"
     )
-    backdrop_albedo: Albedo = Field(default=0.36, description="of the matte surround (Cooksey et al. 2017, dark skin)")
+    backdrop_albedo: Albedo = Field(default=0.36, description="of the matte surround, darker than most skin")
     backdrop_contrast: Contrast = Field(default=1.0, description="of the surround's unevenness")
     backdrop_distance_mm: NonNegative = Field(
         default=10.0, description="how far the surround's plane stands behind the apex of the unrotated eye"

@@ -20,8 +20,13 @@ Texture = NDArray[np.float32]
 _Array = NDArray[np.float64]
 
 
-def _noise(rng: np.random.Generator, shape: tuple[int, int], rows: tuple[float, float], columns: tuple[float, float],
-           periodic_rows: bool = False) -> _Array:
+def _noise(
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    rows: tuple[float, float],
+    columns: tuple[float, float],
+    periodic_rows: bool = False,
+) -> _Array:
     """Gaussian noise of unit variance, band-passed: `rows`, `columns` are (low, high) cycles over the whole extent."""
     h, w = shape
     height = h if periodic_rows else 2 * h
@@ -40,6 +45,23 @@ def _noise(rng: np.random.Generator, shape: tuple[int, int], rows: tuple[float, 
     return np.asarray(field / (field.std() + 1e-30))
 
 
+def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) -> _Array:
+    """Gaussian noise of unit variance on a periodic square, the same in all directions, `low` to `high` cycles."""
+    f = np.hypot((np.fft.fftfreq(size) * size)[:, None], (np.fft.rfftfreq(size) * size)[None, :])
+    keep = np.exp(-((f / high) ** 2))
+    if low > 0:
+        keep *= 1 - np.exp(-((f / low) ** 2))
+    keep[0, 0] = 0
+    field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((size, size))) * keep, s=(size, size))
+    return np.asarray(field / field.std())
+
+
+def _sealed(texture: _Array) -> Texture:
+    out: Texture = texture.astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
 def _step(x: Any, low: float, high: float) -> Any:
     s = np.clip((x - low) / (high - low), 0, 1)
     return s * s * (3 - 2 * s)
@@ -56,8 +78,10 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     s = ((np.arange(radial) + 0.5) / radial)[:, None]
     turn = ((np.arange(angular) + 0.5) / angular)[None, :]
 
-    collarette = 0.34 + 0.022 * _noise(rng, (1, angular), (0, 1), (0, 7), True) + 0.010 * _noise(
-        rng, (1, angular), (0, 1), (8, 26), True
+    collarette = (
+        0.34
+        + 0.022 * _noise(rng, (1, angular), (0, 1), (0, 7), True)
+        + 0.010 * _noise(rng, (1, angular), (0, 1), (8, 26), True)
     )
     ciliary = _step(s - collarette, -0.02, 0.05)
 
@@ -66,9 +90,7 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     rows, columns = np.meshgrid(np.arange(radial), np.arange(angular), indexing="ij")
 
     def bent(field: _Array, strength: float) -> _Array:
-        return np.asarray(
-            ndimage.map_coordinates(field, [rows, columns + strength * warp], order=1, mode="grid-wrap")
-        )
+        return np.asarray(ndimage.map_coordinates(field, [rows, columns + strength * warp], order=1, mode="grid-wrap"))
 
     coarse = bent(_noise(rng, shape, (0, 1.6), (22, 60)), 1.0)
     medium = bent(_noise(rng, shape, (0, 2.5), (50, 120)), 1.0)
@@ -93,9 +115,7 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     texture = np.clip(texture, 0.30, 1.9)
     area = 2.0 + s * 3.8
     texture = texture / (np.sum(texture * area) / np.sum(np.broadcast_to(area, shape)))
-    out = texture.astype(np.float32)
-    out.flags.writeable = False
-    return out
+    return _sealed(texture)
 
 
 def _furrows(rng: np.random.Generator, s: _Array, turn: _Array) -> _Array:
@@ -137,8 +157,10 @@ def sclera_texture(seed: int, size: int = 768) -> Texture:
     out short of the limbus.
     """
     rng = np.random.default_rng((0x5C1E, seed))
-    shade = 1 + 0.025 * _noise(rng, (size, size), (0, 5), (0, 5), True) + 0.012 * _noise(
-        rng, (size, size), (10, 40), (10, 40), True
+    shade = (
+        1
+        + 0.025 * _noise(rng, (size, size), (0, 5), (0, 5), True)
+        + 0.012 * _noise(rng, (size, size), (10, 40), (10, 40), True)
     )
     layers = [np.zeros((size, size)) for _ in range(3)]
     limbus = 0.29 / 0.6 / 2 * size / np.pi * 1.02  # 29 degrees of polar angle, in pixels of the map
@@ -164,25 +186,21 @@ def sclera_texture(seed: int, size: int = 768) -> Texture:
             int(rng.integers(120, 420)), int(rng.integers(0, 3)),
         )  # fmt: skip
     vessels = sum(
-        0.16 * width * ndimage.gaussian_filter(layer, width) for layer, width in zip(layers, (2.2, 1.4, 0.9), strict=True)
+        0.16 * width * ndimage.gaussian_filter(layer, width)
+        for layer, width in zip(layers, (2.2, 1.4, 0.9), strict=True)
     )
     vessels = vessels + 0.05 * ndimage.gaussian_filter(layers[0] + layers[1], 5.0) * 5
     texture = shade * (1 - np.clip(vessels, 0, 0.3))
-    out = (texture / texture.mean()).astype(np.float32)
-    out.flags.writeable = False
-    return out
+    return _sealed(texture / texture.mean())
 
 
 @lru_cache(maxsize=4)
 def skin_texture(seed: int, size: int = 768) -> Texture:
     """Relative albedo (size, size) of a tile of skin, periodic: slow unevenness, the net of furrows, pores."""
     rng = np.random.default_rng((0x5817, seed))
-    shape = (size, size)
-    slow = 0.05 * _noise(rng, shape, (0, 4), (0, 4), True)
-    net = np.abs(_noise(rng, shape, (24, 60), (24, 60), True))
-    net = 0.06 * (np.minimum(net, 1.2) - 0.7)
-    grain = 0.03 * _noise(rng, shape, (60, 150), (60, 150), True)
+    slow = 0.025 * _even_noise(rng, size, 0, 3)
+    net = np.abs(_even_noise(rng, size, 45, 70))  # zero crossings: a net of furrows about a millimetre wide
+    net = 0.055 * (np.minimum(net, 1.0) - 0.6)
+    grain = 0.02 * _even_noise(rng, size, 90, 180)
     texture = np.clip(1 + slow + net + grain, 0.5, 1.5)
-    out = (texture / texture.mean()).astype(np.float32)
-    out.flags.writeable = False
-    return out
+    return _sealed(texture / texture.mean())

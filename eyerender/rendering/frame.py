@@ -19,6 +19,7 @@ from ..rig.camera import Camera
 from ..rig.light import Light
 from ..rig.sensor import SensorSpec
 
+_SENSOR, _LOOK = SensorSpec(), LookSpec()
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
 
@@ -27,8 +28,9 @@ class RenderJob(ArrayValue):
     """One window of one exposure: what is rendered.
 
     eye, and its rigid motion x_world = M x + t; camera, lamps, sensor and look; `window` (x0, y0, width, height) in
-    full-sensor pixels. `apex_mm` is where the apex of the unrotated eye stands in the world (the surround keeps its place
-    to it); by default it follows from a turn about a point 13.5 mm behind the apex. `seed` fixes samples and noise.
+    full-sensor pixels. `apex_mm` is where the apex of the unrotated eye stands in the world (the surround keeps its
+    place to it); by default it follows from a turn about a point 13.5 mm behind the apex. `seed` fixes samples and
+    noise.
     """
 
     eye: Eye
@@ -37,8 +39,8 @@ class RenderJob(ArrayValue):
     camera: Camera
     window: tuple[int, int, int, int]
     lights: tuple[Light, ...]
-    sensor: SensorSpec = SensorSpec()
-    look: LookSpec = LookSpec()
+    sensor: SensorSpec = _SENSOR
+    look: LookSpec = _LOOK
     wavelength_nm: float = 850.0
     seed: int = 0
     labels: bool = True
@@ -137,7 +139,7 @@ def _shape(surface: Surface) -> Floats:
     if not isinstance(surface, Quadric):
         raise InputError(f"a surface of kind {surface.kind} cannot be rendered")
     A, b = np.asarray(surface.matrix), np.asarray(surface.vector)
-    if np.any(A != np.diag(np.diag(A))) or b[1] != 0 or b[2] != 0:
+    if np.any(np.diag(np.diag(A)) != A) or b[1] != 0 or b[2] != 0:
         raise InputError("a quadric cannot be rendered whose axes are not those of its frame")
     return np.array([*np.diag(A), b[0], float(surface.constant)])
 

@@ -122,7 +122,10 @@ def reflectance(cosine: Floats, index: float) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class GlintScene:
-    """What glints need: the front cornea and its rim, the pose (x_world = M x + t), camera, and what may stand between."""
+    """What glints need: the front cornea and its rim, the pose (x_world = M x + t), camera, and what may stand between.
+
+    `clear` takes points (n, 3) and (n, 3) of the world and says where nothing of the scene stands between them.
+    """
 
     surface: Surface
     index: float
@@ -132,7 +135,7 @@ class GlintScene:
     M: Floats
     t: Floats
     camera: Camera
-    clear: Visibility  # (n, 3) and (n, 3) world points -> nothing of the scene stands between them
+    clear: Visibility
 
     def image(self, light: Light, sigma_px: float) -> Image:
         """The image of one lamp, as finely as its size and the point-spread function ask for."""

@@ -41,7 +41,8 @@ class View:
     point: Any  # on the first surface
     normal: Any
     opacity: Any  # of the tissue at the first surface: 0 clear cornea, 1 sclera
-    passed: Any  # transmittance of the refracted branch
+    mirrored: Any  # reflectance of the front cornea
+    passed: Any  # transmittance of the refracted branch, 0 where it does not reach the plane of the iris
     inner: Any  # point in the plane of the iris
     pupil: Any  # the inner point lies in the pupil
     interaction: Any  # with the scene
@@ -62,8 +63,9 @@ class Textures:
         rows = iris_texture(seed)
         # Repeated, so that the angle wraps; the ends along the radius are kept apart by rows of their own.
         rows = np.concatenate([rows[:1], rows, rows[-1:]])
-        iris = mi.Texture2f(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
-        sclera = mi.Texture2f(mi.TensorXf(sclera_texture(seed)[..., None]), use_accel=False)
+        texture: Any = mi.Texture2f
+        iris = texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
+        sclera = texture(mi.TensorXf(sclera_texture(seed)[..., None]), use_accel=False)
         return cls(iris, sclera)
 
 
@@ -91,17 +93,20 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any) -> View:
     on_cornea &= ~on_sclera | (tc < ts)
     on_sclera &= ~on_cornea
     t_eye = t0 + dr.select(on_cornea, tc, ts)
-    amodal_cornea, amodal_sclera = on_cornea & (t_eye > 0), on_sclera & (t_eye > 0)
+    amodal_cornea, amodal_sclera = on_cornea & (t_eye > _EPSILON_MM), on_sclera & (t_eye > _EPSILON_MM)
     on_eye = (amodal_cornea | amodal_sclera) & ~(hit.is_valid() & (hit.t < t_eye)) & active
     on_cornea &= on_eye
     on_sclera &= on_eye
     other = hit.is_valid() & ~on_eye & active
-    interaction = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(o), d), mi.RayFlags.Minimal | mi.RayFlags.UV, other)
+    interaction = hit.compute_surface_interaction(
+        mi.Ray3f(mi.Point3f(o), d), mi.RayFlags.Minimal | mi.RayFlags.UV, other
+    )
 
     Nc = front.normal(yl)
     c = -dr.dot(Nc, dl)
     c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
-    passed = 1 - fresnel(c, c2, front.eta)
+    mirrored = fresnel(c, c2, front.eta)
+    passed = 1 - mirrored
     w = front.vector_out(front.eta * dl + (front.eta * c - c2) * Nc)
     y = oe + tc * de
     inside = mi.Vector3f(y)
@@ -131,6 +136,7 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any) -> View:
         point,
         dr.normalize(normal),
         dr.select(amodal_cornea, opacity(values, rho), 1),
+        mirrored,
         dr.select(reached, passed, 0),
         inner,
         reached & (pu * pu + pv * pv < 1),
@@ -229,7 +235,7 @@ def lamps(
     """Irradiance (mW/mm^2) of all lamps, and the number of light paths that did not converge.
 
     Args:
-        point, normal: matte points in the air, where `outside`; of them the scene's own where `other`, else the globe's.
+        point, normal: matte points in the air, where `outside`; the scene's own where `other`, else the globe's.
         inner: points in the plane of the iris, where `inside`.
         u, v: place on each lamp's disc, [0, 1).
     """
@@ -274,20 +280,80 @@ def _wrap(x: Any) -> Any:
     return x - dr.floor(x)
 
 
+@dataclass(frozen=True, slots=True)
+class Shaded:
+    """Radiance of a ray (mW/mm^2/sr), what it met, the albedo there where it is matte, and failed light paths."""
+
+    radiance: Any
+    view: View
+    albedo: Any
+    failures: Any
+
+
+def shade(
+    values: Values, lights: Lights, textures: Textures, scene: Any, o: Any, d: Any, active: Any, u: Any, v: Any
+) -> Shaded:
+    """Radiance along rays of the scene's frame by light that comes from the lamps on the shortest way."""
+    view = look(values, scene, o, d, active)
+    outer, inner, failures = light(values, lights, scene, view, u, v)
+    albedo = outer_albedo(values, textures, view, active)
+    behind = dr.select(view.pupil, values["pupil.albedo"], iris_albedo(values, textures, view.inner))
+    index = values["inner_index"]
+    through = view.passed * behind * inner / (index * index)
+    seen = dr.select(view.cornea, view.opacity * albedo * outer + (1 - view.opacity) * through, albedo * outer)
+    valid = view.cornea | view.sclera | view.other
+    return Shaded(dr.select(valid, seen * dr.inv_pi, 0), view, albedo, failures)
+
+
+def onward(values: Values, shaded: Shaded, d: Any, u: Any, v: Any) -> tuple[Any, Any, Any, Any]:
+    """How a path goes on: origin, direction (scene's frame), weight, and whether it does.
+
+    From matte points in a cosine-distributed direction; from the clear cornea in the mirror's direction.
+    """
+    view = shaded.view
+    normal = values.vector_to_scene(view.normal)
+    mirror = view.cornea & (view.opacity < 0.5)
+    e1, e2 = mi.coordinate_system(normal)
+    r = dr.sqrt(u)
+    s, c = dr.sincos(v * (2 * dr.pi))
+    diffuse = r * c * e1 + r * s * e2 + dr.sqrt(1 - u) * normal
+    reflected = d - 2 * dr.dot(d, normal) * normal
+    weight = dr.select(mirror, view.mirrored * (1 - view.opacity), shaded.albedo * view.opacity)
+    way = dr.select(mirror, reflected, diffuse)
+    start = values.point_to_scene(view.point) + _EPSILON_MM * normal
+    return start, way, weight, view.cornea | view.sclera | view.other
+
+
+def _random(base: Any, i: Any) -> tuple[Any, Any]:
+    """Two numbers in [0, 1) that are independent for every i: a hash of a sample's own pair (Tea)."""
+    tea: Any = mi.sample_tea_32
+    a, b = tea(mi.UInt32(base.x * 2.0**24) + i * mi.UInt32(0x9E3779B9), mi.UInt32(base.y * 2.0**24))
+    return mi.Float(a >> 8) * 2.0**-24, mi.Float(b >> 8) * 2.0**-24
+
+
+def _start(values: Values, first: Shaded, d: Any, turn: Any) -> tuple[Any, Any, Any, Any]:
+    o, way, weight, on = onward(values, first, d, turn.x, turn.y)
+    return on, o, way, weight
+
+
 _registered: dict[str, type] = {}
 
 
 def integrator_class() -> type:
     """The integrator's class for the variant in use, registered with Mitsuba under `NAME`."""
-    variant = mi.variant()
+    variant = str(mi.variant())
     if variant in _registered:
         return _registered[variant]
 
-    class EyeIntegrator(mi.SamplingIntegrator):  # type: ignore[misc, name-defined]
-        """Radiance (mW/mm^2/sr) along rays of the scene's frame; `bind` gives it the eye, the lamps and the look."""
+    class EyeIntegrator(mi.SamplingIntegrator):
+        """Radiance (mW/mm^2/sr) along rays of the scene's frame; `bind` gives it the eye, the lamps and the look.
+
+        `bounces` counts how often light goes on between sclera, surround and the cornea's mirror before it is seen.
+        """
 
         def __init__(self, props: Any = None) -> None:
             super().__init__(mi.Properties() if props is None else props)
+            self.bounces = 0
             self.values: Values | None = None
             self.lights: Lights | None = None
             self.textures: Textures | None = None
@@ -304,20 +370,33 @@ def integrator_class() -> type:
             del medium
             if self.values is None or self.lights is None or self.textures is None:
                 raise RuntimeError("bind() the integrator to a frame first")
-            values = self.values
+            values, lights, textures = self.values, self.lights, self.textures
             active = mi.Bool(active)
-            view = look(values, scene, mi.Vector3f(ray.o), ray.d, active)
+            d = mi.Vector3f(ray.d)
             spot = sampler.next_2d(active)
-            outer, inner, self.failures = light(values, self.lights, scene, view, spot.x, spot.y)
-            matte = outer_albedo(values, self.textures, view, active) * outer
-            behind = dr.select(
-                view.pupil, values["pupil.albedo"], iris_albedo(values, self.textures, view.inner)
-            )
-            index = values["inner_index"]
-            through = view.passed * behind * inner / (index * index)
-            seen = dr.select(view.cornea, view.opacity * matte + (1 - view.opacity) * through, matte)
-            valid = view.cornea | view.sclera | view.other
-            return mi.Color1f(dr.select(valid, seen * dr.inv_pi, 0)), valid, []
+            first = shade(values, lights, textures, scene, mi.Vector3f(ray.o), d, active, spot.x, spot.y)
+            valid = first.view.cornea | first.view.sclera | first.view.other
+            total, self.failures = first.radiance, first.failures
+            if self.bounces > 0:
+                turn = sampler.next_2d(active)
+                limit = dr.opaque(mi.UInt32, self.bounces)
+
+                def going(i: Any, on: Any, *_: Any) -> Any:
+                    return on & (i < limit)
+
+                def bounce(i: Any, on: Any, o: Any, d: Any, weight: Any, total: Any, failures: Any) -> Any:
+                    u, v = _random(turn, 2 * i)
+                    seen = shade(values, lights, textures, scene, o, d, on, u, v)
+                    total += dr.select(on, weight * seen.radiance, 0)
+                    failures += dr.select(on, seen.failures, 0)
+                    u, v = _random(turn, 2 * i + 1)
+                    o, d, share, further = onward(values, seen, d, u, v)
+                    return i + 1, on & further, o, d, weight * share, total, failures
+
+                state = (mi.UInt32(0), *_start(values, first, d, turn), total, first.failures)
+                names = ("i", "on", "o", "d", "weight", "total", "failures")
+                *_, total, self.failures = dr.while_loop(state, going, bounce, labels=names, label="bounces")
+            return mi.Color1f(total), valid, []
 
         def to_string(self) -> str:
             return "EyeIntegrator[]"

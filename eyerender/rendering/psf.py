@@ -1,7 +1,7 @@
 """The point-spread function: a Gaussian, on the grid of pixels and integrated over them.
 
-On the grid the kernel is the discrete Gaussian T(n) = exp(-s^2) I_n(s^2) (Lindeberg 1990, equation 29), whose variance is
-exactly s^2: sampled Gaussians fall short of it below one pixel, and glints (integrated exactly) and edges (blurred on
+On the grid the kernel is the discrete Gaussian T(n) = exp(-s^2) I_n(s^2) (Lindeberg 1990), whose variance is exactly
+s^2: sampled Gaussians fall short of it below one pixel, and glints (integrated exactly) and edges (blurred on
 the grid) would see two different lenses.
 """
 
@@ -56,8 +56,8 @@ def splat(
     rows = slice(max(int(low[1]), 0), min(int(high[1]) + 1, height))
     if columns.stop <= columns.start or rows.stop <= rows.start:
         return np.zeros((0, 0)), slice(0, 0), slice(0, 0)
-    gx = _integrals(np.arange(columns.start, columns.stop) + x0, xy_px[:, 0], sigma_px)
-    gy = _integrals(np.arange(rows.start, rows.stop) + y0, xy_px[:, 1], sigma_px)
+    gx = _integrals(np.arange(columns.start, columns.stop, dtype=float) + x0, xy_px[:, 0], sigma_px)
+    gy = _integrals(np.arange(rows.start, rows.stop, dtype=float) + y0, xy_px[:, 1], sigma_px)
     return np.asarray(gy.T @ (gx * energy[:, None])), rows, columns
 
 

@@ -67,13 +67,17 @@ class Renderer:
     """Renders jobs on one backend, which `choose_backend` must have set up before this module is imported.
 
     Kernels are compiled once per kind of eye; every number may change between jobs. `obstacles` stand in the scene's
-    frame: they hide and shade the eye.
+    frame: they hide and shade the eye. `bounces` is how often light may go on between sclera, surround and the cornea's
+    mirror (0: only light that comes straight from a lamp; more adds some noise and costs as much again each).
     """
 
-    def __init__(self, backend: Backend, *, spp: int = 16, obstacles: Sequence[Obstacle] = ()) -> None:
+    def __init__(
+        self, backend: Backend, *, spp: int = 16, bounces: int = 0, obstacles: Sequence[Obstacle] = ()
+    ) -> None:
         self.backend = backend
         self.spp = spp
         self._integrator = integrator_class()()
+        self._integrator.bounces = bounces
         self._surround = Surround(obstacles)
         self._textures: dict[int, Textures] = {}
 
@@ -203,8 +207,8 @@ class Renderer:
             return self._surround.clear(a - anchor, b - anchor)
 
         scene = GlintScene(
-            eye.front[0], float(eye.front_indices[0]), eye.limbus_radius_mm, np.asarray(eye.sclera.centre_mm),
-            eye.sclera.radius_mm, job.M, job.t, job.camera, clear,
+            eye.front[0], float(eye.front_indices[0]), float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm),
+            float(eye.sclera.radius_mm), job.M, job.t, job.camera, clear,
         )  # fmt: skip
         table, images = glint_table(scene, job.lights, job.sensor.psf_sigma_px)
         for spots in images:
@@ -225,4 +229,3 @@ def _pixels(pixel: Any, window: tuple[int, int, int, int]) -> tuple[Any, Any]:
     u = mi.Int32(column) + dr.opaque(mi.Int32, window[0])
     v = mi.Int32(row) + dr.opaque(mi.Int32, window[1])
     return u, v
-

@@ -1,12 +1,12 @@
 """Camera rays and sample points of a window of the sensor, on Dr.Jit arrays.
 
 Places in the pixel: a rank-1 lattice, x = k / N, y = frac(k a / N), with the a of the largest smallest distance, tiled
-over the sensor without a shift of its own per pixel. The edges of one frame are thus sampled by one regular lattice, which
-places a contour far better than independent samples of the same number would (Sloan and Joe 1994, chapter 4).
+over the sensor without a shift of its own per pixel. The edges of a frame are thus sampled by one regular lattice,
+which places a contour far better than independent samples of the same number would (Sloan and Joe 1994, chapter 4).
 
-Places on the lamps: sample k at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018), the shift
-a hash of the pixel's place on the whole sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft shadows
-show noise and no bands. Nothing depends on threads, on the window, or on what was rendered before.
+Places on the lamps: sample k at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018), the
+shift a hash of the pixel's place on the whole sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft
+shadows show noise and no bands. Nothing depends on threads, on the window, or on what was rendered before.
 """
 
 from __future__ import annotations
@@ -55,20 +55,24 @@ class Sampler:
         x = mi.Float(k) / mi.Float(n) + dr.opaque(mi.Float, float(shift[0]))
         y = mi.Float((k * a) % n) / mi.Float(n) + dr.opaque(mi.Float, float(shift[1]))
         self._place = mi.Point2f(x - dr.floor(x), y - dr.floor(y))
-        folded = int(np.random.SeedSequence(seed).generate_state(1)[0])
-        u, v = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, folded))
-        self._lamp = mi.Point2f(
-            *(mi.Float((h + k * mi.UInt32(alpha)) >> 8) * (2.0**-24) for h, alpha in zip((u, v), _ALPHA, strict=True))
-        )
+        self._pixel, self._k, self._seed, self._calls = pixel, k, seed, 0
 
     def in_pixel(self) -> Any:
         """Place in the pixel, [0, 1)^2."""
         return self._place
 
     def next_2d(self, active: Any = True) -> Any:
-        """Place on the lamp, [0, 1)^2."""
+        """The next pair, [0, 1)^2: each call of a sample has a shift of its own."""
         del active
-        return self._lamp
+        folded = int(np.random.SeedSequence([self._seed, self._calls]).generate_state(1)[0])
+        self._calls += 1
+        tea: Any = mi.sample_tea_32
+        shifts = tea(self._pixel, dr.opaque(mi.UInt32, folded))
+        pair = [
+            mi.Float((shift + self._k * mi.UInt32(alpha)) >> 8) * (2.0**-24)
+            for shift, alpha in zip(shifts, _ALPHA, strict=True)
+        ]
+        return mi.Point2f(*pair)
 
 
 def camera_ray(values: Values, u: Any, v: Any) -> tuple[Any, Any, Any]:

@@ -38,4 +38,4 @@ def expose(sensor: SensorSpec, irradiance: Floats, wavelength_nm: float, seed: i
     else:
         signal = np.minimum(mean, sensor.full_well_e)
     dn = np.rint(sensor.black_dn + sensor.gain * signal)
-    return np.clip(dn, 0, sensor.full_scale_dn).astype(np.uint16)
+    return np.asarray(np.clip(dn, 0, sensor.full_scale_dn), dtype=np.uint16)

@@ -41,7 +41,7 @@ class Surround:
             material = {"type": "twosided", "bsdf": _matte(mi.TensorXf(np.full((1, 1, 1), body.albedo, np.float32)))}
             parts[f"obstacle{i}"] = _mesh(f"obstacle{i}", body.vertices_mm, body.faces, None, material)
         self.scene = mi.load_dict(parts)
-        self._params = mi.traverse(self.scene)
+        self._params: Any = mi.traverse(self.scene)
         self._shown: tuple[float, float, float] | None = None
 
     def show(self, look: LookSpec) -> None:
@@ -52,7 +52,8 @@ class Surround:
         if self._shown is None or self._shown[0] != wanted[0]:
             self._params["backdrop.vertex_positions"] = mi.Float(_corners(wanted[0]).ravel())
         tile = wanted[1] * (1 + wanted[2] * (skin_texture(1) - 1))
-        (key,) = (k for k in self._params.keys() if k.startswith("backdrop") and k.endswith("reflectance.data"))
+        names: list[str] = list(self._params.keys())  # iterating itself gives pairs
+        (key,) = (k for k in names if k.startswith("backdrop") and k.endswith("reflectance.data"))
         self._params[key] = mi.TensorXf(np.clip(tile, 0.0, 0.98).astype(np.float32)[..., None])
         self._params.update()
         self._shown = wanted
@@ -67,7 +68,7 @@ class Surround:
         buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 7
         o = [dr.gather(mi.Float, buffer, row + k) for k in range(7)]
         ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:6]))
-        ray.maxt = o[6]
+        ray.maxt = o[6]  # type: ignore[assignment]
         return ~np.asarray(self.scene.ray_test(ray).numpy(), dtype=bool)
 
     @staticmethod

@@ -154,7 +154,7 @@ class Camera(ArrayValue):
     @property
     def axis(self) -> Floats:
         """The optical axis, a unit vector (3,) in the world."""
-        return self.R[2].copy()
+        return np.array(self.R[2], dtype=np.float64)
 
     def project(self, points_mm: ArrayLike) -> tuple[Floats, Bools]:
         """Image points of world points.

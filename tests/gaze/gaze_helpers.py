@@ -1,8 +1,9 @@
 """Observations and rigs out of plain numbers, and the conversions of the reference vectors' conventions.
 
-`ets` vectors are in metres, in a world whose screen is the plane y = 0 (x to the user's left, z up, the user at y > 0); their
-cameras look along -z of their own frame, x right and y up, with the principal point at (0, 0). Here that world becomes
-(x, y, z) -> (-y, x, z), lengths stay in metres (estimators do not mind the unit), and images are turned y down.
+`ets` vectors are in metres, in a world whose screen is the plane y = 0 (x to the user's left, z up, the user at y >
+0); their cameras look along -z of their own frame, x right and y up, with the principal point at (0, 0). Here that
+world becomes (x, y, z) -> (-y, x, z), lengths stay in metres (estimators do not mind the unit), and images are turned
+y down.
 """
 
 from __future__ import annotations
@@ -49,9 +50,9 @@ def observations(pupil, glints, targets=None, *, eye=None, camera=None, fixation
         ),
         PoseTruth(frozen(nan), frozen(nan), frozen(nan), frozen(nan)),
         PupilFeatures(
-            frozen(np.where(pupil_ok, "ok", "missing").astype(object), object), frozen(none, object), frozen(pupil_ok, bool),
-            frozen(pupil), frozen(np.full((n, 2), 13.0)), frozen(nan), frozen(pupil), frozen(np.zeros((n, 0, 2))),
-            frozen(np.full((n, 5, 5), np.nan)),
+            frozen(np.where(pupil_ok, "ok", "missing").astype(object), object), frozen(none, object), frozen(pupil_ok,
+            bool), frozen(pupil), frozen(np.full((n, 2), 13.0)), frozen(nan), frozen(pupil), frozen(np.zeros((n, 0,
+            2))), frozen(np.full((n, 5, 5), np.nan)),
         ),
         GlintFeatures(
             frozen(np.broadcast_to(np.arange(m), (n, m)), np.int64),

@@ -1,4 +1,5 @@
-"""Estimators against vectors of independent software: calibrated state, gaze on held-out frames, to 1e-9 of their size."""
+"""Estimators against vectors of independent software: calibrated state, gaze on held-out frames, to 1e-9 of their
+size."""
 
 from __future__ import annotations
 
@@ -28,7 +29,6 @@ CASES = {
     "interpolate_biquadratic": lambda d: PupilGlintRegression((BIQUADRATIC, BIQUADRATIC), normalised=False),
     # The vectors' transform is the plain algebraic least squares in metres.
     "homography_glint4": lambda d: HomographyNormalisation(conditioned=False),
-    "yoo_chung": lambda d: CrossRatio(),
     "hennessey_pupil_center_recalib_angle": hennessey_eye,
 }
 
@@ -55,11 +55,21 @@ def test_homography_state():
     np.testing.assert_allclose(H * np.sign(H[2, 2]), data["state"]["H"], rtol=1e-9, atol=1e-10)
 
 
-def test_cross_ratio_state():
+def test_cross_ratio():
     data = load("estimator_yoo_chung.json")
+    world, frames = ets_rig(data), ets_observations(data["frames"])
+    alpha = np.array(data["state"]["alpha"][0])
+    gaze = CrossRatio(alphas={0: alpha}).predict(frames, world)
+    assert gaze.ok.all()
+    np.testing.assert_allclose(gaze.point_mm, on_plane([f["gaze"] for f in data["frames"]]), rtol=1e-9, atol=4e-10)
     calibration = ets_observations(data["calibration"])
-    fitted = CrossRatio().fit(calibration, calibration.index.target_mm, ets_rig(data))
-    np.testing.assert_allclose(fitted.alphas[0], data["state"]["alpha"][0], rtol=1e-12)
+    fitted = CrossRatio().fit(calibration, calibration.index.target_mm, world)
+    # The features given for the calibration frames are not to the last digit those that the given alpha came from: all
+    # four ratios of lengths differ by 1.9e-5 to 2.3e-5. That is 3e-4 px; gaze on held-out frames is exact with their
+    # alpha.
+    np.testing.assert_allclose(fitted.alphas[0], alpha, rtol=3e-5)
+    own = fitted.predict(frames, world)
+    np.testing.assert_allclose(own.point_mm, gaze.point_mm, atol=2e-5)
 
 
 def test_hennessey_parts():
@@ -145,17 +155,14 @@ def test_guestrin_eizenman_calibrations(case):
     assert found.converged
     assert found.at_bound == ()
     gaze = fitted.predict(seen, world)
-    centre = np.array(data["frames"][0]["cornea_center"]) @ PLANE_TO_WORLD.T
-    from eyerender.gaze.estimate import angular_error_deg
-
-    mean = angular_error_deg(gaze.point_mm, seen.index.target_mm, centre).mean()
-    # With the right index the minimum is zero; with a wrong one, R and K take up what they can and the error is theirs,
-    # whatever exact objective was minimised (sums of squares over distance or angle differ by per cents).
+    miss = np.linalg.norm(gaze.point_mm - seen.index.target_mm, axis=1)
+    mean = np.degrees(np.arctan(miss / 650)).mean()  # the vectors' measure
+    # With the right index the minimum is zero; with a wrong one R and K take up what they can.
     if record["assumed_n"] == 1.3375:
         assert mean < 1e-8
         expected = [*record["solution"][:2], -np.degrees(record["solution"][2]), np.degrees(record["solution"][3])]
         got = found.parameters.vector()[[0, 1, 3, 4]]
         np.testing.assert_allclose(got, expected, rtol=1e-6)
     else:
-        np.testing.assert_allclose(mean, record["H1_mean_deg"], rtol=0.05)
-        np.testing.assert_allclose(found.parameters.vector()[:2], record["solution"][:2], rtol=1e-3)
+        np.testing.assert_allclose(mean, record["H1_mean_deg"], rtol=1e-5)
+        np.testing.assert_allclose(found.parameters.vector()[:2], record["solution"][:2], rtol=1e-6)

@@ -67,7 +67,11 @@ def eye_of(model: str, side: str = "right", pupil_mm: float = 4.0) -> Eye:
 
 
 def job_of(
-    eye: Eye, rig: LampRig, window: tuple[int, int, int, int], pose_deg: tuple[float, float] = (0.0, 0.0), **changes: Any
+    eye: Eye,
+    rig: LampRig,
+    window: tuple[int, int, int, int],
+    pose_deg: tuple[float, float] = (0.0, 0.0),
+    **changes: Any,
 ) -> RenderJob:
     """A job for an eye at the world's origin; the sensor is noise-free unless given."""
     from eyerender.rendering.frame import RenderJob

@@ -6,38 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from render_oracles import centroid, mirror_pixel
 from render_rigs import BLACK, MODELS, RIGS, eye_of, head_rig, job_of, remote_rig
-from scipy.optimize import least_squares
 
 from eyerender.rendering.surround import Obstacle
 from eyerender.rig.sensor import SensorSpec
-
-
-def centroid(image: np.ndarray, window: tuple[int, int, int, int]) -> np.ndarray:
-    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
-    total = image.sum(dtype=float)
-    return np.array([(image * u).sum(dtype=float) / total + window[0], (image * v).sum(dtype=float) / total + window[1]])
-
-
-def mirror_pixel(eye, job, lamp_mm) -> np.ndarray:
-    """Fermat's principle in float64: the mirror point makes lamp - cornea - nodal point stationary."""
-    surface = eye.front[0]
-    lamp, node = job.M.T @ (lamp_mm - job.t), job.M.T @ (job.camera.nodal_point_mm - job.t)
-
-    def point(q):
-        local = np.array([float(surface.sag(q[0], q[1])), q[0], q[1]])
-        return surface.rotation @ local + surface.origin_mm
-
-    def slope(q):
-        y = point(q)
-        N = surface.normal(y[None])[0]
-        pull = (y - lamp) / np.linalg.norm(y - lamp) + (y - node) / np.linalg.norm(y - node)
-        return pull - (pull @ N) * N
-
-    q = least_squares(slope, [0.5, 0.5], xtol=1e-15, ftol=1e-15, gtol=1e-15).x
-    y = point(q)
-    assert np.linalg.norm(slope(q)) < 1e-10
-    return job.camera.project(job.M @ y + job.t)[0], float(np.hypot(*q))
 
 
 @pytest.mark.parametrize("rig_name", RIGS)

@@ -18,7 +18,7 @@ import pytest
 from eyerender.errors import BackendError
 from eyerender.rendering import apt as apt_module
 from eyerender.rendering.apt import Apt
-from eyerender.rendering.libraries import cache_folder, library_folders, load_library, load_runtime
+from eyerender.rendering.libraries import cache_folder, library_folders, llvm_store, load_library, load_runtime
 from eyerender.rendering.llvm import ENVIRONMENT, VARIANT, candidates, find_llvm, version_of
 from eyerender.rendering.llvm_setup import setup_llvm
 from eyerender.rendering.mend import has_archive, llvm_command
@@ -36,6 +36,18 @@ def good() -> Path:
     if found is None or found.path is None:
         pytest.skip("no libLLVM here renders")
     return found.path
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache folder without verdicts; what was unpacked stays in reach, a bare machine cannot load Dr.Jit without."""
+    store = llvm_store()
+    folder = tmp_path / "cache" / "eyerender"
+    folder.mkdir(parents=True)
+    if store is not None and store.is_dir():
+        (folder / "llvm").symlink_to(store)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder.parent))
+    return folder
 
 
 def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -144,12 +156,9 @@ def test_good_library_passes_its_probe(good: Path) -> None:
     assert verdict.detail.startswith("LLVM ")
 
 
-def test_verdict_is_remembered_until_the_library_changes(
-    good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_verdict_is_remembered_until_the_library_changes(good: Path, cache: Path) -> None:
     first = probe(VARIANT, good)
-    (file,) = (tmp_path / "eyerender" / "verdicts").iterdir()
+    (file,) = (cache / "verdicts").iterdir()
     # What the file says is believed: no process is started any more.
     stored = json.loads(file.read_text())
     stored["verdict"]["detail"] = "LLVM remembered"
@@ -161,14 +170,13 @@ def test_verdict_is_remembered_until_the_library_changes(
     assert probe(VARIANT, good) == first
 
 
-def test_refusal_is_looked_into_again_after_a_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refusal_is_looked_into_again_after_a_day(cache: Path) -> None:
     """A refusal may have had a passing cause. libc loads well and is no LLVM: Dr.Jit refuses it."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     libc = next((p for p in map(Path, _mapped_files()) if p.name.startswith("libc.so")), None)
     if libc is None:
         pytest.skip("no libc.so to pass for a libLLVM here")
     assert not probe(VARIANT, libc).ok
-    (file,) = (tmp_path / "eyerender" / "verdicts").iterdir()
+    (file,) = (cache / "verdicts").iterdir()
     stored = json.loads(file.read_text())
     stored["verdict"]["detail"] = "remembered"
     file.write_text(json.dumps(stored))
@@ -178,17 +186,14 @@ def test_refusal_is_looked_into_again_after_a_day(tmp_path: Path, monkeypatch: p
     assert probe(VARIANT, libc).detail != "remembered"
 
 
-def test_library_that_does_not_load_is_refused_but_not_for_good(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def test_library_that_does_not_load_is_refused_but_not_for_good(cache: Path, tmp_path: Path) -> None:
     broken = tmp_path / "libLLVM-19.so"
     broken.write_text("not a library")
     verdict = probe(VARIANT, broken)
     assert not verdict.ok
     assert not verdict.lasting
     assert "libLLVM-19.so" in verdict.detail
-    assert not list((tmp_path / "cache").rglob("*.json"))
+    assert not list(cache.rglob("*.json"))
 
 
 def test_cache_that_cannot_be_written_is_done_without(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,8 +202,7 @@ def test_cache_that_cannot_be_written_is_done_without(good: Path, monkeypatch: p
 
 
 @needs_compiler
-def test_library_that_ends_the_process_is_survived(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def test_library_that_ends_the_process_is_survived(cache: Path, tmp_path: Path) -> None:
     source = "#include <stdlib.h>\n__attribute__((constructor)) static void die(void) { abort(); }"
     verdict = probe(VARIANT, build(tmp_path, "libLLVM-16.so", source))
     assert verdict == Verdict(False, "rendering with it ends the process (SIGABRT)")

@@ -52,39 +52,42 @@ def test_a_fresh_process_gives_the_same_bytes(renderer):
     assert done.stdout.strip() == digest(renderer.render(noisy_job()))
 
 
-def compiled(renderer, jobs) -> int:
-    """Kernels compiled anew (neither found in memory nor a cache hit) while the jobs are rendered."""
+def kernels(renderer, jobs) -> set:
+    """Hashes of the kernels that rendering the jobs launches."""
     import drjit as dr
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for job in jobs:
             renderer.render(job)
-        history = dr.kernel_history([dr.KernelType.JIT])
-    assert history
-    return sum(not kernel["cache_hit"] for kernel in history)
+        return {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
 
 
-def test_nothing_is_compiled_after_the_first_frame(renderer):
+def test_later_frames_launch_the_kernels_of_the_first(renderer):
+    # Hashes and not cache misses: Dr.Jit's cache on disk would hide a compilation.
     rig, other = remote_rig(), head_rig()
     first = job_of(eye_of("E2"), rig, rig.window(64, 48))
-    renderer.render(first)
     jobs = [
         replace(first, seed=5),
         job_of(eye_of("E2"), rig, rig.window(64, 48), (10.0, -7.0)),
         job_of(eye_of("E1", "left", 5.5), rig, rig.window(80, 40), (3.0, 2.0)),
-        job_of(eye_of("E3" if len(eye_of("E3").front) == 1 else "E1"), other, (100, 100, 64, 48)),
+        job_of(eye_of("E1"), other, (100, 100, 64, 48)),
         job_of(eye_of("E2", pupil_mm=2.5), other, (100, 100, 64, 48), lights=other.lights[:3], wavelength_nm=780.0),
         replace(first, look=first.look.model_copy(update={"iris_seed": 4, "iris_albedo": 0.2, "limbus_width_mm": 0.0})),
         replace(first, sensor=SensorSpec(psf_sigma_px=1.3, bit_depth=8)),
     ]
-    assert compiled(renderer, jobs) == 0
+    assert kernels(renderer, jobs) == kernels(renderer, [first])
 
 
-def test_another_number_of_surfaces_is_compiled_once(renderer):
+def test_another_number_of_surfaces_has_kernels_of_its_own_and_keeps_them(renderer):
     rig = remote_rig()
-    renderer.render(job_of(eye_of("E4"), rig, rig.window(64, 48)))
-    assert compiled(renderer, [job_of(eye_of("E4", pupil_mm=3.0), head_rig(), (9, 9, 32, 32), (4.0, 1.0))]) == 0
+    first = kernels(renderer, [job_of(eye_of("E4"), rig, rig.window(64, 48))])
+    assert first != kernels(renderer, [job_of(eye_of("E2"), rig, rig.window(64, 48))])
+    later = [
+        job_of(eye_of("E4", pupil_mm=3.0), head_rig(), (9, 9, 32, 32), (4.0, 1.0)),
+        job_of(eye_of("E3"), rig, rig.window(64, 48)),
+    ]
+    assert kernels(renderer, later) == first
 
 
 def test_a_window_is_a_cut_of_a_larger_one(renderer):

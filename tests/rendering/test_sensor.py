@@ -73,7 +73,8 @@ def test_splats_are_pixel_integrals():
     image[rows, columns] = patch
     v, u = np.meshgrid((np.arange(20 * 50) + 0.5) / 50 - 0.5, (np.arange(24 * 50) + 0.5) / 50 - 0.5, indexing="ij")
     brute = sum(
-        e / (2 * np.pi * 0.64) * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 1.28) for (x, y), e in zip(xy, energy, strict=True)
+        e / (2 * np.pi * 0.64) * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 1.28)
+        for (x, y), e in zip(xy, energy, strict=True)
     )
     brute = brute.reshape(20, 50, 24, 50).sum(axis=(1, 3)) / 2500
     np.testing.assert_allclose(image, brute, atol=5e-5)  # the midpoint rule

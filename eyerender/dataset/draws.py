@@ -1,0 +1,216 @@
+"""Distributions that may stand in place of any value of a scene template.
+
+A draw is a mapping with the key `draw`. Its value is a pure function of the dataset's seed, the draw's dotted path in
+the template, the unit it belongs to (a sample or a subject) and the attempt:
+
+    u = (m + 1/2) / 2^53,   m = the first 53 bits of SHA-256("seed/path/unit/number/attempt")
+
+so it depends neither on any other draw nor on who makes the sample. Grids form one joint full factorial design, Sobol
+draws one joint scrambled sequence (Owen 1998, as `scipy.stats.qmc.Sobol` has it).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+from scipy.special import log_ndtr, ndtri_exp
+
+from ..errors import InputError
+from ..spec import Positive, Spec
+
+Unit = Literal["sample", "subject"]
+MARK = "draw"
+
+
+class _Draw(Spec):
+    per: Unit | None = Field(default=None, description="drawn for each sample or once a subject; default: by the path")
+
+
+class FixedDraw(_Draw):
+    """The value itself; lets `per` and comments stand beside it."""
+
+    draw: Literal["fixed"]
+    value: Any
+
+
+class UniformDraw(_Draw):
+    """low + (high - low) u."""
+
+    draw: Literal["uniform"]
+    low: float
+    high: float
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        return _ordered(self)
+
+
+class IntegerDraw(_Draw):
+    """A whole number from low to high, both included."""
+
+    draw: Literal["integer"]
+    low: int
+    high: int
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        return _ordered(self)
+
+
+class NormalDraw(_Draw):
+    """A normal distribution cut off at `low` and `high` and scaled to 1 in between."""
+
+    draw: Literal["truncated_normal"]
+    mean: float
+    sd: Positive
+    low: float
+    high: float
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        return _ordered(self)
+
+
+class ChoiceDraw(_Draw):
+    """One of `values`, which may be anything, whole sub-mappings with draws of their own too."""
+
+    draw: Literal["choice"]
+    values: Annotated[tuple[Any, ...], Field(min_length=1)]
+    weights: tuple[Annotated[float, Field(ge=0)], ...] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.weights is not None:
+            if len(self.weights) != len(self.values):
+                raise ValueError("weights: one for each value")
+            if not sum(self.weights) > 0:
+                raise ValueError("weights: one must be > 0")
+        return self
+
+
+class GridDraw(_Draw):
+    """Evenly spaced numbers or given values, gone through in order; several grids form their full product."""
+
+    draw: Literal["grid"]
+    low: float | None = None
+    high: float | None = None
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    values: Annotated[tuple[Any, ...], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        spaced = (self.low, self.high, self.steps)
+        if (self.values is None) == all(v is None for v in spaced) or (
+            self.values is None and any(v is None for v in spaced)
+        ):
+            raise ValueError("give either low, high and steps, or values")
+        return self
+
+    @property
+    def points(self) -> tuple[Any, ...]:
+        """The values in order."""
+        if self.values is not None:
+            return self.values
+        assert self.low is not None and self.high is not None and self.steps is not None
+        if self.steps == 1:
+            return (self.low,)
+        return tuple(self.low + (self.high - self.low) * (k / (self.steps - 1)) for k in range(self.steps))
+
+
+class SobolDraw(_Draw):
+    """low + (high - low) s, s one dimension of the joint Sobol sequence of all such draws."""
+
+    draw: Literal["sobol"]
+    low: float
+    high: float
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        return _ordered(self)
+
+
+class SequenceDraw(_Draw):
+    """The k-th value for the k-th frame of a subject, from the start again after the last: a fixation sequence."""
+
+    draw: Literal["sequence"]
+    values: Annotated[tuple[Any, ...], Field(min_length=1)]
+
+
+_KINDS = {
+    "fixed": FixedDraw,
+    "uniform": UniformDraw,
+    "integer": IntegerDraw,
+    "truncated_normal": NormalDraw,
+    "choice": ChoiceDraw,
+    "grid": GridDraw,
+    "sobol": SobolDraw,
+    "sequence": SequenceDraw,
+}
+Draw = FixedDraw | UniformDraw | IntegerDraw | NormalDraw | ChoiceDraw | GridDraw | SobolDraw | SequenceDraw
+KINDS = tuple(_KINDS)
+
+
+def is_draw(node: object) -> bool:
+    """Whether a node of a template is a distribution."""
+    return isinstance(node, dict) and MARK in node
+
+
+def parse_draw(node: dict[str, Any], *, source: str, path: str) -> Draw:
+    """The distribution that a node describes; raises `InputError` with the path of the bad key."""
+    kind = _KINDS.get(str(node[MARK]))
+    if kind is None:
+        raise InputError(f"must be one of {', '.join(KINDS)}, not {node[MARK]!r}", source=source, path=f"{path}.draw")
+    try:
+        found = kind.from_mapping(node)
+    except InputError as error:
+        where = ".".join(part for part in (path, error.path) if part)
+        raise InputError(error.reason, source=source, path=where) from None
+    return found  # type: ignore[return-value]
+
+
+def unit_number(seed: int, path: str, unit: str, number: int, attempt: int) -> float:
+    """u in (0, 1), see the module."""
+    digest = hashlib.sha256(f"{seed}/{path}/{unit}/{number}/{attempt}".encode()).digest()
+    return ((int.from_bytes(digest[:8], "big") >> 11) + 0.5) / 2.0**53
+
+
+def random_value(draw: Draw, u: float) -> Any:
+    """The value of a random draw at u; choices give the index of the value."""
+    if isinstance(draw, UniformDraw | SobolDraw):
+        return draw.low + (draw.high - draw.low) * u
+    if isinstance(draw, IntegerDraw):
+        return min(draw.low + int(u * (draw.high - draw.low + 1)), draw.high)
+    if isinstance(draw, NormalDraw):
+        return truncated_normal(u, draw.mean, draw.sd, draw.low, draw.high)
+    if isinstance(draw, ChoiceDraw):
+        weights = draw.weights or (1.0,) * len(draw.values)
+        level, total = u * math.fsum(weights), 0.0
+        for k, weight in enumerate(weights):
+            total += weight
+            if level < total:
+                return k
+        return max(k for k, weight in enumerate(weights) if weight > 0)
+    raise TypeError(type(draw).__name__)
+
+
+def truncated_normal(u: float, mean: float, sd: float, low: float, high: float) -> float:
+    """The quantile of the truncated normal: Phi^-1(Phi(a) + u (Phi(b) - Phi(a))), in logarithms so that tails hold."""
+    a, b = (low - mean) / sd, (high - mean) / sd
+    if a > 0:
+        # The upper tail by symmetry: there Phi is too close to 1 to be told from it.
+        return -truncated_normal(1 - u, -mean, sd, -high, -low)
+    log_a, log_b = float(log_ndtr(a)), float(log_ndtr(b))
+    # log(Phi(a) + u (Phi(b) - Phi(a))) = log Phi(b) + log(r + u (1 - r)),  r = Phi(a) / Phi(b)
+    r = math.exp(log_a - log_b)
+    x = mean + sd * float(ndtri_exp(log_b + math.log(r + u * (1 - r))))
+    return min(max(x, low), high)
+
+
+def _ordered(draw: Any) -> Any:
+    if not draw.low < draw.high:
+        raise ValueError("low must be < high")
+    return draw
+

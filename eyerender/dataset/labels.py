@@ -1,0 +1,186 @@
+"""The labels of one rendered window: ellipses, glints, points and lines in space, matrices.
+
+`amodal` ellipses are those of the outline as if nothing stood before the eye: the pupil's seen through the cornea, the
+iris' at the circle of the limbus where the cornea is half clear. A `visible` ellipse has the second moments of the
+visible pixels (of pupil, or of iris and pupil together): semi-axes 2 sqrt(eigenvalues of covariance + 1/12).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..analytic.features import fixations
+from ..arrays import Bools, Floats
+from ..capture import WindowImage
+from ..eye.model import Eye
+from ..geometry.ellipse import fit_ellipse_direct
+from ..observation import EYES, Observations
+from ..rig.camera import Camera
+from ..scene import Scene
+
+_OUTLINE_POINTS = 60
+_SAG_STEP_MM = 0.05
+IRIS, PUPIL = 2, 3
+
+
+def image_labels(scene: Scene, observations: Observations, image: WindowImage) -> dict[str, Any]:
+    """The labels of a window; the same keys for every image."""
+    row, camera = image.row, scene.rig.cameras[image.camera]
+    part, window = image.mask, image.window
+    return {
+        "pupil": {
+            "amodal": _ellipse_of_record(observations, row),
+            "visible": moments_ellipse(part == PUPIL, window),
+            "visible_fraction": image.labels["pupil_visible_fraction"],
+        },
+        "iris": {
+            "amodal": iris_outline(scene, image, camera),
+            "visible": moments_ellipse((part == PUPIL) | (part == IRIS), window),
+            "visible_fraction": image.labels["iris_visible_fraction"],
+        },
+        "glints": _glints(observations, image),
+        "space": _space(scene, observations, image, camera),
+        "pose": {"rotation": image.M.tolist(), "translation_mm": image.t.tolist()},
+        "camera": {
+            "K": camera.K.tolist(),
+            "R": camera.R.tolist(),
+            "t_mm": camera.t.tolist(),
+            "distortion": camera.distortion.tolist(),
+            "resolution_px": list(camera.resolution_px),
+        },
+        "lights_mm": [light.position_mm.tolist() for light in scene.rig.lights],
+        "failed_paths": int(image.labels["failed_paths"]),
+    }
+
+
+def moments_ellipse(inside: Bools, window: tuple[int, int, int, int]) -> dict[str, Any]:
+    """The ellipse with the moments of a mask's pixels, in full-sensor pixels; null numbers where there are none.
+
+    `pixels` is their count, `cut` whether they reach the window's edge.
+    """
+    v, u = np.nonzero(inside)
+    out: dict[str, Any] = {"centre_px": None, "semi_axes_px": None, "angle_rad": None, "pixels": len(u), "cut": False}
+    if len(u) == 0:
+        return out
+    h, w = inside.shape
+    out["cut"] = bool(u.min() == 0 or v.min() == 0 or u.max() == w - 1 or v.max() == h - 1)
+    x, y = float(u.mean()), float(v.mean())
+    du, dv = u - x, v - y
+    a, b, c = float(np.mean(du * du)) + 1 / 12, float(np.mean(du * dv)), float(np.mean(dv * dv)) + 1 / 12
+    half, root = (a + c) / 2, float(np.hypot((a - c) / 2, b))
+    angle = 0.5 * float(np.arctan2(2 * b, a - c)) % np.pi
+    axes = [2 * float(np.sqrt(half + root)), 2 * float(np.sqrt(max(half - root, 0.0)))]
+    return out | {"centre_px": [x + window[0], y + window[1]], "semi_axes_px": axes, "angle_rad": angle}
+
+
+def iris_outline(scene: Scene, image: WindowImage, camera: Camera) -> dict[str, Any]:
+    """The apparent limbus: the circle of the front cornea at limbus radius - half the limbus' width, projected."""
+    surface, look = image.eye.front[0], scene.spec.look
+    rho = float(image.eye.limbus_radius_mm) - 0.5 * look.limbus_width_mm
+    angle = 2 * np.pi * np.arange(_OUTLINE_POINTS) / _OUTLINE_POINTS
+    y, z = rho * np.cos(angle), rho * np.sin(angle)
+    local = np.stack([np.broadcast_to(surface.sag(y, z), y.shape), y, z], axis=-1)
+    points = surface.origin_mm + local @ np.asarray(surface.rotation).T
+    eyepoint = image.M.T @ (camera.nodal_point_mm - image.t)
+    facing = np.sum(surface.normal(points) * (eyepoint - points), axis=-1) > 0
+    pixels, front = camera.project(points @ image.M.T + image.t)
+    nothing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
+    if not front.all():
+        return {"status": "missing", "reason": "behind the camera", **nothing}
+    if not facing.all():
+        return {"status": "missing", "reason": "the cornea hides a part of its rim", **nothing}
+    fit = fit_ellipse_direct(pixels)
+    if not fit.ok:
+        return {"status": "missing", "reason": "no ellipse fits the outline", **nothing}
+    return {
+        "status": "ok",
+        "reason": None,
+        "centre_px": fit.centre_px.tolist(),
+        "semi_axes_px": fit.semi_axes_px.tolist(),
+        "angle_rad": float(fit.angle_rad),
+    }
+
+
+def cornea_centre(eye: Eye) -> Floats:
+    """Centre of curvature of the front cornea at its apex, eye frame, (3,) mm: apex - R axis, R the mean radius."""
+    surface = eye.front[0]
+    apex = float(surface.sag(0.0, 0.0))
+    drop = 2 * apex - float(surface.sag(_SAG_STEP_MM, 0.0)) - float(surface.sag(0.0, _SAG_STEP_MM))
+    return np.asarray(surface.origin_mm + surface.rotation[:, 0] * (apex - _SAG_STEP_MM**2 / drop))
+
+
+def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
+    pupil = observations.pupil
+    ok = bool(pupil.ok[row])
+    return {
+        "status": pupil.status[row],
+        "reason": pupil.reason[row] or None,
+        "centre_px": pupil.centre_px[row].tolist() if ok else None,
+        "semi_axes_px": pupil.semi_axes_px[row].tolist() if ok else None,
+        "angle_rad": float(pupil.angle_rad[row]) if ok else None,
+    }
+
+
+def _glints(observations: Observations, image: WindowImage) -> list[dict[str, Any]]:
+    """Each lamp's glint: where ray optics puts its centre, and what of it the camera gets."""
+    glints, table, row = observations.glints, image.rendered.glints, image.row
+    x0, y0, w, h = image.window
+    out = []
+    for k in range(len(table.energy)):
+        xy, _ = glints.of_light(k)
+        found = bool(np.isfinite(xy[row]).all())
+        at = (glints.light[row] == k) & (glints.status[row] != "")
+        slot = int(at.argmax())
+        inside = found and bool(x0 - 0.5 <= xy[row, 0] <= x0 + w - 0.5 and y0 - 0.5 <= xy[row, 1] <= y0 + h - 0.5)
+        lit = np.isfinite(table.xy_px[k]).all()
+        out.append(
+            {
+                "light": k,
+                "status": glints.status[row, slot],
+                "reason": glints.reason[row, slot] or None,
+                "xy_px": xy[row].tolist() if found else None,
+                "in_window": inside,
+                "visible": bool(table.visible[k]) and inside,
+                "visible_share": float(table.share[k]),
+                "spot_xy_px": table.xy_px[k].tolist() if lit else None,
+            }
+        )
+    return out
+
+
+def _space(scene: Scene, observations: Observations, image: WindowImage, camera: Camera) -> dict[str, Any]:
+    """Points (mm) and lines in the world and in the camera's frame."""
+    eye, M, t, row = image.eye, image.M, image.t, image.row
+    index = observations.index
+    point, way = _line_of_sight(scene, observations, image)
+    points = {
+        "rotation_centre_mm": eye.rotation.azimuth_centre_mm,
+        "globe_centre_mm": eye.sclera.centre_mm,
+        "cornea_centre_mm": cornea_centre(eye),
+        "cornea_apex_mm": np.zeros(3),
+        "pupil_centre_mm": eye.stop.centre_mm,
+        "line_of_sight_point_mm": point,
+    }
+    ways = {"optic_axis": np.array([1.0, 0, 0]), "line_of_sight": way}
+    world = {k: M @ np.asarray(p) + t for k, p in points.items()} | {k: M @ np.asarray(d) for k, d in ways.items()}
+    seen = {k: camera.R @ v + (camera.t if k in points else 0.0) for k, v in world.items()}
+    target = index.target_mm[row]
+    there = bool(np.isfinite(target).all())
+    return {
+        "world": {k: v.tolist() for k, v in world.items()} | {"target_mm": target.tolist() if there else None},
+        "camera": {k: v.tolist() for k, v in seen.items()}
+        | {"target_mm": (camera.R @ target + camera.t).tolist() if there else None},
+    }
+
+
+def _line_of_sight(scene: Scene, observations: Observations, image: WindowImage) -> tuple[Floats, Floats]:
+    """The line of sight of the unturned eye: the fixed chief ray, or the one that the entrance window gives."""
+    index, row = observations.index, image.row
+    if scene.spec.eye.line_of_sight == "entrance_window" and np.isfinite(index.target_mm[row]).all():
+        place = index.eye_position_mm[[row]] + index.head_mm[[row]]
+        eyes = [scene.eye(side) for side in EYES]
+        found = fixations(eyes, index.eye[[row]], index.target_mm[[row]], place, "entrance_window")
+        return np.asarray(found.line_of_sight_mm[0]), np.asarray(found.line_of_sight_direction[0])
+    return np.asarray(image.eye.chief_ray.point_mm), np.asarray(image.eye.chief_ray.direction)

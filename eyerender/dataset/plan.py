@@ -1,0 +1,262 @@
+"""What sample i of a dataset is: a pure function of (spec, i).
+
+Sample i belongs to subject floor(i S / N), N samples and S subjects, so a subject's frames stand together and counts
+differ by one at most. Subjects are put in the order of a hash and cut at the splits' shares.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..eye.catalogue import catalogue_names, load_eye
+from ..eye.spec import EyeSpec
+from ..scene import Scene, SceneSpec
+from .draws import is_draw, unit_number
+from .spec import DatasetSpec, find_dataset
+from .template import Template, Turn
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One sample as drawn: a plain mapping `scene` that `SceneSpec` validates, and the eye file it looks with.
+
+    `eye` is the eye file's mapping; `modified` tells whether it differs from the model's own. `draws`: every draw of
+    the spec by its path, None where it was not asked for.
+    """
+
+    turn: Turn
+    split: str
+    scene: dict[str, Any]
+    eye: dict[str, Any]
+    modified: bool
+    draws: dict[str, Any]
+
+    def build(self) -> Scene:
+        """The scene ready to be observed; raises `InputError` where the drawn values do not go together."""
+        spec = SceneSpec.from_mapping(self.scene, source=f"sample {self.turn.sample}")
+        scene = Scene(spec, _eye(json.dumps(self.eye, sort_keys=True)), spec.rig.build())
+        scene.eye("right")
+        return scene
+
+    def to_mapping(self) -> dict[str, Any]:
+        """As JSON and YAML have it."""
+        turn = self.turn
+        return {
+            "sample": turn.sample,
+            "subject": turn.subject,
+            "split": self.split,
+            "sequence_index": turn.sequence,
+            "attempt": turn.attempt,
+            "subject_attempt": turn.subject_attempt,
+            "draws": self.draws,
+            "scene": self.scene,
+            "eye": self.eye,
+        }
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A dataset spec with the eye files it names."""
+
+    spec: DatasetSpec
+    eyes: Mapping[str, Mapping[str, Any]]
+    source: str = ""
+
+    @classmethod
+    def load(cls, path: str | Path, *, seed: int | None = None, count: int | None = None) -> Plan:
+        """From a file, or the bare name of a shipped dataset; raises `InputError` with one line."""
+        file = find_dataset(path)
+        spec = DatasetSpec.load(file)
+        changes = {key: value for key, value in (("seed", seed), ("count", count)) if value is not None}
+        if changes:
+            spec = DatasetSpec.from_mapping(spec.to_mapping() | changes, source=str(file))
+        return cls.of(spec, base=file.parent, source=str(file))
+
+    @classmethod
+    def of(cls, spec: DatasetSpec, *, base: Path | None = None, source: str = "") -> Plan:
+        """Check the template and read the eye files it names (relative to `base`)."""
+        eyes: dict[str, Mapping[str, Any]] = {}
+        eye_part = spec.scene.get("eye", {})
+        names = _possible(eye_part.get("model", "E2")) if isinstance(eye_part, Mapping) else ["E2"]
+        for name in names:
+            if not isinstance(name, str):
+                raise InputError(f"must be names of eyes, not {name!r}", source=source, path="scene.eye.model")
+            file = str(base / name) if base is not None and name not in catalogue_names() else name
+            try:
+                eyes[name] = load_eye(file).to_mapping()
+            except InputError as error:
+                if error.source == file and not error.path and name not in catalogue_names() and "no such" in str(error):
+                    raise InputError(f"{name!r}: {error.reason}", source=source, path="scene.eye.model") from None
+                raise
+        plan = cls(spec, eyes, source)
+        for name in spec.eye_parameters:
+            if name not in eyes:
+                raise InputError("no sample looks with this eye", source=source, path=f"eye_parameters.{name}")
+            for path in spec.eye_parameters[name]:
+                _set(_copy(eyes[name]), path, 0.0, f"eye_parameters.{name}", source)
+        _ = plan.scene_template, plan.eye_template
+        return plan
+
+    @cached_property
+    def scene_template(self) -> Template:
+        """The template of the scene."""
+        return Template.of(self.spec.scene, self.spec.seed, source=self.source, prefix="scene")
+
+    @cached_property
+    def eye_template(self) -> Template:
+        """The template of the eyes' parameters."""
+        tree = {"eye_parameters": self.spec.eye_parameters}
+        return Template.of(tree, self.spec.seed, source=self.source)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the spec and of the eye files it names."""
+        text = json.dumps({"spec": self.spec.to_mapping(), "eyes": self.eyes}, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def to_mapping(self) -> dict[str, Any]:
+        """What `from_mapping` reads back, without files."""
+        return {"spec": self.spec.to_mapping(), "eyes": {name: dict(eye) for name, eye in self.eyes.items()}}
+
+    @classmethod
+    def from_mapping(cls, data: Mapping[str, Any]) -> Plan:
+        """The plan that another process has."""
+        return cls(DatasetSpec.from_mapping(data["spec"]), data["eyes"])
+
+    @cached_property
+    def _splits(self) -> dict[int, str] | None:
+        """Subject -> split; None where there is only one."""
+        spec = self.spec
+        names = list(spec.splits)
+        if len(names) == 1:
+            return None
+        n = spec.subject_count
+        order = sorted(range(n), key=lambda s: unit_number(spec.seed, "split", "subject", s, 0))
+        total = sum(spec.splits.values())
+        out, start, share = {}, 0, 0.0
+        for name in names:
+            share += spec.splits[name] / total
+            end = n if name == names[-1] else round(n * share)
+            out.update(dict.fromkeys(order[start:end], name))
+            start = end
+        return out
+
+    def split_of(self, subject: int) -> str:
+        """The split that a subject belongs to."""
+        found = self._splits
+        return next(iter(self.spec.splits)) if found is None else found[subject]
+
+    def subject_of(self, sample: int) -> tuple[int, int]:
+        """(subject, place in the subject's sequence) of a sample."""
+        n, s = self.spec.count, self.spec.subject_count
+        subject = sample * s // n
+        return subject, sample - -(-subject * n // s)
+
+    def draw(self, sample: int, attempt: int = 0) -> Sample:
+        """Sample `sample` at an attempt.
+
+        Raises:
+            InputError: no such sample, or its subject's eye cannot be made in any attempt.
+        """
+        spec = self.spec
+        if not 0 <= sample < spec.count:
+            raise InputError(f"there are samples 0 to {spec.count - 1}", source=str(sample))
+        subject, sequence = self.subject_of(sample)
+        subject_attempt = self.identity(subject)[0]
+        turn = Turn(sample, subject, sequence, attempt, subject_attempt)
+        tree, drawn = self.scene_template.values(turn)
+        tree.setdefault("format", 1)
+        tree.setdefault("name", f"{spec.name} {sample}")
+        if "seed" not in tree:
+            tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
+        eye, eye_drawn, modified = self._eye_of(tree, turn)
+        return Sample(turn, self.split_of(subject), tree, eye, modified, drawn | eye_drawn)
+
+    @cached_property
+    def _identities(self) -> dict[int, tuple[int, tuple[str, ...]]]:
+        return {}
+
+    def identity(self, subject: int) -> tuple[int, tuple[str, ...]]:
+        """The first attempt in which a subject's eye can be made, and why the earlier ones failed."""
+        if subject not in self._identities:
+            if len(self._identities) >= 1024:
+                self._identities.clear()
+            self._identities[subject] = self._identify(subject)
+        return self._identities[subject]
+
+    def _identify(self, subject: int) -> tuple[int, tuple[str, ...]]:
+        reasons: list[str] = []
+        for attempt in range(self.spec.attempts):
+            turn = Turn(0, subject, 0, 0, attempt)
+            tree, _ = self.scene_template.values(turn)
+            try:
+                eye, _, modified = self._eye_of(tree, turn)
+                if modified:
+                    _eye(json.dumps(eye, sort_keys=True)).build()
+            except InputError as error:
+                reasons.append(error.reason if not error.path else f"{error.path}: {error.reason}")
+                if not self.eye_template.draws:
+                    break
+                continue
+            return attempt, tuple(reasons)
+        raise InputError(f"its eye cannot be made: {reasons[-1]}", source=self.source, path=f"subject {subject}")
+
+    def _eye_of(self, tree: Mapping[str, Any], turn: Turn) -> tuple[dict[str, Any], dict[str, Any], bool]:
+        values, drawn = self.eye_template.values(turn)
+        eye_part = tree.get("eye")
+        model = eye_part.get("model", "E2") if isinstance(eye_part, Mapping) else "E2"
+        eye = _copy(self.eyes[model])
+        mine = values["eye_parameters"].get(model, {})
+        for path, value in mine.items():
+            _set(eye, path, value, f"eye_parameters.{model}", self.source)
+        if mine:
+            eye["name"] = f"{model} of subject {turn.subject}"
+        # Another eye's parameters were not asked for.
+        asked = {k: v if k.startswith(f"eye_parameters.{model}.") else None for k, v in drawn.items()}
+        return eye, asked, bool(mine)
+
+
+@lru_cache(maxsize=64)
+def _eye(text: str) -> EyeSpec:
+    """An eye file from its JSON; the frames of a subject share it, and with it what was computed for it."""
+    return EyeSpec.from_mapping(json.loads(text))
+
+
+def _possible(node: Any) -> list[Any]:
+    """Every value a node of the template can take."""
+    if not is_draw(node):
+        return [node]
+    kind = node.get("draw")
+    values = [node.get("value")] if kind == "fixed" else node.get("values") or []
+    return [leaf for value in values for leaf in _possible(value)]
+
+
+def _copy(node: Any) -> Any:
+    if isinstance(node, Mapping):
+        return {key: _copy(value) for key, value in node.items()}
+    return [_copy(value) for value in node] if isinstance(node, list | tuple) else node
+
+
+def _set(tree: Any, path: str, value: Any, prefix: str, source: str) -> None:
+    """Put a value at a dotted path that is there already."""
+    keys = path.split(".")
+    node = tree
+    for key in keys[:-1]:
+        node = _child(node, key)
+    last = keys[-1]
+    if _child(node, last) is None:
+        raise InputError("no such number in the eye file", source=source, path=f"{prefix}.{path}")
+    node[int(last) if isinstance(node, list) else last] = value
+
+
+def _child(node: Any, key: str) -> Any:
+    if isinstance(node, list):
+        return node[int(key)] if key.isdigit() and int(key) < len(node) else None
+    return node.get(key) if isinstance(node, dict) else None

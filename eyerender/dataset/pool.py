@@ -1,0 +1,212 @@
+"""The local engine: spawned workers, recycled, watched; a shard whose worker crashes or hangs is tried again."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, Protocol
+
+from ..errors import BackendError, EyerenderError
+from .shard import Staged
+from .worker import Job, work
+
+TRIES = 3
+RECYCLE_IMAGES = 2000
+
+
+class Events(Protocol):
+    """What an engine reports to."""
+
+    def ready(self, backend: dict[str, Any], worker: str) -> None:
+        """A worker can render."""
+
+    def sample(self, shard: int, samples: int, images: int) -> None:
+        """`samples` of a shard are made; the last one gave `images`."""
+
+    def staged(self, staged: Staged, worker: str) -> None:
+        """A shard is written and may be put in place."""
+
+    def retry(self, shard: int, reason: str, tries: int) -> None:
+        """A shard's worker ended; it is tried again."""
+
+
+@dataclass(slots=True)
+class _Worker:
+    process: BaseProcess
+    pipe: Connection
+    name: str
+    heard: float
+    shard: int | None = None
+    images: int = 0
+    is_ready: bool = False
+
+
+class LocalPool:
+    """Runs shards on worker processes of this machine."""
+
+    def __init__(
+        self, job: Job, workers: int, *, timeout_s: float = 600.0, recycle_images: int = RECYCLE_IMAGES
+    ) -> None:
+        self.job = job
+        self.size = workers
+        self.timeout_s = timeout_s
+        self.recycle_images = recycle_images
+        self._context = multiprocessing.get_context("spawn")
+        self._workers: list[_Worker] = []
+
+    def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
+        """Make shards; returns those that were given up, with the reason.
+
+        Raises:
+            BackendError: a worker has nothing to render with.
+            EyerenderError: the disk is full or not writable.
+        """
+        pending, tries, lost = deque(shards), Counter[int](), dict[int, str]()
+        try:
+            while pending or any(w.shard is not None for w in self._workers):
+                while pending and len(self._workers) < min(self.size, self._busy() + len(pending)):
+                    self._start()
+                for worker in self._workers:
+                    if worker.is_ready and worker.shard is None and pending:
+                        self._give(worker, pending.popleft())
+                wait([w.pipe for w in self._workers] + [w.process.sentinel for w in self._workers], timeout=1.0)
+                for worker in list(self._workers):
+                    reason = self._listen(worker, events)
+                    if reason is None:
+                        continue
+                    shard = worker.shard
+                    self._end(worker)
+                    key = -1 if shard is None else shard
+                    tries[key] += 1
+                    if shard is None:
+                        if tries[key] >= TRIES:
+                            raise EyerenderError(f"workers do not start: {reason}")
+                    elif tries[key] >= TRIES:
+                        lost[shard] = reason
+                    else:
+                        pending.appendleft(shard)
+                    events.retry(key, reason, tries[key])
+            return lost
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """End all workers."""
+        for worker in self._workers:
+            with suppress(OSError, ValueError):
+                worker.process.terminate()
+        for worker in list(self._workers):
+            self._end(worker)
+
+    def _busy(self) -> int:
+        return sum(w.shard is not None for w in self._workers)
+
+    def _start(self) -> None:
+        ours, theirs = self._context.Pipe()
+        process = self._context.Process(target=work, args=(theirs, self.job), daemon=True)
+        with _environment(self.job.threads), _signals_held():
+            process.start()
+        theirs.close()
+        self._workers.append(_Worker(process, ours, f"{process.pid}", time.monotonic()))
+
+    def _give(self, worker: _Worker, shard: int) -> None:
+        worker.shard, worker.heard = shard, time.monotonic()
+        with suppress(OSError):  # a worker that has just died is noticed when it is listened to
+            worker.pipe.send(shard)
+
+    def _listen(self, worker: _Worker, events: Events) -> str | None:
+        """Take in a worker's messages; the reason why it must be ended, if so."""
+        try:
+            while worker.pipe.poll():
+                message = worker.pipe.recv()
+                worker.heard = time.monotonic()
+                reason = self._take(worker, message, events)
+                if reason is not None:
+                    return reason
+        except (EOFError, OSError):
+            worker.process.join(5)
+        if not worker.process.is_alive():
+            return _end_of(worker.process.exitcode)
+        if time.monotonic() - worker.heard > self.timeout_s and (worker.shard is not None or not worker.is_ready):
+            return f"no sign of life for {self.timeout_s:g} s"
+        return None
+
+    def _take(self, worker: _Worker, message: tuple[Any, ...], events: Events) -> str | None:
+        kind = message[0]
+        if kind == "ready":
+            worker.is_ready = True
+            events.ready(message[1], worker.name)
+        elif kind == "sample":
+            worker.images += message[3]
+            events.sample(*message[1:])
+        elif kind == "done":
+            events.staged(Staged(**message[1]), worker.name)
+            worker.shard = None
+            if worker.images >= self.recycle_images:
+                self._end(worker)
+        elif kind == "failed" and message[1] == "backend":
+            raise BackendError(message[2])
+        elif kind == "failed" and message[1] == "disk":
+            raise EyerenderError(f"{self.job.folder}: cannot be written ({message[2]})")
+        else:
+            return str(message[2])
+        return None
+
+    def _end(self, worker: _Worker) -> None:
+        if worker in self._workers:
+            self._workers.remove(worker)
+        worker.pipe.close()
+        if worker.process.is_alive():
+            worker.process.terminate()
+            worker.process.join(2)
+        if worker.process.is_alive():
+            worker.process.kill()
+            worker.process.join(10)
+
+
+def _end_of(code: int | None) -> str:
+    if code is not None and code < 0:
+        try:
+            return f"the worker was ended by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"the worker was ended by signal {-code}"
+    return f"the worker ended with exit code {code}"
+
+
+@contextmanager
+def _environment(threads: int) -> Iterator[None]:
+    """Numerical libraries of a worker take as many threads as it has; they read these when they are imported."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, str(threads)))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """A child inherits the mask: Ctrl-C must not hit it while it still imports."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+

@@ -1,0 +1,182 @@
+"""A scene template: a scene in which any value may be a draw, and how its draws become values."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from ..arrays import Floats
+from ..errors import InputError
+from .draws import (
+    ChoiceDraw,
+    Draw,
+    FixedDraw,
+    GridDraw,
+    SequenceDraw,
+    SobolDraw,
+    Unit,
+    is_draw,
+    parse_draw,
+    random_value,
+    unit_number,
+)
+
+# What makes an identity: drawn once a subject unless the draw says otherwise.
+IDENTITY = ("eye.model", "look", "subject.ipd_mm", "subject.eyes", "eye_parameters")
+# An eye does not change from frame to frame, whatever the draw says.
+FIXED_IDENTITY = ("eye.model", "eye_parameters")
+_BLOCK = 256
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedDraw:
+    """A draw, where it stands and what it is drawn for."""
+
+    draw: Draw
+    unit: Unit
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """Which sample is drawn: its index, its subject and place in the subject's sequence, and both attempts."""
+
+    sample: int
+    subject: int
+    sequence: int
+    attempt: int
+    subject_attempt: int
+
+
+@dataclass(frozen=True, slots=True)
+class Template:
+    """A tree of plain values and draws; `draws` by their dotted path (a choice's k-th value is `path#k`)."""
+
+    tree: Mapping[str, Any]
+    draws: Mapping[str, PlacedDraw]
+    seed: int
+
+    @classmethod
+    def of(cls, tree: Mapping[str, Any], seed: int, *, source: str = "", prefix: str = "") -> Template:
+        """Find and check every draw; raises `InputError` with its path (after `prefix`)."""
+        draws: dict[str, PlacedDraw] = {}
+        _collect(tree, "", draws, source, prefix)
+        # In the order of their names, so that the order of keys in a file means nothing.
+        return cls(tree, dict(sorted(draws.items())), seed)
+
+    def values(self, turn: Turn) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The tree of plain values of one sample, and every draw's value (None where it was not asked for)."""
+        drawn: dict[str, Any] = dict.fromkeys(self.draws)
+        tree = self._resolve(self.tree, "", turn, drawn)
+        return tree, drawn
+
+    def _resolve(self, node: Any, path: str, turn: Turn, drawn: dict[str, Any]) -> Any:
+        if path in self.draws and is_draw(node):
+            placed = self.draws[path]
+            value, k = self._value(placed, path, turn)
+            drawn[path] = _label(placed.draw, value, k)
+            return self._resolve(value, f"{path}#{k}", turn, drawn)
+        if isinstance(node, Mapping):
+            return {key: self._resolve(v, _join(path, key), turn, drawn) for key, v in node.items()}
+        if isinstance(node, list | tuple):
+            return [self._resolve(v, _join(path, k), turn, drawn) for k, v in enumerate(node)]
+        return node
+
+    def _value(self, placed: PlacedDraw, path: str, turn: Turn) -> tuple[Any, int]:
+        """The value of a draw, and which of its values it is (0 where it has none to choose from)."""
+        draw, unit = placed.draw, placed.unit
+        number = turn.sample if unit == "sample" else turn.subject
+        attempt = turn.attempt if unit == "sample" else turn.subject_attempt
+        if isinstance(draw, FixedDraw):
+            return draw.value, 0
+        if isinstance(draw, SequenceDraw):
+            k = turn.sequence % len(draw.values)
+            return draw.values[k], k
+        if isinstance(draw, GridDraw):
+            k = self._grid_index(path, unit, number)
+            return draw.points[k], k
+        if isinstance(draw, SobolDraw) and attempt == 0:
+            dimensions = [p for p, d in self.draws.items() if isinstance(d.draw, SobolDraw) and d.unit == unit]
+            points = sobol_block(self.seed, unit, len(dimensions), number // _BLOCK)
+            return random_value(draw, float(points[number % _BLOCK, dimensions.index(path)])), 0
+        value = random_value(draw, unit_number(self.seed, path, unit, number, attempt))
+        if isinstance(draw, ChoiceDraw):
+            return draw.values[value], value
+        return value, 0
+
+    def _grid_index(self, path: str, unit: Unit, number: int) -> int:
+        """The place in one grid of the full product, of which the last grid (by name) turns fastest."""
+        grids = [(p, d.draw) for p, d in self.draws.items() if isinstance(d.draw, GridDraw) and d.unit == unit]
+        for name, grid in reversed(grids):
+            size = len(grid.points)
+            if name == path:
+                return number % size
+            number //= size
+        raise KeyError(path)
+
+
+def _label(draw: Draw, value: Any, k: int) -> Any:
+    """How a drawn value is recorded, of one type for every sample: the value, or which it is of unlike ones."""
+    if isinstance(draw, FixedDraw):
+        every: tuple[Any, ...] = (draw.value,)
+    elif isinstance(draw, ChoiceDraw | SequenceDraw):
+        every = draw.values
+    elif isinstance(draw, GridDraw):
+        every = draw.points
+    else:
+        return value
+    if all(isinstance(v, str) for v in every) or all(isinstance(v, bool) for v in every):
+        return value
+    if all(isinstance(v, int | float) and not isinstance(v, bool) for v in every):
+        return value if all(isinstance(v, int) for v in every) else float(value)
+    return k
+
+
+@lru_cache(maxsize=16)
+def sobol_block(seed: int, unit: str, dimensions: int, block: int) -> Floats:
+    """Points block * 256 .. + 255 of a scrambled Sobol sequence in (0, 1), (256, dimensions)."""
+    generator = np.random.default_rng([seed, 1 if unit == "subject" else 0])
+    engine = qmc.Sobol(dimensions, scramble=True, rng=generator)
+    if block:
+        engine.fast_forward(block * _BLOCK)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about counts that are no powers of two: a sequence may stop anywhere
+        return np.asarray(engine.random(_BLOCK))
+
+
+def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, prefix: str) -> None:
+    if is_draw(node):
+        shown = _join(prefix, path)
+        draw = parse_draw(node, source=source, path=shown)
+        bare = path.replace("#", ".")
+        identity = any(bare == p or bare.startswith(p + ".") for p in IDENTITY)
+        unit: Unit = draw.per or ("subject" if identity else "sample")
+        if unit == "sample" and any(bare == p or bare.startswith(p + ".") for p in FIXED_IDENTITY):
+            raise InputError("a subject's eye is drawn once a subject", source=source, path=f"{shown}.per")
+        if isinstance(draw, SequenceDraw) and unit == "subject":
+            raise InputError("a sequence runs over the frames of a subject", source=source, path=shown)
+        draws[path] = PlacedDraw(draw, unit)
+        inner: tuple[Any, ...] = ()
+        if isinstance(draw, FixedDraw):
+            inner = (draw.value,)
+        elif isinstance(draw, ChoiceDraw | SequenceDraw):
+            inner = draw.values
+        elif isinstance(draw, GridDraw) and draw.values is not None:
+            inner = draw.values
+        for k, value in enumerate(inner):
+            _collect(value, f"{path}#{k}", draws, source, prefix)
+    elif isinstance(node, Mapping):
+        for key, value in node.items():
+            _collect(value, _join(path, key), draws, source, prefix)
+    elif isinstance(node, list | tuple):
+        for k, value in enumerate(node):
+            _collect(value, _join(path, k), draws, source, prefix)
+
+
+def _join(path: str, key: object) -> str:
+    return f"{path}.{key}" if path else str(key)

@@ -1,0 +1,71 @@
+"""A worker process: makes the shards it is told to, and says after each sample that it is alive."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from dataclasses import asdict, dataclass
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+from ..errors import BackendError, EyerenderError
+from .maker import Maker
+from .plan import Plan
+from .shard import write_shard
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What every worker of a run is told: the plan, frames a sample, the folder, where and with how many threads."""
+
+    plan: dict[str, Any]
+    frames: int
+    folder: str
+    backend: str
+    threads: int
+
+    def maker(self) -> Maker:
+        """The worker's maker."""
+        plan = Plan.from_mapping(self.plan)
+        return Maker(plan, self.frames, backend=self.backend, threads=self.threads)  # type: ignore[arg-type]
+
+
+def work(pipe: Connection, job: Job) -> None:
+    """The worker's life. Messages out: ("ready", backend), ("sample", shard, samples, images), ("done", summary),
+    ("failed", kind, reason) with kind backend, disk or error. In: a shard's number, or None to end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    try:
+        maker = job.maker()
+    except BackendError as error:
+        pipe.send(("failed", "backend", str(error)))
+        return
+    pipe.send(("ready", maker.backend))
+    folder = Path(job.folder)
+    while True:
+        try:
+            shard = pipe.recv()
+        except EOFError:
+            return
+        if shard is None:
+            return
+
+        def alive(samples: int, images: int, shard: int = shard) -> None:
+            pipe.send(("sample", shard, samples, images))
+
+        try:
+            pipe.send(("done", asdict(write_shard(maker, folder, shard, alive))))
+        except (OSError, EyerenderError) as error:
+            pipe.send(("failed", "disk", getattr(error, "strerror", None) or str(error)))
+        except Exception as error:
+            pipe.send(("failed", "error", f"{type(error).__name__}: {error}"))
+
+
+def _die_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)

@@ -1,0 +1,164 @@
+"""A job as files that the stock `mitsuba` command renders: PLY meshes and a Mitsuba XML, so that anyone can check it.
+
+    mitsuba -m scalar_rgb scene.xml        (or llvm_ad_rgb, cuda_ad_rgb)
+
+Lengths are mm, radiance is mW/mm^2/sr. What stock Mitsuba lacks is left out and said in the file: textures, the limbus'
+soft rim, lens distortion, the point-spread function, and lamps that are neither Lambertian discs nor isotropic points.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import InputError
+from .frame import RenderJob
+from .meshes import Patch, eye_meshes
+
+_BACKDROP_HALF_MM = 500.0
+
+
+def export_scene(
+    job: RenderJob, folder: str | Path, *, spp: int = 64, max_depth: int = 12, rings: int = 48, sectors: int = 128
+) -> Path:
+    """Write `scene.xml` and `meshes/*.ply` for one job.
+
+    Args:
+        job: what to show; its window becomes the film's crop.
+        folder: an existing folder.
+        spp, max_depth: of the path integrator that the file asks for.
+        rings, sectors: of the meshes.
+
+    Returns:
+        The path of the XML file.
+
+    Raises:
+        InputError: the camera's pixels are not square, which Mitsuba's perspective sensor does not know.
+    """
+    K = job.camera.K
+    if abs(K[0, 0] - K[1, 1]) > 1e-6 * K[0, 0]:
+        raise InputError("the camera's pixels are not square; Mitsuba's perspective sensor cannot show it")
+    folder = Path(folder)
+    (folder / "meshes").mkdir(parents=True, exist_ok=True)
+    root = ET.Element("scene", version="3.0.0")
+    for note in _notes(job):
+        root.append(ET.Comment(f" {note} "))
+    integrator = ET.SubElement(root, "integrator", type="path")
+    _value(integrator, "integer", "max_depth", max_depth)
+    _sensor(root, job, spp)
+    look = job.look
+    albedo = {
+        "iris": look.iris_albedo,
+        "sclera": look.sclera_albedo,
+        "retina": look.pupil_albedo,
+        "cornea_rim": look.limbus_albedo,
+        "chamber_wall": look.limbus_albedo,
+    }
+    motion = np.vstack([np.column_stack([job.M, job.t]), [0, 0, 0, 1]])
+    for patch in eye_meshes(job.eye, rings, sectors).patches.values():
+        _patch(root, folder, patch, motion, albedo.get(patch.name, 0.0))
+    place = np.eye(4)
+    place[:3, 3] = job.anchor_mm
+    _patch(root, folder, _backdrop(look.backdrop_distance_mm), place, look.backdrop_albedo)
+    for k, lamp in enumerate(job.lights):
+        _lamp(root, k, lamp.position_mm, lamp.axis, float(lamp.radius_mm), float(lamp.intensity_mw_sr))
+    ET.indent(root)
+    path = folder / "scene.xml"
+    ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+    return path
+
+
+def _notes(job: RenderJob) -> list[str]:
+    notes = ["Written by eyerender. Lengths in mm, radiance in mW/mm^2/sr, reflectances at the job's wavelength."]
+    if np.any(job.camera.distortion):
+        notes.append("The camera's lens distortion is left out.")
+    if any(lamp.radius_mm > 0 and lamp.lobe_exponent != 1 for lamp in job.lights):
+        notes.append("Lamps with a lobe other than cos^1 are shown as Lambertian discs.")
+    if any(lamp.radius_mm == 0 for lamp in job.lights):
+        notes.append("Point lamps: a path tracer cannot light what lies behind the cornea with them.")
+    notes.append("Textures, the limbus' soft rim and the point-spread function are left out.")
+    return notes
+
+
+def _sensor(root: ET.Element, job: RenderJob, spp: int) -> None:
+    camera, (width, height) = job.camera, job.camera.resolution_px
+    sensor = ET.SubElement(root, "sensor", type="perspective")
+    _value(sensor, "string", "fov_axis", "x")
+    _value(sensor, "float", "fov", float(np.degrees(2 * np.arctan(width / 2 / camera.K[0, 0]))))
+    # Mitsuba's pixels are [i, i + 1): a centre at integer i lies at i + 1/2.
+    _value(sensor, "float", "principal_point_offset_x", float((camera.K[0, 2] + 0.5) / width - 0.5))
+    _value(sensor, "float", "principal_point_offset_y", float((camera.K[1, 2] + 0.5) / height - 0.5))
+    _value(sensor, "float", "near_clip", 1e-3)
+    _value(sensor, "float", "far_clip", 1e5)
+    # Mitsuba's camera looks along +z with +x to the left and +y up.
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([-camera.R[0], -camera.R[1], camera.R[2]], axis=1)
+    pose[:3, 3] = camera.nodal_point_mm
+    _transform(sensor, pose)
+    film = ET.SubElement(sensor, "film", type="hdrfilm")
+    x0, y0, w, h = job.window
+    for name, value in (("width", width), ("height", height), ("crop_offset_x", x0), ("crop_offset_y", y0),
+                        ("crop_width", w), ("crop_height", h)):  # fmt: skip
+        _value(film, "integer", name, value)
+    _value(film, "string", "pixel_format", "luminance")
+    ET.SubElement(film, "rfilter", type="box")
+    sampler = ET.SubElement(sensor, "sampler", type="independent")
+    _value(sampler, "integer", "sample_count", spp)
+
+
+def _patch(root: ET.Element, folder: Path, patch: Patch, motion: Floats, albedo: float) -> None:
+    file = f"meshes/{patch.name}.ply"
+    (folder / file).write_bytes(patch.mesh.export(file_type="ply", vertex_normal=True))
+    shape = ET.SubElement(root, "shape", type="ply", id=patch.name)
+    _value(shape, "string", "filename", file)
+    _transform(shape, motion)
+    if patch.interior is not None and patch.exterior is not None:
+        material = ET.SubElement(shape, "bsdf", type="dielectric")
+        _value(material, "float", "int_ior", patch.interior)
+        _value(material, "float", "ext_ior", patch.exterior)
+        return
+    both = ET.SubElement(shape, "bsdf", type="twosided")
+    material = ET.SubElement(both, "bsdf", type="diffuse")
+    _value(material, "rgb", "reflectance", albedo)
+
+
+def _lamp(root: ET.Element, k: int, position: Floats, axis: Floats, radius: float, intensity: float) -> None:
+    if radius == 0:
+        emitter = ET.SubElement(root, "emitter", type="point", id=f"lamp{k}")
+        x, y, z = (_text(v) for v in position)
+        ET.SubElement(emitter, "point", name="position", x=x, y=y, z=z)
+        _value(emitter, "rgb", "intensity", intensity)
+        return
+    shape = ET.SubElement(root, "shape", type="disk", id=f"lamp{k}")
+    helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.6 else np.array([0, 1.0, 0])
+    u = np.cross(helper, axis)
+    u /= np.linalg.norm(u)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([radius * u, radius * np.cross(axis, u), axis], axis=1)
+    pose[:3, 3] = position
+    _transform(shape, pose)
+    emitter = ET.SubElement(shape, "emitter", type="area")
+    _value(emitter, "rgb", "radiance", intensity / (np.pi * radius**2))
+
+
+def _backdrop(distance_mm: float) -> Patch:
+    h = _BACKDROP_HALF_MM
+    corners = np.array([[-distance_mm, y, z] for y, z in ((-h, -h), (h, -h), (h, h), (-h, h))])
+    normals = np.tile([1.0, 0.0, 0.0], (4, 1))
+    return Patch("backdrop", corners, normals, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def _value(parent: ET.Element, kind: str, name: str, value: float | int | str) -> None:
+    ET.SubElement(parent, kind, name=name, value=value if isinstance(value, str) else _text(value))
+
+
+def _transform(parent: ET.Element, matrix: Floats) -> None:
+    transform = ET.SubElement(parent, "transform", name="to_world")
+    ET.SubElement(transform, "matrix", value=" ".join(_text(v) for v in np.asarray(matrix).ravel()))
+
+
+def _text(value: float | int) -> str:
+    return str(value) if isinstance(value, int) else f"{float(value):.12g}"

@@ -1,0 +1,278 @@
+"""Eyes as triangle meshes: every surface a patch, and the closed bodies that the patches make up.
+
+Vertices lie exactly on the surfaces of the model, normals are analytic, faces turn their outside outwards (towards the
+air). A patch between two transparent media carries both indices; an opaque one carries none. Bodies share the vertices
+of their patches, so they close without gaps:
+
+    cornea     front, rim, back                        (models with a posterior cornea)
+    aqueous    cornea's back, chamber wall, hyaloid, lens
+    lens       front, equator, back                    (a gradient lens: one body a shell, each inside the last)
+    vitreous   hyaloid, lens' back, retinal wall
+    interior   cornea's front, chamber wall, retinal wall      (models of one medium)
+    globe      cornea's front, sclera
+
+What the models leave open is closed thus: the posterior cornea ends where it meets the plane of the iris or at the
+limbus; a lens without a rim of its own ends at 4.5 mm or where its surfaces meet; the retinal wall is a sphere 1 mm
+inside the sclera. The renderer itself meets the surfaces in closed form; these meshes serve other integrators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from ..arrays import Floats, Ints
+from ..eye.model import Eye
+from ..geometry.surfaces import Surface
+
+_LENS_RADIUS_MM = 4.5
+_WALL_MM = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A piece of surface: vertices (n, 3) mm, unit normals (n, 3), faces (m, 3).
+
+    `exterior`, `interior` are the indices of refraction on the side of the normal and behind; None where opaque.
+    """
+
+    name: str
+    vertices: Floats
+    normals: Floats
+    faces: Ints
+    exterior: float | None = None
+    interior: float | None = None
+
+    @property
+    def mesh(self) -> Any:
+        """As a trimesh."""
+        return trimesh.Trimesh(self.vertices, self.faces, vertex_normals=self.normals, process=False)
+
+
+@dataclass(frozen=True, slots=True)
+class EyeMeshes:
+    """The patches of an eye by name, and its closed bodies as trimeshes, each facing outwards."""
+
+    patches: dict[str, Patch]
+    bodies: dict[str, Any] = field(default_factory=dict)
+
+
+def eye_meshes(eye: Eye, rings: int = 48, sectors: int = 128) -> EyeMeshes:
+    """All meshes of an eye, in the eye frame (mm)."""
+    angle = 2 * np.pi * np.arange(sectors) / sectors
+    limbus = np.full(sectors, float(eye.limbus_radius_mm))
+    indices = [1.0, *(float(n) for n in eye.front_indices)]
+    front = _cap("cornea_front", eye.front[0], limbus, rings, indices[0], indices[1])
+    patches = {"cornea_front": front}
+    bodies: dict[str, Any] = {}
+    rim = _rim(front, sectors)
+
+    inner_rim = rim
+    if len(eye.front) > 1:
+        rho = _chamber_rim(eye, eye.front[-1], angle)
+        back = _cap("cornea_back", eye.front[-1], rho, rings, indices[1], indices[2])
+        inner_rim = _rim(back, sectors)
+        patches |= {"cornea_back": back, "cornea_rim": _band("cornea_rim", rim, inner_rim)}
+        bodies["cornea"] = _closed((front, 1), (patches["cornea_rim"], 1), (back, -1))
+    aqueous = indices[-1]
+
+    lenses = _lenses(eye, aqueous, rings, sectors, angle)
+    behind = float(eye.back_indices[-1]) if lenses else aqueous
+    equator = _rim(lenses[0][2], sectors) if lenses else None
+    depth = float(np.mean(equator[:, 0])) if equator is not None else float(eye.stop.centre_mm[0]) - 1.0
+    wall, wall_ring = _retinal_wall(eye, depth, rings, sectors, angle)
+    chamber = _band("chamber_wall", inner_rim, wall_ring)
+    patches |= {"chamber_wall": chamber, "retina": wall}
+    if equator is None:
+        bodies["interior"] = _closed((front, 1), (chamber, 1), (wall, 1))
+    else:
+        lens_front, lens_side, lens_back = lenses[0]
+        hyaloid = _band("hyaloid", equator, wall_ring, aqueous, behind)
+        patches["hyaloid"] = hyaloid
+        innermost = patches.get("cornea_back", front)
+        bodies["aqueous"] = _closed(
+            (innermost, 1), (chamber, 1), (hyaloid, -1), (lens_front, -1), (lens_side, -1)
+        )  # fmt: skip
+        bodies["vitreous"] = _closed((hyaloid, 1), (lens_back, -1), (wall, 1))
+        for k, (a, side, b) in enumerate(lenses):
+            name = "lens" if k == 0 else f"lens_shell_{k}"
+            patches |= {p.name: p for p in (a, side, b)}
+            bodies[name] = _closed((a, 1), (side, 1), (b, 1))
+    sclera = _sclera(eye, rim, rings)
+    patches |= {"sclera": sclera, "iris": _iris(eye, sectors)}
+    bodies["globe"] = _closed((front, 1), (sclera, 1))
+    return EyeMeshes(patches, bodies)
+
+
+def _cap(name: str, surface: Surface, rho: Floats, rings: int, exterior: float, interior: float,
+         inward: bool = False) -> Patch:  # fmt: skip
+    """The part of a surface within radius rho (sectors,) of its axis; faces towards +x, or -x if `inward`."""
+    sectors = len(rho)
+    angle = 2 * np.pi * np.arange(sectors) / sectors
+    share = np.arange(1, rings + 1) / rings
+    y = np.concatenate([[0.0], (share[:, None] * rho * np.cos(angle)).ravel()])
+    z = np.concatenate([[0.0], (share[:, None] * rho * np.sin(angle)).ravel()])
+    local = np.stack([np.asarray(surface.sag(y, z)), y, z], axis=1)
+    vertices = local @ surface.rotation.T + surface.origin_mm
+    normals = surface.normal(vertices)
+    faces = _fan(sectors) if rings == 1 else np.concatenate([_fan(sectors), _strips(1, rings, sectors)])
+    if inward:
+        normals, faces = -normals, faces[:, ::-1]
+    return Patch(name, vertices, normals, faces, exterior, interior)
+
+
+def _fan(sectors: int) -> Ints:
+    j = np.arange(sectors)
+    return np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % sectors], axis=1)
+
+
+def _strips(first: int, rings: int, sectors: int) -> Ints:
+    """Quads between consecutive rings of `sectors` vertices, the innermost starting at vertex `first`."""
+    i, j = np.meshgrid(np.arange(rings - 1), np.arange(sectors), indexing="ij")
+    a, k = first + i * sectors, (j + 1) % sectors
+    upper = np.stack([a + j, a + sectors + j, a + sectors + k], axis=-1)
+    lower = np.stack([a + j, a + sectors + k, a + k], axis=-1)
+    return np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3)])
+
+
+def _rim(patch: Patch, sectors: int) -> Floats:
+    """The last ring of a patch."""
+    return patch.vertices[-sectors:]
+
+
+def _band(
+    name: str, inner: Floats, outer: Floats, exterior: float | None = None, interior: float | None = None
+) -> Patch:
+    """The strip between two rings, oriented as a cap that goes on from `inner` to `outer`."""
+    sectors = len(inner)
+    vertices = np.concatenate([inner, outer])
+    faces = _strips(0, 2, sectors)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    return Patch(name, vertices, np.asarray(mesh.vertex_normals), faces, exterior, interior)
+
+
+def _chamber_rim(eye: Eye, surface: Surface, angle: Floats) -> Floats:
+    """Radius (sectors,) at which the posterior cornea meets the plane of the iris, at most the limbus'."""
+    low, high = np.zeros_like(angle), np.full_like(angle, float(eye.limbus_radius_mm) * 0.995)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        y, z = middle * np.cos(angle), middle * np.sin(angle)
+        x = np.stack([np.asarray(surface.sag(y, z)), y, z], axis=1) @ surface.rotation.T + surface.origin_mm
+        above = (x - eye.stop.centre_mm) @ eye.stop.normal > 0
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return low
+
+
+def _lenses(eye: Eye, outside: float, rings: int, sectors: int, angle: Floats) -> list[tuple[Patch, Patch, Patch]]:
+    """(front, equator, back) of the lens and of every shell inside it; all facing out of the lens."""
+    found = []
+    count = len(eye.back) // 2
+    before = [outside, *(float(n) for n in eye.back_indices)]
+    for k in range(count):
+        a, b = eye.back[k], eye.back[-1 - k]
+        rim = min(float(eye.back_rims_mm[k]), float(eye.back_rims_mm[-1 - k]), _LENS_RADIUS_MM)
+        rim = _meeting(a, b, rim, angle)
+        rho = np.full(sectors, rim)
+        tag = "lens" if k == 0 else f"lens_shell_{k}"
+        front = _cap(f"{tag}_front", a, rho, rings, before[k], before[k + 1])
+        # The back's surface normal points to +x, into the lens.
+        back = _cap(f"{tag}_back", b, rho, rings, before[len(eye.back) - k], before[len(eye.back) - 1 - k], inward=True)
+        side = _band(f"{tag}_equator", _rim(front, sectors), _rim(back, sectors), before[k], before[k + 1])
+        found.append((front, side, back))
+    return found
+
+
+def _meeting(front: Surface, back: Surface, rim: float, angle: Floats) -> float:
+    """The largest radius, at most `rim`, at which the front still lies before the back by a hundredth of a mm."""
+    low, high = 0.0, rim
+    for _ in range(50):
+        middle = 0.5 * (low + high) if high != rim or low > 0 else rim
+        y, z = middle * np.cos(angle), middle * np.sin(angle)
+        x = [
+            (np.stack([np.asarray(s.sag(y, z)), y, z], axis=1) @ s.rotation.T + s.origin_mm)[:, 0]
+            for s in (front, back)
+        ]
+        if np.all(x[0] - x[1] > 0.01):
+            if middle == rim:
+                return rim
+            low = middle
+        else:
+            high = middle * (1 - 1e-12) if middle == rim else middle
+    return low
+
+
+def _retinal_wall(eye: Eye, depth: float, rings: int, sectors: int, angle: Floats) -> tuple[Patch, Floats]:
+    """The sphere 1 mm inside the sclera from the plane x = depth to its back pole, and its first ring."""
+    centre, radius = np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm) - _WALL_MM
+    start = np.arccos(np.clip((depth - centre[0]) / radius, -1, 1))
+    polar = start + (np.pi - start) * np.arange(rings) / rings
+    patch = _polar("retina", centre, radius, polar[:, None] * np.ones(sectors), angle)
+    return patch, patch.vertices[:sectors]
+
+
+def _sclera(eye: Eye, rim: Floats, rings: int) -> Patch:
+    """The sclera's sphere from the cornea's rim to its back pole; its first ring is that rim."""
+    centre, radius = np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm)
+    r = rim - centre
+    start = np.arctan2(np.hypot(r[:, 1], r[:, 2]), r[:, 0])
+    polar = start + (np.pi - start) * (np.arange(rings) / rings)[:, None]
+    patch = _polar("sclera", centre, radius, polar, np.arctan2(r[:, 2], r[:, 1]))
+    vertices = patch.vertices.copy()
+    vertices[: len(rim)] = rim
+    return Patch("sclera", vertices, patch.normals, patch.faces)
+
+
+def _polar(name: str, centre: Floats, radius: float, polar: Floats, angle: Floats) -> Patch:
+    """A sphere's part by rings of polar angle (rings, sectors) from +x, closed at its back pole."""
+    rings, sectors = polar.shape
+    n = np.stack(
+        [np.cos(polar), np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle)], axis=-1
+    ).reshape(-1, 3)  # fmt: skip
+    normals = np.concatenate([n, [[-1.0, 0.0, 0.0]]])
+    last, j = (rings - 1) * sectors, np.arange(sectors)
+    pole = np.stack([last + j, np.full(sectors, rings * sectors), last + (j + 1) % sectors], axis=1)
+    faces = np.concatenate([_strips(0, rings, sectors), pole])
+    return Patch(name, centre + radius * normals, normals, faces)
+
+
+def _iris(eye: Eye, sectors: int) -> Patch:
+    """The annulus in the stop's plane from the pupil's margin to the root, facing the cornea."""
+    inner = eye.stop.boundary(sectors)
+    if float(eye.stop.handed) < 0:
+        inner = np.roll(inner[::-1], 1, axis=0)
+    angle = np.arctan2(inner[:, 2], inner[:, 1])
+    y, z = float(eye.iris_root_radius_mm) * np.cos(angle), float(eye.iris_root_radius_mm) * np.sin(angle)
+    n, c = eye.stop.normal, eye.stop.centre_mm
+    outer = np.stack([c[0] - (n[1] * (y - c[1]) + n[2] * (z - c[2])) / n[0], y, z], axis=1)
+    patch = _band("iris", inner, outer)
+    return Patch("iris", patch.vertices, np.broadcast_to(n, patch.vertices.shape).copy(), patch.faces)
+
+
+def _closed(*parts: tuple[Patch, int]) -> Any:
+    """One body of several patches (sign -1: turned around), their common rims merged."""
+    vertices, faces, count = [], [], 0
+    for patch, sign in parts:
+        vertices.append(patch.vertices)
+        faces.append((patch.faces if sign > 0 else patch.faces[:, ::-1]) + count)
+        count += len(patch.vertices)
+    mesh = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=9)
+    return mesh
+
+
+def crossing(eye: Eye, meshes: EyeMeshes, tolerance_mm: float = 1e-6) -> Sequence[str]:
+    """Names of refracting patches that poke through the next surface outside them; empty for a sound eye."""
+    order: list[tuple[str, Surface]] = [("cornea_front", eye.front[0])]
+    if len(eye.front) > 1:
+        order.append(("cornea_back", eye.front[-1]))
+    order += [("lens_front" if k == 0 else f"lens_shell_{k}_front", eye.back[k]) for k in range(len(eye.back) // 2)]
+    bad = []
+    for (_, outer), (name, _) in pairwise(order):
+        if np.any(outer.implicit(meshes.patches[name].vertices) > tolerance_mm):
+            bad.append(name)
+    return bad

@@ -1,0 +1,155 @@
+"""Blignaut (2014), replicated: the scene, the regression and the error of each protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..gaze.estimate import angular_error_deg, binocular_average
+from ..gaze.regression import FUNCTIONS, PupilGlintRegression
+from ..observation import Observations
+from ..rig.rig import Rig
+from ..scene import Scene, SceneSpec, load_scene
+from .literature import CALIBRATION_SETS
+from .results import Departure, Row, mean_row
+
+SCENE = "blignaut2014"
+
+DEPARTURES = (
+    Departure(
+        "focal",
+        "focal length in pixels",
+        "10 mm, 4.48 mm sensor",
+        "3751.43 px at 1600 px (two digits of 3571.43 swapped)",
+        "3571.43 px",
+    ),
+    Departure("screen", "height of the screen", "-131.5 mm", "-140 mm", "-131.5 mm"),
+    Departure(
+        "terms",
+        "terms of the vertical function",
+        "Table 2",
+        "the loop takes the index of the horizontal function for the vertical one too",
+        "Table 2",
+    ),
+    Departure(
+        "minimum_norm",
+        "fewer targets than terms",
+        "not said",
+        "the minimum-norm solution",
+        "refused; no row",
+    ),
+    Departure(
+        "error",
+        "measure of the error",
+        "average angular error",
+        "angle at the origin between (x, y, 800) of estimate and target, x and y from the screen's centre",
+        "the angle at the mid-point of the eyes",
+    ),
+)
+PUBLISHED = frozenset(d.id for d in DEPARTURES)
+CORRECTED: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Errors (deg) of every function and calibration set: `error_deg` (f,) by frame, or the reason why there is none."""
+
+    function: str
+    calibration: str
+    error_deg: Floats
+    reason: str | None
+
+    @property
+    def mean_deg(self) -> float | None:
+        """Mean over the targets with an estimate."""
+        good = self.error_deg[np.isfinite(self.error_deg)]
+        return float(good.mean()) if len(good) else None
+
+
+def scene(eye: str, departures: Collection[str]) -> Scene:
+    """The scene of one eye model."""
+    loaded = load_scene(SCENE, eye=eye)
+    data = loaded.spec.to_mapping()
+    if "focal" in departures:
+        camera = data["rig"]["cameras"][0]
+        del camera["focal_length_mm"], camera["sensor_mm"]
+        camera["focal_length_px"] = 3751.43
+    if "screen" in departures:
+        data["rig"]["screen"]["centre_mm"][2] = -140.0
+    return Scene.of(SceneSpec.from_mapping(data, source=SCENE))
+
+
+def scene_key(departures: Collection[str]) -> frozenset[str]:
+    """The departures that change what is observed."""
+    return frozenset(departures) & {"focal", "screen"}
+
+
+def terms(function: str, departures: Collection[str]) -> tuple[str, str]:
+    """The terms of x and of y of a function of Table 2.
+
+    The authors' loop: the different functions of x, and those of y, are numbered in the order in which Table 2 first
+    shows them, and the number of the function of x is used for both.
+    """
+    x, y = FUNCTIONS[function]
+    if "terms" not in departures:
+        return x, y
+    xs, ys = (list(dict.fromkeys(pair[k] for pair in FUNCTIONS.values())) for k in (0, 1))
+    return x, ys[xs.index(x)]
+
+
+def run(observations: Observations, rig: Rig, departures: Collection[str]) -> list[Outcome]:
+    """Every function calibrated on every set, tested on all targets."""
+    out = []
+    fixation = observations.index.fixation
+    for name, targets in CALIBRATION_SETS.items():
+        calibration = observations.take(np.isin(fixation, np.array(targets) - 1))
+        for function in FUNCTIONS:
+            regression = PupilGlintRegression(terms(function, departures), minimum_norm="minimum_norm" in departures)
+            try:
+                fitted = regression.fit(calibration, calibration.index.target_mm, rig)
+            except InputError as error:
+                out.append(Outcome(function, name, np.zeros(0), str(error)))
+                continue
+            frames, gaze = binocular_average(observations, fitted.predict(observations, rig))
+            index = frames.index
+            eye = index.head_mm
+            if "error" in departures and rig.screen is not None:
+                # As if the screen's centre were straight ahead of the origin.
+                eye = eye + rig.screen.centre_mm * np.array([0.0, 1.0, 1.0])
+            out.append(Outcome(function, name, angular_error_deg(gaze.point_mm, index.target_mm, eye), None))
+    return out
+
+
+def best(outcomes: list[Outcome], calibration: str) -> Outcome | None:
+    """The function with the smallest mean error for a set; None without any."""
+    some = [o for o in outcomes if o.calibration == calibration and o.mean_deg is not None]
+    return min(some, key=lambda o: o.mean_deg or 0.0) if some else None
+
+
+def rows_of(outcomes: list[Outcome], **keys: Any) -> list[Row]:
+    """One row a function and set; `variant` says where a solution is the minimum-norm one."""
+    out = []
+    for o in outcomes:
+        out.append(
+            mean_row(
+                o.error_deg,
+                eye="both",
+                calibration=o.calibration,
+                function=o.function,
+                reason=o.reason,
+                **{**keys, "variant": _solution(o)},
+            )
+        )
+    return out
+
+
+def _solution(outcome: Outcome) -> str | None:
+    if outcome.reason is not None:
+        return None
+    need = max(len(FUNCTIONS[outcome.function][k].split("+")) for k in (0, 1))
+    return "minimum norm" if need > len(CALIBRATION_SETS[outcome.calibration]) else "least squares"

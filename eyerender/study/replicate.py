@@ -1,0 +1,166 @@
+"""One eye model through a replication: every protocol and variant, the waterfall, the restarts, the misprints."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..observation import Observations
+from ..scene import Scene
+from . import blignaut, guestrin
+from .clouds import Cloud
+from .observing import Observing
+from .results import Row, WaterfallStep
+
+PROTOCOLS = {"guestrin2006": guestrin.PUBLISHED, "blignaut2014": blignaut.PUBLISHED}
+
+
+@dataclass(slots=True)
+class GuestrinPart:
+    """What one eye model gave: rows, calibrations with their restarts, H1's errors and means by (protocol, observer)."""
+
+    eye_model: str
+    rows: list[Row] = field(default_factory=list)
+    calibrations: list[dict[str, Any]] = field(default_factory=list)
+    means: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
+    h1_errors: dict[tuple[str, str], Floats] = field(default_factory=dict)
+    waterfall: list[WaterfallStep] = field(default_factory=list)
+    misprints: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class BlignautPart:
+    """What one eye model gave: rows, outcomes and feature clouds by (protocol, observer), the waterfall."""
+
+    eye_model: str
+    rows: list[Row] = field(default_factory=list)
+    outcomes: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
+    clouds: dict[tuple[str, str], Cloud] = field(default_factory=dict)
+    waterfall: list[WaterfallStep] = field(default_factory=list)
+
+
+class _Scenes:
+    """Scenes and observations of one eye model and study, each made once."""
+
+    def __init__(self, module: Any, eye: str, observing: Observing) -> None:
+        self.module, self.eye, self.observing = module, eye, observing
+        self._seen: dict[frozenset[str], tuple[Scene, Observations]] = {}
+
+    def __call__(self, departures: Collection[str]) -> tuple[Scene, Observations]:
+        key = self.module.scene_key(departures)
+        if key not in self._seen:
+            scene = self.module.scene(self.eye, key)
+            name = "-".join([self.eye.replace("/", "_"), *(sorted(key) or ["corrected"])])
+            self._seen[key] = scene, self.observing.observe(scene, name, facing=self.module is guestrin)
+        return self._seen[key]
+
+
+def departures_of(module: Any, protocol: str) -> frozenset[str]:
+    """The departures of a protocol by name."""
+    return frozenset(module.PUBLISHED if protocol == "published" else module.CORRECTED)
+
+
+def guestrin_part(
+    eye: str, protocols: Sequence[str], observing: Observing, *, starts: int = guestrin.STARTS
+) -> GuestrinPart:
+    """Replicate [28] with one eye model and one observer."""
+    scenes = _Scenes(guestrin, eye, observing)
+    analytic = observing.kind == "analytic"
+    out = GuestrinPart(eye)
+    for protocol in protocols:
+        departures = departures_of(guestrin, protocol)
+        scene, seen = scenes(departures)
+        for variant, free in (("index fixed", False), ("index free", True)):
+            if free and "index" in departures:
+                continue
+            done = guestrin.run(seen, scene.rig, departures, free_index=free)
+            keys = {"protocol": protocol, "observer": observing.kind, "variant": variant, "eye_model": eye}
+            out.rows += guestrin.rows_of(done, **keys)
+            if not free:
+                means = {h: done.mean_deg(h) for h in guestrin.HEADS}
+                out.means[protocol, observing.kind] = {h: np.nan if m is None else m for h, m in means.items()}
+                out.h1_errors[protocol, observing.kind] = done.error_deg[done.rows("H1")]
+            if analytic:
+                # The left eye is the right eye's mirror image, and so are its calibrations.
+                for spread in guestrin.restarts(done, scene.rig, departures, starts=starts):
+                    out.calibrations.append({**keys, **spread.to_mapping()})
+    if analytic and len(protocols) == 2:
+        out.waterfall = _waterfall(eye, guestrin, lambda d: _guestrin_means(scenes, d))
+    if analytic and "corrected" in protocols:
+        out.misprints = _misprints(eye)
+    return out
+
+
+def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> BlignautPart:
+    """Replicate [29] with one eye model and one observer."""
+    scenes = _Scenes(blignaut, eye, observing)
+    out = BlignautPart(eye)
+    for protocol in protocols:
+        departures = departures_of(blignaut, protocol)
+        scene, seen = scenes(departures)
+        done = blignaut.run(seen, scene.rig, departures)
+        key = protocol, observing.kind
+        out.outcomes[key] = done
+        out.clouds[key] = Cloud.of(seen)
+        out.rows += blignaut.rows_of(done, protocol=protocol, observer=observing.kind, eye_model=eye)
+    if observing.kind == "analytic" and len(protocols) == 2:
+
+        def best(departures: Collection[str]) -> dict[str, float | None]:
+            scene, seen = scenes(departures)
+            done = blignaut.run(seen, scene.rig, departures)
+            found = {c: blignaut.best(done, c) for c in blignaut.CALIBRATION_SETS}
+            return {c: b.mean_deg if b else None for c, b in found.items()}
+
+        out.waterfall = _waterfall(eye, blignaut, best)
+    return out
+
+
+def _waterfall(eye: str, module: Any, measure: Any) -> list[WaterfallStep]:
+    """From `published` to `corrected`, one departure corrected after the other; and each of them corrected alone."""
+    start = measure(module.PUBLISHED)
+    steps = [WaterfallStep(eye, "published", start, start)]
+    left = set(module.PUBLISHED)
+    for departure in module.DEPARTURES:
+        left.discard(departure.id)
+        steps.append(
+            WaterfallStep(eye, departure.id, measure(frozenset(left)), measure(module.PUBLISHED - {departure.id}))
+        )
+    return steps
+
+
+def _guestrin_means(scenes: _Scenes, departures: Collection[str]) -> dict[str, float | None]:
+    scene, seen = scenes(departures)
+    done = guestrin.run(seen, scene.rig, departures)
+    return {h: done.mean_deg(h) for h in guestrin.HEADS}
+
+
+def _misprints(eye: str) -> dict[str, dict[str, Any]]:
+    """The corrected protocol with one of Table 4's or the text's misprints put in."""
+    cases: dict[str, dict[str, Any]] = {
+        "camera at x = 315": {"position_mm": [315.0, 0.0, -150.5], "tilt_deg": 13.8},
+        "head positions in cm": {
+            "head_positions_mm": [[0, 0, 0], [0, 300, 0], [0, -300, 0], [400, 0, 0], [-400, 0, 0]]
+        },
+    }
+    out = {}
+    for name, changes in cases.items():
+        try:
+            scene = guestrin.scene(eye, guestrin.CORRECTED, changes)
+            seen = Observing().observe(scene, name)
+            done = guestrin.run(seen, scene.rig, guestrin.CORRECTED)
+        except InputError as error:
+            out[name] = {"H1": None, "H2": None, "reason": str(error)}
+            continue
+        inside = seen.pupil.in_image & seen.glints.in_image.all(axis=1)
+        out[name] = {
+            **{h: done.mean_deg(h) for h in guestrin.HEADS},
+            "in_image": int(inside.sum()),
+            "n": len(seen),
+            "missing": int((~np.isfinite(done.error_deg)).sum()),
+        }
+    return out

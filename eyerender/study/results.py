@@ -1,0 +1,143 @@
+"""What a study gives: rows of errors and findings, and the files they are written to."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import EyerenderError
+from ..imagefolder import versions, write_json
+
+SUMMARY_SCHEMA = "eyerender/study-summary/1"
+FINDINGS_SCHEMA = "eyerender/study-findings/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One mean error; keys that do not apply are None. `sd_deg` is over the fixations (n - 1); `reason`: why no mean."""
+
+    protocol: str
+    observer: str
+    variant: str | None
+    eye_model: str
+    eye: str
+    head: str | None
+    calibration: str | None
+    function: str | None
+    mean_deg: float | None
+    sd_deg: float | None
+    n: int
+    missing: int = 0
+    in_image: int | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One statement tested on the study's own data; `verdict` is None where it cannot be."""
+
+    id: str
+    protocol: str
+    observer: str
+    rule: str
+    value: float | None
+    threshold: str
+    verdict: bool | None
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class Departure:
+    """Where the authors' software departs from the paper's text."""
+
+    id: str
+    title: str
+    paper: str
+    software: str
+    corrected: str
+
+
+@dataclass(frozen=True, slots=True)
+class Erratum:
+    """What a table or the text misprints, what is used instead, and what the misprint does."""
+
+    where: str
+    printed: str
+    used: str
+    effect: str
+
+
+@dataclass(frozen=True, slots=True)
+class WaterfallStep:
+    """Mean errors (deg) of one eye model after a departure has been corrected, and with only it corrected.
+
+    `departure` is "published" for the start. `errors` holds the study's own measures by name.
+    """
+
+    eye_model: str
+    departure: str
+    errors: dict[str, float | None]
+    alone: dict[str, float | None]
+
+
+def mean_row(error_deg: Floats, **keys: Any) -> Row:
+    """A row of the errors (n,) that there are; NaN counts as missing."""
+    good = error_deg[np.isfinite(error_deg)]
+    n = len(good)
+    return Row(
+        mean_deg=float(good.mean()) if n else None,
+        sd_deg=float(good.std(ddof=1)) if n > 1 else None,
+        n=n,
+        missing=int(len(error_deg) - n),
+        **{"variant": None, "head": None, "calibration": None, "function": None, **keys},
+    )
+
+
+def write_results(
+    folder: Path, study: str, rows: Sequence[Row], findings: Sequence[Finding], more: dict[str, Any]
+) -> dict[str, Any]:
+    """Write summary.json, findings.json and the CSV of both; returns the summary."""
+    summary = {
+        "schema": SUMMARY_SCHEMA,
+        "study": study,
+        "versions": versions(),
+        **more,
+        "rows": [asdict(row) for row in rows],
+    }
+    write_json(folder / "summary.json", summary)
+    write_json(
+        folder / "findings.json",
+        {"schema": FINDINGS_SCHEMA, "study": study, "findings": [asdict(finding) for finding in findings]},
+    )
+    write_text(folder / "summary.csv", table(Row, rows))
+    write_text(folder / "findings.csv", table(Finding, findings))
+    return summary
+
+
+def table(kind: type, items: Sequence[Any]) -> str:
+    """CSV of dataclasses; empty cells where there is no value."""
+    names = [f.name for f in fields(kind)]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    for item in items:
+        writer.writerow(["" if (v := getattr(item, name)) is None else v for name in names])
+    return text.getvalue()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, complete or not at all."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None

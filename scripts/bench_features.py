@@ -1,0 +1,139 @@
+#!/usr/bin/env python3
+"""Bench of the analytic features: time a frame and eye, how it grows, memory, residuals.
+
+    bench_features.py [--quick] [--json F]
+
+The Blignaut scene: both eyes, random targets on its screen, fixation by chief ray, 30 boundary points with their
+ellipse, the stop's centre and a glint. The clock is the process' CPU time, the best of several runs, so that other work
+on the machine counts as little as may be; no product of matrices here is large enough to be spread over cores. Exit 1
+when a `must` is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+import tracemalloc
+from dataclasses import fields
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from eyerender.analytic.features import Features, features, fixations
+from eyerender.eye.catalogue import load_eye
+from eyerender.scene import load_scene
+
+EYES = ("E2", "E4", "E5")
+# Best published time of a Python simulator of such eyes, ms a frame without fixation; quoted, not measured here.
+QUOTED_MS = (5.4, 6.8)
+
+
+def observe(name: str, frames: int, seed: int = 0) -> tuple[float, Features, float]:
+    """(CPU seconds, features, largest fixation residual) of `frames` frames of both eyes."""
+    scene = load_scene("blignaut2014")
+    screen = scene.rig.screen
+    assert screen is not None
+    rng = np.random.default_rng(seed)
+    half = np.array(screen.size_mm) / 2
+    target = np.repeat(screen.world(rng.uniform(-half, half, (frames, 2))), 2, axis=0)
+    which = np.tile([0, 1], frames)
+    position = np.stack([scene.eye_position_mm(side) for side in ("right", "left")])[which]
+    lights = np.array([light.position_mm for light in scene.rig.lights])
+    eyes = [load_eye(name).build(eye=side) for side in ("right", "left")]
+    start = time.process_time()
+    found = fixations(eyes, which, target, position)
+    seen = features(eyes, which, found.poses, position, scene.rig.cameras, np.zeros(2 * frames, dtype=int), lights)
+    return time.process_time() - start, seen, float(found.residual_mm.max())
+
+
+def cost_us(name: str, frames: int, runs: int) -> float:
+    """Microseconds a frame and eye, best of `runs`."""
+    return min(observe(name, frames, seed)[0] for seed in range(runs)) / (2 * frames) * 1e6
+
+
+def row(name: str, value: float, unit: str, must: float | None = None, aim: float | None = None) -> dict[str, Any]:
+    """One line of the result; smaller is better everywhere here."""
+    met = None if must is None else bool(value <= must)
+    return {"name": name, "value": value, "unit": unit, "must": must, "aim": aim, "met": met}
+
+
+def measure(quick: bool) -> list[dict[str, Any]]:
+    """All rows."""
+    frames, runs, most = (2_000, 4, 10_000) if quick else (10_000, 8, 100_000)
+    for name in EYES:
+        observe(name, 100)
+    cost = {name: cost_us(name, frames, runs) for name in EYES}
+    rows = [
+        row("E2, fixation + 30 points + glint", cost["E2"], "us/frame and eye", 25.0, 10.0),
+        row("E4 / E2", cost["E4"] / cost["E2"], "ratio", 2.0),
+        row("E5 / E2", cost["E5"] / cost["E2"], "ratio", 3.0),
+        row("E4", cost["E4"], "us/frame and eye"),
+        row("E5", cost["E5"], "us/frame and eye"),
+    ]
+    growth: dict[int, float] = {}
+    for _ in range(5):
+        # In turns, so that a busy spell of the machine falls on all sizes alike.
+        for n in sorted({1_000, 10_000, most}):
+            growth[n] = min(growth.get(n, np.inf), cost_us("E2", n, max(1, 20_000 // n)))
+    rows += [row(f"E2, {n} frames", c, "us/frame and eye") for n, c in growth.items()]
+    rows.append(
+        row(f"E2, slowest / fastest, 1000 to {most} frames", max(growth.values()) / min(growth.values()), "ratio", 1.2)
+    )
+    rows += [memory("E2"), memory("E5")]
+    for name in EYES:
+        _, seen, fixation = observe(name, 1_000, seed=99)
+        bad = int(np.count_nonzero(seen.point_status) + np.count_nonzero(seen.glint_status))
+        rows.append(row(f"{name}, points and glints without a ray", bad, "count", 0))
+        rows.append(row(f"{name}, worst residual of a boundary point", float(seen.point_residual_mm.max()), "mm", 1e-9))
+        rows.append(row(f"{name}, worst residual of a glint", float(seen.glint_residual_mm.max()), "mm", 1e-9))
+        rows.append(row(f"{name}, worst residual of a fixation", fixation, "mm", 1e-6))
+    for quoted in QUOTED_MS:
+        rows.append(row(f"quoted {quoted} ms of another Python simulator / E2", quoted * 1e3 / cost["E2"], "ratio"))
+    return rows
+
+
+def memory(name: str) -> dict[str, Any]:
+    """How peak memory grows with the batch, over how the result does: little above 1 where chunks bound the work."""
+    peaks = []
+    for count in (4_000, 12_000):
+        tracemalloc.start()
+        _, seen, _ = observe(name, count)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        kept = sum(getattr(seen, f.name).nbytes for f in fields(seen))
+        peaks.append((peak, kept))
+    # Targets and poses grow with the batch too; they are smaller than the result.
+    growth = (peaks[1][0] - peaks[0][0]) / (peaks[1][1] - peaks[0][1])
+    return row(f"{name}, growth of peak memory / growth of the result", growth, "ratio", 1.5)
+
+
+def main() -> int:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--quick", action="store_true", help="fewer frames and runs")
+    parser.add_argument("--json", metavar="F", help="write the result to a file")
+    options = parser.parse_args()
+    rows = measure(options.quick)
+    for r in rows:
+        bars = "".join(f"  {k} {r[k]:g}" for k in ("must", "aim") if r[k] is not None)
+        mark = "" if r["met"] is None else ("  met" if r["met"] else "  MISSED")
+        print(f"{r['name']:<58} {r['value']:>12.4g} {r['unit']:<17}{bars}{mark}")
+    if options.json:
+        result = {
+            "schema": "eyerender/bench/1",
+            "machine": {"platform": platform.platform(), "processor": platform.processor(), "cpus": os.cpu_count()},
+            "versions": {"python": platform.python_version(), **{p: version(p) for p in ("eyerender", "numpy")}},
+            "rows": rows,
+        }
+        with open(options.json, "w", encoding="utf-8") as file:
+            json.dump(result, file, indent=1)
+    return 1 if any(r["met"] is False for r in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

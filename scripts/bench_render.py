@@ -1,0 +1,437 @@
+#!/usr/bin/env python3
+"""Bench of the renderer: physics against oracles of another kind, cost against stock Mitsuba, memory, determinism.
+
+    bench_render.py [--quick] [--json F] [--backend llvm|cuda] [--threads N]
+
+Bars are ratios or counts; seconds are reported. CPU time is the process' own, so that other work on the machine counts as
+little as may be. --quick takes fewer samples and poses: bars on what is measured stay, the oracle's own standard error is
+then reported without its bar. Exit 1 when a `must` is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "rendering"))
+
+import numpy as np
+
+from eyerender.rendering.backend import choose_backend
+
+Row = dict[str, Any]
+MODELS = ("E1", "E2", "E3", "E4", "E5")
+
+
+def row(name: str, value: float, unit: str, must: float | None = None, aim: float | None = None) -> Row:
+    """A result; `must` and `aim` are upper bars."""
+    met = None if must is None and aim is None else bool(value <= (must if must is not None else aim))
+    if must is None:
+        met = None
+    return {"name": name, "value": float(value), "unit": unit, "must": must, "aim": aim, "met": met}
+
+
+def cpu_of(work: Callable[[], Any], runs: int) -> tuple[float, float]:
+    """(CPU seconds, wall seconds) of one call, best of `runs`."""
+    best = [np.inf, np.inf]
+    for _ in range(runs):
+        c, w = time.process_time(), time.perf_counter()
+        work()
+        best = [min(best[0], time.process_time() - c), min(best[1], time.perf_counter() - w)]
+    return best[0], best[1]
+
+
+class Bench:
+    """The measurements; `small` for --quick."""
+
+    def __init__(self, backend: Any, small: bool) -> None:
+        import render_rigs
+
+        from eyerender.rendering.renderer import Renderer
+
+        self.rigs, self.small = render_rigs, small
+        self.renderer = Renderer(backend, spp=16)
+        self.backend = backend
+
+    def rows(self) -> Iterable[Row]:
+        """All rows, as they are measured."""
+        for part in (
+            self.iris_against_path, self.iris_against_light_tracer, self.noise, self.glint_centroids, self.large_disc,
+            self.pupil_outline, self.cost, self.recompiles, self.fixed_cost, self.memory, self.determinism,
+        ):  # fmt: skip
+            yield from part()
+
+    def iris_against_path(self) -> Iterable[Row]:
+        """Radiance of E2's iris under two LEDs of 100 mm at 300 mm, against the stock path integrator on the meshes.
+
+        The lamps stand 65 degrees off the axis; pixels that show a lamp's mirror image are left out on both sides.
+        """
+        import drjit as dr
+        import mitsuba as mi
+        from render_oracles import RINGS_MM
+
+        from eyerender.arrays import frozen
+        from eyerender.rendering.integrator import look
+        from eyerender.rendering.renderer import _pixels
+        from eyerender.rendering.sampling import camera_ray
+        from eyerender.rig.camera import CameraSpec
+        from eyerender.rig.light import Light
+
+        rigs, n = self.rigs, 72
+        eye = rigs.eye_of("E2")
+        camera = CameraSpec(
+            resolution_px=(n, n),
+            position_mm=(600.0, 0.0, 0.0),
+            look_at_mm=(0.0, 0.0, 0.0),
+            focal_length_px=600 * n / 11.4,
+        ).build()
+        lights = []
+        for side in (1, -1):
+            a = np.radians(65.0)
+            place = 300 * np.array([np.cos(a), side * np.sin(a), 0.0])
+            lights.append(Light(frozen(place), frozen(-place / 300), 100.0, 1000.0, 1.0))
+        black = rigs.BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
+        rig = rigs.LampRig(camera, tuple(lights))
+        job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
+        values, _ = self.renderer._bind(job)
+        u, v = _pixels(dr.arange(mi.UInt32, n * n), job.window)
+        o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
+        view = look(values, self.renderer._surround.scene, o, d, True)
+        inner = view.inner.numpy().T
+        rho = np.hypot(inner[:, 1], inner[:, 2]).reshape(n, n)
+        cornea = view.cornea.numpy().astype(bool).reshape(n, n)
+        first = view.point.numpy().T.astype(float)
+        ray = camera.rays(np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2))
+        N = eye.front[0].normal(first)
+        w = ray - 2 * np.sum(ray * N, axis=1, keepdims=True) * N
+        glint = np.zeros(n * n, bool)
+        for lamp in lights:
+            s = ((lamp.position_mm - first) @ lamp.axis) / (w @ lamp.axis)
+            glint |= (np.linalg.norm(first + s[:, None] * w - lamp.position_mm, axis=1) < 130) & (s > 0)
+        mine = self.renderer.radiance(job, spp=512)
+        cos4 = (ray @ camera.axis).reshape(n, n) ** 4
+
+        with tempfile.TemporaryDirectory() as folder:
+            scene = self._stock(job, folder, max_depth=4, rings=256, sectors=512)
+            spp = 512 if self.small else 2048
+            runs = 4 if self.small else 24
+            stock = np.array([np.array(mi.render(scene, seed=k, spp=spp))[..., 0] for k in range(runs)], dtype=float)
+        for name, (p, q) in zip(("inner", "mid", "outer"), RINGS_MM, strict=True):
+            ring = cornea & (rho >= p) & (rho < q) & ~glint.reshape(n, n)
+            each = stock[:, ring].mean(axis=1)
+            truth, error = each.mean(), each.std(ddof=1) / np.sqrt(runs) / each.mean()
+            difference = abs((mine / cos4)[ring].mean() / truth - 1)
+            yield row(f"E2 iris {name}: oracle's standard error", 100 * error, "%", None if self.small else 0.1)
+            yield row(f"E2 iris {name}: difference to path", 100 * difference, "%", 0.2 + 200 * error)
+
+    def _stock(self, job: Any, folder: str, *, max_depth: int, rings: int = 48, sectors: int = 128) -> Any:
+        """The exported job as stock Mitsuba loads it."""
+        import mitsuba as mi
+
+        from eyerender.rendering.export import export_scene
+
+        path = export_scene(job, folder, spp=16, max_depth=max_depth, rings=rings, sectors=sectors)
+        return mi.load_file(str(path))
+
+    def iris_against_light_tracer(self) -> Iterable[Row]:
+        """Irradiance of the iris of E4 and E5 by a point lamp, against flux counted by a forward tracer in float64."""
+        from render_oracles import RINGS_MM, flux_on_rings, ring_points
+
+        from eyerender.arrays import frozen
+        from eyerender.rig.light import Light
+
+        rigs = self.rigs
+        for model in ("E4", "E5"):
+            eye = rigs.eye_of(model)
+            for where, place in (("remote", (500.0, 0.0, -150.0)), ("head-mounted", (30.0, -6.0, -14.0))):
+                lamp = Light(frozen(place), frozen([-1.0, 0, 0]), 0.0, 100.0, 0.0)
+                rig = rigs.LampRig(rigs.remote_rig().camera, (lamp,))
+                plain = rigs.PLAIN.model_copy(update={"limbus_width_mm": 0.0})
+                job = rigs.job_of(eye, rig, (0, 0, 16, 16), look=plain)
+                parts = [flux_on_rings(eye, np.array(place) + 1e-4 * k, 100.0, 1500) for k in range(4)]
+                truth = np.mean(parts, axis=0) * abs(eye.stop.normal[0])
+                error = np.std(parts, axis=0, ddof=1) / np.sqrt(4) / np.mean(parts, axis=0)
+                mine = np.array(
+                    [self.renderer.iris_irradiance(job, ring_points(eye, p, q)).mean() for p, q in RINGS_MM]
+                )
+                worst = int(np.argmax(np.abs(mine / truth - 1) - 2 * error))
+                yield row(f"{model} iris {where}: tracer's standard error", 100 * error.max(), "%", 0.1)
+                yield row(
+                    f"{model} iris {where}: largest difference of a ring", 100 * abs(mine / truth - 1)[worst], "%",
+                    0.2 + 200 * error[worst],
+                )  # fmt: skip
+
+    def noise(self) -> Iterable[Row]:
+        """Relative noise of a uniform iris at 1 spp: pixels against the same pixels at 256 spp."""
+        rigs = self.rigs
+        rig = rigs.remote_rig()
+        job = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(96, 96), look=rigs.PLAIN)
+        part = self.renderer.labels(job).part
+        iris = part == 2
+        for axis in (0, 1):
+            for shift in (1, -1, 2, -2):
+                iris &= np.roll(part, shift, axis) == 2
+        one, many = self.renderer.radiance(job, spp=1), self.renderer.radiance(job, spp=256)
+        smooth = (one / many)[iris]
+        yield row("noise of a uniform iris at 1 spp, remote", 100 * smooth.std(), "%", 0.5)
+
+    def glint_centroids(self) -> Iterable[Row]:
+        """Centroids of rendered glints of point lamps against Fermat's principle in float64."""
+        from render_oracles import centroid, mirror_pixel
+
+        rigs = self.rigs
+        poses = 10 if self.small else 200
+        for name in ("remote", "head"):
+            errors = []
+            for model in MODELS:
+                rng = np.random.default_rng(MODELS.index(model))
+                eye, rig = rigs.eye_of(model), rigs.RIGS[name](radius_mm=0.0)
+                done = 0
+                while done < poses:
+                    pose = (rng.uniform(-30, 30), rng.uniform(-25, 25))
+                    lamp = rig.lights[rng.integers(len(rig.lights))]
+                    job = rigs.job_of(eye, rig, rig.window(32, 32), pose, look=rigs.BLACK, lights=(lamp,), labels=False)
+                    xy, rho = mirror_pixel(eye, job, lamp.position_mm)
+                    if rho > eye.limbus_radius_mm - 0.05:
+                        continue
+                    job = replace(job, window=rig.window(32, 32, np.round(xy)))
+                    image = self.renderer.render(job, spp=1).irradiance
+                    errors.append(np.linalg.norm(centroid(image, job.window) - xy))
+                    done += 1
+            yield row(f"glint centroid E1..E5 {name}: median of {len(errors)}", np.median(errors), "px", 0.002)
+            yield row(f"glint centroid E1..E5 {name}: maximum", np.max(errors), "px", 0.01)
+
+    def large_disc(self) -> Iterable[Row]:
+        """Flux and place of the glint of a large disc LED against stock path on the exported scene."""
+        import mitsuba as mi
+        from render_oracles import centroid
+
+        rigs = self.rigs
+        rig = rigs.head_rig(radius_mm=4.0, count=1)
+        job = rigs.job_of(rigs.eye_of("E2"), rig, (0, 0, 8, 8), (4.0, -3.0), look=rigs.BLACK, labels=False)
+        xy = self.renderer.render(job, spp=1).glints.xy_px[0]
+        window = rig.window(48, 48, np.round(xy))
+        job = replace(job, window=window, sensor=job.sensor.model_copy(update={"psf_sigma_px": 0.0}))
+        mine = self.renderer.render(job, spp=1)
+        unit = 1e3 * np.pi * job.sensor.lens_transmission / (4 * job.sensor.f_number**2)
+        v, u = np.mgrid[: window[3], : window[2]]
+        pixels = np.stack([u + window[0], v + window[1]], axis=-1).reshape(-1, 2)
+        cos4 = ((job.camera.rays(pixels) @ job.camera.axis) ** 4).reshape(window[3], window[2])
+        with tempfile.TemporaryDirectory() as folder:
+            scene = self._stock(job, folder, max_depth=2, rings=256, sectors=512)
+            spp = 1024 if self.small else 4096
+            runs = [np.array(mi.render(scene, seed=k, spp=spp))[..., 0].astype(float) * cos4 * unit for k in range(4)]
+        # Pixels centred at integers on both sides; both are box-integrated, so their centroids can be compared.
+        flux, place = np.mean([r.sum() for r in runs]), centroid(np.mean(runs, axis=0), window)
+        yield row("large disc: flux against path", 100 * abs(mine.irradiance.sum(dtype=float) / flux - 1), "%", 1.0)
+        yield row(
+            "large disc: centroid against path", np.linalg.norm(centroid(mine.irradiance, window) - place), "px", 0.02
+        )
+
+    def pupil_outline(self) -> Iterable[Row]:
+        """RMS of the smooth contour (12 harmonics) of rendered pupils at 64 spp against the refracted margin."""
+        from render_oracles import contour_error, outline
+
+        rigs = self.rigs
+        dark = rigs.PLAIN.model_copy(update={"pupil_albedo": 0.0})
+        grey = rigs.PLAIN.model_copy(update={"pupil_albedo": rigs.PLAIN.iris_albedo})
+        for name, size in (("remote", 48), ("head", 128)):
+            errors = []
+            for model in MODELS if not self.small else ("E2", "E5"):
+                for pose in ((0.0, 0.0), (9.0, -6.0), (-14.0, 8.0)):
+                    eye, rig = rigs.eye_of(model), rigs.RIGS[name]()
+                    polygon = outline(rigs.job_of(eye, rig, (0, 0, 1, 1), pose))
+                    window = rig.window(size, size, polygon.mean(axis=0))
+                    a, b = (
+                        self.renderer.radiance(rigs.job_of(eye, rig, window, pose, look=k), spp=64)
+                        for k in (dark, grey)
+                    )
+                    errors.append(contour_error(1 - a / b, polygon, window))
+            yield row(f"pupil outline {name}: largest of {len(errors)}", max(errors), "px rms", 0.01)
+
+    def cost(self) -> Iterable[Row]:
+        """CPU time at 640 x 480, 16 spp, 2 disc LEDs, remote, against stock path and against Embree alone."""
+        import drjit as dr
+        import mitsuba as mi
+
+        rigs = self.rigs
+        rig = rigs.remote_rig()
+        lamps = (rig.lights[0], replace(rig.lights[0], position_mm=rig.lights[0].position_mm + np.array([0, 80.0, 0])))
+        runs = 3 if self.small else 6
+        cpu, wall = {}, {}
+        for model in ("E2", "E4", "E5"):
+            job = rigs.job_of(rigs.eye_of(model), rig, rig.window(640, 480), lights=lamps, labels=False)
+            self.renderer.render(job)
+            cpu[model], wall[model] = cpu_of(lambda job=job: self.renderer.render(job), runs)
+        job = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(640, 480), lights=lamps)
+        with tempfile.TemporaryDirectory() as folder:
+            scene = self._stock(job, folder, max_depth=4)
+            np.array(mi.render(scene, spp=16))
+            stock, stock_wall = cpu_of(lambda: np.array(mi.render(scene, spp=16, seed=1)), runs)
+            sensor = scene.sensors()[0]
+            index = dr.arange(mi.UInt32, 640 * 480 * 16)
+            pixel = index // 16
+            place = mi.Point2f(mi.Float(pixel % 640) / 640, mi.Float(pixel // 640) / 480)
+            ray, _ = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+            dr.eval(ray)
+
+            def embree() -> None:
+                hit = scene.ray_intersect_preliminary(ray, coherent=True)
+                dr.eval(hit.t)
+                dr.sync_thread()
+
+            embree()
+            limit, _ = cpu_of(embree, runs)
+        yield row("640x480, 16 spp, 2 LEDs, E2: CPU / stock path's", cpu["E2"] / stock, "ratio", 0.6)
+        yield row("640x480, 16 spp, 2 LEDs, E2: CPU", cpu["E2"], "s")
+        yield row("640x480, 16 spp, 2 LEDs, E2: wall", wall["E2"], "s", None, 0.25)
+        yield row("stock path, the same: CPU", stock, "s")
+        yield row("stock path, the same: wall", stock_wall, "s")
+        yield row("three coherent Embree rays a sample / our CPU", 3 * limit / cpu["E2"], "ratio")
+        yield row("E4 / E2, CPU", cpu["E4"] / cpu["E2"], "ratio", 1.6)
+        yield row("E5 / E2, CPU", cpu["E5"] / cpu["E2"], "ratio", 1.6)
+
+    def _varied(self, count: int, seed: int = 0) -> Iterable[Any]:
+        """Jobs of one structure whose every number varies."""
+        rigs = self.rigs
+        rng = np.random.default_rng(seed)
+        head = rigs.head_rig()
+        for _ in range(count):
+            eye = rigs.eye_of(str(rng.choice(["E1", "E2"])), "right", float(rng.uniform(2.5, 6.0)))
+            shift = rng.uniform(-2, 2, 3)
+            camera = rigs.CameraSpec(
+                resolution_px=(640, 480), position_mm=tuple(float(x) for x in 35 * np.array([0.87, -0.2, -0.4]) + shift),
+                look_at_mm=(0.0, 0.0, 0.0), focal_length_px=float(rng.uniform(500, 700)),
+            ).build()  # fmt: skip
+            lights = tuple(
+                replace(lamp, position_mm=lamp.position_mm + shift, intensity_mw_sr=float(rng.uniform(0.1, 0.5)))
+                for lamp in head.lights[: int(rng.integers(1, 6))]
+            )
+            look = rigs.PLAIN.model_copy(update={"iris_albedo": float(rng.uniform(0.1, 0.5))})
+            pose = (float(rng.uniform(-20, 20)), float(rng.uniform(-20, 20)))
+            rig = rigs.LampRig(camera, lights)
+            yield rigs.job_of(eye, rig, (304, 224, 32, 32), pose, look=look, seed=int(rng.integers(1 << 40)))
+
+    def recompiles(self) -> Iterable[Row]:
+        """Kernels that later frames launch and the first did not (by hash: a cache on disk hides nothing)."""
+        import drjit as dr
+
+        def kernels(jobs: Iterable[Any]) -> set[Any]:
+            with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+                dr.kernel_history_clear()
+                for job in jobs:
+                    self.renderer.render(job)
+                return {k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])}
+
+        first, *later = self._varied(30)
+        known = kernels([first])
+        yield row("new kernels after the first frame, 29 varied frames", len(kernels(later) - known), "kernels", 0)
+
+    def fixed_cost(self) -> Iterable[Row]:
+        """Time of a frame of 32 x 32 pixels at 1 spp with two lamps: tracing, packing, launching, glints, labels off."""
+        rigs = self.rigs
+        rig = rigs.remote_rig()
+        lamps = (rig.lights[0], replace(rig.lights[0], position_mm=rig.lights[0].position_mm + np.array([0, 80.0, 0])))
+        eye = rigs.eye_of("E2")
+        jobs = [
+            rigs.job_of(eye, rig, rig.window(32, 32), (float(k % 20), 0.1 * k), lights=lamps, labels=False)
+            for k in range(60)
+        ]
+        times = []
+        for job in jobs:
+            start = time.perf_counter()
+            self.renderer.render(job, spp=1)
+            times.append(time.perf_counter() - start)
+        yield row("fixed cost of a frame (median of 60)", 1e3 * np.median(times), "ms", 15)
+
+    def memory(self) -> Iterable[Row]:
+        """Growth of the resident memory between two frames, everything varied."""
+        first, last = (20, 120) if self.small else (100, 1100)
+        at = 0.0
+        for k, job in enumerate(self._varied(last + 1, seed=1)):
+            self.renderer.render(job, spp=4)
+            if k == first:
+                at = _resident_mb()
+        yield row(f"resident memory, frame {last} - frame {first}", _resident_mb() - at, "MB", 30)
+
+    def determinism(self) -> Iterable[Row]:
+        """Differing digests of one job: here, with other threads, and in a fresh process with two threads."""
+        import drjit as dr
+
+        job = next(iter(self._varied(1, seed=9)))
+        job = replace(job, window=(200, 150, 160, 120))
+        digests = [_digest(self.renderer.render(job, spp=16))]
+        if self.backend.name == "llvm":
+            before = dr.thread_count()
+            dr.set_thread_count(1)
+            digests.append(_digest(self.renderer.render(job, spp=16)))
+            dr.set_thread_count(before)
+        code = (
+            "import sys; sys.path[:0] = [%r]; import bench_render as b; from dataclasses import replace\n"
+            "bench = b.Bench(b.choose_backend(%r, 2), True)\n"
+            "job = replace(next(iter(bench._varied(1, seed=9))), window=(200, 150, 160, 120))\n"
+            "print(b._digest(bench.renderer.render(job, spp=16)))"
+        ) % (str(ROOT / "scripts"), self.backend.name)
+        fresh = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        digests.append(fresh.stdout.strip())
+        yield row("one seed, 1 or 2 threads, fresh process: digests beyond one", len(set(digests)) - 1, "digests", 0)
+
+
+def _digest(done: Any) -> str:
+    return hashlib.sha256(done.irradiance.tobytes() + done.dn.tobytes()).hexdigest()
+
+
+def _resident_mb() -> float:
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * resource.getpagesize() / 2**20
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def main() -> int:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer samples and poses")
+    parser.add_argument("--json", metavar="F", help="write the result to a file")
+    parser.add_argument("--backend", choices=["auto", "llvm", "cuda"], default="llvm")
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    backend = choose_backend(options.backend, options.threads)
+    rows = []
+    for r in Bench(backend, options.quick).rows():
+        rows.append(r)
+        bars = "".join(f"  {k} {r[k]:g}" for k in ("must", "aim") if r[k] is not None)
+        mark = "" if r["met"] is None else ("  met" if r["met"] else "  MISSED")
+        print(f"{r['name']:<62} {r['value']:>11.4g} {r['unit']:<8}{bars}{mark}", flush=True)
+    if backend.name != "cuda":
+        print("physics on a GPU: not measured, no GPU here")
+    if options.json:
+        result = {
+            "schema": "eyerender/bench/1",
+            "machine": {"platform": platform.platform(), "device": backend.device, "threads": backend.threads},
+            "versions": {"python": platform.python_version(), "eyerender": version("eyerender"), **backend.versions},
+            "rows": rows,
+        }
+        Path(options.json).write_text(json.dumps(result, indent=1), encoding="utf-8")
+    return 1 if any(r["met"] is False for r in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,95 @@
+#!/usr/bin/env python3
+"""Fit the weights of the extractor's confidence on ideal images and print the table of confidence.py.
+
+    fit_confidence.py [--count 2000] [--processes 2]
+
+Development seeds only (below 10,000): `count` mixed images and a tenth as many without an eye. Takes about ten minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from multiprocessing import Pool
+from typing import Any, Literal
+
+import cv2
+import make_ideal_images as ideal
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from eyerender.extraction import ExtractionSettings, extract
+from eyerender.extraction.confidence import TABLE, design, features
+from eyerender.geometry.ellipse import Ellipse, iou
+
+Array = NDArray[np.float64]
+METHODS: tuple[Literal["fast", "refined"], ...] = ("fast", "refined")
+PRIOR_VARIANCE = 10.0
+EYELESS = -1  # seeds below this stand for images without an eye
+
+
+def observe(seed: int) -> list[tuple[Array, bool] | None]:
+    """(features, whether IoU > 0.9) by each method; None where nothing was found."""
+    cv2.setNumThreads(1)
+    truth = None
+    if seed <= EYELESS:
+        image: Any = ideal.draw_no_eye(EYELESS - seed)
+    else:
+        drawing = ideal.draw("mixed", seed)
+        image, label = drawing.image, drawing.label["pupil"]
+        truth = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"])
+    out: list[tuple[Array, bool] | None] = []
+    for method in METHODS:
+        pupil = extract(image, settings=ExtractionSettings(method=method, min_confidence=0.0)).pupil
+        if pupil.ellipse is None or pupil.goodness is None:
+            out.append(None)
+        else:
+            right = truth is not None and iou(pupil.ellipse, truth) > 0.9
+            out.append((features(pupil.ellipse, pupil.goodness), right))
+    return out
+
+
+def fit(rows: Array, right: Array) -> tuple[Array, Array, Array]:
+    """(low, high, weights)."""
+    low, high = np.percentile(rows, (1.0, 99.0), axis=0)
+    columns = design(rows, low, high)
+
+    def cost(weights: Array) -> tuple[float, Array]:
+        logit = columns @ weights
+        probability = 1.0 / (1.0 + np.exp(-logit))
+        prior = np.concatenate([[0.0], weights[1:]]) / PRIOR_VARIANCE
+        value = np.sum(np.logaddexp(0.0, logit) - right * logit) + 0.5 * float(prior @ weights)
+        return float(value), columns.T @ (probability - right) + prior
+
+    start = np.zeros(columns.shape[1])
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", options={"maxiter": 5000, "maxfun": 20000})
+    return low, high, np.asarray(found.x)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=2000)
+    parser.add_argument("--processes", type=int, default=2)
+    options = parser.parse_args()
+    if not 0 < options.count <= 10_000:
+        raise SystemExit("error: --count: must be between 1 and 10,000 (the seeds for development)")
+    # Before the first fit there is no table; extraction then still needs one to report a number.
+    for method in METHODS:
+        TABLE.setdefault(method, ((0.0,) * 14, (1.0,) * 14, (0.0,) * 29))
+    seeds = [*range(options.count), *(EYELESS - i for i in range(options.count // 10))]
+    with Pool(options.processes) as pool:
+        observed = pool.map(observe, seeds, chunksize=20)
+    print("TABLE: dict[str, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]] = {")
+    for i, method in enumerate(METHODS):
+        found = [item[i] for item in observed if item[i] is not None]
+        rows, right = np.array([row for row, _ in found]), np.array([float(ok) for _, ok in found])
+        low, high, weights = fit(rows, right)
+        print(f'    "{method}": (')
+        for values in (low, high, weights):
+            print("        (" + ", ".join(f"{value:.4g}" for value in values) + "),")
+        print(f"    ),  # {len(found)} found, {100 * right.mean():.1f} % of them right")
+    print("}  # fmt: skip")
+
+
+if __name__ == "__main__":
+    main()

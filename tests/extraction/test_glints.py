@@ -1,0 +1,103 @@
+"""Glints: error against the bound, clipped, merged and edge spots, rejections; and the spot model's derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from eyerender.extraction import extract
+from eyerender.extraction import spotfit
+
+SEEDS = range(20_000, 20_008)
+
+
+def _errors(ideal, condition: str, which: slice) -> np.ndarray:
+    errors = []
+    for seed in SEEDS:
+        drawing = ideal.draw(condition, seed)
+        found = extract(drawing.image).glints
+        truth = [g["xy_px"] for g in drawing.label["glints"]]
+        assert len(found) == len(truth)
+        for xy in truth[which]:
+            errors.append(min(np.hypot(*(g.xy_px - xy)) for g in found))
+    return np.array(errors)
+
+
+@pytest.mark.parametrize(
+    ("condition", "which", "median"),
+    [
+        ("noise2", slice(None), 0.015),
+        ("saturated-glint", slice(None), 0.010),
+        ("edge-glint", slice(0, 1), 0.020),
+    ],
+)
+def test_centre_error(ideal, condition, which, median):
+    assert np.median(_errors(ideal, condition, which)) <= median
+
+
+def test_clipped_glints_say_so_and_keep_their_amplitude(ideal):
+    drawing = ideal.draw("saturated-glint", SEEDS[0])
+    for glint in extract(drawing.image).glints:
+        assert glint.saturated
+        # Drawn with a peak of 1000 grey levels over 20 or 75; what lies above 255 is extrapolated.
+        assert glint.amplitude == pytest.approx(950 / 255, rel=0.15)
+    assert not any(g.saturated for g in extract(ideal.draw("noise2", SEEDS[0]).image).glints)
+
+
+def test_merged_pair_is_parted(ideal):
+    """Two spots 3.5 px apart, sigma 1.2 px: one bright patch with a dent."""
+    drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none", aspect=(0.95, 1.0)), SEEDS[0])
+    centre = np.array(drawing.label["pupil"]["centre_px"]) + [4.3, -2.6]
+    pair = [centre, centre + [2.8, 2.1]]
+    image = drawing.image.astype(np.float64)
+    for xy in pair:
+        ideal._add_glint(image, {"xy": xy, "sigma": 1.2}, 200.0)
+    found = extract(np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    assert len(found.glints) == 2
+    for xy in pair:
+        assert min(np.hypot(*(g.xy_px - xy)) for g in found.glints) < 0.06
+
+
+def test_elongated_reflection_is_rejected_with_the_reason(ideal):
+    drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[1])
+    x, y = np.array(drawing.label["pupil"]["centre_px"]) + [0.0, 2.0 * drawing.label["pupil"]["semi_axes_px"][0]]
+    yy, xx = np.mgrid[: drawing.image.shape[0], : drawing.image.shape[1]]
+    streak = 150.0 * np.exp(-0.5 * (((xx - x) / 5.0) ** 2 + ((yy - y) / 1.1) ** 2))
+    found = extract(np.clip(drawing.image + streak, 0, 255).astype(np.uint8))
+    assert not found.glints
+    assert any("elongated" in g.reason for g in found.rejected)
+    assert all(g.status == "rejected" for g in found.rejected)
+
+
+def test_pupil_does_not_feel_a_glint_on_its_edge(ideal):
+    """The same noise with and without a spot on the rim: the centre moves by less than the noise moves it."""
+    plain = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[2])
+    pupil = plain.label["pupil"]
+    rim = np.array(pupil["centre_px"]) + pupil["semi_axes_px"][0] * np.array(
+        [np.cos(pupil["angle_rad"]), np.sin(pupil["angle_rad"])]
+    )
+    image = plain.image.astype(np.float64)
+    ideal._add_glint(image, {"xy": rim, "sigma": 1.4}, 220.0)
+    spotted = extract(np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    moved = spotted.pupil.ellipse.centre_px - extract(plain.image).pupil.ellipse.centre_px
+    assert np.hypot(*moved) < 0.015
+    assert np.hypot(*(spotted.glints[0].xy_px - rim)) < 0.05
+
+
+def test_spot_jacobian_is_the_models_slope():
+    rng = np.random.default_rng(0)
+    windows = spotfit._cut(
+        np.zeros((40, 40), np.float32),
+        lambda x, y: np.zeros(x.shape),
+        np.array([[20.2, 19.7]]),
+        np.array([9.0]),
+        8,
+        255.0,
+    )
+    theta = np.array([[20.2, 19.7, 4.0, 0.2, 0.4, 10.0, 0.3, -0.2]]) + rng.normal(0.0, 0.02, (1, 8))
+    _, jacobian = spotfit._model(windows, theta)
+    for k in range(spotfit.PARAMETERS):
+        step = np.zeros_like(theta)
+        step[0, k] = 1e-5
+        slope = (spotfit._model(windows, theta + step)[0] - spotfit._model(windows, theta - step)[0]) / 2e-5
+        np.testing.assert_allclose(jacobian[..., k], slope, atol=1e-6 * max(1.0, np.abs(slope).max()))

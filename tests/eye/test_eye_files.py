@@ -1,0 +1,152 @@
+"""Eye files: any eye a person may write, and one table of what is refused, with the path of the key."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+
+from eyerender.errors import InputError
+from eyerender.eye.catalogue import load_eye
+from eyerender.eye.model import EyeSpec
+
+
+def changed(name, path, value):
+    data = copy.deepcopy(load_eye(name).to_mapping())
+    place = data
+    *parents, last = path.split(".")
+    for key in parents:
+        place = place[int(key) if key.isdigit() else key]
+    if value is ...:
+        del place[last]
+    else:
+        place[last] = value
+    return data
+
+
+BAD = [
+    ("E2", "colour", 1, "colour", "unknown key"),
+    ("E2", "stop.diameter_mm", -4.0, "stop.diameter_mm", "must be > 0"),
+    ("E2", "stop.diameter_mm", float("nan"), "stop.diameter_mm", "finite"),
+    ("E2", "stop.diameter_mm", 12.0, "stop.diameter_mm", "wider than the cornea"),
+    ("E2", "stop.diameter_mm", 11.2, "stop.diameter_mm", "wider than the iris"),
+    ("E2", "stop.position_mm", [-3.6, 0.0], "stop.position_mm.2", "missing"),
+    ("E2", "stop.position_mm", [1.0, 0.0, 0.0], "stop.position_mm", "not behind"),
+    ("E2", "stop.ellipticity", 1.0, "stop.ellipticity", "must be < 1"),
+    ("E2", "cornea.0.medium.index", 0.9, "cornea.0.medium.index", "must be >= 1"),
+    ("E2", "cornea.0.medium.index", float("inf"), "cornea.0.medium.index", "finite"),
+    ("E2", "cornea.0.medium", {}, "cornea.0.medium", "either"),
+    ("E2", "cornea.0.medium", {"index": 1.3, "cauchy": [1.3, 0.0, 0.0, 0.0]}, "cornea.0.medium", "either"),
+    ("E2", "cornea.0.shape.radius_mm", 0.0, "cornea.0.shape.radius_mm", "must not be 0"),
+    ("E2", "cornea.0.shape.radius_mm", "wide", "cornea.0.shape.radius_mm", "number"),
+    ("E2", "cornea.0.shape.kind", "torus", "cornea.0.shape", "kind must be"),
+    ("E2", "cornea.0.shape.radius_mm", 4.0, "limbus_radius_mm", "ends"),
+    ("E2", "cornea", [], "cornea", "at least 1"),
+    ("E2", "retina", ..., "retina", "missing"),
+    ("E2", "retina.position_mm", [-3.0, 0.0, 0.0], "retina.position_mm", "crosses the stop"),
+    ("E2", "iris.root_radius_mm", 6.5, "iris.root_radius_mm", "wider than the cornea"),
+    ("E2", "sclera.radius_mm", 5.0, "sclera.radius_mm", "limbus"),
+    ("E2", "fovea.field_deg", [80.0, 0.0], "fovea.field_deg", "within 60"),
+    ("E4", "cornea.1.position_mm", [0.5, 0.0, 0.0], "cornea.1.position_mm", "crosses cornea.0"),
+    ("E4", "cornea.1.shape.radius_mm", 12.0, "cornea.1.position_mm", "crosses cornea.0"),
+    ("E4", "lens.surfaces.1.position_mm", [-3.7, 0.0, 0.0], "lens.surfaces.1.position_mm", "crosses the lens"),
+    ("E4", "lens.surfaces.0.position_mm", [-2.0, 0.0, 0.0], "lens.surfaces.0.position_mm", "crosses the stop"),
+    ("E4", "lens.kind", "mirror", "lens", "kind must be"),
+    ("E4", "lens.surfaces", [], "lens.surfaces", "at least 1"),
+    ("E5", "cornea.0.shape.radii_mm", [7.7, -7.7], "cornea.0.shape.radii_mm", "both"),
+    ("E5", "cornea.0.placed_by", "centre", "cornea.0.placed_by", "apex"),
+    ("E5", "lens.shells", 0, "lens.shells", "must be >= 1"),
+    ("E5", "lens.centre_fraction", 1.0, "lens.centre_fraction", "must be < 1"),
+    ("E5-published", "cornea.0.shape.semi_axes_mm", [10.0, -9.0, 9.0], "cornea.0.shape.semi_axes_mm.1", "must be > 0"),
+]
+
+
+@pytest.mark.parametrize(("name", "key", "value", "path", "reason"), BAD, ids=[f"{b[1]}={b[2]}" for b in BAD])
+def test_bad_input_is_refused_with_its_path(name, key, value, path, reason):
+    with pytest.raises(InputError) as caught:
+        EyeSpec.from_mapping(changed(name, key, value), source="eye.yaml")
+    assert caught.value.path == path
+    assert reason in caught.value.reason
+    assert str(caught.value).startswith(f"eye.yaml: {path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_index_that_falls_below_one_at_a_wavelength_is_refused():
+    spec = EyeSpec.from_mapping(changed("E5", "cornea.0.medium.cauchy", [0.9, 1e5, 0.0, 0.0]))
+    assert spec.build(wavelength_nm=600.0).front_indices[0] > 1.0
+    with pytest.raises(InputError, match=r"cornea\.0\.medium: the index at 1500 nm"):
+        spec.build(wavelength_nm=1500.0)
+
+
+@pytest.mark.parametrize("diameter", [0.0, -1.0, float("nan"), 11.5, 14.0])
+def test_a_pupil_that_cannot_be_is_refused(diameter):
+    with pytest.raises(InputError, match="pupil_diameter_mm"):
+        load_eye("E4").build(pupil_diameter_mm=diameter)
+
+
+def test_a_decentred_pupil_must_not_reach_into_the_cornea():
+    with pytest.raises(InputError, match="beyond the cornea"):
+        load_eye("E5-published").build(pupil_diameter_mm=9.0)
+
+
+def test_the_same_cornea_written_in_five_ways_is_the_same_surface():
+    """A sphere as sphere, conic, biconic, ellipsoid by its centre, and general quadric, moved and tilted."""
+    radius, centre = 7.8, [-7.8, 0.3, -0.2]
+    apex = [0.0, 0.3, -0.2]
+    shapes = {
+        "sphere": ({"kind": "sphere", "radius_mm": radius}, apex, "apex"),
+        "sphere by centre": ({"kind": "sphere", "radius_mm": radius}, centre, "centre"),
+        "conic": ({"kind": "conic", "radius_mm": radius, "conic_constant": 0.0}, apex, "apex"),
+        "biconic": ({"kind": "biconic", "radii_mm": [radius] * 2, "conic_constants": [0.0, 0.0]}, apex, "apex"),
+        "ellipsoid": ({"kind": "ellipsoid", "semi_axes_mm": [radius] * 3, "side": "front"}, centre, "centre"),
+        "ellipsoid by apex": ({"kind": "ellipsoid", "semi_axes_mm": [radius] * 3}, apex, "apex"),
+        "quadric": (
+            {"kind": "quadric", "coefficients": [1.0, 1.0, 1.0, 0.0, 0.0, 0.0, radius, 0.0, 0.0, 0.0]},
+            apex,
+            "apex",
+        ),
+    }
+    rng = np.random.default_rng(0)
+    yz = rng.uniform(-3.0, 3.0, (100, 2))
+    found = []
+    for shape, position, placed_by in shapes.values():
+        data = changed("E2", "cornea.0.shape", shape)
+        data["cornea"][0] |= {"position_mm": position, "placed_by": placed_by}
+        data["limbus_radius_mm"], data["iris"]["root_radius_mm"] = 5.5, 5.2
+        surface = EyeSpec.from_mapping(data).build().front[0]
+        start = np.column_stack([np.full(100, 30.0), yz])
+        found.append(surface.intersect(start, np.broadcast_to([-1.0, 0.0, 0.0], start.shape))[0])
+    assert np.allclose(found, found[0], atol=1e-12)
+
+
+def test_a_tilt_turns_about_the_point_that_places_the_surface():
+    data = changed("E2", "cornea.0.tilt_deg", [0.0, 2.0, 5.0])
+    data["cornea"][0]["position_mm"] = [0.0, 0.2, -0.1]
+    surface = EyeSpec.from_mapping(data).build().front[0]
+    assert np.allclose(surface.to_eye([0.0, 0.0, 0.0]), [0.0, 0.2, -0.1], atol=1e-15)
+    data["cornea"][0] |= {"placed_by": "centre", "position_mm": [-10.4, 0.2, -0.1]}
+    surface = EyeSpec.from_mapping(data).build().front[0]
+    # The ellipsoid's centre is R / (1 + Q) = 10.4 mm behind its apex.
+    assert np.allclose(surface.to_eye([-10.4, 0.0, 0.0]), [-10.4, 0.2, -0.1], atol=1e-14)
+
+
+def test_an_elliptic_turned_and_shifted_pupil():
+    """Area kept, axis ratio 1 - ellipticity, the long axis where it is said to be, the centre moving with the size."""
+    data = changed("E2", "stop", {"diameter_mm": 4.0, "position_mm": [-3.6, 0.0, 0.0], "ellipticity": 0.2})
+    data["stop"] |= {"axis_deg": 30.0, "shift_mm_per_mm": [0.05, -0.02]}
+    stop = EyeSpec.from_mapping(data).build(pupil_diameter_mm=3.0).stop
+    a, b = stop.semi_axes_mm
+    assert a * b == pytest.approx(1.5**2, rel=1e-14)
+    assert b / a == pytest.approx(0.8, rel=1e-14)
+    assert np.allclose(stop.centre_mm, [-3.6, -0.05, 0.02], atol=1e-15)
+    points = stop.boundary(40) - stop.centre_mm
+    longest = points[np.argmax(np.linalg.norm(points, axis=1))]
+    assert np.degrees(np.arctan2(longest[2], longest[1])) % 180.0 == pytest.approx(30.0, abs=1e-9)
+    assert stop.contains(stop.centre_mm + 0.999 * points).all()
+    assert not stop.contains(stop.centre_mm + 1.001 * points).any()
+
+
+def test_the_json_schema_names_every_key():
+    schema = EyeSpec.json_schema()
+    assert set(EyeSpec.model_fields) == set(schema["properties"])

@@ -1,0 +1,89 @@
+"""Reflection, refraction, Fresnel."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eyerender.geometry.surfaces import components, join
+from eyerender.geometry.transforms import normalize
+from eyerender.optics.interface import fresnel, reflect, refract
+from eyerender.optics.media import CauchyMedium, ConstantMedium
+
+DATA = Path(__file__).resolve().parents[1] / "data"
+
+
+def rays(seed=0, count=500):
+    rng = np.random.default_rng(seed)
+    return normalize(rng.normal(size=(count, 3))), normalize(rng.normal(size=(count, 3)))
+
+
+def test_refraction_keeps_the_tangential_component_of_n_times_direction():
+    """n1 d x N = n2 w x N, whichever way N points."""
+    d, normal = rays()
+    for n1, n2 in ((1.0, 1.3375), (1.42, 1.336), (1.5, 1.0)):
+        w, passes = refract(components(d), components(normal), n1, n2)
+        w = join(w)
+        assert np.allclose(np.linalg.norm(w, axis=1)[passes], 1.0, atol=1e-14)
+        assert np.allclose(n1 * np.cross(d, normal)[passes], n2 * np.cross(w, normal)[passes], atol=1e-14)
+        assert (np.sign(np.sum(d * normal, 1)) == np.sign(np.sum(w * normal, 1)))[passes].all()
+        sine = n1 * np.linalg.norm(np.cross(d, normal), axis=1)
+        assert (passes == (sine < n2)).all()
+
+
+def test_a_refracted_ray_runs_back_the_way_it_came():
+    d, normal = rays(1)
+    w, passes = refract(components(d), components(normal), 1.0, 1.376)
+    back, _ = refract(tuple(-c for c in w), components(normal), 1.376, 1.0)
+    assert passes.all()
+    # Near grazing the square root of a small number doubles the digits lost.
+    assert np.allclose(join(back), -d, atol=1e-12)
+
+
+def test_reflection_turns_the_normal_component_round():
+    d, normal = rays(2)
+    w = join(reflect(components(d), components(normal)))
+    assert np.allclose(np.sum(w * normal, 1), -np.sum(d * normal, 1), atol=1e-14)
+    assert np.allclose(np.cross(w, normal), np.cross(d, normal), atol=1e-14)
+
+
+def test_fresnel_shares_add_up_to_one_with_the_transmitted_amplitudes():
+    """R + T = 1 with T from the transmission coefficients (Born & Wolf 1.5.2 eq. 20), an independent formula."""
+    angle = np.random.default_rng(3).uniform(0.0, np.pi / 2 - 1e-3, 200)
+    for n1, n2 in ((1.0, 1.376), (1.376, 1.336), (1.336, 1.0)):
+        inside = angle[n1 * np.sin(angle) < n2 * 0.999999]
+        refracted = np.arcsin(n1 * np.sin(inside) / n2)
+        shares = fresnel(np.cos(inside), n1, n2)
+        t_s = 2 * n1 * np.cos(inside) / (n1 * np.cos(inside) + n2 * np.cos(refracted))
+        t_p = 2 * n1 * np.cos(inside) / (n2 * np.cos(inside) + n1 * np.cos(refracted))
+        area = n2 * np.cos(refracted) / (n1 * np.cos(inside))
+        assert np.allclose(shares.s + area * t_s**2, 1.0, atol=1e-12)
+        assert np.allclose(shares.p + area * t_p**2, 1.0, atol=1e-12)
+        assert np.allclose(shares.unpolarized, 0.5 * (shares.s + shares.p), atol=1e-15)
+
+
+def test_fresnel_at_normal_incidence_brewster_and_total_reflection():
+    assert fresnel(1.0, 1.0, 1.376).unpolarized == pytest.approx((0.376 / 2.376) ** 2, abs=1e-15)
+    assert fresnel(np.cos(np.arctan(1.376)), 1.0, 1.376).p == pytest.approx(0.0, abs=1e-30)
+    assert fresnel(np.cos(np.radians(60.0)), 1.376, 1.0).unpolarized == 1.0
+
+
+def test_indices_agree_with_the_reference():
+    """To 1e-10, the reference's own digits being exact; rounding is near 1e-15."""
+    data = json.loads((DATA / "refractive_index.json").read_text())
+    count = 0
+    for name, table in data["values"].items():
+        if name not in data["coefficients"]:
+            continue
+        medium = CauchyMedium(*data["coefficients"][name])
+        for wavelength, index in table.items():
+            assert medium.index(float(wavelength)) == pytest.approx(index, abs=1e-10)
+            count += 1
+    assert count >= 40
+
+
+def test_a_constant_medium_is_the_same_at_every_wavelength():
+    assert ConstantMedium(1.3375).index(400.0) == ConstantMedium(1.3375).index(940.0) == 1.3375

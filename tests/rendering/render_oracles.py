@@ -1,0 +1,151 @@
+"""Oracles for the renderer that share no code with it: float64 tracers, Fermat's principle, contour fits."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.path import Path
+from scipy.optimize import least_squares
+
+from eyerender.eye.model import Eye
+from eyerender.optics.solve import apparent_points
+
+RINGS_MM = ((2.1, 3.1), (3.1, 4.1), (4.1, 5.1))
+HARMONICS = 12
+
+
+def flux_on_rings(eye: Eye, lamp_mm: np.ndarray, intensity: float, rays: int = 1500) -> np.ndarray:
+    """Mean irradiance (mW/mm^2) of rings of the iris by forward tracing in float64: light leaves an isotropic point in
+    even steps of solid angle about the eye, is refracted at every surface by Snell's law, and is counted per ring."""
+    axis = -lamp_mm / np.linalg.norm(lamp_mm)
+    e1 = np.cross(axis, [0.0, 0.3, 1.0])
+    e1 /= np.linalg.norm(e1)
+    e2 = np.cross(axis, e1)
+    half = 7.5 / np.linalg.norm(lamp_mm)
+    a, b = np.meshgrid(*[(np.arange(rays) + 0.5) / rays * 2 * half - half] * 2)
+    d = axis + a.reshape(-1, 1) * e1 + b.reshape(-1, 1) * e2
+    length = np.linalg.norm(d, axis=1)
+    d /= length[:, None]
+    power = intensity * (2 * half / rays) ** 2 / length**3
+    o = np.broadcast_to(lamp_mm, d.shape)
+    before = 1.0
+    for k, (surface, index) in enumerate(zip(eye.front, eye.front_indices, strict=True)):
+        hit = surface.hit(tuple(o.T), tuple(d.T), True)
+        y = np.stack(hit.point, axis=-1)
+        N = surface.normal(y)
+        c = -np.sum(N * d, axis=1)
+        ok = hit.ok & (c > 0)
+        if k == 0:
+            ok &= surface.axis_distance(tuple(y.T)) < eye.limbus_radius_mm
+        y, N, c, d, power = y[ok], N[ok], c[ok], d[ok], power[ok]
+        t = np.arcsin(np.sqrt(1 - c * c) * before / index)
+        i = np.arccos(np.clip(c, -1, 1))
+        with np.errstate(divide="ignore", invalid="ignore"):  # Fresnel by Born & Wolf's sines and tangents
+            F = 0.5 * ((np.sin(i - t) / np.sin(i + t)) ** 2 + (np.tan(i - t) / np.tan(i + t)) ** 2)
+        normal = ((before - index) / (before + index)) ** 2
+        power = power * (1 - np.where(i < 1e-4, normal, F))
+        along = d + c[:, None] * N
+        size = np.linalg.norm(along, axis=1, keepdims=True)
+        along = np.divide(along, size, out=np.zeros_like(along), where=size > 0)
+        d = np.sin(t)[:, None] * along - np.cos(t)[:, None] * N
+        o, before = y, float(index)
+    n = eye.stop.normal
+    s = ((eye.stop.centre_mm - o) @ n) / (d @ n)
+    x = o + s[:, None] * d
+    rho = np.hypot(x[:, 1], x[:, 2])
+    return np.array([power[(rho >= p) & (rho < q)].sum() / (np.pi * (q * q - p * p)) for p, q in RINGS_MM])
+
+
+def ring_points(eye: Eye, p: float, q: float, count: int = 20000) -> np.ndarray:
+    k = np.arange(count)
+    r = np.sqrt(p * p + (q * q - p * p) * (k + 0.5) / count)
+    a = k * np.pi * (3 - np.sqrt(5))
+    y, z = r * np.cos(a), r * np.sin(a)
+    n, c = eye.stop.normal, eye.stop.centre_mm
+    return np.stack([c[0] - (n[1] * (y - c[1]) + n[2] * (z - c[2])) / n[0], y, z], axis=1)
+
+
+def centroid(image: np.ndarray, window: tuple[int, int, int, int]) -> np.ndarray:
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    total = image.sum(dtype=float)
+    return np.array(
+        [(image * u).sum(dtype=float) / total + window[0], (image * v).sum(dtype=float) / total + window[1]]
+    )
+
+
+def mirror_pixel(eye, job, lamp_mm) -> np.ndarray:
+    """Fermat's principle in float64: the mirror point makes lamp - cornea - nodal point stationary."""
+    surface = eye.front[0]
+    lamp, node = job.M.T @ (lamp_mm - job.t), job.M.T @ (job.camera.nodal_point_mm - job.t)
+
+    def point(q):
+        local = np.array([float(surface.sag(q[0], q[1])), q[0], q[1]])
+        return surface.rotation @ local + surface.origin_mm
+
+    def slope(q):
+        y = point(q)
+        N = surface.normal(y[None])[0]
+        pull = (y - lamp) / np.linalg.norm(y - lamp) + (y - node) / np.linalg.norm(y - node)
+        return pull - (pull @ N) * N
+
+    q = least_squares(slope, [0.5, 0.5], xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    y = point(q)
+    assert np.linalg.norm(slope(q)) < 1e-10
+    return job.camera.project(job.M @ y + job.t)[0], float(np.hypot(*q))
+
+
+def outline(job, count: int = 720) -> np.ndarray:
+    """Image of the stop's margin, (count, 2) px, by the float64 solver."""
+    eye = job.eye
+    node = job.M.T @ (job.camera.nodal_point_mm - job.t)
+    seen = apparent_points(eye.front, eye.front_indices, eye.stop.boundary(count), node)
+    assert np.max(seen.residual_mm) < 1e-9
+    return job.camera.project(seen.exit_points_mm @ job.M.T + job.t)[0]
+
+
+def coverage(polygon: np.ndarray, window: tuple[int, int, int, int], k: int = 40) -> np.ndarray:
+    """Share of each pixel inside a polygon, by k x k points; 1e-3 for the pixels of the edge, less on average."""
+    x0, y0, w, h = window
+    out = np.zeros((h, w))
+    sub = (np.arange(k) + 0.5) / k - 0.5
+    path = Path(polygon)
+    v, u = np.mgrid[:h, :w]
+    centre = polygon.mean(axis=0)
+    r = np.linalg.norm(polygon - centre, axis=1)
+    d = np.hypot(u + x0 - centre[0], v + y0 - centre[1])
+    out[d < r.min() - 1] = 1.0
+    for row, column in zip(*np.nonzero((d >= r.min() - 1) & (d <= r.max() + 1)), strict=True):
+        grid = np.stack(np.meshgrid(column + x0 + sub, row + y0 + sub), axis=-1).reshape(-1, 2)
+        out[row, column] = path.contains_points(grid).mean()
+    return out
+
+
+def contour_error(rendered: np.ndarray, polygon: np.ndarray, window: tuple[int, int, int, int]) -> float:
+    """RMS distance (px) of the smooth contour with 12 harmonics that explains the rendered coverage best.
+
+    A shift of the contour by delta along its normal adds delta ds to the pixels it runs through; least squares over all
+    pixels near the edge gives the harmonics of delta.
+    """
+    n = len(polygon)
+    dense = np.stack(
+        [np.interp(np.arange(64 * n) / 64, np.arange(n + 1), np.append(c, c[0])) for c in polygon.T], axis=1
+    )
+    ds = np.linalg.norm(np.roll(dense, -1, axis=0) - dense, axis=1)
+    angle = 2 * np.pi * np.arange(len(dense)) / len(dense)
+    basis = [np.ones_like(angle)]
+    for m in range(1, HARMONICS + 1):
+        basis += [np.cos(m * angle), np.sin(m * angle)]
+    pixel = np.round(dense).astype(int) - window[:2]
+    A = np.zeros((rendered.size, len(basis)))
+    for k, b in enumerate(basis):
+        np.add.at(A[:, k], pixel[:, 1] * window[2] + pixel[:, 0], b * ds)
+
+    # A displaced edge also changes the next pixels; summing over 3 x 3 makes the linear model whole.
+    def box(image: np.ndarray) -> np.ndarray:
+        padded = np.pad(image.reshape(window[3], window[2]), 1)
+        return sum(np.roll(padded, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))[1:-1, 1:-1].ravel()
+
+    wide = np.stack([box(c) for c in A.T], axis=1)
+    rows = np.abs(wide).sum(axis=1) > 0
+    missing = box(rendered - coverage(polygon, window))
+    delta = np.linalg.lstsq(wide[rows], missing[rows], rcond=None)[0]
+    return float(np.sqrt(np.mean((np.stack(basis, axis=1) @ delta) ** 2)))
