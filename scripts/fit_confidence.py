@@ -1,14 +1,16 @@
 #!/usr/bin/env python3
 """Fit the weights of the extractor's confidence on ideal images and print the table of confidence.py.
 
-    fit_confidence.py [--count 2000] [--processes 2]
+    fit_confidence.py [--count 4000] [--processes 2]
 
-Development seeds only (below 10,000): `count` mixed images and a tenth as many without an eye. Takes about ten minutes.
+Development seeds only (below 10,000): `count` mixed images and a tenth as many without an eye. Takes about a quarter
+of an hour.
 """
 
 from __future__ import annotations
 
 import argparse
+import textwrap
 from multiprocessing import Pool
 from typing import Any, Literal
 
@@ -24,7 +26,7 @@ from eyerender.geometry.ellipse import Ellipse, iou
 
 Array = NDArray[np.float64]
 METHODS: tuple[Literal["fast", "refined"], ...] = ("fast", "refined")
-PRIOR_VARIANCE = 10.0
+PRIOR_VARIANCE = 20.0
 EYELESS = -1  # seeds below this stand for images without an eye
 
 
@@ -66,16 +68,22 @@ def fit(rows: Array, right: Array) -> tuple[Array, Array, Array]:
     return low, high, np.asarray(found.x)
 
 
+def lines(values: Array) -> str:
+    """A tuple of numbers as lines of the table."""
+    body = textwrap.fill(", ".join(f"{value:.4g}" for value in values), 106)
+    return textwrap.indent(f"(\n{textwrap.indent(body, '    ')},\n),", " " * 8)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=2000)
+    parser.add_argument("--count", type=int, default=4000)
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
     if not 0 < options.count <= 10_000:
         raise SystemExit("error: --count: must be between 1 and 10,000 (the seeds for development)")
     # Before the first fit there is no table; extraction then still needs one to report a number.
     for method in METHODS:
-        TABLE.setdefault(method, ((0.0,) * 14, (1.0,) * 14, (0.0,) * 29))
+        TABLE.setdefault(method, ((0.0,) * 14, (1.0,) * 14, (0.0,) * 43))
     seeds = [*range(options.count), *(EYELESS - i for i in range(options.count // 10))]
     with Pool(options.processes) as pool:
         observed = pool.map(observe, seeds, chunksize=20)
@@ -86,7 +94,7 @@ def main() -> None:
         low, high, weights = fit(rows, right)
         print(f'    "{method}": (')
         for values in (low, high, weights):
-            print("        (" + ", ".join(f"{value:.4g}" for value in values) + "),")
+            print(lines(values))
         print(f"    ),  # {len(found)} found, {100 * right.mean():.1f} % of them right")
     print("}  # fmt: skip")
 

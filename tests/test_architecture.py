@@ -35,6 +35,8 @@ FLOORS = {
     "observers": 6,
     "comparison": 6,
     "report": 7,
+    "dataset": 7,
+    "study": 8,
     "quickstart": 8,
     "cli": 9,
     "__init__": 10,

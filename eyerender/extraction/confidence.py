@@ -1,10 +1,10 @@
 """Confidence: the probability that the ellipse found overlaps the true one with IoU > 0.9.
 
-A logistic function of what the fit itself knows. Every feature is limited to the range it had in the development images,
-scaled to 0..1 there, and enters with its value and with its excess over 1/2 (a bend in the middle). The weights are
-maximum a-posteriori estimates (Gaussian prior of variance 10 on each) made by `scripts/fit_confidence.py` from seeds below
-10,000: 2,000 mixed images (noise 0.5 to 30 DN, blur 0.7 to 4 px, steps of 12 to 75 DN, lids over up to half the pupil, iris
-texture) and 200 without an eye.
+A logistic function of what the fit itself knows. Every feature is limited to the range it had in the development
+images, scaled to 0..1 there, and enters with its value and its excess over 1/3 and 2/3 (two bends). The weights are
+maximum a-posteriori estimates (Gaussian prior of variance 20 on each) made by `scripts/fit_confidence.py` from seeds
+below 10,000: 4,000 mixed images (noise 0.5 to 30 DN, blur 0.7 to 4 px, steps of 12 to 75 DN, lids over up to half the
+pupil, iris texture) and 400 without an eye.
 """
 
 from __future__ import annotations
@@ -51,9 +51,10 @@ def features(ellipse: Ellipse, goodness: Goodness) -> Array:
 
 
 def design(rows: Array, low: Array, high: Array) -> Array:
-    """(n, 1 + 2 x 14) columns: 1, then every feature scaled to 0..1 within its limits, then each one's excess over 1/2."""
+    """(n, 1 + 3 x 14) columns: 1, every feature scaled to 0..1 within its limits, the excess over 1/3, over 2/3."""
     scaled = (np.clip(rows, low, high) - low) / np.where(high > low, high - low, 1.0)
-    return np.concatenate([np.ones((rows.shape[0], 1)), scaled, np.maximum(scaled - 0.5, 0.0)], axis=1)
+    bends = [np.maximum(scaled - knot, 0.0) for knot in (1.0 / 3.0, 2.0 / 3.0)]
+    return np.concatenate([np.ones((rows.shape[0], 1)), scaled, *bends], axis=1)
 
 
 def confidence(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "refined"]) -> float:
@@ -67,13 +68,30 @@ def confidence(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "re
 # Lower limits, upper limits, weights; printed by scripts/fit_confidence.py.
 TABLE: dict[str, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]] = {
     "fast": (
-        (0.25, 0, 0.25, -0.09514, -3.313, -7.612, -6.821, 2.031, 0.02467, 0.4146, -0.2264, 0, -1.204, 0),
-        (1, 0.5246, 1, 4.523, -0.8024, -0.9622, -2.305, 3.726, 0.3045, 0.9919, 0.2381, 1.263, -1.204, 0),
-        (2.395, 3.924, 1.833, 3.924, -2.8, -3.915, -4.499, -5.337, 0.05028, 1.24, 0.8114, 3.376, 0.3909, 0, 0, 1.793, 3.177, 1.793, 0.9534, 1.342, -3.171, -4.351, 0.001583, -1.37, -0.5722, -3.429, 1.475, 0, 0),
+        (
+            0.25, 0, 0.25, -0.09514, -3.313, -7.612, -6.821, 2.031, 0.02467, 0.4146, -0.2264, 0, -1.204, 0,
+        ),
+        (
+            1, 0.5246, 1, 4.523, -0.8024, -0.9622, -2.305, 3.726, 0.3045, 0.9919, 0.2381, 1.263, -1.204, 0,
+        ),
+        (
+            0.6365, 4.275, 0.3295, 4.275, -3.471, -4.63, -3.127, -2.14, 1.14, 1.218, 5.185, 4.604, -0.4864, 0, 0,
+            0.1257, 4.313, 0.1257, 0.475, 1.367, -3.686, -7.833, -1.562, 0.2039, -7.252, -1.789, 3.647, 0, 0, 1.914,
+            -1.63, 1.914, 1.009, 1.473, 0.5843, 0.7731, 0.3052, -1.606, 5.509, -6.052, -1.646, 0, 0,
+        ),
     ),  # 1983 found, 78.5 % of them right
     "refined": (
-        (0.25, 0, 0.2292, -0.08075, -3.38, -8.008, -6.82, 2.032, 0.02585, 0.4203, -0.1895, 0, -1.204, 0),
-        (1, 0.5246, 1, 5.993, 0.7459, 0.1684, -2.357, 3.728, 0.3896, 0.9929, 0.2156, 1.256, 1.751, 1),
-        (2.457, 6.613, 0.2721, 0.2764, 0.243, -4.967, -7.669, -4.277, -0.686, -0.03347, 1.819, 2.618, -0.0239, -5.685, 2.804, 1.167, 4.539, 0.7951, 3.273, 4.938, 0.4012, -3.907, 0.9725, 1.134, -1.543, -1.099, 1.32, 0.8849, 1.402),
+        (
+            0.25, 0, 0.2292, -0.08075, -3.38, -8.008, -6.82, 2.032, 0.02585, 0.4203, -0.1895, 0, -1.204, 0,
+        ),
+        (
+            1, 0.5246, 1, 5.993, 0.7459, 0.1684, -2.357, 3.728, 0.3896, 0.9929, 0.2156, 1.256, 1.751, 1,
+        ),
+        (
+            0.9527, 7.344, -1.841, 0.3371, -0.7651, -7.258, -5.725, -2.286, -0.3618, 0.2162, 6.664, 3.267, -0.7391,
+            -3.088, 1.831, -1.471, 6.356, 0.1918, 3.172, 4.685, -3.821, -4.677, 0.1962, 0.1953, -7.98, -0.6236, 3.416,
+            -3.714, 1.22, 2.623, -2.205, 0.8963, 4.778, 3.231, 5.167, -0.2325, 0.2891, 1.454, 4.126, -2.433, -1.277,
+            1.012, 0.6102,
+        ),
     ),  # 1983 found, 78.0 % of them right
 }  # fmt: skip

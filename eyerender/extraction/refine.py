@@ -51,6 +51,8 @@ def refine(linear: Image, start: RimModel, sectors: Mask, masked: Mask, noise_dn
     sectors that the model cannot explain (lids, lashes, reflections) are put aside, and the rest is fitted again.
     """
     model = start
+    # Harmonics of the outer level are 0 +- 0.3 steps beforehand: under a lid nothing else holds them.
+    prior = (noise_dn / (0.3 * max(start.step_dn, noise_dn))) ** 2
     pixels = _band(linear, model, masked)
     use = np.ones(pixels.x.size, dtype=bool)
     result: tuple[RimModel, Array, Array, Place] | None = None
@@ -64,13 +66,13 @@ def refine(linear: Image, start: RimModel, sectors: Mask, masked: Mask, noise_dn
         if use_now.sum() < 60:
             return "too few pixels on the rim are free of glints and lids"
         chosen = _Pixels(pixels.x[use_now], pixels.y[use_now], pixels.level[use_now])
-        result = _gauss_newton(chosen, model, steps=6 if turn == 0 else 4)
+        result = _gauss_newton(chosen, model, prior, steps=6 if turn == 0 else 4)
         model = result[0]
         if not order_settled:
             order = _best_order(chosen, model, noise_dn)
             if order > 0:
                 model = RimModel(model.ellipse, model.inner_dn, _padded(model.outer, order), model.sigma_px)
-                result = _gauss_newton(chosen, model, steps=4)
+                result = _gauss_newton(chosen, model, prior, steps=4)
                 model = result[0]
             order_settled = True
         if not _sane(model, start):
@@ -88,7 +90,7 @@ def refine(linear: Image, start: RimModel, sectors: Mask, masked: Mask, noise_dn
             return "too little of the rim fits the pixel model"
     if result is None:
         return "nothing was fitted"
-    return _report(chosen, result, noise_dn, seen)
+    return _report(result, prior, noise_dn, seen)
 
 
 def _band(linear: Image, model: RimModel, masked: Mask) -> _Pixels:
@@ -147,18 +149,22 @@ def _moved(model: RimModel, step: Array) -> RimModel:
     return RimModel(ellipse, model.inner_dn + float(step[6]), model.outer + step[7:], max(sigma, 0.3))
 
 
-def _gauss_newton(pixels: _Pixels, model: RimModel, steps: int) -> tuple[RimModel, Array, Array, Place]:
-    """(model, residual, Jacobian, place) after at most `steps` steps."""
+def _gauss_newton(pixels: _Pixels, model: RimModel, prior: float, steps: int) -> tuple[RimModel, Array, Array, Place]:
+    """(model, residual, Jacobian, place) after at most `steps` steps; cost = sum r^2 + prior sum (harmonics)^2."""
     place = Place.of(model.ellipse, pixels.x, pixels.y)
     value, jacobian = _jacobian(model, place)
     residual = pixels.level - value
-    cost = float(residual @ residual)
+    cost = float(residual @ residual + prior * (model.outer[1:] @ model.outer[1:]))
     damping = 1e-4
+    held = np.arange(SHAPE + 3, jacobian.shape[1])
     for _ in range(steps):
         matrix = jacobian.T @ jacobian
+        matrix[held, held] += prior
+        vector = jacobian.T @ residual
+        vector[held] -= prior * model.outer[1:]
         scale = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
         system = matrix / np.outer(scale, scale) + damping * np.eye(scale.size)
-        step = np.linalg.solve(system, (jacobian.T @ residual) / scale) / scale
+        step = np.linalg.solve(system, vector / scale) / scale
         largest = float(np.abs(step[:SHAPE]).max())
         if largest > 3.0:
             step *= 3.0 / largest
@@ -166,7 +172,7 @@ def _gauss_newton(pixels: _Pixels, model: RimModel, steps: int) -> tuple[RimMode
         trial_place = Place.of(trial.ellipse, pixels.x, pixels.y)
         trial_value, trial_jacobian = _jacobian(trial, trial_place)
         trial_residual = pixels.level - trial_value
-        trial_cost = float(trial_residual @ trial_residual)
+        trial_cost = float(trial_residual @ trial_residual + prior * (trial.outer[1:] @ trial.outer[1:]))
         if trial_cost <= cost:
             model, place, jacobian, residual = trial, trial_place, trial_jacobian, trial_residual
             gained, cost = cost - trial_cost, trial_cost
@@ -236,11 +242,13 @@ def _sane(model: RimModel, start: RimModel) -> bool:
     return moved < 0.25 * float(b) + 1.0 and bool((ratio > 0.7).all() and (ratio < 1.4).all()) and model.step_dn > 0.0
 
 
-def _report(pixels: _Pixels, result: tuple[RimModel, Array, Array, Place], noise_dn: float, seen: Mask) -> PixelFit:
+def _report(result: tuple[RimModel, Array, Array, Place], prior: float, noise_dn: float, seen: Mask) -> PixelFit:
     model, residual, jacobian, place = result
     free = max(residual.size - jacobian.shape[1], 1)
     variance = float(residual @ residual) / free
     matrix = jacobian.T @ jacobian
+    held = np.arange(SHAPE + 3, jacobian.shape[1])
+    matrix[held, held] += prior
     inverse = np.linalg.inv(matrix + 1e-12 * np.diag(np.diag(matrix)))
     plain = inverse[:SHAPE, :SHAPE] * variance
     # Texture leaves residuals that agree within a sector; their excess over white noise scales the covariance.

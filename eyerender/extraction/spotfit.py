@@ -105,7 +105,8 @@ def split_blends(
 
     starts: xy (n, 2), width (n,), height (n,), as given to `fit_spots`. Two spots less than 2.5 sigma apart have one
     maximum; their patch is longer than wide, and one Gaussian leaves a residual of several times the noise. The halves
-    start at one deviation either way along the patch's longer axis; they must come out round and cut the residual to 60 %.
+    start at one deviation either way along the patch's longer axis; they must come out round and cut the residual to
+    60 %.
     """
     suspicious = np.nonzero(fit.converged & (fit.residual_dn > 2.0 * noise_dn))[0]
     for i in suspicious:

@@ -68,8 +68,9 @@ FUNCTIONS: dict[str, tuple[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Coefficients of one eye on the scaled vector v / scale."""
+    """Coefficients of one eye on the scaled vector (v - origin) / scale."""
 
+    origin: Floats
     scale: Floats
     a: Floats
     b: Floats
@@ -84,12 +85,15 @@ class PupilGlintRegression:
         light: which light's glint the vector runs from.
         minimum_norm: allow fewer targets than terms and take the minimum-norm solution, as the study's authors did.
         normalised: divide by the distance of the two pupils; False takes the vector in pixels, of one eye alone.
+        centred: take the polynomial about the calibration vectors' mean. That is another function wherever the terms are
+            not closed under a shift, as in R4 to R12.
     """
 
     function: str | tuple[str, str] = "R3"
     light: int = 0
     minimum_norm: bool = False
     normalised: bool = True
+    centred: bool = False
     _fits: dict[int, _Fit] = field(default_factory=dict, repr=False)
 
     @property
@@ -120,13 +124,13 @@ class PupilGlintRegression:
                 raise InputError(
                     f"{name} eye: {rows.sum()} usable calibration targets, but {self.function} has {need} terms"
                 )
-            # Scaled, never centred: most functions of Table 2 lack terms that a shift of the origin would bring in. The
-            # minimum norm depends on the scale too; the study's is that of the unscaled polynomial.
-            scale = np.ones(2) if self.minimum_norm else np.maximum(np.abs(v[rows]).max(axis=0), 1e-300)
-            u = v[rows] / scale
+            origin = v[rows].mean(axis=0) if self.centred else np.zeros(2)
+            # Scaling alone leaves the function the same. The minimum norm depends on it; the study's is the unscaled one.
+            scale = np.ones(2) if self.minimum_norm else np.maximum(np.abs(v[rows] - origin).max(axis=0), 1e-300)
+            u = (v[rows] - origin) / scale
             a = self._solve(_monomials(u, x_terms), wanted[rows, 0], name)
             b = self._solve(_monomials(u, y_terms), wanted[rows, 1], name)
-            fits[int(eye)] = _Fit(scale, a, b)
+            fits[int(eye)] = _Fit(origin, scale, a, b)
         return replace(self, _fits=fits)
 
     def predict(self, observations: Observations, rig: Rig) -> GazePoints:
@@ -144,7 +148,7 @@ class PupilGlintRegression:
             if fit is None:
                 reason[rows] = "this eye is not calibrated"
                 continue
-            u = v[rows] / fit.scale
+            u = (v[rows] - fit.origin) / fit.scale
             on_screen[rows] = np.stack([_monomials(u, x_terms) @ fit.a, _monomials(u, y_terms) @ fit.b], axis=-1)
         return gaze_points(screen.world(on_screen), reason)
 

@@ -1,0 +1,82 @@
+"""The data card: what is in a dataset, in words, with the block that tells `datasets` where the splits are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+from ..imagefolder import CONVENTIONS
+from .plan import Plan
+from .shard import run_versions
+
+_LABELS = """\
+- `records`: the analytic observer's record: pose, target, apparent pupil (ellipse and boundary points), glints.
+- `labels.pupil`, `labels.iris`: `amodal` ellipse of the outline as if nothing stood before the eye, `visible` ellipse
+  with the second moments of the visible pixels, and the visible share of the amodal pixels.
+- `labels.glints`: for each light the reflection's place by ray optics (`xy_px`), the energy-weighted place in the image
+  (`spot_xy_px`), whether it is visible and which share of the lamp's image is.
+- `labels.space`: centres of rotation, globe, corneal curvature and pupil, corneal apex, optic axis, line of sight and
+  target, in the world's and in the camera's frame (mm; unit vectors).
+- `labels.pose`: x_world = rotation x_eye + translation. `labels.camera`: K, R, t, distortion (OpenCV). `lights_mm`.
+- `mask_file_name`: {mask}.
+- `parameters`: every drawn value by its path in the spec (`draws`), the whole scene and eye as JSON text.
+- `subject`, `split`, `sample`, `sequence_index` (place in the subject's sequence of frames), `window_px`."""
+
+
+def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
+    """The text of README.md."""
+    spec = plan.spec
+    splits = sorted(statistics["images_by_split"])
+    head = {
+        "configs": [
+            {
+                "config_name": "default",
+                "data_files": [
+                    {"split": name, "path": ["metadata.jsonl", f"images/*/{name}-*.png"]} for name in splits
+                ],
+            }
+        ]
+    }
+    front = yaml.safe_dump(head, sort_keys=False, width=200)
+    versions = ", ".join(f"{name} {number}" for name, number in run_versions().items() if name != "python")
+    by_split = "\n".join(
+        f"| {name} | {statistics['subjects_by_split'][name]} | {statistics['images_by_split'][name]} |"
+        for name in splits
+    )
+    size = statistics["pupil_semi_axis_px"]
+    pupils = "" if size is None else f" The pupil's long semi-axis is {size[0]:.1f} to {size[2]:.1f} px."
+    return f"""---
+{front}---
+
+# {spec.name}
+
+{spec.description or "Rendered near-infrared images of eyes."}
+
+{statistics["images"]} synthetic near-infrared images of eyes, rendered through refracting corneas, with exact labels.
+No person was recorded. Subjects are drawn eyes; a subject is in one split only.{pupils}
+
+| split | subjects | images |
+|---|---|---|
+{by_split}
+
+Values are {CONVENTIONS["values"]}. Of {statistics["samples"]} samples {statistics["samples_given_up"]} could not be
+made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jsonl` says why).
+
+## Labels
+`metadata.jsonl` has one line an image, with the same keys in every line.
+
+{_LABELS.format(mask=CONVENTIONS["mask"])}
+
+## Conventions
+- World frame: {CONVENTIONS["world_frame"]}.
+- Pixels: {CONVENTIONS["pixels"]}.
+- Ellipses: {CONVENTIONS["ellipse"]}.
+
+## What to know before training on it
+Lids and lashes are as the scene has them; skin, iris and sclera textures are procedural, their albedos at 850 nm chosen,
+not measured. What a network learns here should be tested on recorded images.
+
+## Made by
+{versions}. The spec is in `dataset.json`; sample i is a pure function of the spec and i.
+"""
