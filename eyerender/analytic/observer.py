@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -20,6 +23,24 @@ def observe(scene: Scene, *, boundary_points: int = 30) -> Observations:
     Raises:
         InputError: a target that no pose of an eye fixates; the message says which, and why.
     """
+    return observe_in_detail(scene, boundary_points=boundary_points)[0]
+
+
+def observe_in_detail(
+    scene: Scene, *, boundary_points: int = 30, purkinje: Sequence[int] = (1,)
+) -> tuple[Observations, Features]:
+    """The same with what a record has no place for: residuals, how far the pupil is from an ellipse, Purkinje images.
+
+    Args:
+        purkinje: which images, from 1 (the glint) to 4; those the eye has no surface for are refused.
+    """
+    has = scene.eye("right").purkinje_orders
+    if not set(purkinje) <= set(has):
+        raise InputError(
+            f"must be among {', '.join(map(str, has))}: {scene.eye_spec.name} has no other Purkinje images",
+            path="purkinje",
+        )
+    orders = (1, *sorted(set(purkinje) - {1}))
     frames = scene.frames()
     pose = poses_of(scene, frames)
     index = frames.index
@@ -32,8 +53,30 @@ def observe(scene: Scene, *, boundary_points: int = 30) -> Observations:
         index.camera,
         np.array([light.position_mm for light in scene.rig.lights]),
         boundary_points=boundary_points,
+        purkinje=orders,
     )
-    return Observations(index, pose, pupil_features(seen), glint_features(seen))
+    return Observations(index, pose, pupil_features(seen), glint_features(seen)), seen
+
+
+def purkinje_records(observed: Observations, seen: Features, orders: Sequence[int]) -> list[dict[str, Any]]:
+    """Purkinje images as plain records: frame, eye, light, image (1 to 4), status, reason, in_image, xy_px."""
+    index = observed.index
+    out = []
+    for i, j, p in np.ndindex(seen.glint_status.shape):
+        ok = seen.glint_status[i, j, p] == 0
+        out.append(
+            {
+                "frame": int(index.frame[i]),
+                "eye": EYES[int(index.eye[i])],
+                "light": j,
+                "image": orders[p],
+                "status": OK if ok else MISSING,
+                "reason": None if ok else reason_of(int(seen.glint_status[i, j, p])),
+                "in_image": bool(seen.glint_in_image[i, j, p]) if ok else None,
+                "xy_px": seen.glints_px[i, j, p].tolist() if ok else None,
+            }
+        )
+    return out
 
 
 def poses_of(scene: Scene, frames: Frames) -> PoseTruth:

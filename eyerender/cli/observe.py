@@ -15,7 +15,15 @@ from .output import Json, emit, progress
 
 
 @app.command(name="features")
-def features(scene: str, /, *, eye: str | None = None, points: int = 30, json: Json = None) -> int:
+def features(
+    scene: str,
+    /,
+    *,
+    eye: str | None = None,
+    points: int = 30,
+    purkinje: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (),
+    json: Json = None,
+) -> int:
     """Compute the apparent pupil and the glints of a scene by ray optics; needs no renderer.
 
     Parameters
@@ -26,18 +34,23 @@ def features(scene: str, /, *, eye: str | None = None, points: int = 30, json: J
         Replace the scene's eye model: a name of the catalogue, or an eye file.
     points
         Boundary points of the pupil.
+    purkinje
+        Also compute these Purkinje images (1 to 4) and how far the pupil is from an ellipse; in the JSON.
     json
         Write the features as JSON to a file, or to stdout with '-'.
     """
     # Not through `observers`, which would load OpenCV for nothing.
-    from ..analytic.observer import observe
+    from ..analytic.observer import observe_in_detail, purkinje_records
     from ..scene import load_scene
 
     if points < 6:
         raise InputError("must be >= 6", source="--points")
     loaded = load_scene(scene, eye=eye)
-    observed = observe(loaded, boundary_points=points)
+    observed, seen = observe_in_detail(loaded, boundary_points=points, purkinje=purkinje or (1,))
     data = {"schema": "eyerender/features/1", "rig": loaded.rig_mapping(), "records": list(observed.records())}
+    if purkinje:
+        data["purkinje"] = purkinje_records(observed, seen, (1, *sorted(set(purkinje) - {1})))
+        data["non_ellipticity_px"] = [float(v) if np.isfinite(v) else None for v in seen.ellipse_residual_px]
     emit(data, _feature_table(observed), json)
     return 0
 

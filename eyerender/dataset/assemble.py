@@ -12,7 +12,7 @@ from ..errors import EyerenderError
 from ..imagefolder import CONVENTIONS, DATASET, DATASET_SCHEMA, METADATA, write_json
 from .card import data_card
 from .plan import Plan
-from .shard import SHARDS, read_done, run_versions, shard_name
+from .shard import LINES, SHARDS, read_done, run_versions, shard_name
 
 FAILURES, CARD = "failures.jsonl", "README.md"
 _PART = ".part"
@@ -21,17 +21,19 @@ _PART = ".part"
 def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
     """Put the dataset together; the same shards give the same bytes. Returns its statistics."""
     statistics = Statistics()
-    with open(folder / (METADATA + _PART), "w", encoding="utf-8") as metadata:
-        with open(folder / (FAILURES + _PART), "w", encoding="utf-8") as failures:
-            for shard in range(plan.spec.shard_count):
-                done = read_done(folder, shard)
-                statistics.take_shard(done)
-                for rejection in done["rejections"]:
-                    failures.write(json.dumps(rejection) + "\n")
-                with open(folder / SHARDS / shard_name(shard) / METADATA, encoding="utf-8") as lines:
-                    for line in lines:
-                        statistics.take_line(json.loads(line))
-                        metadata.write(line)
+    with (
+        open(folder / (METADATA + _PART), "w", encoding="utf-8") as metadata,
+        open(folder / (FAILURES + _PART), "w", encoding="utf-8") as failures,
+    ):
+        for shard in range(plan.spec.shard_count):
+            done = read_done(folder, shard)
+            statistics.take_shard(done)
+            for rejection in done["rejections"]:
+                failures.write(json.dumps(rejection) + "\n")
+            with open(folder / SHARDS / shard_name(shard) / LINES, encoding="utf-8") as lines:
+                for line in lines:
+                    statistics.take_line(json.loads(line))
+                    metadata.write(line)
     found = statistics.to_mapping()
     if found["images"] == 0:
         raise EyerenderError(f"{folder}: no sample of this spec can be made; {FAILURES}{_PART} says why")

@@ -1,10 +1,8 @@
-"""The data card: what is in a dataset, in words, with the block that tells `datasets` where the splits are."""
+"""The data card: what is in a dataset, in words."""
 
 from __future__ import annotations
 
 from typing import Any
-
-import yaml
 
 from ..imagefolder import CONVENTIONS
 from .plan import Plan
@@ -28,17 +26,6 @@ def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
     """The text of README.md."""
     spec = plan.spec
     splits = sorted(statistics["images_by_split"])
-    head = {
-        "configs": [
-            {
-                "config_name": "default",
-                "data_files": [
-                    {"split": name, "path": ["metadata.jsonl", f"images/*/{name}-*.png"]} for name in splits
-                ],
-            }
-        ]
-    }
-    front = yaml.safe_dump(head, sort_keys=False, width=200)
     versions = ", ".join(f"{name} {number}" for name, number in run_versions().items() if name != "python")
     by_split = "\n".join(
         f"| {name} | {statistics['subjects_by_split'][name]} | {statistics['images_by_split'][name]} |"
@@ -46,10 +33,7 @@ def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
     )
     size = statistics["pupil_semi_axis_px"]
     pupils = "" if size is None else f" The pupil's long semi-axis is {size[0]:.1f} to {size[2]:.1f} px."
-    return f"""---
-{front}---
-
-# {spec.name}
+    return f"""# {spec.name}
 
 {spec.description or "Rendered near-infrared images of eyes."}
 
@@ -64,7 +48,8 @@ Values are {CONVENTIONS["values"]}. Of {statistics["samples"]} samples {statisti
 made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jsonl` says why).
 
 ## Labels
-`metadata.jsonl` has one line an image, with the same keys in every line.
+`metadata.jsonl` has one line an image, with the same keys in every line; the column `split` says which split it is in.
+`datasets.load_dataset("imagefolder", data_dir=...)` reads the folder as it is.
 
 {_LABELS.format(mask=CONVENTIONS["mask"])}
 
@@ -74,8 +59,8 @@ made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jso
 - Ellipses: {CONVENTIONS["ellipse"]}.
 
 ## What to know before training on it
-Lids and lashes are as the scene has them; skin, iris and sclera textures are procedural, their albedos at 850 nm chosen,
-not measured. What a network learns here should be tested on recorded images.
+Lids and lashes are as the scene has them; skin, iris and sclera textures are procedural, their albedos at 850 nm
+chosen, not measured. What a network learns here should be tested on recorded images.
 
 ## Made by
 {versions}. The spec is in `dataset.json`; sample i is a pure function of the spec and i.

@@ -45,7 +45,8 @@ class UniformDraw(_Draw):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        return _ordered(self)
+        _order(self.low, self.high)
+        return self
 
 
 class IntegerDraw(_Draw):
@@ -57,7 +58,8 @@ class IntegerDraw(_Draw):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        return _ordered(self)
+        _order(self.low, self.high)
+        return self
 
 
 class NormalDraw(_Draw):
@@ -71,7 +73,8 @@ class NormalDraw(_Draw):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        return _ordered(self)
+        _order(self.low, self.high)
+        return self
 
 
 class ChoiceDraw(_Draw):
@@ -114,8 +117,7 @@ class GridDraw(_Draw):
         """The values in order."""
         if self.values is not None:
             return self.values
-        assert self.low is not None and self.high is not None and self.steps is not None
-        if self.steps == 1:
+        if self.low is None or self.high is None or self.steps is None or self.steps == 1:
             return (self.low,)
         return tuple(self.low + (self.high - self.low) * (k / (self.steps - 1)) for k in range(self.steps))
 
@@ -129,7 +131,8 @@ class SobolDraw(_Draw):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        return _ordered(self)
+        _order(self.low, self.high)
+        return self
 
 
 class SequenceDraw(_Draw):
@@ -139,7 +142,8 @@ class SequenceDraw(_Draw):
     values: Annotated[tuple[Any, ...], Field(min_length=1)]
 
 
-_KINDS = {
+Draw = FixedDraw | UniformDraw | IntegerDraw | NormalDraw | ChoiceDraw | GridDraw | SobolDraw | SequenceDraw
+_KINDS: dict[str, type[Draw]] = {
     "fixed": FixedDraw,
     "uniform": UniformDraw,
     "integer": IntegerDraw,
@@ -149,7 +153,6 @@ _KINDS = {
     "sobol": SobolDraw,
     "sequence": SequenceDraw,
 }
-Draw = FixedDraw | UniformDraw | IntegerDraw | NormalDraw | ChoiceDraw | GridDraw | SobolDraw | SequenceDraw
 KINDS = tuple(_KINDS)
 
 
@@ -164,11 +167,10 @@ def parse_draw(node: dict[str, Any], *, source: str, path: str) -> Draw:
     if kind is None:
         raise InputError(f"must be one of {', '.join(KINDS)}, not {node[MARK]!r}", source=source, path=f"{path}.draw")
     try:
-        found = kind.from_mapping(node)
+        return kind.from_mapping(node)
     except InputError as error:
         where = ".".join(part for part in (path, error.path) if part)
         raise InputError(error.reason, source=source, path=where) from None
-    return found  # type: ignore[return-value]
 
 
 def unit_number(seed: int, path: str, unit: str, number: int, attempt: int) -> float:
@@ -209,8 +211,6 @@ def truncated_normal(u: float, mean: float, sd: float, low: float, high: float) 
     return min(max(x, low), high)
 
 
-def _ordered(draw: Any) -> Any:
-    if not draw.low < draw.high:
+def _order(low: float, high: float) -> None:
+    if not low < high:
         raise ValueError("low must be < high")
-    return draw
-

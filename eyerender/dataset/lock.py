@@ -54,7 +54,13 @@ def final_lock(folder: Path, warn: Callable[[str], None]) -> Iterator[None]:
 
 
 def _take(
-    stack: contextlib.ExitStack, path: Path, *, shared: bool, folder: Path, warn: Callable[[str], None], wait: bool = False
+    stack: contextlib.ExitStack,
+    path: Path,
+    *,
+    shared: bool,
+    folder: Path,
+    warn: Callable[[str], None],
+    wait: bool = False,
 ) -> None:
     try:
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)

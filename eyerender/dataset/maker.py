@@ -72,7 +72,7 @@ class Maker:
             # A frame's number is its own in the whole dataset.
             record = {**record, "frame": turn.sample * self.frames + frame}
             side = EYES[int(observations.index.eye[image.row])]
-            name = f"{sample.split}-{turn.sample:08d}-{f'{frame:03d}-' if many else ''}{side}"
+            name = f"{turn.sample:08d}-{f'{frame:03d}-' if many else ''}{side}"
             line = {
                 "sample": turn.sample,
                 "subject": turn.subject,

@@ -92,7 +92,7 @@ class Plan:
             try:
                 eyes[name] = load_eye(file).to_mapping()
             except InputError as error:
-                if error.source == file and not error.path and name not in catalogue_names() and "no such" in str(error):
+                if error.source == file and error.reason.startswith("no such"):
                     raise InputError(f"{name!r}: {error.reason}", source=source, path="scene.eye.model") from None
                 raise
         plan = cls(spec, eyes, source)

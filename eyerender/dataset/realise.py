@@ -1,7 +1,7 @@
 """From sample i to a scene with its analytic observations: drawn again, by a stated rule, while it cannot be made.
 
-Attempt a of sample i draws every random value of the sample anew (grids and sequences stay: they are the design; a Sobol
-draw becomes a random one); the subject's identity stays. The first attempt that can be made is the sample. After
+Attempt a of sample i draws every random value of the sample anew (grids and sequences stay: they are the design; a
+Sobol draw becomes a random one); the subject's identity stays. The first attempt that can be made is the sample. After
 `attempts` of them, or at once where nothing random is left to draw, the sample is given up.
 """
 
@@ -102,4 +102,3 @@ def _require_pupils(scene: Scene, found: Observations) -> None:
 def _inside(xy: Floats, x0: int, y0: int, w: int, h: int) -> Bools:
     x, y = xy[:, 0], xy[:, 1]
     return np.asarray((x >= x0 - 0.5) & (x <= x0 + w - 0.5) & (y >= y0 - 0.5) & (y <= y0 + h - 0.5))
-

@@ -219,7 +219,9 @@ class _Run:
         samples, seconds = sum(self.made.values()), time.monotonic() - self.start
         rate = self.images / seconds if seconds > 0 else 0.0
         left = (self.total - samples) * seconds / samples if samples else 0.0
-        note = f"samples, {rate:.2f} images/s, {_clock(left)} left, {self.rejected} drawn again, {self.given_up} given up"
+        note = f"samples, {rate:.2f} images/s, {_clock(left)} left"
+        if self.rejected:
+            note += f", {self.rejected} attempts drawn again, {self.given_up} samples given up"
         self.progress(samples, self.total, note)
 
     def _note_backends(self, done: set[int]) -> None:
@@ -231,7 +233,7 @@ class _Run:
         backend = made_by["backend"]
         key = json.dumps([backend["name"], backend.get("llvm"), backend.get("device"), made_by.get("cpu")])
         if self.seen and key not in self.seen and not old:
-            self.say("warning: shards of this dataset are made by different backends or processors; rounding may differ")
+            self.say("warning: different backends or processors make shards of this dataset; rounding may differ")
             self._log("warning", reason="mixed backends or processors", backend=backend)
         self.seen.add(key)
 

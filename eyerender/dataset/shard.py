@@ -1,6 +1,6 @@
 """Shards: written to a folder of a temporary name, renamed when complete.
 
-    images/00003/*.png   masks/00003/*.png   shards/00003/metadata.jsonl, done.json
+    images/00003/*.png   masks/00003/*.png   shards/00003/lines.jsonl, done.json
 
 `shards/00003` is renamed last, so a shard that has one is complete; whatever else a killed run left is removed.
 """
@@ -20,11 +20,13 @@ from typing import Any
 
 from ..errors import EyerenderError, InputError
 from ..imagefile import write_png
-from ..imagefolder import IMAGE_SCHEMA, METADATA, STAGE
+from ..imagefolder import IMAGE_SCHEMA, STAGE
 from .maker import Maker
 
 SHARD_SCHEMA = "eyerender/shard/1"
 DONE, SHARDS = "done.json", "shards"
+# Not called metadata.jsonl: loaders of image folders would read it besides the dataset's own.
+LINES = "lines.jsonl"
 KINDS = ("images", "masks", "amodal_masks")
 
 
@@ -76,7 +78,7 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
                 lines.append(json.dumps({"schema": IMAGE_SCHEMA, **names, **image.line}, allow_nan=False))
             on_sample(k + 1, len(made.images))
         text = "".join(line + "\n" for line in lines)
-        (stage / "shard" / METADATA).write_text(text, encoding="utf-8")
+        (stage / "shard" / LINES).write_text(text, encoding="utf-8")
         seconds = time.monotonic() - start
         done = {
             "schema": SHARD_SCHEMA,
@@ -198,6 +200,6 @@ def _checksums(stage: Path, shard: int, kinds: tuple[str, ...]) -> dict[str, dic
     for kind in kinds:
         for path in sorted((stage / kind).iterdir()):
             out[_place(kind, shard, path.name)] = {"bytes": path.stat().st_size, "sha256": checksum(path)}
-    path = stage / "shard" / METADATA
-    out[_place(SHARDS, shard, METADATA)] = {"bytes": path.stat().st_size, "sha256": checksum(path)}
+    path = stage / "shard" / LINES
+    out[_place(SHARDS, shard, LINES)] = {"bytes": path.stat().st_size, "sha256": checksum(path)}
     return out

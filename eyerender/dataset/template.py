@@ -164,10 +164,8 @@ def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, pr
         inner: tuple[Any, ...] = ()
         if isinstance(draw, FixedDraw):
             inner = (draw.value,)
-        elif isinstance(draw, ChoiceDraw | SequenceDraw):
-            inner = draw.values
-        elif isinstance(draw, GridDraw) and draw.values is not None:
-            inner = draw.values
+        elif isinstance(draw, ChoiceDraw | SequenceDraw | GridDraw):
+            inner = draw.values or ()
         for k, value in enumerate(inner):
             _collect(value, f"{path}#{k}", draws, source, prefix)
     elif isinstance(node, Mapping):

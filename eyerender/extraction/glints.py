@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -98,13 +98,13 @@ def _widths(hat: Image, xy: Array, height: Array, size: int) -> Array:
 
 
 def judge_spots(
-    spots: Spots, fit: SpotFit, prepared: Prepared, step_dn: float, settings: ExtractionSettings
+    spots: Spots, fit: SpotFit, prepared: Prepared, step_dn: float, blur_px: float, settings: ExtractionSettings
 ) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
     """(accepted, rejected), brightest first."""
     accepted: list[GlintResult] = []
     rejected: list[GlintResult] = []
     for i in np.argsort(-fit.amplitude_dn, kind="stable"):
-        reason = _objection(spots, fit, int(i), prepared, step_dn)
+        reason = _objection(spots, fit, int(i), prepared, step_dn, blur_px)
         spread = np.sqrt(fit.sigma_px[i].prod())
         result = GlintResult(
             status="ok" if reason is None else "rejected",
@@ -116,11 +116,12 @@ def judge_spots(
             saturated=bool(fit.clipped[i] > 0),
         )
         (accepted if reason is None else rejected).append(result)
-    surplus = accepted[settings.max_glints :]
+    reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
+    surplus = [replace(glint, status="rejected", reason=reason) for glint in accepted[settings.max_glints :]]
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus)
 
 
-def _objection(spots: Spots, fit: SpotFit, i: int, prepared: Prepared, step_dn: float) -> str | None:
+def _objection(spots: Spots, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float) -> str | None:
     """Why spot i is no glint, or None."""
     if not fit.converged[i]:
         return "the spot's fit did not converge"
@@ -128,20 +129,40 @@ def _objection(spots: Spots, fit: SpotFit, i: int, prepared: Prepared, step_dn: 
     moved = float(np.hypot(*(fit.xy_px[i] - spots.xy_px[i])))
     if moved > max(2.5, 2.0 * wide):
         return f"no spot: the fit moved {moved:.1f} px from the bright pixel"
+    # The rim's blur holds the pixel's own, 1/12; no light passes the optics sharper than that blur.
+    if wide < 0.5 * math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0)):
+        return f"sharper than the optics (sigma {wide:.1f} px): a bad pixel"
     if wide > MAX_SIGMA_PX:
         return f"too wide for a glint: sigma {wide:.1f} px"
     if wide > 2.2 * max(narrow, 0.4):
         return f"elongated {wide / narrow:.1f} : 1, as reflections off the sclera and wet lid margins are"
     if fit.amplitude_dn[i] < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
         return "too faint for a glint"
+    if wide > 2.5 and not _outshines(fit, i, prepared):
+        return "no brighter than what lies beside it, as a corner of sclera between lid and iris is"
     if fit.residual_dn[i] > max(0.3 * min(fit.amplitude_dn[i], DN), 3.0 * prepared.noise_dn):
         return "no spot: the bright patch is not bell-shaped"
     return None
 
 
-def assign(results: tuple[GlintResult, ...], lights: tuple[int | None, ...]) -> tuple[GlintResult, ...]:
-    """The same glints with their lights' indices."""
-    return tuple(
-        GlintResult(g.status, g.reason, g.xy_px, g.covariance, g.amplitude, g.sigma_px, g.saturated, light)
-        for g, light in zip(results, lights, strict=True)
-    )
+def _outshines(fit: SpotFit, i: int, prepared: Prepared) -> bool:
+    """Whether a spot's peak stands above the brightest surroundings, other spots apart, by half its own height.
+
+    Asked of wide spots only: a narrow one has no time to be anything else.
+    """
+    x, y = fit.xy_px[i]
+    wide = float(fit.sigma_px[i].max())
+    reach = 3.5 * wide + 1.0
+    linear = prepared.linear
+    x0, x1 = max(0, math.floor(x - reach)), min(linear.shape[1], math.ceil(x + reach) + 1)
+    y0, y1 = max(0, math.floor(y - reach)), min(linear.shape[0], math.ceil(y + reach) + 1)
+    columns, rows = np.arange(x0, x1)[None, :], np.arange(y0, y1)[:, None]
+    ring = np.hypot(columns - x, rows - y) > 2.2 * wide
+    for k in range(fit.amplitude_dn.size):
+        if k != i and fit.converged[k]:
+            ring &= np.hypot(columns - fit.xy_px[k, 0], rows - fit.xy_px[k, 1]) > 3.0 * float(fit.sigma_px[k].max())
+    beside = linear[y0:y1, x0:x1][ring]
+    if beside.size < 8:
+        return True
+    height = min(float(fit.amplitude_dn[i]), DN)
+    return float(fit.background_dn[i]) + height - float(np.percentile(beside, 97.0)) > 0.5 * height

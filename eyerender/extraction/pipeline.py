@@ -19,7 +19,8 @@ from .refine import SECTORS, PixelFit, edge_covariance, refine, rim_deviation, s
 from .result import Extraction, GlintResult, Goodness, PupilResult, frozen
 from .rimmodel import Place, RimModel
 from .settings import ExtractionSettings
-from .spotfit import fit_spots, split_blends
+from .spotfit import fit_spots
+from .spotmend import give_edges, split_blends
 
 Array = NDArray[np.float64]
 
@@ -213,6 +214,7 @@ def _glints(
     starts = (spots.xy_px, spots.width_px, spots.height_dn)
     limits = (prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * step))
     fit = fit_spots(prepared.linear, known, *starts, *limits)
-    starts, fit = split_blends(prepared.linear, known, starts, fit, *limits)
+    fit = give_edges(prepared.linear, known, starts, fit, model.sigma_px, limits)
+    starts, fit = split_blends(prepared.linear, known, starts, fit, limits)
     spots = Spots(*starts)
-    return judge_spots(spots, fit, prepared, step, settings)
+    return judge_spots(spots, fit, prepared, step, model.sigma_px, settings)

@@ -104,10 +104,14 @@ def _from_float(array: NDArray[np.generic], gamma: float) -> Image | str:
     scale = float(np.percentile(values[::step, ::step], 99.5))
     if scale <= 0.0:
         scale = float(values.max())
-    if not (scale > 0.0 and np.isfinite(scale) and np.isfinite(values.max() / scale)):
+    if scale <= 0.0:
         return "the image holds no positive intensity"
-    linear = (values * (DN / (1.7 * scale))).astype(np.float32)
-    return linear if np.isfinite(linear).all() else "the image's range is too large"
+    with np.errstate(over="ignore"):
+        values = values * (DN / (1.7 * scale))
+    # float32 overflows at 3e38, and squares are taken.
+    if not np.abs(values).max() < 1e12:
+        return "the image's range is too large"
+    return values.astype(np.float32)
 
 
 def estimate_noise(linear: Image) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,23 @@ class SpotFit:
     residual_dn: Array
     clipped: NDArray[np.intp]
     converged: NDArray[np.bool_]
+
+    def taken(self, index: NDArray[np.intp]) -> SpotFit:
+        """The chosen spots."""
+        return SpotFit(*(getattr(self, one.name)[index] for one in fields(self)))
+
+    def one(self, i: int) -> SpotFit:
+        """A batch of spot i alone."""
+        return self.taken(np.array([i]))
+
+    def replaced(self, i: int, other: SpotFit) -> SpotFit:
+        """Spot i replaced by the only one of `other`."""
+        parts = []
+        for one in fields(self):
+            values = getattr(self, one.name).copy()
+            values[i] = getattr(other, one.name)[0]
+            parts.append(values)
+        return SpotFit(*parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,73 +109,11 @@ def fit_spots(
     return _report(windows, theta, settled, others, noise_dn, clip_dn, slope_dn)
 
 
-def split_blends(
-    linear: Image,
-    known: Callable[[Array, Array], Array],
-    starts: tuple[Array, Array, Array],
-    fit: SpotFit,
-    noise_dn: float,
-    clip_dn: float,
-    slope_dn: float,
-) -> tuple[tuple[Array, Array, Array], SpotFit]:
-    """(starts, fit) with every badly fitting spot replaced by two, where two fit it much better.
-
-    starts: xy (n, 2), width (n,), height (n,), as given to `fit_spots`. Two spots less than 2.5 sigma apart have one
-    maximum; their patch is longer than wide, and one Gaussian leaves a residual of several times the noise. The halves
-    start at one deviation either way along the patch's longer axis; they must come out round and cut the residual to
-    60 %.
-    """
-    suspicious = np.nonzero(fit.converged & (fit.residual_dn > 2.0 * noise_dn))[0]
-    for i in suspicious:
-        axis = _long_axis(linear, fit, int(i))
-        if axis is None:
-            continue
-        offset, across = axis
-        xy, width, height = starts
-        rest = np.arange(width.size) != i
-        trial = (
-            np.vstack([xy[rest], fit.xy_px[i] - offset, fit.xy_px[i] + offset]),
-            np.append(width[rest], [across, across]),
-            np.append(height[rest], [height[i], height[i]]),
-        )
-        again = fit_spots(linear, known, *trial, noise_dn, clip_dn, slope_dn)
-        halves = slice(-2, None)
-        sigma = again.sigma_px[halves]
-        good = bool(again.converged[halves].all()) and bool((sigma.max(axis=1) < 1.5 * sigma.min(axis=1)).all())
-        if good and float(again.residual_dn[halves].max()) < 0.6 * float(fit.residual_dn[i]):
-            order = np.argsort(np.append(np.nonzero(rest)[0], [i, i]), kind="stable")
-            return split_blends(
-                linear, known, (trial[0][order], trial[1][order], trial[2][order]), _taken(again, order),
-                noise_dn, clip_dn, slope_dn,
-            )  # fmt: skip
-    return starts, fit
-
-
-def _long_axis(linear: Image, fit: SpotFit, i: int) -> tuple[Array, float] | None:
-    """((2,) one deviation along a patch's longer axis, deviation across it) by moments above half height, or None."""
-    half = math.ceil(3.0 * float(fit.sigma_px[i].max()) + 1.0)
-    cx, cy = (round(float(v)) for v in fit.xy_px[i])
-    y0, x0 = max(0, cy - half), max(0, cx - half)
-    patch = linear[y0 : cy + half + 1, x0 : cx + half + 1].astype(np.float64) - fit.background_dn[i]
-    weight = np.maximum(patch - 0.35 * patch.max(initial=0.0), 0.0) if patch.size else patch
-    total = float(weight.sum())
-    if total <= 0.0:
-        return None
-    x, y = np.arange(weight.shape[1])[None, :], np.arange(weight.shape[0])[:, None]
-    mx, my = float((weight * x).sum()) / total, float((weight * y).sum()) / total
-    cxx, cyy = float((weight * (x - mx) ** 2).sum()) / total, float((weight * (y - my) ** 2).sum()) / total
-    cxy = float((weight * (x - mx) * (y - my)).sum()) / total
-    values, vectors = np.linalg.eigh(np.array([[cxx, cxy], [cxy, cyy]]))
-    if values[1] < 1.3 * values[0]:
-        return None
-    return np.asarray(vectors[:, 1] * math.sqrt(values[1])), float(np.clip(1.3 * math.sqrt(values[0]), 0.5, 8.0))
-
-
-def _taken(fit: SpotFit, order: NDArray[np.intp]) -> SpotFit:
-    return SpotFit(
-        fit.xy_px[order], fit.covariance[order], fit.amplitude_dn[order], fit.sigma_px[order],
-        fit.background_dn[order], fit.residual_dn[order], fit.clipped[order], fit.converged[order],
-    )  # fmt: skip
+def spot_light(fit: SpotFit, x: Array, y: Array) -> Array:
+    """The light of the first spot of a batch at pixels (x, y)."""
+    gx = _profile(x, float(fit.xy_px[0, 0]), float(fit.sigma_px[0, 0]))[0]
+    gy = _profile(y, float(fit.xy_px[0, 1]), float(fit.sigma_px[0, 1]))[0]
+    return np.asarray(fit.amplitude_dn[0] * gx * gy)
 
 
 def _cut(

@@ -102,7 +102,7 @@ def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple
         spread = np.sqrt((cross * cross).sum(axis=-1))
         b = unit(cross)
     else:
-        finite = np.isfinite(normals).all(axis=(-1, -2))
+        finite = np.array(np.isfinite(normals).all(axis=(-1, -2)), dtype=bool)
         _, values, vt = np.linalg.svd(np.where(finite[..., None, None], normals, 0.0))
         b, spread = vt[..., -1, :], np.where(finite, values[..., 1], 0.0)
     ok = np.array(spread > COPLANAR, dtype=bool)

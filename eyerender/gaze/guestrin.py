@@ -29,7 +29,7 @@ from .parameters import HUMAN_BOUNDS, MEAN_EYE, NAMES, Calibration, EyeParameter
 from .rays import FeatureRays, feature_rays, nasal_sign, screen_of
 from .search import Objective, calibrate
 
-# Chebyshev degree of the centre as a function of sqrt(R): its last terms are below 1e-8 mm over 3 to 20 mm.
+# Chebyshev degree of the centre as a function of sqrt(R): its last terms are below 1e-6 mm over 3 to 20 mm.
 _DEGREE = 14
 _OFF_SCREEN_MM = 1e4  # the miss of a visual axis that never meets the screen's plane, in a search
 

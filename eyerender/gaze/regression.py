@@ -85,8 +85,8 @@ class PupilGlintRegression:
         light: which light's glint the vector runs from.
         minimum_norm: allow fewer targets than terms and take the minimum-norm solution, as the study's authors did.
         normalised: divide by the distance of the two pupils; False takes the vector in pixels, of one eye alone.
-        centred: take the polynomial about the calibration vectors' mean. That is another function wherever the terms are
-            not closed under a shift, as in R4 to R12.
+        centred: take the polynomial about the calibration vectors' mean. That is another function wherever the terms
+            are not closed under a shift, as in R4 and R6 to R12.
     """
 
     function: str | tuple[str, str] = "R3"
@@ -125,7 +125,7 @@ class PupilGlintRegression:
                     f"{name} eye: {rows.sum()} usable calibration targets, but {self.function} has {need} terms"
                 )
             origin = v[rows].mean(axis=0) if self.centred else np.zeros(2)
-            # Scaling alone leaves the function the same. The minimum norm depends on it; the study's is the unscaled one.
+            # Scaling leaves the function the same. The minimum norm depends on it; the study's is the unscaled one.
             scale = np.ones(2) if self.minimum_norm else np.maximum(np.abs(v[rows] - origin).max(axis=0), 1e-300)
             u = (v[rows] - origin) / scale
             a = self._solve(_monomials(u, x_terms), wanted[rows, 0], name)

@@ -101,6 +101,7 @@ def look_numbers(look: LookSpec) -> dict[str, ArrayLike]:
         "sclera.albedo": look.sclera_albedo,
         "sclera.contrast": look.sclera_contrast,
         "limbus.albedo": look.limbus_albedo,
+        "backdrop.x": -look.backdrop_distance_mm,
     }
 
 

@@ -13,8 +13,10 @@ image to several pixels, come out as the energy-weighted disc and not as the ima
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -77,38 +79,36 @@ def mirror_paths(surface: Surface, sources: Floats, eyepoint: Floats) -> tuple[F
     for _ in range(_STEPS):
         e = _basis(d)
         hit = surface.hit(_xyz(sources), _xyz(d), True)
-        y = sources + hit.distance[:, None] * d
+        t = hit.distance[:, None]
+        y = sources + t * d
         g = np.stack(np.broadcast_arrays(*hit.gradient), axis=-1)
-        size = np.linalg.norm(g, axis=-1, keepdims=True)
+        size = np.sqrt(_dot(g, g))[:, None]
         N = g / size
-        c = -np.sum(N * d, axis=-1, keepdims=True)
+        c = -_dot(N, d)[:, None]
         w = d + 2 * c * N
         hessian = surface.hessian_at(_xyz(y))
-        s = np.sum((eyepoint - y) * w, axis=-1, keepdims=True)
+        s = _dot(eyepoint - y, w)[:, None]
         r = eyepoint - (y + s * w)
         a = []
         for k in range(2):
-            v = hit.distance[:, None] * e[k]
-            dy = v + d * (np.sum(N * v, axis=-1, keepdims=True) / c)
+            dy = t * (e[k] + d * (_dot(N, e[k])[:, None] / c))
             h = np.stack(np.broadcast_arrays(*hessian.times(_xyz(dy))), axis=-1) / size
-            dN = h - N * np.sum(N * h, axis=-1, keepdims=True)
-            dc = -(np.sum(e[k] * N, axis=-1, keepdims=True) + np.sum(d * dN, axis=-1, keepdims=True))
+            dN = h - N * _dot(N, h)[:, None]
+            dc = -(_dot(e[k], N) + _dot(d, dN))[:, None]
             a.append(dy + s * (e[k] + 2 * (dc * N + c * dN)))
-        det = np.sum(w * np.cross(a[0], a[1]), axis=-1)
+        det = _dot(w, _cross(a[0], a[1]))
         J = np.abs(det)
-        miss = np.linalg.norm(r, axis=-1)
+        miss = np.sqrt(_dot(r, r))
         found = hit.ok & (miss < _RESIDUAL_MM) & (s[:, 0] > 0) & (c[:, 0] > 0)
         bad = ~np.isfinite(miss)
         if np.all(found | bad):
             break
         with np.errstate(divide="ignore", invalid="ignore"):
-            du = np.sum(w * np.cross(r, a[1]), axis=-1) / det
-            dv = np.sum(w * np.cross(a[0], r), axis=-1) / det
-        length = np.hypot(du, dv) * np.abs(hit.distance)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            cut = np.minimum(1.0, 2.0 / length)[:, None]
-        step = cut * (du[:, None] * e[0] + dv[:, None] * e[1])
-        d = np.where(found[:, None] | bad[:, None], d, _unit(d + np.nan_to_num(step)))
+            du, dv = _dot(w, _cross(r, a[1])) / det, _dot(w, _cross(a[0], r)) / det
+            cut = np.minimum(1.0, 2.0 / (np.hypot(du, dv) * np.abs(hit.distance)))
+        step = (cut * du)[:, None] * e[0] + (cut * dv)[:, None] * e[1]
+        moved = d + np.where(np.isfinite(step), step, 0.0)
+        d = np.where((found | bad)[:, None], d, _unit(moved))
     return y, d, w, J, found
 
 
@@ -137,51 +137,64 @@ class GlintScene:
     camera: Camera
     clear: Visibility
 
-    def image(self, light: Light, sigma_px: float) -> Image:
-        """The image of one lamp, as finely as its size and the point-spread function ask for."""
-        if light.radius_mm == 0:
-            return self._trace(light, light.position_mm[None, :], np.ones(1))
-        rough = self._trace(light, *_disc(light, *_nodes(1, 4)))
-        if not np.any(rough.energy > 0):
-            return self._trace(light, *_disc(light, *_nodes(4, 18)))
-        # The integrand, a Gaussian over the lamp's image, is smooth on the scale of sigma (and of the pixel).
-        xy = rough.xy_px[rough.energy > 0]
-        extent = float(np.max(np.linalg.norm(xy - xy.mean(axis=0), axis=-1)))
-        radial = int(np.clip(np.ceil(1.5 + 1.5 * extent / np.hypot(sigma_px, 0.29)), 2, 64))
-        return self._trace(light, *_disc(light, *_nodes(radial, 4 * radial + 2)))
+    def images(self, lights: Sequence[Light], sigma_px: float) -> list[Image]:
+        """The image of each lamp, as finely as its size and the point-spread function ask for."""
+        rough = self._trace(lights, [_nodes(1, 4) if lamp.radius_mm > 0 else _POINT for lamp in lights])
+        nodes = []
+        for lamp, image in zip(lights, rough, strict=True):
+            if lamp.radius_mm == 0:
+                nodes.append(_POINT)
+                continue
+            # The integrand, a Gaussian over the lamp's image, is smooth on the scale of sigma (and of the pixel).
+            xy = image.xy_px[image.energy > 0]
+            extent = float(np.max(np.hypot(*(xy - xy.mean(axis=0)).T))) if len(xy) else 1.0
+            radial = min(max(math.ceil(1.5 + 1.5 * extent / math.hypot(sigma_px, 0.29)), 2), 64)
+            nodes.append(_nodes(radial, 4 * radial + 2))
+        return self._trace(lights, nodes) if any(lamp.radius_mm > 0 for lamp in lights) else rough
 
-    def _trace(self, light: Light, points: Floats, weights: Floats) -> Image:
+    def _trace(self, lights: Sequence[Light], nodes: Sequence[_Nodes]) -> list[Image]:
+        """Images of lamps by the given points of their discs; all lamps in one batch."""
         camera = self.camera
+        points = np.concatenate([_disc(lamp, n) for lamp, n in zip(lights, nodes, strict=True)])
+        counts = [len(n.weight) for n in nodes]
+        which = np.repeat(np.arange(len(lights)), counts)
+        weights = np.concatenate([n.weight for n in nodes])
+        axes = np.stack([lamp.axis for lamp in lights]) @ self.M
+        strength = np.array([float(lamp.intensity_mw_sr) for lamp in lights])
+        exponent = np.array([float(lamp.lobe_exponent) for lamp in lights])
         eyepoint = self.M.T @ (camera.nodal_point_mm - self.t)
         sources = (points - self.t) @ self.M
         y, d, w, J, found = mirror_paths(self.surface, sources, eyepoint)
         found &= self.surface.axis_distance(_xyz(y)) < self.limbus_radius_mm
-        y, d, w, J = (np.where(found.reshape(-1, *[1] * (a.ndim - 1)), a, 1.0) for a in (y, d, w, J))
-        N = self.surface.normal(y)
-        F = reflectance(np.clip(-np.sum(N * d, axis=-1), 0, 1), self.index)
-        leaving = np.clip(d @ (self.M.T @ light.axis), 0, 1)
-        intensity = light.intensity_mw_sr * (leaving**light.lobe_exponent if light.lobe_exponent else 1.0)
+        y, d, w = (np.where(found[:, None], a, (1.0, 0.0, 0.0)) for a in (y, d, w))
+        F = reflectance(np.clip(-_dot(self.surface.normal(y), d), 0, 1), self.index)
+        leaving = np.maximum(_dot(d, axes[which]), 0)
+        power = exponent[which]
+        lobe = np.where(power == 0, 1.0, np.where(leaving > 0, leaving ** np.where(power == 0, 1.0, power), 0.0))
         cam = -(w @ self.M.T) @ camera.R.T
         found &= cam[:, 2] > 0
         z = np.where(found, cam[:, 2], 1.0)
         x, v = cam[:, 0] / z, cam[:, 1] / z
         scale = camera.K[0, 0] * camera.K[1, 1] * _distortion_determinant(camera, x, v) / z**3
         found &= ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, eyepoint - y)
-        energy = np.where(found, weights * intensity * F / J * scale, 0.0)
-        return Image(points, y @ self.M.T + self.t, camera.pixels_of(x, v), energy)
+        energy = np.where(found, weights * strength[which] * lobe * F / np.where(found, J, 1.0) * scale, 0.0)
+        mirrors, xy = y @ self.M.T + self.t, camera.pixels_of(x, v)
+        parts = np.cumsum(counts)[:-1]
+        columns = (np.split(a, parts) for a in (points, mirrors, xy, energy))
+        return [Image(*c) for c in zip(*columns, strict=True)]
 
     def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
         """Whether the way from points of the cornea is barred by the sclera's sphere (eye frame)."""
         d = _unit(towards)
         o = y - self.sclera_centre_mm
-        b = np.sum(o * d, axis=-1)
-        disc = b * b - (np.sum(o * o, axis=-1) - self.sclera_radius_mm**2)
+        b = _dot(o, d)
+        disc = b * b - (_dot(o, o) - self.sclera_radius_mm**2)
         return np.asarray((disc > 0) & (-b - np.sqrt(np.maximum(disc, 0)) > 1e-6))
 
 
 def glint_table(scene: GlintScene, lights: Sequence[Light], sigma_px: float) -> tuple[GlintTable, list[Spots]]:
     """The glints of all lamps, and the points that each is made of."""
-    images = [scene.image(light, sigma_px) for light in lights]
+    images = scene.images(lights, sigma_px)
     sources, mirrors = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "mirror_mm"))
     node = np.broadcast_to(scene.camera.nodal_point_mm, mirrors.shape)
     both = scene.clear(np.concatenate([sources, node]), np.concatenate([mirrors, mirrors]))
@@ -201,19 +214,31 @@ def glint_table(scene: GlintScene, lights: Sequence[Light], sigma_px: float) -> 
     return table, spots
 
 
-def _nodes(radial: int, angular: int) -> tuple[Floats, Floats, Floats]:
-    """Radii in (0, 1), angles and weights of a quadrature over the unit disc, flattened."""
+@dataclass(frozen=True, slots=True)
+class _Nodes:
+    """A quadrature over the unit disc: points (k, 2) and weights (k,) that add up to 1."""
+
+    point: Floats
+    weight: Floats
+
+
+_POINT = _Nodes(np.zeros((1, 2)), np.ones(1))
+
+
+@lru_cache(maxsize=64)
+def _nodes(radial: int, angular: int) -> _Nodes:
+    """Gauss-Legendre nodes in r^2, even angles."""
     x, weight = np.polynomial.legendre.leggauss(radial)
     angle = 2 * np.pi * (np.arange(angular) + 0.5) / angular
-    r = np.repeat(np.sqrt(0.5 * (x + 1)), angular)
-    return r, np.tile(angle, radial), np.repeat(0.5 * weight, angular) / angular
+    r = np.sqrt(0.5 * (x + 1))
+    point = np.stack([np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()], axis=1)
+    return _Nodes(point, np.repeat(0.5 * weight, angular) / angular)
 
 
-def _disc(light: Light, r: Floats, angle: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Points of a lamp's disc in the world, and their weights."""
-    e = _basis(light.axis[None, :])
-    offset = light.radius_mm * r[:, None] * (np.cos(angle)[:, None] * e[0] + np.sin(angle)[:, None] * e[1])
-    return light.position_mm + offset, weights
+def _disc(light: Light, nodes: _Nodes) -> Floats:
+    """Points (k, 3) of a lamp's disc in the world."""
+    e1, e2 = _basis(light.axis[None, :])
+    return np.asarray(light.position_mm + float(light.radius_mm) * (nodes.point[:, :1] * e1 + nodes.point[:, 1:] * e2))
 
 
 def _distortion_determinant(camera: Camera, x: Floats, y: Floats) -> Floats:
@@ -228,15 +253,25 @@ def _distortion_determinant(camera: Camera, x: Floats, y: Floats) -> Floats:
     return np.asarray(a * c - b * b)
 
 
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.asarray(np.einsum("...i,...i->...", a, b))
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """The cross product of (n, 3) arrays; np.cross spends more time on axes than on numbers."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+
+
 def _unit(v: Floats) -> Floats:
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+    return np.asarray(v / np.sqrt(_dot(v, v))[..., None])
 
 
 def _basis(d: Floats) -> tuple[Floats, Floats]:
     """Two unit vectors orthogonal to each unit vector (n, 3) and to each other."""
     helper = np.where(np.abs(d[:, :1]) < 0.6, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
-    e1 = _unit(np.cross(d, helper))
-    return e1, np.cross(d, e1)
+    e1 = _unit(_cross(d, helper))
+    return e1, _cross(d, e1)
 
 
 def _xyz(v: Floats) -> tuple[Floats, Floats, Floats]:

@@ -102,15 +102,50 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any) -> View:
         mi.Ray3f(mi.Point3f(o), d), mi.RayFlags.Minimal | mi.RayFlags.UV, other
     )
 
-    Nc = front.normal(yl)
-    c = -dr.dot(Nc, dl)
+    normal, mirrored, passed, inner, pupil = dr.if_stmt(
+        (yl, oe + tc * de, dl),
+        amodal_cornea,
+        lambda yl, y, dl: _refracted(values, yl, y, dl),
+        lambda yl, y, dl: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Bool(False)),
+    )
+    y = oe + tc * de
+    xs = oe + ts * de
+    xo, no = values.point_to_eye(interaction.p), values.vector_to_eye(interaction.n)
+    no = dr.select(dr.dot(no, de) > 0, -no, no)
+    point = dr.select(on_cornea, y, dr.select(on_sclera, xs, xo))
+    normal = dr.select(on_cornea, normal, dr.select(on_sclera, xs - values["sclera.centre"], no))
+    return View(
+        on_cornea,
+        on_sclera,
+        other,
+        dr.select(on_eye, t_eye, hit.t),
+        point,
+        dr.normalize(normal),
+        dr.select(amodal_cornea, opacity(values, rho), 1),
+        mirrored,
+        passed,
+        inner,
+        pupil,
+        interaction,
+        amodal_cornea,
+        amodal_sclera,
+    )
+
+
+def _refracted(values: Values, yl: Any, y: Any, dl: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """From the front cornea to the plane of the iris: normal, reflectance, transmittance, point, whether in the pupil.
+
+    yl, dl: hit point and direction in the front surface's frame; y: the point in the eye frame.
+    """
+    front = values.surfaces[0]
+    N = front.normal(yl)
+    c = -dr.dot(N, dl)
     c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
     mirrored = fresnel(c, c2, front.eta)
     passed = 1 - mirrored
-    w = front.vector_out(front.eta * dl + (front.eta * c - c2) * Nc)
-    y = oe + tc * de
+    w = front.vector_out(front.eta * dl + (front.eta * c - c2) * N)
     inside = mi.Vector3f(y)
-    reached = mi.Bool(amodal_cornea)
+    reached = mi.Bool(True)
     for surface in values.surfaces[1:]:
         inside, w, share, ok = surface.refract(inside, w)
         passed *= share
@@ -122,28 +157,8 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any) -> View:
     q = inner - values["stop.centre"]
     a, b = values["stop.axes"]
     pu, pv = dr.dot(q, values["stop.u"]) / a, dr.dot(q, values["stop.v"]) / b
-
-    xs = oe + ts * de
-    xo, no = values.point_to_eye(interaction.p), values.vector_to_eye(interaction.n)
-    no = dr.select(dr.dot(no, de) > 0, -no, no)
-    point = dr.select(on_cornea, y, dr.select(on_sclera, xs, xo))
-    normal = dr.select(on_cornea, front.vector_out(Nc), dr.select(on_sclera, xs - values["sclera.centre"], no))
-    return View(
-        on_cornea,
-        on_sclera,
-        other,
-        dr.select(on_eye, t_eye, hit.t),
-        point,
-        dr.normalize(normal),
-        dr.select(amodal_cornea, opacity(values, rho), 1),
-        mirrored,
-        dr.select(reached, passed, 0),
-        inner,
-        reached & (pu * pu + pv * pv < 1),
-        interaction,
-        amodal_cornea,
-        amodal_sclera,
-    )
+    pupil = reached & (pu * pu + pv * pv < 1)
+    return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, pupil
 
 
 def _sphere(o: Any, d: Any, radius: Any) -> tuple[Any, Any]:
@@ -172,7 +187,18 @@ def iris_albedo(values: Values, textures: Textures, x: Any) -> Any:
 
 def outer_albedo(values: Values, textures: Textures, view: View, active: Any) -> Any:
     """Albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
-    r = view.point - values["sclera.centre"]
+    si = view.interaction
+    other = si.bsdf().eval_diffuse_reflectance(si, active & view.other)[0]
+    return dr.if_stmt(
+        (view.point, other),
+        view.other,
+        lambda point, other: other,
+        lambda point, other: _sclera_albedo(values, textures, point),
+    )
+
+
+def _sclera_albedo(values: Values, textures: Textures, point: Any) -> Any:
+    r = point - values["sclera.centre"]
     # Azimuthal equidistant map of the front of the globe, from the pole out to 108 degrees.
     polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / (0.6 * dr.pi)
     inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
@@ -180,14 +206,11 @@ def outer_albedo(values: Values, textures: Textures, view: View, active: Any) ->
     texture = textures.sclera.eval(uv)[0]
     sclera = values["sclera.albedo"] * dr.maximum(1 + values["sclera.contrast"] * (texture - 1), 0.02)
     # The limbus' grey ring fades into the white over its width, on the side of the sclera.
-    local = values.surfaces[0].point_in(view.point)
+    local = values.surfaces[0].point_in(point)
     away = dr.sqrt(local.y * local.y + local.z * local.z) - values["limbus_radius"]
     s = dr.clip(0.5 + 0.5 * away * values["limbus_gain"], 0, 1)
     s = s * s * (3 - 2 * s)
-    sclera = values["limbus.albedo"] + s * (sclera - values["limbus.albedo"])
-    si = view.interaction
-    other = si.bsdf().eval_diffuse_reflectance(si, active & view.other)[0]
-    return dr.select(view.other, other, sclera)
+    return values["limbus.albedo"] + s * (sclera - values["limbus.albedo"])
 
 
 def lamp_blocked(values: Values, scene: Any, x: Any, lamp: Any, sphere: Any, cornea: Any, active: Any) -> Any:
@@ -207,6 +230,8 @@ def lamp_blocked(values: Values, scene: Any, x: Any, lamp: Any, sphere: Any, cor
     rho2 = y.y * y.y + y.z * y.z
     met &= (rho2 < values["limbus_radius"] * values["limbus_radius"]) & (y.x > values["limbus_floor"])
     blocked |= met & cornea & (t > _EPSILON_MM) & (t < distance)
+    if not values.structure.obstacles:
+        return blocked | (values.point_to_scene(lamp).x < values["backdrop.x"])
     ray = mi.Ray3f(mi.Point3f(values.point_to_scene(x + _EPSILON_MM * d)), values.vector_to_scene(d))
     ray.maxt = distance * (1 - 1e-4)
     return blocked | scene.ray_test(ray, coherent=True, active=active & ~blocked)
@@ -244,13 +269,14 @@ def lamps(
     scale, shift = values["image.scale"], values["image.shift"]
     aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
 
+    sine, cosine_v = dr.sincos(v * (2 * dr.pi))
+
     def more(i: Any, *_: Any) -> Any:
         return i < lights.count
 
     def body(i: Any, direct: Any, bent: Any, failures: Any) -> Any:
         lamp: Lamp = lights[i]
-        turn = mi.Float(i) * 0.7548776662
-        source = lamp.point(_wrap(u + turn), _wrap(v + turn))
+        source = lamp.point(u, sine, cosine_v)
         to = source - point
         inv2 = dr.rcp(dr.squared_norm(to))
         to *= dr.sqrt(inv2)
@@ -259,14 +285,22 @@ def lamps(
         blocked = lamp_blocked(values, scene, point, source, other, True, lit)
         direct += dr.select(lit & ~blocked, lamp.radiant_intensity(-to) * cosine * inv2, 0)
 
-        path = connect(values.surfaces, source, inner, n, aim, values["limbus_radius"], inside)
-        local = values.surfaces[0].point_in(path.entry)
-        clear = 1 - opacity(values, dr.sqrt(local.y * local.y + local.z * local.z))
-        enters = path.found & (clear > 0)
-        blocked = lamp_blocked(values, scene, path.entry, source, True, False, enters)
-        gain = lamp.radiant_intensity(path.leaving) * path.transfer * clear
-        bent += dr.select(enters & ~blocked, gain, 0)
-        failures += dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
+        def through_cornea(source: Any, inner: Any, aim: Any, bent: Any, failures: Any) -> Any:
+            path = connect(values.surfaces, source, inner, n, aim, values["limbus_radius"], inside)
+            local = values.surfaces[0].point_in(path.entry)
+            clear = 1 - opacity(values, dr.sqrt(local.y * local.y + local.z * local.z))
+            enters = path.found & (clear > 0)
+            blocked = lamp_blocked(values, scene, path.entry, source, True, False, enters)
+            gain = lamp.radiant_intensity(path.leaving) * path.transfer * clear
+            bent += dr.select(enters & ~blocked, gain, 0)
+            return bent, failures + dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
+
+        bent, failures = dr.if_stmt(
+            (source, inner, aim, bent, failures),
+            inside,
+            through_cornea,
+            lambda source, inner, aim, bent, failures: (bent, failures),
+        )
         return i + 1, direct, bent, failures
 
     state = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.UInt32(0))
@@ -274,10 +308,6 @@ def lamps(
         state, more, body, labels=("i", "direct", "bent", "failures"), label="lamps"
     )
     return direct, bent, failures
-
-
-def _wrap(x: Any) -> Any:
-    return x - dr.floor(x)
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,7 +327,12 @@ def shade(
     view = look(values, scene, o, d, active)
     outer, inner, failures = light(values, lights, scene, view, u, v)
     albedo = outer_albedo(values, textures, view, active)
-    behind = dr.select(view.pupil, values["pupil.albedo"], iris_albedo(values, textures, view.inner))
+    behind = dr.if_stmt(
+        (view.inner,),
+        view.cornea & ~view.pupil,
+        lambda inner: iris_albedo(values, textures, inner),
+        lambda inner: mi.Float(values["pupil.albedo"]),
+    )
     index = values["inner_index"]
     through = view.passed * behind * inner / (index * index)
     seen = dr.select(view.cornea, view.opacity * albedo * outer + (1 - view.opacity) * through, albedo * outer)

@@ -128,7 +128,7 @@ class Renderer:
         return self._labels(self._bind(job)[0], job.window)
 
     def _bind(self, job: RenderJob) -> tuple[Values, Lights]:
-        structure = Structure(kinds(job.eye), bool(np.any(job.camera.distortion)))
+        structure = Structure(kinds(job.eye), bool(np.any(job.camera.distortion)), self._surround.obstructed)
         anchor = job.anchor_mm
         numbers = {
             **eye_numbers(job.eye),

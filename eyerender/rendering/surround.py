@@ -42,6 +42,7 @@ class Surround:
             parts[f"obstacle{i}"] = _mesh(f"obstacle{i}", body.vertices_mm, body.faces, None, material)
         self.scene = mi.load_dict(parts)
         self._params: Any = mi.traverse(self.scene)
+        self.obstructed = len(obstacles) > 0
         self._shown: tuple[float, float, float] | None = None
 
     def show(self, look: LookSpec) -> None:

@@ -22,10 +22,12 @@ LIGHT_WIDTH = 10  # position 3, axis 3, radius, intensity, lobe exponent, inner 
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """What a kernel is compiled for: (biconic, tilted) of each surface, and whether the camera's lens distorts."""
+    """What a kernel is compiled for: (biconic, tilted) of each surface, whether the camera's lens distorts, and whether
+    anything but the surround's plane, which hides no lamp before it, can stand in the way of light."""
 
     surfaces: tuple[tuple[bool, bool], ...]
     distorted: bool = False
+    obstacles: bool = True
 
     @property
     def layout(self) -> tuple[tuple[str, int], ...]:
@@ -68,6 +70,7 @@ class Structure:
             ("sclera.albedo", 1),
             ("sclera.contrast", 1),
             ("limbus.albedo", 1),
+            ("backdrop.x", 1),
         ]
         return tuple(rows)
 
@@ -146,16 +149,21 @@ class Lamp:
     exponent: Any
     inner_radius: Any
 
-    def point(self, u: Any, v: Any) -> Any:
-        """A point of the emitting disc or ring, uniform by area."""
+    def point(self, u: Any, sine: Any, cosine: Any) -> Any:
+        """A point of the emitting disc or ring, uniform by area: u in [0, 1) and a direction in its plane."""
         e1, e2 = mi.coordinate_system(self.axis)
         inner = self.inner_radius * self.inner_radius
         r = dr.sqrt(inner + u * (self.radius * self.radius - inner))
-        s, c = dr.sincos(v * (2 * dr.pi))
-        return self.position + r * (c * e1 + s * e2)
+        return self.position + (r * cosine) * e1 + (r * sine) * e2
 
     def radiant_intensity(self, direction: Any) -> Any:
         """Radiant intensity (mW/sr) into a unit direction that leaves the lamp."""
         c = dr.dot(direction, self.axis)
-        lobe = dr.select(self.exponent == 0, 1, dr.power(dr.maximum(c, 1e-6), self.exponent))
-        return dr.select((c > 0) | (self.exponent == 0), self.intensity * lobe, 0)
+        # A Lambertian lamp, the usual one, is spared the power.
+        lobe = dr.if_stmt(
+            (c, self.exponent),
+            self.exponent != 1,
+            lambda c, m: dr.select(m == 0, 1, dr.select(c > 0, dr.power(dr.maximum(c, 1e-6), m), 0)),
+            lambda c, m: dr.maximum(c, 0),
+        )
+        return self.intensity * lobe

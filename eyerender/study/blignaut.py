@@ -57,7 +57,7 @@ CORRECTED: frozenset[str] = frozenset()
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Errors (deg) of every function and calibration set: `error_deg` (f,) by frame, or the reason why there is none."""
+    """Errors of one function and calibration set: `error_deg` (f,) by frame, or the reason why there are none."""
 
     function: str
     calibration: str
@@ -102,14 +102,16 @@ def terms(function: str, departures: Collection[str]) -> tuple[str, str]:
     return x, ys[xs.index(x)]
 
 
-def run(observations: Observations, rig: Rig, departures: Collection[str]) -> list[Outcome]:
-    """Every function calibrated on every set, tested on all targets."""
+def run(observations: Observations, rig: Rig, departures: Collection[str], *, centred: bool = False) -> list[Outcome]:
+    """Every function calibrated on every set, tested on all targets; `centred` as in `PupilGlintRegression`."""
     out = []
     fixation = observations.index.fixation
     for name, targets in CALIBRATION_SETS.items():
         calibration = observations.take(np.isin(fixation, np.array(targets) - 1))
         for function in FUNCTIONS:
-            regression = PupilGlintRegression(terms(function, departures), minimum_norm="minimum_norm" in departures)
+            regression = PupilGlintRegression(
+                terms(function, departures), minimum_norm="minimum_norm" in departures, centred=centred
+            )
             try:
                 fitted = regression.fit(calibration, calibration.index.target_mm, rig)
             except InputError as error:
@@ -132,7 +134,7 @@ def best(outcomes: list[Outcome], calibration: str) -> Outcome | None:
 
 
 def rows_of(outcomes: list[Outcome], **keys: Any) -> list[Row]:
-    """One row a function and set; `variant` says where a solution is the minimum-norm one."""
+    """One row a function and set."""
     out = []
     for o in outcomes:
         out.append(
@@ -142,7 +144,8 @@ def rows_of(outcomes: list[Outcome], **keys: Any) -> list[Row]:
                 calibration=o.calibration,
                 function=o.function,
                 reason=o.reason,
-                **{**keys, "variant": _solution(o)},
+                solution=_solution(o),
+                **keys,
             )
         )
     return out

@@ -65,8 +65,8 @@ def findings(clouds: Mapping[str, Cloud], protocol: str, observer: str) -> list[
     if "E1" in clouds:
         moved = extent_px(clouds["E1"].glint_px)
         add(
-            "F1", "E1's glint does not move when the eye turns: largest distance from its mean (px)", moved, "< 0.001 px",
-            moved < 1e-3, "E1 turns about the centre of its spherical cornea",
+            "F1", "E1's glint does not move when the eye turns: largest distance from its mean (px)", moved,
+            "< 0.001", moved < 1e-3, "E1 turns about the centre of its spherical cornea",
         )  # fmt: skip
     if "E5" in clouds and len(clouds) > 1:
         shapes = {n: (aspect(c.pupil_px), aspect(c.glint_px)) for n, c in clouds.items()}
@@ -78,8 +78,8 @@ def findings(clouds: Mapping[str, Cloud], protocol: str, observer: str) -> list[
             f"{n} pupil {s[0]:.3f}" + (f", glint {s[1]:.3f}" if n != "E1" else "") for n, s in shapes.items()
         )
         add(
-            "F2", "E5's clouds are flatter than every other model's: its aspect over the smallest other one", ratio, "< 1",
-            ratio < 1, detail,
+            "F2", "E5's clouds are flatter than every other model's: its aspect over the smallest other one", ratio,
+            "< 1", ratio < 1, detail,
         )  # fmt: skip
     if {"E3", "E4"} <= set(clouds):
         a, b = clouds["E3"].pupil_px, clouds["E4"].pupil_px
@@ -91,11 +91,11 @@ def findings(clouds: Mapping[str, Cloud], protocol: str, observer: str) -> list[
     order = [n for n in ("E3", "E2", "E4", "E5") if n in clouds]
     if len(order) > 1:
         bows = [bow(clouds[n].glint_px) for n in order]
-        rise = min(np.diff(bows))
+        rise = float(min(np.diff(bows)))
         add(
             "F4",
             "the glint clouds bend more with the cornea's asphericity (Q 0, -.25, -.26, -.27/-.36 for E3, E2, E4, E5): "
             "smallest rise of the rows' bow from one to the next",
-            rise, "> 0", rise > 0, ", ".join(f"{n} {v:.4f}" for n, v in zip(order, bows, strict=True)),
+            rise, "> 0", bool(rise > 0), ", ".join(f"{n} {v:.4f}" for n, v in zip(order, bows, strict=True)),
         )  # fmt: skip
     return out

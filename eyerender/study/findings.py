@@ -18,7 +18,7 @@ _TIE_DEG = 0.001  # functions whose means are closer than this count as equally 
 
 
 def t_tests(means: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
-    """Two-tailed one-sample t-tests of the four participants' errors against each simulated mean (3 degrees of freedom).
+    """Two-tailed one-sample t-tests of the four participants' errors against each simulated mean.
 
     Args:
         means: simulated mean (deg) by eye model and head.
@@ -66,7 +66,7 @@ def guestrin(
         worst = max(rises.values())
         out.append(
             Finding(
-                "G2", protocol, observer, "no model's error rises by more than .02 deg from H1 to H2: largest rise (deg)",
+                "G2", protocol, observer, "no model's error rises by over .02 deg from H1 to H2: largest rise (deg)",
                 worst, "<= 0.02", worst <= 0.02, ", ".join(f"{m} {r:+.4f}" for m, r in rises.items()),
             )
         )  # fmt: skip
@@ -82,7 +82,7 @@ def guestrin(
         out.append(
             Finding(
                 "G3", protocol, observer,
-                "conic models (E2, E4) err more than spherical ones (E1, E3): smallest conic over largest spherical mean",
+                "conic models (E2, E4) err more than spherical ones (E1, E3): smallest conic mean over largest other",
                 ratio, "> 1", ratio > 1, "; ".join(pairs),
             )
         )  # fmt: skip
@@ -102,7 +102,7 @@ def guestrin(
                 low = min(means[model].values())
                 out.append(
                     Finding(
-                        "P2", protocol, observer, f"{model}: the error exceeds 11 deg, as the paper reports of E5 (deg)",
+                        "P2", protocol, observer, f"{model} errs by over 11 deg, as the paper reports of E5 (deg)",
                         low, "> 11", low > lit.PAPER_GUESTRIN_E5,
                         "H1 " + ", H2 ".join(f"{v:.3f}" for v in means[model].values()),
                     )
@@ -126,7 +126,7 @@ def blignaut(outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str
         share = float(np.mean([measured in t for t in ties.values()]))
         add(
             "B1",
-            f"{c}: the best function is the experiment's, {measured} (the paper names {lit.PAPER_BEST[c]}): share of models",
+            f"{c}: the best function is the experiment's {measured} (the paper: {lit.PAPER_BEST[c]}): share of models",
             share, "= 1", share == 1, "; ".join(f"{m} {' = '.join(t)} {error[m][c]:.3f}" for m, t in ties.items()),
         )  # fmt: skip
     drop = {m: 1 - e["C9"] / e["C5"] for m, e in error.items()}
@@ -152,7 +152,7 @@ def blignaut(outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str
         share_of = {m: e[c] / measured_deg for m, e in error.items()}
         low, high = min(share_of.values()), max(share_of.values())
         add(
-            "B5", f"{c}: the simulated best error is 10 to 20 % of the measured one: the share furthest from that range",
+            "B5", f"{c}: the simulated best error is 10 to 20 % of the measured one: the share furthest off",
             low if 0.1 - low > high - 0.2 else high, "0.10 to 0.20", low >= 0.1 and high <= 0.2, _by_model(share_of),
         )  # fmt: skip
     return out
@@ -160,9 +160,7 @@ def blignaut(outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str
 
 def _ties(outcomes: Sequence[Outcome], calibration: str) -> list[str]:
     """The functions that are as good as the best one for a set, the best first."""
-    some = sorted(
-        ((o.mean_deg, o.function) for o in outcomes if o.calibration == calibration and o.mean_deg is not None)
-    )
+    some = sorted((o.mean_deg, o.function) for o in outcomes if o.calibration == calibration and o.mean_deg is not None)
     return [name for mean, name in some if mean - some[0][0] < _TIE_DEG]
 
 

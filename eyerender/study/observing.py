@@ -1,11 +1,12 @@
 """Observing a study's scenes: by ray optics, or in images that are rendered into folders and used again.
 
-A camera that does not see an eye is turned about its nodal point until it faces it. That changes no ray: the features it
-gives are brought back to the study's own camera along their rays,
+A camera that does not see an eye is turned about its nodal point until it faces it. That changes no ray: the features
+it gives are brought back to the study's own camera along their rays,
 
     x_cam = R R_turned^T ray,    pixel = K x_cam / z
 
-so that estimators and rig stay as they are. (The centre of an ellipse is not quite the image of a centre, in either camera.)
+so that estimators and rig stay as they are. (The centre of an ellipse is not quite the image of a centre, in either
+camera.)
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ class Observing:
     images: ImageSettings | None = None
 
     def observe(self, scene: Scene, name: str, *, facing: bool = False) -> Observations:
-        """Every (frame, eye) of a scene. `name` is its folder of images; with `facing` the cameras are turned to the eyes.
+        """Every (frame, eye) of a scene. `name` is its folder of images; with `facing` the cameras are turned to the
+        eyes.
 
         Raises:
             InputError: a target that no pose of an eye fixates, or a folder that holds something else.

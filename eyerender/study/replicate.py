@@ -14,6 +14,7 @@ from ..observation import Observations
 from ..scene import Scene
 from . import blignaut, guestrin
 from .clouds import Cloud
+from .literature import CALIBRATION_SETS
 from .observing import Observing
 from .results import Row, WaterfallStep
 
@@ -22,7 +23,7 @@ PROTOCOLS = {"guestrin2006": guestrin.PUBLISHED, "blignaut2014": blignaut.PUBLIS
 
 @dataclass(slots=True)
 class GuestrinPart:
-    """What one eye model gave: rows, calibrations with their restarts, H1's errors and means by (protocol, observer)."""
+    """What one eye model gave: rows, calibrations with restarts, means and H1's errors by (protocol, observer)."""
 
     eye_model: str
     rows: list[Row] = field(default_factory=list)
@@ -40,6 +41,7 @@ class BlignautPart:
     eye_model: str
     rows: list[Row] = field(default_factory=list)
     outcomes: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
+    centred: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
     clouds: dict[tuple[str, str], Cloud] = field(default_factory=dict)
     waterfall: list[WaterfallStep] = field(default_factory=list)
 
@@ -107,13 +109,18 @@ def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> B
         key = protocol, observing.kind
         out.outcomes[key] = done
         out.clouds[key] = Cloud.of(seen)
-        out.rows += blignaut.rows_of(done, protocol=protocol, observer=observing.kind, eye_model=eye)
+        keys = {"protocol": protocol, "observer": observing.kind, "eye_model": eye}
+        out.rows += blignaut.rows_of(done, variant="vector", **keys)
+        if protocol == "corrected":
+            centred = blignaut.run(seen, scene.rig, departures, centred=True)
+            out.centred[key] = centred
+            out.rows += blignaut.rows_of(centred, variant="centred vector", **keys)
     if observing.kind == "analytic" and len(protocols) == 2:
 
         def best(departures: Collection[str]) -> dict[str, float | None]:
             scene, seen = scenes(departures)
             done = blignaut.run(seen, scene.rig, departures)
-            found = {c: blignaut.best(done, c) for c in blignaut.CALIBRATION_SETS}
+            found = {c: blignaut.best(done, c) for c in CALIBRATION_SETS}
             return {c: b.mean_deg if b else None for c, b in found.items()}
 
         out.waterfall = _waterfall(eye, blignaut, best)
@@ -147,7 +154,7 @@ def _misprints(eye: str) -> dict[str, dict[str, Any]]:
             "head_positions_mm": [[0, 0, 0], [0, 300, 0], [0, -300, 0], [400, 0, 0], [-400, 0, 0]]
         },
     }
-    out = {}
+    out: dict[str, dict[str, Any]] = {}
     for name, changes in cases.items():
         try:
             scene = guestrin.scene(eye, guestrin.CORRECTED, changes)

@@ -21,7 +21,11 @@ FINDINGS_SCHEMA = "eyerender/study-findings/1"
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One mean error; keys that do not apply are None. `sd_deg` is over the fixations (n - 1); `reason`: why no mean."""
+    """One mean error; keys that do not apply are None.
+
+    `sd_deg` is over the fixations (n - 1), `missing` counts those without an estimate, `in_image` those whose features
+    lie on the sensor; `reason` says why there is no mean, `solution` how the coefficients were found.
+    """
 
     protocol: str
     observer: str
@@ -37,6 +41,7 @@ class Row:
     missing: int = 0
     in_image: int | None = None
     reason: str | None = None
+    solution: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,308 @@
+"""Commands about datasets: generate, sample, preview, validate, export-dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from ..errors import EyerenderError, InputError
+from .app import app
+from .output import BackendName, Json, emit, progress, say
+
+
+@app.command(name="generate")
+def generate(
+    spec: str,
+    folder: Annotated[Path | None, Parameter(name="DIR")] = None,
+    /,
+    *,
+    workers: int | None = None,
+    shard: str | None = None,
+    engine: Literal["local", "ray"] = "local",
+    address: str | None = None,
+    dry_run: bool = False,
+    seed: int | None = None,
+    count: int | None = None,
+    backend: BackendName = "auto",
+    threads: int | None = None,
+    timeout: float = 600.0,
+    overwrite: bool = False,
+    json: Json = None,
+) -> int:
+    """Make a labelled dataset; started again on the same folder, it makes what is missing.
+
+    Parameters
+    ----------
+    spec
+        A dataset file, or the bare name of a shipped one.
+    folder
+        The folder to write.
+    workers
+        Worker processes (default: one a processor while memory lasts).
+    shard
+        K/N: make only every N-th shard, from the K-th on (1 <= K <= N), for array jobs on one folder.
+    engine
+        Processes of this machine, or actors of a Ray cluster.
+    address
+        The Ray cluster's address (default: one started on this machine).
+    dry_run
+        Only tell how long it would take and how much disk.
+    seed
+        Replace the spec's seed.
+    count
+        Replace the spec's number of samples.
+    backend
+        Where to render.
+    threads
+        Processor threads of all workers together (default: all).
+    timeout
+        Seconds without a sign of life after which a worker is ended and its shard tried again.
+    overwrite
+        Replace what the folder holds.
+    json
+        Write a summary as JSON to a file, or to stdout with '-'.
+    """
+    from ..dataset.plan import Plan
+    from ..dataset.run import Options
+    from ..dataset.run import generate as run
+
+    plan = Plan.load(spec, seed=seed, count=count)
+    for name, value in (("--workers", workers), ("--threads", threads)):
+        if value is not None and value < 1:
+            raise InputError(f"must be >= 1, not {value}", source=name)
+    if not timeout > 0:
+        raise InputError("must be > 0", source="--timeout")
+    options = Options(
+        workers=workers,
+        part=_part(shard),
+        engine=engine,
+        address=address,
+        backend=backend,
+        threads=threads,
+        timeout_s=timeout,
+        overwrite=overwrite,
+    )
+    if dry_run:
+        from ..dataset.estimate import estimate
+
+        found = estimate(plan, options)
+        emit(found, _estimate_text(found), json)
+        return 0
+    if folder is None:
+        raise InputError("give the folder to write", source="DIR")
+    if overwrite and shard is not None:
+        raise InputError("cannot be given with --shard: other parts may be at work in the folder", source="--overwrite")
+    with progress("generating") as steps:
+        done = run(plan, folder, options, progress=steps, say=say)
+    emit(done, _generate_text(done), json)
+    return 0
+
+
+@app.command(name="sample")
+def sample(
+    spec: str,
+    index: Annotated[int, Parameter(name="I", allow_leading_hyphen=True)],
+    /,
+    *,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    seed: int | None = None,
+    json: Json = None,
+) -> int:
+    """Show sample I of a dataset: whose it is, what was drawn, and the scene and eye that come of it.
+
+    Parameters
+    ----------
+    spec
+        A dataset file, or the bare name of a shipped one.
+    index
+        The sample, from 0.
+    output
+        A folder for scene.yaml and eye.yaml, which the other commands read.
+    seed
+        Replace the spec's seed.
+    json
+        Write the sample as JSON to a file, or to stdout with '-'.
+    """
+    import yaml
+
+    from ..dataset.plan import Plan
+    from ..dataset.realise import realise
+
+    plan = Plan.load(spec, seed=seed)
+    if not 0 <= index < plan.spec.count:
+        raise InputError(f"must be 0 to {plan.spec.count - 1}, not {index}", source="I")
+    found = realise(plan, index)
+    if found.sample is None:
+        raise InputError(f"sample {index} is given up: {found.rejections[-1].reason}", source=plan.source)
+    data = {"schema": "eyerender/sample/1", **found.sample.to_mapping()}
+    data["rejections"] = [f"{r.of}, attempt {r.attempt}: {r.reason}" for r in found.rejections]
+    if output is not None:
+        _write_sample(output, data)
+    text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100).rstrip()
+    emit(data, text, json)
+    return 0
+
+
+@app.command(name="preview")
+def preview(
+    spec: Annotated[str, Parameter(name="SCENE_OR_SPEC")],
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    eye: str | None = None,
+    seed: int | None = None,
+    backend: BackendName = "auto",
+    threads: int | None = None,
+) -> int:
+    """Render a contact sheet of 16 images of a scene or a dataset; for people, never to measure in.
+
+    Parameters
+    ----------
+    spec
+        A scene or a dataset: a file, or the bare name of a shipped one.
+    output
+        The picture to write.
+    eye
+        Replace a scene's eye model.
+    seed
+        Replace the seed.
+    backend
+        Where to render.
+    threads
+        Processor threads (default: all).
+    """
+    from ..dataset.plan import Plan
+    from ..dataset.sheet import FORMATS, write_sheet
+    from ..dataset.spec import shipped_datasets
+    from ..scene import Scene, is_dataset, load_scene
+
+    if output.suffix.lower() not in FORMATS:
+        raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(output))
+    what: Plan | Scene
+    if spec in shipped_datasets() or is_dataset(Path(spec)):
+        if eye is not None:
+            raise InputError("a dataset's eyes are in its spec", source="--eye")
+        what = Plan.load(spec, seed=seed)
+    else:
+        what = load_scene(spec, eye=eye, seed=seed)
+    with progress("rendering") as steps:
+        write_sheet(what, output, backend=backend, threads=threads, progress=steps)
+    print(output)
+    return 0
+
+
+@app.command(name="validate")
+def validate(folder: Annotated[Path, Parameter(name="DIR")], /, *, quick: bool = False, json: Json = None) -> int:
+    """Check a folder of images: checksums, ranges, masks against ellipses, records; and print its statistics.
+
+    Exit code 1 where something is wrong.
+
+    Parameters
+    ----------
+    folder
+        A folder that render, quickstart or generate wrote.
+    quick
+        Do not open the images.
+    json
+        Write the report as JSON to a file, or to stdout with '-'.
+    """
+    from ..dataset.validate import validate as check
+
+    with progress("validating") as steps:
+        report = check(folder, quick=quick, progress=steps)
+    emit(report, _validate_text(report), json)
+    return 0 if report["ok"] else EyerenderError.exit_code
+
+
+@app.command(name="export-dataset")
+def export_dataset(
+    folder: Annotated[Path, Parameter(name="DIR")],
+    out: Annotated[Path, Parameter(name="OUT")],
+    /,
+    *,
+    format: Literal["webdataset", "coco", "csv", "openeds", "ellseg", "teyed", "croissant"],
+    overwrite: bool = False,
+    json: Json = None,
+) -> int:
+    """Write a generated dataset in a layout that existing training code reads.
+
+    Parameters
+    ----------
+    folder
+        A folder that generate wrote.
+    out
+        The folder to write.
+    format
+        The layout.
+    overwrite
+        Replace what OUT holds.
+    json
+        Write a summary as JSON to a file, or to stdout with '-'.
+    """
+    from ..dataset.export import export
+
+    with progress("exporting") as steps:
+        done = export(folder, out, format, overwrite=overwrite, progress=steps)
+    emit(done, f"{done['images']} images as {format} in {out}", json)
+    return 0
+
+
+def _part(text: str | None) -> tuple[int, int]:
+    if text is None:
+        return 1, 1
+    k, slash, n = text.partition("/")
+    if not (slash and k.isdigit() and n.isdigit() and 1 <= int(k) <= int(n)):
+        raise InputError(f"must be K/N with 1 <= K <= N, not {text!r}", source="--shard")
+    return int(k), int(n)
+
+
+def _write_sample(folder: Path, data: dict[str, Any]) -> None:
+    from ..eye.spec import EyeSpec
+    from ..imagefolder import refuse_non_empty
+    from ..scene import SceneSpec
+
+    refuse_non_empty(folder, False)
+    scene = {**data["scene"], "eye": {**data["scene"].get("eye", {}), "model": "eye.yaml"}}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        EyeSpec.from_mapping(data["eye"]).dump(folder / "eye.yaml")
+        SceneSpec.from_mapping(scene).dump(folder / "scene.yaml")
+    except OSError as error:
+        raise EyerenderError(f"{folder}: cannot be written ({error.strerror or error})") from None
+
+
+def _generate_text(done: dict[str, Any]) -> str:
+    lines = [f"{done['images_made']} images made in {done['seconds']:.1f} s ({done['shards_made']} shards)"]
+    if not done["complete"]:
+        lines.append(f"{done['shards_missing']} shards are still missing")
+        return "\n".join(lines)
+    s = done["statistics"]
+    splits = ", ".join(f"{name} {n}" for name, n in s["images_by_split"].items())
+    lines.append(f"{s['images']} images in {done['path']}: {splits}; {s['bytes_per_image']} bytes an image")
+    if s["attempts_rejected"]:
+        given = s["samples_given_up"]
+        lines.append(f"{s['attempts_rejected']} attempts drawn again, {given} samples given up (see failures.jsonl)")
+    return "\n".join(lines)
+
+
+def _estimate_text(found: dict[str, Any]) -> str:
+    minutes, seconds = divmod(round(found["seconds"]), 60)
+    return (
+        f"{found['images']} images in {found['shards']} shards: about {minutes} min {seconds} s with "
+        f"{found['workers']} workers of {found['threads_per_worker']} threads on {found['backend']['name']}, "
+        f"{found['bytes'] / 1e6:.1f} MB"
+    )
+
+
+def _validate_text(report: dict[str, Any]) -> str:
+    lines = [f"{report['images']} images checked"]
+    for key, value in report["statistics"].items():
+        shown = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else value
+        lines.append(f"{key:<22} {shown}")
+    lines += [f"wrong: {problem}" for problem in report["problems"]]
+    if report["problems_left_out"]:
+        lines.append(f"and {report['problems_left_out']} more")
+    lines.append("all is well" if report["ok"] else f"{report['problem_count']} problems")
+    return "\n".join(lines)

@@ -1,0 +1,104 @@
+"""A contact sheet of sixteen images, for people: of a dataset spec's samples, or of a scene's windows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from ..analytic.observer import observe
+from ..capture import BackendName, make_renderer, render_windows
+from ..errors import EyerenderError, InputError
+from ..imagefile import preview
+from ..scene import Scene
+from .maker import Maker
+from .plan import Plan
+from .realise import frames_of
+
+TILES = 16
+_COLUMNS, _WIDTH, _GAP = 4, 320, 4
+FORMATS = (".png", ".jpg", ".jpeg", ".webp")
+Progress = Callable[[int, int, str], None]
+Tile = tuple[NDArray[np.uint8], str]
+
+
+def write_sheet(
+    what: Plan | Scene,
+    path: str | Path,
+    *,
+    backend: BackendName = "auto",
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> int:
+    """Render a contact sheet into a picture file; returns the number of images on it.
+
+    Raises:
+        InputError: a file ending that is no picture's, or a spec none of whose samples can be made.
+        EyerenderError: the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(path))
+    maker = _of_plan(what, backend, threads) if isinstance(what, Plan) else _of_scene(what, backend, threads)
+    tiles: list[Tile] = []
+    for total, tile in maker:
+        tiles.append(tile)
+        if progress is not None:
+            progress(len(tiles), total, "")
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        contact_sheet(tiles).save(part)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+    return len(tiles)
+
+
+def contact_sheet(tiles: list[Tile]) -> Image.Image:
+    """Tiles with their captions, four in a row."""
+    shown = []
+    for image, caption in tiles:
+        picture = Image.fromarray(image)
+        if picture.width > _WIDTH:
+            picture = picture.resize((_WIDTH, round(picture.height * _WIDTH / picture.width)), Image.Resampling.BOX)
+        shown.append((picture, caption))
+    width, height = max(p.width for p, _ in shown), max(p.height for p, _ in shown) + 14
+    columns = min(_COLUMNS, len(shown))
+    rows = -(-len(shown) // columns)
+    sheet = Image.new("L", (columns * (width + _GAP) + _GAP, rows * (height + _GAP) + _GAP), 255)
+    pen = ImageDraw.Draw(sheet)
+    for k, (picture, caption) in enumerate(shown):
+        x, y = _GAP + k % columns * (width + _GAP), _GAP + k // columns * (height + _GAP)
+        sheet.paste(picture, (x, y + 12))
+        pen.text((x, y), caption, fill=0)
+    return sheet
+
+
+def _of_plan(plan: Plan, backend: BackendName, threads: int | None) -> Iterator[tuple[int, Tile]]:
+    maker = Maker(plan, frames_of(plan), backend=backend, threads=threads)
+    count = min(TILES, plan.spec.count)
+    for k in range(count):
+        made = maker.make(k * plan.spec.count // count)
+        if not made.images:
+            raise InputError(f"sample {made.index} cannot be made: {made.rejections[-1].reason}", source=plan.source)
+        image = made.images[0]
+        caption = f"{image.line['split']} sample {made.index} subject {image.line['subject']}"
+        yield count, _tile(image.dn, image.line["bit_depth"], caption)
+
+
+def _of_scene(scene: Scene, backend: BackendName, threads: int | None) -> Iterator[tuple[int, Tile]]:
+    observed = observe(scene)
+    count = min(TILES, len(observed))
+    rows = np.array([k * len(observed) // count for k in range(count)])
+    renderer = make_renderer(backend, threads)
+    for image in render_windows(scene, observed.take(rows), renderer=renderer):
+        yield count, _tile(image.dn, scene.spec.sensor.bit_depth, image.name)
+
+
+def _tile(dn: Any, bit_depth: int, caption: str) -> Tile:
+    return preview(dn, 2.0**bit_depth - 1), caption

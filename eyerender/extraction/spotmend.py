@@ -1,0 +1,142 @@
+"""Spots that one Gaussian on the expected background does not explain: two in one, or one beside an edge of its own.
+
+A spot counts as unexplained when its residual is more than twice the image's noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.special import ndtr
+
+from .preprocess import Image
+from .spotfit import SpotFit, fit_spots, spot_light
+
+Array = NDArray[np.float64]
+Background = Callable[[Array, Array], Array]
+
+UNEXPLAINED = 2.0
+
+
+def give_edges(
+    linear: Image,
+    known: Background,
+    starts: tuple[Array, Array, Array],
+    fit: SpotFit,
+    blur_px: float,
+    limits: tuple[float, float, float],
+) -> SpotFit:
+    """The fit with unexplained single spots refitted beside a straight blurred edge (the limbus, a lid's margin).
+
+    B gains c + h Phi((x cos p + y sin p - o) / blur): edge and spot are fitted in turn, three times, and the result
+    is taken when the residual falls to 70 %. limits: noise, clip level and background slope, as for `fit_spots`.
+    """
+    noise, clip, _ = limits
+    for i in np.nonzero(fit.converged & (fit.residual_dn > UNEXPLAINED * noise))[0]:
+        apart = np.hypot(*(fit.xy_px - fit.xy_px[i]).T)
+        wide = float(fit.sigma_px[i].max())
+        if np.sum(apart < 5.0 * wide + 3.0) > 1:
+            continue
+        start = tuple(part[i : i + 1] for part in starts)
+        x, y, data = _window(linear, start[0][0], math.ceil(2.7 * float(start[1][0]) + 3.0))
+        best = fit.one(int(i))
+        current = best
+        for _ in range(3):
+            rest = data - known(x, y) - spot_light(current, x, y)
+            edge = _edge(x, y, rest, (data < clip) & np.isfinite(data), fit.xy_px[i], blur_px)
+            if edge is None:
+                break
+
+            def background(x: Array, y: Array, edge: Array = edge, at: Array = fit.xy_px[i]) -> Array:
+                return known(x, y) + _edge_level(edge, x - at[0], y - at[1], blur_px)
+
+            current = fit_spots(linear, background, start[0], start[1], start[2], *limits)
+        if current.converged[0] and current.residual_dn[0] < 0.7 * best.residual_dn[0]:
+            fit = fit.replaced(int(i), current)
+    return fit
+
+
+def _window(linear: Image, centre: Array, half: int) -> tuple[Array, Array, Array]:
+    cx, cy = (round(float(v)) for v in centre)
+    columns = np.arange(max(0, cx - half), min(linear.shape[1], cx + half + 1))
+    rows = np.arange(max(0, cy - half), min(linear.shape[0], cy + half + 1))
+    x, y = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
+    return x, y, linear[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].astype(np.float64)
+
+
+def _edge_level(edge: Array, x: Array, y: Array, blur_px: float) -> Array:
+    """edge: level, height, direction, offset."""
+    return np.asarray(edge[0] + edge[1] * ndtr((x * math.cos(edge[2]) + y * math.sin(edge[2]) - edge[3]) / blur_px))
+
+
+def _edge(x: Array, y: Array, level: Array, use: NDArray[np.bool_], at: Array, blur_px: float) -> Array | None:
+    """The straight edge that explains a patch best, or None."""
+    dx, dy, value = (x - at[0])[use], (y - at[1])[use], level[use]
+    if value.size < 20:
+        return None
+    plane = np.linalg.lstsq(np.stack([np.ones_like(dx), dx, dy], axis=-1), value, rcond=None)[0]
+    low, high = np.percentile(value, (10.0, 90.0))
+    start = np.array([low, high - low, math.atan2(plane[2], plane[1]), 0.0])
+    found = least_squares(lambda p: _edge_level(p, dx, dy, blur_px) - value, start, method="lm", max_nfev=60)
+    return np.asarray(found.x) if np.isfinite(found.x).all() else None
+
+
+def split_blends(
+    linear: Image,
+    known: Background,
+    starts: tuple[Array, Array, Array],
+    fit: SpotFit,
+    limits: tuple[float, float, float],
+) -> tuple[tuple[Array, Array, Array], SpotFit]:
+    """(starts, fit) with every unexplained spot replaced by two, where two fit it much better.
+
+    starts: xy (n, 2), width (n,), height (n,), as given to `fit_spots`. Two spots less than 2.5 sigma apart have one
+    maximum; their patch is longer than wide, and one Gaussian leaves a residual of several times the noise. The halves
+    start at one deviation either way along the patch's longer axis; they must come out round and cut the residual to
+    60 %.
+    """
+    for i in np.nonzero(fit.converged & (fit.residual_dn > UNEXPLAINED * limits[0]))[0]:
+        axis = _long_axis(linear, fit, int(i))
+        if axis is None:
+            continue
+        offset, across = axis
+        xy, width, height = starts
+        rest = np.arange(width.size) != i
+        trial = (
+            np.vstack([xy[rest], fit.xy_px[i] - offset, fit.xy_px[i] + offset]),
+            np.append(width[rest], [across, across]),
+            np.append(height[rest], [height[i], height[i]]),
+        )
+        again = fit_spots(linear, known, trial[0], trial[1], trial[2], *limits)
+        halves = slice(-2, None)
+        sigma = again.sigma_px[halves]
+        good = bool(again.converged[halves].all()) and bool((sigma.max(axis=1) < 1.5 * sigma.min(axis=1)).all())
+        if good and float(again.residual_dn[halves].max()) < 0.6 * float(fit.residual_dn[i]):
+            order = np.argsort(np.append(np.nonzero(rest)[0], [i, i]), kind="stable")
+            halved = (trial[0][order], trial[1][order], trial[2][order])
+            return split_blends(linear, known, halved, again.taken(order), limits)
+    return starts, fit
+
+
+def _long_axis(linear: Image, fit: SpotFit, i: int) -> tuple[Array, float] | None:
+    """((2,) one deviation along a patch's longer axis, deviation across it) by moments above half height, or None."""
+    half = math.ceil(3.0 * float(fit.sigma_px[i].max()) + 1.0)
+    cx, cy = (round(float(v)) for v in fit.xy_px[i])
+    y0, x0 = max(0, cy - half), max(0, cx - half)
+    patch = linear[y0 : cy + half + 1, x0 : cx + half + 1].astype(np.float64) - fit.background_dn[i]
+    weight = np.maximum(patch - 0.35 * patch.max(initial=0.0), 0.0) if patch.size else patch
+    total = float(weight.sum())
+    if total <= 0.0:
+        return None
+    x, y = np.arange(weight.shape[1])[None, :], np.arange(weight.shape[0])[:, None]
+    mx, my = float((weight * x).sum()) / total, float((weight * y).sum()) / total
+    cxx, cyy = float((weight * (x - mx) ** 2).sum()) / total, float((weight * (y - my) ** 2).sum()) / total
+    cxy = float((weight * (x - mx) * (y - my)).sum()) / total
+    values, vectors = np.linalg.eigh(np.array([[cxx, cxy], [cxy, cyy]]))
+    if values[1] < 1.3 * values[0]:
+        return None
+    return np.asarray(vectors[:, 1] * math.sqrt(values[1])), float(np.clip(1.3 * math.sqrt(values[0]), 0.5, 8.0))

@@ -1,0 +1,73 @@
+"""The page of a study: cards, sections of text, figures and tables, in one self-contained HTML file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from ..errors import EyerenderError
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """A number that stands for much, and what it is."""
+
+    value: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """An <svg> element and its caption."""
+
+    svg: str
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Header, rows of text, a caption; `wide` columns (by index) hold sentences and may wrap."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    wide: Sequence[int] = ()
+    folded: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A heading and what stands below it, in this order: text, figures, tables."""
+
+    heading: str
+    text: Sequence[str] = ()
+    figures: Sequence[Figure] = ()
+    tables: Sequence[Table] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A report."""
+
+    title: str
+    lead: Sequence[str]
+    cards: Sequence[Card] = ()
+    sections: Sequence[Section] = field(default_factory=tuple)
+
+
+def write_page(path: Path, page: Page) -> None:
+    """Write one self-contained HTML file, complete or not at all."""
+    environment = Environment(
+        loader=PackageLoader("eyerender.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    text = environment.get_template("study.html.j2").render(page=page)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None

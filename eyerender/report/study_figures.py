@@ -1,0 +1,189 @@
+"""Figures of the studies; eye models keep their colour and marker everywhere (Okabe and Ito's colours)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from .style import figure, svg
+
+_LOOK = {
+    "E1": ("#E69F00", "o"),
+    "E2": ("#0072B2", "s"),
+    "E3": ("#56B4E9", "^"),
+    "E4": ("#009E73", "D"),
+    "E5": ("#CC79A7", "v"),
+}
+_OTHER = (("#D55E00", "P"), ("#777777", "X"), ("#F0E442", "h"), ("#000000", "*"))
+_MEASURED = "#222222"
+
+
+def look(model: str, others: Sequence[str] = ()) -> tuple[str, str]:
+    """Colour and marker of an eye model."""
+    if model in _LOOK:
+        return _LOOK[model]
+    rest = [m for m in others if m not in _LOOK]
+    return _OTHER[rest.index(model) % len(_OTHER)] if model in rest else _OTHER[0]
+
+
+def clouds_figure(clouds: Mapping[str, tuple[Floats, Floats]]) -> str:
+    """Figure 3: pupil centres and glints of every fixation (n, 2) px by eye model."""
+    with figure(9.6, 4.4, 2) as (fig, axes):
+        for ax, part, title in ((axes[0], 0, "(a) pupil centre"), (axes[1], 1, "(b) glint")):
+            for model, points in clouds.items():
+                colour, marker = look(model, list(clouds))
+                p = points[part]
+                ax.scatter(
+                    p[:, 0], p[:, 1], s=13, marker=marker, facecolor="none", edgecolor=colour, linewidth=0.9, label=model
+                )
+            ax.set(aspect="equal", adjustable="datalim", title=title, xlabel="x (px)", ylabel="y (px, down)")
+            ax.invert_yaxis()
+        handles, labels = axes[0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=len(clouds), frameon=False)
+        return svg(fig)
+
+
+def heads_figure(
+    own: Mapping[str, Mapping[str, Mapping[str, float]]],
+    paper: Mapping[str, tuple[float, float]],
+    measured: Mapping[str, Floats],
+    interval: Mapping[str, tuple[float, float]],
+) -> str:
+    """Figure 4: errors at H1 and H2 by eye model, beside the paper's and the experiment's.
+
+    Args:
+        own: label -> eye model -> head -> mean (deg). paper: eye model -> (H1, H2). measured: head -> participants (deg).
+        interval: head -> 95 % confidence interval of the participants' mean (deg).
+    """
+    models = list(dict.fromkeys(m for by_model in own.values() for m in by_model))
+    styles = [("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9")]
+    with figure(9.6, 4.2, 2) as (fig, axes):
+        for ax, head, title in zip(axes, ("H1", "H2"), ("H1: central head position", "H2: others"), strict=True):
+            low, high = interval[head]
+            ax.axhspan(low, high, color="#000000", alpha=0.08, lw=0, label="experiment: 95 % interval of the mean")
+            ax.axhline(float(np.mean(measured[head])), color=_MEASURED, lw=1.4, ls="--", label="experiment: mean")
+            x = np.arange(len(models))
+            ax.scatter(
+                np.full(4, len(models)) + np.linspace(-0.12, 0.12, 4), measured[head], s=26, color=_MEASURED, marker="_",
+                label="experiment: participants",
+            )  # fmt: skip
+            for k, (label, by_model) in enumerate(own.items()):
+                marker, colour = styles[k % len(styles)]
+                shift = (k - (len(own) - 1) / 2) * 0.16
+                at = [i for i, m in enumerate(models) if m in by_model]
+                values = [by_model[models[i]][head] for i in at]
+                ax.scatter(x[at] + shift, values, s=46, marker=marker, color=colour, label=label, zorder=3)
+            at = [i for i, m in enumerate(models) if m in paper]
+            column = 0 if head == "H1" else 1
+            ax.scatter(
+                x[at], [paper[models[i]][column] for i in at], s=150, marker="o", facecolor="none", edgecolor=_MEASURED,
+                linewidth=1.2, label="the paper's simulation", zorder=2,
+            )  # fmt: skip
+            ax.set_xticks([*x, len(models)], [*models, "people"])
+            ax.set(title=title, ylabel="mean gaze error (deg)", xlabel="eye model")
+            ax.set_ylim(bottom=0)
+            ax.grid(axis="x", visible=False)
+        handles, labels = axes[0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+        return svg(fig)
+
+
+def sets_figure(
+    sets: Sequence[str], own: Mapping[str, Mapping[str, Sequence[float]]], measured: Sequence[float]
+) -> str:
+    """Figure 5: the best function's error for each calibration set by eye model; a panel a label of `own`."""
+    with figure(max(5.4, 4.6 * len(own)), 4.2, len(own)) as (fig, axes):
+        panels = np.atleast_1d(axes)
+        top = 2.0 * max(measured)
+        for ax, (label, by_model) in zip(panels, own.items(), strict=True):
+            x = np.arange(len(sets))
+            ax.plot(x, measured, color=_MEASURED, marker="x", lw=1.6, label="experiment (26 people)")
+            for model, values in by_model.items():
+                colour, marker = look(model, list(by_model))
+                ax.plot(x, values, color=colour, marker=marker, ms=6, lw=1.2, label=model)
+            ax.set_yscale("log")
+            ax.set_ylim(0.02, top)
+            ticks = [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0]
+            ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
+            ax.minorticks_off()
+            ax.set_xticks(x, sets)
+            ax.set(title=label, xlabel="calibration set", ylabel="error of the best function (deg)")
+        handles, labels = panels[0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=6, frameon=False)
+        return svg(fig)
+
+
+def waterfall_figure(
+    labels: Sequence[str], panels: Mapping[str, Mapping[str, Sequence[float | None]]], *, log: bool = False
+) -> str:
+    """From published to corrected: mean error after each correction, by eye model; a panel a measure."""
+    with figure(max(7.0, 2.6 + 3.2 * len(panels)), 1.6 + 0.36 * len(labels), len(panels)) as (fig, axes):
+        y = np.arange(len(labels))
+        for k, (ax, (name, by_model)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
+            for model, values in by_model.items():
+                colour, marker = look(model, list(by_model))
+                line = [np.nan if v is None else v for v in values]
+                ax.plot(line, y, color=colour, marker=marker, ms=5.5, lw=1.2, label=model)
+            ax.set_ylim(len(labels) - 0.5, -0.5)
+            ax.set_yticks(y, labels if k == 0 else [""] * len(labels))
+            if log:
+                ax.set_xscale("log")
+            else:
+                ax.set_xlim(left=0)
+            ax.set(title=name, xlabel="mean error (deg)")
+        handles, names = np.atleast_1d(axes)[0].get_legend_handles_labels()
+        fig.legend(handles, names, loc="outside upper center", ncols=6, frameon=False)
+        return svg(fig)
+
+
+def map_figure(
+    maps: Mapping[str, Floats], x: Floats, y: Floats, xlabel: str, ylabel: str, colour_label: str, marks: Any = None
+) -> str:
+    """Maps of a mean error (len(y), len(x)) over two quantities, one a panel, on one scale; NaN stays white."""
+    top = max(float(np.nanmax(m)) for m in maps.values())
+    with figure(max(5.0, 3.0 * len(maps)), 3.2, len(maps)) as (fig, axes):
+        for k, (ax, (name, values)) in enumerate(zip(np.atleast_1d(axes), maps.items(), strict=True)):
+            shown = ax.pcolormesh(x, y, values, cmap="cividis", vmin=0, vmax=top, shading="nearest")
+            if marks is not None:
+                ax.scatter(*np.asarray(marks).T, marker="+", color="white", s=24, linewidth=1.0)
+            ax.set(title=name, xlabel=xlabel, ylabel=ylabel if k == 0 else "")
+            ax.set_aspect("equal")
+            ax.grid(visible=False)
+        fig.colorbar(shown, ax=list(np.atleast_1d(axes)), label=colour_label, shrink=0.85)
+        return svg(fig)
+
+
+def lines_figure(
+    panels: Mapping[str, Mapping[str, Sequence[float]]], x: Sequence[float], xlabel: str, ylabel: str
+) -> str:
+    """Lines by eye model over one quantity; a panel a key."""
+    with figure(max(5.4, 4.4 * len(panels)), 3.6, len(panels)) as (fig, axes):
+        for ax, (name, by_model) in zip(np.atleast_1d(axes), panels.items(), strict=True):
+            for model, values in by_model.items():
+                colour, marker = look(model, list(by_model))
+                ax.plot(x, values, color=colour, marker=marker, ms=5.5, lw=1.2, label=model)
+            ax.set_ylim(bottom=0)
+            ax.set(title=name, xlabel=xlabel, ylabel=ylabel)
+        handles, names = np.atleast_1d(axes)[0].get_legend_handles_labels()
+        fig.legend(handles, names, loc="outside upper center", ncols=6, frameon=False)
+        return svg(fig)
+
+
+def bars_figure(names: Sequence[str], values: Mapping[str, Sequence[float]], xlabel: str) -> str:
+    """Horizontal bars, grouped by name; a colour a key."""
+    colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+    with figure(9.0, 1.4 + 0.32 * len(names) * max(1, 0.6 * len(values))) as (fig, ax):
+        y = np.arange(len(names))
+        height = 0.8 / len(values)
+        for k, (label, v) in enumerate(values.items()):
+            ax.barh(y + (k - (len(values) - 1) / 2) * height, v, height=0.9 * height, color=colours[k % 4], label=label)
+        ax.axvline(0, color="#444444", lw=0.8)
+        ax.set_yticks(y, names)
+        ax.set_ylim(len(names) - 0.5, -0.5)
+        ax.grid(axis="y", visible=False)
+        ax.set(xlabel=xlabel)
+        fig.legend(loc="outside upper center", ncols=4, frameon=False)
+        return svg(fig)

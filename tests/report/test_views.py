@@ -1,0 +1,90 @@
+"""Drawings of eyes and scenes: vector output that shows what it says, from the numbers of the model."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+from eyerender.cli.app import run
+from eyerender.eye.catalogue import load_eye
+from eyerender.report.eye_section import eye_section
+from eyerender.report.scene_view import scene_view
+from eyerender.scene import load_scene
+
+
+def legend(fig):
+    return {text.get_text() for text in fig.legends[0].get_texts()}
+
+
+@pytest.mark.parametrize("name", ["E1", "E5"])
+def test_eye_section_shows_its_parts_where_the_model_has_them(name):
+    eye = load_eye(name).build()
+    fig = eye_section(eye)
+    shown = legend(fig)
+    assert {"cornea", "sclera", "iris", "optic axis", "line of sight", "fovea", "azimuth centre"} <= shown
+    assert ("lens" in shown) == bool(eye.back)
+    for ax, across in zip(fig.axes[:2], (1, 2), strict=True):
+        (fovea,) = [line for line in ax.lines if line.get_label() == "fovea"]
+        np.testing.assert_allclose([fovea.get_xdata()[0], fovea.get_ydata()[0]], eye.fovea_mm[[0, across]])
+        assert ax.get_aspect() == 1.0
+        # The drawn cornea stands on the front surface, to the grid's contouring error (cells of .03 mm).
+        cornea = np.concatenate([p.vertices for p in ax.collections[0].get_paths() if len(p.vertices)])
+        points = np.zeros((len(cornea), 3))
+        points[:, 0], points[:, across] = cornea[:, 0], cornea[:, 1]
+        normal = np.linalg.norm(eye.front[0].gradient(points), axis=-1)
+        assert np.abs(eye.front[0].implicit(points) / (2 * normal)).max() < 2e-3
+        assert np.ptp(cornea[:, 1]) > 10  # out to the limbus on both sides
+
+
+def test_left_eye_is_drawn_mirrored():
+    right, left = (eye_section(load_eye("E5").build(eye=side)) for side in ("right", "left"))
+    fovea = [next(li for li in f.axes[0].lines if li.get_label() == "fovea").get_ydata()[0] for f in (right, left)]
+    assert fovea[0] == pytest.approx(-fovea[1])
+    assert "temporal" in left.axes[0].get_ylabel()
+
+
+def test_scene_view_shows_rig_and_rays():
+    fig = scene_view(load_scene("guestrin2006"))
+    assert {"screen", "target", "camera", "infrared LED", "line of sight", "light to glint to camera"} <= legend(fig)
+
+
+@pytest.mark.parametrize("argv", [["eye", "E4"], ["scene", "quickstart"], ["scene", "head_mounted"]])
+def test_view_writes_well_formed_svg(tmp_path, argv):
+    out = tmp_path / "picture.svg"
+    assert run(["view", *argv, "-o", str(out)]) == 0
+    root = ET.parse(out).getroot()
+    assert root.tag.endswith("svg")
+    assert not [e for e in root.iter() if e.tag.endswith("}image")]  # vectors, not a bitmap in a wrapper
+    assert [p.name for p in tmp_path.iterdir()] == ["picture.svg"]
+
+
+def test_printed_eye_loads_back_as_the_same_eye(tmp_path, capsys):
+    for name in ("E1", "E4", "E5", "E5-published"):
+        assert run(["eyes", name]) == 0
+        (tmp_path / "eye.yaml").write_text(capsys.readouterr().out, encoding="utf-8")
+        assert load_eye(tmp_path / "eye.yaml") == load_eye(name)
+    assert run(["eyes", "--json", "-"]) == 0
+    names = [e["name"] for e in json.loads(capsys.readouterr().out)["eyes"]]
+    assert names == ["E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop"]
+
+
+def test_purkinje_images_on_demand(capsys):
+    assert run(["features", "quickstart", "--eye", "E4", "--purkinje", "2", "3", "4", "--json", "-"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    lost = [p for p in data["purkinje"] if p["status"] != "ok"]
+    assert {p["image"] for p in lost} <= {3, 4}  # those behind the pupil can be hidden by the iris
+    assert all("iris" in p["reason"] for p in lost)
+    data["purkinje"] = [p for p in data["purkinje"] if p["status"] == "ok"]
+    first = [p for p in data["purkinje"] if p["image"] == 1]
+    assert [p["xy_px"] for p in first] == [r["glints"][0]["xy_px"] for r in data["records"]]
+    assert len(data["non_ellipticity_px"]) == 18
+    assert 0 < max(data["non_ellipticity_px"]) < 0.05  # of an apparent pupil of 13 px
+    # The image in the back of the lens is inverted: it moves against the glint as the eye turns.
+    fourth = np.array([p["xy_px"] for p in data["purkinje"] if p["image"] == 4 and p["eye"] == "right"])
+    glint = np.array([p["xy_px"] for p in first if p["eye"] == "right"])
+    pupil = np.array([r["pupil"]["centre_px"] for r in data["records"] if r["eye"] == "right"])
+    a, b = glint - pupil, fourth - pupil
+    assert np.corrcoef(a[:, 0], b[:, 0])[0, 1] < -0.9
