@@ -171,8 +171,8 @@ def features(
     )
 
 
-def reason_of(status: int) -> str:
-    """A point's status in words."""
+def reason_of(status: int) -> str | None:
+    """A point's status in words; None where nothing is wrong."""
     return "behind the camera" if status == BEHIND_CAMERA else RayStatus(status).reason
 
 

@@ -7,8 +7,9 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..eye.model import Eye
-from ..geometry.surfaces import Xyz, components, join
-from ..optics.solve import mirrored_rays, purkinje_points, refracted_rays
+from ..geometry.surfaces import Xyz, components, fit, join, shift
+from ..optics.purkinje import purkinje_points
+from ..optics.solve import mirrored_rays, refracted_rays
 from ..optics.trace import RayStatus
 
 Statuses = npt.NDArray[np.int8]
@@ -42,7 +43,8 @@ def glint_exits(eye: Eye, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[X
     """Where the light of m lights (n, m) leaves the cornea for the camera, reflected at the surface of Purkinje's
     `order`.
 
-    Returns exit points as three arrays (n, m), residuals, status.
+    Images 3 and 4 are seen through the pupil: BEHIND_IRIS where the iris is in the light's way in or out. Returns exit
+    points as three arrays (n, m), residuals, status.
     """
     if order not in eye.purkinje_orders:
         nothing = np.full(lights_mm[0].shape, np.nan)
@@ -62,11 +64,30 @@ def glint_exits(eye: Eye, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[X
         join(lights_mm),
         join(camera_mm)[:, None, :],
     )
-    return components(found.exit_points_mm), found.residual_mm, found.status
+    status = found.status
+    if order > 2:
+        status = np.where((status == RayStatus.OK) & ~_passes_stop(eye, found.course_mm), RayStatus.BEHIND_IRIS, status)
+    return components(found.exit_points_mm), found.residual_mm, status.astype(np.int8)
+
+
+def _passes_stop(eye: Eye, course_mm: Floats) -> npt.NDArray[np.bool_]:
+    """Whether a ray passes the stop wherever it crosses its plane; course_mm (k, n, m, 3) its points in the eye."""
+    height = _height(eye, components(np.moveaxis(course_mm, 0, 2)))
+    low, high = height[..., :-1], height[..., 1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.moveaxis(low / (low - high), -1, 0)[..., None]
+        crossing = course_mm[:-1] + share * (course_mm[1:] - course_mm[:-1])
+        inside = eye.stop.contains(np.moveaxis(crossing, 0, 2))
+    return np.asarray((inside | ~((low > 0.0) ^ (high > 0.0))).all(axis=-1))
+
+
+def _height(eye: Eye, point: Xyz) -> Floats:
+    """Height of points (n, ...) above the plane of the iris, towards the cornea (mm)."""
+    ndim = point[0].ndim
+    gap = shift(point, eye.stop.centre_mm, -1.0)
+    return np.asarray(sum(gap[i] * fit(eye.stop.normal[..., i], ndim) for i in range(3)))
 
 
 def _behind_stop(eye: Eye, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
     """Whether the camera stands behind the plane of the iris, (n,)."""
-    normal, centre = eye.stop.normal, eye.stop.centre_mm
-    depth = sum((camera_mm[i] - centre[..., i]) * normal[..., i] for i in range(3))
-    return np.asarray(~(np.asarray(depth) > 0.0))
+    return ~(_height(eye, camera_mm) > 0.0)

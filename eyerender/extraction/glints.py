@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 SMOOTH_PX = 0.7
 MAX_SIGMA_PX = 8.0
+MOST_PEAKS = 80  # maxima looked at, brightest first
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,20 +50,48 @@ def detect_spots(
     hat = smooth - opened
     # A top-hat of noise alone is near 3 sigma of the smoothed noise everywhere.
     noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * SMOOTH_PX)
-    threshold = max(9.0 * noise, 0.45 * step_dn)
+    threshold = max(9.0 * noise, 0.6 * step_dn)
     peak = (hat > threshold) & (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8)))
     row, column = np.nonzero(peak)
     if row.size == 0:
         return _no_spots()
     height = hat[row, column].astype(np.float64)
-    order = np.argsort(-height, kind="stable")[: 3 * max(settings.max_glints, 1)]
-    xy = np.stack([column[order], row[order]], axis=-1).astype(np.float64)
+    order = np.argsort(-height, kind="stable")[:MOST_PEAKS]
+    xy, height = np.stack([column[order], row[order]], axis=-1).astype(np.float64), height[order]
+    width = _widths(hat, xy, height, size)
+    spot = _compact(smooth, xy, width, height) & (width < widest(blur_px))
+    xy, width, height = xy[spot], width[spot], height[spot]
     keep: list[int] = []
-    for i in range(order.size):  # flat tops of clipped spots give several maxima, and so does noise on wide ones
+    for i in range(height.size):  # flat tops of clipped spots give several maxima, and so does noise on wide ones
         if all(_parted(smooth, xy[i], xy[j], 4.0 * noise, size) for j in keep):
             keep.append(i)
-    xy, height = xy[keep], height[order[keep]]
-    return Spots(xy + np.array([x0, y0]), _widths(hat, xy, height, size), height)
+        if len(keep) >= settings.max_glints + 8:
+            break
+    return Spots(xy[keep] + np.array([x0, y0]), width[keep], height[keep])
+
+
+def widest(blur_px: float) -> float:
+    """Largest sigma of a glint, px: a light's image in the cornea is a few pixels wide, and blurred by the optics."""
+    return min(2.5 * optics_sigma(blur_px) + 2.0, MAX_SIGMA_PX)
+
+
+def optics_sigma(blur_px: float) -> float:
+    """The rim's blur without the pixel's own share of it, 1/12 px^2."""
+    return math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0))
+
+
+def _compact(smooth: Image, xy: Array, width: Array, height: Array) -> NDArray[np.bool_]:
+    """Whether the level falls by a third of the height or more in at least 9 of 12 directions, 2.5 sigma away.
+
+    Strips of sclera and corners between lid and iris do not; a glint beside another one, or on an edge, does.
+    """
+    angle = np.arange(12) * (np.pi / 6.0)
+    reach = (2.5 * width + 1.5)[:, None]
+    x = np.clip(np.rint(xy[:, :1] + reach * np.cos(angle)).astype(np.intp), 0, smooth.shape[1] - 1)
+    y = np.clip(np.rint(xy[:, 1:] + reach * np.sin(angle)).astype(np.intp), 0, smooth.shape[0] - 1)
+    top = smooth[xy[:, 1].astype(np.intp), xy[:, 0].astype(np.intp)]
+    fallen = top[:, None] - smooth[y, x] > 0.33 * height[:, None]
+    return np.asarray(fallen.sum(axis=1) >= 9)
 
 
 def _parted(smooth: Image, first: Array, second: Array, dip: float, size: int) -> bool:
@@ -129,10 +158,9 @@ def _objection(spots: Spots, fit: SpotFit, i: int, prepared: Prepared, step_dn: 
     moved = float(np.hypot(*(fit.xy_px[i] - spots.xy_px[i])))
     if moved > max(2.5, 2.0 * wide):
         return f"no spot: the fit moved {moved:.1f} px from the bright pixel"
-    # The rim's blur holds the pixel's own, 1/12; no light passes the optics sharper than that blur.
-    if wide < 0.5 * math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0)):
+    if wide < 0.5 * optics_sigma(blur_px):
         return f"sharper than the optics (sigma {wide:.1f} px): a bad pixel"
-    if wide > MAX_SIGMA_PX:
+    if wide > widest(blur_px):
         return f"too wide for a glint: sigma {wide:.1f} px"
     if wide > 2.2 * max(narrow, 0.4):
         return f"elongated {wide / narrow:.1f} : 1, as reflections off the sclera and wet lid margins are"

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Background = Callable[[Array, Array], Array]
 
 UNEXPLAINED = 2.0
+MOST = 12  # spots that are mended: where there are more, they are no glints
 
 
 def give_edges(
@@ -36,7 +37,7 @@ def give_edges(
     is taken when the residual falls to 70 %. limits: noise, clip level and background slope, as for `fit_spots`.
     """
     noise, clip, _ = limits
-    for i in np.nonzero(fit.converged & (fit.residual_dn > UNEXPLAINED * noise))[0]:
+    for i in np.nonzero(fit.converged & (fit.residual_dn > UNEXPLAINED * noise))[0][:MOST]:
         apart = np.hypot(*(fit.xy_px - fit.xy_px[i]).T)
         wide = float(fit.sigma_px[i].max())
         if np.sum(apart < 5.0 * wide + 3.0) > 1:
@@ -99,6 +100,8 @@ def split_blends(
     start at one deviation either way along the patch's longer axis; they must come out round and cut the residual to
     60 %.
     """
+    if fit.converged.size > MOST:
+        return starts, fit
     for i in np.nonzero(fit.converged & (fit.residual_dn > UNEXPLAINED * limits[0]))[0]:
         axis = _long_axis(linear, fit, int(i))
         if axis is None:
@@ -137,6 +140,6 @@ def _long_axis(linear: Image, fit: SpotFit, i: int) -> tuple[Array, float] | Non
     cxx, cyy = float((weight * (x - mx) ** 2).sum()) / total, float((weight * (y - my) ** 2).sum()) / total
     cxy = float((weight * (x - mx) * (y - my)).sum()) / total
     values, vectors = np.linalg.eigh(np.array([[cxx, cxy], [cxy, cyy]]))
-    if values[1] < 1.3 * values[0]:
+    if values[1] <= 1.3 * max(float(values[0]), 0.01):
         return None
-    return np.asarray(vectors[:, 1] * math.sqrt(values[1])), float(np.clip(1.3 * math.sqrt(values[0]), 0.5, 8.0))
+    return np.asarray(vectors[:, 1] * math.sqrt(values[1])), float(np.clip(1.3 * math.sqrt(max(float(values[0]), 0.1)), 0.5, 8.0))

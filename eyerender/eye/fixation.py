@@ -53,13 +53,12 @@ class FixationStatus(IntEnum):
     NOT_CONVERGED = 4
 
     @property
-    def reason(self) -> str:
-        """The status in words."""
-        return _REASONS[self]
+    def reason(self) -> str | None:
+        """The status in words; None where nothing is wrong."""
+        return _REASONS.get(self)
 
 
 _REASONS = {
-    FixationStatus.OK: "",
     FixationStatus.TARGET_TOO_NEAR: "the target lies inside the eye",
     FixationStatus.OUT_OF_REACH: "the target is out of reach of the eye's rotation",
     FixationStatus.NO_LINE_OF_SIGHT: "no line of sight joins the target and the fovea",
@@ -82,8 +81,8 @@ class Fixations(ArrayValue):
     line_of_sight_mm: Array
     line_of_sight_direction: Array
 
-    def reason(self, item: int) -> str:
-        """Why fixation `item` failed; empty if it did not."""
+    def reason(self, item: int) -> str | None:
+        """Why fixation `item` failed; None if it did not."""
         return FixationStatus(int(self.status[item])).reason
 
     def __len__(self) -> int:

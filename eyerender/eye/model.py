@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import ArrayValue
-from ..geometry.surfaces import Surface
+from ..geometry.surfaces import Surface, components, fit, shift, turn_back
 from ..geometry.transforms import Array, read_only
 from ..optics.interface import Number
 from .spec import EyeSpec, Side
@@ -51,10 +51,11 @@ class Stop(ArrayValue):
         return np.asarray(c + first[..., None] * r[..., :, 1] + second[..., None] * r[..., :, 2])
 
     def contains(self, points_mm: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Whether points (..., 3) of the plane lie inside the ellipse (one stop, not a batch)."""
-        local = (np.asarray(points_mm, dtype=np.float64) - self.centre_mm) @ self.rotation
-        square = (local[..., 1] / self.semi_axes_mm[0]) ** 2 + (local[..., 2] / self.semi_axes_mm[1]) ** 2
-        return np.asarray(square <= 1.0)
+        """Whether points (..., 3) of the plane lie inside the ellipse; for a batch of stops (n, ..., 3)."""
+        point = components(points_mm)
+        _, y, z = turn_back(self.rotation, shift(point, self.centre_mm, -1.0))
+        a, b = (fit(self.semi_axes_mm[..., k], point[0].ndim) for k in (0, 1))
+        return np.asarray((y / a) ** 2 + (z / b) ** 2 <= 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ vector is that of one eye alone (Morimoto & Mimica, CVIU 98, 2005).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -67,7 +68,7 @@ FUNCTIONS: dict[str, tuple[str, str]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class _Fit:
+class EyeFit:
     """Coefficients of one eye on the scaled vector (v - origin) / scale."""
 
     origin: Floats
@@ -94,7 +95,7 @@ class PupilGlintRegression:
     minimum_norm: bool = False
     normalised: bool = True
     centred: bool = False
-    _fits: dict[int, _Fit] = field(default_factory=dict, repr=False)
+    fits: Mapping[int, EyeFit] = field(default_factory=dict, repr=False)
 
     @property
     def terms(self) -> tuple[Terms, Terms]:
@@ -130,12 +131,12 @@ class PupilGlintRegression:
             u = (v[rows] - origin) / scale
             a = self._solve(_monomials(u, x_terms), wanted[rows, 0], name)
             b = self._solve(_monomials(u, y_terms), wanted[rows, 1], name)
-            fits[int(eye)] = _Fit(origin, scale, a, b)
-        return replace(self, _fits=fits)
+            fits[int(eye)] = EyeFit(origin, scale, a, b)
+        return replace(self, fits=fits)
 
     def predict(self, observations: Observations, rig: Rig) -> GazePoints:
         """Gaze points on the screen's plane."""
-        if not self._fits:
+        if not self.fits:
             raise InputError("the estimator is not calibrated; call fit first")
         screen = screen_of(rig)
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
@@ -144,7 +145,7 @@ class PupilGlintRegression:
         on_screen = np.full((len(observations), 2), np.nan)
         for eye in np.unique(observations.index.eye):
             rows = np.flatnonzero(observations.index.eye == eye)
-            fit = self._fits.get(int(eye))
+            fit = self.fits.get(int(eye))
             if fit is None:
                 reason[rows] = "this eye is not calibrated"
                 continue

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -54,6 +55,18 @@ class Connection:
     end: Xyz
     residual_mm: Array
     tube_mm2_sr: Array
+    status: Status
+
+
+class Corrected(NamedTuple):
+    """Rays of `correct`, named as in `Connection`; determinant_mm2_sr keeps its sign."""
+
+    start: Xyz
+    first: Xyz
+    last: Xyz
+    turning: Xyz
+    residual_mm: Array
+    determinant_mm2_sr: Array
     status: Status
 
 
@@ -107,6 +120,25 @@ def connect(path: Sequence[Crossing], n_start: Number, source: Xyz, target: Xyz,
         tube.reshape(()),
         status.reshape(()),
     )
+
+
+def correct(
+    path: Sequence[Crossing], n_start: Number, source: Xyz, target: Xyz, aim: Xyz, steps: int = _FAST_STEPS
+) -> Corrected:
+    """`connect` for rays (m,) whose aim is close already: at most `steps` undamped steps, and no other attempt.
+
+    Only the surfaces are held against a ray, not their rims.
+    """
+    direction = _unit(_minus(aim, source))
+    shot = _shoot(path, n_start, source, direction, target)
+    for _ in range(steps):
+        if not ((shot.status == RayStatus.OK) & ~_settled(shot, 1.0)).any():
+            break
+        direction = _stepped(direction, shot, 1.0)
+        shot = _shoot(path, n_start, source, direction, target)
+    settled = _settled(shot, 100.0) & (shot.residual_mm <= RESIDUAL_LIMIT_MM)
+    mark(shot.status, ~settled, RayStatus.NOT_CONVERGED)
+    return Corrected(direction, shot.first, shot.last, shot.turning, shot.residual_mm, shot.determinant, shot.status)
 
 
 def _shoot(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xyz, target: Xyz) -> _Shot:

@@ -47,13 +47,11 @@ class ApparentPoints(ArrayValue):
 class MirrorPoints(ArrayValue):
     """Where light from a source is thrown back to a viewpoint.
 
-    points_mm (..., 3): the mirror point itself (for a Purkinje image from inside: on the reflecting surface);
-    exit_points_mm (..., 3): where the ray meets the outermost surface on its way to the viewpoint (the same for the
-    first Purkinje image); directions (..., 3): unit, from the exit point to the viewpoint; residual_mm, status (...,).
+    points_mm (..., 3): on the surface; directions (..., 3): unit, from there to the viewpoint; residual_mm (...,);
+    status (...,).
     """
 
     points_mm: Array
-    exit_points_mm: Array
     directions: Array
     residual_mm: Array
     status: Status
@@ -97,39 +95,7 @@ def mirror_points(
 ) -> MirrorPoints:
     """Reflection of a source (..., 3) to a viewpoint (..., 3) at the outside of `surface`: the first Purkinje image."""
     rays = mirrored_rays(surface, components(source_mm), components(viewpoint_mm), rim_mm=rim_mm)
-    points = join(rays.exit)
-    return MirrorPoints(points, points, -join(rays.way), rays.residual_mm, rays.status)
-
-
-def purkinje_points(
-    surfaces: Sequence[Surface],
-    indices: Sequence[Number],
-    rims_mm: Sequence[Number],
-    passing: Sequence[bool],
-    source_mm: npt.ArrayLike,
-    viewpoint_mm: npt.ArrayLike,
-    n_outside: float = 1.0,
-) -> MirrorPoints:
-    """Reflection at the innermost of `surfaces`, refraction at the others on the way in and out.
-
-    surfaces : outside in, the last one reflects; indices : the index behind each; rims_mm : where each ends; passing :
-    whether a ray that does not meet a surface passes on (shells of a gradient lens).
-    """
-
-    def crossing(k: int, n_after: Number, inward: bool) -> Crossing:
-        edge = RayStatus.OUTSIDE_LIMBUS if k == 0 else RayStatus.MISSED
-        return Crossing(surfaces[k], n_after, inward, False, rims_mm[k], None if passing[k] else edge)
-
-    last = len(surfaces) - 1
-    before = [n_outside, *indices]
-    path = [
-        *(crossing(k, indices[k], True) for k in range(last)),
-        Crossing(surfaces[last], 1.0, True, True, rims_mm[last], RayStatus.MISSED),
-        *(crossing(k, before[k], False) for k in reversed(range(last))),
-    ]
-    viewpoint, source = components(viewpoint_mm), components(source_mm)
-    found = connect(path, n_outside, viewpoint, source, mirror_start(surfaces[last], source, viewpoint))
-    return MirrorPoints(join(found.turning), join(found.first), -join(found.start), found.residual_mm, found.status)
+    return MirrorPoints(join(rays.exit), -join(rays.way), rays.residual_mm, rays.status)
 
 
 def refracted_rays(
@@ -306,7 +272,7 @@ def mirror_start(surface: Surface, source: Xyz, viewpoint: Xyz) -> Xyz:
     """
     ndim = max(source[0].ndim, viewpoint[0].ndim)
     shape = np.broadcast_shapes(source[0].shape, viewpoint[0].shape)
-    apex = components(surface.to_eye(_apex(surface)))
+    apex = components(apex_of(surface))
     gradient, hessian = surface.gradient_at(apex), surface.hessian_at(apex)
     size = np.sqrt(dot(gradient, gradient))
     normal = (gradient[0] / size, gradient[1] / size, gradient[2] / size)
@@ -324,10 +290,10 @@ def mirror_start(surface: Surface, source: Xyz, viewpoint: Xyz) -> Xyz:
     )
 
 
-def _apex(surface: Surface) -> Array:
-    """The sheet's point on the local axis, local frame, (..., 3)."""
+def apex_of(surface: Surface) -> Array:
+    """The sheet's point on its local axis, (..., 3)."""
     zero = np.zeros(surface.batch_shape)
-    return np.stack([surface.sag(zero, zero), zero, zero], axis=-1)
+    return surface.to_eye(np.stack([surface.sag(zero, zero), zero, zero], axis=-1))
 
 
 def _spread_index(n: Number, ndim: int) -> Number:

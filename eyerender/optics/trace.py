@@ -26,20 +26,21 @@ class RayStatus(IntEnum):
     OUTSIDE_LIMBUS = 3
     BEHIND_IRIS = 4
     NOT_CONVERGED = 5
+    NO_MIRROR_POINT = 6
 
     @property
-    def reason(self) -> str:
-        """The status in words."""
-        return _REASONS[self]
+    def reason(self) -> str | None:
+        """The status in words; None where nothing is wrong."""
+        return _REASONS.get(self)
 
 
 _REASONS = {
-    RayStatus.OK: "",
     RayStatus.MISSED: "the ray misses a surface",
     RayStatus.TOTAL_REFLECTION: "total reflection",
     RayStatus.OUTSIDE_LIMBUS: "outside the limbus",
     RayStatus.BEHIND_IRIS: "behind the iris",
     RayStatus.NOT_CONVERGED: "the solver did not converge",
+    RayStatus.NO_MIRROR_POINT: "no point of the surface mirrors the light to the viewpoint",
 }
 
 

@@ -30,7 +30,7 @@ class RenderJob(ArrayValue):
     eye, and its rigid motion x_world = M x + t; camera, lamps, sensor and look; `window` (x0, y0, width, height) in
     full-sensor pixels. `apex_mm` is where the apex of the unrotated eye stands in the world (the surround keeps its
     place to it); by default it follows from a turn about a point 13.5 mm behind the apex. `seed` fixes samples and
-    noise.
+    noise. `purkinje` lists the mirror images of the lamps to show, 1 (the glint) to 4.
     """
 
     eye: Eye
@@ -44,6 +44,7 @@ class RenderJob(ArrayValue):
     wavelength_nm: float = 850.0
     seed: int = 0
     labels: bool = True
+    purkinje: tuple[int, ...] = (1,)
     apex_mm: Floats | None = None
 
     @property
@@ -128,10 +129,15 @@ def light_table(lights: Sequence[Light], M: Floats, t: Floats) -> Floats:
     """The lamps in the eye frame, (n, 10): position, axis, radius, intensity, lobe exponent, inner radius."""
     rows = [
         [*(M.T @ (lamp.position_mm - t)), *(M.T @ lamp.axis), lamp.radius_mm, lamp.intensity_mw_sr,
-         lamp.lobe_exponent, 0.0]
+         lamp.lobe_exponent, ring_radius_mm(lamp)]
         for lamp in lights
     ]  # fmt: skip
     return np.reshape(rows, (-1, 10))
+
+
+def ring_radius_mm(lamp: Light) -> float:
+    """The radius of the dark middle of a ring-shaped lamp; 0 for points and discs."""
+    return float(getattr(lamp, "inner_radius_mm", 0.0))
 
 
 def _shape(surface: Surface) -> Floats:

@@ -24,10 +24,9 @@ from ..arrays import ArrayValue, Bools, Floats, frozen
 from ..geometry.surfaces import Surface
 from ..rig.camera import Camera
 from ..rig.light import Light
-from .frame import apex_of
+from .frame import apex_of, ring_radius_mm
 
 _STEPS = 40
-_RESIDUAL_MM = 1e-9
 Visibility = Callable[[Floats, Floats], Bools]
 
 
@@ -52,20 +51,24 @@ class Spots(ArrayValue):
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """A lamp's points, their mirror points in the world, pixels, and energies (0 where there is no glint)."""
+    """A lamp's points, where their light meets the eye and leaves it (world), pixels, energies (0: no glint there)."""
 
     source_mm: Floats
-    mirror_mm: Floats
+    entry_mm: Floats
+    exit_mm: Floats
     xy_px: Floats
     energy: Floats
 
 
-def mirror_paths(surface: Surface, sources: Floats, eyepoint: Floats) -> tuple[Floats, Floats, Floats, Floats, Bools]:
+def mirror_paths(
+    surface: Surface, sources: Floats, eyepoint: Floats, residual_mm: float = 1e-9
+) -> tuple[Floats, Floats, Floats, Floats, Bools]:
     """Rays from points through the mirror of `surface` to one point, all in the eye frame.
 
     Args:
         sources: (n, 3) mm.
         eyepoint: (3,) mm, the camera's nodal point.
+        residual_mm: by which a path may miss it.
 
     Returns:
         mirror points (n, 3), directions before and after (n, 3), J (n,) mm^2, and whether the path was found.
@@ -99,7 +102,7 @@ def mirror_paths(surface: Surface, sources: Floats, eyepoint: Floats) -> tuple[F
         det = _dot(w, _cross(a[0], a[1]))
         J = np.abs(det)
         miss = np.sqrt(_dot(r, r))
-        found = hit.ok & (miss < _RESIDUAL_MM) & (s[:, 0] > 0) & (c[:, 0] > 0)
+        found = hit.ok & (miss < residual_mm) & (s[:, 0] > 0) & (c[:, 0] > 0)
         bad = ~np.isfinite(miss)
         if np.all(found | bad):
             break
@@ -139,23 +142,25 @@ class GlintScene:
 
     def images(self, lights: Sequence[Light], sigma_px: float) -> list[Image]:
         """The image of each lamp, as finely as its size and the point-spread function ask for."""
-        rough = self._trace(lights, [_nodes(1, 4) if lamp.radius_mm > 0 else _POINT for lamp in lights])
+        if all(lamp.radius_mm == 0 for lamp in lights):
+            return self._trace(lights, [POINT] * len(lights))
+        rough = self._trace(lights, [quadrature(1, 4) if lamp.radius_mm > 0 else POINT for lamp in lights], 1e-2)
         nodes = []
         for lamp, image in zip(lights, rough, strict=True):
             if lamp.radius_mm == 0:
-                nodes.append(_POINT)
+                nodes.append(POINT)
                 continue
             # The integrand, a Gaussian over the lamp's image, is smooth on the scale of sigma (and of the pixel).
             xy = image.xy_px[image.energy > 0]
             extent = float(np.max(np.hypot(*(xy - xy.mean(axis=0)).T))) if len(xy) else 1.0
             radial = min(max(math.ceil(1.5 + 1.5 * extent / math.hypot(sigma_px, 0.29)), 2), 64)
-            nodes.append(_nodes(radial, 4 * radial + 2))
-        return self._trace(lights, nodes) if any(lamp.radius_mm > 0 for lamp in lights) else rough
+            nodes.append(quadrature(radial, 4 * radial + 2))
+        return self._trace(lights, nodes)
 
-    def _trace(self, lights: Sequence[Light], nodes: Sequence[_Nodes]) -> list[Image]:
+    def _trace(self, lights: Sequence[Light], nodes: Sequence[Nodes], residual_mm: float = 1e-9) -> list[Image]:
         """Images of lamps by the given points of their discs; all lamps in one batch."""
         camera = self.camera
-        points = np.concatenate([_disc(lamp, n) for lamp, n in zip(lights, nodes, strict=True)])
+        points = np.concatenate([disc_points(lamp, n) for lamp, n in zip(lights, nodes, strict=True)])
         counts = [len(n.weight) for n in nodes]
         which = np.repeat(np.arange(len(lights)), counts)
         weights = np.concatenate([n.weight for n in nodes])
@@ -164,7 +169,7 @@ class GlintScene:
         exponent = np.array([float(lamp.lobe_exponent) for lamp in lights])
         eyepoint = self.M.T @ (camera.nodal_point_mm - self.t)
         sources = (points - self.t) @ self.M
-        y, d, w, J, found = mirror_paths(self.surface, sources, eyepoint)
+        y, d, w, J, found = mirror_paths(self.surface, sources, eyepoint, residual_mm)
         found &= self.surface.axis_distance(_xyz(y)) < self.limbus_radius_mm
         y, d, w = (np.where(found[:, None], a, (1.0, 0.0, 0.0)) for a in (y, d, w))
         F = reflectance(np.clip(-_dot(self.surface.normal(y), d), 0, 1), self.index)
@@ -175,12 +180,12 @@ class GlintScene:
         found &= cam[:, 2] > 0
         z = np.where(found, cam[:, 2], 1.0)
         x, v = cam[:, 0] / z, cam[:, 1] / z
-        scale = camera.K[0, 0] * camera.K[1, 1] * _distortion_determinant(camera, x, v) / z**3
+        scale = camera.K[0, 0] * camera.K[1, 1] * distortion_determinant(camera, x, v) / z**3
         found &= ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, eyepoint - y)
         energy = np.where(found, weights * strength[which] * lobe * F / np.where(found, J, 1.0) * scale, 0.0)
         mirrors, xy = y @ self.M.T + self.t, camera.pixels_of(x, v)
         parts = np.cumsum(counts)[:-1]
-        columns = (np.split(a, parts) for a in (points, mirrors, xy, energy))
+        columns = (np.split(a, parts) for a in (points, mirrors, mirrors, xy, energy))
         return [Image(*c) for c in zip(*columns, strict=True)]
 
     def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
@@ -192,12 +197,13 @@ class GlintScene:
         return np.asarray((disc > 0) & (-b - np.sqrt(np.maximum(disc, 0)) > 1e-6))
 
 
-def glint_table(scene: GlintScene, lights: Sequence[Light], sigma_px: float) -> tuple[GlintTable, list[Spots]]:
-    """The glints of all lamps, and the points that each is made of."""
-    images = scene.images(lights, sigma_px)
-    sources, mirrors = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "mirror_mm"))
-    node = np.broadcast_to(scene.camera.nodal_point_mm, mirrors.shape)
-    both = scene.clear(np.concatenate([sources, node]), np.concatenate([mirrors, mirrors]))
+def glint_table(scene: GlintScene, images: Sequence[Image]) -> tuple[GlintTable, list[Spots]]:
+    """The glints of all lamps as they are seen, and the points that each is made of."""
+    sources, entries, exits = (
+        np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm")
+    )
+    node = np.broadcast_to(scene.camera.nodal_point_mm, exits.shape)
+    both = scene.clear(np.concatenate([sources, node]), np.concatenate([entries, exits]))
     clear = np.split(both[: len(sources)] & both[len(sources) :], np.cumsum([len(i.energy) for i in images])[:-1])
     spots, place, share = [], [], []
     for image, open_ in zip(images, clear, strict=True):
@@ -215,33 +221,38 @@ def glint_table(scene: GlintScene, lights: Sequence[Light], sigma_px: float) -> 
 
 
 @dataclass(frozen=True, slots=True)
-class _Nodes:
+class Nodes:
     """A quadrature over the unit disc: points (k, 2) and weights (k,) that add up to 1."""
 
     point: Floats
     weight: Floats
 
 
-_POINT = _Nodes(np.zeros((1, 2)), np.ones(1))
+POINT = Nodes(np.zeros((1, 2)), np.ones(1))
 
 
 @lru_cache(maxsize=64)
-def _nodes(radial: int, angular: int) -> _Nodes:
+def quadrature(radial: int, angular: int) -> Nodes:
     """Gauss-Legendre nodes in r^2, even angles."""
     x, weight = np.polynomial.legendre.leggauss(radial)
     angle = 2 * np.pi * (np.arange(angular) + 0.5) / angular
     r = np.sqrt(0.5 * (x + 1))
     point = np.stack([np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()], axis=1)
-    return _Nodes(point, np.repeat(0.5 * weight, angular) / angular)
+    return Nodes(point, np.repeat(0.5 * weight, angular) / angular)
 
 
-def _disc(light: Light, nodes: _Nodes) -> Floats:
-    """Points (k, 3) of a lamp's disc in the world."""
+def disc_points(light: Light, nodes: Nodes) -> Floats:
+    """Points (k, 3) of a lamp's disc or ring in the world."""
     e1, e2 = _basis(light.axis[None, :])
-    return np.asarray(light.position_mm + float(light.radius_mm) * (nodes.point[:, :1] * e1 + nodes.point[:, 1:] * e2))
+    outer, inner = float(light.radius_mm), ring_radius_mm(light)
+    r2 = _dot(nodes.point, nodes.point)
+    # Even area on the disc stays even on the ring: r^2 runs from inner^2 to outer^2.
+    stretch = np.sqrt(inner**2 + r2 * (outer**2 - inner**2)) / np.sqrt(np.maximum(r2, 1e-300))
+    offset = (stretch[:, None] if outer > 0 else 0.0) * nodes.point
+    return np.asarray(light.position_mm + offset[:, :1] * e1 + offset[:, 1:] * e2)
 
 
-def _distortion_determinant(camera: Camera, x: Floats, y: Floats) -> Floats:
+def distortion_determinant(camera: Camera, x: Floats, y: Floats) -> Floats:
     """det of d(distorted) / d(undistorted) normalised coordinates."""
     k1, k2, p1, p2, k3 = camera.distortion
     r2 = x * x + y * y

@@ -22,7 +22,7 @@ import mitsuba as mi
 
 from .surfaces import Bundle, Surface
 
-MAX_STEPS = 24
+MAX_STEPS = 48
 TOLERANCE_MM = 1e-4  # moves the irradiance by less than 1e-4 of itself; float32 reaches about 1e-6 mm
 _STANDOFF_MM = 15.0
 _STEP_MM = 2.5

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from ..arrays import ArrayValue, Bools, Floats, frozen
 from . import psf, sensor
 from .frame import RenderJob, camera_numbers, eye_numbers, kinds, light_table, look_numbers, pose_numbers
-from .glints import GlintScene, GlintTable, glint_table
+from .glints import POINT, GlintScene, GlintTable, Spots, glint_table, quadrature
 from .integrator import Textures, integrator_class, lamps, look
+from .purkinje import purkinje_images
 from .sampling import Sampler, camera_ray
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
@@ -51,7 +52,8 @@ class PartLabels(ArrayValue):
 class RenderedWindow(ArrayValue):
     """A rendered window: `irradiance` (height, width) W/m^2 of the sensor, `dn` after the sensor, labels, glints.
 
-    `failed_paths` counts light paths that did not converge (they are missing from the irradiance).
+    `purkinje` holds (order, table) of the mirror images beyond the first that were asked for. `failed_paths` counts
+    light paths that did not converge (they are missing from the irradiance).
     """
 
     window: tuple[int, int, int, int]
@@ -60,6 +62,7 @@ class RenderedWindow(ArrayValue):
     bit_depth: int
     labels: PartLabels | None
     glints: GlintTable
+    purkinje: tuple[tuple[int, GlintTable], ...]
     failed_paths: int
 
 
@@ -90,7 +93,7 @@ class Renderer:
             values, lights, (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad), spp or self.spp, job.seed
         )
         blurred = psf.blur(radiance, job.sensor.psf_sigma_px).copy()
-        glints = self._add_glints(job, blurred)
+        glints, others = self._add_glints(job, blurred)
         irradiance = blurred * sensor.radiance_to_irradiance(job.sensor)
         dn = sensor.expose(job.sensor, irradiance, job.wavelength_nm, job.seed)
         labels = self._labels(values, job.window) if job.labels else None
@@ -101,6 +104,7 @@ class Renderer:
             job.sensor.bit_depth,
             labels,
             glints,
+            others,
             failed,
         )
 
@@ -200,8 +204,9 @@ class Renderer:
             frozen(depth.numpy().reshape(shape), np.float32),
         )
 
-    def _add_glints(self, job: RenderJob, image: Floats) -> GlintTable:
-        eye, anchor = job.eye, job.anchor_mm
+    def _add_glints(self, job: RenderJob, image: Floats) -> tuple[GlintTable, tuple[tuple[int, GlintTable], ...]]:
+        """Add the lamps' mirror images to the blurred picture: the glints' table, and those of further orders."""
+        eye, anchor, sigma = job.eye, job.anchor_mm, job.sensor.psf_sigma_px
 
         def clear(a: Floats, b: Floats) -> Bools:
             return self._surround.clear(a - anchor, b - anchor)
@@ -210,15 +215,28 @@ class Renderer:
             eye.front[0], float(eye.front_indices[0]), float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm),
             float(eye.sclera.radius_mm), job.M, job.t, job.camera, clear,
         )  # fmt: skip
-        table, images = glint_table(scene, job.lights, job.sensor.psf_sigma_px)
+        tables = {}
+        for order in sorted({1, *job.purkinje}):
+            if order == 1:
+                images = scene.images(job.lights, sigma)
+            else:
+                # These images are small: their mirrors are strongly curved, or concave with a short focus.
+                nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in job.lights]
+                images = purkinje_images(scene, eye, order, job.lights, nodes)
+            tables[order], spots = glint_table(scene, images)
+            if order in job.purkinje:
+                self._splat(job, image, spots)
+        return tables[1], tuple((order, table) for order, table in tables.items() if order > 1)
+
+    @staticmethod
+    def _splat(job: RenderJob, image: Floats, images: Sequence[Spots]) -> None:
         for spots in images:
             if len(spots.energy):
-                direction = job.camera.rays(spots.xy_px) @ job.camera.axis
+                cosine = job.camera.rays(spots.xy_px) @ job.camera.axis
                 patch, rows, columns = psf.splat(
-                    spots.xy_px, spots.energy * direction**4, job.sensor.psf_sigma_px, job.window
+                    spots.xy_px, spots.energy * cosine**4, job.sensor.psf_sigma_px, job.window
                 )
                 image[rows, columns] += patch
-        return table
 
 
 def _pixels(pixel: Any, window: tuple[int, int, int, int]) -> tuple[Any, Any]:

@@ -38,7 +38,7 @@ class Surround:
     def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
         parts: dict[str, Any] = {"type": "scene", "backdrop": self._backdrop()}
         for i, body in enumerate(obstacles):
-            material = {"type": "twosided", "bsdf": _matte(mi.TensorXf(np.full((1, 1, 1), body.albedo, np.float32)))}
+            material = _matte(mi.TensorXf(np.full((1, 1, 1), body.albedo, np.float32)))
             parts[f"obstacle{i}"] = _mesh(f"obstacle{i}", body.vertices_mm, body.faces, None, material)
         self.scene = mi.load_dict(parts)
         self._params: Any = mi.traverse(self.scene)
@@ -75,7 +75,7 @@ class Surround:
     @staticmethod
     def _backdrop() -> Any:
         uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (2 * _HALF_MM / _TILE_MM)
-        material = {"type": "twosided", "bsdf": _matte(mi.TensorXf(np.full((2, 2, 1), 0.4, np.float32)))}
+        material = _matte(mi.TensorXf(np.full((2, 2, 1), 0.4, np.float32)))
         return _mesh("backdrop", _corners(10.0), np.array([[0, 1, 2], [0, 2, 3]]), uv, material)
 
 
@@ -85,6 +85,7 @@ def _corners(distance_mm: float) -> Floats:
 
 
 def _matte(data: Any) -> dict[str, Any]:
+    """A diffuse material; the integrator reads its albedo and turns normals to the viewer, so both sides are matte."""
     return {"type": "diffuse", "reflectance": {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "repeat"}}
 
 

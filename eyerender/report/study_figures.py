@@ -37,7 +37,14 @@ def clouds_figure(clouds: Mapping[str, tuple[Floats, Floats]]) -> str:
                 colour, marker = look(model, list(clouds))
                 p = points[part]
                 ax.scatter(
-                    p[:, 0], p[:, 1], s=13, marker=marker, facecolor="none", edgecolor=colour, linewidth=0.9, label=model
+                    p[:, 0],
+                    p[:, 1],
+                    s=13,
+                    marker=marker,
+                    facecolor="none",
+                    edgecolor=colour,
+                    linewidth=0.9,
+                    label=model,
                 )
             ax.set(aspect="equal", adjustable="datalim", title=title, xlabel="x (px)", ylabel="y (px, down)")
             ax.invert_yaxis()
@@ -55,8 +62,8 @@ def heads_figure(
     """Figure 4: errors at H1 and H2 by eye model, beside the paper's and the experiment's.
 
     Args:
-        own: label -> eye model -> head -> mean (deg). paper: eye model -> (H1, H2). measured: head -> participants (deg).
-        interval: head -> 95 % confidence interval of the participants' mean (deg).
+        own: label -> eye model -> head -> mean (deg). paper: eye model -> (H1, H2). measured: head -> participants
+        (deg). interval: head -> 95 % confidence interval of the participants' mean (deg).
     """
     models = list(dict.fromkeys(m for by_model in own.values() for m in by_model))
     styles = [("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9")]
@@ -67,8 +74,8 @@ def heads_figure(
             ax.axhline(float(np.mean(measured[head])), color=_MEASURED, lw=1.4, ls="--", label="experiment: mean")
             x = np.arange(len(models))
             ax.scatter(
-                np.full(4, len(models)) + np.linspace(-0.12, 0.12, 4), measured[head], s=26, color=_MEASURED, marker="_",
-                label="experiment: participants",
+                np.full(4, len(models)) + np.linspace(-0.12, 0.12, 4), measured[head], s=26, color=_MEASURED,
+                marker="_", label="experiment: participants",
             )  # fmt: skip
             for k, (label, by_model) in enumerate(own.items()):
                 marker, colour = styles[k % len(styles)]

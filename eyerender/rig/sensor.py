@@ -17,8 +17,12 @@ from pydantic import Field
 from ..spec import NonNegative, Positive, Spec
 
 
+# Converters end a little below the well: pixels that saturate then all read full scale, instead of a noisy plateau.
+_WELL_AT_FULL_SCALE = 0.98
+
+
 class SensorSpec(Spec):
-    """Lens aperture, exposure and sensor of a camera; `gain_dn_per_e` defaults to full scale at full well."""
+    """Lens aperture, exposure and sensor of a camera; `gain_dn_per_e` defaults to full scale at 98 % of the well."""
 
     f_number: Positive = Field(default=2.0, description="working f-number: image distance over aperture diameter")
     pixel_pitch_um: Positive = Field(default=2.8, description="side of a square pixel")
@@ -31,7 +35,7 @@ class SensorSpec(Spec):
     )
     full_well_e: Positive = Field(default=6000.0, description="saturation capacity, electrons")
     read_noise_e: NonNegative = Field(default=3.0, description="temporal dark noise, electrons rms")
-    gain_dn_per_e: Positive | None = Field(default=None, description="system gain K; default: full scale at full well")
+    gain_dn_per_e: Positive | None = Field(default=None, description="system gain K; default: full scale at 98 % of the full well")
     black_level_dn: NonNegative | None = Field(default=None, description="default: 1/256 of full scale")
     bit_depth: Literal[8, 10, 12, 16] = Field(default=16, description="of the stored numbers")
     psf_sigma_px: Annotated[float, Field(ge=0, le=20)] = Field(
@@ -54,4 +58,4 @@ class SensorSpec(Spec):
         """The system gain K in DN per electron, with its default filled in."""
         if self.gain_dn_per_e is not None:
             return self.gain_dn_per_e
-        return (self.full_scale_dn - self.black_dn) / self.full_well_e
+        return (self.full_scale_dn - self.black_dn) / (_WELL_AT_FULL_SCALE * self.full_well_e)

@@ -262,3 +262,24 @@ def restarts(
             )
         )
     return out
+
+
+def optimiser_settings(protocols: Sequence[str]) -> dict[str, Any]:
+    """How each protocol's calibration searches: method, start, bounds, tolerance."""
+    out = {}
+    for protocol in protocols:
+        e = estimator(PUBLISHED if protocol == "published" else CORRECTED)
+        out[protocol] = {
+            "objective": e.objective,
+            "method": "SLSQP (scipy.optimize.minimize)"
+            if e.objective == "sum_of_errors"
+            else "trust region reflective (scipy.optimize.least_squares)",
+            "start": e.start.to_mapping(),
+            "lower": e.bounds.lower.to_mapping(),
+            "upper": e.bounds.upper.to_mapping(),
+            "index": "fixed" if protocol == "published" else "fixed; and free as a variant",
+            "tolerance": e.tolerance,
+            "derivatives": "central differences",
+            "random_starts": {"count": STARTS, "seed": SEED, "drawn": "uniformly within the bounds", "eye": "right"},
+        }
+    return out

@@ -12,9 +12,11 @@ from eyerender.analytic.features import features, fixations
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeSpec
-from eyerender.eye.pose import Poses
-from eyerender.geometry.transforms import tilt_rotation
-from eyerender.optics.trace import RayStatus
+from eyerender.eye.pose import Poses, Turning, into_eye
+from eyerender.geometry.surfaces import components, join
+from eyerender.geometry.transforms import normalize, tilt_rotation
+from eyerender.optics.purkinje import purkinje_points
+from eyerender.optics.trace import RayStatus, inward_path, trace
 from eyerender.rig.camera import Camera, distort
 
 DATA = Path(__file__).resolve().parents[1] / "data"
@@ -238,6 +240,53 @@ def test_purkinje_images_of_a_four_surface_eye():
     assert (reduced.glint_status[:, 0, 0] == 0).all()
     assert (reduced.glint_status[:, 0, 1] == RayStatus.MISSED).all()
     assert np.isnan(reduced.glints_px[:, 0, 1]).all()
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize(("name", "order"), [("E3", 3), ("E4", 3), ("E4", 4), ("E5", 3), ("E5", 4)])
+def test_the_iris_hides_images_of_the_lens_from_the_pupil_on_that_just_lets_them_pass(name, order, side):
+    """The narrowest pupil, from where the ray crosses the stop's plane on its way in and out, found here by tracing."""
+    cameras, lights = rig()
+    camera, spec, narrowest = cameras[0], load_eye(name), []
+    for elevation in (-25.0, -27.5, -33.0):
+        pose = Poses.from_degrees(1.0, elevation)
+
+        def status(diameter, pose=pose, orders=(1, 2, order)):
+            eye = spec.build(eye=side, pupil_diameter_mm=diameter)
+            seen = features([eye], [0], pose, np.zeros((1, 3)), [camera], [0], lights[:1], purkinje=orders)
+            return seen.glint_status[0, 0].tolist()
+
+        # Not through the pupil: the cornea's images do not care.
+        assert status(0.05)[:2] == [0, 0]
+        eye = spec.build(eye=side, pupil_diameter_mm=4.0)
+        turning = Turning.of(pose)
+        place = join(into_eye(turning, eye, components(-camera.R.T @ camera.t[None])))
+        lamp = join(into_eye(turning, eye, components(lights[:1])))
+        depth = {3: len(eye.front) + 1, 4: len(eye.front) + len(eye.back)}[order]
+        path = [
+            (eye.front + eye.back)[:depth],
+            (eye.front_indices + eye.back_indices)[:depth],
+            ((eye.limbus_radius_mm,) * len(eye.front) + eye.back_rims_mm)[:depth],
+            ((False,) * len(eye.front) + eye.back_passing)[:depth],
+        ]
+        found = purkinje_points(*path, lamp, place)
+        assert found.status[0] == RayStatus.OK
+        reach = []
+        for start, target in ((place, found.exit_points_mm), (lamp, found.course_mm[-1])):
+            into = trace(inward_path(eye.front, eye.front_indices), 1.0, start, normalize(target - start))
+            point, way = into.points_mm[-1][0], into.directions[-1][0]
+            along = (eye.stop.centre_mm - point) @ eye.stop.normal / (way @ eye.stop.normal)
+            # Before the plane is reached the ray may meet a lens that bulges through the pupil.
+            met = eye.back[0].intersect(point, way)[0]
+            if order == 4 or along < met:
+                across = (point + along * way - eye.stop.centre_mm) @ eye.stop.rotation
+                reach.append(np.linalg.norm(across[1:] / eye.stop.semi_axes_mm))
+        assert len(reach) == 2
+        narrowest.append(4.0 * max(reach))
+        if order == 4 or name != "E5":
+            assert status(narrowest[-1] * 1.01)[2] == RayStatus.OK
+            assert status(narrowest[-1] * 0.99)[2] == RayStatus.BEHIND_IRIS
+    assert np.ptp(narrowest) > 0.3
 
 
 def test_what_cannot_be_seen_has_a_status_and_no_number():

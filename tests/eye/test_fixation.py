@@ -144,7 +144,7 @@ def test_what_cannot_be_fixated_says_why(reading):
     eye = load_eye("E2").build()
     found = fixate(eye, [[600.0, 0.0, 0.0], [-600.0, 30.0, 10.0], [-8.0, 0.5, 0.0], [-13.5, 500.0, 0.0]], reading)
     assert found.status[0] == FixationStatus.OK
-    assert found.reason(0) == ""
+    assert found.reason(0) is None
     assert (found.status[1:] != FixationStatus.OK).all()
     assert all(found.reason(k) for k in (1, 2, 3))
     assert found.status[1] == FixationStatus.OUT_OF_REACH

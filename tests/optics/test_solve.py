@@ -16,8 +16,9 @@ from eyerender.geometry.surfaces_biconic import Biconic
 from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.geometry.transforms import tilt_rotation
 from eyerender.optics.fermat import stationary_path
+from eyerender.optics.purkinje import purkinje_points
 from eyerender.optics.shooting import connect
-from eyerender.optics.solve import apparent_points, mirror_points, purkinje_points
+from eyerender.optics.solve import apparent_points, mirror_points
 from eyerender.optics.trace import Crossing, RayStatus, inward_path, outward_path, trace
 
 DATA = Path(__file__).resolve().parents[1] / "data"

@@ -1,0 +1,152 @@
+"""The commands gaze fit and gaze predict: gaze estimation on a user's own records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import App, Parameter
+
+from ..errors import InputError
+from .app import app
+from .output import Json, emit
+
+gaze = App(name="gaze", help="Estimate gaze from records of features, those of real images too.")
+app.command(gaze)
+
+EstimatorName = Literal["regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman"]
+
+
+@gaze.command(name="fit")
+def fit(
+    records: Path,
+    /,
+    *,
+    estimator: EstimatorName,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    scene: str | None = None,
+    function: str = "R3",
+    terms_x: str | None = None,
+    terms_y: str | None = None,
+    monocular: bool = False,
+    method: Literal["A", "B"] = "A",
+    free_index: bool = False,
+    index: float | None = None,
+    recalibration: Literal["angle", "screen", "none"] = "angle",
+    fixations: str | None = None,
+    json: Json = None,
+) -> int:
+    """Calibrate a gaze estimator on records of known targets, and write the calibration.
+
+    Parameters
+    ----------
+    records
+        Records as `features` or `extract` write them (JSON), or one record a line (JSONL); each with its target_mm.
+    estimator
+        Which estimator.
+    output
+        The calibration file to write.
+    scene
+        A scene file or the name of a shipped one, for its rig; default: the rig in the records' file.
+    function
+        regression: R1 to R12.
+    terms_x
+        regression: terms of x instead, such as 'x + xy + 1'.
+    terms_y
+        regression: terms of y.
+    monocular
+        regression: the vector of one eye in pixels, not divided by the distance of both pupils.
+    method
+        guestrin-eizenman: centre of the cornea from all glints (A), or on the planes' common line (B).
+    free_index
+        guestrin-eizenman: calibrate the index of refraction too.
+    index
+        guestrin-eizenman, hennessey: the index assumed.
+    recalibration
+        hennessey, shih-wu-liu: what the correcting polynomial works on.
+    fixations
+        Calibrate on these fixations only, counted from 0: '0,4,8'.
+    json
+        Write a summary as JSON to a file, or to stdout with '-'.
+    """
+    from ..gaze.store import EstimatorSpec, fit_estimator, load_observations, save_estimator
+
+    if (terms_x is None) != (terms_y is None):
+        raise InputError("give both --terms-x and --terms-y", source="--terms-x")
+    observations, rig = load_observations(records, scene)
+    chosen = _chosen(fixations)
+    spec = EstimatorSpec.from_mapping(
+        {
+            "name": estimator,
+            "function": function,
+            "terms": [terms_x, terms_y] if terms_x is not None else None,
+            "normalised": not monocular,
+            "method": method,
+            "free_index": free_index,
+            "index": index,
+            "recalibration": recalibration,
+        }
+    )
+    fitted, summary = fit_estimator(spec, observations, rig, chosen, source=str(records))
+    save_estimator(output, spec, fitted)
+    summary = {**summary, "path": str(output)}
+    mean = summary["calibration_error_deg"]["mean_deg"]
+    text = f"{estimator}: calibrated on {summary['calibration_observations']} observations, written to {output}"
+    if mean is not None:
+        text += f"\nerror on them (not a test): mean {mean:.4f} deg over {summary['calibration_error_deg']['n']}"
+    emit(summary, text, json)
+    return 0
+
+
+@gaze.command(name="predict")
+def predict(
+    records: Path,
+    /,
+    *,
+    calibration: Annotated[Path, Parameter(name=["--calibration", "-c"])],
+    scene: str | None = None,
+    json: Json = None,
+) -> int:
+    """Estimate gaze points with a calibration that `gaze fit` wrote; where targets are known, their errors too.
+
+    Parameters
+    ----------
+    records
+        Records as `features` or `extract` write them (JSON), or one record a line (JSONL).
+    calibration
+        The calibration file.
+    scene
+        A scene file or the name of a shipped one, for its rig; default: the rig in the records' file.
+    json
+        Write the gaze points as JSON to a file, or to stdout with '-'.
+    """
+    from ..gaze.store import load_estimator, load_observations, predictions
+
+    observations, rig = load_observations(records, scene)
+    data = predictions(load_estimator(calibration), observations, rig)
+    emit(data, _gaze_table(data), json)
+    return 0
+
+
+def _chosen(text: str | None) -> list[int] | None:
+    if text is None:
+        return None
+    try:
+        return [int(part) for part in text.split(",") if part.strip()]
+    except ValueError:
+        raise InputError(f"{text!r} is no list of whole numbers", source="--fixations") from None
+
+
+def _gaze_table(data: dict[str, Any]) -> str:
+    lines = [f"{'frame':>6} {'eye':<6} {'gaze point mm':>32} {'error deg':>10}"]
+    for entry in data["gaze"]:
+        point = entry["point_mm"]
+        where = f"missing: {entry['reason']}" if point is None else "".join(f"{v:>11.3f}" for v in point)
+        error = "-" if entry["error_deg"] is None else f"{entry['error_deg']:.4f}"
+        lines.append(f"{entry['frame']:>6} {entry['eye'] or '-':<6} {where:>32} {error:>10}")
+    for entry in data["binocular"]:
+        if entry["point_mm"] is not None:
+            where = "".join(f"{v:>11.3f}" for v in entry["point_mm"])
+            error = "-" if entry["error_deg"] is None else f"{entry['error_deg']:.4f}"
+            lines.append(f"{entry['frame']:>6} {'both':<6} {where:>32} {error:>10}")
+    return "\n".join(lines)

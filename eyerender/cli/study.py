@@ -1,0 +1,116 @@
+"""The command study."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from ..errors import InputError
+from .app import app
+from .output import BackendName, Json, emit, progress
+
+
+@app.command(name="study")
+def study(
+    name: Annotated[str, Parameter(name="NAME")],
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    protocol: Literal["corrected", "published", "both"] = "both",
+    observer: Literal["analytic", "image", "both"] = "analytic",
+    eyes: str | None = None,
+    workers: int | None = None,
+    spp: int | None = None,
+    noise: bool = True,
+    backend: BackendName = "auto",
+    threads: int | None = None,
+    overwrite: bool = False,
+    json: Json = None,
+) -> int:
+    """Replicate a published study of gaze estimation, and test its findings on the replication's own data.
+
+    Writes summary.json, findings.json, CSV of both and report.html. A folder of the same study is run again in place.
+
+    Parameters
+    ----------
+    name
+        guestrin2006, blignaut2014, or conditions (over the screen, head positions, pupil sizes, eye parameters).
+    output
+        The folder to write.
+    protocol
+        What the authors' software did (published), what the text says (corrected), or both.
+    observer
+        Features by ray optics (analytic), recovered from rendered images (image), or both.
+    eyes
+        Eye models, separated by commas: names of the catalogue, or eye files (default: E1 to E5).
+    workers
+        Processes for the analytic part (default: all processors).
+    spp
+        Samples per pixel of the images (default: the scene's).
+    noise
+        Sensor noise in the images.
+    backend
+        Where to render.
+    threads
+        Processor threads of the renderer (default: all).
+    overwrite
+        Replace what the folder holds.
+    json
+        Write the summary as JSON to a file, or to stdout with '-'.
+    """
+    from ..study.literature import MODELS
+    from ..study.run import REPORT, run_study
+
+    if spp is not None and spp < 1:
+        raise InputError("must be >= 1", source="--spp")
+    if threads is not None and threads < 1:
+        raise InputError("must be >= 1", source="--threads")
+    names = MODELS if eyes is None else tuple(e.strip() for e in eyes.split(",") if e.strip())
+    with progress(f"study {name}") as steps:
+        summary = run_study(
+            name,
+            output,
+            protocol=protocol,
+            observer=observer,
+            eyes=names,
+            workers=workers if workers is not None else len(os.sched_getaffinity(0)),
+            spp=spp,
+            noise=noise,
+            backend=backend,
+            threads=threads,
+            overwrite=overwrite,
+            progress=steps,
+        )
+    emit(summary, f"{_table(summary)}\n\nreport: {output / REPORT}", json)
+    return 0
+
+
+def _table(summary: dict[str, Any]) -> str:
+    """The means that matter, one line each."""
+    rows = summary["rows"]
+    if summary["study"] == "blignaut2014":
+        lines = [f"{'protocol':<10} {'observer':<9} {'eye':<18} {'set':<5} {'best':<5} {'mean deg':>9}"]
+        best: dict[tuple[str, ...], dict[str, Any]] = {}
+        for row in rows:
+            key = (row["protocol"], row["observer"], row["eye_model"], row["calibration"])
+            if row["variant"] != "vector" or row["mean_deg"] is None:
+                continue
+            if key not in best or row["mean_deg"] < best[key]["mean_deg"]:
+                best[key] = row
+        lines += [
+            f"{k[0]:<10} {k[1]:<9} {k[2]:<18} {k[3]:<5} {row['function']:<5} {row['mean_deg']:>9.4f}"
+            for k, row in best.items()
+        ]
+        return "\n".join(lines)
+    lines = [f"{'protocol':<10} {'observer':<9} {'eye':<18} {'side':<6} {'mean deg':>9} {'n':>4}  condition"]
+    for row in rows:
+        mean = "-" if row["mean_deg"] is None else f"{row['mean_deg']:.4f}"
+        condition = " ".join(str(v) for v in (row["head"], row["variant"]) if v)
+        lines.append(
+            f"{row['protocol']:<10} {row['observer']:<9} {row['eye_model']:<18} {row['eye']:<6} {mean:>9} "
+            f"{row['n']:>4}  {condition}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,195 @@
+"""Purkinje images from inside the eye: light that goes in, is thrown back by a surface and comes out to a viewpoint.
+
+Such a mirror point need not exist (the front of a lens that flattens outwards, a hyperboloid, faces no farther than its
+asymptotic cone), and where several do, one is the Purkinje image: the one that moves without a break from the axis,
+where paraxial optics has a single one. It is followed from there. With t from 0 to 1 source and viewpoint go along
+
+    p(t) = o + (1 - t) |p - o| a + t (p - o)        (o, a: apex and axis of the outermost surface)
+
+The exit point is predicted along the secant of the two positions before, then corrected by Newton with ray
+differentials; the step in t is halved where that fails or where the ray tube's determinant has changed its sign
+(another branch), and doubled where it succeeds (Allgower & Georg 1990, "Numerical continuation methods", chapter 2). A
+branch ends at a fold, where the determinant vanishes (the viewpoint lies on a caustic), at total reflection, or where a
+surface ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import ArrayValue
+from ..geometry.surfaces import Mask, Surface, components, join
+from ..geometry.transforms import Array, normalize
+from .interface import Number
+from .shooting import Corrected, correct, taken
+from .solve import apex_of
+from .trace import Crossing, RayStatus, Status, trace
+
+Rows = npt.NDArray[np.intp]
+
+FIRST_STEP = 0.125
+SHORTEST_STEP = 2.0**-14
+FOLD = 0.05
+"""A branch that stalls with the tube's determinant below this part of its largest value ends there. At a fold the
+determinant falls as the square root of what is left of t: to about 0.01 at the shortest step.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PurkinjePoints(ArrayValue):
+    """Where light from a source is thrown back to a viewpoint inside the eye.
+
+    points_mm (..., 3): the mirror point on the reflecting surface; exit_points_mm (..., 3): where the ray meets the
+    outermost surface on its way to the viewpoint; directions (..., 3): unit, from there to the viewpoint; course_mm
+    (2 k - 1, ..., 3): all points of the ray on k surfaces, from the exit point over the mirror point back to where the
+    light came in; residual_mm, status (...,). NaN where there is no such ray.
+    """
+
+    points_mm: Array
+    exit_points_mm: Array
+    directions: Array
+    course_mm: Array
+    residual_mm: Array
+    status: Status
+
+
+def purkinje_path(
+    surfaces: Sequence[Surface],
+    indices: Sequence[Number],
+    rims_mm: Sequence[Number],
+    passing: Sequence[bool],
+    n_outside: float = 1.0,
+) -> tuple[Crossing, ...]:
+    """The crossings of a ray thrown back by the innermost of `surfaces`.
+
+    surfaces : outside in, the last one reflects; indices : the index behind each; rims_mm : where each ends; passing :
+    whether a ray that does not meet a surface passes on (shells of a gradient lens).
+    """
+
+    def crossing(k: int, n_after: Number, inward: bool) -> Crossing:
+        edge = RayStatus.OUTSIDE_LIMBUS if k == 0 else RayStatus.MISSED
+        return Crossing(surfaces[k], n_after, inward, False, rims_mm[k], None if passing[k] else edge)
+
+    last = len(surfaces) - 1
+    before = [n_outside, *indices]
+    return (
+        *(crossing(k, indices[k], True) for k in range(last)),
+        Crossing(surfaces[last], 1.0, True, True, rims_mm[last], RayStatus.NO_MIRROR_POINT),
+        *(crossing(k, before[k], False) for k in reversed(range(last))),
+    )
+
+
+def purkinje_points(
+    surfaces: Sequence[Surface],
+    indices: Sequence[Number],
+    rims_mm: Sequence[Number],
+    passing: Sequence[bool],
+    source_mm: npt.ArrayLike,
+    viewpoint_mm: npt.ArrayLike,
+    n_outside: float = 1.0,
+) -> PurkinjePoints:
+    """Reflection at the innermost of `surfaces`, refraction at the others on the way in and out.
+
+    The surfaces are those of `purkinje_path`; source_mm, viewpoint_mm (..., 3) broadcast against each other. Status
+    NO_MIRROR_POINT: the image, followed from the axis, ends before source and viewpoint are where they are, or lies
+    beyond the rim of the reflecting surface.
+    """
+    path = purkinje_path(surfaces, indices, rims_mm, passing, n_outside)
+    viewpoint, source = np.broadcast_arrays(
+        np.asarray(viewpoint_mm, dtype=np.float64), np.asarray(source_mm, dtype=np.float64)
+    )
+    shape = source.shape[:-1]
+    full = shape or (1,)
+    # One row a ray, so that those which are done drop out.
+    frame = np.repeat(np.arange(full[0]), int(np.prod(full[1:], dtype=np.intp)))
+    outer = surfaces[0].take(frame)
+    apex, axis = apex_of(outer), outer.rotation[..., :, 0]
+    route = _Route(apex, axis, viewpoint.reshape(-1, 3) - apex, source.reshape(-1, 3) - apex)
+    found = _followed(tuple(taken(c, frame) for c in path), n_outside, route)
+    return PurkinjePoints(
+        found.points_mm.reshape(*shape, 3),
+        found.exit_points_mm.reshape(*shape, 3),
+        found.directions.reshape(*shape, 3),
+        found.course_mm.reshape(-1, *shape, 3),
+        found.residual_mm.reshape(shape),
+        found.status.reshape(shape),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Route:
+    """How viewpoints and sources (m, 3), given from the apex, go from the axis to their places; apex, axis (3,) or
+    (m, 3).
+    """
+
+    apex: Array
+    axis: Array
+    viewpoint: Array
+    source: Array
+
+    def at(self, t: Array, rows: Rows) -> tuple[Array, Array]:
+        """(viewpoints, sources) of `rows` at t."""
+        apex = np.broadcast_to(self.apex, self.source.shape)[rows]
+        axis = np.broadcast_to(self.axis, self.source.shape)[rows]
+        along, left = t[:, None], 1.0 - t[:, None]
+
+        def place(end: Array) -> Array:
+            return np.asarray(apex + left * np.linalg.norm(end, axis=-1, keepdims=True) * axis + along * end)
+
+        return place(self.viewpoint[rows]), place(self.source[rows])
+
+
+def _followed(path: Sequence[Crossing], n_outside: float, route: _Route) -> PurkinjePoints:
+    """The images of a route's m rays."""
+    count = len(route.source)
+    t, t_before, step = np.zeros(count), np.zeros(count), np.full(count, FIRST_STEP)
+    point, exits, way = (np.zeros((count, 3)) for _ in range(3))
+    exits += route.apex
+    before = exits.copy()
+    residual, tube, largest = np.zeros(count), np.zeros(count), np.zeros(count)
+
+    def sought(rows: Rows, to: Array, aim: Array) -> Corrected:
+        viewpoint, source = route.at(to, rows)
+        some = path if len(rows) == count else [taken(c, rows) for c in path]
+        return correct(some, n_outside, components(viewpoint), components(source), components(aim))
+
+    def accept(rows: Rows, found: Corrected, good: Mask) -> None:
+        into = rows[good]
+        before[into] = exits[into]
+        point[into], exits[into], way[into] = (join(p)[good] for p in (found.turning, found.first, found.start))
+        residual[into], tube[into] = found.residual_mm[good], found.determinant_mm2_sr[good]
+        largest[into] = np.maximum(largest[into], np.abs(tube[into]))
+
+    everything = np.arange(count)
+    found = sought(everything, t, exits)
+    good = found.status == RayStatus.OK
+    accept(everything, found, good)
+    status = np.where(good, RayStatus.OK, RayStatus.NOT_CONVERGED).astype(np.int8)
+    while len(rows := np.flatnonzero((status == RayStatus.OK) & (t < 1.0))):
+        here, stride = t[rows], np.minimum(step[rows], 1.0 - t[rows])
+        past = here - t_before[rows]
+        slope = (exits[rows] - before[rows]) / np.where(past > 0.0, past, np.inf)[:, None]
+        found = sought(rows, here + stride, exits[rows] + stride[:, None] * slope)
+        good = (found.status == RayStatus.OK) & (found.determinant_mm2_sr * tube[rows] > 0.0)
+        accept(rows, found, good)
+        t_before[rows[good]], t[rows[good]] = here[good], (here + stride)[good]
+        step[rows] = np.where(good, 2.0 * stride, 0.5 * stride)
+        lost = ~good & (step[rows] < SHORTEST_STEP)
+        folded = np.abs(tube[rows]) < FOLD * largest[rows]
+        ended = lost & (folded | (found.status == RayStatus.MISSED) | (found.status == RayStatus.TOTAL_REFLECTION))
+        status[rows[lost]] = RayStatus.NOT_CONVERGED
+        status[rows[ended]] = RayStatus.NO_MIRROR_POINT
+    ok = status == RayStatus.OK
+    # The rims count only for the ray that is left.
+    traced = trace(
+        path, n_outside, route.apex + route.viewpoint, np.where(ok[:, None], way, -normalize(route.viewpoint))
+    )
+    status = np.where(ok, traced.status, status)
+    none = (status != RayStatus.OK)[:, None]
+    point, exits, way = (np.where(none, np.nan, value) for value in (point, exits, -way))
+    course = np.where(none, np.nan, traced.points_mm[1:])
+    return PurkinjePoints(point, exits, way, course, np.where(none[:, 0], np.nan, residual), status)

@@ -1,0 +1,147 @@
+"""The palpebral fissure: the inner edge of the lids' margin around the eye, on the globe and off it.
+
+Columns run once around the fissure: angle 0 at the medial canthus, 90 degrees in the middle of the upper lid, 180 at the
+lateral canthus, 270 in the middle of the lower lid. Along the chord between the canthi a = cos(angle) is -1 temporal and
++1 nasal; a lid stands above or below the chord by
+
+    h(a) = H (1 + a)^p (1 - a)^q / max,
+
+its peak at a = (p - q) / (p + q). The upper lid's height follows the turn of the eye and the blink: its middle lies at
+an angle about the globe's centre that turns by `upper_follows` of the eye's elevation.
+
+Where the contour lies in front of the globe it lies on it; past a polar angle of 46 (nasal) to 58 degrees (temporal) it
+leaves along the tangent, which softens towards the canthi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import ArrayValue, Floats
+from .anatomy import RegionSpec
+from .globe import Globe
+
+COLUMNS = 176
+_LATERAL, _MEDIAL, _VERTICAL = np.radians(58.0), np.radians(45.0), np.radians(62.0)
+_GAP_MM = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contour(ArrayValue):
+    """Per column: `angle` (n,), `along` a (n,), `upper` 1 or -1, the inner edge `point` (n, 3), the `normal` (n, 3) of the globe
+    or its continuation, the direction `away` (n, 3) from the fissure along it, and `along_lid` (n, 3), towards the nose.
+
+    `openness` is 1 for lids as wide as straight ahead, 0 for closed ones.
+    """
+
+    angle: Floats
+    along: Floats
+    upper: Floats
+    point: Floats
+    normal: Floats
+    away: Floats
+    along_lid: Floats
+    openness: float
+
+
+def step(x: Floats | float, low: float, high: float) -> Floats:
+    """A smooth step from 0 at `low` to 1 at `high`."""
+    s = np.clip((np.asarray(x, dtype=float) - low) / (high - low), 0, 1)
+    return np.asarray(s * s * (3 - 2 * s))
+
+
+def unit(v: Floats) -> Floats:
+    """Vectors (..., 3) of length 1."""
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))
+
+
+def canthi(spec: RegionSpec) -> tuple[Floats, Floats]:
+    """(y, z) of the middle of the chord between the canthi, and half the chord from there to the medial one."""
+    f = spec.fissure
+    tilt = np.radians(f.tilt_deg)
+    half = f.width_mm / 2 * np.array([np.cos(tilt), -np.sin(tilt)])
+    middle = np.array([f.width_mm * (0.5 - f.lateral_share), f.canthi_mm])
+    return middle, half
+
+
+def contour(spec: RegionSpec, globe: Globe, columns: int = COLUMNS) -> Contour:
+    """The fissure's contour for a posed globe."""
+    angle = 2 * np.pi * np.arange(columns) / columns
+    a = np.cos(angle)
+    upper = np.where(np.sin(angle) >= -1e-12, 1.0, -1.0)
+    yz, openness = _outline(spec, globe, a, upper)
+    on_globe = step(np.abs(np.sin(angle)), 0.08, 0.5)[:, None]
+    centre = globe.rest + on_globe * (globe.centre - globe.rest)
+    point, normal = _support(globe, centre, yz)
+    film = spec.lids.film_mm
+    point = globe.pushed_out(point, film)
+    sideways = np.sign(a) * np.abs(a) ** 6
+    flat = unit(np.stack([np.zeros_like(a), sideways, np.sin(angle) + 0.02 * upper], axis=-1))
+    away = unit(flat - normal * np.sum(flat * normal, axis=-1, keepdims=True))
+    along_lid = unit(np.cross(away, normal) * upper[:, None])
+    along_lid = along_lid * np.where(along_lid[:, 1:2] < 0, -1.0, 1.0)
+    return Contour(angle, a, upper, point, normal, away, along_lid, openness)
+
+
+def _outline(spec: RegionSpec, globe: Globe, a: Floats, upper: Floats) -> tuple[Floats, float]:
+    """(y, z) of the inner edge as seen from the front (n, 2), and the openness."""
+    f, lids = spec.fissure, spec.lids
+    middle, half = canthi(spec)
+    chord = middle + a[:, None] * half
+    middle_z = middle[1] + f.peak * half[1]
+    reach = globe.radius_mm + 0.5
+    # Where the margins' middles stand, as angles about the globe's centre; the lids never quite touch unless they blink.
+    turn = globe.elevation_rad
+
+    def height(rest_mm: float, follows: float) -> float:
+        at_rest = np.arcsin(np.clip(rest_mm / reach, -0.95, 0.95))
+        return float(reach * np.sin(np.clip(at_rest + follows * turn, -0.8, 0.8)))
+
+    low = -height(f.lower_mm, -lids.lower_follows) - middle_z
+    low = min(low, -0.6)
+    high = max(height(f.upper_mm, lids.upper_follows) - middle_z, low + 1.0)
+    rest = f.upper_mm - middle_z
+    shut = 0.8 * low + 0.2 * high if high < 0 else 0.8 * low
+    shape_up = _shape(a, f.peak, 0.78)
+    shape_low = _shape(a, -0.06, 0.80)
+    # Beside the caruncle both lids run close together.
+    bay = 1 - 0.30 * np.exp(-(((1 - a) / 0.16) ** 2))
+    closed = shut * shape_low
+    b = spec.blink
+    up = (1 - b) * high * shape_up * bay + b * (closed + _GAP_MM * shape_up)
+    down = (1 - b) * low * shape_low * bay + b * (closed - _GAP_MM * shape_low)
+    up = np.maximum(up, down + _GAP_MM * shape_up)
+    z = chord[:, 1] + np.where(upper > 0, up, down)
+    openness = (1 - b) * float(np.clip((high - low) / (rest - low), 0, 1.3))
+    return np.stack([chord[:, 0], z], axis=-1), openness
+
+
+def _shape(a: Floats, peak: float, power: float) -> Floats:
+    p, q = power * (1 + peak), power * (1 - peak)
+    most = (1 + peak) ** p * (1 - peak) ** q
+    return np.asarray(np.maximum(1 + a, 0) ** p * np.maximum(1 - a, 0) ** q / most)
+
+
+def _support(globe: Globe, centre: Floats, yz: Floats) -> tuple[Floats, Floats]:
+    """Points over (y, z) of the sphere or its softened tangent continuation, and their normals."""
+    d = yz - centre[..., 1:]
+    rho = np.maximum(np.hypot(d[..., 0], d[..., 1]), 1e-9)
+    e = d / rho[..., None]
+    R = globe.radius_mm
+    nasal, temporal = step(e[..., 0], 0.2, 0.85), step(-e[..., 0], 0.2, 0.85)
+    limit = _VERTICAL + nasal * (_MEDIAL - _VERTICAL) + temporal * (_LATERAL - _VERTICAL)
+    soft = 14.0 - 8.0 * nasal
+    rho0 = R * np.sin(limit)
+    past = np.maximum(rho - rho0, 0.0)
+    tangent = np.tan(limit)
+    x = np.where(
+        rho < rho0,
+        np.sqrt(np.maximum(R * R - np.minimum(rho, rho0) ** 2, 0)),
+        R * np.cos(limit) - tangent * soft * (1 - np.exp(-past / soft)),
+    )
+    slope = np.where(rho < rho0, rho / np.maximum(x, 1e-6), tangent * np.exp(-past / soft))
+    point = np.stack([centre[..., 0] + x, yz[..., 0], yz[..., 1]], axis=-1)
+    normal = np.stack([np.ones_like(x), slope * e[..., 0], slope * e[..., 1]], axis=-1)
+    return point, unit(normal)

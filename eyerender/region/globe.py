@@ -1,0 +1,108 @@
+"""The globe as it really stands, as a distance from its centre over direction: what lids lie on.
+
+    r(n) = max(R, distance to the front cornea along n where that lies within the limbus)
+
+with n a unit direction from the centre of the sclera's sphere (radius R). The globe is star-shaped from there, so r
+tells everything. All points are in the region's frame: the eye frame of the unrotated right eye (a left eye's region is
+the mirror image).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy import ndimage
+
+from ..arrays import ArrayValue, Floats, frozen
+from ..geometry.surfaces import Surface
+
+_POLAR, _TURNS = 241, 96
+_WIDEST = np.radians(40.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Globe(ArrayValue):
+    """A posed globe: `cornea` and `centre_mm` (3,) in the eye frame, the motion p = M x + t into the unrotated frame.
+
+    `mirrored`: a left eye, whose region's frame has y the other way round.
+    """
+
+    cornea: Surface
+    limbus_radius_mm: float
+    centre_mm: Floats
+    radius_mm: float
+    M: Floats
+    t: Floats
+    mirrored: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("centre_mm", "M", "t"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def centre(self) -> Floats:
+        """Centre of the sclera's sphere in the region's frame, (3,) mm."""
+        return self._mirror(self.M @ self.centre_mm + self.t)
+
+    @property
+    def rest(self) -> Floats:
+        """The same for the unrotated eye."""
+        return self._mirror(self.centre_mm)
+
+    @property
+    def axis(self) -> Floats:
+        """Direction of the optic axis in the region's frame."""
+        return self._mirror(self.M[:, 0])
+
+    @property
+    def elevation_rad(self) -> float:
+        """Elevation of the optic axis."""
+        return float(np.arcsin(np.clip(self.M[2, 0], -1, 1)))
+
+    def radial(self, direction: Floats) -> Floats:
+        """r (n,) mm along unit directions (n, 3) from the centre."""
+        local = self._mirror(direction) @ self.M
+        polar = np.arccos(np.clip(local[..., 0], -1, 1))
+        turn = np.arctan2(local[..., 2], local[..., 1]) / (2 * np.pi) % 1.0
+        table = _table(self.cornea, self.limbus_radius_mm, tuple(self.centre_mm.tolist()), self.radius_mm)
+        place = np.stack([polar / _WIDEST * (_POLAR - 1), turn * _TURNS])
+        bulge = ndimage.map_coordinates(table, place, order=1, mode="nearest")
+        return self.radius_mm + np.where(polar < _WIDEST, bulge, 0.0)
+
+    def clearance(self, points: Floats) -> Floats:
+        """Distance (n,) mm of points (n, 3) from the globe along the line from its centre; negative inside."""
+        away = points - self.centre
+        distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-9)
+        return distance - self.radial(away / distance[..., None])
+
+    def pushed_out(self, points: Floats, clearance_mm: Floats | float) -> Floats:
+        """The points, moved along the line from the globe's centre where they lie nearer to it than `clearance_mm`."""
+        away = points - self.centre
+        distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-9)
+        direction = away / distance[..., None]
+        least = self.radial(direction) + clearance_mm
+        return self.centre + direction * np.maximum(distance, least)[..., None]
+
+    def _mirror(self, vector: Floats) -> Floats:
+        return vector * np.array([1.0, -1.0, 1.0]) if self.mirrored else np.asarray(vector)
+
+
+@lru_cache(maxsize=32)
+def _table(cornea: Surface, limbus_mm: float, centre: tuple[float, ...], radius_mm: float) -> Floats:
+    """How far the cornea stands out of the sphere (polar angle, turn about x), the last column as the first; mm."""
+    polar = np.linspace(0, _WIDEST, _POLAR)[:, None]
+    turn = (2 * np.pi * np.arange(_TURNS + 1) / _TURNS)[None, :]
+    n = np.stack(
+        np.broadcast_arrays(np.cos(polar), np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn)), axis=-1
+    )
+    n = n / np.linalg.norm(n, axis=-1, keepdims=True)
+    c = np.array(centre)
+    # From outside inwards: the front of the cornea is what such a ray meets first.
+    start = radius_mm + 8.0
+    distance, met = cornea.intersect(c + start * n, -n)
+    r = np.where(met, start - distance, radius_mm)
+    local = cornea.to_local(c + r[..., None] * n)
+    inside = met & (np.hypot(local[..., 1], local[..., 2]) <= limbus_mm) & (r > 0.5 * radius_mm)
+    return frozen(np.where(inside, np.maximum(r - radius_mm, 0.0), 0.0))

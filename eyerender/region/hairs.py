@@ -1,0 +1,57 @@
+"""Hairs as curves, and curves as tapered three-sided tubes.
+
+A hair is a polyline of `SEGMENTS` + 1 points with a radius at each, thinning towards the tip.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..arrays import ArrayValue, Floats, Ints, frozen
+from .contour import unit
+
+SEGMENTS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hairs(ArrayValue):
+    """`points` (n, k, 3) mm from root to tip, `radii` (n, k) mm."""
+
+    points: Floats
+    radii: Floats
+
+    def tubes(self) -> Floats:
+        """Vertices (n * k * 3, 3) of three-sided tubes about the curves; `tube_faces` joins them."""
+        p = self.points
+        if len(p) == 0:
+            return np.zeros((0, 3))
+        along = np.empty_like(p)
+        along[:, 1:-1] = p[:, 2:] - p[:, :-2]
+        along[:, 0], along[:, -1] = p[:, 1] - p[:, 0], p[:, -1] - p[:, -2]
+        along = unit(along)
+        # One reference per hair, across its chord, so that a tube does not twist.
+        chord = unit(p[:, -1] - p[:, 0])
+        helper = np.where(np.abs(chord[:, 1:2]) < 0.8, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+        e1 = unit(np.cross(along, helper[:, None, :]))
+        e2 = np.cross(along, e1)
+        angle = 2 * np.pi * np.arange(3) / 3
+        ring = np.cos(angle)[:, None] * e1[:, :, None, :] + np.sin(angle)[:, None] * e2[:, :, None, :]
+        return np.asarray((p[:, :, None, :] + self.radii[:, :, None, None] * ring).reshape(-1, 3))
+
+
+@lru_cache(maxsize=8)
+def tube_faces(count: int, points: int) -> Ints:
+    """Triangles (m, 3) of `count` tubes of `points` rings."""
+    j, s = np.meshgrid(np.arange(points - 1), np.arange(3), indexing="ij")
+    a, b = 3 * j + s, 3 * j + (s + 1) % 3
+    one = np.concatenate([np.stack([a, b, b + 3], -1).reshape(-1, 3), np.stack([a, b + 3, a + 3], -1).reshape(-1, 3)])
+    return frozen((one[None] + 3 * points * np.arange(count)[:, None, None]).reshape(-1, 3), np.int64)
+
+
+def taper(length: Floats, root_mm: float, points: int) -> Floats:
+    """Radii (n, k): full at the root, thinning to a fifth at the tip."""
+    s = np.linspace(0, 1, points)
+    return np.asarray(np.broadcast_to(root_mm / 2 * (1 - 0.85 * s**1.5), (len(length), points)))

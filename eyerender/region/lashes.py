@@ -1,0 +1,126 @@
+"""Lashes: curves that grow from the outer edge of the lids' margins, and move with them.
+
+A lash starts in the lash line and turns in the plane of the lid's normal n and the direction m away from the fissure:
+
+    d(s) = cos(f) (cos(b) n + sin(b) m) + sin(f) t,   b(s) = b0 + curl s,
+
+b0 < 0 points towards the fissure, the fan f follows the lid from one canthus to the other. Tips of neighbours lean
+together by `clumping`. A lash that would dip into the skin is lifted out of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..arrays import ArrayValue, Floats, frozen
+from .anatomy import LashSpec, RegionSpec
+from .contour import Contour, step
+from .globe import Globe
+from .hairs import SEGMENTS, Hairs, taper
+from .lids import Sheet, sheet_depth
+
+_ABOVE_MM = 0.12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LashPlan(ArrayValue):
+    """What of the lashes does not move: column angle, place across the margin (0 to 1), length, fan, start and curl."""
+
+    angle: Floats
+    across: Floats
+    length_mm: Floats
+    fan: Floats
+    start: Floats
+    curl: Floats
+
+
+@lru_cache(maxsize=16)
+def plan(spec: LashSpec, seed: int) -> LashPlan:
+    """The lashes of a subject; upper ones first."""
+    parts = [_lid(spec, seed, True), _lid(spec, seed, False)]
+    return LashPlan(*(frozen(np.concatenate([p[i] for p in parts])) for i in range(6)))
+
+
+def _lid(spec: LashSpec, seed: int, upper: bool) -> tuple[Floats, ...]:
+    rng = np.random.default_rng((0x1A5, seed, int(upper)))
+    count = spec.upper_count if upper else spec.lower_count
+    low, high = (-0.955, 0.70) if upper else (-0.93, 0.62)
+    place = (np.arange(count) + 0.5 + rng.uniform(-0.45, 0.45, count)) / max(count, 1)
+    # Denser towards the temple.
+    a = low + (high - low) * place**1.08
+    across = rng.choice([0.72, 0.86, 0.97], count, p=[0.25, 0.4, 0.35]) + rng.normal(0, 0.03, count)
+    # Longest a little temporal of the middle, short at both ends.
+    end = (a - low) / (high - low)
+    profile = 0.45 + 0.55 * np.sin(np.pi * np.clip(end, 0, 1) ** 0.9) ** 0.6
+    most = spec.upper_length_mm if upper else spec.lower_length_mm
+    length = most * profile * rng.triangular(0.45, 0.92, 1.0, count)
+    spread = np.radians(spec.spread_deg)
+    fan = np.radians(38.0) * np.sin(1.35 * a) + spread * rng.normal(0, 1, count)
+    droop = np.radians(spec.upper_droop_deg) if upper else np.radians(14.0)
+    start = -droop + 0.6 * spread * rng.normal(0, 1, count)
+    curl = np.radians(spec.upper_curl_deg if upper else spec.lower_curl_deg) * rng.uniform(0.8, 1.15, count)
+    # Clumps: groups of two to five share fan and curl towards their tips.
+    group = np.cumsum(rng.uniform(size=count) < 0.32)
+    for values in (fan, start, curl):
+        for g in np.unique(group):
+            members = group == g
+            mean = values[members].mean()
+            values[members] += 0.5 * spec.clumping * (mean - values[members])
+    fan = fan + _lean(a, group, spec.clumping, float(np.mean(length)) if count else 1.0)
+    angle = np.arccos(np.clip(a, -1, 1)) if upper else 2 * np.pi - np.arccos(np.clip(a, -1, 1))
+    return angle, across, length, fan, start, curl
+
+
+def _lean(a: Floats, group: Floats, clumping: float, length: float) -> Floats:
+    """Turn of each lash towards the middle of its clump, so that tips meet."""
+    out = np.zeros_like(a)
+    for g in np.unique(group):
+        members = group == g
+        offset_mm = (a[members].mean() - a[members]) * 14.5
+        out[members] = clumping * np.arctan(offset_mm / max(length, 1.0))
+    return out
+
+
+def lashes(spec: RegionSpec, globe: Globe, sheet: Sheet) -> Hairs:
+    """The lashes of a posed sheet."""
+    p = plan(spec.lashes, spec.seed)
+    c = sheet.contour
+    inner, outer, n, m, t = (
+        _at(p.angle, v) for v in (c.point, sheet.lash_line, c.normal, c.away, c.along_lid)
+    )
+    root = inner + p.across[:, None] * (outer - inner)
+    # With the lids shut there is less room between them.
+    fold_back = step(1 - c.openness, 0.5, 1.0)
+    start = p.start * (1 - 0.6 * fold_back)
+    k = SEGMENTS + 1
+    points = np.empty((len(root), k, 3))
+    points[:, 0] = root - 0.15 * n
+    for j in range(1, k):
+        s = (j - 0.5) / SEGMENTS
+        b = start + p.curl * s**0.9
+        f = p.fan * (0.55 + 0.6 * s)
+        d = np.cos(f)[:, None] * (np.cos(b)[:, None] * n + np.sin(b)[:, None] * m) + np.sin(f)[:, None] * t
+        points[:, j] = points[:, j - 1] + (p.length_mm / SEGMENTS)[:, None] * d
+    points[:, 1:] = _out_of_skin(spec, globe, c, sheet, points[:, 1:])
+    return Hairs(frozen(points), frozen(taper(p.length_mm, spec.lashes.diameter_mm, k)))
+
+
+def _at(angle: Floats, values: Floats) -> Floats:
+    """Values (columns, 3) at column angles, linear in between."""
+    n = len(values)
+    place = angle / (2 * np.pi) * n
+    i = np.floor(place).astype(int)
+    w = (place - i)[:, None]
+    return np.asarray((1 - w) * values[i % n] + w * values[(i + 1) % n])
+
+
+def _out_of_skin(spec: RegionSpec, globe: Globe, c: Contour, sheet: Sheet, points: Floats) -> Floats:
+    flat = points.reshape(-1, 3).copy()
+    least = sheet_depth(spec, globe, sheet, flat[:, 1], flat[:, 2]) + _ABOVE_MM
+    flat[:, 0] = np.maximum(flat[:, 0], least)
+    # And off the globe, for lashes that turn in.
+    flat = globe.pushed_out(flat, 0.3)
+    return flat.reshape(points.shape)

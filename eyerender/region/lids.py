@@ -1,0 +1,242 @@
+"""Lids and skin as one sheet: from the conjunctiva under the lids over their margins out to the face.
+
+A grid of `ROWS` rows by columns once around the fissure (see `contour`); its topology never changes. Rows, inside out:
+
+    conjunctiva   from the globe (just below its surface, so that no gap shows) to the margin's inner edge; off the globe,
+                  beside the nose, it carries the plica and the caruncle
+    margin        the lid's edge, `margin_mm` thick, its two edges rounded
+    lid           from the lash line to the crease
+    face          from the crease to far outside
+
+The skin's depth is the greater of the lids' shell about the globe and the face, joined smoothly; the crease's fold is
+added. The sheet is kept `film_mm` clear of the globe wherever it lies on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..arrays import ArrayValue, Floats, Ints, frozen
+from .anatomy import RegionSpec
+from .contour import COLUMNS, Contour, contour, step, unit
+from .face import face_depth
+from .globe import Globe
+
+CONJUNCTIVA, MARGIN, LID, FACE = 7, 7, 16, 26
+ROWS = CONJUNCTIVA + MARGIN + LID + FACE
+_DIP_MM = 0.035
+_FAR_MM = (66.0, 58.0)
+_JOINT_MM = 2.4
+_SOFT_MM = 9.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sheet(ArrayValue):
+    """The posed sheet: `vertices`, `normals` (ROWS, columns, 3); the lash line's frame is in `contour`.
+
+    `lash_line` (columns, 3) is the outer edge of the margin.
+    """
+
+    vertices: Floats
+    normals: Floats
+    contour: Contour
+    lash_line: Floats
+
+
+def sheet(spec: RegionSpec, globe: Globe) -> Sheet:
+    """The sheet for a posed globe, in the region's frame."""
+    c = contour(spec, globe)
+    margin, lash_line = _margin(spec, globe, c)
+    conjunctiva = _conjunctiva(spec, globe, c)
+    skin = _skin(spec, globe, c, margin[-1], lash_line)
+    vertices = np.concatenate([conjunctiva, margin, skin])
+    return Sheet(frozen(vertices), frozen(grid_normals(vertices)), c, frozen(lash_line))
+
+
+@lru_cache(maxsize=4)
+def faces(rows: int = ROWS, columns: int = COLUMNS) -> Ints:
+    """Triangles (m, 3) of a grid that is closed along its columns, facing outwards for a right eye."""
+    i, j = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
+    k = (j + 1) % columns
+    a, b, c, d = i * columns + j, i * columns + k, (i + 1) * columns + j, (i + 1) * columns + k
+    return frozen(np.concatenate([np.stack([a, c, d], -1).reshape(-1, 3), np.stack([a, d, b], -1).reshape(-1, 3)]),
+                  np.int64)  # fmt: skip
+
+
+def grid_normals(vertices: Floats) -> Floats:
+    """Unit normals of a grid (rows, columns, 3) that is closed along its columns."""
+    across = np.roll(vertices, -1, axis=1) - np.roll(vertices, 1, axis=1)
+    out = np.empty_like(vertices)
+    out[1:-1] = vertices[2:] - vertices[:-2]
+    out[0], out[-1] = vertices[1] - vertices[0], vertices[-1] - vertices[-2]
+    normal = np.cross(out, across)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    # Where rows meet in a point the neighbour's normal serves.
+    normal = np.where(length > 1e-9, normal, np.array([1.0, 0.0, 0.0]))
+    return unit(normal)
+
+
+def margin_width(spec: RegionSpec, c: Contour) -> Floats:
+    """Thickness of the margin (columns,): it thins towards the canthi."""
+    return np.asarray(spec.lids.margin_mm * (0.45 + 0.55 * step(np.abs(np.sin(c.angle)), 0.0, 0.55)))
+
+
+def _margin(spec: RegionSpec, globe: Globe, c: Contour) -> tuple[Floats, Floats]:
+    tilt = np.radians(spec.lids.margin_tilt_deg) * (0.25 + 0.75 * min(c.openness, 1.0))
+    width = margin_width(spec, c)
+    out = np.cos(tilt) * c.normal + np.sin(tilt) * c.away
+    u = np.linspace(0, 1, MARGIN)[:, None, None]
+    u = 0.5 - 0.5 * np.cos(np.pi * u) * (0.6 + 0.4 * np.cos(np.pi * u) ** 2)
+    rounding = 0.22 * (2 * u - 1) ** 4 * (width / spec.lids.margin_mm)[:, None]
+    rows = c.point + width[:, None] * u * out + rounding * c.away
+    rows = globe.pushed_out(rows, spec.lids.film_mm)
+    # The two lids meet in the middle between them, never beyond.
+    return rows, rows[-1]
+
+
+def _conjunctiva(spec: RegionSpec, globe: Globe, c: Contour) -> Floats:
+    """From under the globe's surface to the inner edge (exclusive)."""
+    away = c.point - globe.centre
+    distance = np.linalg.norm(away, axis=-1)
+    on_globe = step(distance - globe.radial(unit(away)), 0.6, 0.05)
+    end = c.point + 1.2 * on_globe[:, None] * c.away
+    end = globe.centre + unit(end - globe.centre) * (globe.radial(unit(end - globe.centre)) - _DIP_MM)[:, None]
+    # Beside the nose it reaches further on to the globe: the plica.
+    nasal = step(c.along, 0.80, 0.97)
+    inward = np.stack([np.full_like(nasal, 0.9), -1.6 * np.ones_like(nasal), np.zeros_like(nasal)], axis=-1)
+    reach = end + nasal[:, None] * inward
+    reach = globe.centre + unit(reach - globe.centre) * (globe.radial(unit(reach - globe.centre)) - _DIP_MM)[:, None]
+    u = (np.arange(CONJUNCTIVA) / CONJUNCTIVA)[:, None, None]
+    rows = reach + u * (c.point - reach)
+    # Plica: a low crescent on the globe; caruncle: a mound off it.
+    s = u[..., 0]
+    size = nasal[None, :] * (1 - spec.blink)
+    plica = 0.45 * np.exp(-(((s - 0.22) / 0.14) ** 2)) * size
+    caruncle = 1.5 * np.exp(-(((s - 0.55) / 0.2) ** 2)) * step(c.along, 0.9, 0.995)[None, :] * (1 - 0.6 * spec.blink)
+    rows = rows + (plica + caruncle)[..., None] * c.normal
+    clear = globe.pushed_out(rows, np.where(u[..., 0] > 0, spec.lids.film_mm * on_globe + 0.05 * (1 - on_globe), -_DIP_MM))
+    return np.asarray(clear)
+
+
+def _skin(spec: RegionSpec, globe: Globe, c: Contour, edge: Floats, lash_line: Floats) -> Floats:
+    """Rows from the lash line (exclusive) outwards."""
+    y0, z0 = lash_line[:, 1], lash_line[:, 2]
+    border_y, border_z = _border(c)
+    dy, dz = border_y - y0, border_z - z0
+    length = np.hypot(dy, dz)
+    crease = _crease(spec, c)
+    v = _distances(crease, length)
+    q = v / length
+    y, z = y0 + dy * q, z0 + dz * q
+    x = skin_depth(spec, globe, y, z)
+    start = lash_line[:, 0] - skin_depth(spec, globe, y0, z0)
+    x = x + start * np.exp(-((v / 2.2) ** 2))
+    strength = _fold_strength(c)
+    lift, drop = _fold(spec, c, v, crease, strength)
+    x = x + lift
+    z = z - drop * c.upper
+    rows = np.stack([x, y, z], axis=-1)
+    return globe.pushed_out(rows, 0.4)
+
+
+def _border(c: Contour) -> tuple[Floats, Floats]:
+    """(y, z) of the sheet's outer end: a rounded rectangle."""
+    cos, sin = np.cos(c.angle), np.sin(c.angle)
+    power = 0.72
+    return (
+        np.asarray(2.0 + _FAR_MM[0] * np.sign(cos) * np.abs(cos) ** power),
+        np.asarray(_FAR_MM[1] * np.sign(sin) * np.abs(sin) ** power),
+    )
+
+
+def _crease(spec: RegionSpec, c: Contour) -> Floats:
+    """Distance (columns,) of the crease from the lash line, mm; below the lower lid that of its own faint crease."""
+    lids = spec.lids
+    openness = min(c.openness, 1.2)
+    middle = lids.crease_mm + (min(lids.show_mm, lids.crease_mm - 1.0) - lids.crease_mm) * openness
+    arch = 0.72 + 0.28 * np.abs(np.sin(c.angle)) ** 1.5
+    return np.where(c.upper > 0, middle * arch, 5.5 * arch)
+
+
+def _fold_strength(c: Contour) -> Floats:
+    upper = step(np.sin(c.angle), 0.12, 0.75)
+    lower = 0.0 * upper
+    return np.where(c.upper > 0, upper, lower)
+
+
+def _distances(crease: Floats, length: Floats) -> Floats:
+    """Distances v (LID + FACE, columns) from the lash line: dense at the lash line and about the crease."""
+    s = np.arange(1, LID + 1) / LID
+    # Fine at both ends of the lid.
+    s = 0.5 - 0.5 * np.cos(np.pi * s) * (0.55 + 0.45 * np.cos(np.pi * s) ** 2)
+    lid = s[:, None] * crease
+    k = np.arange(1, FACE + 1) / FACE
+    growth = (np.exp(4.6 * k) - 1) / (np.exp(4.6) - 1)
+    face = crease + growth[:, None] * (length - crease)
+    return np.concatenate([lid, face])
+
+
+def _fold(spec: RegionSpec, c: Contour, v: Floats, crease: Floats, strength: Floats) -> tuple[Floats, Floats]:
+    """What the fold adds to the depth, and how far it hangs over the crease (both rows x columns, mm)."""
+    lids = spec.lids
+    open_ = min(max(c.openness, 0.0), 1.15)
+    height = lids.fold_mm * (0.25 + 0.75 * open_) * strength
+    w = v - crease
+    groove = -0.3 * np.exp(-((w / 0.5) ** 2)) * (0.4 + 0.6 * open_) * (lids.fold_mm > 0)
+    swell = step(w, -0.05, 0.9) * np.exp(-np.maximum(w - 0.9, 0) / 4.5)
+    lift = height * swell + groove * strength
+    drop = 0.55 * height * step(w, 0.0, 0.7) * np.exp(-np.maximum(w - 0.7, 0) / 1.6)
+    bags = np.where(c.upper < 0, 1.0, 0.0) * lids.bags_mm * np.exp(-(((v - 8.5) / 3.5) ** 2)) * np.abs(np.sin(c.angle))
+    line = np.where(c.upper < 0, -0.22, 0.0) * np.exp(-(((v - crease) / 0.7) ** 2)) * np.abs(np.sin(c.angle))
+    return lift + bags + line, drop
+
+
+def skin_depth(spec: RegionSpec, globe: Globe, y: Floats, z: Floats) -> Floats:
+    """x (mm) of the skin over (y, z) without margins and folds: the lids' shell and the face, joined smoothly."""
+    centre = 0.5 * (globe.centre + globe.rest)
+    dy, dz = y - centre[1], z - centre[2]
+    outer = globe.radius_mm + spec.lids.thickness_mm
+    # Past 46 degrees from the front the shell leaves the sphere along its tangent and flattens: the orbit's fat.
+    rho, limit = np.hypot(dy, dz), np.radians(46.0)
+    rho0 = outer * np.sin(limit)
+    past = np.maximum(rho - rho0, 0.0)
+    over = np.sqrt(outer * outer - np.minimum(rho, rho0) ** 2)
+    shell = centre[0] + over - np.tan(limit) * _SOFT_MM * (1 - np.exp(-past / _SOFT_MM)) - 0.2 * past
+    shell = shell + _bulge(globe, y, z, outer)
+    face = face_depth(spec.face, y, z)
+    return np.asarray(np.maximum(shell, face) + _JOINT_MM * np.log1p(np.exp(-np.abs(shell - face) / _JOINT_MM)))
+
+
+def sheet_depth(spec: RegionSpec, globe: Globe, sheet: Sheet, y: Floats, z: Floats) -> Floats:
+    """x (mm) that hairs over (y, z) must stay in front of: skin with its fold; -inf over the fissure."""
+    c, line = sheet.contour, sheet.lash_line
+    half = len(line) // 2
+    up, low = line[: half + 1][::-1], np.concatenate([line[half:], line[:1]])
+    z_up, z_low = np.interp(y, up[:, 1], up[:, 2]), np.interp(y, low[:, 1], low[:, 2])
+    crease_up = np.interp(y, up[:, 1], _crease(spec, c)[: half + 1][::-1])
+    v = np.where(z > z_up, z - z_up, z_low - z)
+    base = skin_depth(spec, globe, y, z)
+    start = np.where(z > z_up, np.interp(y, up[:, 1], up[:, 0]), np.interp(y, low[:, 1], low[:, 0]))
+    start_z = np.where(z > z_up, z_up, z_low)
+    rest = start - skin_depth(spec, globe, y, start_z)
+    open_ = min(max(c.openness, 0.0), 1.15)
+    height = spec.lids.fold_mm * (0.25 + 0.75 * open_)
+    # The fold hangs over: its lower edge counts from where it may reach down to.
+    w = v - crease_up
+    swell = step(w + 0.55 * height, -0.3, 0.6) * np.exp(-np.maximum(w - 0.9, 0) / 4.5)
+    lift = np.where(z > z_up, height * swell, spec.lids.bags_mm * np.exp(-(((v - 8.5) / 3.5) ** 2)))
+    depth = base + rest * np.exp(-((np.maximum(v, 0) / 2.2) ** 2)) + lift
+    beyond = (y < up[0, 1]) | (y > up[-1, 1])
+    depth = np.where(beyond, base + 0.3, depth)
+    return np.asarray(np.where((v > 0) | beyond, depth, -np.inf))
+
+
+def _bulge(globe: Globe, y: Floats, z: Floats, outer: float) -> Floats:
+    """The cornea under a lid lifts it: a soft hill about the optic axis."""
+    axis, centre = globe.axis, globe.centre
+    apex = centre + outer * axis
+    d2 = (y - apex[1]) ** 2 + (z - apex[2]) ** 2
+    return np.asarray(0.75 * np.exp(-d2 / (2 * 3.6**2)))

@@ -1,0 +1,124 @@
+"""Purkinje images 2 to 4: lamps mirrored by the back of the cornea, the lens' front and its back, with their energy.
+
+The path from the camera's nodal point through the surfaces, back at the mirror and out to the lamp is found by the
+solver of `optics`; here it gets its energy. With T the product of 1 - F at every refraction and F at the mirror, and J
+the ray tube's cross section at the lamp per solid angle at the camera (equal to the reverse, both being in air):
+
+    e = I(d) T f_x f_y D / (J cos^3(theta))        as for the first image (`glints`)
+
+Images 3 and 4 pass the pupil twice, and are there only where both passages lie inside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..arrays import Bools, Floats
+from ..errors import InputError
+from ..eye.model import Eye
+from ..geometry.surfaces import Surface
+from ..optics.interface import fresnel
+from ..optics.purkinje import purkinje_path, purkinje_points
+from ..optics.trace import Crossing, Traced, trace
+from ..rig.light import Light
+from .glints import GlintScene, Image, Nodes, disc_points, distortion_determinant
+
+_ANGLE = 2e-6  # of the finite differences: their error is of its square, the rounding's of 1e-16 over it
+
+
+def purkinje_images(
+    scene: GlintScene, eye: Eye, order: int, lights: Sequence[Light], nodes: Sequence[Nodes]
+) -> list[Image]:
+    """Images of the lamps by the given points of their discs."""
+    camera, M, t = scene.camera, scene.M, scene.t
+    images = []
+    surfaces, indices, rims, passing = stack(eye, order)
+    path = purkinje_path(surfaces, indices, rims, passing)
+    eyepoint = M.T @ (camera.nodal_point_mm - t)
+    for lamp, node in zip(lights, nodes, strict=True):
+        points = disc_points(lamp, node)
+        sources = (points - t) @ M
+        found = purkinje_points(surfaces, indices, rims, passing, sources, eyepoint)
+        ok = np.asarray(found.status) == 0
+        out = np.where(ok[:, None], -np.asarray(found.directions), np.array([-1.0, 0.0, 0.0]))
+        traced = trace(path, 1.0, np.broadcast_to(eyepoint, out.shape), out)
+        ok &= np.asarray(traced.status) == 0
+        if order > 2:
+            ok &= _through_pupil(eye, traced.points_mm, len(eye.front))
+        tube, towards = tube_mm2_sr(path, eyepoint, out, sources)
+        passed = transmittance(path, traced, indices[-1])
+        leaving = np.maximum(np.einsum("ij,ij->i", -towards, np.broadcast_to(M.T @ lamp.axis, towards.shape)), 0)
+        lobe = leaving ** float(lamp.lobe_exponent) if lamp.lobe_exponent else np.ones_like(leaving)
+        cam = out @ M.T @ camera.R.T
+        ok &= cam[:, 2] > 0
+        z = np.where(ok, cam[:, 2], 1.0)
+        x, y = cam[:, 0] / z, cam[:, 1] / z
+        scale = camera.K[0, 0] * camera.K[1, 1] * distortion_determinant(camera, x, y) / z**3
+        energy = node.weight * float(lamp.intensity_mw_sr) * lobe * passed * scale / np.where(ok, tube, 1.0)
+        entry, leave = traced.points_mm[-1] @ M.T + t, traced.points_mm[1] @ M.T + t
+        images.append(Image(points, entry, leave, camera.pixels_of(x, y), np.where(ok, energy, 0.0)))
+    return images
+
+
+def tube_mm2_sr(path: Sequence[Crossing], start: Floats, d: Floats, end: Floats) -> tuple[Floats, Floats]:
+    """Cross section of the ray tube at `end` (n, 3) per solid angle at `start`, and the rays' directions there."""
+    helper = np.where(np.abs(d[:, :1]) < 0.6, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
+    e1 = np.cross(d, helper)
+    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+    e2 = np.cross(d, e1)
+    ways = np.stack([d, *(d + sign * _ANGLE * e for e in (e1, e2) for sign in (1, -1))])
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+    traced = trace(path, 1.0, np.broadcast_to(start, ways.shape), ways)
+    p, w = traced.points_mm[-1], traced.directions[-1]
+    axis = w[0]
+    # Where each ray passes the plane through the end, across the middle ray.
+    s = np.einsum("kij,ij->ki", end - p, axis) / np.einsum("kij,ij->ki", w, axis)
+    q = p + s[..., None] * w
+    a, b = (q[1] - q[2]) / (2 * _ANGLE), (q[3] - q[4]) / (2 * _ANGLE)
+    return np.abs(np.einsum("ij,ij->i", axis, np.cross(a, b))), axis
+
+
+def transmittance(path: Sequence[Crossing], traced: Traced, behind: float) -> Floats:
+    """F at the mirror, `behind` which the index is given, times 1 - F at every other crossing that the rays meet."""
+    share = np.ones(traced.points_mm.shape[1])
+    index = np.ones_like(share)
+    for k, crossing in enumerate(path):
+        y, before = traced.points_mm[k + 1], traced.directions[k]
+        cosine = np.abs(np.einsum("ij,ij->i", crossing.surface.normal(y), before))
+        if crossing.reflects:
+            share *= np.asarray(fresnel(cosine, index, behind).unpolarized)
+            continue
+        # A ray passes by the shells of a gradient lens that do not reach as far as it.
+        met = np.any(traced.directions[k + 1] != before, axis=1)
+        after = float(np.asarray(crossing.n_after))
+        share *= np.where(met, 1 - np.asarray(fresnel(cosine, index, after).unpolarized), 1.0)
+        index = np.where(met, after, index)
+    return share
+
+
+def _through_pupil(eye: Eye, points: Floats, corneal: int) -> Bools:
+    """Whether rays cross the plane of the stop inside the pupil, on the way in and out."""
+    n, c = eye.stop.normal, eye.stop.centre_mm
+    inside = np.ones(points.shape[1], dtype=bool)
+    for a, b in ((points[corneal], points[corneal + 1]), (points[-corneal - 1], points[-corneal - 2])):
+        step = (c - a) @ n / ((b - a) @ n)
+        inside &= eye.stop.contains(a + step[:, None] * (b - a))
+    return inside
+
+
+def stack(eye: Eye, order: int) -> tuple[tuple[Surface, ...], tuple[float, ...], tuple[float, ...], tuple[bool, ...]]:
+    """Surfaces down to the mirror, the indices behind them, their rims, and which a ray may pass by.
+
+    Raises:
+        InputError: the eye has no such image.
+    """
+    if order not in eye.purkinje_orders or order == 1:
+        raise InputError(f"{eye.name} has no Purkinje image {order}", path="purkinje")
+    corneal = len(eye.front)
+    depth = {2: 2, 3: corneal + 1, 4: corneal + len(eye.back)}[order]
+    rims = (float(eye.limbus_radius_mm), *(np.inf for _ in eye.front[1:]), *(float(r) for r in eye.back_rims_mm))
+    indices = tuple(float(n) for n in (*eye.front_indices, *eye.back_indices))
+    passing = ((False,) * corneal + eye.back_passing)[:depth]
+    return (eye.front + eye.back)[:depth], indices[:depth], rims[:depth], passing

@@ -1,0 +1,251 @@
+"""Beyond the paper: how the errors depend on where one looks, where the head is, the pupil's size and the eye itself.
+
+Two trackers, both calibrated at the central head position with a 4 mm pupil, on analytic features of both studies'
+corrected scenes: the model-based one of [28] (nine targets, index fixed) and the interpolation-based one of [29]
+(R8 on C14). Everything is seen from the right eye (model-based) or the mid-point of both (interpolation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ..analytic.observer import observe
+from ..arrays import Floats, frozen
+from ..errors import InputError
+from ..eye.spec import EyeSpec
+from ..gaze.estimate import angular_error_deg, binocular_average
+from ..gaze.guestrin import GuestrinEizenman
+from ..gaze.quality import quality
+from ..gaze.regression import PupilGlintRegression
+from ..observation import Observations
+from ..scene import Scene, SceneSpec
+from . import blignaut, guestrin
+from .literature import CALIBRATION_SETS
+from .results import Row, mean_row
+
+TRACKERS = ("model-based", "interpolation")
+FUNCTION, CALIBRATION = "R8", "C14"
+DIAMETERS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
+HEAD_MM = (-40.0, -20.0, 0.0, 20.0, 40.0)
+GRID = (13, 11)
+NOISE_PX, SAMPLES, SEED = 0.05, 100, 2014
+
+
+def _with_lens(axis: int) -> str:
+    """The paths of the stop's place and, where there is a lens, of the lens': it may not come through the stop."""
+    stop, where = f"stop.position_mm.{axis}", f"position_mm.{axis}"
+    surfaces = f"{stop}&lens.surfaces.0.{where}&lens.surfaces.1.{where}"
+    return f"{surfaces}|{stop}&lens.front.{where}&lens.back.{where}|{stop}"
+
+
+# Label, path in the eye file, step, unit. Each is changed by plus and minus one step.
+PARAMETERS: tuple[tuple[str, str, float, str], ...] = (
+    ("corneal radius", "cornea.0.shape.radius_mm|cornea.0.shape.radii_mm", 0.1, "mm"),
+    ("corneal asphericity Q", "cornea.0.shape.conic_constant|cornea.0.shape.conic_constants", 0.05, ""),
+    ("index behind the cornea", "cornea.0.medium.index|cornea.0.medium.cauchy.0", 0.005, ""),
+    ("cornea moved nasally", "cornea.0.position_mm.1", 0.1, "mm"),
+    ("cornea moved up", "cornea.0.position_mm.2", 0.1, "mm"),
+    ("cornea tilted about y", "cornea.0.tilt_deg.1", 1.0, "deg"),
+    ("cornea tilted about z", "cornea.0.tilt_deg.2", 1.0, "deg"),
+    ("posterior corneal radius", "cornea.1.shape.radius_mm", 0.1, "mm"),
+    ("corneal thickness", "cornea.1.position_mm.0", -0.05, "mm"),
+    ("pupil and lens moved back", _with_lens(0), -0.1, "mm"),
+    ("pupil and lens moved nasally", _with_lens(1), 0.1, "mm"),
+    ("pupil and lens moved up", _with_lens(2), 0.1, "mm"),
+    ("centres of rotation moved back", "rotation.azimuth_centre_mm.0&rotation.elevation_centre_mm.0", -0.5, "mm"),
+    ("fovea, horizontal angle", "fovea.field_deg.0", 0.5, "deg"),
+    ("fovea, vertical angle", "fovea.field_deg.1", 0.5, "deg"),
+)
+
+
+@dataclass(slots=True)
+class ConditionsPart:
+    """What one eye model gave; errors in degrees. Maps (rows, columns) by tracker; NaN where there is no estimate."""
+
+    eye_model: str
+    screen_maps: dict[str, Floats] = field(default_factory=dict)
+    head_maps: dict[str, Floats] = field(default_factory=dict)
+    diameters: dict[str, list[float]] = field(default_factory=dict)
+    sensitivity: list[dict[str, Any]] = field(default_factory=list)
+    precision: dict[str, dict[str, float]] = field(default_factory=dict)
+    rows: list[Row] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class _Tracker:
+    """A calibrated tracker: errors of observations, one a target in the scene's order for each head position."""
+
+    name: str
+    estimator: GuestrinEizenman | PupilGlintRegression
+    scene: Scene
+
+    def points(self, seen: Observations) -> tuple[Observations, Floats]:
+        """Gaze points, by frame."""
+        gaze = self.estimator.predict(seen, self.scene.rig)
+        if self.name == "interpolation":
+            seen, gaze = binocular_average(seen, gaze)
+        return seen, np.asarray(gaze.point_mm)
+
+    def from_mm(self, seen: Observations) -> Floats:
+        """Where the angles are seen from, (n, 3)."""
+        place = np.asarray(seen.index.head_mm)
+        return place if self.name == "interpolation" else place + seen.index.eye_position_mm
+
+    def errors_deg(self, seen: Observations) -> Floats:
+        """Errors (n,) by frame."""
+        frames, points = self.points(seen)
+        return angular_error_deg(points, frames.index.target_mm, self.from_mm(frames))
+
+
+def conditions_part(eye: str) -> ConditionsPart:
+    """All conditions for one eye model."""
+    out = ConditionsPart(eye)
+    for name in TRACKERS:
+        tracker, seen = _calibrated(_scene(name, eye))
+        errors = tracker.errors_deg(seen)
+        keys = {"protocol": "corrected", "observer": "analytic", "eye_model": eye}
+        both = {"eye": "both", "function": FUNCTION, "calibration": CALIBRATION}
+        keys |= {"eye": "right"} if name == "model-based" else both
+        columns, rows = GRID if name == "model-based" else (15, 9)
+        wide = _changed(tracker.scene, {"targets": {"grid": [columns, rows]}})
+        over = tracker.errors_deg(observe(wide))
+        out.screen_maps[name] = over.reshape(columns, rows).T
+        out.rows.append(mean_row(errors, variant=f"{name}, as calibrated", **keys))
+        out.rows.append(mean_row(over, variant=f"{name}, {columns} x {rows} targets", **keys))
+        out.head_maps[name], head_rows = _over_heads(tracker, keys)
+        out.rows += head_rows
+        out.diameters[name] = []
+        for diameter in DIAMETERS_MM:
+            row = mean_row(
+                tracker.errors_deg(observe(_changed(tracker.scene, {"eye": {"pupil_diameter_mm": diameter}}))),
+                variant=f"{name}, pupil {diameter:g} mm",
+                **keys,
+            )
+            out.rows.append(row)
+            out.diameters[name].append(np.nan if row.mean_deg is None else row.mean_deg)
+        out.precision[name] = _precision(tracker, seen)
+    base = {name: _mean(_scene(name, eye)) for name in TRACKERS}
+    for label, paths, step, unit in PARAMETERS:
+        own = _scene(TRACKERS[0], eye).eye_spec
+        more, less = _eye_with(own, paths, step), _eye_with(own, paths, -step)
+        if more is None or less is None:
+            continue
+        entry: dict[str, Any] = {"parameter": label, "step": abs(step), "unit": unit}
+        for name in TRACKERS:
+            values: dict[str, Any] = {"base": base[name], "at_plus": None, "at_minus": None}
+            entry[name] = {**values, "per_step": None, "reason": None}
+            try:
+                up, down = (_mean(replace(_scene(name, eye), eye_spec=spec)) for spec in (more, less))
+            except InputError as error:
+                # A changed eye may be one that no ray leaves, which is a result of this parameter and not of the others.
+                entry[name]["reason"] = str(error)
+                continue
+            entry[name] |= {"at_plus": up, "at_minus": down, "per_step": 0.5 * (up - down)}
+        out.sensitivity.append(entry)
+    return out
+
+
+def _scene(tracker: str, eye: str) -> Scene:
+    """The scene a tracker is calibrated in: one head position."""
+    if tracker == "interpolation":
+        return blignaut.scene(eye, blignaut.CORRECTED)
+    scene = guestrin.scene(eye, guestrin.CORRECTED)
+    return _changed(scene, {"subject": {"eyes": ["right"], "head_positions_mm": [[0.0, 0.0, 0.0]]}})
+
+
+def _changed(scene: Scene, changes: dict[str, dict[str, Any]]) -> Scene:
+    """The scene with keys of its groups replaced; the eye's spec stays as it is."""
+    data = scene.spec.to_mapping()
+    for group, values in changes.items():
+        data[group] = values if group == "targets" else {**data[group], **values}
+    spec = SceneSpec.from_mapping(data)
+    return replace(scene, spec=spec, rig=spec.rig.build())
+
+
+def _calibrated(scene: Scene) -> tuple[_Tracker, Observations]:
+    """The scene's tracker, calibrated in it, and what it was calibrated and tested on."""
+    seen = observe(scene)
+    if len(scene.rig.lights) > 1:
+        fitted = guestrin.estimator(guestrin.CORRECTED).fit(seen, seen.index.target_mm, scene.rig)
+        return _Tracker("model-based", fitted, scene), seen
+    some = seen.take(np.isin(seen.index.fixation, np.array(CALIBRATION_SETS[CALIBRATION]) - 1))
+    regression = PupilGlintRegression(FUNCTION).fit(some, some.index.target_mm, scene.rig)
+    return _Tracker("interpolation", regression, scene), seen
+
+
+def _mean(scene: Scene) -> float:
+    """Mean error of the scene's tracker, calibrated on this very eye."""
+    tracker, seen = _calibrated(scene)
+    return float(np.nanmean(tracker.errors_deg(seen)))
+
+
+def _over_heads(tracker: _Tracker, keys: dict[str, Any]) -> tuple[Floats, list[Row]]:
+    """Mean errors (depth, sideways) of nine targets over head positions."""
+    places = [[x, y, 0.0] for x in HEAD_MM for y in HEAD_MM]
+    scene = _changed(tracker.scene, {"targets": {"grid": [3, 3]}, "subject": {"head_positions_mm": places}})
+    errors = tracker.errors_deg(observe(scene)).reshape(len(places), -1)
+    rows = [
+        mean_row(e, variant=f"{tracker.name}, head at ({p[0]:g}, {p[1]:g}, 0) mm", **keys)
+        for p, e in zip(places, errors, strict=True)
+    ]
+    with np.errstate(invalid="ignore"):
+        return errors.mean(axis=1).reshape(len(HEAD_MM), len(HEAD_MM)), rows
+
+
+def _precision(tracker: _Tracker, seen: Observations) -> dict[str, float]:
+    """Accuracy and precision with Gaussian noise on the features; means over the fixations."""
+    rng = np.random.default_rng(SEED)
+    samples = []
+    for _ in range(SAMPLES):
+        frames, points = tracker.points(_noisy(seen, rng))
+        samples.append(points)
+    found = quality(np.stack(samples), frames.index.target_mm, tracker.from_mm(frames))
+    return {
+        "accuracy_deg": float(np.nanmean(found.accuracy_deg)),
+        "rms_s2s_deg": float(np.nanmean(found.rms_s2s_deg)),
+        "sd_deg": float(np.nanmean(found.sd_deg)),
+    }
+
+
+def _noisy(seen: Observations, rng: np.random.Generator) -> Observations:
+    """Features with independent Gaussian noise of `NOISE_PX` in x and y."""
+    pupil = seen.pupil.centre_px + rng.normal(0.0, NOISE_PX, seen.pupil.centre_px.shape)
+    glints = seen.glints.xy_px + rng.normal(0.0, NOISE_PX, seen.glints.xy_px.shape)
+    return replace(
+        seen, pupil=replace(seen.pupil, centre_px=frozen(pupil)), glints=replace(seen.glints, xy_px=frozen(glints))
+    )
+
+
+def _eye_with(spec: EyeSpec, paths: str, change: float) -> EyeSpec | None:
+    """The eye with a parameter changed; None where it has no such parameter.
+
+    `paths` names alternatives (|), each of one or more (&) dotted paths; a list is changed in all its numbers.
+    """
+    for alternative in paths.split("|"):
+        data: Any = spec.to_mapping()
+        if all(_add(data, path.split("."), change) for path in alternative.split("&")):
+            try:
+                return EyeSpec.from_mapping(data)
+            except InputError:
+                return None
+    return None
+
+
+def _add(node: Any, path: Sequence[str], change: float) -> bool:
+    """Add to the number at a path in place; False where there is none."""
+    for k, key in enumerate(path):
+        index: Any = int(key) if isinstance(node, list) else key
+        if isinstance(node, list) and not 0 <= index < len(node):
+            return False
+        if isinstance(node, dict) and node.get(index) is None:
+            return False
+        if k < len(path) - 1:
+            node = node[index]
+            continue
+        value = node[index]
+        node[index] = [v + change for v in value] if isinstance(value, list) else value + change
+    return True

@@ -1,0 +1,107 @@
+"""The light on matte surfaces and on the iris against Mitsuba's own path integrator, on the exported meshes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of, remote_rig
+
+from eyerender.arrays import frozen
+from eyerender.rendering.export import export_scene
+from eyerender.rig.camera import CameraSpec
+from eyerender.rig.light import Light
+
+MATTE = PLAIN.model_copy(
+    update={
+        "limbus_width_mm": 0.0,
+        "iris_albedo": 0.0,
+        "pupil_albedo": 0.0,
+        "limbus_albedo": 0.0,
+        "sclera_albedo": 0.6,
+        "backdrop_albedo": 0.6,
+    }
+)
+
+
+def stock(job, folder, max_depth, spp, **meshes):
+    import mitsuba as mi
+
+    scene = mi.load_file(str(export_scene(job, folder, max_depth=max_depth, **meshes)))
+    return np.array(mi.render(scene, spp=spp, seed=3))[..., 0].astype(float)
+
+
+def cos4(job):
+    x0, y0, w, h = job.window
+    grid = np.stack(np.meshgrid(np.arange(w) + x0, np.arange(h) + y0), axis=-1).reshape(-1, 2)
+    return ((job.camera.rays(grid) @ job.camera.axis) ** 4).reshape(h, w)
+
+
+@pytest.mark.parametrize(("bounces", "spp", "tolerance"), [(0, 64, 2e-3), (3, 128, 8e-3)])
+def test_sclera_and_surround_against_path(renderer, tmp_path, bounces, spp, tolerance):
+    # Means over thousands of pixels; a bounce's directions are random on both sides.
+    from eyerender.rendering.renderer import Renderer
+
+    rig = remote_rig()
+    job = job_of(eye_of("E2"), rig, rig.window(96, 72), (0.0, -20.0), look=MATTE)
+    mine = Renderer(renderer.backend, bounces=bounces).radiance(job, spp=spp) / cos4(job)
+    truth = stock(job, tmp_path, 2 + bounces, 4 * spp)
+    part = renderer.labels(job).part
+    for kind in (0, 1):
+        inner = part == kind
+        for axis in (0, 1):
+            inner &= (np.roll(part, 1, axis) == kind) & (np.roll(part, -1, axis) == kind)
+        assert inner.sum() > 500
+        assert mine[inner].mean() == pytest.approx(truth[inner].mean(), rel=tolerance)
+
+
+@pytest.mark.slow
+def test_iris_under_large_lamps_against_path(renderer, tmp_path):
+    # The path tracer finds a lamp behind a cornea only by chance; two lamps of 100 mm at 300 mm make that bearable.
+    eye = eye_of("E2")
+    n = 48
+    camera = CameraSpec(
+        resolution_px=(n, n), position_mm=(600.0, 0.0, 0.0), look_at_mm=(0.0, 0.0, 0.0), focal_length_px=600 * n / 11.4
+    ).build()
+    a = np.radians(65.0)
+    places = [300 * np.array([np.cos(a), side * np.sin(a), 0.0]) for side in (1, -1)]
+    lights = tuple(Light(frozen(p), frozen(-p / 300), 100.0, 1000.0, 1.0) for p in places)
+    look = BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
+    job = job_of(eye, LampRig(camera, lights), (0, 0, n, n), look=look)
+    mine = renderer.radiance(job, spp=512) / cos4(job)
+    truth = stock(job, tmp_path, 4, 8192, rings=128, sectors=256)
+    iris = renderer.labels(job).part == 2
+    v, u = np.mgrid[:n, :n] - (n - 1) / 2
+    # The lamps' mirror images lie left and right; above and below the iris shows itself alone.
+    iris &= np.abs(u) < 0.45 * np.abs(v)
+    assert iris.sum() > 200
+    assert mine[iris].mean() == pytest.approx(truth[iris].mean(), rel=0.01)  # the oracle's standard error is .4 %
+
+
+@dataclass(frozen=True)
+class Ring:
+    """A lamp with a dark middle."""
+
+    position_mm: np.ndarray
+    axis: np.ndarray
+    radius_mm: float
+    intensity_mw_sr: float
+    lobe_exponent: float
+    inner_radius_mm: float
+
+
+def test_a_ring_is_a_disc_without_its_middle(renderer):
+    # Equal radiance: a disc of radius 8 is a ring from 5 to 8 and a disc of radius 5, in light and in glints.
+    rig = remote_rig()
+    lamp = rig.lights[0]
+    parts = {
+        "disc": (replace(lamp, radius_mm=8.0, intensity_mw_sr=64.0),),
+        "ring": (Ring(lamp.position_mm, lamp.axis, 8.0, 39.0, 1.0, 5.0),),
+        "middle": (replace(lamp, radius_mm=5.0, intensity_mw_sr=25.0),),
+    }
+    base = job_of(eye_of("E2"), rig, rig.window(64, 64), (0.0, -10.0), look=PLAIN)
+    done = {k: renderer.render(replace(base, lights=v), spp=64).irradiance.astype(float) for k, v in parts.items()}
+    both = done["ring"] + done["middle"]
+    assert np.max(np.abs(both - done["disc"])) < 1e-3 * np.max(done["disc"])
+    assert both.sum() == pytest.approx(done["disc"].sum(), rel=1e-3)
