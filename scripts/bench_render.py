@@ -87,9 +87,9 @@ class Bench:
         from render_oracles import RINGS_MM
 
         from eyerender.arrays import frozen
-        from eyerender.rendering.integrator import look
         from eyerender.rendering.renderer import _pixels
         from eyerender.rendering.sampling import camera_ray
+        from eyerender.rendering.view import look
         from eyerender.rig.camera import CameraSpec
         from eyerender.rig.light import Light
 
@@ -130,7 +130,7 @@ class Bench:
         with tempfile.TemporaryDirectory() as folder:
             scene = self._stock(job, folder, max_depth=4, rings=256, sectors=512)
             spp = 512 if self.small else 2048
-            runs = 4 if self.small else 24
+            runs = 4 if self.small else 32
             stock = np.array([np.array(mi.render(scene, seed=k, spp=spp))[..., 0] for k in range(runs)], dtype=float)
         for name, (p, q) in zip(("inner", "mid", "outer"), RINGS_MM, strict=True):
             ring = cornea & (rho >= p) & (rho < q) & ~glint.reshape(n, n)

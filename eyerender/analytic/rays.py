@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..eye.model import Eye
-from ..geometry.surfaces import Xyz, components, fit, join, shift
+from ..geometry.surfaces import Xyz, components, join
 from ..optics.purkinje import purkinje_points
 from ..optics.solve import mirrored_rays, refracted_rays
 from ..optics.trace import RayStatus
@@ -66,28 +66,12 @@ def glint_exits(eye: Eye, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[X
     )
     status = found.status
     if order > 2:
-        status = np.where((status == RayStatus.OK) & ~_passes_stop(eye, found.course_mm), RayStatus.BEHIND_IRIS, status)
+        status = np.where(
+            (status == RayStatus.OK) & ~eye.stop.lets_through(found.course_mm), RayStatus.BEHIND_IRIS, status
+        )
     return components(found.exit_points_mm), found.residual_mm, status.astype(np.int8)
-
-
-def _passes_stop(eye: Eye, course_mm: Floats) -> npt.NDArray[np.bool_]:
-    """Whether a ray passes the stop wherever it crosses its plane; course_mm (k, n, m, 3) its points in the eye."""
-    height = _height(eye, components(np.moveaxis(course_mm, 0, 2)))
-    low, high = height[..., :-1], height[..., 1:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.moveaxis(low / (low - high), -1, 0)[..., None]
-        crossing = course_mm[:-1] + share * (course_mm[1:] - course_mm[:-1])
-        inside = eye.stop.contains(np.moveaxis(crossing, 0, 2))
-    return np.asarray((inside | ~((low > 0.0) ^ (high > 0.0))).all(axis=-1))
-
-
-def _height(eye: Eye, point: Xyz) -> Floats:
-    """Height of points (n, ...) above the plane of the iris, towards the cornea (mm)."""
-    ndim = point[0].ndim
-    gap = shift(point, eye.stop.centre_mm, -1.0)
-    return np.asarray(sum(gap[i] * fit(eye.stop.normal[..., i], ndim) for i in range(3)))
 
 
 def _behind_stop(eye: Eye, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
     """Whether the camera stands behind the plane of the iris, (n,)."""
-    return ~(_height(eye, camera_mm) > 0.0)
+    return ~(eye.stop.height_mm(camera_mm) > 0.0)

@@ -222,7 +222,7 @@ def export_dataset(
     out: Annotated[Path, Parameter(name="OUT")],
     /,
     *,
-    format: Literal["webdataset", "coco", "csv", "openeds", "ellseg", "teyed", "croissant"],
+    format: Literal["webdataset", "coco", "csv", "openeds", "ellseg", "teyed"],
     overwrite: bool = False,
     json: Json = None,
 ) -> int:

@@ -48,8 +48,8 @@ def setup_llvm() -> int:
 
 
 @app.command(name="schema")
-def schema(name: Literal["scene", "eye"] = "scene", /) -> int:
-    """Print the JSON Schema of a scene file or an eye file, for editors.
+def schema(name: Literal["scene", "eye", "dataset"] = "scene", /) -> int:
+    """Print the JSON Schema of a scene, an eye or a dataset file, for editors.
 
     Parameters
     ----------
@@ -60,6 +60,10 @@ def schema(name: Literal["scene", "eye"] = "scene", /) -> int:
         from ..scene import SceneSpec
 
         text = SceneSpec.json_schema()
+    elif name == "dataset":
+        from ..dataset.spec import DatasetSpec
+
+        text = DatasetSpec.json_schema()
     else:
         from ..eye.spec import EyeSpec
 

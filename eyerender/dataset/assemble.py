@@ -11,8 +11,9 @@ from typing import Any
 from ..errors import EyerenderError
 from ..imagefolder import CONVENTIONS, DATASET, DATASET_SCHEMA, METADATA, write_json
 from .card import data_card
+from .croissant import CROISSANT, croissant
 from .plan import Plan
-from .shard import LINES, SHARDS, read_done, run_versions, shard_name
+from .shard import LINES, SHARDS, checksum, read_done, run_versions, shard_name
 
 FAILURES, CARD = "failures.jsonl", "README.md"
 _PART = ".part"
@@ -39,6 +40,7 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
         raise EyerenderError(f"{folder}: no sample of this spec can be made; {FAILURES}{_PART} says why")
     os.replace(folder / (METADATA + _PART), folder / METADATA)
     os.replace(folder / (FAILURES + _PART), folder / FAILURES)
+    write_json(folder / CROISSANT, croissant(plan, checksum(folder / METADATA)))
     card = folder / (CARD + _PART)
     card.write_text(data_card(plan, found), encoding="utf-8")
     os.replace(card, folder / CARD)

@@ -12,6 +12,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ class RayEngine:
             BackendError, EyerenderError: as the local engine.
         """
         try:
-            import ray
+            ray: Any = import_module("ray")
         except ImportError:
             raise InputError("Ray is not installed; run: pip install 'eyerender[ray]'", source="--engine") from None
         variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ}

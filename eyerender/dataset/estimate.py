@@ -29,7 +29,10 @@ def estimate(plan: Plan, options: Options) -> dict[str, Any]:
     firsts = sorted({int(s) for s in np.linspace(0, spec.subject_count - 1, _SUBJECTS)})
     starts = [-(-s * spec.count // spec.subject_count) for s in firsts]
     maker.make(starts[0])  # kernels are compiled once a worker
-    first, again, sizes, images = [], [], [], []
+    first: list[float] = []
+    again: list[float] = []
+    sizes: list[int] = []
+    images: list[int] = []
     for start in starts:
         second = start + 1 if start + 1 < spec.count and plan.subject_of(start + 1)[1] == 1 else None
         for sample, times in ((start, first), (second, again)):

@@ -42,6 +42,7 @@ def image_labels(scene: Scene, observations: Observations, image: WindowImage) -
         },
         "glints": _glints(observations, image),
         "space": _space(scene, observations, image, camera),
+        "globe_radius_mm": float(image.eye.sclera.radius_mm),
         "pose": {"rotation": image.M.tolist(), "translation_mm": image.t.tolist()},
         "camera": {
             "K": camera.K.tolist(),

@@ -15,6 +15,7 @@ import time
 import uuid
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,11 @@ DONE, SHARDS = "done.json", "shards"
 # Not called metadata.jsonl: loaders of image folders would read it besides the dataset's own.
 LINES = "lines.jsonl"
 KINDS = ("images", "masks", "amodal_masks")
+# The rooms and modules that a sample's bytes come from.
+SHAPING = {
+    "analytic", "arrays", "capture", "dataset", "eye", "geometry", "imagefile", "imagefolder", "observation", "optics",
+    "region", "rendering", "rig", "scene", "spec",
+}  # fmt: skip
 
 
 def shard_name(shard: int) -> str:
@@ -176,11 +182,24 @@ def run_versions() -> dict[str, str]:
 
     found = versions()
     found.pop("opencv-python-headless", None)  # nothing here uses it
+    found["eyerender_source"] = source_digest()
     try:
         found["pillow"] = version("pillow")
     except PackageNotFoundError:
         found["pillow"] = "unknown"
     return found
+
+
+@cache
+def source_digest() -> str:
+    """A short digest of the package's code that shapes a dataset's bytes; it tells versions of a checkout apart."""
+    package = Path(__file__).resolve().parent.parent
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        place = path.relative_to(package)
+        if place.parts[0].removesuffix(".py") in SHAPING:
+            digest.update(str(place).encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
 
 
 def cpu_family() -> str:

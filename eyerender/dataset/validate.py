@@ -48,7 +48,9 @@ def validate(path: str | Path, *, quick: bool = False, progress: Progress | None
         try:
             problems += [f"{where}: {problem}" for problem in _image(entry, quick, tally)]
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            problems.append(f"{METADATA} line {k + 1}: has not the labels it should have ({type(error).__name__}: {error})")
+            problems.append(
+                f"{METADATA} line {k + 1}: has not the labels it should have ({type(error).__name__}: {error})"
+            )
         except InputError as error:
             problems.append(str(error))
         if progress is not None:
@@ -137,7 +139,7 @@ def _image(entry: ImageEntry, quick: bool, tally: _Tally) -> Iterator[str]:
             yield "missing"
         return
     image, stored = read_image(entry.path)
-    x0, y0, w, h = entry.window
+    w, h = entry.window[2:]
     if image.shape != (h, w):
         yield f"is {image.shape[1]} x {image.shape[0]} px, its window is {w} x {h}"
         return

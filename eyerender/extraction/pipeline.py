@@ -154,7 +154,14 @@ def _seen(found: _Found) -> NDArray[np.bool_]:
 
 
 def _agrees(fit: PixelFit, found: _Found) -> bool:
-    """Whether the refined rim still passes along the edges: it may move by what noise and texture move it, no more."""
+    """Whether the refined rim still passes along the edges, and is no less certain than they make it.
+
+    It may move by what noise and texture move it, no more; and where glints leave it too few pixels, it is of no use.
+    """
+    rim = found.rim
+    by_edges = rim_deviation(rim.ellipse, edge_covariance(rim.ellipse, rim.points_px, rim.residual_px))
+    if rim_deviation(fit.model.ellipse, fit.covariance) > 1.5 * by_edges:
+        return False
     points = found.edges.points_px[found.rim.inliers]
     ellipse = fit.model.ellipse
     shift = 0.5 * found.edges.sigma_px**2 * curvature_at(ellipse, points)

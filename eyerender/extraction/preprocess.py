@@ -61,6 +61,9 @@ def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | st
         return f"the image is {name}"
     # Rounding to integers is noise of 1/sqrt(12) of a step.
     noise = max(estimate_noise(linear), quantum / np.sqrt(12.0), 1e-3)
+    # A sensor's own noise comes after its wells are full: clipped pixels scatter a little below full scale.
+    if np.isfinite(clip):
+        clip -= float(np.clip(3.0 * noise, 0.004 * DN, 0.02 * DN))
     return Prepared(linear, clip, float(noise))
 
 

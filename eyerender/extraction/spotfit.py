@@ -2,7 +2,8 @@
 
 Model of a spot in pixel (x, y): B(x, y) + b0 + bx (x - xc) + by (y - yc) + A Gx(x) Gy(y), with Gx the mean over the
 pixel of exp(-(x - x0)^2 / (2 sx^2)). B is the image expected without spots (pupil, iris, the blurred edge between
-them). A pixel at the clip level only says that the intensity is at least that: it counts only where the model is below.
+them). A pixel at the clip level only says that the intensity is at least its own; it counts only where the model is
+below.
 """
 
 from __future__ import annotations
@@ -91,22 +92,22 @@ def fit_spots(
         return _empty()
     half = int(np.clip(math.ceil(3.2 * float(np.max(width_px)) + 1.0), 4, 20))
     windows = _cut(linear, known, start_px, np.minimum(2.7 * width_px + 1.2, half), half, clip_dn)
-    theta = _start(windows, start_px, width_px, height_dn, clip_dn)
+    theta = _start(windows, start_px, width_px, height_dn)
     distance = np.hypot(*np.moveaxis(start_px[:, None] - start_px[None], -1, 0)) + 1e9 * np.eye(count)
     crowded = bool((distance < 2.0 * half).any())
     if not crowded:
-        theta, settled = _fit(windows, theta, np.zeros_like(windows.data), noise_dn, clip_dn, slope_dn)
+        theta, settled = _fit(windows, theta, np.zeros_like(windows.data), noise_dn, slope_dn)
         others = np.zeros_like(windows.data)
     else:
         others = _others(windows, theta)
         for _ in range(20):
             previous = theta
-            theta, settled = _fit(windows, theta, others, noise_dn, clip_dn, slope_dn, turns=6)
+            theta, settled = _fit(windows, theta, others, noise_dn, slope_dn, turns=6)
             others = _others(windows, theta)
             if np.abs(theta[:, :2] - previous[:, :2]).max() < 1e-4:
                 break
         settled |= np.abs(theta[:, :2] - previous[:, :2]).max(axis=1) < 0.02
-    return _report(windows, theta, settled, others, noise_dn, clip_dn, slope_dn)
+    return _report(windows, theta, settled, others, noise_dn, slope_dn)
 
 
 def spot_light(fit: SpotFit, x: Array, y: Array) -> Array:
@@ -135,12 +136,12 @@ def _cut(
         data,
         known(*(part.astype(np.float64) for part in np.broadcast_arrays(x[:, None, :], y[:, :, None]))),
         inside.astype(np.float64),
-        data >= clip_dn * (1.0 - 1e-6),
+        data >= clip_dn,
         centre.astype(np.float64),
     )
 
 
-def _start(windows: _Windows, start: Array, width: Array, height: Array, clip_dn: float) -> Array:
+def _start(windows: _Windows, start: Array, width: Array, height: Array) -> Array:
     n = start.shape[0]
     theta = np.zeros((n, PARAMETERS))
     theta[:, :2] = start
@@ -188,14 +189,13 @@ def _model(windows: _Windows, theta: Array) -> tuple[Array, Array]:
 
 
 def _normal(
-    windows: _Windows, theta: Array, others: Array, noise: float, clip: float, slope: float
+    windows: _Windows, theta: Array, others: Array, noise: float, slope: float
 ) -> tuple[Array, Array, Array, Array]:
     """(cost, gradient, normal matrix, squared residual of the data alone) in units of the noise."""
     value, jacobian = _model(windows, theta)
     total = value + windows.known + others
-    target = np.where(windows.clip, np.maximum(total, clip), windows.data)
-    weight = windows.weight * ~(windows.clip & (total >= clip)) / noise
-    residual = (target - total) * weight
+    weight = windows.weight * ~(windows.clip & (total >= windows.data)) / noise
+    residual = (windows.data - total) * weight
     n = theta.shape[0]
     flat = (jacobian * weight[..., None]).reshape(n, -1, PARAMETERS)
     r = residual.reshape(n, -1)
@@ -219,13 +219,13 @@ def _normal(
 
 
 def _fit(
-    windows: _Windows, theta: Array, others: Array, noise: float, clip: float, slope: float, turns: int = MAX_TURNS
+    windows: _Windows, theta: Array, others: Array, noise: float, slope: float, turns: int = MAX_TURNS
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Levenberg-Marquardt on every spot side by side."""
     n = theta.shape[0]
     damping = np.full(n, 1e-2)
     settled = np.zeros(n, dtype=bool)
-    cost, gradient, matrix, _ = _normal(windows, theta, others, noise, clip, slope)
+    cost, gradient, matrix, _ = _normal(windows, theta, others, noise, slope)
     diagonal = np.arange(PARAMETERS)
     for _ in range(turns):
         damped = matrix.copy()
@@ -237,7 +237,7 @@ def _fit(
         trial = theta + step
         trial[:, 3:5] = np.clip(trial[:, 3:5], math.log(0.2), math.log(30.0))
         trial[:, 2] = np.clip(trial[:, 2], -5.0, 15.0)
-        new_cost, new_gradient, new_matrix, _ = _normal(windows, trial, others, noise, clip, slope)
+        new_cost, new_gradient, new_matrix, _ = _normal(windows, trial, others, noise, slope)
         better = new_cost <= cost * (1.0 + 1e-12)
         small = np.abs(step[:, :2]).max(axis=1) < 2e-4
         settled |= better & small & (np.abs(step[:, 2:5]).max(axis=1) < 2e-3)
@@ -265,11 +265,11 @@ def _others(windows: _Windows, theta: Array) -> Array:
 
 
 def _report(
-    windows: _Windows, theta: Array, settled: NDArray[np.bool_], others: Array, noise: float, clip: float, slope: float
+    windows: _Windows, theta: Array, settled: NDArray[np.bool_], others: Array, noise: float, slope: float
 ) -> SpotFit:
-    _, _, matrix, data_cost = _normal(windows, theta, others, noise, clip, slope)
+    _, _, matrix, data_cost = _normal(windows, theta, others, noise, slope)
     value, _ = _model(windows, theta)
-    used = windows.weight * ~(windows.clip & (value + windows.known + others >= clip))
+    used = windows.weight * ~(windows.clip & (value + windows.known + others >= windows.data))
     pixels = used.sum(axis=(1, 2))
     free = np.maximum(pixels - PARAMETERS, 1.0)
     diagonal = np.arange(PARAMETERS)

@@ -142,4 +142,6 @@ def _long_axis(linear: Image, fit: SpotFit, i: int) -> tuple[Array, float] | Non
     values, vectors = np.linalg.eigh(np.array([[cxx, cxy], [cxy, cyy]]))
     if values[1] <= 1.3 * max(float(values[0]), 0.01):
         return None
-    return np.asarray(vectors[:, 1] * math.sqrt(values[1])), float(np.clip(1.3 * math.sqrt(max(float(values[0]), 0.1)), 0.5, 8.0))
+    return np.asarray(vectors[:, 1] * math.sqrt(values[1])), float(
+        np.clip(1.3 * math.sqrt(max(float(values[0]), 0.1)), 0.5, 8.0)
+    )

@@ -34,6 +34,7 @@ def stack_eyes(eyes: Sequence[Eye]) -> Eye:
     def points(values: Sequence[Array]) -> Array:
         return read_only(np.stack(values))
 
+    waves = max(e.stop.contour.shape[-1] for e in eyes)
     return Eye(
         name=first.name,
         side=first.side,
@@ -45,7 +46,7 @@ def stack_eyes(eyes: Sequence[Eye]) -> Eye:
         back_rims_mm=tuple(numbers(n) for n in zip(*(e.back_rims_mm for e in eyes), strict=True)),
         back_passing=first.back_passing,
         retina=_stack(tuple(e.retina for e in eyes)),
-        stop=Stop(*(points(v) for v in zip(*(_stop_parts(e.stop) for e in eyes), strict=True))),
+        stop=Stop(*(points(v) for v in zip(*(_stop_parts(e.stop, waves) for e in eyes), strict=True))),
         limbus_radius_mm=numbers([e.limbus_radius_mm for e in eyes]),
         iris_root_radius_mm=numbers([e.iris_root_radius_mm for e in eyes]),
         sclera=Sphere(points([e.sclera.centre_mm for e in eyes]), numbers([e.sclera.radius_mm for e in eyes])),
@@ -82,7 +83,7 @@ def take_eyes(eye: Eye, index: npt.NDArray[np.intp]) -> Eye:
         back_rims_mm=numbers(eye.back_rims_mm),
         back_passing=eye.back_passing,
         retina=eye.retina.take(index),
-        stop=Stop(*(part[index] for part in _stop_parts(eye.stop))),
+        stop=Stop(*(part[index] for part in _stop_parts(eye.stop, eye.stop.contour.shape[-1]))),
         limbus_radius_mm=np.asarray(eye.limbus_radius_mm)[index],
         iris_root_radius_mm=np.asarray(eye.iris_root_radius_mm)[index],
         sclera=Sphere(eye.sclera.centre_mm[index], np.asarray(eye.sclera.radius_mm)[index]),
@@ -99,5 +100,8 @@ def _stack(surfaces: tuple[S, ...]) -> S:
     return type(surfaces[0]).stack(surfaces)
 
 
-def _stop_parts(stop: Stop) -> tuple[Array, Array, Array, Array]:
-    return stop.centre_mm, stop.rotation, stop.semi_axes_mm, stop.handed
+def _stop_parts(stop: Stop, waves: int) -> tuple[Array, ...]:
+    """The stop's numbers, its contour continued by zeros to as many `waves`."""
+    contour = np.zeros((*stop.contour.shape[:-1], waves))
+    contour[..., : stop.contour.shape[-1]] = stop.contour
+    return stop.centre_mm, stop.rotation, stop.semi_axes_mm, stop.handed, contour

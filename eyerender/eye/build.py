@@ -44,7 +44,7 @@ def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm
     if not (np.isfinite(diameter) and diameter > 0.0):
         raise InputError("must be > 0", path=path)
     stop = stop_of(spec, diameter)
-    if 2.0 * float(np.max(stop.semi_axes_mm)) >= widest:
+    if 2.0 * stop_reach_mm(stop) >= widest:
         raise InputError(f"the pupil is wider than the iris or the cornea ({widest:g} mm)", path=path)
     # Behind a surface its implicit function is negative.
     if not (surface_of(spec.cornea[-1]).implicit(stop.boundary(32)) < 0.0).all():
@@ -153,7 +153,19 @@ def stop_of(spec: EyeSpec, diameter_mm: float) -> Stop:
     centre = np.array(stop.position_mm) + np.array([0.0, *stop.shift_mm_per_mm]) * change
     rotation = tilt_rotation(np.radians(stop.tilt_deg)) @ rotation_x(np.radians(stop.axis_deg))
     ratio = np.sqrt(1.0 - stop.ellipticity)
-    return Stop(centre, rotation, 0.5 * diameter_mm * np.array([1.0 / ratio, ratio]), np.array(1.0))
+    semi_axes = 0.5 * diameter_mm * np.array([1.0 / ratio, ratio])
+    if stop.contour is None:
+        return Stop(centre, rotation, semi_axes, np.array(1.0))
+    rows = (stop.contour.cosines, stop.contour.sines)
+    contour = np.zeros((2, max(map(len, rows))))
+    for row, values in zip(contour, rows, strict=True):
+        row[: len(values)] = values
+    return Stop(centre, rotation, semi_axes, np.array(1.0), contour)
+
+
+def stop_reach_mm(stop: Stop) -> float:
+    """The largest distance of the margin from the stop's centre, within 0.1 %."""
+    return float(np.max(np.linalg.norm(stop.boundary(360) - stop.centre_mm, axis=-1)))
 
 
 def sclera_of(spec: EyeSpec, cornea: Surface) -> Sphere:
@@ -233,7 +245,11 @@ def mirrored_eye(eye: Eye) -> Eye:
         back_passing=eye.back_passing,
         retina=eye.retina.mirrored(),
         stop=Stop(
-            flip_y(eye.stop.centre_mm), mirror_rotation(eye.stop.rotation), eye.stop.semi_axes_mm, -eye.stop.handed
+            flip_y(eye.stop.centre_mm),
+            mirror_rotation(eye.stop.rotation),
+            eye.stop.semi_axes_mm,
+            -eye.stop.handed,
+            eye.stop.contour,
         ),
         limbus_radius_mm=eye.limbus_radius_mm,
         iris_root_radius_mm=eye.iris_root_radius_mm,

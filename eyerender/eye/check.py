@@ -28,6 +28,7 @@ _FAR_MM = 60.0
 
 def check_eye(spec: EyeSpec, *, source: str = "") -> None:
     """Raise `InputError` with the path of the first key that cannot stand."""
+    from .build import stop_of, stop_reach_mm
 
     def refuse(path: str, reason: str) -> None:
         raise InputError(reason, source=source, path=path)
@@ -39,7 +40,10 @@ def check_eye(spec: EyeSpec, *, source: str = "") -> None:
     for path, medium in _media(spec):
         if (medium.index is None) == (medium.cauchy is None):
             refuse(path, "give either 'index' or 'cauchy'")
-    radius = spec.stop.diameter_mm / 2.0 / np.sqrt(1.0 - spec.stop.ellipticity)
+    stop = stop_of(spec, spec.stop.diameter_mm)
+    if not (stop.relative_radius(np.linspace(0.0, 2.0 * np.pi, 720)) > 0.0).all():
+        refuse("stop.contour", "the margin's radius must be > 0 all around")
+    radius = stop_reach_mm(stop)
     if radius >= spec.limbus_radius_mm:
         refuse("stop.diameter_mm", f"the pupil is wider than the cornea ({2 * spec.limbus_radius_mm:g} mm)")
     if radius >= spec.iris.root_radius_mm:

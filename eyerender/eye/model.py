@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import ArrayValue
-from ..geometry.surfaces import Surface, components, fit, shift, turn_back
+from ..geometry.surfaces import Surface, Xyz, components, fit, shift, turn_back
 from ..geometry.transforms import Array, read_only
 from ..optics.interface import Number
 from .spec import EyeSpec, Side
@@ -16,21 +17,28 @@ from .spec import EyeSpec, Side
 __all__ = ["Eye", "EyeSpec", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
 
 
+def _no_contour() -> Array:
+    return read_only(np.zeros((2, 0)))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop(ArrayValue):
-    """The aperture stop (the anatomical pupil): an ellipse with semi-axes along local y and z of its frame.
+    """The aperture stop (the anatomical pupil): an ellipse with semi-axes along local y and z of its frame, or a
+    contour about one.
 
-    centre_mm (3,), rotation (3, 3) local -> eye, semi_axes_mm (2,), handed: +1 right eye, -1 left eye. In a batch all
-    arrays have a leading axis, `handed` too.
+    centre_mm (3,), rotation (3, 3) local -> eye, semi_axes_mm (2,), handed: +1 right eye, -1 left eye, contour (2, k):
+    c and s of the margin's relative radius r(f) = 1 + sum_k c_k cos(k f) + s_k sin(k f); k = 0: an ellipse. In a batch
+    all arrays have a leading axis, `handed` too.
     """
 
     centre_mm: Array
     rotation: Array
     semi_axes_mm: Array
     handed: Array
+    contour: Array = field(default_factory=_no_contour)
 
     def __post_init__(self) -> None:
-        for name in ("centre_mm", "rotation", "semi_axes_mm", "handed"):
+        for name in ("centre_mm", "rotation", "semi_axes_mm", "handed", "contour"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @property
@@ -38,8 +46,20 @@ class Stop(ArrayValue):
         """Unit normal of the plane, towards the cornea, (..., 3)."""
         return np.asarray(self.rotation[..., :, 0])
 
+    def relative_radius(self, angle_rad: npt.ArrayLike) -> Array:
+        """r at the parameter f of the ellipse, from the first semi-axis of the right eye's stop towards up, mirrored
+        for a left one; angle () or (m,), or (n, ...) for a batch of n stops.
+        """
+        angle = np.asarray(angle_rad, dtype=np.float64)
+        out = np.ones(angle.shape)
+        ndim = max(angle.ndim, 1)
+        for k in range(self.contour.shape[-1]):
+            cosine, sine = (fit(self.contour[..., i, k], ndim) for i in (0, 1))
+            out = out + cosine * np.cos((k + 1) * angle) + sine * np.sin((k + 1) * angle)
+        return out
+
     def boundary(self, count: int) -> Array:
-        """`count` points evenly spaced in the ellipse's parameter, (..., count, 3).
+        """`count` points of the margin evenly spaced in the ellipse's parameter, (..., count, 3).
 
         The first lies on the first semi-axis (nasal where it is not turned), the next follow towards up; those of a
         left eye are the mirror images of the right eye's.
@@ -47,15 +67,42 @@ class Stop(ArrayValue):
         angle = 2.0 * np.pi * np.arange(count) / count
         first = (self.handed * self.semi_axes_mm[..., 0])[..., None] * np.cos(angle)
         second = self.semi_axes_mm[..., 1, None] * np.sin(angle)
+        if self.contour.shape[-1]:
+            radius = self.relative_radius(np.broadcast_to(angle, first.shape))
+            first, second = first * radius, second * radius
         r, c = self.rotation[..., None, :, :], self.centre_mm[..., None, :]
         return np.asarray(c + first[..., None] * r[..., :, 1] + second[..., None] * r[..., :, 2])
 
     def contains(self, points_mm: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Whether points (..., 3) of the plane lie inside the ellipse; for a batch of stops (n, ..., 3)."""
+        """Whether points (..., 3) of the plane lie inside the margin; for a batch of stops (n, ..., 3)."""
         point = components(points_mm)
+        ndim = point[0].ndim
         _, y, z = turn_back(self.rotation, shift(point, self.centre_mm, -1.0))
-        a, b = (fit(self.semi_axes_mm[..., k], point[0].ndim) for k in (0, 1))
-        return np.asarray((y / a) ** 2 + (z / b) ** 2 <= 1.0)
+        first, second = y / fit(self.semi_axes_mm[..., 0], ndim), z / fit(self.semi_axes_mm[..., 1], ndim)
+        limit: Number = 1.0
+        if self.contour.shape[-1]:
+            limit = self.relative_radius(np.arctan2(second, fit(self.handed, ndim) * first))
+        return np.asarray(first * first + second * second <= limit * limit)
+
+    def height_mm(self, point: Xyz) -> Array:
+        """Height of points above the stop's plane, towards the cornea."""
+        ndim = point[0].ndim
+        gap = shift(point, self.centre_mm, -1.0)
+        return np.asarray(sum(gap[i] * fit(self.rotation[..., i, 0], ndim) for i in range(3)))
+
+    def lets_through(self, course_mm: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether rays pass inside the margin wherever they cross the stop's plane.
+
+        course_mm : their points (k, ..., 3) in order, inside the eye; (k, n, ..., 3) for a batch of n stops.
+        """
+        course = np.asarray(course_mm, dtype=np.float64)
+        passes = np.ones(course.shape[1:-1], dtype=bool)
+        heights = [self.height_mm(components(points)) for points in course]
+        for (before, low), (after, high) in pairwise(zip(course, heights, strict=True)):
+            crosses = (low > 0.0) != (high > 0.0)
+            share = np.where(crosses, low, 0.0) / np.where(crosses, low - high, 1.0)
+            passes &= ~crosses | self.contains(before + share[..., None] * (after - before))
+        return passes
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -157,8 +157,20 @@ LensSpec = Annotated[
 ]
 
 
+class ContourSpec(Spec):
+    """A margin that is not an ellipse: r(f) = 1 + sum_k c_k cos(k f) + s_k sin(k f), k from 1, times the ellipse.
+
+    f is the ellipse's parameter from its first semi-axis (nasal where it is not turned) towards up, and
+    r (a cos f, b sin f) the margin: c_k and s_k are the Fourier coefficients of a measured pupil's radius over its mean
+    (Wyatt 1995, "The form of the human pupil", Vision Res. 35, 2021-2036). The shorter list is continued by zeros.
+    """
+
+    cosines: tuple[float, ...] = Field(default=(), max_length=32)
+    sines: tuple[float, ...] = Field(default=(), max_length=32)
+
+
 class StopSpec(Spec):
-    """The anatomical pupil: an ellipse in a plane.
+    """The anatomical pupil: an ellipse in a plane, or a `contour` about one.
 
     `ellipticity` = 1 - b/a at the area of the circle of `diameter_mm`; the long axis lies `axis_deg` from nasal
     towards up. A pupil of another diameter d is centred at position_mm + (0, s_y, s_z) (d - diameter_mm), s =
@@ -171,6 +183,7 @@ class StopSpec(Spec):
     ellipticity: float = Field(default=0.0, ge=0.0, lt=1.0)
     axis_deg: float = 0.0
     shift_mm_per_mm: Vec2 = (0.0, 0.0)
+    contour: ContourSpec | None = None
 
 
 class IrisSpec(Spec):

@@ -80,12 +80,12 @@ class LashSpec(Spec):
 class BrowSpec(Spec):
     """The brow's hairs."""
 
-    count: Annotated[int, Field(ge=0, le=700)] = Field(default=420, description="number of hairs (Wolff: 250 to 700)")
+    count: Annotated[int, Field(ge=0, le=700)] = Field(default=520, description="number of hairs (Wolff: 250 to 700)")
     length_mm: float = _number(9.0, 5.0, 13.0, "longest hair (Farkas)")
     height_mm: float = _number(15.5, 10.0, 24.0, "lower border above the pupil (Farkas)")
     thickness_mm: float = _number(8.5, 3.0, 12.0, "height of the band at its head (chosen)")
     arch_mm: float = _number(3.5, 0.0, 8.0, "rise from head to arch (chosen)")
-    diameter_mm: float = _number(0.08, 0.05, 0.12, "at the root (chosen)")
+    diameter_mm: float = _number(0.1, 0.05, 0.14, "at the root (chosen)")
     albedo: float = _number(0.13, 0.02, 0.6, "at 850 nm (chosen)")
 
 
@@ -106,7 +106,7 @@ class SkinSpec(Spec):
     relief_mm: float = _number(0.045, 0.0, 0.12, "depth of the skin's fine furrows (Tchvialeva 2013: 20 to 100 um)")
     wrinkles: Share = Field(default=0.35, description="lines on and below the lids (chosen)")
     sheen: Share = Field(default=0.5, description="strength of the oily skin's rough mirror (chosen)")
-    wet_albedo: float = _number(0.48, 0.2, 0.7, "of the margins and the caruncle (chosen)")
+    wet_albedo: float = _number(0.43, 0.2, 0.7, "of the margins and the caruncle (chosen)")
 
 
 class TearSpec(Spec):

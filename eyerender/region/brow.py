@@ -26,7 +26,7 @@ def brow(spec: RegionSpec) -> Hairs:
     rng = np.random.default_rng((0xB405, spec.seed))
     n = b.count
     # 0 at the head, 1 at the tail; sparse at both ends.
-    s = np.clip(rng.beta(1.25, 1.35, n), 0.0, 1.0)
+    s = np.clip(rng.beta(1.1, 1.3, n), 0.0, 1.0)
     across = np.clip(rng.normal(0.5, 0.24, n), 0, 1)
     y, low, high = _band(spec, s)
     z = low + across * (high - low)
@@ -36,7 +36,7 @@ def brow(spec: RegionSpec) -> Hairs:
     lean = np.radians(18 + 62 * (1 - head) + 38 * upper * (1 - 0.8 * head) + 18 * step(s, 0.6, 1.0))
     lean = lean + np.radians(9.0) * rng.normal(0, 1, n)
     length = b.length_mm * rng.uniform(0.55, 1.0, n) * (0.75 + 0.25 * np.sin(np.pi * s))
-    bend = np.radians(22.0) * rng.normal(0.9, 0.5, n)
+    bend = np.radians(20.0) * rng.normal(0.9, 0.45, n) * (1 - 0.55 * head)
     points = np.empty((n, POINTS, 3))
     lift = 0.35 + 0.55 * rng.uniform(0, 1, n) + 0.5 * head
     for j in range(POINTS):

@@ -9,7 +9,7 @@ lateral canthus, 270 in the middle of the lower lid. Along the chord between the
 its peak at a = (p - q) / (p + q). The upper lid's height follows the turn of the eye and the blink: its middle lies at
 an angle about the globe's centre that turns by `upper_follows` of the eye's elevation.
 
-Where the contour lies in front of the globe it lies on it; past a polar angle of 46 (nasal) to 58 degrees (temporal) it
+Where the contour lies in front of the globe it lies on it; past a polar angle of 51 (nasal) to 58 degrees (temporal) it
 leaves along the tangent, which softens towards the canthi.
 """
 
@@ -24,7 +24,7 @@ from .anatomy import RegionSpec
 from .globe import Globe
 
 COLUMNS = 176
-_LATERAL, _MEDIAL, _VERTICAL = np.radians(58.0), np.radians(45.0), np.radians(62.0)
+_LATERAL, _MEDIAL, _VERTICAL = np.radians(58.0), np.radians(51.0), np.radians(62.0)
 _GAP_MM = 0.01
 
 
@@ -132,7 +132,7 @@ def _support(globe: Globe, centre: Floats, yz: Floats) -> tuple[Floats, Floats]:
     R = globe.radius_mm
     nasal, temporal = step(e[..., 0], 0.2, 0.85), step(-e[..., 0], 0.2, 0.85)
     limit = _VERTICAL + nasal * (_MEDIAL - _VERTICAL) + temporal * (_LATERAL - _VERTICAL)
-    soft = 14.0 - 8.0 * nasal
+    soft = 14.0 - 9.5 * nasal
     rho0 = R * np.sin(limit)
     past = np.maximum(rho - rho0, 0.0)
     tangent = np.tan(limit)

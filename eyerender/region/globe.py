@@ -26,10 +26,10 @@ _WIDEST = np.radians(40.0)
 class Globe(ArrayValue):
     """A posed globe: `cornea` and `centre_mm` (3,) in the eye frame, the motion p = M x + t into the unrotated frame.
 
-    `mirrored`: a left eye, whose region's frame has y the other way round.
+    `mirrored`: a left eye, whose region's frame has y the other way round. Without a cornea it is the bare sphere.
     """
 
-    cornea: Surface
+    cornea: Surface | None
     limbus_radius_mm: float
     centre_mm: Floats
     radius_mm: float
@@ -40,6 +40,11 @@ class Globe(ArrayValue):
     def __post_init__(self) -> None:
         for name in ("centre_mm", "M", "t"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @classmethod
+    def sphere(cls, radius_mm: float = 12.0, depth_mm: float = 13.0) -> Globe:
+        """An average globe at rest, without a cornea."""
+        return cls(None, 0.0, np.array([-depth_mm, 0.0, 0.0]), radius_mm, np.eye(3), np.zeros(3))
 
     @property
     def centre(self) -> Floats:
@@ -63,6 +68,8 @@ class Globe(ArrayValue):
 
     def radial(self, direction: Floats) -> Floats:
         """r (n,) mm along unit directions (n, 3) from the centre."""
+        if self.cornea is None:
+            return np.full(np.shape(direction)[:-1], self.radius_mm)
         local = self._mirror(direction) @ self.M
         polar = np.arccos(np.clip(local[..., 0], -1, 1))
         turn = np.arctan2(local[..., 2], local[..., 1]) / (2 * np.pi) % 1.0

@@ -14,15 +14,17 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..arrays import ArrayValue, Floats, frozen
 from .anatomy import LashSpec, RegionSpec
-from .contour import Contour, step
+from .contour import step
 from .globe import Globe
 from .hairs import SEGMENTS, Hairs, taper
-from .lids import Sheet, sheet_depth
+from .lids import CONJUNCTIVA, LID, MARGIN, Sheet
 
-_ABOVE_MM = 0.12
+_ABOVE_MM = 0.2
+_REACH_ROWS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,7 +106,7 @@ def lashes(spec: RegionSpec, globe: Globe, sheet: Sheet) -> Hairs:
         f = p.fan * (0.55 + 0.6 * s)
         d = np.cos(f)[:, None] * (np.cos(b)[:, None] * n + np.sin(b)[:, None] * m) + np.sin(f)[:, None] * t
         points[:, j] = points[:, j - 1] + (p.length_mm / SEGMENTS)[:, None] * d
-    points[:, 1:] = _out_of_skin(spec, globe, c, sheet, points[:, 1:])
+    points[:, 1:] = _out_of_skin(globe, sheet, points[:, 1:])
     return Hairs(frozen(points), frozen(taper(p.length_mm, spec.lashes.diameter_mm, k)))
 
 
@@ -117,10 +119,39 @@ def _at(angle: Floats, values: Floats) -> Floats:
     return np.asarray((1 - w) * values[i % n] + w * values[(i + 1) % n])
 
 
-def _out_of_skin(spec: RegionSpec, globe: Globe, c: Contour, sheet: Sheet, points: Floats) -> Floats:
-    flat = points.reshape(-1, 3).copy()
-    least = sheet_depth(spec, globe, sheet, flat[:, 1], flat[:, 2]) + _ABOVE_MM
-    flat[:, 0] = np.maximum(flat[:, 0], least)
+def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats) -> Floats:
+    """The points (n, k, 3), lifted along the nearest skin's normal to `_ABOVE_MM` over it, and off the globe.
+
+    The middles between points count too: a straight piece must not cut through a fold.
+    """
+    if not points.size:
+        return points
+    rows = slice(CONJUNCTIVA + MARGIN - 1, CONJUNCTIVA + MARGIN + LID + _REACH_ROWS)
+    skin, normals = sheet.vertices[rows].reshape(-1, 3), sheet.normals[rows].reshape(-1, 3)
+    tree = cKDTree(skin)
+    out, k = points.copy(), points.shape[1]
+
+    def lift(at: Floats, within: float) -> Floats:
+        distance, nearest = tree.query(at, distance_upper_bound=within)
+        known = np.isfinite(distance)
+        nearest = np.where(known, nearest, 0)
+        above = np.sum((at - skin[nearest]) * normals[nearest], axis=-1)
+        return np.asarray(normals[nearest] * np.where(known, np.maximum(_ABOVE_MM - above, 0), 0)[..., None])
+
+    out += lift(out, np.inf)
+    active = np.arange(len(out))
+    for _ in range(10):
+        some = out[active]
+        middles = (2 * some[:, :-1] + some[:, 1:]) / 3, (some[:, :-1] + 2 * some[:, 1:]) / 3
+        push = lift(np.concatenate([some, *middles], axis=1), 1.0)
+        some = some + push[:, :k]
+        for i in range(2):
+            between = push[:, k + i * (k - 1) : k + (i + 1) * (k - 1)]
+            some[:, :-1] += 0.7 * between
+            some[:, 1:] += 0.7 * between
+        out[active] = some
+        active = active[np.abs(push).max(axis=(1, 2)) > 0.01]
+        if not len(active):
+            break
     # And off the globe, for lashes that turn in.
-    flat = globe.pushed_out(flat, 0.3)
-    return flat.reshape(points.shape)
+    return globe.pushed_out(out, 0.3)

@@ -104,11 +104,12 @@ def _conjunctiva(spec: RegionSpec, globe: Globe, c: Contour) -> Floats:
     on_globe = step(distance - globe.radial(unit(away)), 0.6, 0.05)
     end = c.point + 1.2 * on_globe[:, None] * c.away
     end = globe.centre + unit(end - globe.centre) * (globe.radial(unit(end - globe.centre)) - _DIP_MM)[:, None]
-    # Beside the nose it reaches further on to the globe: the plica.
-    nasal = step(c.along, 0.80, 0.97)
-    inward = np.stack([np.full_like(nasal, 0.9), -1.6 * np.ones_like(nasal), np.zeros_like(nasal)], axis=-1)
-    reach = end + nasal[:, None] * inward
-    reach = globe.centre + unit(reach - globe.centre) * (globe.radial(unit(reach - globe.centre)) - _DIP_MM)[:, None]
+    # Beside the nose it reaches further on to the globe, to a crescent about the cornea: the plica.
+    nasal = step(c.along, 0.72, 0.93)
+    z = c.point[:, 2] - globe.centre[2]
+    crescent = np.stack([np.full_like(z, 5.2), 10.7 + 0.03 * z**2, 0.85 * z], axis=-1)
+    reach = unit((1 - nasal)[:, None] * unit(end - globe.centre) + nasal[:, None] * unit(crescent))
+    reach = globe.centre + reach * (globe.radial(reach) - _DIP_MM)[:, None]
     u = (np.arange(CONJUNCTIVA) / CONJUNCTIVA)[:, None, None]
     rows = reach + u * (c.point - reach)
     # Plica: a low crescent on the globe; caruncle: a mound off it.
@@ -158,7 +159,8 @@ def _crease(spec: RegionSpec, c: Contour) -> Floats:
     openness = min(c.openness, 1.2)
     middle = lids.crease_mm + (min(lids.show_mm, lids.crease_mm - 1.0) - lids.crease_mm) * openness
     arch = 0.72 + 0.28 * np.abs(np.sin(c.angle)) ** 1.5
-    return np.where(c.upper > 0, middle * arch, 5.5 * arch)
+    upper = step(np.sin(c.angle), -0.3, 0.3)
+    return np.asarray((5.5 + upper * (middle - 5.5)) * arch)
 
 
 def _fold_strength(c: Contour) -> Floats:
@@ -208,30 +210,6 @@ def skin_depth(spec: RegionSpec, globe: Globe, y: Floats, z: Floats) -> Floats:
     shell = shell + _bulge(globe, y, z, outer)
     face = face_depth(spec.face, y, z)
     return np.asarray(np.maximum(shell, face) + _JOINT_MM * np.log1p(np.exp(-np.abs(shell - face) / _JOINT_MM)))
-
-
-def sheet_depth(spec: RegionSpec, globe: Globe, sheet: Sheet, y: Floats, z: Floats) -> Floats:
-    """x (mm) that hairs over (y, z) must stay in front of: skin with its fold; -inf over the fissure."""
-    c, line = sheet.contour, sheet.lash_line
-    half = len(line) // 2
-    up, low = line[: half + 1][::-1], np.concatenate([line[half:], line[:1]])
-    z_up, z_low = np.interp(y, up[:, 1], up[:, 2]), np.interp(y, low[:, 1], low[:, 2])
-    crease_up = np.interp(y, up[:, 1], _crease(spec, c)[: half + 1][::-1])
-    v = np.where(z > z_up, z - z_up, z_low - z)
-    base = skin_depth(spec, globe, y, z)
-    start = np.where(z > z_up, np.interp(y, up[:, 1], up[:, 0]), np.interp(y, low[:, 1], low[:, 0]))
-    start_z = np.where(z > z_up, z_up, z_low)
-    rest = start - skin_depth(spec, globe, y, start_z)
-    open_ = min(max(c.openness, 0.0), 1.15)
-    height = spec.lids.fold_mm * (0.25 + 0.75 * open_)
-    # The fold hangs over: its lower edge counts from where it may reach down to.
-    w = v - crease_up
-    swell = step(w + 0.55 * height, -0.3, 0.6) * np.exp(-np.maximum(w - 0.9, 0) / 4.5)
-    lift = np.where(z > z_up, height * swell, spec.lids.bags_mm * np.exp(-(((v - 8.5) / 3.5) ** 2)))
-    depth = base + rest * np.exp(-((np.maximum(v, 0) / 2.2) ** 2)) + lift
-    beyond = (y < up[0, 1]) | (y > up[-1, 1])
-    depth = np.where(beyond, base + 0.3, depth)
-    return np.asarray(np.where((v > 0) | beyond, depth, -np.inf))
 
 
 def _bulge(globe: Globe, y: Floats, z: Floats, outer: float) -> Floats:

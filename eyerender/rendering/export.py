@@ -8,6 +8,8 @@ soft rim, lens distortion, the point-spread function, and lamps that are neither
 
 from __future__ import annotations
 
+import hashlib
+import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -15,6 +17,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..eye.model import Eye
 from .frame import RenderJob
 from .meshes import Patch, eye_meshes
 
@@ -68,6 +71,44 @@ def export_scene(
     ET.indent(root)
     path = folder / "scene.xml"
     ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+    return path
+
+
+def bake_meshes(eye: Eye, folder: str | Path, *, rings: int = 24, sectors: int = 96) -> Path:
+    """Write every patch of an eye as PLY, and `manifest.json`: what it is, unit, frame, licence, indices, SHA-256.
+
+    Returns:
+        The path of the manifest.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    meshes = eye_meshes(eye, rings, sectors)
+    files = {}
+    for patch in meshes.patches.values():
+        data = patch.mesh.export(file_type="ply", vertex_normal=True)
+        (folder / f"{patch.name}.ply").write_bytes(data)
+        files[f"{patch.name}.ply"] = {
+            "sha256": hashlib.sha256(data).hexdigest(),
+            "vertices": len(patch.vertices),
+            "faces": len(patch.faces),
+            "exterior_index": patch.exterior,
+            "interior_index": patch.interior,
+        }
+    manifest = {
+        "schema": "eyerender/meshes/1",
+        "eye_model": eye.name,
+        "side": eye.side,
+        "wavelength_nm": eye.wavelength_nm,
+        "unit": "mm",
+        "frame": "eye: origin at the front corneal apex, +x outward, +z up; normals towards the exterior",
+        "licence": "MIT",
+        "rings": rings,
+        "sectors": sectors,
+        "bodies": sorted(meshes.bodies),
+        "files": files,
+    }
+    path = folder / "manifest.json"
+    path.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
     return path
 
 

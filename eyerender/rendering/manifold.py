@@ -33,8 +33,9 @@ _GRAZING = 0.01
 class Connection:
     """The path found: irradiance per radiant intensity (mm^-2), the entry point, the direction that leaves the lamp.
 
-    `found` where there is a path; `failed` where Newton's method neither converged nor ended beyond `reach` or the
-    cornea's horizon, where no light enters.
+    `found` where there is a path. `failed` where Newton's method did not converge although it never left the part of
+    the cornea that the lamp sees; points in the cornea's own shadow have no path, and the steps towards it run over the
+    horizon.
     """
 
     transfer: Any
@@ -91,7 +92,7 @@ def connect(
         step += 1
         local = front.point_in(y)
         out = local.y * local.y + local.z * local.z > dr.square(reach + 1)
-        dark = on & (over | out)
+        dark |= on & (over | out)
         on &= ~done & (step < MAX_STEPS)
         return dr.select(on, after, y), dr.select(on & ~over, y, last), step, on, dark, transfer
 

@@ -15,11 +15,13 @@ from ..arrays import ArrayValue, Bools, Floats, frozen
 from . import psf, sensor
 from .frame import RenderJob, camera_numbers, eye_numbers, kinds, light_table, look_numbers, pose_numbers
 from .glints import POINT, GlintScene, GlintTable, Spots, glint_table, quadrature
-from .integrator import Textures, integrator_class, lamps, look
+from .integrator import integrator_class
+from .lighting import lamps
 from .purkinje import purkinje_images
 from .sampling import Sampler, camera_ray
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
+from .view import Textures, look
 
 if TYPE_CHECKING:
     from .backend import Backend

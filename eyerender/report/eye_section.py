@@ -12,7 +12,7 @@ from ..geometry.surfaces import Surface
 from .style import ANALYTIC, IMAGE, TARGET, figure
 
 _SCLERA, _CORNEA, _LENS, _RETINA, _IRIS = "#9a9a9a", ANALYTIC, "#009E73", IMAGE, "#8c564b"
-_GRID = 900
+_GRID, _LENS_GRID = 900, 300
 # Lenses of adults are 9 to 10 mm wide; their optical surfaces meet farther out than they do.
 _LENS_MM = 4.8
 
@@ -43,11 +43,14 @@ def _draw(ax: Any, eye: Eye, across: int) -> None:
             rim &= x >= _iris_x(eye, s, across)
         _curve(ax, surface, x, s, across, rim, _CORNEA, 1.8, "cornea" if k == 0 else None)
     shells = len(eye.back) > 2
+    # A gradient lens has dozens of shells: a grid of their own, no larger than they are.
+    back = float(eye.stop.centre_mm[0]) - 6.0
+    lx, ls = np.meshgrid(np.linspace(back, back + 7.0, _LENS_GRID), np.linspace(-6.5, 6.5, _LENS_GRID))
     for k, (surface, rim_mm) in enumerate(zip(eye.back, eye.back_rims_mm, strict=True)):
         outer = k in (0, len(eye.back) - 1)
-        inside = _axis_distance(surface, x, s, across) <= min(float(np.asarray(rim_mm)), _LENS_MM)
+        inside = _axis_distance(surface, lx, ls, across) <= min(float(np.asarray(rim_mm)), _LENS_MM)
         name = "lens" if k == 0 else None
-        _curve(ax, surface, x, s, across, inside, _LENS, 1.6 if outer or not shells else 0.35, name)
+        _curve(ax, surface, lx, ls, across, inside, _LENS, 1.6 if outer or not shells else 0.35, name)
     _curve(ax, eye.retina, x, s, across, x < -8.0, _RETINA, 1.6, "retina (optical)")
     outside = np.hypot(x - centre[0], s - centre[across]) - radius
     beside = (_axis_distance(eye.front[0], x, s, across) >= eye.limbus_radius_mm) | (x < -8.0)

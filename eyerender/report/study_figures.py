@@ -31,7 +31,7 @@ def look(model: str, others: Sequence[str] = ()) -> tuple[str, str]:
 
 def clouds_figure(clouds: Mapping[str, tuple[Floats, Floats]]) -> str:
     """Figure 3: pupil centres and glints of every fixation (n, 2) px by eye model."""
-    with figure(9.6, 4.4, 2) as (fig, axes):
+    with figure(11.0, 4.9, 2) as (fig, axes):
         for ax, part, title in ((axes[0], 0, "(a) pupil centre"), (axes[1], 1, "(b) glint")):
             for model, points in clouds.items():
                 colour, marker = look(model, list(clouds))
@@ -39,7 +39,7 @@ def clouds_figure(clouds: Mapping[str, tuple[Floats, Floats]]) -> str:
                 ax.scatter(
                     p[:, 0],
                     p[:, 1],
-                    s=13,
+                    s=11,
                     marker=marker,
                     facecolor="none",
                     edgecolor=colour,
@@ -67,6 +67,8 @@ def heads_figure(
     """
     models = list(dict.fromkeys(m for by_model in own.values() for m in by_model))
     styles = [("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9")]
+    highest = [v[h] for by_model in own.values() for v in by_model.values() for h in v]
+    top = 1.08 * max([*highest, *(float(v.max()) for v in measured.values()), *(high for _, high in interval.values())])
     with figure(9.6, 4.2, 2) as (fig, axes):
         for ax, head, title in zip(axes, ("H1", "H2"), ("H1: central head position", "H2: others"), strict=True):
             low, high = interval[head]
@@ -90,8 +92,7 @@ def heads_figure(
                 linewidth=1.2, label="the paper's simulation", zorder=2,
             )  # fmt: skip
             ax.set_xticks([*x, len(models)], [*models, "people"])
-            ax.set(title=title, ylabel="mean gaze error (deg)", xlabel="eye model")
-            ax.set_ylim(bottom=0)
+            ax.set(title=title, ylabel="mean gaze error (deg)", xlabel="eye model", ylim=(0, top))
             ax.grid(axis="x", visible=False)
         handles, labels = axes[0].get_legend_handles_labels()
         fig.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
@@ -151,7 +152,7 @@ def map_figure(
 ) -> str:
     """Maps of a mean error (len(y), len(x)) over two quantities, one a panel, on one scale; NaN stays white."""
     top = max(float(np.nanmax(m)) for m in maps.values())
-    with figure(max(5.0, 3.0 * len(maps)), 3.2, len(maps)) as (fig, axes):
+    with figure(max(5.0, 2.1 * len(maps) + 1.0), 2.5, len(maps)) as (fig, axes):
         for k, (ax, (name, values)) in enumerate(zip(np.atleast_1d(axes), maps.items(), strict=True)):
             shown = ax.pcolormesh(x, y, values, cmap="cividis", vmin=0, vmax=top, shading="nearest")
             if marks is not None:

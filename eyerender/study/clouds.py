@@ -39,7 +39,7 @@ def aspect(points: Floats) -> float:
     """Spread across over spread along the cloud's long axis (ratio of singular values)."""
     good = points[np.isfinite(points).all(axis=1)]
     values = np.linalg.svd(good - good.mean(axis=0), compute_uv=False)
-    return float(values[1] / values[0])
+    return float(values[1] / values[0]) if values[0] > 0 else float("nan")
 
 
 def bow(points: Floats) -> float:

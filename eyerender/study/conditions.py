@@ -141,7 +141,7 @@ def conditions_part(eye: str) -> ConditionsPart:
             try:
                 up, down = (_mean(replace(_scene(name, eye), eye_spec=spec)) for spec in (more, less))
             except InputError as error:
-                # A changed eye may be one that no ray leaves, which is a result of this parameter and not of the others.
+                # A changed eye may be one that no ray leaves: a result of this parameter, not of the others.
                 entry[name]["reason"] = str(error)
                 continue
             entry[name] |= {"at_plus": up, "at_minus": down, "per_step": 0.5 * (up - down)}

@@ -69,7 +69,7 @@ def page(parts: Sequence[ConditionsPart], found: Sequence[Finding]) -> Page:
     models = [p.eye_model for p in parts]
     cards = [
         Card(
-            " · ".join(f"{p.eye_model} {np.nanmax(p.head_maps[t]):.2f}" for p in parts),
+            " ".join(f"{p.eye_model}\u00a0{np.nanmax(p.head_maps[t]):.2f}" for p in parts),
             f"largest mean error (deg) over heads within 40 mm, {t}",
         )
         for t in c.TRACKERS

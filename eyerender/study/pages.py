@@ -12,8 +12,11 @@ from ..report.study import Card, Figure, Page, Section, Table
 from ..report.study_figures import clouds_figure, heads_figure, sets_figure, waterfall_figure
 from . import blignaut, guestrin
 from . import literature as lit
+from .observers_compared import FeatureDifference, GazeDifference
 from .replicate import BlignautPart, GuestrinPart
 from .results import Departure, Erratum, Finding, WaterfallStep
+
+Apart = tuple[Sequence[FeatureDifference], Sequence[GazeDifference]]
 
 _WHAT = (
     "'published' does what the authors' software did, with all its departures from the paper's text; 'corrected' "
@@ -28,6 +31,7 @@ def guestrin_page(
     found: Sequence[Finding],
     tests: Sequence[dict[str, object]],
     faults: Sequence[Erratum],
+    apart: Apart = ((), ()),
 ) -> Page:
     """The report of [28]'s replication."""
     keys = list(dict.fromkeys(key for part in parts for key in part.means))
@@ -47,7 +51,7 @@ def guestrin_page(
     for (protocol, observer), label in zip(keys, shown, strict=True):
         means = {p.eye_model: p.means[protocol, observer] for p in parts if (protocol, observer) in p.means}
         listed: list[str] = [m for m in lit.MODELS if m in means] or list(means)
-        text = " · ".join(f"{m} {means[m]['H1']:.2f}/{means[m]['H2']:.2f}" for m in listed)
+        text = " ".join(f"{m}\u00a0{means[m]['H1']:.2f}/{means[m]['H2']:.2f}" for m in listed)
         cards.append(Card(text, f"mean error at H1/H2 in degrees, {label}"))
     sections = [
         Section(
@@ -56,6 +60,7 @@ def guestrin_page(
                 "The paper's Figure 4 redrawn from the data of this run, beside the paper's simulated means and the"
                 " four "
                 "participants of Guestrin & Eizenman. The estimator is calibrated on the nine targets at H1.",
+                *_about_e5(parts),
             ),
             (
                 [
@@ -99,6 +104,7 @@ def guestrin_page(
                 )
             ],
         ),
+        *_observers_section(apart),
         _findings_section(found),
         *_waterfall_section([s for p in parts for s in p.waterfall], guestrin.DEPARTURES, ("H1", "H2"), log=False),
         _departures_section(guestrin.DEPARTURES, faults),
@@ -123,7 +129,9 @@ def guestrin_page(
     return Page("Guestrin & Eizenman (2006), replicated", lead, cards, sections)
 
 
-def blignaut_page(parts: Sequence[BlignautPart], found: Sequence[Finding], faults: Sequence[Erratum]) -> Page:
+def blignaut_page(
+    parts: Sequence[BlignautPart], found: Sequence[Finding], faults: Sequence[Erratum], apart: Apart = ((), ())
+) -> Page:
     """The report of [29]'s replication."""
     sets = list(lit.CALIBRATION_SETS)
     keys = list(dict.fromkeys(key for part in parts for key in part.outcomes))
@@ -137,7 +145,7 @@ def blignaut_page(parts: Sequence[BlignautPart], found: Sequence[Finding], fault
     }
     cards = [
         Card(
-            " · ".join(f"{m} {v[0]:.2f}/{v[1]:.2f}/{v[-1]:.3f}" for m, v in by_model.items()),
+            " ".join(f"{m}\u00a0{v[0]:.2f}/{v[1]:.2f}/{v[-1]:.3f}" for m, v in by_model.items()),
             f"error of the best function with C5/C9/C135 in degrees, {label}",
         )
         for label, by_model in best.items()
@@ -172,6 +180,7 @@ def blignaut_page(parts: Sequence[BlignautPart], found: Sequence[Finding], fault
             ],
             [_best_table(parts, sets)],
         ),
+        *_observers_section(apart),
         _findings_section(found),
         *_waterfall_section(
             [s for p in parts for s in p.waterfall], blignaut.DEPARTURES, ("C5", "C9", "C14", "C135"), log=True
@@ -186,6 +195,21 @@ def blignaut_page(parts: Sequence[BlignautPart], found: Sequence[Finding], fault
         _WHAT,
     )
     return Page("Blignaut (2014), replicated", lead, cards, sections)
+
+
+def _about_e5(parts: Sequence[GuestrinPart]) -> list[str]:
+    """What becomes of the paper's 'errors exceeding 11 deg'."""
+    means = {p.eye_model: p.means.get(("published", "analytic")) for p in parts}
+    told = {m: f"{v['H1']:.2f}/{v['H2']:.2f} deg" for m, v in means.items() if v and m.startswith("E5")}
+    if not {"E5", "E5-published", "E5-published-stop"} <= set(told):
+        return []
+    return [
+        "The paper reports errors above 11 deg for E5 and puts them down to its decentred and tilted surfaces. With "
+        f"the published protocol E5 as Table 3 states it gives {told['E5']} (H1/H2). Errors above 11 deg come out only "
+        "when the pupil's tilt (0.91, -1.64 deg) is used as its translation in mm, as the authors' software does: "
+        f"{told['E5-published']} with all of that software's E5 (E5-published), {told['E5-published-stop']} with Table "
+        "3's E5 and only the pupil misplaced (E5-published-stop); R, K and beta then end at their bounds."
+    ]
 
 
 def _points(part: BlignautPart, key: tuple[str, str]) -> tuple[Floats, Floats]:
@@ -246,6 +270,52 @@ def _calibration_table(parts: Sequence[GuestrinPart]) -> Table:
     return Table(header, rows)
 
 
+def _observers_section(apart: Apart) -> list[Section]:
+    features, gaze = apart
+    if not features:
+        return []
+    feature_rows = [
+        (
+            f.protocol, f.eye_model, f.feature, str(f.n), str(f.missing), _number(f.bias_x_px), _number(f.bias_y_px),
+            _number(f.sd_x_px), _number(f.sd_y_px), _number(f.median_distance_px), _number(f.bias_mm), _number(f.sd_mm),
+        )
+        for f in features
+    ]  # fmt: skip
+    gaze_rows = [
+        (
+            g.protocol, g.eye_model, g.estimator, str(g.n), _number(g.analytic_deg), _number(g.image_deg),
+            _number(g.difference_deg), f"{g.low_deg:.4f} to {g.high_deg:.4f}",
+        )
+        for g in gaze
+    ]  # fmt: skip
+    return [
+        Section(
+            "The two observers",
+            ("Image-derived minus analytic features of the same frames, and the gaze errors they lead to.",),
+            (),
+            [
+                Table(
+                    (
+                        "protocol", "eye model", "feature", "n", "missing", "bias x (px)", "bias y (px)", "SD x (px)",
+                        "SD y (px)", "median distance (px)", "bias (mm at the eye)", "SD (mm at the eye)",
+                    ),
+                    feature_rows,
+                    "Features",
+                ),
+                Table(
+                    (
+                        "protocol", "eye model", "estimator", "n", "analytic (deg)", "image (deg)", "difference (deg)",
+                        "95 % interval",
+                    ),
+                    gaze_rows,
+                    "Gaze errors: paired differences, image minus analytic",
+                    folded=len(gaze_rows) > 30,
+                ),
+            ],
+        )
+    ]  # fmt: skip
+
+
 def _findings_section(found: Sequence[Finding]) -> Section:
     rows = [
         (
@@ -268,7 +338,7 @@ def _waterfall_section(
     shown = [m for m in models if max(v or 0 for s in steps if s.eye_model == m for v in s.errors.values()) < 3]
     titles = {d.id: d.title for d in departures}
     names = ["published", *(d.id for d in departures)]
-    labels = ["published", *(f"- {titles[n]}" for n in names[1:])]
+    labels = ["published", *(f"{titles[n]} corrected" for n in names[1:])]
     by = {(s.eye_model, s.departure): s for s in steps}
     panels = {m: {e: [by[e, n].errors[m] for n in names] for e in shown} for m in measures}
     rows = [

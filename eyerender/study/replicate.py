@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..observation import Observations
+from ..rig.rig import Rig
 from ..scene import Scene
 from . import blignaut, guestrin
 from .clouds import Cloud
@@ -23,12 +24,17 @@ PROTOCOLS = {"guestrin2006": guestrin.PUBLISHED, "blignaut2014": blignaut.PUBLIS
 
 @dataclass(slots=True)
 class GuestrinPart:
-    """What one eye model gave: rows, calibrations with restarts, means and H1's errors by (protocol, observer)."""
+    """What one eye model gave: rows, calibrations with restarts; the others by (protocol, observer).
+
+    `seen` is the rig and what was observed, `errors` the errors (n,) by name of the estimator.
+    """
 
     eye_model: str
     rows: list[Row] = field(default_factory=list)
     calibrations: list[dict[str, Any]] = field(default_factory=list)
     means: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
+    seen: dict[tuple[str, str], tuple[Rig, Observations]] = field(default_factory=dict)
+    errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
     h1_errors: dict[tuple[str, str], Floats] = field(default_factory=dict)
     waterfall: list[WaterfallStep] = field(default_factory=list)
     misprints: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -36,12 +42,17 @@ class GuestrinPart:
 
 @dataclass(slots=True)
 class BlignautPart:
-    """What one eye model gave: rows, outcomes and feature clouds by (protocol, observer), the waterfall."""
+    """What one eye model gave: rows, outcomes and feature clouds by (protocol, observer), the waterfall.
+
+    `seen` is the rig and what was observed, `errors` the errors (f,) by name of the estimator.
+    """
 
     eye_model: str
     rows: list[Row] = field(default_factory=list)
     outcomes: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
     centred: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
+    seen: dict[tuple[str, str], tuple[Rig, Observations]] = field(default_factory=dict)
+    errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
     clouds: dict[tuple[str, str], Cloud] = field(default_factory=dict)
     waterfall: list[WaterfallStep] = field(default_factory=list)
 
@@ -83,7 +94,9 @@ def guestrin_part(
             done = guestrin.run(seen, scene.rig, departures, free_index=free)
             keys = {"protocol": protocol, "observer": observing.kind, "variant": variant, "eye_model": eye}
             out.rows += guestrin.rows_of(done, **keys)
+            out.errors.setdefault((protocol, observing.kind), {})[f"model-based, {variant}"] = done.error_deg
             if not free:
+                out.seen[protocol, observing.kind] = scene.rig, seen
                 means = {h: done.mean_deg(h) for h in guestrin.HEADS}
                 out.means[protocol, observing.kind] = {h: np.nan if m is None else m for h, m in means.items()}
                 out.h1_errors[protocol, observing.kind] = done.error_deg[done.rows("H1")]
@@ -109,6 +122,8 @@ def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> B
         key = protocol, observing.kind
         out.outcomes[key] = done
         out.clouds[key] = Cloud.of(seen)
+        out.seen[key] = scene.rig, seen
+        out.errors[key] = {f"{o.function} on {o.calibration}": o.error_deg for o in done if len(o.error_deg)}
         keys = {"protocol": protocol, "observer": observing.kind, "eye_model": eye}
         out.rows += blignaut.rows_of(done, variant="vector", **keys)
         if protocol == "corrected":

@@ -17,7 +17,7 @@ from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
 from ..imagefolder import refuse_non_empty, write_json
 from ..report.study import Page, write_page
-from . import blignaut, clouds, conditions_page, errata, findings, guestrin, pages
+from . import blignaut, clouds, conditions_page, errata, findings, guestrin, observers_compared, pages
 from .conditions import conditions_part
 from .literature import MODELS
 from .observing import ImageSettings, Observing
@@ -81,34 +81,39 @@ def run_study(
     if observer != "analytic":
         settings |= {"spp": spp, "sensor_noise": noise}
     folder = Path(folder)
-    _claim(folder, settings, overwrite)
-    start = time.monotonic()
-    if name == "conditions":
-        models = _collected(conditions_part, list(eyes), list(eyes), workers, progress)
-        rows = [row for part in models for row in part.rows]
-        found = conditions_page.findings(models)
-        more, page = conditions_page.more(models), conditions_page.page(models, found)
-    else:
-        protocols = ("published", "corrected") if protocol == "both" else (protocol,)
-        parts: list[Any] = []
-        if observer in ("analytic", "both"):
-            parts += _analytic(name, _models(name, eyes, protocols), workers, progress)
-        if observer in ("image", "both"):
-            images = ImageSettings(folder / "images", spp, noise, backend, threads, progress)
-            function = guestrin_part if name == "guestrin2006" else blignaut_part
-            parts += [function(eye, protocols, Observing("image", images)) for eye in eyes]
-        assemble = _guestrin if name == "guestrin2006" else _blignaut
-        rows, found, more, page = assemble(parts, protocols)
-    more = {"settings": settings, "seconds": round(time.monotonic() - start, 2), **more}
-    summary = write_results(folder, name, rows, found, more)
-    if "waterfall" in more:
-        write_text(folder / "waterfall.csv", _waterfall_csv(more["waterfall"]))
-    write_page(folder / REPORT, page)
-    return summary
+    with _claimed(folder, settings, overwrite):
+        start = time.monotonic()
+        if name == "conditions":
+            models = _collected(conditions_part, list(eyes), list(eyes), workers, progress)
+            rows = [row for part in models for row in part.rows]
+            found = conditions_page.findings(models)
+            more, page = conditions_page.more(models), conditions_page.page(models, found)
+        else:
+            protocols = ("published", "corrected") if protocol == "both" else (protocol,)
+            parts: list[Any] = []
+            if observer in ("analytic", "both"):
+                parts += _analytic(name, _models(name, eyes, protocols), workers, progress)
+            if observer in ("image", "both"):
+                images = ImageSettings(folder / "images", spp, noise, backend, threads, progress)
+                function = guestrin_part if name == "guestrin2006" else blignaut_part
+                parts += [function(eye, protocols, Observing("image", images)) for eye in eyes]
+            assemble = _guestrin if name == "guestrin2006" else _blignaut
+            rows, found, more, page = assemble(parts, protocols)
+        more = {"settings": settings, "seconds": round(time.monotonic() - start, 2), **more}
+        summary = write_results(folder, name, rows, found, more)
+        if "waterfall" in more:
+            write_text(folder / "waterfall.csv", _waterfall_csv(more["waterfall"]))
+        write_page(folder / REPORT, page)
+        return summary
 
 
-def _claim(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
-    """Mark a folder as this study's; raise `InputError` where it holds something else."""
+@contextmanager
+def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterator[None]:
+    """Mark a folder as this study's while it runs; one that fails before it wrote anything leaves nothing behind.
+
+    Raises:
+        InputError: the folder holds something else.
+    """
     try:
         found = json.loads((folder / MARKER).read_text(encoding="utf-8"))
         same = found.get("schema") == RUN_SCHEMA and found.get("settings", {}).get("study") == settings["study"]
@@ -116,11 +121,25 @@ def _claim(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
         same = False
     if not same:
         refuse_non_empty(folder, overwrite)
+    created = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise EyerenderError(f"{folder}: cannot be written ({error.strerror or error})") from None
-    write_json(folder / MARKER, {"schema": RUN_SCHEMA, "settings": settings})
+    done = False
+    try:
+        write_json(folder / MARKER, {"schema": RUN_SCHEMA, "settings": settings})
+        yield
+        done = True
+    finally:
+        if not done and not same:
+            for empty in (folder / "images",):
+                if empty.is_dir() and not any(empty.iterdir()):
+                    empty.rmdir()
+            if [p.name for p in folder.iterdir()] == [MARKER]:
+                (folder / MARKER).unlink()
+            if created and not any(folder.iterdir()):
+                folder.rmdir()
 
 
 def _models(name: str, eyes: Sequence[str], protocols: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
@@ -179,6 +198,7 @@ def _guestrin(
     misprints = {p.eye_model: p.misprints for p in parts if p.misprints}
     steps = [asdict(step) for part in parts for step in part.waterfall]
     faults = errata.guestrin(misprints)
+    apart = _observers_apart(parts)
     more = {
         "optimiser": guestrin.optimiser_settings(protocols),
         "calibrations": [c for part in parts for c in part.calibrations],
@@ -187,8 +207,9 @@ def _guestrin(
         "errata": [asdict(e) for e in faults],
         "misprints": misprints,
         "waterfall": steps,
+        **_as_mappings(apart),
     }
-    return rows, found, more, pages.guestrin_page(parts, found, tests, faults)
+    return rows, found, more, pages.guestrin_page(parts, found, tests, faults, apart)
 
 
 def _blignaut(
@@ -205,12 +226,41 @@ def _blignaut(
             centred = {m: p.centred[protocol, observer] for m, p in here.items()}
             found += findings.blignaut(centred, "corrected, centred vector", observer)
     faults = errata.blignaut()
+    apart = _observers_apart(parts)
     more = {
         "departures": [asdict(d) for d in blignaut.DEPARTURES],
         "errata": [asdict(e) for e in faults],
         "waterfall": [asdict(step) for part in parts for step in part.waterfall],
+        **_as_mappings(apart),
     }
-    return rows, found, more, pages.blignaut_page(parts, found, faults)
+    return rows, found, more, pages.blignaut_page(parts, found, faults, apart)
+
+
+def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart]) -> pages.Apart:
+    """How the observers differ on the frames that both have seen."""
+    features: list[observers_compared.FeatureDifference] = []
+    gaze: list[observers_compared.GazeDifference] = []
+    seen = {(p.eye_model, *key): (p, key) for p in parts for key in p.seen}
+    for (model, protocol, observer), (part, key) in seen.items():
+        other = seen.get((model, protocol, "image"))
+        if observer != "analytic" or other is None:
+            continue
+        rig, truth = part.seen[key]
+        found = other[0].seen[other[1]][1]
+        features += observers_compared.features(truth, found, rig, protocol, model)
+        mine, theirs = part.errors[key], other[0].errors[other[1]]
+        for name in mine:
+            if name in theirs:
+                difference = observers_compared.gaze(mine[name], theirs[name], protocol, model, name)
+                gaze += [difference] if difference else []
+    return features, gaze
+
+
+def _as_mappings(apart: pages.Apart) -> dict[str, Any]:
+    features, gaze = apart
+    if not features:
+        return {}
+    return {"observers": {"features": [f.to_mapping() for f in features], "gaze": [g.to_mapping() for g in gaze]}}
 
 
 def _waterfall_csv(steps: Sequence[dict[str, Any]]) -> str:

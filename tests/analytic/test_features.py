@@ -12,10 +12,11 @@ from eyerender.analytic.features import features, fixations
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeSpec
-from eyerender.eye.pose import Poses, Turning, into_eye
+from eyerender.eye.pose import Poses, Turning, into_eye, rigid_motion
 from eyerender.geometry.surfaces import components, join
 from eyerender.geometry.transforms import normalize, tilt_rotation
 from eyerender.optics.purkinje import purkinje_points
+from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import RayStatus, inward_path, trace
 from eyerender.rig.camera import Camera, distort
 
@@ -260,7 +261,7 @@ def test_the_iris_hides_images_of_the_lens_from_the_pupil_on_that_just_lets_them
         assert status(0.05)[:2] == [0, 0]
         eye = spec.build(eye=side, pupil_diameter_mm=4.0)
         turning = Turning.of(pose)
-        place = join(into_eye(turning, eye, components(-camera.R.T @ camera.t[None])))
+        place = join(into_eye(turning, eye, components(-(camera.t @ camera.R)[None])))
         lamp = join(into_eye(turning, eye, components(lights[:1])))
         depth = {3: len(eye.front) + 1, 4: len(eye.front) + len(eye.back)}[order]
         path = [
@@ -283,10 +284,29 @@ def test_the_iris_hides_images_of_the_lens_from_the_pupil_on_that_just_lets_them
                 reach.append(np.linalg.norm(across[1:] / eye.stop.semi_axes_mm))
         assert len(reach) == 2
         narrowest.append(4.0 * max(reach))
-        if order == 4 or name != "E5":
-            assert status(narrowest[-1] * 1.01)[2] == RayStatus.OK
-            assert status(narrowest[-1] * 0.99)[2] == RayStatus.BEHIND_IRIS
-    assert np.ptp(narrowest) > 0.3
+        assert status(narrowest[-1] * 1.0001)[2] == RayStatus.OK
+        assert status(narrowest[-1] * 0.9999)[2] == RayStatus.BEHIND_IRIS
+    assert np.ptp(narrowest) > 0.25  # not the same for every pose
+
+
+def test_a_pupil_with_a_measured_margin_is_seen_as_such():
+    """A margin with three lobes: boundary points are refracted images of its points, and no ellipse any more."""
+    cameras, lights = rig()
+    data = load_eye("E4").to_mapping()
+    data["stop"]["contour"] = {"cosines": [0.0, 0.0, 0.03], "sines": [0.01]}
+    lobed, plain = EyeSpec.from_mapping(data).build(), load_eye("E4").build()
+    pose = Poses.from_degrees(3.0, -20.0)
+    seen, before = (features([eye], [0], pose, np.zeros((1, 3)), cameras[:1], [0], lights) for eye in (lobed, plain))
+    place = join(into_eye(Turning.of(pose), lobed, components(-(cameras[0].t @ cameras[0].R)[None])))
+    angle = 2 * np.pi * np.arange(30) / 30
+    radius = 2.0 * (1.0 + 0.03 * np.cos(3 * angle) + 0.01 * np.sin(angle))
+    margin = np.column_stack([np.full(30, -3.6), radius * np.cos(angle), radius * np.sin(angle)])
+    exits = apparent_points(lobed.front, lobed.front_indices, margin, place).exit_points_mm
+    turn, shift = rigid_motion(pose, lobed)
+    assert np.abs(seen.points_px[0] - cameras[0].project(exits @ turn[0].T + shift[0])[0]).max() < 1e-8
+    # Lobes of 0.06 mm are 0.3 px or so at 6 px a mm; the plain pupil is nearly an ellipse.
+    assert seen.ellipse_residual_px[0] > 20 * before.ellipse_residual_px[0]
+    assert np.abs(seen.anatomical_centre_px - before.anatomical_centre_px).max() < 1e-9
 
 
 def test_what_cannot_be_seen_has_a_status_and_no_number():

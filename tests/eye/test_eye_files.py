@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from eyerender.errors import InputError
+from eyerender.eye.batch import stack_eyes, take_eyes
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeSpec
 
@@ -145,6 +147,66 @@ def test_an_elliptic_turned_and_shifted_pupil():
     assert np.degrees(np.arctan2(longest[2], longest[1])) % 180.0 == pytest.approx(30.0, abs=1e-9)
     assert stop.contains(stop.centre_mm + 0.999 * points).all()
     assert not stop.contains(stop.centre_mm + 1.001 * points).any()
+
+
+CONTOUR = {"cosines": [0.0, 0.02, -0.015], "sines": [0.01, 0.0, 0.03, 0.01]}
+
+
+def with_contour(**stop):
+    return changed("E2", "stop", {"diameter_mm": 4.0, "position_mm": [-3.6, 0.1, 0.0], "contour": CONTOUR} | stop)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_pupil_with_a_measured_margin(side):
+    """Its radius over the angle from nasal to up has the Fourier coefficients of the file, in either eye."""
+    spec = EyeSpec.from_mapping(with_contour())
+    assert EyeSpec.from_mapping(spec.to_mapping()) == spec
+    stop = spec.build(eye=side, pupil_diameter_mm=3.0).stop
+    y, z = (stop.boundary(64) - stop.centre_mm)[:, 1:].T
+    radius, angle = np.hypot(y, z), np.arctan2(z, y if side == "right" else -y)
+    waves = np.arange(1, 6)
+    cosine, sine = (2 / 64 * (radius / 1.5) @ f(waves * angle[:, None]) for f in (np.cos, np.sin))
+    assert np.mean(radius) == pytest.approx(1.5, rel=1e-13)
+    assert np.allclose(cosine, [0.0, 0.02, -0.015, 0.0, 0.0], atol=1e-13)
+    assert np.allclose(sine, [0.01, 0.0, 0.03, 0.01, 0.0], atol=1e-13)
+    points = stop.boundary(200) - stop.centre_mm
+    assert stop.contains(stop.centre_mm + 0.9999 * points).all()
+    assert not stop.contains(stop.centre_mm + 1.0001 * points).any()
+    # On an ellipse: the same factor on its points.
+    flat = {"ellipticity": 0.2, "axis_deg": 30.0}
+    bent, plain = (EyeSpec.from_mapping(d).build(eye=side).stop for d in (with_contour(**flat), with_contour(**flat)))
+    plain = replace(plain, contour=np.zeros((2, 0)))
+    factor = np.linalg.norm(bent.boundary(16) - bent.centre_mm, axis=1)
+    factor /= np.linalg.norm(plain.boundary(16) - plain.centre_mm, axis=1)
+    assert np.allclose(factor, bent.relative_radius(2 * np.pi * np.arange(16) / 16), rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("stop", "path"),
+    [
+        ({"contour": {"cosines": [1.2]}}, "stop.contour"),
+        ({"contour": {"radii": [1.0]}}, "stop.contour.radii"),
+        ({"contour": {"sines": [float("nan")]}}, "stop.contour.sines.0"),
+        ({"diameter_mm": 10.7}, "stop.diameter_mm"),  # 10.8 mm wide is the iris; the margin reaches 4 % beyond 10.7
+    ],
+)
+def test_a_margin_that_cannot_be_is_refused(stop, path):
+    with pytest.raises(InputError) as caught:
+        EyeSpec.from_mapping(with_contour(**stop)).build()
+    assert caught.value.path == path
+
+
+def test_stacked_stops_keep_their_margins():
+    specs = [with_contour(), changed("E2", "stop.diameter_mm", 3.0), with_contour(contour={"cosines": [0.0, 0.05]})]
+    eyes = [EyeSpec.from_mapping(d).build(eye="left") for d in specs]
+    stacked = stack_eyes(eyes).stop
+    margins = np.stack([eye.stop.boundary(24) for eye in eyes])
+    assert np.allclose(stacked.boundary(24), margins, atol=1e-15)
+    rng = np.random.default_rng(0)
+    points = stacked.centre_mm[:, None] + rng.uniform(0.9, 1.1, (3, 24, 1)) * (margins - stacked.centre_mm[:, None])
+    assert np.array_equal(stacked.contains(points), [e.stop.contains(p) for e, p in zip(eyes, points, strict=True)])
+    taken = take_eyes(stack_eyes(eyes), np.array([2, 0])).stop
+    assert np.allclose(taken.boundary(24), margins[[2, 0]], atol=1e-15)
 
 
 def test_the_json_schema_names_every_key():

@@ -13,7 +13,7 @@ RINGS_MM = ((2.1, 3.1), (3.1, 4.1), (4.1, 5.1))
 HARMONICS = 12
 
 
-def flux_on_rings(eye: Eye, lamp_mm: np.ndarray, intensity: float, rays: int = 1500) -> np.ndarray:
+def flux_on_rings(eye: Eye, lamp_mm: np.ndarray, intensity: float, rays: int = 800) -> np.ndarray:
     """Mean irradiance (mW/mm^2) of rings of the iris by forward tracing in float64: light leaves an isotropic point in
     even steps of solid angle about the eye, is refracted at every surface by Snell's law, and is counted per ring."""
     axis = -lamp_mm / np.linalg.norm(lamp_mm)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+
 import numpy as np
 import pytest
+import trimesh
 from render_rigs import eye_of, job_of, remote_rig
 
-from eyerender.rendering.export import export_scene
+from eyerender.rendering.export import bake_meshes, export_scene
 from eyerender.rendering.meshes import crossing, eye_meshes
 
 EYES = ["E1", "E2", "E3", "E4", "E5", "E5-published"]
@@ -82,3 +86,16 @@ def test_stock_mitsuba_loads_the_export_and_sees_the_same_depths(renderer, tmp_p
     assert np.quantile(np.abs(error), 0.98) < 0.05
     assert abs(np.median(error)) < 5e-3
     assert {s.id() for s in scene.shapes()} >= {"cornea_front", "iris", "sclera", "backdrop", "lamp0"}
+
+
+def test_baked_meshes_match_their_manifest(tmp_path):
+    eye = eye_of("E4")
+    manifest = json.loads(bake_meshes(eye, tmp_path, rings=6, sectors=24).read_text())
+    assert {p.name for p in tmp_path.glob("*.ply")} == set(manifest["files"])
+    for name, entry in manifest["files"].items():
+        assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() == entry["sha256"]
+    front = trimesh.load(tmp_path / "cornea_front.ply", process=False)
+    assert len(front.vertices) == manifest["files"]["cornea_front.ply"]["vertices"]
+    assert np.max(np.abs(eye.front[0].implicit(front.vertices))) < 2e-5  # PLY holds single precision
+    again = json.loads(bake_meshes(eye, tmp_path / "again", rings=6, sectors=24).read_text())
+    assert again == manifest

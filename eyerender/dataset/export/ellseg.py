@@ -1,0 +1,77 @@
+"""EllSeg: one HDF5 archive a split in All/, its key as a MATLAB file in MasterKey/.
+
+Archive: Images, Masks, Masks_noSkin (n, h, w); pupil_loc (n, 2); Fits/pupil, Fits/iris (n, 5) = x, y, a, b, angle
+(rad); Info; -1 where there is none. Kothari et al. (2021), "EllSeg: An Ellipse Segmentation Framework".
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import savemat
+
+from ...errors import InputError
+from .item import Item, Items
+
+
+def write(items: Items, out: Path) -> None:
+    """Archives and keys of every split."""
+    try:
+        h5py: Any = import_module("h5py")
+    except ImportError:
+        raise InputError("needs h5py; run: pip install h5py", source="--format ellseg") from None
+    sizes = {entry.window[2:] for entry in items.folder.entries}
+    if len(sizes) > 1:
+        raise InputError("needs images of one size", source="--format ellseg")
+    (w, h) = sizes.pop()
+    (out / "All").mkdir()
+    (out / "MasterKey").mkdir()
+    counts = {split: sum(e.line["split"] == split for e in items.folder.entries) for split in items.splits}
+    archives: dict[str, Any] = {}
+    places: dict[str, list[NDArray[np.float64]]] = {split: [] for split in items.splits}
+    infos: dict[str, list[str]] = {split: [] for split in items.splits}
+    try:
+        for split, n in counts.items():
+            file = archives[split] = h5py.File(out / "All" / f"{items.name}_{split}.h5", "w")
+            for name in ("Images", "Masks", "Masks_noSkin"):
+                file.create_dataset(name, (n, h, w), dtype="u1" if name == "Images" else "i1", chunks=(1, h, w))
+            file.create_dataset("pupil_loc", (n, 2), dtype="f8")
+            for name in ("pupil", "iris"):
+                file.create_dataset(f"Fits/{name}", (n, 5), dtype="f8")
+        for item in items:
+            file, k = archives[item.split], len(infos[item.split])
+            file["Images"][k], file["Masks"][k], file["Masks_noSkin"][k] = item.image8, item.mask, item.amodal
+            fits = {name: fit_of(item, name) for name in ("pupil", "iris")}
+            for name, fit in fits.items():
+                file[f"Fits/{name}"][k] = fit
+            file["pupil_loc"][k] = fits["pupil"][:2]
+            places[item.split].append(fits["pupil"][:2])
+            infos[item.split].append(item.line["file_name"])
+        for split, file in archives.items():
+            file.create_dataset("Info", data=np.array(infos[split], dtype="S"))
+    finally:
+        for file in archives.values():
+            file.close()
+    for split, n in counts.items():
+        archive = f"{items.name}_{split}"
+        key = {
+            "dataset": items.name,
+            "subset": split,
+            "archive": np.array([archive] * n),
+            "resolution": np.tile([h, w], (n, 1)),
+            "pupil_loc": np.stack(places[split]),
+            "Info": np.array(infos[split]),
+        }
+        savemat(out / "MasterKey" / f"{archive}.mat", key)
+
+
+def fit_of(item: Item, part: str) -> NDArray[np.float64]:
+    """x, y, a, b, angle of the amodal outline, or -1 five times."""
+    ellipse = item.ellipse(part)
+    if ellipse is None:
+        return np.full(5, -1.0)
+    return np.array([*ellipse.centre_px, *ellipse.semi_axes_px, ellipse.angle_rad])

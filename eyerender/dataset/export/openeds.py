@@ -1,0 +1,30 @@
+"""OpenEDS (semantic segmentation, 2019): SPLIT/images/000000.png (8 bits) and SPLIT/labels/000000.npy.
+
+Labels are uint8: 0 background, 1 sclera, 2 iris, 3 pupil. Garbin et al. (2019), "OpenEDS: Open Eye Dataset".
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...imagefile import write_png
+from .item import Items
+
+
+def write(items: Items, out: Path) -> None:
+    """Images and labels of every split; files.csv says which image became which."""
+    counts: dict[str, int] = {}
+    for split in items.splits:
+        (out / split / "images").mkdir(parents=True)
+        (out / split / "labels").mkdir()
+    with open(out / "files.csv", "w", encoding="utf-8") as table:
+        table.write("file,from,subject\n")
+        for item in items:
+            # Names of digits only: readers strip letters of '.png' off both ends of a name.
+            name = f"{counts.get(item.split, 0):06d}"
+            counts[item.split] = counts.get(item.split, 0) + 1
+            write_png(out / item.split / "images" / f"{name}.png", item.image8)
+            np.save(out / item.split / "labels" / f"{name}.npy", item.mask)
+            table.write(f"{item.split}/images/{name}.png,{item.line['file_name']},{item.line['subject']}\n")

@@ -1,0 +1,70 @@
+"""CSV: labels.csv with one row an image, beside copies of the images and masks."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from pathlib import Path
+from typing import Any
+
+from ...geometry.ellipse import Ellipse
+from .item import Item, Items
+
+_ELLIPSE = ("x_px", "y_px", "a_px", "b_px", "angle_rad")
+
+
+def write(items: Items, out: Path) -> None:
+    """images/, masks/ and labels.csv; a place that does not exist is an empty field."""
+    (out / "images").mkdir()
+    (out / "masks").mkdir()
+    lights = max(len(entry.line["labels"]["glints"]) for entry in items.folder.entries)
+    writer = None
+    with open(out / "labels.csv", "w", newline="", encoding="utf-8") as file:
+        for item in items:
+            shutil.copyfile(item.entry.path, out / "images" / item.entry.path.name)
+            if item.entry.mask_path is not None:
+                shutil.copyfile(item.entry.mask_path, out / "masks" / item.entry.mask_path.name)
+            row = row_of(item, lights)
+            if writer is None:
+                writer = csv.DictWriter(file, list(row))
+                writer.writeheader()
+            writer.writerow(row)
+
+
+def row_of(item: Item, lights: int) -> dict[str, Any]:
+    """The flat labels of an image."""
+    line = item.line
+    record, labels = line["records"][0], line["labels"]
+    x0, y0 = item.entry.window[:2]
+    row: dict[str, Any] = {
+        "file_name": f"images/{item.name}.png",
+        "mask_file_name": f"masks/{item.name}.png",
+        **{key: line[key] for key in ("sample", "subject", "split", "sequence_index", "bit_depth")},
+        "eye": record["eye"],
+        "eye_model": record["eye_model"],
+        "window_x0_px": x0,
+        "window_y0_px": y0,
+    }
+    for part in ("pupil", "iris"):
+        for kind in ("amodal", "visible"):
+            values = _flat(item.ellipse(part, kind))
+            row |= {f"{part}_{kind}_{key}": value for key, value in zip(_ELLIPSE, values, strict=True)}
+        row[f"{part}_visible_fraction"] = labels[part]["visible_fraction"]
+    spots = {light: (x, y, int(visible)) for light, x, y, visible in item.glints()}
+    for k in range(lights):
+        x, y, visible = spots.get(k, (None, None, 0))
+        row |= {f"glint{k}_x_px": x, f"glint{k}_y_px": y, f"glint{k}_visible": visible}
+    for name in ("azimuth_deg", "elevation_deg", "torsion_deg"):
+        row[name] = record["pose"][name]
+    for frame in ("world", "camera"):
+        for name, value in labels["space"][frame].items():
+            for axis, number in zip("xyz", value or [None] * 3, strict=True):
+                row[f"{frame}_{name}_{axis}"] = number
+    row["pupil_diameter_mm"] = line["parameters"]["pupil_diameter_mm"]
+    return row
+
+
+def _flat(ellipse: Ellipse | None) -> list[float | None]:
+    if ellipse is None:
+        return [None] * 5
+    return [*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad]

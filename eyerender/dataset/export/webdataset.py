@@ -1,0 +1,43 @@
+"""WebDataset: tar files of at most 1000 images a split; NAME.png, NAME.mask.png and NAME.json make a sample."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from pathlib import Path
+
+from .item import Items
+
+SAMPLES = 1000
+
+
+def write(items: Items, out: Path) -> None:
+    """SPLIT-000000.tar and so on; the image's own PNG (16 bits stay 16 bits)."""
+    counts: dict[str, int] = {}
+    tars: dict[str, tarfile.TarFile] = {}
+    try:
+        for item in items:
+            split, k = item.split, counts.get(item.split, 0)
+            if k % SAMPLES == 0:
+                if split in tars:
+                    tars[split].close()
+                tars[split] = _open(out / f"{split}-{k // SAMPLES:06d}.tar")
+            counts[split] = k + 1
+            _add(tars[split], f"{item.name}.png", item.entry.path.read_bytes())
+            if item.entry.mask_path is not None:
+                _add(tars[split], f"{item.name}.mask.png", item.entry.mask_path.read_bytes())
+            _add(tars[split], f"{item.name}.json", json.dumps(item.line).encode())
+    finally:
+        for tar in tars.values():
+            tar.close()
+
+
+def _open(path: Path) -> tarfile.TarFile:
+    return tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)
+
+
+def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
+    member = tarfile.TarInfo(name)  # no times or owners: the same dataset gives the same bytes
+    member.size = len(data)
+    tar.addfile(member, io.BytesIO(data))

@@ -1,0 +1,146 @@
+"""The whole region as one triangle mesh with one map, posed with the globe; its topology never changes.
+
+Vertices in the region's frame of a right eye are mirrored for a left one, whose faces then run the other way round.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import trimesh
+
+from ..arrays import ArrayValue, Floats, Ints, frozen
+from .anatomy import RegionSpec
+from .brow import brow
+from .contour import COLUMNS
+from .globe import Globe
+from .hairs import SEGMENTS, Hairs, tube_faces
+from .lashes import lashes
+from .lids import ROWS, Sheet, grid_normals, sheet
+from .skin import BROW, LASH, TEAR, band_row, sheet_v
+from .tears import ROWS as TEAR_ROWS
+from .tears import meniscus
+
+PARTS = ("skin", "tears", "lashes", "brow")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegionLayout(ArrayValue):
+    """What never moves: `faces` (m, 3), `uv` (n, 2), and where each part's vertices and faces start and end."""
+
+    faces: Ints
+    uv: Floats
+    vertex_ends: Ints
+    face_ends: Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegionMesh(ArrayValue):
+    """A posed region: `vertices`, unit `normals` (n, 3) in the scene's frame (mm), and its layout.
+
+    `upper_margin`, `lower_margin` (k, 3): landmarks along the lids' inner edges from the temple to the nose.
+    """
+
+    vertices: Floats
+    normals: Floats
+    layout: RegionLayout
+    upper_margin: Floats
+    lower_margin: Floats
+
+    def part(self, name: str) -> trimesh.Trimesh:
+        """One part as a trimesh: skin, tears, lashes or brow."""
+        i = PARTS.index(name)
+        v0, f0 = (0, 0) if i == 0 else (int(self.layout.vertex_ends[i - 1]), int(self.layout.face_ends[i - 1]))
+        v1, f1 = int(self.layout.vertex_ends[i]), int(self.layout.face_ends[i])
+        return trimesh.Trimesh(self.vertices[v0:v1], self.layout.faces[f0:f1] - v0, process=False)
+
+
+def region_mesh(spec: RegionSpec, globe: Globe) -> RegionMesh:
+    """The region of a subject around a posed globe."""
+    s = sheet(spec, globe)
+    tears = meniscus(spec, globe, s)
+    lash, hair = lashes(spec, globe, s), brow(spec)
+    vertices = np.concatenate(
+        [_closed(s.vertices), _closed(tears), lash.tubes(), _brow_tubes(spec)]
+    )
+    normals = np.concatenate(
+        [_closed(s.normals), _closed(grid_normals(tears)), _round(lash, lash.tubes()), _brow_normals(spec)]
+    )
+    upper, lower = _margins(s)
+    if globe.mirrored:
+        vertices, normals, upper, lower = (v * np.array([1.0, -1.0, 1.0]) for v in (vertices, normals, upper, lower))
+    layout = _layout(len(lash.points), len(hair.points), globe.mirrored)
+    return RegionMesh(frozen(vertices), frozen(normals), layout, frozen(upper), frozen(lower))
+
+
+def _closed(grid: Floats) -> Floats:
+    """A grid with its first column again at the end (where the map's u is 1), flat."""
+    return np.concatenate([grid, grid[:, :1]], axis=1).reshape(-1, 3)
+
+
+@lru_cache(maxsize=16)
+def _brow_tubes(spec: RegionSpec) -> Floats:
+    return frozen(brow(spec).tubes())
+
+
+@lru_cache(maxsize=16)
+def _brow_normals(spec: RegionSpec) -> Floats:
+    return frozen(_round(brow(spec), _brow_tubes(spec)))
+
+
+def _round(hairs: Hairs, tubes: Floats) -> Floats:
+    """Normals of tubes, away from their curves."""
+    if len(tubes) == 0:
+        return np.zeros((0, 3))
+    away = tubes - np.repeat(hairs.points.reshape(-1, 3), 3, axis=0)
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-12))
+
+
+def _margins(s: Sheet) -> tuple[Floats, Floats]:
+    point = s.contour.point
+    half = COLUMNS // 2
+    return point[: half + 1][::-1], np.concatenate([point[half:], point[:1]])
+
+
+@lru_cache(maxsize=16)
+def _layout(lash_count: int, brow_count: int, mirrored: bool) -> RegionLayout:
+    parts = [
+        (_grid_faces(ROWS), _grid_uv(ROWS, None)),
+        (_grid_faces(TEAR_ROWS), _grid_uv(TEAR_ROWS, band_row(TEAR))),
+        (tube_faces(lash_count, SEGMENTS + 1), _hair_uv(lash_count, SEGMENTS + 1, band_row(LASH))),
+        (tube_faces(brow_count, 5), _hair_uv(brow_count, 5, band_row(BROW))),
+    ]
+    faces, uv, start = [], [], 0
+    for f, t in parts:
+        faces.append(f + start)
+        uv.append(t)
+        start += len(t)
+    joined = np.concatenate(faces)
+    if mirrored:
+        joined = joined[:, ::-1]
+    return RegionLayout(
+        frozen(joined, np.int64),
+        frozen(np.concatenate(uv)),
+        frozen(np.cumsum([len(t) for t in uv]), np.int64),
+        frozen(np.cumsum([len(f) for f in faces]), np.int64),
+    )
+
+
+def _grid_faces(rows: int) -> Ints:
+    n = COLUMNS + 1
+    i, j = np.meshgrid(np.arange(rows - 1), np.arange(COLUMNS), indexing="ij")
+    a, b, c, d = i * n + j, i * n + j + 1, (i + 1) * n + j, (i + 1) * n + j + 1
+    both = [np.stack([a, c, d], -1).reshape(-1, 3), np.stack([a, d, b], -1).reshape(-1, 3)]
+    return np.concatenate(both).astype(np.int64)
+
+
+def _grid_uv(rows: int, v: float | None) -> Floats:
+    u = np.arange(COLUMNS + 1) / COLUMNS
+    down = sheet_v(np.linspace(0, 1, rows)) if v is None else np.full(rows, v)
+    return np.stack(np.meshgrid(u, down), axis=-1).reshape(-1, 2)
+
+
+def _hair_uv(count: int, points: int, v: float) -> Floats:
+    return np.tile([0.5, v], (count * points * 3, 1)).reshape(-1, 2)

@@ -1,0 +1,204 @@
+"""What a camera ray meets: the exact surfaces of the eye, or the scene; and the albedo there.
+
+A ray meets the eye in closed form (the exact surfaces, not a mesh of them) and everything else by Embree or OptiX; the
+nearer counts. Through the clear cornea it goes on to the plane of the iris.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..region.texture import iris_texture, sclera_texture
+from .surfaces import fresnel
+from .values import Values
+
+EPSILON_MM = 2e-3  # lengths below are one and the same point in single precision
+_NEAR_MM = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What a camera ray meets, points and normals in the eye frame."""
+
+    cornea: Any  # it enters through the clear part of the cornea
+    sclera: Any
+    other: Any  # anything of the scene that is not the eye
+    distance: Any
+    point: Any  # on the first surface
+    normal: Any
+    opacity: Any  # of the tissue at the first surface: 0 clear cornea, 1 sclera
+    mirrored: Any  # reflectance of the front cornea
+    passed: Any  # transmittance of the refracted branch, 0 where it does not reach the plane of the iris
+    inner: Any  # point in the plane of the iris
+    pupil: Any  # the inner point lies in the pupil
+    interaction: Any  # with the scene
+    amodal_cornea: Any  # as if the eye stood alone
+    amodal_sclera: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Textures:
+    """Relative albedos with mean 1: the iris over (angle, pupil to root), the sclera over its front, the surround."""
+
+    iris: Any
+    sclera: Any
+
+    @classmethod
+    def of_seed(cls, seed: int) -> Textures:
+        """The textures of one eye."""
+        rows = iris_texture(seed)
+        # Repeated, so that the angle wraps; the ends along the radius are kept apart by rows of their own.
+        rows = np.concatenate([rows[:1], rows, rows[-1:]])
+        texture: Any = mi.Texture2f
+        iris = texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
+        sclera = texture(mi.TensorXf(sclera_texture(seed)[..., None]), use_accel=False)
+        return cls(iris, sclera)
+
+
+def opacity(values: Values, rho: Any) -> Any:
+    """How much of the cornea's rim has turned to sclera at radius `rho` (mm): a smooth step that ends at the limbus."""
+    s = dr.clip((rho - values["limbus_radius"]) * values["limbus_gain"] + 1, 0, 1)
+    return s * s * (3 - 2 * s)
+
+
+def look(values: Values, scene: Any, o: Any, d: Any, active: Any) -> View:
+    """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris."""
+    hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True, active=active)
+    # Single precision: start next to the eye.
+    t0 = -dr.dot(o, d) - _NEAR_MM
+    oe, de = values.point_to_eye(o + t0 * d), values.vector_to_eye(d)
+    front = values.surfaces[0]
+    ol, dl = front.point_in(oe), front.vector_in(de)
+    tc, on_cornea = front.hit(ol, dl)
+    yl = ol + tc * dl
+    rho = dr.sqrt(yl.y * yl.y + yl.z * yl.z)
+    on_cornea &= (rho < values["limbus_radius"]) & (yl.x > values["limbus_floor"])
+    ts, on_sclera = meet_sphere(oe - values["sclera.centre"], de, values["sclera.radius"])
+    # The sphere's front lies behind the cornea, so a ray that meets it first has met no clear cornea: no cracks, even
+    # where the rim of a tilted or toric cornea is no circle of the sphere.
+    on_cornea &= ~on_sclera | (tc < ts)
+    on_sclera &= ~on_cornea
+    t_eye = t0 + dr.select(on_cornea, tc, ts)
+    amodal_cornea, amodal_sclera = on_cornea & (t_eye > EPSILON_MM), on_sclera & (t_eye > EPSILON_MM)
+    on_eye = (amodal_cornea | amodal_sclera) & ~(hit.is_valid() & (hit.t < t_eye)) & active
+    on_cornea &= on_eye
+    on_sclera &= on_eye
+    other = hit.is_valid() & ~on_eye & active
+    interaction = hit.compute_surface_interaction(
+        mi.Ray3f(mi.Point3f(o), d), mi.RayFlags.Minimal | mi.RayFlags.UV, other
+    )
+
+    normal, mirrored, passed, inner, pupil = dr.if_stmt(
+        (yl, oe + tc * de, dl),
+        amodal_cornea,
+        lambda yl, y, dl: _refracted(values, yl, y, dl),
+        lambda yl, y, dl: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Bool(False)),
+    )
+    y = oe + tc * de
+    xs = oe + ts * de
+    xo, no = values.point_to_eye(interaction.p), values.vector_to_eye(interaction.n)
+    no = dr.select(dr.dot(no, de) > 0, -no, no)
+    point = dr.select(on_cornea, y, dr.select(on_sclera, xs, xo))
+    normal = dr.select(on_cornea, normal, dr.select(on_sclera, xs - values["sclera.centre"], no))
+    return View(
+        on_cornea,
+        on_sclera,
+        other,
+        dr.select(on_eye, t_eye, hit.t),
+        point,
+        dr.normalize(normal),
+        dr.select(amodal_cornea, opacity(values, rho), 1),
+        mirrored,
+        passed,
+        inner,
+        pupil,
+        interaction,
+        amodal_cornea,
+        amodal_sclera,
+    )
+
+
+def _refracted(values: Values, yl: Any, y: Any, dl: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """From the front cornea to the plane of the iris: normal, reflectance, transmittance, point, whether in the pupil.
+
+    yl, dl: hit point and direction in the front surface's frame; y: the point in the eye frame.
+    """
+    front = values.surfaces[0]
+    N = front.normal(yl)
+    c = -dr.dot(N, dl)
+    c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
+    mirrored = fresnel(c, c2, front.eta)
+    passed = 1 - mirrored
+    w = front.vector_out(front.eta * dl + (front.eta * c - c2) * N)
+    inside = mi.Vector3f(y)
+    reached = mi.Bool(True)
+    for surface in values.surfaces[1:]:
+        inside, w, share, ok = surface.refract(inside, w)
+        passed *= share
+        reached &= ok
+    n = values["stop.normal"]
+    s = dr.dot(values["stop.centre"] - inside, n) / dr.dot(w, n)
+    inner = inside + s * w
+    reached &= s > 0
+    q = inner - values["stop.centre"]
+    a, b = values["stop.axes"]
+    pu, pv = dr.dot(q, values["stop.u"]) / a, dr.dot(q, values["stop.v"]) / b
+    pupil = reached & (pu * pu + pv * pv < 1)
+    return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, pupil
+
+
+def meet_sphere(o: Any, d: Any, radius: Any) -> tuple[Any, Any]:
+    """Distance to the near side of a sphere about the origin, and whether it is met from outside."""
+    b, c = dr.dot(o, d), dr.squared_norm(o) - radius * radius
+    disc = b * b - c
+    q = dr.sqrt(dr.maximum(disc, 0)) - b
+    return c / q, (disc > 0) & (q > 0) & (c > 0)
+
+
+def iris_albedo(values: Values, textures: Textures, x: Any) -> Any:
+    """Albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
+    q = x - values["stop.centre"]
+    a, b = values["stop.axes"]
+    pu, pv = dr.dot(q, values["stop.u"]) / a, dr.dot(q, values["stop.v"]) / b
+    beyond = (dr.sqrt(pu * pu + pv * pv) - 1) * dr.sqrt(a * b)
+    rho = dr.sqrt(x.y * x.y + x.z * x.z)
+    left = values["iris_root"] - rho
+    s = dr.clip(beyond / dr.maximum(beyond + dr.maximum(left, 0), 1e-4), 0, 1)
+    angle = dr.atan2(pv, pu) / (2 * dr.pi)
+    rows = textures.iris.shape[0]
+    texture = textures.iris.eval(mi.Point2f(angle, (1 + s * (rows - 2)) / rows))[0]
+    albedo = values["iris.albedo"] * dr.maximum(1 + values["iris.contrast"] * (texture - 1), 0.02)
+    return dr.select(left > 0, albedo, values["limbus.albedo"])
+
+
+def outer_albedo(values: Values, textures: Textures, view: View, active: Any) -> Any:
+    """Albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
+    si = view.interaction
+    other = si.bsdf().eval_diffuse_reflectance(si, active & view.other)[0]
+    return dr.if_stmt(
+        (view.point, other),
+        view.other,
+        lambda point, other: other,
+        lambda point, other: _sclera_albedo(values, textures, point),
+    )
+
+
+def _sclera_albedo(values: Values, textures: Textures, point: Any) -> Any:
+    r = point - values["sclera.centre"]
+    # Azimuthal equidistant map of the front of the globe, from the pole out to 108 degrees.
+    polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / (0.6 * dr.pi)
+    inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
+    uv = mi.Point2f(0.5 + 0.5 * polar * r.y * inv, 0.5 + 0.5 * polar * r.z * inv)
+    texture = textures.sclera.eval(uv)[0]
+    sclera = values["sclera.albedo"] * dr.maximum(1 + values["sclera.contrast"] * (texture - 1), 0.02)
+    # The limbus' grey ring fades into the white over its width, on the side of the sclera.
+    local = values.surfaces[0].point_in(point)
+    away = dr.sqrt(local.y * local.y + local.z * local.z) - values["limbus_radius"]
+    s = dr.clip(0.5 + 0.5 * away * values["limbus_gain"], 0, 1)
+    s = s * s * (3 - 2 * s)
+    return values["limbus.albedo"] + s * (sclera - values["limbus.albedo"])

@@ -1,0 +1,123 @@
+"""The two observers on a study's own frames: errors of image-derived features, and what they do to the gaze error.
+
+bias = mean(image - analytic),  spread = SD;      in mm at the eye: px times distance over focal length
+paired difference = mean(error from images - error from rays) with its 95 % confidence interval (Student's t)
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import t as student
+
+from ..arrays import Floats
+from ..comparison import feature_errors
+from ..observation import Observations
+from ..rig.rig import Rig
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureDifference:
+    """Image-derived minus analytic of one kind of feature, in x and y px, and in mm at the eye."""
+
+    protocol: str
+    eye_model: str
+    feature: str
+    n: int
+    missing: int
+    bias_x_px: float | None
+    bias_y_px: float | None
+    sd_x_px: float | None
+    sd_y_px: float | None
+    median_distance_px: float | None
+    bias_mm: float | None
+    sd_mm: float | None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
+class GazeDifference:
+    """Paired difference of gaze errors (deg), image minus analytic, by estimator."""
+
+    protocol: str
+    eye_model: str
+    estimator: str
+    n: int
+    analytic_deg: float
+    image_deg: float
+    difference_deg: float
+    low_deg: float
+    high_deg: float
+
+    def to_mapping(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def features(
+    truth: Observations, found: Observations, rig: Rig, protocol: str, eye_model: str
+) -> list[FeatureDifference]:
+    """Differences of the pupil's centre, its semi-axes (where both have them) and each light's glint."""
+    errors = feature_errors(truth, found)
+    index = truth.index
+    place = index.eye_position_mm + index.head_mm
+    mm_per_px = np.array(
+        [1.0 / rig.cameras[max(int(c), 0)].scale_at(p) for c, p in zip(index.camera, place, strict=True)]
+    )
+    # What is not in the image of the study's camera was seen by the same camera, turned: it counts all the same.
+    moved = ~truth.pupil.in_image
+    centre = np.where(moved[:, None], found.pupil.centre_px - truth.pupil.centre_px, errors.centre_px)
+    out = [_difference(protocol, eye_model, "pupil centre", centre, mm_per_px)]
+    if np.isfinite(errors.semi_axes_px).any():
+        out.append(_difference(protocol, eye_model, "pupil semi-axes (a, b)", errors.semi_axes_px, mm_per_px))
+    for light in range(len(rig.lights)):
+        (a, seen), (b, got) = found.glints.of_light(light), truth.glints.of_light(light)
+        vectors = np.where((seen & got)[:, None], a - b, np.nan)
+        out.append(_difference(protocol, eye_model, f"glint of light {light}", vectors, mm_per_px))
+    return out
+
+
+def gaze(
+    analytic_deg: Floats, image_deg: Floats, protocol: str, eye_model: str, estimator: str
+) -> GazeDifference | None:
+    """The paired difference over the frames that both observers have an estimate of; None for fewer than two."""
+    both = np.isfinite(analytic_deg) & np.isfinite(image_deg)
+    n = int(both.sum())
+    if n < 2:
+        return None
+    d = image_deg[both] - analytic_deg[both]
+    half = float(student.ppf(0.975, n - 1) * d.std(ddof=1) / np.sqrt(n))
+    mean = float(d.mean())
+    return GazeDifference(
+        protocol, eye_model, estimator, n, float(analytic_deg[both].mean()), float(image_deg[both].mean()),
+        mean, mean - half, mean + half,
+    )  # fmt: skip
+
+
+def _difference(protocol: str, eye_model: str, feature: str, vectors: Floats, mm_per_px: Floats) -> FeatureDifference:
+    good = np.isfinite(vectors).all(axis=1)
+    v = vectors[good]
+    n = len(v)
+    if n < 2:
+        nothing = (None,) * 7
+        return FeatureDifference(protocol, eye_model, feature, n, int((~good).sum()), *nothing)
+    at_eye = v * mm_per_px[good, None]
+    return FeatureDifference(
+        protocol,
+        eye_model,
+        feature,
+        n,
+        int((~good).sum()),
+        float(v[:, 0].mean()),
+        float(v[:, 1].mean()),
+        float(v[:, 0].std(ddof=1)),
+        float(v[:, 1].std(ddof=1)),
+        float(np.median(np.linalg.norm(v, axis=1))),
+        float(np.linalg.norm(at_eye.mean(axis=0))),
+        float(np.sqrt(at_eye.var(axis=0, ddof=1).sum())),
+    )

@@ -1,0 +1,25 @@
+"""One small dataset for the session, made by one worker."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from dataset_specs import make, plan
+
+from eyerender.errors import BackendError
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory):
+    """The folder of the tiny spec."""
+    folder = tmp_path_factory.mktemp("dataset") / "tiny"
+    try:
+        make(folder, plan())
+    except BackendError as error:
+        pytest.skip(f"nothing to render with: {error}")
+    return folder

@@ -1,0 +1,164 @@
+"""Samples as pure functions of (spec, i); subjects, splits, and the rule of drawing again."""
+
+from __future__ import annotations
+
+import pickle
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import yaml
+from dataset_specs import plan
+
+from eyerender.dataset.plan import Plan
+from eyerender.dataset.realise import frames_of, realise
+from eyerender.dataset.spec import DatasetSpec, shipped_datasets
+from eyerender.errors import InputError
+from eyerender.eye.catalogue import load_eye
+from eyerender.scene import SceneSpec
+
+
+def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
+    assert sorted(shipped_datasets()) == ["dataset_quick"]
+    for name, path in shipped_datasets().items():
+        spec = DatasetSpec.load(path)
+        spec.dump(tmp_path / "copy.yaml")
+        assert DatasetSpec.load(tmp_path / "copy.yaml") == spec
+        made = Plan.load(name)
+        assert spec.shard_count >= 8
+        assert realise(made, spec.count - 1, frames_of(made)).sample is not None
+
+
+def test_a_sample_depends_on_nothing_but_spec_and_index():
+    forwards = [plan().draw(i).to_mapping() for i in range(24)]
+    again = plan()
+    backwards = [again.draw(i).to_mapping() for i in reversed(range(24))]
+    assert backwards[::-1] == forwards
+    sent = Plan.from_mapping(pickle.loads(pickle.dumps(plan().to_mapping())))
+    assert sent.digest == plan().digest
+    assert sent.draw(11).to_mapping() == forwards[11]
+    assert plan(seed=6).draw(11).draws != forwards[11]["draws"]
+
+
+def test_samples_are_plain_scenes():
+    for i in range(24):
+        sample = plan().draw(i)
+        spec = SceneSpec.from_mapping(yaml.safe_load(yaml.safe_dump(sample.scene)))
+        assert spec.eye.pupil_diameter_mm == sample.draws["eye.pupil_diameter_mm"]
+        assert 2.5 <= spec.eye.pupil_diameter_mm <= 6.0
+        assert spec.subject.ipd_mm == sample.draws["subject.ipd_mm"]
+        radius = sample.draws["eye_parameters.E2.cornea.0.shape.radius_mm"]
+        assert sample.build().eye_spec.to_mapping()["cornea"][0]["shape"]["radius_mm"] == radius
+    assert len({plan().draw(i).scene["seed"] for i in range(24)}) == 24
+
+
+def test_an_identity_fixes_its_eye_and_its_looks():
+    made = plan()
+    identity = defaultdict(set)
+    frames = defaultdict(set)
+    for i in range(24):
+        sample = made.draw(i)
+        names = ("look.iris_albedo", "subject.ipd_mm", "eye_parameters.E2.cornea.0.shape.radius_mm")
+        identity[sample.turn.subject].add(tuple(sample.draws[n] for n in names))
+        frames[sample.turn.subject].add(sample.draws["eye.pupil_diameter_mm"])
+    assert {len(v) for v in identity.values()} == {1}
+    assert len(set.union(*identity.values())) == 4
+    assert {len(v) for v in frames.values()} == {6}
+
+
+@pytest.mark.parametrize(("count", "subjects"), [(24, 4), (25, 4), (7, 7), (100, 33)])
+def test_subjects_take_consecutive_samples_alike(count, subjects):
+    made = plan(count=count, subjects=subjects)
+    pairs = [made.subject_of(i) for i in range(count)]
+    assert [s for s, _ in pairs] == sorted(s for s, _ in pairs)
+    sizes = np.bincount([s for s, _ in pairs])
+    assert len(sizes) == subjects
+    assert sizes.max() - sizes.min() <= 1
+    for s in range(subjects):
+        assert [k for q, k in pairs if q == s] == list(range(sizes[s]))
+
+
+def test_splits_part_the_subjects_by_their_shares():
+    made = plan(count=1000, subjects=1000)
+    names = [made.split_of(s) for s in range(1000)]
+    assert [names.count(n) for n in ("train", "validation", "test")] == [500, 250, 250]
+    # In random order: blocks of one split would be longer.
+    assert sum(a != b for a, b in zip(names, names[1:], strict=False)) > 500
+    other = plan(count=1000, subjects=1000)
+    assert names == [other.split_of(s) for s in reversed(range(1000))][::-1]
+
+
+def test_a_sample_that_cannot_be_made_is_drawn_again():
+    # Half of the targets lie behind the head, where no eye can look.
+    made = plan(
+        **{
+            "scene.targets": {"world_mm": [[{"draw": "uniform", "low": -600, "high": 600}, 0, 0]]},
+            "attempts": 40,
+        }
+    )
+    rejected = 0
+    for i in range(24):
+        found = realise(made, i, 1)
+        assert found.sample is not None
+        attempts = [r.attempt for r in found.rejections]
+        assert attempts == list(range(found.sample.turn.attempt))
+        for r in found.rejections:
+            x = made.draw(i, r.attempt).draws["targets.world_mm.0.0"]
+            assert x < 120  # behind, or too near to the eye
+            assert r.reason
+        rejected += len(attempts)
+        # Another attempt is another frame of the same subject.
+        assert made.draw(i, 1).draws["look.iris_albedo"] == made.draw(i, 0).draws["look.iris_albedo"]
+        assert made.draw(i, 1).draws["eye.pupil_diameter_mm"] != made.draw(i, 0).draws["eye.pupil_diameter_mm"]
+    assert 5 < rejected < 100
+
+
+def test_a_sample_with_nothing_left_to_draw_is_given_up_at_once():
+    made = plan(**{"scene.targets": {"world_mm": [[-600, 0, 0]]}, "scene.eye.pupil_diameter_mm": 4.0})
+    found = realise(made, 3)
+    assert found.sample is None
+    assert len(found.rejections) == 1
+    with pytest.raises(InputError, match="sample 0 cannot be made"):
+        frames_of(made)
+
+
+def test_an_identity_whose_eye_cannot_be_is_drawn_again():
+    # A cornea of less than 5.07 mm radius (5.85 sqrt(1 - 0.25)) does not reach its own limbus.
+    wide = {"draw": "uniform", "low": 3.0, "high": 8.5}
+    made = plan(eye_parameters={"E2": {"cornea.0.shape.radius_mm": wide}}, subjects=12)
+    again = 0
+    for s in range(12):
+        attempt, reasons = made.identity(s)
+        assert len(reasons) == attempt
+        again += attempt
+        sample = made.draw(2 * s)
+        assert sample.turn.subject_attempt == attempt
+        sample.build()
+    assert again > 0
+
+
+def test_pupils_must_lie_in_the_window_unless_not_required():
+    far = {"scene.rig.cameras.0.look_at_mm": [0.0, 80.0, 0.0]}
+    assert realise(plan(**far, attempts=2), 0).sample is None
+    assert realise(plan(**far, require="nothing"), 0).sample is not None
+
+
+def test_eyes_of_several_models():
+    made = plan(
+        **{
+            "scene.eye.model": {"draw": "choice", "values": ["E1", "E2", "E5"]},
+            "count": 40,
+            "subjects": 40,
+        }
+    )
+    models = set()
+    for i in range(40):
+        sample = made.draw(i)
+        model = sample.draws["eye.model"]
+        models.add(model)
+        assert sample.modified == (model == "E2")
+        asked = sample.draws["eye_parameters.E2.cornea.0.shape.radius_mm"]
+        assert (asked is None) == (model != "E2")
+        if model != "E2":
+            assert sample.eye == load_eye(model).to_mapping()
+    assert models == {"E1", "E2", "E5"}

@@ -1,0 +1,105 @@
+"""Validation: a sound dataset passes, each kind of harm is found."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from dataset_specs import mapping
+
+from eyerender.dataset.validate import validate
+from eyerender.errors import InputError
+from eyerender.imagefile import read_image, write_png
+
+pytestmark = pytest.mark.render
+
+
+@pytest.fixture
+def copy(tiny, tmp_path):
+    return shutil.copytree(tiny, tmp_path / "copy")
+
+
+def edit(folder, number, change):
+    path = folder / "metadata.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    change(lines[number])
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def problems(folder, **options):
+    report = validate(folder, **options)
+    assert report["ok"] == (report["problem_count"] == 0)
+    return report["problems"]
+
+
+def test_a_sound_dataset_passes(tiny):
+    report = validate(tiny)
+    assert report["ok"], report["problems"]
+    assert report["images"] == 24
+    assert report["statistics"]["subjects_by_split"] == {"test": 1, "train": 2, "validation": 1}
+    assert 0.05 < report["statistics"]["mean_level"] < 0.6
+    assert validate(tiny, quick=True)["ok"]
+
+
+def test_every_line_has_the_same_keys(tiny):
+    def shape(node):
+        if isinstance(node, dict):
+            return {k: shape(v) for k, v in node.items()}
+        return [shape(v) for v in node] if isinstance(node, list) else type(node).__name__
+
+    lines = [json.loads(line) for line in (tiny / "metadata.jsonl").read_text().splitlines()]
+    assert len(lines) == mapping()["count"]
+    assert all(shape(line) == shape(lines[0]) for line in lines)
+
+
+def test_a_changed_byte_is_found(copy):
+    path = next((copy / "masks" / "00002").iterdir())
+    data = bytearray(path.read_bytes())
+    data[-20] ^= 1
+    path.write_bytes(data)
+    assert any("checksum differs" in p for p in problems(copy))
+    assert problems(copy, quick=True) == []
+
+
+def test_a_missing_and_a_cut_file_are_found(copy):
+    first, second = sorted((copy / "images" / "00001").iterdir())[:2]
+    first.unlink()
+    second.write_bytes(second.read_bytes()[:-100])
+    found = problems(copy, quick=True)
+    assert any(p.startswith(f"images/00001/{first.name}: missing") for p in found)
+    assert any("bytes, not" in p for p in found)
+
+
+def test_a_moved_mask_is_found(copy):
+    path = sorted((copy / "masks" / "00000").iterdir())[0]
+    mask, _ = read_image(path)
+    write_png(path, np.roll(mask, 3, axis=1))
+    found = problems(copy)
+    assert any("the mask of its pupil leaves the ellipse" in p for p in found)
+    assert any("is not that of its mask" in p for p in found)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda line: line["records"][0]["pupil"].update(angle_rad=4.0), "no ellipse in the record's convention"),
+        (lambda line: line["records"][0].pop("pose"), "pose.azimuth_deg: missing"),
+        (lambda line: line["labels"].pop("iris"), "has other keys than line 1"),
+        (lambda line: line.update(split="elsewhere"), "is in two splits"),
+        (lambda line: line["window_px"].update(width=90), "its window is 90 x 72"),
+        (lambda line: line.update(bit_depth=8), "has values above 255"),
+    ],
+)
+def test_wrong_lines_are_found(copy, change, words):
+    edit(copy, 4, change)
+    assert any(words in p for p in problems(copy))
+
+
+def test_what_is_no_finished_dataset_is_refused(copy, tmp_path):
+    (copy / "dataset.json").unlink()
+    with pytest.raises(InputError, match="not finished"):
+        validate(copy)
+    with pytest.raises(InputError, match="no such folder"):
+        validate(tmp_path / "nowhere")

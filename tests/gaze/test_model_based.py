@@ -1,0 +1,321 @@
+"""Model-based estimators on an eye whose glints and pupil come from Fermat's principle, not from the law of reflection."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gaze_helpers import observations, rig
+from scipy.optimize import minimize
+
+from eyerender.errors import InputError
+from eyerender.gaze.cornea import from_all_glints, from_plane
+from eyerender.gaze.guestrin import GuestrinEizenman
+from eyerender.gaze.hennessey import Hennessey
+from eyerender.gaze.parameters import EyeParameters, ParameterBounds
+from eyerender.gaze.rays import unit
+from eyerender.gaze.twocamera import ShihWuLiu
+from eyerender.rig.camera import CameraSpec
+
+EYE = EyeParameters(7.9, 4.3, 1.3375, 5.2, 1.8)
+LIGHTS = np.array([[615.0, 208.5, 0.0], [615.0, -208.5, 0.0], [640.0, 30.0, 180.0], [600.0, -90.0, -190.0]])
+SCREEN = (650.0, 0.0, 0.0)
+
+
+def camera(x, y, z):
+    return CameraSpec(
+        position_mm=(x, y, z), look_at_mm=(0, 0, 0), focal_length_px=4666.0, resolution_px=(640, 480)
+    ).build()
+
+
+CAMERAS = [camera(615.0, 0.0, -150.5), camera(600.0, -160.0, -120.0)]
+
+
+def shortest_path(a, b, centre, radius, na, nb):
+    """The point of a sphere with a stationary path from a to b: a minimum for refraction and for a convex mirror."""
+    middle = unit(unit(a - centre) + (unit(b - centre) if na == nb else 0))
+    e1 = unit(np.cross(middle, [0.1, 0.3, 0.9]))
+    e2 = np.cross(middle, e1)
+
+    def point(s):
+        return centre + radius * unit(middle + s[0] * e1 + s[1] * e2)
+
+    def path(s):
+        p = point(s)
+        return na * np.linalg.norm(a - p) + nb * np.linalg.norm(b - p)
+
+    s = np.zeros(2)
+    for scale in (1e-1, 1e-3, 1e-5):  # a quadratic fit polishes what rounding of the path length leaves open
+        s = minimize(path, s, method="Nelder-Mead", options={"xatol": 1e-12, "fatol": 0, "initial_simplex": s + scale * np.array([[0, 0], [1, 0], [0, 1]]), "maxiter": 400}).x  # fmt: skip
+    h = 3e-3
+    g = np.array([path(s + d) - path(s - d) for d in h * np.eye(2)]) / (2 * h)
+    H = np.array([[path(s + di + dj) - path(s + di - dj) - path(s - di + dj) + path(s - di - dj) for dj in h * np.eye(2)] for di in h * np.eye(2)]) / (4 * h * h)  # fmt: skip
+    return point(s - np.linalg.solve(H, g))
+
+
+def pixels(centre, w, cam, lights, eye=EYE):
+    O = cam.nodal_point_mm
+    glints = [shortest_path(O, L, centre, eye.cornea_radius_mm, 1.0, 1.0) for L in lights]
+    pupil = shortest_path(O, centre + eye.pupil_distance_mm * w, centre, eye.cornea_radius_mm, 1.0, eye.index)
+    return cam.project(pupil)[0], cam.project(np.array(glints))[0]
+
+
+def axis_to(target, centre, eye, sign=1.0):
+    """The optic axis whose visual axis meets the target."""
+    v = unit(np.asarray(target, dtype=float) - centre)
+    theta = np.arctan2(v[1], v[0]) - sign * np.radians(eye.alpha_deg)
+    phi = np.arcsin(v[2]) - np.radians(eye.beta_deg)
+    return np.array([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Nine targets, right and left eye, both cameras, four lights; a slightly different eye place at each fixation."""
+    rng = np.random.default_rng(5)
+    targets = [[650.0, y, z] for y in (180.0, 0.0, -180.0) for z in (140.0, 0.0, -140.0)]
+    rows = {k: [] for k in ("pupil", "glints", "target", "eye", "camera", "fixation", "centre", "axis")}
+    for f, target in enumerate(targets):
+        for eye, y in ((0, -31.5), (1, 31.5)):
+            centre = np.array([-8.0, y, 0.0]) + rng.normal(0, 1.0, 3)
+            w = axis_to(target, centre, EYE, 1.0 if eye == 0 else -1.0)
+            for c, cam in enumerate(CAMERAS):
+                p, g = pixels(centre, w, cam, LIGHTS)
+                values = (p, g, target, eye, c, f, centre, w)
+                for key, value in zip(rows, values, strict=True):
+                    rows[key].append(value)
+    seen = observations(
+        rows["pupil"], rows["glints"], rows["target"], eye=rows["eye"], camera=rows["camera"], fixation=rows["fixation"],
+        frame=2 * np.array(rows["fixation"]) + np.array(rows["camera"]),
+    )  # fmt: skip
+    return seen, np.array(rows["centre"]), np.array(rows["axis"])
+
+
+def world(lights=2, cameras=1):
+    return rig(CAMERAS[:cameras], LIGHTS[:lights], SCREEN, (377, 301))
+
+
+def one_camera(scene):
+    rows = scene[0].index.camera == 0
+    return scene[0].take(rows), scene[1][rows], scene[2][rows]
+
+
+@pytest.mark.parametrize(("method", "lights"), [("all_glints", 2), ("all_glints", 3), ("all_glints", 4), ("plane", 2)])
+def test_centre_axis_and_gaze_point(scene, method, lights):
+    seen, centre, axis = one_camera(scene)
+    estimator = GuestrinEizenman(centre=method).with_parameters({0: EYE, 1: EYE})
+    axes = estimator.optic_axes(seen, world(lights))
+    # Fermat's points are good to 1e-7 mm; the distance magnifies that by 2 d / R, about 150.
+    np.testing.assert_allclose(axes.origin_mm, centre, atol=2e-4)
+    np.testing.assert_allclose(axes.direction, axis, atol=1e-5)
+    gaze = estimator.predict(seen, world(lights))
+    assert gaze.ok.all()
+    np.testing.assert_allclose(gaze.point_mm, seen.index.target_mm, atol=5e-3)
+
+
+@pytest.mark.parametrize("start", [EyeParameters(), EyeParameters(8.6, 5.0, 1.3375, -3.0, -4.0)])
+def test_calibration_recovers_the_eye_on_either_side(scene, start):
+    seen, _, _ = one_camera(scene)
+    fitted = GuestrinEizenman(start=start).fit(seen, seen.index.target_mm, world())
+    for eye in (0, 1):  # alpha is towards the nose on both sides
+        found = fitted.calibrations[eye]
+        assert found.converged
+        assert found.at_bound == ()
+        np.testing.assert_allclose(found.parameters.vector(), EYE.vector(), atol=2e-3)
+    gaze = fitted.predict(seen, world())
+    np.testing.assert_allclose(gaze.point_mm, seen.index.target_mm, atol=5e-3)
+
+
+def test_free_index_is_nearly_unobservable_but_the_gaze_is_right(scene):
+    seen, _, _ = one_camera(scene)
+    fitted = GuestrinEizenman(free_index=True, start=EyeParameters(index=1.38)).fit(seen, seen.index.target_mm, world())
+    gaze = fitted.predict(seen, world())
+    assert np.linalg.norm(gaze.point_mm - seen.index.target_mm, axis=1).max() < 0.05
+
+
+def test_fixed_world_rotation_is_another_visual_axis(scene):
+    seen, _, _ = one_camera(scene)
+    a = GuestrinEizenman().with_parameters({0: EYE, 1: EYE}).visual_axes(seen, world())
+    b = GuestrinEizenman(visual_axis="rotation").with_parameters({0: EYE, 1: EYE}).visual_axes(seen, world())
+    ca, sa = np.cos(np.radians(EYE.alpha_deg)), np.sin(np.radians(EYE.alpha_deg))
+    cb, sb = np.cos(np.radians(EYE.beta_deg)), np.sin(np.radians(EYE.beta_deg))
+    right = seen.index.eye == 0
+    turn = np.array([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]]) @ np.array([[cb, 0, -sb], [0, 1, 0], [sb, 0, cb]])
+    w = GuestrinEizenman().with_parameters({0: EYE, 1: EYE}).optic_axes(seen, world()).direction
+    np.testing.assert_allclose(b.direction[right], w[right] @ turn.T, atol=1e-12)
+    assert 1e-4 < np.abs(a.direction - b.direction).max() < 1e-2
+
+
+def test_sum_of_errors_is_minimised(scene):
+    seen, _, _ = one_camera(scene)
+    rng = np.random.default_rng(2)
+    noisy = observations(
+        seen.pupil.centre_px + rng.normal(0, 0.2, (len(seen), 2)), seen.glints.xy_px[:, :2], seen.index.target_mm,
+        fixation=seen.index.fixation,
+    ).take(seen.index.eye == 0)  # fmt: skip
+    estimator = GuestrinEizenman(objective="sum_of_errors", viewing_distance_mm=650.0)
+    fitted = estimator.fit(noisy, noisy.index.target_mm, world())
+    found = fitted.calibrations[0]
+
+    def cost(v):
+        p = EyeParameters(v[0], v[1], 1.3375, v[2], v[3])
+        gaze = estimator.with_parameters({0: p}).predict(noisy, world())
+        miss = np.linalg.norm(gaze.point_mm - noisy.index.target_mm, axis=1)
+        return np.degrees(np.arctan(miss / 650)).sum()
+
+    best = found.parameters.vector()[[0, 1, 3, 4]]
+    np.testing.assert_allclose(cost(best), found.cost, rtol=1e-6)
+    # An independent simplex search from there finds nothing lower.
+    other = minimize(cost, best, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-10, "maxiter": 600})
+    assert other.fun > found.cost * (1 - 1e-5)
+    squares = GuestrinEizenman().fit(noisy, noisy.index.target_mm, world()).calibrations[0]
+    assert found.cost < cost(squares.parameters.vector()[[0, 1, 3, 4]])
+
+
+def test_method_b_has_a_status_where_camera_lights_and_eye_are_coplanar():
+    cam = camera(615.0, 0.0, 0.0)
+    centre = np.array([-8.0, 0.0, 0.0])
+    lights = np.array([[650.0, 200.0, 0.0], [650.0, -200.0, 0.0]])
+    w = axis_to([650.0, 0.0, 0.0], centre, EYE)
+    p, g = pixels(centre, w, cam, lights)
+    g[:, 1] = cam.K[1, 2]  # exactly in the plane, as geometry has it
+    seen = observations([p], [g], [[650.0, 0.0, 0.0]])
+    flat = rig([cam], lights, SCREEN)
+    gaze = GuestrinEizenman(centre="plane").with_parameters({0: EYE}).predict(seen, flat)
+    assert gaze.status[0] == "missing"
+    assert "coplanar" in gaze.reason[0]
+    # Both glints together still determine the centre.
+    a = GuestrinEizenman().with_parameters({0: EYE}).predict(seen, flat)
+    np.testing.assert_allclose(a.point_mm[0], [650, 0, 0], atol=0.05)
+
+
+def test_statuses(scene):
+    seen, _, _ = one_camera(scene)
+    pupil, glints = seen.pupil.centre_px.copy(), seen.glints.xy_px.copy()
+    pupil[0] = np.nan
+    glints[1, 1] = np.nan
+    pupil[2] += [900.0, 0.0]  # a ray that passes the cornea
+    pupil[3] += [40.0, 0.0]  # one that meets the cornea but not the sphere of the pupil
+    broken = observations(pupil, glints, seen.index.target_mm, eye=seen.index.eye)
+    gaze = GuestrinEizenman().with_parameters({0: EYE, 1: EYE}).predict(broken, world())
+    assert gaze.reason[:4].tolist() == [
+        "no pupil", "no glint of light 1", "the pupil ray misses the cornea",
+        "the refracted pupil ray misses the sphere that holds the pupil",
+    ]  # fmt: skip
+    assert np.isnan(gaze.point_mm[:4]).all()
+    assert gaze.ok[4:].all()
+    only_right = GuestrinEizenman().with_parameters({0: EYE}).predict(seen, world())
+    assert set(only_right.reason[seen.index.eye == 1]) == {"this eye is not calibrated"}
+
+
+def test_a_gaze_away_from_the_screen_has_a_status(scene):
+    seen, _, _ = one_camera(scene)
+    behind = rig(CAMERAS[:1], LIGHTS[:2], (-650.0, 0.0, 0.0))
+    gaze = GuestrinEizenman().with_parameters({0: EYE, 1: EYE}).predict(seen, behind)
+    assert set(gaze.reason) == {"the visual axis does not meet the screen"}
+
+
+def test_refusals(scene):
+    seen, _, _ = one_camera(scene)
+    targets = seen.index.target_mm
+    with pytest.raises(InputError, match="right eye: 1 usable calibration targets; 4 parameters need 2"):
+        GuestrinEizenman().fit(seen.take(np.arange(2)), targets[:2], world())
+    with pytest.raises(InputError, match="needs 2 lights, the rig has 1"):
+        GuestrinEizenman().fit(seen, targets, world(lights=1))
+    with pytest.raises(InputError, match="not different lights"):
+        GuestrinEizenman(lights=(0, 7)).fit(seen, targets, world())
+    with pytest.raises(InputError, match="outside its bounds"):
+        GuestrinEizenman(start=EyeParameters(12.0)).fit(seen, targets, world())
+    with pytest.raises(InputError, match="call fit first"):
+        GuestrinEizenman().predict(seen, world())
+    with pytest.raises(InputError, match="needs a screen"):
+        GuestrinEizenman().fit(seen, targets, replace(world(), screen=None))
+    with pytest.raises(InputError, match="less than its upper bound"):
+        ParameterBounds(lower=EyeParameters(9.0), upper=EyeParameters(8.0))
+
+
+def test_random_starts_end_at_one_minimum_and_are_seeded(scene):
+    seen, _, _ = one_camera(scene)
+    estimator = GuestrinEizenman()
+    starts = estimator.bounds.draw(4, 7)
+    assert starts == estimator.bounds.draw(4, 7)
+    assert starts != estimator.bounds.draw(4, 8)
+    ends = estimator.restarts(seen, seen.index.target_mm, world(), starts)
+    for calibrations in ends.values():
+        for c in calibrations:
+            np.testing.assert_allclose(c.parameters.vector()[3:], EYE.vector()[3:], atol=2e-3)
+
+
+def test_two_cameras_need_no_eye_parameter(scene):
+    seen, centre, axis = scene
+    other = EyeParameters(7.9, 4.3, 1.3375, 0.0, 0.0)
+    assert other != EYE
+    axes = ShihWuLiu().optic_axes(seen, world(cameras=2))
+    assert all(r is None for r in axes.reason)
+    # A line to the centre is good to Fermat's 1e-7 mm over R; two lines 15 degrees apart meet accordingly.
+    np.testing.assert_allclose(axes.origin_mm, centre, atol=2e-3)
+    np.testing.assert_allclose(axes.direction, axis, atol=2e-4)
+    more = ShihWuLiu().optic_axes(seen, world(lights=4, cameras=2))
+    np.testing.assert_allclose(more.direction, axis, atol=2e-4)
+
+
+def test_two_cameras_recalibrated(scene):
+    seen, _, _ = scene
+    rows = seen.index.eye == 0
+    seen = seen.take(rows)
+    fitted = ShihWuLiu().fit(seen, seen.index.target_mm, world(cameras=2))
+    gaze = fitted.predict(seen, world(cameras=2))
+    assert gaze.ok.all()
+    # The same estimate for the two cameras' observations of a fixation.
+    np.testing.assert_array_equal(gaze.point_mm[::2], gaze.point_mm[1::2])
+    # The angles to the visual axis are constant, so the polynomial takes them up but for the eye's small moves.
+    assert np.linalg.norm(gaze.point_mm - seen.index.target_mm, axis=1).max() < 0.2
+
+
+def test_two_cameras_statuses(scene):
+    seen, _, _ = scene
+    alone = seen.take(np.arange(len(seen)) != 1)
+    axes = ShihWuLiu().optic_axes(alone, world(cameras=2))
+    assert axes.reason[0] == "the other camera has no observation of this fixation"
+    assert all(r is None for r in axes.reason[1:])
+    glints = seen.glints.xy_px.copy()
+    glints[1, 0] = np.nan
+    i = seen.index
+    broken = observations(
+        seen.pupil.centre_px, glints, i.target_mm, eye=i.eye, camera=i.camera, fixation=i.fixation, frame=i.frame
+    )
+    axes = ShihWuLiu().optic_axes(broken, world(cameras=2))
+    assert axes.reason[:2].tolist() == ["no glint of light 0"] * 2
+    with pytest.raises(InputError, match="needs two cameras, the rig has 1"):
+        ShihWuLiu().predict(one_camera(scene)[0], world(cameras=1))
+
+
+def test_hennessey_takes_up_a_wrong_eye(scene):
+    seen, _, _ = one_camera(scene)
+    targets = seen.index.target_mm
+    wrong = Hennessey(EyeParameters(7.5, 4.6, 1.36))
+    before = replace(wrong, recalibration="none").predict(seen, world()).point_mm - targets
+    for kind in ("angle", "screen"):
+        fitted = replace(wrong, recalibration=kind).fit(seen, targets, world())
+        after = fitted.predict(seen, world()).point_mm - targets
+        assert np.linalg.norm(after, axis=1).mean() < 0.05 * np.linalg.norm(before, axis=1).mean()
+    with pytest.raises(InputError, match="5 usable calibration targets"):
+        wrong.fit(seen.take(np.arange(10)), targets[:10], world())
+    row = seen.take(seen.index.fixation % 3 == 1)
+    with pytest.raises(InputError, match="3 usable"):
+        wrong.fit(row, row.index.target_mm, world())
+    with pytest.raises(InputError, match="call fit first"):
+        wrong.predict(seen, world())
+
+
+def test_centres_are_batches_over_parameters():
+    O = np.array([[615.0, 0.0, -150.5]])
+    c = np.array([-8.0, 0.0, 0.0])
+    glints = np.array([[unit(shortest_path(O[0], L, c, 7.9, 1, 1) - O[0]) for L in LIGHTS[:2]]])
+    radius = np.array([[7.0], [7.9], [8.8]])
+    for method in (from_all_glints, from_plane):
+        many = method(np.repeat(O[None], 3, axis=0), np.repeat(glints[None], 3, axis=0), LIGHTS[:2], radius)
+        for k in range(3):
+            one = method(O, glints, LIGHTS[:2], radius[k])
+            np.testing.assert_allclose(many.centre_mm[k], one.centre_mm, atol=1e-6)
+        assert many.ok.all()

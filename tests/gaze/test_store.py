@@ -1,0 +1,190 @@
+"""`gaze fit` and `gaze predict`: calibrations survive their file, records of a user are enough, mistakes get one line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from gaze_helpers import ets_observations, ets_rig, load
+
+from eyerender.analytic.observer import observe
+from eyerender.cli.app import run
+from eyerender.errors import InputError
+from eyerender.gaze.store import (
+    EstimatorSpec, fit_estimator, load_estimator, load_observations, predictions, rig_from_mapping, save_estimator,
+)  # fmt: skip
+from eyerender.scene import load_scene
+
+
+@pytest.fixture(scope="module")
+def guestrin(tmp_path_factory):
+    """The features of the shipped scene, as the command writes them."""
+    path = tmp_path_factory.mktemp("records") / "features.json"
+    assert run(["features", "guestrin2006", "--json", str(path)]) == 0
+    return path
+
+
+def test_the_rig_comes_back_from_the_features_file(guestrin):
+    seen, rig = load_observations(guestrin)
+    scene = load_scene("guestrin2006")
+    assert len(seen) == 90
+    for a, b in zip(rig.cameras, scene.rig.cameras, strict=True):
+        np.testing.assert_array_equal(a.K, b.K)
+        np.testing.assert_allclose(a.nodal_point_mm, b.nodal_point_mm, atol=1e-12)
+    np.testing.assert_array_equal(rig.lights[1].position_mm, scene.rig.lights[1].position_mm)
+    np.testing.assert_array_equal(rig.screen.centre_mm, scene.rig.screen.centre_mm)
+
+
+@pytest.mark.parametrize("name", ["regression", "hennessey", "guestrin-eizenman"])
+def test_fit_and_predict_on_the_command_line(guestrin, tmp_path, capsys, name):
+    calibration, out = tmp_path / "calibration.json", tmp_path / "gaze.json"
+    argv = ["gaze", "fit", str(guestrin), "--estimator", name, "-o", str(calibration)]
+    assert run([*argv, "--fixations", "0,1,2,3,4,5,6,7,8"]) == 0
+    assert run(["gaze", "predict", str(guestrin), "-c", str(calibration), "--json", str(out)]) == 0
+    capsys.readouterr()
+    data = json.loads(out.read_text())
+    assert data["schema"] == "eyerender/gaze/1"
+    assert len(data["gaze"]) == 90
+    assert len(data["binocular"]) == 45
+    seen, rig = load_observations(guestrin)
+    spec = EstimatorSpec.from_mapping({"name": name})
+    fitted, summary = fit_estimator(spec, seen, rig, list(range(9)))
+    direct = fitted.predict(seen, rig)
+    np.testing.assert_array_equal([g["point_mm"] for g in data["gaze"]], direct.point_mm)
+    assert summary["calibration_error_deg"]["mean_deg"] < 1.0
+
+
+def test_calibration_with_two_lines_of_text(guestrin, tmp_path, capsys):
+    calibration = tmp_path / "c.json"
+    code = run(
+        ["gaze", "fit", str(guestrin), "--estimator", "regression", "--terms-x", "x + 1", "--terms-y", "y + xy + 1",
+         "--monocular", "-o", str(calibration)]
+    )  # fmt: skip
+    assert code == 0
+    assert "calibrated on 90 observations" in capsys.readouterr().out
+    eyes = json.loads(calibration.read_text())["eyes"]
+    assert {k: (len(v["a"]), len(v["b"])) for k, v in eyes.items()} == {"right": (2, 3), "left": (2, 3)}
+
+
+@pytest.mark.parametrize(
+    ("name", "vectors"),
+    [
+        ("homography", "homography_glint4"),
+        ("cross-ratio", "yoo_chung"),
+        ("hennessey", "hennessey_pupil_center_recalib_angle"),
+        ("guestrin-eizenman", None),
+        ("regression", None),
+        ("shih-wu-liu", None),
+    ],
+)
+def test_calibrations_survive_their_file(tmp_path, name, vectors):
+    if vectors is not None:
+        data = load(f"estimator_{vectors}.json")
+        seen, rig = ets_observations(data["calibration"]), ets_rig(data)
+    else:
+        scene = load_scene("guestrin2006")
+        if name == "shih-wu-liu":
+            spec = scene.spec.to_mapping()
+            spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})
+            spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
+            from eyerender.scene import Scene, SceneSpec
+
+            scene = Scene.of(SceneSpec.from_mapping(spec))
+        seen, rig = observe(scene), scene.rig
+    fitted, _ = fit_estimator(EstimatorSpec.from_mapping({"name": name}), seen, rig)
+    save_estimator(tmp_path / "c.json", EstimatorSpec.from_mapping({"name": name}), fitted)
+    again = load_estimator(tmp_path / "c.json")
+    np.testing.assert_array_equal(again.predict(seen, rig).point_mm, fitted.predict(seen, rig).point_mm)
+
+
+def test_two_cameras_on_an_aspheric_eye(tmp_path):
+    """Two cameras need no eye parameters, but a spherical cornea: E1 comes out to some thousandths of a degree."""
+    from eyerender.scene import Scene, SceneSpec
+
+    spec = load_scene("guestrin2006", eye="E1").spec.to_mapping()
+    spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})
+    spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
+    scene = Scene.of(SceneSpec.from_mapping(spec), eye="E1")
+    seen = observe(scene)
+    _, summary = fit_estimator(EstimatorSpec.from_mapping({"name": "shih-wu-liu"}), seen, scene.rig)
+    assert summary["calibration_error_deg"]["n"] == 36
+    assert summary["calibration_error_deg"]["mean_deg"] < 0.05
+
+
+def test_jsonl_and_folder_metadata_are_records_too(guestrin, tmp_path):
+    records = json.loads(guestrin.read_text())["records"]
+    lines = tmp_path / "records.jsonl"
+    lines.write_text("\n".join(json.dumps(r) for r in records))
+    meta = tmp_path / "metadata.jsonl"
+    meta.write_text("\n".join(json.dumps({"records": [r]}) for r in records))
+    for path in (lines, meta):
+        seen, rig = load_observations(path, "guestrin2006")
+        assert len(seen) == 90
+        assert len(rig.lights) == 2
+    with pytest.raises(InputError, match="holds no rig; give --scene"):
+        load_observations(lines)
+
+
+BAD = [
+    (["gaze", "fit", "none.json", "--estimator", "regression", "-o", "c.json"], "none.json: no such file"),
+    (["gaze", "fit", "features.json", "--estimator", "magic", "-o", "c.json"], "magic"),
+    (["gaze", "fit", "features.json", "--estimator", "regression", "--function", "R13", "-o", "c.json"], "R13"),
+    (["gaze", "fit", "features.json", "--estimator", "regression", "--terms-x", "x+1", "-o", "c.json"], "--terms-y"),
+    (["gaze", "fit", "features.json", "--estimator", "regression", "--fixations", "0,a", "-o", "c.json"], "--fixations"),
+    (["gaze", "fit", "features.json", "--estimator", "regression", "--fixations", "99", "-o", "c.json"], "no fixation 99"),
+    (["gaze", "fit", "features.json", "--estimator", "regression", "--fixations", "0", "-o", "c.json"], "R3 has 6"),
+    (["gaze", "fit", "features.json", "--estimator", "homography", "-o", "c.json"], "lights"),
+    (["gaze", "fit", "features.json", "--estimator", "shih-wu-liu", "-o", "c.json"], "two cameras"),
+    (["gaze", "fit", "features.json", "--estimator", "guestrin-eizenman", "--index", "0.5", "-o", "c.json"], "index"),
+    (["gaze", "fit", "empty.jsonl", "--estimator", "regression", "-o", "c.json"], "holds no records"),
+    (["gaze", "fit", "text.txt", "--estimator", "regression", "-o", "c.json"], "line 1: is not valid JSON"),
+    (["gaze", "fit", "norig.json", "--estimator", "regression", "-o", "c.json"], "holds no rig"),
+    (["gaze", "fit", "badrig.json", "--estimator", "regression", "-o", "c.json"], "rig.cameras.0.K: must be 3 x 3 numbers"),
+    (["gaze", "predict", "features.json", "-c", "none.json"], "none.json: no such file"),
+    (["gaze", "predict", "features.json", "-c", "features.json"], "features.json: schema: is 'eyerender/features/1'"),
+    (["gaze", "predict", "features.json", "-c", "hollow.json"], "eyes: is no calibration"),
+    (["gaze", "predict", "features.json"], "--calibration"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("argv", "words"), BAD, ids=lambda v: " ".join(v) if isinstance(v, list) else None)
+def test_bad_input(guestrin, tmp_path, monkeypatch, capsys, argv, words):
+    monkeypatch.chdir(tmp_path)
+    data = json.loads(guestrin.read_text())
+    (tmp_path / "features.json").write_text(json.dumps(data))
+    (tmp_path / "norig.json").write_text(json.dumps({**data, "rig": None}))
+    bad = json.loads(json.dumps(data))
+    bad["rig"]["cameras"][0]["K"] = [1, 2]
+    (tmp_path / "badrig.json").write_text(json.dumps(bad))
+    (tmp_path / "empty.jsonl").write_text("\n")
+    (tmp_path / "text.txt").write_text("dear diary")
+    hollow = {"schema": "eyerender/gaze-calibration/1", "estimator": {"name": "regression"}, "eyes": {"right": {}}}
+    (tmp_path / "hollow.json").write_text(json.dumps(hollow))
+    assert run(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    assert err.startswith("error: ")
+    assert words in err
+    assert not (tmp_path / "c.json").exists()
+
+
+def test_rig_without_screen_or_lights():
+    rig = rig_from_mapping({"cameras": []})
+    assert rig.screen is None
+    assert rig.lights == ()
+
+
+def test_predictions_without_targets_have_no_errors(guestrin):
+    seen, rig = load_observations(guestrin)
+    fitted, _ = fit_estimator(EstimatorSpec.from_mapping({"name": "guestrin-eizenman"}), seen, rig)
+    from dataclasses import replace
+
+    from eyerender.arrays import frozen
+
+    blind = replace(seen, index=replace(seen.index, target_mm=frozen(np.full((len(seen), 3), np.nan))))
+    data = predictions(fitted, blind, rig)
+    assert all(g["status"] == "ok" and g["error_deg"] is None and g["target_mm"] is None for g in data["gaze"])
+    with pytest.raises(InputError, match="needs records with target_mm"):
+        fit_estimator(EstimatorSpec.from_mapping({"name": "regression"}), blind, rig)

@@ -1,0 +1,132 @@
+"""Lids, lashes and globe as solids: signed distances over seeded random subjects, poses, blinks and eye models.
+
+The globe's distance is taken from its exact surfaces here, while the region itself works from a table over direction.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from eyerender.eye.catalogue import load_eye
+from eyerender.eye.pose import Poses, rigid_motion
+from eyerender.region.anatomy import RegionSpec
+from eyerender.region.globe import Globe
+from eyerender.region.lids import CONJUNCTIVA, ROWS
+from eyerender.region.mesh import region_mesh
+
+MODELS = ("E1", "E2", "E3", "E4", "E5")
+INTO_MM = 0.05  # the bar for any interpenetration
+
+
+def posed(model, azimuth, elevation, side="right"):
+    eye = load_eye(model).build(eye=side, wavelength_nm=850.0, pupil_diameter_mm=4.0)
+    M, t = rigid_motion(Poses.from_degrees([azimuth], [elevation]), eye)
+    sclera = eye.sclera
+    globe = Globe(
+        eye.front[0], float(eye.limbus_radius_mm), sclera.centre_mm, float(sclera.radius_mm), M[0], t[0], side == "left"
+    )
+    return eye, globe
+
+
+def signed_distance(eye, globe, points):
+    """Distance (mm) from the posed globe's exact surface, negative inside; first order next to the cornea."""
+    local = (points - globe.t) @ globe.M
+    sphere = np.linalg.norm(local - eye.sclera.centre_mm, axis=-1) - eye.sclera.radius_mm
+    front = eye.front[0]
+    flat = front.to_local(local)
+    off_axis = np.hypot(flat[..., 1], flat[..., 2])
+    near = np.minimum(off_axis, 7.0) / np.maximum(off_axis, 1e-9)
+    depth = flat[..., 0] - front.sag(flat[..., 1] * near, flat[..., 2] * near)
+    slope = np.gradient(front.sag(np.linspace(0, 7, 701), np.zeros(701)), 0.01)
+    s = np.interp(off_axis, np.linspace(0, 7, 701), slope)
+    cornea = np.maximum(depth / np.sqrt(1 + s * s), off_axis - eye.limbus_radius_mm)
+    return np.minimum(sphere, cornea)
+
+
+def instance(i):
+    """Subject, eye and globe number i: everything drawn from its number."""
+    rng = np.random.default_rng((0x9E0, i))
+    blink = float(rng.choice([0.0, rng.uniform(), 1.0], p=[0.5, 0.4, 0.1]))
+    side = ("right", "left")[i % 2]
+    spec = RegionSpec.drawn(i, spread=float(rng.uniform(0.3, 1.0)), blink=blink)
+    eye, globe = posed(MODELS[i % 5], *rng.uniform(-25, 25, 2), side)
+    return spec, eye, globe, region_mesh(spec, globe)
+
+
+def points_on(mesh, faces):
+    """Vertices, middles of edges and middles of triangles."""
+    corners = mesh.vertices[faces]
+    middles = (corners + np.roll(corners, 1, axis=1)) / 2
+    return np.concatenate([corners.reshape(-1, 3), middles.reshape(-1, 3), corners.mean(axis=1)])
+
+
+def crossings(start, end, mesh):
+    """Whether each segment (n, 3) crosses any triangle of a mesh: Moeller and Trumbore's test on those near by."""
+    corners = mesh.vertices[mesh.faces]
+    centres = corners.mean(axis=1)
+    size = np.linalg.norm(corners - centres[:, None], axis=-1).max(axis=1)
+    keep = size < 1.5  # the coarse triangles far from the lids
+    corners, centres = np.asarray(corners[keep]), centres[keep]
+    length = np.linalg.norm(end - start, axis=-1)
+    near = cKDTree(centres).query_ball_point((start + end) / 2, length / 2 + size[keep].max())
+    segment = np.repeat(np.arange(len(start)), [len(n) for n in near])
+    triangle = np.concatenate([np.asarray(n, dtype=int) for n in near])
+    o, d = start[segment], (end - start)[segment]
+    a, e1, e2 = corners[triangle, 0], *np.swapaxes(corners[triangle, 1:] - corners[triangle, :1], 0, 1)
+    p = np.cross(d, e2)
+    det = np.sum(e1 * p, axis=-1)
+    det = np.where(np.abs(det) < 1e-12, 1e-12, det)
+    u = np.sum((o - a) * p, axis=-1) / det
+    q = np.cross(o - a, e1)
+    v = np.sum(d * q, axis=-1) / det
+    t = np.sum(e2 * q, axis=-1) / det
+    hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
+    out = np.zeros(len(start), dtype=bool)
+    np.logical_or.at(out, segment, hit)
+    return out
+
+
+def check(i):
+    spec, eye, globe, mesh = instance(i)
+    note = f"instance {i}"
+    skin = mesh.part("skin")
+    columns = len(skin.vertices) // ROWS
+    assert signed_distance(eye, globe, points_on(skin, skin.faces)).min() > -INTO_MM, note
+
+    grid = np.asarray(skin.vertices).reshape(ROWS, columns, 3)
+    # No gap: the sheet's inner rim lies in the globe's surface, between its vertices too (a chord may bridge the
+    # notch of the limbus by a few micrometres).
+    rim = np.concatenate([grid[0], (grid[0] + np.roll(grid[0], 1, axis=0)) / 2])
+    inside = signed_distance(eye, globe, rim)
+    assert inside.max() < 0.02 and inside.min() > -INTO_MM, note
+    # And the margin rests on the globe where it stands before it.
+    edge = grid[CONJUNCTIVA]
+    front = np.hypot(*(edge - globe.centre * [1, -1 if globe.mirrored else 1, 1])[:, 1:].T) < 8.0
+    assert np.count_nonzero(front) > 20 and signed_distance(eye, globe, edge[front]).max() < 0.25, note
+
+    # Lids do not pass through each other: at the same place along the fissure the upper margin is the upper one.
+    middle = (columns - 1) // 4
+    assert grid[CONJUNCTIVA, middle, 2] > grid[CONJUNCTIVA, 3 * middle, 2], note
+
+    # Lashes: beyond their roots none is under the skin or in the globe.
+    lashes = np.asarray(mesh.part("lashes").vertices)
+    if len(lashes):
+        shafts = lashes.reshape(-1, 6, 3, 3)[:, 1:].mean(axis=2).reshape(-1, 3)
+        assert signed_distance(eye, globe, shafts).min() > -INTO_MM, note
+        paths = lashes.reshape(-1, 6, 3, 3).mean(axis=2)
+        assert not np.any(crossings(paths[:, 1:-1].reshape(-1, 3), paths[:, 2:].reshape(-1, 3), skin)), note
+    assert np.all(np.isfinite(mesh.vertices)) and np.all(np.abs(np.linalg.norm(mesh.normals, axis=-1) - 1) < 1e-6), note
+    assert len(mesh.layout.faces) < 60_000
+
+
+def test_seeded_instances_hold():
+    for i in range(40):
+        check(i)
+
+
+@pytest.mark.slow
+def test_five_hundred_instances_hold():
+    for i in range(500):
+        check(i)

@@ -1,0 +1,242 @@
+"""The command study: its files, its folder, its mistakes; the turned camera; conditions."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+
+from eyerender.analytic.observer import observe
+from eyerender.cli.app import run
+from eyerender.errors import InputError
+from eyerender.study import guestrin, observers_compared
+from eyerender.study.conditions import PARAMETERS, TRACKERS, conditions_part
+from eyerender.study.observing import ImageSettings, Observing, facing_scene, moved, with_index_of
+from eyerender.study.run import run_study
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Both replications, each of a model."""
+    place = tmp_path_factory.mktemp("studies")
+    for name in ("guestrin2006", "blignaut2014"):
+        run_study(name, place / name, eyes=("E1",))
+    return place
+
+
+@pytest.mark.parametrize("name", ["guestrin2006", "blignaut2014"])
+def test_files(folders, name):
+    folder = folders / name
+    assert {p.name for p in folder.iterdir()} == {
+        "study.json", "summary.json", "findings.json", "summary.csv", "findings.csv", "waterfall.csv", "report.html",
+    }  # fmt: skip
+    summary = json.loads((folder / "summary.json").read_text())
+    found = json.loads((folder / "findings.json").read_text())
+    assert summary["schema"] == "eyerender/study-summary/1"
+    assert found["schema"] == "eyerender/study-findings/1"
+    wanted = {"protocol", "observer", "eye_model", "eye", "head", "calibration", "function", "mean_deg", "sd_deg", "n"}
+    assert all(wanted <= set(row) for row in summary["rows"])
+    assert {row["protocol"] for row in summary["rows"]} == {"published", "corrected"}
+    assert all({"id", "rule", "value", "threshold", "verdict"} <= set(f) for f in found["findings"])
+    with open(folder / "summary.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == len(summary["rows"])
+    with open(folder / "findings.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == len(found["findings"])
+    assert summary["departures"]
+    assert summary["errata"]
+
+
+def test_the_optimiser_is_in_the_result(folders):
+    summary = json.loads((folders / "guestrin2006" / "summary.json").read_text())
+    settings = summary["optimiser"]["published"]
+    assert settings["start"] == {
+        "cornea_radius_mm": 7.8, "pupil_distance_mm": 4.2, "index": 1.376, "alpha_deg": 5.0, "beta_deg": 1.5
+    }  # fmt: skip
+    assert settings["random_starts"]["count"] == 20
+    assert all(c["restarts"]["count"] == 20 for c in summary["calibrations"])
+    assert len(summary["t_tests"]) == 2 * 2
+
+
+@pytest.mark.parametrize("name", ["guestrin2006", "blignaut2014"])
+def test_the_report_is_one_file(folders, name):
+    page = (folders / name / "report.html").read_text()
+    assert page.count("<svg") >= 2
+    for pattern in (r"<link", r"<script", r'src="', r"url\(", r"@import", r'href="http'):
+        assert not re.search(pattern, re.sub(r'clip-path="url\(#\w+\)"|url\(#\w+\)', "", page)), pattern
+    assert "Errata" in page
+    assert "From published to corrected" in page
+    assert "Findings" in page
+
+
+def test_a_folder_of_the_same_study_is_run_again_and_another_is_refused(folders):
+    first = (folders / "blignaut2014" / "summary.json").read_text()
+    again = run_study("blignaut2014", folders / "blignaut2014", eyes=("E1",))
+    rows = json.loads(first)["rows"]
+    assert json.loads(json.dumps(again["rows"])) == rows  # the same figures, to the last digit
+    with pytest.raises(InputError, match="is not empty"):
+        run_study("guestrin2006", folders / "blignaut2014", eyes=("E1",))
+
+
+@pytest.mark.slow
+def test_processes_give_the_same_rows(tmp_path):
+    one, two = (run_study("blignaut2014", tmp_path / str(n), eyes=("E1", "E2"), workers=n) for n in (1, 2))
+    assert one["rows"] == two["rows"]
+
+
+def test_protocol_and_eye_are_chosen_on_the_command_line(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(["study", "guestrin2006", "-o", str(out), "--protocol", "published", "--eyes", "E3", "--json", "-"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert {(r["protocol"], r["eye_model"]) for r in summary["rows"]} == {("published", "E3")}
+    assert summary["waterfall"] == []
+    assert run(["study", "blignaut2014", "-o", str(tmp_path / "b"), "--protocol", "corrected", "--eyes", "E2"]) == 0
+    assert re.search(r"corrected\s+analytic\s+E2\s+C135\s+R8\s+0\.03", capsys.readouterr().out)
+
+
+BAD = [
+    (["study", "newton1687", "-o", "out"], 2, "'newton1687' is no study; there are guestrin2006"),
+    (["study", "guestrin2006"], 2, "--output"),
+    (["study"], 2, "NAME"),
+    (["study", "guestrin2006", "-o", "out", "--eyes", "E9"], 2, "E9"),
+    (["study", "guestrin2006", "-o", "out", "--eyes", "E1,E1"], 2, "--eyes: name each eye once"),
+    (["study", "guestrin2006", "-o", "out", "--eyes", ","], 2, "--eyes"),
+    (["study", "guestrin2006", "-o", "out", "--protocol", "mine"], 2, "--protocol"),
+    (["study", "guestrin2006", "-o", "out", "--observer", "mine"], 2, "--observer"),
+    (["study", "conditions", "-o", "out", "--observer", "image"], 2, "analytic observer only"),
+    (["study", "guestrin2006", "-o", "out", "--workers", "0"], 2, "--workers: must be >= 1"),
+    (["study", "guestrin2006", "-o", "out", "--spp", "0"], 2, "--spp: must be >= 1"),
+    (["study", "guestrin2006", "-o", "taken"], 2, "taken: is not empty"),
+    (["study", "guestrin2006", "-o", "file"], 2, "file: exists and is not a folder"),
+    (["study", "guestrin2006", "-o", "file/deeper"], 1, "file/deeper"),
+]
+
+
+@pytest.mark.parametrize(("argv", "code", "words"), BAD, ids=lambda v: " ".join(v) if isinstance(v, list) else None)
+def test_bad_input(tmp_path, monkeypatch, capsys, argv, code, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "thesis.txt").write_text("years of work")
+    (tmp_path / "file").write_text("x")
+    before = sorted(str(p) for p in tmp_path.rglob("*"))
+    assert run(argv) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    assert words in err
+    assert sorted(str(p) for p in tmp_path.rglob("*")) == before
+
+
+def test_a_turned_camera_changes_no_ray():
+    scene = guestrin.scene("E2", guestrin.CORRECTED)
+    direct = observe(scene)
+    index = direct.index
+    outside = 0
+    for head, place in enumerate(scene.spec.subject.head_positions_mm):
+        rows = np.flatnonzero((index.head == head) & (index.eye == 1))
+        turned = facing_scene(scene, place, "left")
+        seen = observe(turned)
+        assert (seen.pupil.in_image & seen.glints.in_image.all(axis=1)).all()
+        outside += int((~direct.glints.in_image[rows].all(axis=1)).sum())
+        back = with_index_of(moved(seen, turned.rig.cameras[0], scene.rig.cameras[0]), scene, rows)
+        np.testing.assert_array_equal(back.index.target_mm, index.target_mm[rows])
+        np.testing.assert_allclose(back.glints.xy_px, direct.glints.xy_px[rows], atol=1e-8)
+        # The centre of an ellipse is not the image of a centre: some thousandths of a pixel.
+        np.testing.assert_allclose(back.pupil.centre_px, direct.pupil.centre_px[rows], atol=0.02)
+        np.testing.assert_array_equal(back.pupil.in_image, direct.pupil.in_image[rows])
+    assert outside > 0  # some frames do need the turn
+
+
+def test_turned_frames_come_back_in_the_scenes_order(monkeypatch):
+    scene = guestrin.scene("E1", guestrin.CORRECTED)
+    # The image part alone is replaced by the analytic one: what is tested is the order and the index.
+    monkeypatch.setattr(Observing, "_images", staticmethod(lambda s, name, settings: observe(s)))
+    seen = Observing("image", ImageSettings(folder=None)).observe(scene, "x", facing=True)
+    direct = observe(scene)
+    for name in ("frame", "fixation", "head", "eye", "target_mm"):
+        np.testing.assert_array_equal(getattr(seen.index, name), getattr(direct.index, name))
+    np.testing.assert_allclose(seen.glints.xy_px, direct.glints.xy_px, atol=1e-8)
+
+
+def test_images_need_a_folder():
+    with pytest.raises(InputError, match="needs a folder"):
+        Observing("image").observe(guestrin.scene("E1", set()), "x")
+
+
+def test_known_feature_errors_and_paired_differences():
+    from dataclasses import replace
+
+    from eyerender.arrays import frozen
+
+    scene = guestrin.scene("E2", {"eyes"})
+    truth = observe(scene)
+    shift = np.array([0.3, -0.1])
+    found = replace(truth, pupil=replace(truth.pupil, centre_px=frozen(truth.pupil.centre_px + shift)))
+    rows = {f.feature: f for f in observers_compared.features(truth, found, scene.rig, "c", "E2")}
+    pupil = rows["pupil centre"]
+    assert (pupil.n, pupil.missing) == (len(truth), 0)
+    np.testing.assert_allclose([pupil.bias_x_px, pupil.bias_y_px], shift, atol=1e-9)
+    assert pupil.sd_x_px == pytest.approx(0, abs=1e-9)
+    # 640 mm away, 4667 px: 0.137 mm a pixel.
+    assert pupil.bias_mm == pytest.approx(np.hypot(*shift) * 0.137, rel=0.03)
+    assert rows["glint of light 1"].median_distance_px == 0
+    a, b = np.array([1.0, 2, 3, np.nan]), np.array([1.5, 2.7, 3.3, 9.0])
+    d = observers_compared.gaze(a, b, "c", "E2", "x")
+    assert (d.n, d.difference_deg) == (3, pytest.approx(0.5))
+    # Student's t with 2 degrees of freedom: 4.3027 * SD / sqrt(3), SD = 0.2.
+    assert d.high_deg - d.difference_deg == pytest.approx(4.3027 * 0.2 / np.sqrt(3), rel=1e-4)
+    assert observers_compared.gaze(a[:1], b[:1], "c", "E2", "x") is None
+
+
+def test_conditions():
+    part = conditions_part("E2")
+    for tracker in TRACKERS:
+        centre = part.head_maps[tracker][2, 2]
+        assert centre == np.nanmin(part.head_maps[tracker]) or tracker == "model-based"
+        # 4 mm is what it was calibrated with.
+        own = next(r for r in part.rows if r.variant == f"{tracker}, as calibrated")
+        assert part.diameters[tracker][2] == pytest.approx(own.mean_deg, rel=1e-9)
+        assert part.precision[tracker]["rms_s2s_deg"] / part.precision[tracker]["sd_deg"] == pytest.approx(
+            2**0.5, rel=0.03
+        )
+    assert part.screen_maps["model-based"].shape == (11, 13)
+    assert part.screen_maps["interpolation"].shape == (9, 15)
+    names = [e["parameter"] for e in part.sensitivity]
+    assert "corneal asphericity Q" in names
+    assert "posterior corneal radius" not in names  # E2 has none
+    assert len(names) == len(PARAMETERS) - 2
+    assert all(e[t]["per_step"] is not None for e in part.sensitivity for t in TRACKERS)
+    # A rounder cornea (Q towards 0) is what the model-based tracker assumes.
+    q = next(e for e in part.sensitivity if e["parameter"] == "corneal asphericity Q")
+    assert q["model-based"]["at_plus"] < q["model-based"]["base"] < q["model-based"]["at_minus"]
+
+
+@pytest.mark.slow
+def test_conditions_of_all_models(tmp_path):
+    summary = run_study("conditions", tmp_path / "out")
+    assert [m["eye_model"] for m in summary["models"]] == ["E1", "E2", "E3", "E4", "E5"]
+    lost = [e for m in summary["models"] for e in m["sensitivity"] for t in TRACKERS if e[t]["reason"]]
+    assert lost == []
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_image_observer_resumes(tmp_path):
+    arguments = {"observer": "both", "protocol": "corrected", "eyes": ("E2",), "spp": 4}
+    first = run_study("guestrin2006", tmp_path / "out", **arguments)
+    images = sorted((tmp_path / "out" / "images").rglob("*.png"))
+    assert len(images) == 2 * 90  # images and masks
+    stamps = [p.stat().st_mtime_ns for p in images]
+    again = run_study("guestrin2006", tmp_path / "out", **arguments)
+    assert [p.stat().st_mtime_ns for p in images] == stamps
+    assert again["rows"] == first["rows"]
+    rows = {
+        (r["observer"], r["head"]): r for r in first["rows"] if r["eye"] == "both" and r["variant"] == "index fixed"
+    }
+    assert rows["image", "H1"]["missing"] == 0
+    assert rows["image", "H1"]["mean_deg"] < 0.5
+    pupil = next(f for f in first["observers"]["features"] if f["feature"] == "pupil centre")
+    assert pupil["n"] == 90
+    assert pupil["median_distance_px"] < 0.3
