@@ -21,6 +21,7 @@ from .observation import EYES, Observations
 from .scene import Scene
 
 if TYPE_CHECKING:
+    from .rendering.frame import RenderJob
     from .rendering.renderer import RenderedWindow, Renderer
 
 Progress = Callable[[int, int, str], None]
@@ -69,27 +70,11 @@ def render_windows(
     check_windows(scene)
     if renderer is None:
         renderer = make_renderer(backend, threads)
-    from .rendering.frame import RenderJob
-
-    index, windows = observations.index, scene.windows()
+    index = observations.index
     eyes: dict[str, Eye] = {side: scene.eye(side) for side in scene.spec.subject.eyes}
     for row in range(len(observations)):
-        side, camera, head = EYES[index.eye[row]], int(index.camera[row]), int(index.head[row])
-        M, t = _motion(eyes[side], observations, row)
-        t = t + index.eye_position_mm[row] + index.head_mm[row]
-        job = RenderJob(
-            eye=eyes[side],
-            M=M,
-            t=t,
-            camera=scene.rig.cameras[camera],
-            window=windows[camera, head, int(index.eye[row])],
-            lights=scene.rig.lights,
-            sensor=scene.spec.sensor,
-            look=scene.spec.look,
-            wavelength_nm=scene.spec.wavelength_nm,
-            seed=image_seed(scene.spec.seed, int(index.frame[row]), int(index.eye[row])),
-            apex_mm=index.eye_position_mm[row] + index.head_mm[row],
-        )
+        side, camera = EYES[index.eye[row]], int(index.camera[row])
+        job = render_job(scene, observations, row, eyes[side])
         done = renderer.render(job, spp=scene.spec.image.spp)
         labels = done.labels
         assert labels is not None
@@ -107,12 +92,37 @@ def render_windows(
                 "failed_paths": done.failed_paths,
             },
             eyes[side],
-            M,
-            t,
+            job.M,
+            job.t,
             done,
         )
         if progress is not None:
             progress(row + 1, len(observations), "")
+
+
+def render_job(scene: Scene, observations: Observations, row: int, eye: Eye | None = None) -> RenderJob:
+    """What the renderer is asked for one observation: the eye in its pose, the rig, the window, the seed."""
+    from .rendering.frame import RenderJob
+
+    index, windows = observations.index, scene.windows()
+    side, camera, head = EYES[index.eye[row]], int(index.camera[row]), int(index.head[row])
+    eye = scene.eye(side) if eye is None else eye
+    M, t = _motion(eye, observations, row)
+    apex = index.eye_position_mm[row] + index.head_mm[row]
+    return RenderJob(
+        eye=eye,
+        M=M,
+        t=t + apex,
+        camera=scene.rig.cameras[camera],
+        window=windows[camera, head, int(index.eye[row])],
+        lights=scene.rig.lights,
+        sensor=scene.spec.sensor,
+        look=scene.spec.look,
+        region=scene.spec.region,
+        wavelength_nm=scene.spec.wavelength_nm,
+        seed=image_seed(scene.spec.seed, int(index.frame[row]), int(index.eye[row])),
+        apex_mm=apex,
+    )
 
 
 def check_windows(scene: Scene) -> None:

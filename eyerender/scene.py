@@ -19,6 +19,7 @@ from .eye.catalogue import load_eye
 from .eye.model import Eye
 from .eye.spec import EyeSpec
 from .observation import EYES, Index
+from .region.anatomy import RegionSpec
 from .region.look import LookSpec
 from .rig.rig import Rig, RigSpec
 from .rig.sensor import SensorSpec
@@ -95,6 +96,7 @@ class SceneSpec(FileSpec):
     image: ImageSpec = ImageSpec()
     sensor: SensorSpec = SensorSpec()
     look: LookSpec = LookSpec()
+    region: RegionSpec | None = None
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
 
     @model_validator(mode="after")

@@ -244,7 +244,7 @@ def coverage(table: Table, tallies: dict[str, Tally], method: str) -> None:
 
 
 def reliability(table: Table, count: int, first: int) -> None:
-    """Confidence against frequency by decile of confidence, over the mixed condition."""
+    """Confidence against frequency by decile, over the mixed condition and a tenth as many images without an eye."""
     for settings in (REFINED, FAST):
         tally = Tally()
         stated, right = [], []
@@ -256,6 +256,13 @@ def reliability(table: Table, count: int, first: int) -> None:
             if found.pupil.ellipse is not None:
                 stated.append(found.pupil.confidence)
                 right.append(tally.right > before)
+        false = []
+        for seed in range(first, first + count // 10):
+            pupil = extract(ideal.draw_no_eye(seed), settings=settings).pupil
+            if pupil.ellipse is not None:
+                stated.append(pupil.confidence)
+                right.append(False)
+                false.append(pupil.confidence)
         order = np.argsort(stated, kind="stable")
         gaps = [
             abs(float(np.mean(np.array(stated)[part]) - np.mean(np.array(right)[part])))
@@ -266,6 +273,9 @@ def reliability(table: Table, count: int, first: int) -> None:
         table.add(f"{name}: confidence off the frequency, mean of deciles", float(np.mean(gaps)), "1")
         table.add(f"{name}: not found", tally.missing / count, "1")
         table.add(f"{name}: found, IoU <= 0.9", (len(tally.iou) - tally.right) / count, "1")
+        table.add(f"no eye, {settings.method}: found all the same", len(false) / max(count // 10, 1), "1", aim=0.0)
+        wrong = sum(value > 0.9 for value in false) / max(count // 10, 1)
+        table.add(f"no eye, {settings.method}: found with confidence > 0.9", wrong, "1", aim=0.0)
         sure = np.array(stated) > 0.9
         table.add(f"{name}: confidence > 0.9, share of images", float(np.sum(sure)) / count, "1")
         table.add(f"{name}: confidence > 0.9, of those wrong", float(1.0 - np.mean(np.array(right)[sure])), "1")

@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
-    from . import dataset, environment, eyes, gaze, images, observe, study  # noqa: F401  (they register their commands)
+    from . import dataset, environment, export, eyes, gaze, images, observe, study  # noqa: F401  (they register their commands)
 
     tokens = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in tokens

@@ -123,7 +123,7 @@ class Plan:
 
     def to_mapping(self) -> dict[str, Any]:
         """What `from_mapping` reads back, without files."""
-        return {"spec": self.spec.to_mapping(), "eyes": {name: dict(eye) for name, eye in self.eyes.items()}}
+        return dict(_sorted({"spec": self.spec.to_mapping(), "eyes": self.eyes}))
 
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any]) -> Plan:
@@ -134,7 +134,7 @@ class Plan:
     def _splits(self) -> dict[int, str] | None:
         """Subject -> split; None where there is only one."""
         spec = self.spec
-        names = list(spec.splits)
+        names = sorted(spec.splits)  # the order of keys in a file means nothing
         if len(names) == 1:
             return None
         n = spec.subject_count
@@ -236,6 +236,13 @@ def _possible(node: Any) -> list[Any]:
     kind = node.get("draw")
     values = [node.get("value")] if kind == "fixed" else node.get("values") or []
     return [leaf for value in values for leaf in _possible(value)]
+
+
+def _sorted(node: Any) -> Any:
+    """A copy whose mappings have their keys in order."""
+    if isinstance(node, Mapping):
+        return {key: _sorted(node[key]) for key in sorted(node)}
+    return [_sorted(value) for value in node] if isinstance(node, list | tuple) else node
 
 
 def _copy(node: Any) -> Any:

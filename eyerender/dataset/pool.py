@@ -81,6 +81,8 @@ class LocalPool:
                 for worker in list(self._workers):
                     reason = self._listen(worker, events)
                     if reason is None:
+                        if worker.shard is None and worker.images >= self.recycle_images:
+                            self._end(worker)  # before what its libraries leak adds up
                         continue
                     shard = worker.shard
                     self._end(worker)
@@ -150,8 +152,6 @@ class LocalPool:
         elif kind == "done":
             events.staged(Staged(**message[1]), worker.name)
             worker.shard = None
-            if worker.images >= self.recycle_images:
-                self._end(worker)
         elif kind == "failed" and message[1] == "backend":
             raise BackendError(message[2])
         elif kind == "failed" and message[1] == "disk":

@@ -14,6 +14,7 @@ from .preprocess import DN, Image, Prepared, as_image
 from .result import GlintResult, frozen
 from .settings import ExtractionSettings
 from .spotfit import SpotFit
+from .spotmend import patch_moments
 
 Array = NDArray[np.float64]
 
@@ -25,11 +26,12 @@ MOST_PEAKS = 80  # maxima looked at, brightest first
 @dataclass(frozen=True, slots=True, eq=False)
 class Spots:
     """Detected spots: xy_px (n, 2) of the peak pixels, width_px (n,) sigma guessed from the area above half height,
-    height_dn (n,) above the surroundings."""
+    height_dn (n,) above the surroundings. patches_px (k, 2): peaks of bright places that are no spots."""
 
     xy_px: Array
     width_px: Array
     height_dn: Array
+    patches_px: Array
 
 
 def detect_spots(
@@ -60,6 +62,7 @@ def detect_spots(
     xy, height = np.stack([column[order], row[order]], axis=-1).astype(np.float64), height[order]
     width = _widths(hat, xy, height, size)
     spot = _compact(smooth, xy, width, height) & (width < widest(blur_px))
+    patches = xy[~spot & (height > 1.5 * threshold)][: settings.max_glints]
     xy, width, height = xy[spot], width[spot], height[spot]
     keep: list[int] = []
     for i in range(height.size):  # flat tops of clipped spots give several maxima, and so does noise on wide ones
@@ -67,7 +70,8 @@ def detect_spots(
             keep.append(i)
         if len(keep) >= settings.max_glints + 8:
             break
-    return Spots(xy[keep] + np.array([x0, y0]), width[keep], height[keep])
+    corner = np.array([x0, y0])
+    return Spots(xy[keep] + corner, width[keep], height[keep], patches + corner)
 
 
 def widest(blur_px: float) -> float:
@@ -106,7 +110,7 @@ def _parted(smooth: Image, first: Array, second: Array, dip: float, size: int) -
 
 
 def _no_spots() -> Spots:
-    return Spots(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    return Spots(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 2)))
 
 
 def _opening(smooth: Image, size: int) -> Image:
@@ -147,7 +151,13 @@ def judge_spots(
         (accepted if reason is None else rejected).append(result)
     reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
     surplus = [replace(glint, status="rejected", reason=reason) for glint in accepted[settings.max_glints :]]
-    return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus)
+    strip = "a strip or a broad patch, as reflections off the sclera and wet lid margins are"
+    patches = [
+        GlintResult("rejected", strip, frozen(xy), None, 0.0, 0.0, saturated=False)
+        for xy in spots.patches_px
+        if all(glint.xy_px is None or math.dist(xy, glint.xy_px) > 4.0 for glint in accepted)
+    ]
+    return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
 
 
 def _objection(spots: Spots, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float) -> str | None:
@@ -160,10 +170,15 @@ def _objection(spots: Spots, fit: SpotFit, i: int, prepared: Prepared, step_dn: 
         return f"no spot: the fit moved {moved:.1f} px from the bright pixel"
     if wide < 0.5 * optics_sigma(blur_px):
         return f"sharper than the optics (sigma {wide:.1f} px): a bad pixel"
+    moments = patch_moments(prepared.linear, fit, i)
+    if moments is not None:
+        # A pixel's own 1/12 keeps a spot of one row of pixels from being a line.
+        short, long = np.sqrt(np.linalg.eigvalsh(moments) + 1.0 / 12.0).tolist()
+        narrow, wide = min(narrow, short), max(wide, long)
+        if long > 2.0 * short:
+            return f"elongated {long / short:.1f} : 1, as reflections off the sclera and wet lid margins are"
     if wide > widest(blur_px):
         return f"too wide for a glint: sigma {wide:.1f} px"
-    if wide > 2.2 * max(narrow, 0.4):
-        return f"elongated {wide / narrow:.1f} : 1, as reflections off the sclera and wet lid margins are"
     if fit.amplitude_dn[i] < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
         return "too faint for a glint"
     if wide > 2.5 and not _outshines(fit, i, prepared):

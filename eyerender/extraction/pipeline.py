@@ -223,5 +223,5 @@ def _glints(
     fit = fit_spots(prepared.linear, known, *starts, *limits)
     fit = give_edges(prepared.linear, known, starts, fit, model.sigma_px, limits)
     starts, fit = split_blends(prepared.linear, known, starts, fit, limits)
-    spots = Spots(*starts)
+    spots = Spots(*starts, spots.patches_px)
     return judge_spots(spots, fit, prepared, step, model.sigma_px, settings)

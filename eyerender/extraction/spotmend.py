@@ -63,6 +63,7 @@ def give_edges(
 
 def _window(linear: Image, centre: Array, half: int) -> tuple[Array, Array, Array]:
     cx, cy = (round(float(v)) for v in centre)
+    cx, cy = int(np.clip(cx, 0, linear.shape[1] - 1)), int(np.clip(cy, 0, linear.shape[0] - 1))
     columns = np.arange(max(0, cx - half), min(linear.shape[1], cx + half + 1))
     rows = np.arange(max(0, cy - half), min(linear.shape[0], cy + half + 1))
     x, y = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
@@ -126,22 +127,29 @@ def split_blends(
 
 
 def _long_axis(linear: Image, fit: SpotFit, i: int) -> tuple[Array, float] | None:
-    """((2,) one deviation along a patch's longer axis, deviation across it) by moments above half height, or None."""
+    """((2,) one deviation along a patch's longer axis, deviation across it), or None for a round one."""
+    moments = patch_moments(linear, fit, i)
+    if moments is None:
+        return None
+    values, vectors = np.linalg.eigh(moments)
+    if values[1] <= 1.3 * max(float(values[0]), 0.01):
+        return None
+    across = float(np.clip(1.3 * math.sqrt(max(float(values[0]), 0.1)), 0.5, 8.0))
+    return np.asarray(vectors[:, 1] * math.sqrt(values[1])), across
+
+
+def patch_moments(linear: Image, fit: SpotFit, i: int) -> Array | None:
+    """(2, 2) second moments, px^2, of what stands above a third of spot i's height, the other spots taken away."""
     half = math.ceil(3.0 * float(fit.sigma_px[i].max()) + 1.0)
-    cx, cy = (round(float(v)) for v in fit.xy_px[i])
-    y0, x0 = max(0, cy - half), max(0, cx - half)
-    patch = linear[y0 : cy + half + 1, x0 : cx + half + 1].astype(np.float64) - fit.background_dn[i]
-    weight = np.maximum(patch - 0.35 * patch.max(initial=0.0), 0.0) if patch.size else patch
+    x, y, data = _window(linear, fit.xy_px[i], half)
+    patch = data - fit.background_dn[i]
+    for k in range(fit.amplitude_dn.size):
+        if k != i and fit.converged[k] and math.dist(fit.xy_px[k], fit.xy_px[i]) < 3.0 * half:
+            patch = patch - spot_light(fit.one(k), x, y)
+    weight = np.maximum(patch - 0.35 * patch.max(initial=0.0), 0.0)
     total = float(weight.sum())
     if total <= 0.0:
         return None
-    x, y = np.arange(weight.shape[1])[None, :], np.arange(weight.shape[0])[:, None]
-    mx, my = float((weight * x).sum()) / total, float((weight * y).sum()) / total
-    cxx, cyy = float((weight * (x - mx) ** 2).sum()) / total, float((weight * (y - my) ** 2).sum()) / total
-    cxy = float((weight * (x - mx) * (y - my)).sum()) / total
-    values, vectors = np.linalg.eigh(np.array([[cxx, cxy], [cxy, cyy]]))
-    if values[1] <= 1.3 * max(float(values[0]), 0.01):
-        return None
-    return np.asarray(vectors[:, 1] * math.sqrt(values[1])), float(
-        np.clip(1.3 * math.sqrt(max(float(values[0]), 0.1)), 0.5, 8.0)
-    )
+    dx, dy = x - float((weight * x).sum()) / total, y - float((weight * y).sum()) / total
+    xy = float((weight * dx * dy).sum()) / total
+    return np.array([[float((weight * dx * dx).sum()) / total, xy], [xy, float((weight * dy * dy).sum()) / total]])

@@ -103,10 +103,10 @@ class SkinSpec(Spec):
 
     albedo: float = _number(0.55, 0.30, 0.75, "of the skin (Cooksey, Allen, Tsai 2017: about 0.4 to 0.65 at 850 nm)")
     mottling: Share = Field(default=0.5, description="unevenness of the albedo (chosen)")
-    relief_mm: float = _number(0.045, 0.0, 0.12, "depth of the skin's fine furrows (Tchvialeva 2013: 20 to 100 um)")
+    relief_mm: float = _number(0.032, 0.0, 0.12, "depth of the skin's fine furrows (Tchvialeva 2013: 20 to 100 um)")
     wrinkles: Share = Field(default=0.35, description="lines on and below the lids (chosen)")
     sheen: Share = Field(default=0.5, description="strength of the oily skin's rough mirror (chosen)")
-    wet_albedo: float = _number(0.43, 0.2, 0.7, "of the margins and the caruncle (chosen)")
+    wet_albedo: float = _number(0.40, 0.2, 0.7, "of the margins and the caruncle (chosen)")
 
 
 class TearSpec(Spec):

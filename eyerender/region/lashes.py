@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from ..arrays import ArrayValue, Floats, frozen
 from .anatomy import LashSpec, RegionSpec
-from .contour import step
+from .contour import step, unit
 from .globe import Globe
 from .hairs import SEGMENTS, Hairs, taper
 from .lids import CONJUNCTIVA, LID, MARGIN, Sheet
@@ -53,7 +53,7 @@ def _lid(spec: LashSpec, seed: int, upper: bool) -> tuple[Floats, ...]:
     place = (np.arange(count) + 0.5 + rng.uniform(-0.45, 0.45, count)) / max(count, 1)
     # Denser towards the temple.
     a = low + (high - low) * place**1.08
-    across = rng.choice([0.72, 0.86, 0.97], count, p=[0.25, 0.4, 0.35]) + rng.normal(0, 0.03, count)
+    across = rng.choice([0.60, 0.76, 0.92], count, p=[0.3, 0.4, 0.3]) + rng.normal(0, 0.03, count)
     # Longest a little temporal of the middle, short at both ends.
     end = (a - low) / (high - low)
     profile = 0.45 + 0.55 * np.sin(np.pi * np.clip(end, 0, 1) ** 0.9) ** 0.6
@@ -106,7 +106,9 @@ def lashes(spec: RegionSpec, globe: Globe, sheet: Sheet) -> Hairs:
         f = p.fan * (0.55 + 0.6 * s)
         d = np.cos(f)[:, None] * (np.cos(b)[:, None] * n + np.sin(b)[:, None] * m) + np.sin(f)[:, None] * t
         points[:, j] = points[:, j - 1] + (p.length_mm / SEGMENTS)[:, None] * d
-    points[:, 1:] = _out_of_skin(globe, sheet, points[:, 1:])
+    ahead = unit(n + 0.4 * np.array([1.0, 0.0, 0.0]))
+    straight = root[:, None] + (p.length_mm[:, None] * np.linspace(0, 1, k))[..., None] * ahead[:, None]
+    points[:, 1:] = _out_of_skin(globe, sheet, points, straight)
     return Hairs(frozen(points), frozen(taper(p.length_mm, spec.lashes.diameter_mm, k)))
 
 
@@ -119,13 +121,16 @@ def _at(angle: Floats, values: Floats) -> Floats:
     return np.asarray((1 - w) * values[i % n] + w * values[(i + 1) % n])
 
 
-def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats) -> Floats:
-    """The points (n, k, 3), lifted along the nearest skin's normal to `_ABOVE_MM` over it, and off the globe.
+def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -> Floats:
+    """The points (n, k, 3) beyond the roots, lifted along the nearest skin's normal to `_ABOVE_MM` over it, and off the globe.
 
-    The middles between points count too: a straight piece must not cut through a fold.
+    Places between points count too: a straight piece must not cut through a fold. A lash that stays caught gives way
+    towards `straight`, which stands off the lid.
     """
     if not points.size:
-        return points
+        return points[:, 1:]
+    root, points, straight = points[:, 0], points[:, 1:], straight[:, 1:]
+    stride = np.linalg.norm(points[:, 0] - root, axis=-1)
     rows = slice(CONJUNCTIVA + MARGIN - 1, CONJUNCTIVA + MARGIN + LID + _REACH_ROWS)
     skin, normals = sheet.vertices[rows].reshape(-1, 3), sheet.normals[rows].reshape(-1, 3)
     tree = cKDTree(skin)
@@ -140,8 +145,10 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats) -> Floats:
 
     out += lift(out, np.inf)
     active = np.arange(len(out))
-    for _ in range(10):
+    for turn in range(16):
         some = out[active]
+        if turn >= 6:  # caught in a fold, where the nearest skin's normals disagree
+            some = some + 0.35 * (straight[active] - some)
         middles = (2 * some[:, :-1] + some[:, 1:]) / 3, (some[:, :-1] + 2 * some[:, 1:]) / 3
         push = lift(np.concatenate([some, *middles], axis=1), 1.0)
         some = some + push[:, :k]
@@ -149,6 +156,11 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats) -> Floats:
             between = push[:, k + i * (k - 1) : k + (i + 1) * (k - 1)]
             some[:, :-1] += 0.7 * between
             some[:, 1:] += 0.7 * between
+        # A lifted lash keeps its length.
+        last = root[active]
+        for i in range(k):
+            piece = some[:, i] - last
+            last = some[:, i] = last + piece * (stride[active] / np.maximum(np.linalg.norm(piece, axis=-1), 1e-9))[:, None]
         out[active] = some
         active = active[np.abs(push).max(axis=(1, 2)) > 0.01]
         if not len(active):

@@ -90,7 +90,7 @@ def _margin(spec: RegionSpec, globe: Globe, c: Contour) -> tuple[Floats, Floats]
     out = np.cos(tilt) * c.normal + np.sin(tilt) * c.away
     u = np.linspace(0, 1, MARGIN)[:, None, None]
     u = 0.5 - 0.5 * np.cos(np.pi * u) * (0.6 + 0.4 * np.cos(np.pi * u) ** 2)
-    rounding = 0.22 * (2 * u - 1) ** 4 * (width / spec.lids.margin_mm)[:, None]
+    rounding = 0.26 * (2 * u - 1) ** 4 * (width / spec.lids.margin_mm)[:, None]
     rows = c.point + width[:, None] * u * out + rounding * c.away
     rows = globe.pushed_out(rows, spec.lids.film_mm)
     # The two lids meet in the middle between them, never beyond.
@@ -188,9 +188,9 @@ def _fold(spec: RegionSpec, c: Contour, v: Floats, crease: Floats, strength: Flo
     height = lids.fold_mm * (0.25 + 0.75 * open_) * strength
     w = v - crease
     groove = -0.3 * np.exp(-((w / 0.5) ** 2)) * (0.4 + 0.6 * open_) * (lids.fold_mm > 0)
-    swell = step(w, -0.05, 0.9) * np.exp(-np.maximum(w - 0.9, 0) / 4.5)
+    swell = step(w, -0.1, 1.5) * np.exp(-(np.maximum(w - 1.3, 0) ** 2) / 24.0)
     lift = height * swell + groove * strength
-    drop = 0.55 * height * step(w, 0.0, 0.7) * np.exp(-np.maximum(w - 0.7, 0) / 1.6)
+    drop = 0.55 * height * step(w, 0.0, 0.7) * np.exp(-(np.maximum(w - 0.7, 0) ** 2) / 5.0)
     bags = np.where(c.upper < 0, 1.0, 0.0) * lids.bags_mm * np.exp(-(((v - 8.5) / 3.5) ** 2)) * np.abs(np.sin(c.angle))
     line = np.where(c.upper < 0, -0.22, 0.0) * np.exp(-(((v - crease) / 0.7) ** 2)) * np.abs(np.sin(c.angle))
     return lift + bags + line, drop

@@ -81,8 +81,8 @@ def _field(seed: int, y: Floats, z: Floats, across: tuple[float, float], up: tup
 def _relief(spec: RegionSpec, y: Floats, z: Floats, near: Floats) -> Floats:
     """Height (mm): cells parted by furrows, drawn out across on the lids; wrinkles along the lids; pores."""
     skin = spec.skin
-    coarse = sampled(furrows(spec.seed, _TILE, 950), y, z, _TILE_MM)
-    drawn = sampled(furrows(spec.seed + 7, _TILE, 1100, 0.45), y, z, _TILE_MM)
+    coarse = sampled(furrows(spec.seed, _TILE, 1700), y, z, _TILE_MM)
+    drawn = sampled(furrows(spec.seed + 7, _TILE, 1500, 0.6), y, z, _TILE_MM)
     lids = np.exp(-((np.hypot(y / 19.0, z / 13.0)) ** 4)) * near
     cells = (1 - lids) * coarse + lids * drawn
     grain = _field(spec.seed + 3, y, z, (60, 200), (60, 200))
@@ -113,7 +113,7 @@ def _albedo(spec: RegionSpec, y: Floats, z: Floats, rows: Floats, upper: Floats,
     slow = _field(seed + 21, y, z, (0, 4), (0, 4))
     blotch = _field(seed + 22, y, z, (3, 22), (3, 22))
     fine = _field(seed + 23, y, z, (40, 150), (40, 150))
-    net = sampled(furrows(seed, _TILE, 950), y, z, _TILE_MM)
+    net = sampled(furrows(seed, _TILE, 1700), y, z, _TILE_MM)
     tone = 1 + skin.mottling * (0.05 * slow + 0.045 * blotch + 0.03 * fine + 0.07 * (net - 0.6))
     # The hollow beside the nose and the rim below the lower lid are a little darker, the lash line more so.
     tone = tone * (1 - 0.10 * np.exp(-(((y - 15.0) / 5.0) ** 2) - ((z - 4.0) / 6.0) ** 2))

@@ -14,6 +14,7 @@ from ..eye.model import Eye
 from ..geometry.surfaces import Surface
 from ..geometry.surfaces_biconic import Biconic
 from ..geometry.surfaces_quadric import Quadric
+from ..region.anatomy import RegionSpec
 from ..region.look import LookSpec
 from ..rig.camera import Camera
 from ..rig.light import Light
@@ -46,6 +47,7 @@ class RenderJob(ArrayValue):
     labels: bool = True
     purkinje: tuple[int, ...] = (1,)
     apex_mm: Floats | None = None
+    region: RegionSpec | None = None
 
     @property
     def anchor_mm(self) -> Floats:
@@ -85,6 +87,9 @@ def eye_numbers(eye: Eye) -> dict[str, ArrayLike]:
         "limbus_floor": float(np.min(rim)) - 2.0,
         "sclera.centre": eye.sclera.centre_mm,
         "sclera.radius": eye.sclera.radius_mm,
+        # Of the sphere about the sclera's centre that holds the cornea too.
+        "globe.reach": max(float(eye.sclera.radius_mm), float(np.linalg.norm(apex_of(front) - eye.sclera.centre_mm)))
+        + 0.5,
         "image.scale": scale,
         "image.shift": shift,
     }
@@ -137,7 +142,7 @@ def light_table(lights: Sequence[Light], M: Floats, t: Floats) -> Floats:
 
 def ring_radius_mm(lamp: Light) -> float:
     """The radius of the dark middle of a ring-shaped lamp; 0 for points and discs."""
-    return float(getattr(lamp, "inner_radius_mm", 0.0))
+    return lamp.inner_radius_mm
 
 
 def _shape(surface: Surface) -> Floats:

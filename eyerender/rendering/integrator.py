@@ -40,8 +40,8 @@ def shade(
     values: Values, lights: Lights, textures: Textures, scene: Any, o: Any, d: Any, active: Any, u: Any, v: Any
 ) -> Shaded:
     """Radiance along rays of the scene's frame by light that comes from the lamps on the shortest way."""
-    view = look(values, scene, o, d, active)
-    outer, inner, failures = light(values, lights, scene, view, u, v)
+    view = look(values, scene, o, d, active, textures.region)
+    outer, shine, inner, failures = light(values, lights, scene, view, -values.vector_to_eye(d), u, v)
     albedo = outer_albedo(values, textures, view, active)
     behind = dr.if_stmt(
         (view.inner,),
@@ -52,6 +52,7 @@ def shade(
     index = values["inner_index"]
     through = view.passed * behind * inner / (index * index)
     seen = dr.select(view.cornea, view.opacity * albedo * outer + (1 - view.opacity) * through, albedo * outer)
+    seen += dr.pi * shine * dr.select(view.cornea, view.opacity, 1)
     valid = view.cornea | view.sclera | view.other
     return Shaded(dr.select(valid, seen * dr.inv_pi, 0), view, albedo, failures)
 

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .manifold import connect
+from .region import sheen
 from .values import Lamp, Lights, Values
 from .view import EPSILON_MM, View, meet_sphere, opacity
 
@@ -20,15 +21,15 @@ def lamp_blocked(values: Values, scene: Any, x: Any, lamp: Any, sphere: Any, cor
     d = lamp - x
     distance = dr.norm(d)
     d /= distance
-    t, met = meet_sphere(x - values["sclera.centre"], d, values["sclera.radius"])
-    blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
-    front = values.surfaces[0]
-    o, dl = front.point_in(x), front.vector_in(d)
-    t, met = front.hit(o, dl)
-    y = o + t * dl
-    rho2 = y.y * y.y + y.z * y.z
-    met &= (rho2 < values["limbus_radius"] * values["limbus_radius"]) & (y.x > values["limbus_floor"])
-    blocked |= met & cornea & (t > EPSILON_MM) & (t < distance)
+    r = x - values["sclera.centre"]
+    past = r - dr.dot(r, d) * d
+    reach = values["globe.reach"]
+    blocked = dr.if_stmt(
+        (x, r, d, distance, mi.Bool(sphere), mi.Bool(cornea)),
+        dr.squared_norm(past) < reach * reach,
+        lambda x, r, d, distance, sphere, cornea: _globe_blocks(values, x, r, d, distance, sphere, cornea),
+        lambda x, r, d, distance, sphere, cornea: mi.Bool(False),
+    )
     if not values.structure.obstacles:
         return blocked | (values.point_to_scene(lamp).x < values["backdrop.x"])
     ray = mi.Ray3f(mi.Point3f(values.point_to_scene(x + EPSILON_MM * d)), values.vector_to_scene(d))
@@ -36,11 +37,28 @@ def lamp_blocked(values: Values, scene: Any, x: Any, lamp: Any, sphere: Any, cor
     return blocked | scene.ray_test(ray, coherent=True, active=active & ~blocked)
 
 
-def light(values: Values, lights: Lights, scene: Any, view: View, u: Any, v: Any) -> tuple[Any, Any, Any]:
-    """Irradiance (mW/mm^2) at the first surface where it is matte and in the plane of the iris, and failed paths."""
+def _globe_blocks(values: Values, x: Any, r: Any, d: Any, distance: Any, sphere: Any, cornea: Any) -> Any:
+    """Whether the globe stands in the way; r: the point from the sclera's centre."""
+    t, met = meet_sphere(r, d, values["sclera.radius"])
+    blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
+    front = values.surfaces[0]
+    o, dl = front.point_in(x), front.vector_in(d)
+    t, met = front.hit(o, dl)
+    y = o + t * dl
+    rho2 = y.y * y.y + y.z * y.z
+    met &= (rho2 < values["limbus_radius"] * values["limbus_radius"]) & (y.x > values["limbus_floor"])
+    return blocked | (met & cornea & (t > EPSILON_MM) & (t < distance))
+
+
+def light(
+    values: Values, lights: Lights, scene: Any, view: View, back: Any, u: Any, v: Any
+) -> tuple[Any, Any, Any, Any]:
+    """Irradiance (mW/mm^2) at the first surface where it is matte and in the plane of the iris, the radiance of its
+    sheen towards the unit direction `back` (eye frame), and failed paths."""
     outside = (view.cornea & (view.opacity > 0)) | view.sclera | view.other
     inside = view.cornea & (view.opacity < 1) & (view.passed > 0)
-    return lamps(values, lights, scene, view.point, view.normal, outside, view.other, view.inner, inside, u, v)
+    return lamps(values, lights, scene, view.point, view.normal, outside, view.other, view.inner, inside, u, v,
+                 (back, view.gloss) if values.structure.region else None)  # fmt: skip
 
 
 def lamps(
@@ -55,13 +73,15 @@ def lamps(
     inside: Any,
     u: Any,
     v: Any,
-) -> tuple[Any, Any, Any]:
-    """Irradiance (mW/mm^2) of all lamps, and the number of light paths that did not converge.
+    glossy: tuple[Any, Any] | None = None,
+) -> tuple[Any, Any, Any, Any]:
+    """Irradiance (mW/mm^2) of all lamps outside and inside, radiance of the sheen, and the number of failed light paths.
 
     Args:
         point, normal: matte points in the air, where `outside`; the scene's own where `other`, else the globe's.
         inner: points in the plane of the iris, where `inside`.
         u, v: place on each lamp's disc, [0, 1).
+        glossy: unit direction to the viewer and gloss of the points outside, where they mirror at all.
     """
     n = values["stop.normal"]
     # The point's Gaussian image: where the straight line from a lamp must aim to be bent on to the point.
@@ -73,7 +93,7 @@ def lamps(
     def more(i: Any, *_: Any) -> Any:
         return i < lights.count
 
-    def body(i: Any, direct: Any, bent: Any, failures: Any) -> Any:
+    def body(i: Any, direct: Any, shine: Any, bent: Any, failures: Any) -> Any:
         lamp: Lamp = lights[i]
         source = lamp.point(u, sine, cosine_v)
         to = source - point
@@ -82,7 +102,10 @@ def lamps(
         cosine = dr.dot(to, normal)
         lit = outside & (cosine > 0)
         blocked = lamp_blocked(values, scene, point, source, other, True, lit)
-        direct += dr.select(lit & ~blocked, lamp.radiant_intensity(-to) * cosine * inv2, 0)
+        arriving = dr.select(lit & ~blocked, lamp.radiant_intensity(-to) * cosine * inv2, 0)
+        direct += arriving
+        if glossy is not None:
+            shine += arriving * sheen(normal, to, *glossy)
 
         def through_cornea(source: Any, inner: Any, aim: Any, bent: Any, failures: Any) -> Any:
             path = connect(values.surfaces, source, inner, n, aim, values["limbus_radius"], inside)
@@ -100,10 +123,10 @@ def lamps(
             through_cornea,
             lambda source, inner, aim, bent, failures: (bent, failures),
         )
-        return i + 1, direct, bent, failures
+        return i + 1, direct, shine, bent, failures
 
-    state = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.UInt32(0))
-    _, direct, bent, failures = dr.while_loop(
-        state, more, body, labels=("i", "direct", "bent", "failures"), label="lamps"
+    state = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0), mi.UInt32(0))
+    _, direct, shine, bent, failures = dr.while_loop(
+        state, more, body, labels=("i", "direct", "shine", "bent", "failures"), label="lamps"
     )
-    return direct, bent, failures
+    return direct, shine, bent, failures

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..errors import InputError
 from . import psf, sensor
 from .frame import RenderJob, camera_numbers, eye_numbers, kinds, light_table, look_numbers, pose_numbers
 from .glints import POINT, GlintScene, GlintTable, Spots, glint_table, quadrature
 from .integrator import integrator_class
 from .lighting import lamps
 from .purkinje import purkinje_images
+from .region import RegionScene, globe_of
 from .sampling import Sampler, camera_ray
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
@@ -85,6 +87,7 @@ class Renderer:
         self._integrator.bounces = bounces
         self._surround = Surround(obstacles)
         self._textures: dict[int, Textures] = {}
+        self._regions: dict[Any, RegionScene] = {}
 
     def render(self, job: RenderJob, *, spp: int | None = None) -> RenderedWindow:
         """Render one window."""
@@ -92,13 +95,13 @@ class Renderer:
         pad = psf.margin(job.sensor.psf_sigma_px)
         x0, y0, width, height = job.window
         radiance, failed = self._radiance(
-            values, lights, (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad), spp or self.spp, job.seed
+            self._place(job).scene, values, lights, (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad), spp or self.spp, job.seed
         )
         blurred = psf.blur(radiance, job.sensor.psf_sigma_px).copy()
         glints, others = self._add_glints(job, blurred)
         irradiance = blurred * sensor.radiance_to_irradiance(job.sensor)
         dn = sensor.expose(job.sensor, irradiance, job.wavelength_nm, job.seed)
-        labels = self._labels(values, job.window) if job.labels else None
+        labels = self._labels(job, values) if job.labels else None
         return RenderedWindow(
             job.window,
             frozen(irradiance, np.float32),
@@ -113,7 +116,7 @@ class Renderer:
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
         """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), before lens and glints."""
         values, lights = self._bind(job)
-        return self._radiance(values, lights, job.window, spp or self.spp, job.seed)[0]
+        return self._radiance(self._place(job).scene, values, lights, job.window, spp or self.spp, job.seed)[0]
 
     def iris_irradiance(self, job: RenderJob, points_mm: Floats) -> Floats:
         """Irradiance (n,) mW/mm^2 that points (n, 3) of the iris' plane (eye frame, mm) get from all lamps.
@@ -124,29 +127,53 @@ class Renderer:
         x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
         no, yes = mi.Bool(False), dr.full(mi.Bool, True, len(points_mm))
         corner = mi.Float(0)  # of the unit square: the disc's centre
-        _, bent, _ = lamps(
-            values, lights, self._surround.scene, mi.Vector3f(0), mi.Vector3f(1, 0, 0), no, no, x, yes, corner, corner
+        _, _, bent, _ = lamps(
+            values, lights, self._place(job).scene, mi.Vector3f(0), mi.Vector3f(1, 0, 0), no, no, x, yes, corner, corner
         )
         return np.asarray(bent.numpy(), dtype=float)
 
     def labels(self, job: RenderJob) -> PartLabels:
         """The labels of a window alone."""
-        return self._labels(self._bind(job)[0], job.window)
+        return self._labels(job, self._bind(job)[0])
 
     def _bind(self, job: RenderJob) -> tuple[Values, Lights]:
-        structure = Structure(kinds(job.eye), bool(np.any(job.camera.distortion)), self._surround.obstructed)
+        place = self._place(job)
+        structure = Structure(
+            kinds(job.eye), bool(np.any(job.camera.distortion)), place.obstructed, isinstance(place, RegionScene)
+        )
         anchor = job.anchor_mm
         numbers = {
             **eye_numbers(job.eye),
             **look_numbers(job.look),
             **pose_numbers(job.M, job.t, anchor),
             **camera_numbers(job.camera, anchor),
+            "region.mirror": place.mirror if isinstance(place, RegionScene) else 1.0,
         }
         values = Values(structure, structure.pack(numbers))
         lights = Lights(light_table(job.lights, job.M, job.t))
-        self._surround.show(job.look)
-        self._integrator.bind(values, lights, self._textures_of(job))
+        textures = self._textures_of(job)
+        if isinstance(place, RegionScene):
+            textures = replace(textures, region=place.map)
+        else:
+            place.show(job.look)
+        self._integrator.bind(values, lights, textures)
         return values, lights
+
+    def _place(self, job: RenderJob) -> Surround | RegionScene:
+        """What stands around the job's eye: its region at the job's pose, or the surround."""
+        if job.region is None:
+            return self._surround
+        if self._surround.obstructed:
+            raise InputError("obstacles and an eye region do not go together")
+        globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
+        key = RegionScene.key(job.region, globe)
+        if key not in self._regions:
+            if len(self._regions) >= 4:
+                self._regions.pop(next(iter(self._regions)))
+            self._regions[key] = RegionScene(job.region, globe)
+        place = self._regions[key]
+        place.show(job.region, globe)
+        return place
 
     def _textures_of(self, job: RenderJob) -> Textures:
         seed = job.look.iris_seed
@@ -157,7 +184,7 @@ class Renderer:
         return self._textures[seed]
 
     def _radiance(
-        self, values: Values, lights: Lights, window: tuple[int, int, int, int], spp: int, seed: int
+        self, scene: Any, values: Values, lights: Lights, window: tuple[int, int, int, int], spp: int, seed: int
     ) -> tuple[Floats, int]:
         width, height = window[2:]
         pixels = width * height
@@ -176,7 +203,7 @@ class Renderer:
             spot = sampler.in_pixel()
             o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
             ray = mi.Ray3f(mi.Point3f(o), d)
-            seen, _, _ = self._integrator.sample(self._surround.scene, sampler, ray)
+            seen, _, _ = self._integrator.sample(scene, sampler, ray)
             cosine = cosine * cosine
             samples, failures = seen[0] * cosine * cosine, self._integrator.failures
             dr.eval(samples, failures)  # together: a reduction of its own would trace everything anew
@@ -184,11 +211,11 @@ class Renderer:
             failed += int(dr.sum(failures).numpy()[0])
         return (total / spp).reshape(height, width), failed
 
-    def _labels(self, values: Values, window: tuple[int, int, int, int]) -> PartLabels:
-        width, height = window[2:]
-        u, v = _pixels(dr.arange(mi.UInt32, width * height), window)
+    def _labels(self, job: RenderJob, values: Values) -> PartLabels:
+        width, height = job.window[2:]
+        u, v = _pixels(dr.arange(mi.UInt32, width * height), job.window)
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
-        view = look(values, self._surround.scene, o, d, True)
+        view = look(values, self._place(job).scene, o, d, True)
         clear = view.amodal_cornea & (view.opacity < 0.5)
         amodal = dr.select(
             view.amodal_cornea | view.amodal_sclera,
@@ -211,7 +238,7 @@ class Renderer:
         eye, anchor, sigma = job.eye, job.anchor_mm, job.sensor.psf_sigma_px
 
         def clear(a: Floats, b: Floats) -> Bools:
-            return self._surround.clear(a - anchor, b - anchor)
+            return self._place(job).clear(a - anchor, b - anchor)
 
         scene = GlintScene(
             eye.front[0], float(eye.front_indices[0]), float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm),

@@ -61,22 +61,27 @@ class Surround:
 
     def clear(self, a: Floats, b: Floats) -> Bools:
         """Whether nothing of the surround stands between points (n, 3) of the scene's frame; ends not included."""
-        length = np.linalg.norm(b - a, axis=-1)
-        d = (b - a) / length[:, None]
-        margin = 1e-3
-        table = np.column_stack([a + margin * d, d, length - 2 * margin]).astype(np.float32)
-        # Gathered from one buffer: the kernel would depend on the alignment of every array that NumPy owns.
-        buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 7
-        o = [dr.gather(mi.Float, buffer, row + k) for k in range(7)]
-        ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:6]))
-        ray.maxt = o[6]  # type: ignore[assignment]
-        return ~np.asarray(self.scene.ray_test(ray).numpy(), dtype=bool)
+        return clear_between(self.scene, a, b)
 
     @staticmethod
     def _backdrop() -> Any:
         uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (2 * _HALF_MM / _TILE_MM)
         material = _matte(mi.TensorXf(np.full((2, 2, 1), 0.4, np.float32)))
         return _mesh("backdrop", _corners(10.0), np.array([[0, 1, 2], [0, 2, 3]]), uv, material)
+
+
+def clear_between(scene: Any, a: Floats, b: Floats) -> Bools:
+    """Whether nothing of a Mitsuba scene stands between points (n, 3) of its frame; ends not included."""
+    length = np.linalg.norm(b - a, axis=-1)
+    d = (b - a) / length[:, None]
+    margin = 1e-3
+    table = np.column_stack([a + margin * d, d, length - 2 * margin]).astype(np.float32)
+    # Gathered from one buffer: the kernel would depend on the alignment of every array that NumPy owns.
+    buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 7
+    o = [dr.gather(mi.Float, buffer, row + k) for k in range(7)]
+    ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:6]))
+    ray.maxt = o[6]  # type: ignore[assignment]
+    return ~np.asarray(scene.ray_test(ray).numpy(), dtype=bool)
 
 
 def _corners(distance_mm: float) -> Floats:

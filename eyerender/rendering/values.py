@@ -23,11 +23,13 @@ LIGHT_WIDTH = 10  # position 3, axis 3, radius, intensity, lobe exponent, inner 
 @dataclass(frozen=True, slots=True)
 class Structure:
     """What a kernel is compiled for: (biconic, tilted) of each surface, whether the camera's lens distorts, and whether
-    anything but the surround's plane, which hides no lamp before it, can stand in the way of light."""
+    anything but the surround's plane, which hides no lamp before it, can stand in the way of light; whether the scene is
+    an eye region instead of a surround."""
 
     surfaces: tuple[tuple[bool, bool], ...]
     distorted: bool = False
     obstacles: bool = True
+    region: bool = False
 
     @property
     def layout(self) -> tuple[tuple[str, int], ...]:
@@ -51,6 +53,7 @@ class Structure:
             ("limbus_gain", 1),
             ("sclera.centre", 3),
             ("sclera.radius", 1),
+            ("globe.reach", 1),
             ("image.scale", 1),
             ("image.shift", 1),
             ("pose.col0", 3),
@@ -71,6 +74,7 @@ class Structure:
             ("sclera.contrast", 1),
             ("limbus.albedo", 1),
             ("backdrop.x", 1),
+            ("region.mirror", 1),
         ]
         return tuple(rows)
 

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..region.texture import iris_texture, sclera_texture
+from .region import surface
 from .surfaces import fresnel
 from .values import Values
 
@@ -39,6 +40,8 @@ class View:
     interaction: Any  # with the scene
     amodal_cornea: Any  # as if the eye stood alone
     amodal_sclera: Any
+    albedo: Any  # of the region's mesh, where there is one
+    gloss: Any  # likewise, and of the wet sclera
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +50,7 @@ class Textures:
 
     iris: Any
     sclera: Any
+    region: Any = None
 
     @classmethod
     def of_seed(cls, seed: int) -> Textures:
@@ -66,8 +70,11 @@ def opacity(values: Values, rho: Any) -> Any:
     return s * s * (3 - 2 * s)
 
 
-def look(values: Values, scene: Any, o: Any, d: Any, active: Any) -> View:
-    """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris."""
+def look(values: Values, scene: Any, o: Any, d: Any, active: Any, region: Any = None) -> View:
+    """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris.
+
+    `region` is the map of an eye region, whose normals and albedos then count.
+    """
     hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True, active=active)
     # Single precision: start next to the eye.
     t0 = -dr.dot(o, d) - _NEAR_MM
@@ -89,9 +96,10 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any) -> View:
     on_cornea &= on_eye
     on_sclera &= on_eye
     other = hit.is_valid() & ~on_eye & active
-    interaction = hit.compute_surface_interaction(
-        mi.Ray3f(mi.Point3f(o), d), mi.RayFlags.Minimal | mi.RayFlags.UV, other
-    )
+    flags = mi.RayFlags.Minimal | mi.RayFlags.UV
+    if region is not None:
+        flags = flags | mi.RayFlags.ShadingFrame
+    interaction = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(o), d), flags, other)
 
     normal, mirrored, passed, inner, pupil = dr.if_stmt(
         (yl, oe + tc * de, dl),
@@ -101,7 +109,12 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any) -> View:
     )
     y = oe + tc * de
     xs = oe + ts * de
-    xo, no = values.point_to_eye(interaction.p), values.vector_to_eye(interaction.n)
+    facing, albedo, gloss = mi.Vector3f(interaction.n), mi.Float(0), mi.Float(0)
+    if region is not None:
+        skin = surface(region, values["region.mirror"], interaction, other)
+        facing, albedo = skin.normal, skin.albedo
+        gloss = dr.select(other, skin.gloss, 0.8)
+    xo, no = values.point_to_eye(interaction.p), values.vector_to_eye(facing)
     no = dr.select(dr.dot(no, de) > 0, -no, no)
     point = dr.select(on_cornea, y, dr.select(on_sclera, xs, xo))
     normal = dr.select(on_cornea, normal, dr.select(on_sclera, xs - values["sclera.centre"], no))
@@ -120,6 +133,8 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any) -> View:
         interaction,
         amodal_cornea,
         amodal_sclera,
+        albedo,
+        gloss,
     )
 
 
@@ -179,7 +194,7 @@ def iris_albedo(values: Values, textures: Textures, x: Any) -> Any:
 def outer_albedo(values: Values, textures: Textures, view: View, active: Any) -> Any:
     """Albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
     si = view.interaction
-    other = si.bsdf().eval_diffuse_reflectance(si, active & view.other)[0]
+    other = view.albedo if textures.region is not None else si.bsdf().eval_diffuse_reflectance(si, active & view.other)[0]
     return dr.if_stmt(
         (view.point, other),
         view.other,

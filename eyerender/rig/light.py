@@ -31,6 +31,7 @@ class LightSpec(Spec):
     position_mm: Vec3 | None = None
     ring: RingSpec | None = None
     radius_mm: NonNegative = Field(default=0.0, description="radius of the emitting disc; 0 is a point")
+    inner_radius_mm: NonNegative = Field(default=0.0, description="of the hole of a ring-shaped emitter")
     aim_mm: Vec3 = Field(default=(0, 0, 0), description="world point its axis goes through")
     intensity_mw_sr: Positive = Field(default=20.0, description="radiant intensity on the axis")
     lobe_exponent: NonNegative = Field(default=1.0, description="m of cos^m; 1 is Lambertian, 0 isotropic")
@@ -39,6 +40,8 @@ class LightSpec(Spec):
     def _check(self) -> Self:
         if (self.position_mm is None) == (self.ring is None):
             raise ValueError("give either position_mm or ring")
+        if self.inner_radius_mm > 0 and self.inner_radius_mm >= self.radius_mm:
+            raise ValueError("inner_radius_mm must be less than radius_mm")
         if self.position_mm is not None and np.allclose(self.position_mm, self.aim_mm, atol=1e-6):
             raise ValueError("aim_mm is the light's own position")
         return self
@@ -63,6 +66,7 @@ class LightSpec(Spec):
                 self.radius_mm,
                 self.intensity_mw_sr,
                 self.lobe_exponent,
+                self.inner_radius_mm,
             )
             for p in places
         )
@@ -77,3 +81,4 @@ class Light(ArrayValue):
     radius_mm: float
     intensity_mw_sr: float
     lobe_exponent: float
+    inner_radius_mm: float = 0.0

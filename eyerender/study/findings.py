@@ -49,11 +49,11 @@ def guestrin(
     out = []
     for test in t_tests(means):
         expected = {"E1": True, "E3": True, "E2": False, "E4": False}.get(test["eye_model"])
-        claim = {True: "differs", False: "does not differ", None: "(no claim)"}[expected]
+        claim = {True: "differs from", False: "does not differ from", None: "against"}[expected]
         out.append(
             Finding(
                 "G1", protocol, observer,
-                f"{test['eye_model']} {test['head']} {claim} from the experiment: p of a two-tailed t-test",
+                f"{test['eye_model']} {test['head']} {claim} the experiment: p of a two-tailed t-test",
                 test["p"], "p < 0.05" if expected else "p >= 0.05" if expected is not None else "none",
                 None if expected is None else test["differs"] == expected,
                 f"simulated {test['simulated_deg']:.3f}, measured {test['measured_deg']:.3f} (SD "

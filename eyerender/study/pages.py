@@ -319,14 +319,14 @@ def _observers_section(apart: Apart) -> list[Section]:
 def _findings_section(found: Sequence[Finding]) -> Section:
     rows = [
         (
-            f.id, f.protocol, f.observer, f.rule, "-" if f.value is None else f"{f.value:.4g}", f.threshold,
-            {True: "true", False: "false", None: "-"}[f.verdict], f.detail,
+            f.id, {True: "true", False: "false", None: "-"}[f.verdict], f.rule,
+            "-" if f.value is None else f"{f.value:.4g}", f.threshold, f.protocol, f.observer, f.detail,
         )
         for f in found
     ]  # fmt: skip
-    header = ("id", "protocol", "observer", "statement: value", "value", "threshold", "verdict", "detail")
+    header = ("id", "verdict", "statement: value", "value", "threshold", "protocol", "observer", "detail")
     text = ("Each statement tested on this run's own data; the value stands beside its threshold.",)
-    return Section("Findings", text, (), [Table(header, rows, wide=(3, 7))])
+    return Section("Findings", text, (), [Table(header, rows, wide=(2, 5, 7))])
 
 
 def _waterfall_section(

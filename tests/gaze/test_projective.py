@@ -117,7 +117,7 @@ def test_refusals():
     line[:, 2] = 0.0
     with pytest.raises(InputError, match="do not determine a homography"):
         HomographyNormalisation().fit(seen, line, WORLD)
-    with pytest.raises(InputError, match="needs 4 lights|not different lights"):
+    with pytest.raises(InputError, match="not different lights"):
         HomographyNormalisation().fit(seen, seen.index.target_mm, rig([CAMERA], LIGHTS[:2], (650, 0, 0)))
     both = data(eyes=(0, 1))
     only = HomographyNormalisation().fit(seen, seen.index.target_mm, WORLD).predict(both, WORLD)

@@ -21,7 +21,7 @@ def test_quality_of_known_noise():
     noise = rng.normal(0, sigma_mm, (4000, 2, 2))
     samples = target + np.array([0.0, offset, 0.0]) + np.concatenate([np.zeros((4000, 2, 1)), noise], axis=-1)
     q = quality(samples, target, np.zeros(3))
-    # Straight ahead: accuracy atan(5/700); SD sigma sqrt(2)/d; RMS-S2S sqrt(2) of that for white noise. 4000 samples: 2 %.
+    # Accuracy atan(5/700); SD sigma sqrt(2)/d; RMS-S2S sqrt(2) times that for white noise. 4000 samples: 2 %.
     np.testing.assert_allclose(q.accuracy_deg[0], np.degrees(np.arctan(offset / distance)), atol=0.01)
     np.testing.assert_allclose(q.sd_deg[0], np.degrees(sigma_mm * np.sqrt(2) / distance), rtol=0.02)
     np.testing.assert_allclose(q.rms_s2s_deg / q.sd_deg, np.sqrt(2), rtol=0.03)

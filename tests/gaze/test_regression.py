@@ -15,7 +15,9 @@ from eyerender.rig.rig import RigSpec
 
 RIG = RigSpec.from_mapping(
     {
-        "cameras": [{"position_mm": [520, 0, -300], "tilt_deg": 30, "focal_length_px": 3571, "resolution_px": [1600, 1200]}],
+        "cameras": [
+            {"position_mm": [520, 0, -300], "tilt_deg": 30, "focal_length_px": 3571, "resolution_px": [1600, 1200]}
+        ],
         "lights": [{"position_mm": [560, 0, -250]}],
         "screen": {"centre_mm": [800, 0, -131.5], "size_mm": [495, 280]},
     }

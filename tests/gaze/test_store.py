@@ -1,4 +1,4 @@
-"""`gaze fit` and `gaze predict`: calibrations survive their file, records of a user are enough, mistakes get one line."""
+"""`gaze fit` and `gaze predict`: calibrations survive their file, a user's records suffice, mistakes get one line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from eyerender.analytic.observer import observe
 from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.gaze.store import (
-    EstimatorSpec, fit_estimator, load_estimator, load_observations, predictions, rig_from_mapping, save_estimator,
+    EstimatorSpec,
+    fit_estimator,
+    load_estimator,
+    load_observations,
+    predictions,
+    rig_from_mapping,
+    save_estimator,
 )  # fmt: skip
 from eyerender.scene import load_scene
 
@@ -126,21 +132,22 @@ def test_jsonl_and_folder_metadata_are_records_too(guestrin, tmp_path):
         load_observations(lines)
 
 
+FIT = ["gaze", "fit", "features.json", "--estimator"]
 BAD = [
     (["gaze", "fit", "none.json", "--estimator", "regression", "-o", "c.json"], "none.json: no such file"),
-    (["gaze", "fit", "features.json", "--estimator", "magic", "-o", "c.json"], "magic"),
-    (["gaze", "fit", "features.json", "--estimator", "regression", "--function", "R13", "-o", "c.json"], "R13"),
-    (["gaze", "fit", "features.json", "--estimator", "regression", "--terms-x", "x+1", "-o", "c.json"], "--terms-y"),
-    (["gaze", "fit", "features.json", "--estimator", "regression", "--fixations", "0,a", "-o", "c.json"], "--fixations"),
-    (["gaze", "fit", "features.json", "--estimator", "regression", "--fixations", "99", "-o", "c.json"], "no fixation 99"),
-    (["gaze", "fit", "features.json", "--estimator", "regression", "--fixations", "0", "-o", "c.json"], "R3 has 6"),
-    (["gaze", "fit", "features.json", "--estimator", "homography", "-o", "c.json"], "lights"),
-    (["gaze", "fit", "features.json", "--estimator", "shih-wu-liu", "-o", "c.json"], "two cameras"),
-    (["gaze", "fit", "features.json", "--estimator", "guestrin-eizenman", "--index", "0.5", "-o", "c.json"], "index"),
+    ([*FIT, "magic", "-o", "c.json"], "magic"),
+    ([*FIT, "regression", "--function", "R13", "-o", "c.json"], "R13"),
+    ([*FIT, "regression", "--terms-x", "x+1", "-o", "c.json"], "--terms-y"),
+    ([*FIT, "regression", "--fixations", "0,a", "-o", "c.json"], "--fixations"),
+    ([*FIT, "regression", "--fixations", "99", "-o", "c.json"], "no fixation 99"),
+    ([*FIT, "regression", "--fixations", "0", "-o", "c.json"], "R3 has 6"),
+    ([*FIT, "homography", "-o", "c.json"], "lights"),
+    ([*FIT, "shih-wu-liu", "-o", "c.json"], "two cameras"),
+    ([*FIT, "guestrin-eizenman", "--index", "0.5", "-o", "c.json"], "index"),
     (["gaze", "fit", "empty.jsonl", "--estimator", "regression", "-o", "c.json"], "holds no records"),
     (["gaze", "fit", "text.txt", "--estimator", "regression", "-o", "c.json"], "line 1: is not valid JSON"),
     (["gaze", "fit", "norig.json", "--estimator", "regression", "-o", "c.json"], "holds no rig"),
-    (["gaze", "fit", "badrig.json", "--estimator", "regression", "-o", "c.json"], "rig.cameras.0.K: must be 3 x 3 numbers"),
+    (["gaze", "fit", "badrig.json", "--estimator", "regression", "-o", "c.json"], "rig.cameras.0.K: must be 3 x 3"),
     (["gaze", "predict", "features.json", "-c", "none.json"], "none.json: no such file"),
     (["gaze", "predict", "features.json", "-c", "features.json"], "features.json: schema: is 'eyerender/features/1'"),
     (["gaze", "predict", "features.json", "-c", "hollow.json"], "eyes: is no calibration"),

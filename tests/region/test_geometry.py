@@ -104,7 +104,9 @@ def check(i):
     # And the margin rests on the globe where it stands before it.
     edge = grid[CONJUNCTIVA]
     front = np.hypot(*(edge - globe.centre * [1, -1 if globe.mirrored else 1, 1])[:, 1:].T) < 8.0
-    assert np.count_nonzero(front) > 20 and signed_distance(eye, globe, edge[front]).max() < 0.25, note
+    assert np.all(signed_distance(eye, globe, edge[front]) < 0.25), note
+    if spec.blink == 0:
+        assert np.count_nonzero(front) > 20, note
 
     # Lids do not pass through each other: at the same place along the fissure the upper margin is the upper one.
     middle = (columns - 1) // 4

@@ -1,4 +1,4 @@
-"""The two replications: the published protocol gives the paper's figures, the corrected one what an independent run gave."""
+"""The two replications: `published` gives the paper's figures, `corrected` what an independent run gave."""
 
 from __future__ import annotations
 

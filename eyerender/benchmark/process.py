@@ -1,0 +1,145 @@
+"""An extractor as a process: asked over pipes, watched by the clock, killed with all it started."""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from types import TracebackType
+from typing import IO, Self
+
+from ..errors import InputError
+from .protocol import Greeting, Reply, Request
+
+_LONGEST_LINE = 4_000_000
+# One core: seconds of different extractors are only comparable when none spreads over more.
+_ONE_CORE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
+
+
+class Failed(Exception):
+    """The extractor did not answer as it must; the message is the reason."""
+
+
+class ExtractorProcess:
+    """A running extractor; a context manager that leaves nothing running.
+
+    After `Failed` the process is dead; a new one must be started.
+    """
+
+    def __init__(
+        self, argv: Sequence[str], *, start_timeout_s: float, timeout_s: float, env: Mapping[str, str] | None = None
+    ) -> None:
+        self._timeout_s = timeout_s
+        self._stderr: IO[bytes] = tempfile.TemporaryFile()
+        self._buffer = b""
+        try:
+            self._process = subprocess.Popen(
+                list(argv),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._stderr,
+                # A group of its own, so that killing it takes along whatever it started.
+                start_new_session=True,
+                env={**os.environ, **_ONE_CORE, **(env or {})},
+            )
+        except OSError as error:
+            self._stderr.close()
+            raise Failed(f"cannot be started: {error.strerror or error}") from None
+        try:
+            self.greeting = Greeting.parse(self._line(start_timeout_s, "no greeting"))
+        except InputError as error:
+            self.close()
+            raise Failed(f"greeting: {error}") from None
+        except BaseException:
+            self.close()
+            raise
+
+    def ask(self, request: Request) -> tuple[Reply, float]:
+        """The answer to one request, and the seconds the round trip took."""
+        begin = time.monotonic()
+        try:
+            assert self._process.stdin is not None
+            self._process.stdin.write(request.to_line().encode())
+            self._process.stdin.flush()
+        except OSError:
+            raise self._died() from None
+        line = self._line(self._timeout_s, "no answer")
+        seconds = time.monotonic() - begin
+        try:
+            return Reply.parse(line, request.id, self.greeting.conventions), seconds
+        except InputError as error:
+            # What it says next may belong to any image: it is not to be trusted any more.
+            self.close()
+            raise Failed(f"unusable answer: {error}") from None
+
+    def close(self) -> None:
+        """End the process and all it started."""
+        if self._process.poll() is None or self._process.returncode is not None:
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
+        if not self._stderr.closed:
+            self._stderr.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _line(self, timeout_s: float, what: str) -> str:
+        """The next line of its output; raises `Failed` when it takes longer, ends, or the line never does."""
+        assert self._process.stdout is not None
+        end = time.monotonic() + timeout_s
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._process.stdout, selectors.EVENT_READ)
+            while b"\n" not in self._buffer:
+                left = end - time.monotonic()
+                if left <= 0 or not selector.select(left):
+                    self.close()
+                    raise Failed(f"{what} within {timeout_s:g} s")
+                chunk = os.read(self._process.stdout.fileno(), 65536)
+                if not chunk:
+                    raise self._died()
+                self._buffer += chunk
+                if len(self._buffer) > _LONGEST_LINE:
+                    self.close()
+                    raise Failed(f"printed {len(self._buffer)} bytes without an answer")
+        line, _, self._buffer = self._buffer.partition(b"\n")
+        return line.decode("utf-8", "replace")
+
+    def _died(self) -> Failed:
+        """Why it ended: its exit status and the last line it wrote to stderr."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=2.0)
+        code = self._process.poll()
+        last = self._last_words()
+        self.close()
+        if code is None:
+            how = "closed its output"
+        elif code < 0:
+            name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+            how = f"was killed by {name}"
+        else:
+            how = f"ended with exit code {code}"
+        return Failed(f"{how}: {last}" if last else how)
+
+    def _last_words(self) -> str:
+        if self._stderr.closed:
+            return ""
+        size = self._stderr.seek(0, os.SEEK_END)
+        self._stderr.seek(max(0, size - 4096))
+        lines = [line.strip() for line in self._stderr.read().decode("utf-8", "replace").splitlines()]
+        lines = [line for line in lines if line]
+        return "".join(c if c.isprintable() else "?" for c in lines[-1])[:160] if lines else ""

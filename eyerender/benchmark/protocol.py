@@ -1,0 +1,150 @@
+"""Versioned JSON lines between the bench and an extractor.
+
+    extractor -> bench  {"schema": "eyerender/extractor/1", "name", "conventions": {..}, "reports": ["pupil", "glints"]}
+    bench -> extractor  {"schema": "eyerender/extractor/1", "id", "image", "bit_depth", "hints": {..}}
+    extractor -> bench  {"id", "record": {"pupil": {..}, "glints": [..]}, "cpu_s": null, "wall_s": null}
+
+One object a line, the greeting once, then an answer to each request in turn; end of input is the end. The record is the
+package's (eyerender/record/1); only `pupil.status` is needed of it, and with "ok" centre, axes and angle: either
+`semi_axes_px` and `angle_rad`, which say what they are, or `axes_px` and `angle` as `conventions` declares. Places are
+relative to the image.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ..errors import InputError
+from ..geometry.ellipse import Ellipse
+from .conventions import Conventions, number, pair
+
+SCHEMA = "eyerender/extractor/1"
+FEATURES = ("pupil", "glints")
+_MOST_GLINTS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Greeting:
+    """What an extractor says of itself. `reports`: the features it looks for at all."""
+
+    name: str
+    conventions: Conventions
+    reports: tuple[str, ...]
+
+    @classmethod
+    def parse(cls, line: str) -> Greeting:
+        """Raises `InputError` saying what is wrong with the line."""
+        data = _object(line)
+        if data.get("schema") != SCHEMA:
+            raise InputError(f"is {data.get('schema')!r}; this version speaks {SCHEMA!r}", path="schema")
+        name, reports = data.get("name"), data.get("reports", list(FEATURES))
+        if not isinstance(name, str) or not name.strip() or len(name) > 80:
+            raise InputError("must be a name", path="name")
+        if not isinstance(reports, list) or "pupil" not in reports or any(r not in FEATURES for r in reports):
+            raise InputError(f"must name 'pupil' and at most {', '.join(FEATURES)}", path="reports")
+        return cls(name.strip(), Conventions.of(data.get("conventions")), tuple(f for f in FEATURES if f in reports))
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One image to look at. `hints`: what any extractor may know; never the truth."""
+
+    id: int
+    image: str
+    bit_depth: int
+    hints: Mapping[str, Any]
+
+    def to_line(self) -> str:
+        """The line that is sent."""
+        data = {"schema": SCHEMA, "id": self.id, "image": self.image, "bit_depth": self.bit_depth}
+        return json.dumps({**data, "hints": dict(self.hints)}, allow_nan=False) + "\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What an extractor found, in this package's conventions: `ellipse` is None where it found no pupil (`reason`).
+
+    `glints`: ((x, y), light or None) in px. `cpu_s`, `wall_s`: the extractor's own figures, None where it gives none.
+    """
+
+    ellipse: Ellipse | None
+    reason: str | None
+    confidence: float | None
+    glints: tuple[tuple[tuple[float, float], int | None], ...]
+    cpu_s: float | None
+    wall_s: float | None
+
+    @classmethod
+    def parse(cls, line: str, request_id: int, conventions: Conventions) -> Reply:
+        """Raises `InputError` saying what is wrong with the line."""
+        data = _object(line)
+        if data.get("id") != request_id:
+            raise InputError(f"must be {request_id}, not {data.get('id')!r}", path="id")
+        record = data.get("record")
+        if not isinstance(record, dict) or not isinstance(record.get("pupil"), dict):
+            raise InputError("must hold the pupil", path="record")
+        pupil = record["pupil"]
+        ellipse = None
+        if pupil.get("status") == "ok":
+            ellipse = _ellipse(pupil, conventions)
+        elif pupil.get("status") != "missing":
+            raise InputError(f"must be 'ok' or 'missing', not {pupil.get('status')!r}", path="pupil.status")
+        reason = pupil.get("reason")
+        return cls(
+            ellipse,
+            str(reason)[:200] if reason else None,
+            _optional(pupil.get("confidence"), "pupil.confidence"),
+            _glints(record.get("glints"), conventions),
+            _optional(data.get("cpu_s"), "cpu_s"),
+            _optional(data.get("wall_s"), "wall_s"),
+        )
+
+
+def _ellipse(pupil: Mapping[str, Any], conventions: Conventions) -> Ellipse:
+    centre = pair(pupil.get("centre_px"), "pupil.centre_px")
+    if "semi_axes_px" in pupil:
+        axes = pair(pupil["semi_axes_px"], "pupil.semi_axes_px")
+        angle = number(pupil.get("angle_rad"), "pupil.angle_rad")
+        # The names say what these are; only the origin is left to declare.
+        conventions = Conventions(pixel_origin=conventions.pixel_origin)
+    else:
+        axes = pair(pupil.get("axes_px"), "pupil.axes_px")
+        angle = number(pupil.get("angle"), "pupil.angle")
+    return conventions.ellipse(centre, axes, angle)
+
+
+def _glints(entries: Any, conventions: Conventions) -> tuple[tuple[tuple[float, float], int | None], ...]:
+    if entries is None:
+        return ()
+    if not isinstance(entries, list) or len(entries) > _MOST_GLINTS:
+        raise InputError(f"must be a list of at most {_MOST_GLINTS}", path="glints")
+    out = []
+    for k, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise InputError("must be an object", path=f"glints.{k}")
+        if entry.get("status", "ok") != "ok":
+            continue
+        light = entry.get("light")
+        if light is not None and (isinstance(light, bool) or not isinstance(light, int)):
+            raise InputError("must be a whole number or null", path=f"glints.{k}.light")
+        known = light if light is not None and light >= 0 else None
+        out.append((conventions.point(pair(entry.get("xy_px"), f"glints.{k}.xy_px")), known))
+    return tuple(out)
+
+
+def _optional(value: Any, path: str) -> float | None:
+    return None if value is None else number(value, path)
+
+
+def _object(line: str) -> dict[str, Any]:
+    try:
+        data = json.loads(line)
+    except (ValueError, RecursionError):
+        shown = line.strip()
+        raise InputError(f"printed what is no JSON: {shown[:60]!r}") from None
+    if not isinstance(data, dict):
+        raise InputError("printed JSON that is no object")
+    return data

@@ -1,0 +1,80 @@
+"""A Python callable behind the protocol: `python -m eyerender.benchmark.worker module:callable [NAME]`.
+
+The callable takes (image, request): the image as (h, w) numbers as stored, the request as the mapping that was sent. It
+returns the record, {"pupil": {..}, "glints": [..]}. Its attributes `conventions` and `reports`, where it has them, are
+those of the greeting. What it prints goes to stderr.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ..imagefile import read_image
+from .conventions import Conventions
+from .protocol import FEATURES, SCHEMA
+
+ExtractorCallable = Callable[[Any, Mapping[str, Any]], Mapping[str, Any]]
+
+
+def main(argv: list[str]) -> int:
+    """Serve requests until the input ends."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    # Nothing that a library or the callable prints may mix with the answers.
+    os.dup2(2, 1)
+    sys.stdout = sys.stderr
+    extractor = load(argv[0])
+    greeting = {
+        "schema": SCHEMA,
+        "name": argv[1] if len(argv) > 1 else argv[0],
+        "conventions": Conventions.of(getattr(extractor, "conventions", None)).to_mapping(),
+        "reports": list(getattr(extractor, "reports", FEATURES)),
+    }
+    _send(answers, greeting)
+    warm = False
+    for line in sys.stdin:
+        request = json.loads(line)
+        image, _ = read_image(request["image"])
+        if not warm:
+            extractor(image, request)  # the first call loads libraries and tables
+            warm = True
+        wall, cpu = time.perf_counter(), time.process_time()
+        record = extractor(image, request)
+        spent = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
+        _send(answers, {"id": request["id"], "record": record, **spent})
+    return 0
+
+
+def load(name: str) -> ExtractorCallable:
+    """The object behind `module:attribute.attribute`."""
+    module, _, path = name.partition(":")
+    found: Any = importlib.import_module(module)
+    for part in path.split("."):
+        found = getattr(found, part)
+    if not callable(found):
+        raise TypeError(f"{name} is not callable")
+    return found  # type: ignore[no-any-return]
+
+
+def _send(stream: Any, data: Mapping[str, Any]) -> None:
+    stream.write(json.dumps(data, default=_plain) + "\n")
+    stream.flush()
+
+
+def _plain(value: object) -> Any:
+    """NumPy's numbers and arrays as JSON knows them."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"the record holds a {type(value).__name__}, which JSON does not know")
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, os.getcwd())
+    sys.exit(main(sys.argv[1:]))

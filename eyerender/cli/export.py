@@ -1,0 +1,73 @@
+"""Commands that hand a scene to other programs: export-scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from ..errors import InputError
+from .app import app
+from .output import Json, emit
+
+
+@app.command(name="export-scene")
+def export_scene(
+    scene: str,
+    folder: Annotated[Path, Parameter(name="DIR")],
+    /,
+    *,
+    eye: str | None = None,
+    frame: int = 0,
+    side: str | None = None,
+    spp: int = 64,
+    overwrite: bool = False,
+    json: Json = None,
+) -> int:
+    """Write one frame as PLY meshes and a Mitsuba XML that the stock `mitsuba` command renders as it is.
+
+    Parameters
+    ----------
+    scene
+        A scene file, or the bare name of a shipped scene.
+    folder
+        The folder to write.
+    eye
+        Replace the scene's eye model: a name of the catalogue, or an eye file.
+    frame
+        Which frame of the scene.
+    side
+        Which eye, right or left; default: the first that the frame shows.
+    spp
+        Samples per pixel that the file asks for; the stock path integrator needs many.
+    overwrite
+        Replace what the folder holds.
+    json
+        Write a summary as JSON to a file, or to stdout with '-'.
+    """
+    from ..analytic.observer import observe
+    from ..capture import check_windows, render_job
+    from ..imagefolder import staged
+    from ..observation import EYES
+    from ..rendering.export import export_scene as write_scene
+    from ..scene import load_scene
+
+    if spp < 1:
+        raise InputError("must be >= 1", source="--spp")
+    loaded = load_scene(scene, eye=eye)
+    check_windows(loaded)
+    observed = observe(loaded)
+    if side is not None and side not in EYES:
+        raise InputError("must be right or left", source="--side")
+    index = observed.index
+    rows = [r for r in range(len(observed)) if index.frame[r] == frame and side in (None, EYES[index.eye[r]])]
+    if not rows:
+        raise InputError(f"the scene has frames 0 to {int(index.frame.max())} of {', '.join(loaded.spec.subject.eyes)} eye", source="--frame")
+    with staged(folder, overwrite=overwrite) as stage:
+        written = write_scene(render_job(loaded, observed, rows[0]), stage, spp=spp)
+        name = written.name
+    files = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+    data = {"schema": "eyerender/export-scene/1", "path": str(folder), "scene": name, "files": files}
+    emit(data, f"{folder / name}\nrender it with: mitsuba -m llvm_mono {folder / name}", json)
+    return 0

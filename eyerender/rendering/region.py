@@ -1,0 +1,126 @@
+"""The eye region in Mitsuba: one mesh with one map, moved in place; its topology is a subject's.
+
+The mesh stands in the scene's frame (the world's axes, origin at the apex of the unrotated eye). Its vertices change
+with the pose, so each frame rebuilds the tree over its triangles; kernels stay what they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..arrays import Bools, Floats
+from ..eye.model import Eye
+from ..region.anatomy import RegionSpec
+from ..region.globe import Globe
+from ..region.mesh import RegionMesh, region_mesh
+from ..region.skin import skin_map
+from .surround import clear_between
+
+_F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, about the same (n 1.40 and 1.33)
+_ROUGH_SKIN, _ROUGH_WET = 0.30, 0.04
+
+
+def globe_of(eye: Eye, M: Floats, t: Floats) -> Globe:
+    """The posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
+    sclera = eye.sclera
+    return Globe(
+        eye.front[0],
+        float(eye.limbus_radius_mm),
+        np.asarray(sclera.centre_mm),
+        float(sclera.radius_mm),
+        M,
+        t,
+        eye.side == "left",
+    )
+
+
+class RegionScene:
+    """The Mitsuba scene of one subject's eye region; `show` moves it."""
+
+    obstructed = True
+
+    def __init__(self, spec: RegionSpec, globe: Globe) -> None:
+        self._spec = spec
+        posed = region_mesh(spec, globe)
+        layout = posed.layout
+        props = mi.Properties()
+        props["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": 0.5})
+        n, m = len(posed.vertices), len(layout.faces)
+        mesh = mi.Mesh("region", n, m, props=props, has_vertex_normals=True, has_vertex_texcoords=True)
+        params = mi.traverse(mesh)
+        params["faces"] = mi.UInt32(layout.faces.astype(np.uint32).ravel())
+        params["vertex_texcoords"] = mi.Float(layout.uv.astype(np.float32).ravel())
+        params["vertex_positions"] = mi.Float(posed.vertices.astype(np.float32).ravel())
+        params["vertex_normals"] = mi.Float(posed.normals.astype(np.float32).ravel())
+        params.update()
+        self.scene = mi.load_dict({"type": "scene", "region": mesh})
+        self._params: Any = mi.traverse(self.scene)
+        texture: Any = mi.Texture2f
+        self.map = texture(mi.TensorXf(skin_map(spec)), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
+        self.mirror = -1.0 if globe.mirrored else 1.0
+        self._shown: tuple[RegionSpec, Globe] | None = (spec, globe)
+        self.posed = posed
+
+    @staticmethod
+    def key(spec: RegionSpec, globe: Globe) -> tuple[RegionSpec, bool]:
+        """What a scene is made for: a subject and a side."""
+        return spec.model_copy(update={"blink": 0.0}), globe.mirrored
+
+    def show(self, spec: RegionSpec, globe: Globe) -> RegionMesh:
+        """Move lids and lashes to a pose and a blink."""
+        if self._shown != (spec, globe):
+            self.posed = region_mesh(spec, globe)
+            self._params["region.vertex_positions"] = mi.Float(self.posed.vertices.astype(np.float32).ravel())
+            self._params["region.vertex_normals"] = mi.Float(self.posed.normals.astype(np.float32).ravel())
+            self._params.update()
+            self._shown = (spec, globe)
+        return self.posed
+
+    def clear(self, a: Floats, b: Floats) -> Bools:
+        """Whether nothing of the region stands between points (n, 3) of the scene's frame; ends not included."""
+        return clear_between(self.scene, a, b)
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """What the map says at points of the region: albedo, shading normal (scene's frame), gloss."""
+
+    albedo: Any
+    normal: Any
+    gloss: Any
+
+
+def surface(texture: Any, mirror: Any, interaction: Any, active: Any) -> Surface:
+    """Read the map; the relief tilts the normal n by its slope g over the tangent plane: n - (g - n (n . g))."""
+    albedo, slope_y, slope_z, gloss = texture.eval(interaction.uv, active)
+    n = mi.Vector3f(interaction.sh_frame.n)
+    g = mi.Vector3f(0, mirror * slope_y, slope_z)
+    return Surface(albedo, dr.normalize(n - (g - n * dr.dot(n, g))), gloss)
+
+
+def sheen(normal: Any, to_lamp: Any, to_camera: Any, gloss: Any) -> Any:
+    """Mirror-like reflectance f (1/sr) of skin (gloss below 0.5) and of wet tissue (above).
+
+        f = w D F / (4 (l . h)^2),  D = a^2 / (pi ((n . h)^2 (a^2 - 1) + 1)^2)
+
+    with h half way between lamp and camera (GGX: Walter et al. 2007; the visibility term: Kelemen, Szirmay-Kalos 2001;
+    F: Schlick 1994).
+    """
+    half = dr.normalize(to_lamp + to_camera)
+    lh = dr.maximum(dr.dot(to_lamp, half), 0.05)
+    nh = dr.maximum(dr.dot(normal, half), 0)
+    wet = gloss > 0.5
+    a = dr.select(wet, _ROUGH_WET, _ROUGH_SKIN)
+    weight = dr.select(wet, 2 * gloss - 1, gloss * (1 / 0.45))
+    a2 = a * a
+    base = nh * nh * (a2 - 1) + 1
+    D = a2 * dr.inv_pi / (base * base)
+    s = 1 - lh
+    s2 = s * s
+    F = _F0 + (1 - _F0) * s2 * s2 * s
+    return weight * D * F * 0.25 / (lh * lh)

@@ -1,0 +1,249 @@
+"""Exports, each read back with the loader that training code uses, where there is one."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.io import loadmat
+
+from eyerender.dataset.export import FORMATS, export
+from eyerender.dataset.export.coco import run_lengths
+from eyerender.dataset.export.mp4 import PngVideo
+from eyerender.errors import InputError
+from eyerender.imagefile import read_image, write_png
+from eyerender.imagefolder import ImageFolder
+
+pytestmark = pytest.mark.render
+SPLITS = {"train": 12, "validation": 6, "test": 6}
+
+
+@pytest.fixture(scope="module")
+def lines(tiny):
+    return {entry.path.stem: entry.line for entry in ImageFolder.load(tiny).entries}
+
+
+@pytest.fixture(scope="module")
+def exported(tiny, tmp_path_factory):
+    """Format -> its folder, made when asked for."""
+    place = tmp_path_factory.mktemp("export")
+
+    def made(format):
+        folder = place / format
+        if not folder.exists():
+            assert export(tiny, folder, format)["images"] == 24
+        return folder
+
+    return made
+
+
+def eight_bit(tiny, line):
+    return np.round(read_image(tiny / line["file_name"])[0] * (255 / 65535)).astype(np.uint8)
+
+
+def local(line, xy):
+    return np.array(xy) - [line["window_px"]["x0"], line["window_px"]["y0"]]
+
+
+def test_webdataset_reads_it(tiny, exported, lines):
+    wds = pytest.importorskip("webdataset")
+    folder = exported("webdataset")
+    for split, count in SPLITS.items():
+        url = f"{folder}/{split}-000000.tar"
+        samples = list(wds.WebDataset(url, shardshuffle=False, empty_check=False))
+        assert len(samples) == count
+        for sample in samples:
+            line = json.loads(sample["json"])
+            assert line == lines[sample["__key__"]]
+            assert line["split"] == split
+            assert sample["png"] == (tiny / line["file_name"]).read_bytes()
+            assert sample["mask.png"] == (tiny / line["mask_file_name"]).read_bytes()
+        decoded = next(iter(wds.WebDataset(url, shardshuffle=False, empty_check=False).decode("pil")))
+        assert decoded["json"]["split"] == split
+
+
+def test_coco_masks_come_back(tiny, exported, lines):
+    coco = pytest.importorskip("pycocotools.coco")
+    folder = exported("coco")
+    for split, count in SPLITS.items():
+        data = coco.COCO(folder / "annotations" / f"instances_{split}.json")
+        assert len(data.imgs) == count
+        names = {c["id"]: c["name"] for c in data.loadCats(data.getCatIds())}
+        for number, info in data.imgs.items():
+            line = lines[Path(info["file_name"]).stem]
+            assert line["split"] == split
+            picture = np.asarray(Image.open(folder / split / info["file_name"]))
+            np.testing.assert_array_equal(picture, eight_bit(tiny, line))
+            mask, _ = read_image(tiny / line["mask_file_name"])
+            glints = 0
+            for mark in data.loadAnns(data.getAnnIds(imgIds=[number])):
+                name = names[mark["category_id"]]
+                if name == "glint":
+                    spot = local(line, line["labels"]["glints"][mark["light"]]["xy_px"])
+                    np.testing.assert_allclose(mark["keypoints"][:2], spot, atol=1e-9)
+                    glints += 1
+                    continue
+                inside = data.annToMask(mark).astype(bool)
+                np.testing.assert_array_equal(inside, mask == mark["category_id"])
+                assert mark["area"] == inside.sum()
+                x, y, w, h = mark["bbox"]
+                assert inside[y : y + h, x : x + w].sum() == inside.sum()
+                if name in ("pupil", "iris"):
+                    centre = line["labels"][name]["amodal"]["centre_px"]
+                    np.testing.assert_allclose(mark["ellipse"][:2], local(line, centre))
+            assert glints == 2
+
+
+def test_run_lengths_of_corners():
+    assert run_lengths(np.zeros((2, 3), bool)) == [6]
+    assert run_lengths(np.ones((2, 3), bool)) == [0, 6]
+    assert run_lengths(np.array([[0, 1], [1, 1]], bool)) == [1, 3]
+
+
+def test_csv_rows(tiny, exported, lines):
+    folder = exported("csv")
+    with open(folder / "labels.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 24
+    for row in rows:
+        line = lines[Path(row["file_name"]).stem]
+        np.testing.assert_array_equal(read_image(folder / row["file_name"])[0], read_image(tiny / line["file_name"])[0])
+        centre = local(line, line["labels"]["pupil"]["amodal"]["centre_px"])
+        assert [float(row["pupil_amodal_x_px"]), float(row["pupil_amodal_y_px"])] == centre.tolist()
+        assert float(row["camera_target_mm_z"]) == line["labels"]["space"]["camera"]["target_mm"][2]
+        assert int(row["subject"]) == line["subject"]
+
+
+def test_openeds_reads_it(tiny, exported):
+    """As RITnet's loader goes about it: names from images/, stripped, labels/NAME.npy resized to the picture."""
+    folder = exported("openeds")
+    with open(folder / "files.csv", newline="") as file:
+        origin = {row["file"]: row["from"] for row in csv.DictReader(file)}
+    for split, count in SPLITS.items():
+        names = [f.strip(".png") for f in os.listdir(folder / split / "images") if f.endswith(".png")]  # noqa: B005
+        assert len(names) == count
+        for name in names:
+            picture = Image.open(folder / split / "images" / f"{name}.png").convert("L")
+            label = np.load(folder / split / "labels" / f"{name}.npy")
+            label = np.resize(label, (picture.height, picture.width))
+            source = origin[f"{split}/images/{name}.png"]
+            np.testing.assert_array_equal(label, read_image(tiny / source.replace("images", "masks"))[0])
+            assert label.dtype == np.uint8
+
+
+def test_ellseg_reads_it(tiny, exported, lines):
+    """As EllSeg's loader goes about it: key files name archives, archives are read by index."""
+    h5py = pytest.importorskip("h5py")
+    folder = exported("ellseg")
+    keys = sorted(os.listdir(folder / "MasterKey"))
+    assert keys == [f"tiny_{s}.mat" for s in sorted(SPLITS)]
+    for name in keys:
+        key = loadmat(folder / "MasterKey" / name)
+        count = np.size(key["archive"])
+        assert key["dataset"].item() == "tiny"
+        assert key["subset"].item() in SPLITS
+        assert count == SPLITS[key["subset"].item()]
+        assert key["resolution"].tolist() == [[72, 96]] * count
+        with h5py.File(folder / "All" / f"{key['archive'].reshape(-1)[0]}.h5") as file:
+            for k in range(count):
+                line = lines[Path(file["Info"][k].decode()).stem]
+                assert line["split"] == key["subset"].item()
+                np.testing.assert_array_equal(file["Images"][k, ...], eight_bit(tiny, line))
+                mask = read_image(tiny / line["mask_file_name"])[0]
+                np.testing.assert_array_equal(file["Masks"][k, ...], mask)
+                # Nothing stands before these eyes: the whole outlines differ in a few pixels of their edges.
+                assert np.mean(file["Masks_noSkin"][k, ...] != mask) < 0.01
+                for part in ("pupil", "iris"):
+                    amodal = line["labels"][part]["amodal"]
+                    fit = [*local(line, amodal["centre_px"]), *amodal["semi_axes_px"], amodal["angle_rad"]]
+                    np.testing.assert_allclose(file["Fits"][part][k, ...], fit)
+                np.testing.assert_allclose(key["pupil_loc"][k], file["Fits"]["pupil"][k, :2])
+
+
+def test_teyed_reads_it(tiny, exported, lines):
+    """Videos through OpenCV, text files line by line; a pupil drawn as OpenCV reads the ellipse covers the mask."""
+    folder = exported("teyed")
+    with open(folder / "splits.csv", newline="") as file:
+        videos = list(csv.DictReader(file))
+    assert sum(int(v["frames"]) for v in videos) == 24
+    by_subject = {}
+    for name in sorted(lines):
+        by_subject.setdefault(lines[name]["subject"], []).append(lines[name])
+    for video in videos:
+        frames = by_subject[int(video["subject"])]
+        assert video["split"] == frames[0]["split"]
+        stream = cv2.VideoCapture(str(folder / "VIDEOS" / video["video"]))
+        rows = {}
+        for kind in ("pupil_eli", "iris_eli", "validity_pupil", "gaze_vec", "eye_ball", "pupil_lm_2D"):
+            text = (folder / "ANNOTATIONS" / f"{video['video']}{kind}.txt").read_text().splitlines()
+            assert text[0].startswith("FRAME;")
+            rows[kind] = [[float(v) for v in line.split(";")[:-1]] for line in text[1:]]
+        for k, line in enumerate(frames):
+            good, picture = stream.read()
+            assert good
+            np.testing.assert_array_equal(picture[..., 0], eight_bit(tiny, line))
+            frame, angle, x, y, width, height = rows["pupil_eli"][k]
+            assert frame == k + 1
+            drawn = np.zeros(picture.shape[:2], np.uint8)
+            cv2.ellipse(drawn, ((x, y), (width, height), angle), 1, -1)
+            mask = read_image(tiny / line["mask_file_name"])[0] == 3
+            assert np.count_nonzero((drawn > 0) & mask) / np.count_nonzero((drawn > 0) | mask) > 0.9
+            assert np.linalg.norm(rows["gaze_vec"][k][1:]) == pytest.approx(1, abs=1e-5)
+            assert rows["validity_pupil"][k] == [k + 1, 1]
+            assert len(rows["pupil_lm_2D"][k]) == 2 + 16
+        assert not stream.read()[0]
+
+
+def test_videos_are_lossless(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 256, (5, 46, 62), dtype=np.uint8)
+    with PngVideo(tmp_path / "v.mp4", 62, 46) as video:
+        for frame in frames:
+            video.add(frame)
+    stream = cv2.VideoCapture(str(tmp_path / "v.mp4"))
+    assert stream.get(cv2.CAP_PROP_FRAME_COUNT) == 5
+    assert stream.get(cv2.CAP_PROP_FPS) == 25
+    for frame in frames:
+        np.testing.assert_array_equal(stream.read()[1][..., 1], frame)
+
+
+def test_hugging_face_reads_the_folder_as_it_is(tiny, tmp_path, monkeypatch, lines):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    datasets = pytest.importorskip("datasets")
+    read = datasets.load_dataset("imagefolder", data_dir=str(tiny), cache_dir=str(tmp_path))
+    assert list(read) == ["train"]  # one split as files go; the column tells the dataset's own
+    rows = read["train"]
+    assert len(rows) == 24
+    for row, line in zip(rows, lines.values(), strict=True):
+        assert row["split"] == line["split"]
+        assert row["labels"]["pupil"]["amodal"] == line["labels"]["pupil"]["amodal"]
+        np.testing.assert_array_equal(np.asarray(row["image"]), read_image(tiny / line["file_name"])[0])
+        np.testing.assert_array_equal(np.asarray(row["mask"]), read_image(tiny / line["mask_file_name"])[0])
+
+
+def test_mlcroissant_validates_and_reads_the_description(tiny, lines):
+    mlcroissant = pytest.importorskip("mlcroissant")
+    described = mlcroissant.Dataset(jsonld=str(tiny / "croissant.json"))
+    assert not described.metadata.ctx.issues.errors
+    records = list(described.records("images"))
+    assert len(records) == 24
+    for record, line in zip(records, lines.values(), strict=True):
+        assert record["images/sample"] == line["sample"]
+        assert record["images/file_name"] in (line["file_name"], line["file_name"].encode())
+
+
+def test_what_cannot_be_exported_is_refused(tiny, tmp_path):
+    with pytest.raises(InputError, match="must be one of webdataset, coco"):
+        export(tiny, tmp_path / "out", "zip")
+    (tmp_path / "taken").mkdir()
+    write_png(tmp_path / "taken" / "a.png", np.zeros((4, 4), np.uint8))
+    for format in FORMATS:
+        with pytest.raises(InputError, match="is not empty"):
+            export(tiny, tmp_path / "taken", format)
+    with pytest.raises(InputError, match="no such folder"):
+        export(tmp_path / "nowhere", tmp_path / "out", "coco")
