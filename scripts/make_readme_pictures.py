@@ -67,4 +67,4 @@ if __name__ == "__main__":
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
     out.mkdir(parents=True, exist_ok=True)
     picture(er.load_scene("head_mounted", spp=64), 4, 0, (420, 315), 1.0, out / "head_mounted.png")
-    picture(er.load_scene("quickstart", spp=64), 4, 0, (112, 84), 0.5, out / "remote.png")
+    picture(er.load_scene("quickstart", spp=64), 4, 0, (112, 84), 0.7, out / "remote.png")

@@ -37,6 +37,7 @@ class ExtractorProcess:
         self._timeout_s = timeout_s
         self._stderr: IO[bytes] = tempfile.TemporaryFile()
         self._buffer = b""
+        self._closed = False
         try:
             self._process = subprocess.Popen(
                 list(argv),
@@ -59,6 +60,11 @@ class ExtractorProcess:
             self.close()
             raise
 
+    @property
+    def alive(self) -> bool:
+        """Whether it can be asked again."""
+        return not self._closed
+
     def ask(self, request: Request) -> tuple[Reply, float]:
         """The answer to one request, and the seconds the round trip took."""
         begin = time.monotonic()
@@ -78,17 +84,19 @@ class ExtractorProcess:
             raise Failed(f"unusable answer: {error}") from None
 
     def close(self) -> None:
-        """End the process and all it started."""
-        if self._process.poll() is None or self._process.returncode is not None:
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, signal.SIGKILL)
+        """End the process and all it started; may be called again."""
+        if self._closed:
+            return
+        self._closed = True
+        # Also when it has ended by itself: what it started may live on in its group.
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 with suppress(OSError):
                     pipe.close()
-        if not self._stderr.closed:
-            self._stderr.close()
+        self._stderr.close()
 
     def __enter__(self) -> Self:
         return self
@@ -136,8 +144,6 @@ class ExtractorProcess:
         return Failed(f"{how}: {last}" if last else how)
 
     def _last_words(self) -> str:
-        if self._stderr.closed:
-            return ""
         size = self._stderr.seek(0, os.SEEK_END)
         self._stderr.seek(max(0, size - 4096))
         lines = [line.strip() for line in self._stderr.read().decode("utf-8", "replace").splitlines()]

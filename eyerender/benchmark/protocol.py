@@ -3,6 +3,7 @@
     extractor -> bench  {"schema": "eyerender/extractor/1", "name", "conventions": {..}, "reports": ["pupil", "glints"]}
     bench -> extractor  {"schema": "eyerender/extractor/1", "id", "image", "bit_depth", "hints": {..}}
     extractor -> bench  {"id", "record": {"pupil": {..}, "glints": [..]}, "cpu_s": null, "wall_s": null}
+                    or  {"id", "error": "why this image could not be looked at"}
 
 One object a line, the greeting once, then an answer to each request in turn; end of input is the end. The record is the
 package's (eyerender/record/1); only `pupil.status` is needed of it, and with "ok" centre, axes and angle: either
@@ -68,6 +69,7 @@ class Reply:
     """What an extractor found, in this package's conventions: `ellipse` is None where it found no pupil (`reason`).
 
     `glints`: ((x, y), light or None) in px. `cpu_s`, `wall_s`: the extractor's own figures, None where it gives none.
+    `error`: why it failed on this image, in its own words; the rest is then empty.
     """
 
     ellipse: Ellipse | None
@@ -76,6 +78,7 @@ class Reply:
     glints: tuple[tuple[tuple[float, float], int | None], ...]
     cpu_s: float | None
     wall_s: float | None
+    error: str | None = None
 
     @classmethod
     def parse(cls, line: str, request_id: int, conventions: Conventions) -> Reply:
@@ -83,6 +86,8 @@ class Reply:
         data = _object(line)
         if data.get("id") != request_id:
             raise InputError(f"must be {request_id}, not {data.get('id')!r}", path="id")
+        if data.get("error") is not None:
+            return cls(None, None, None, (), None, None, " ".join(str(data["error"]).split())[:200] or "no reason given")
         record = data.get("record")
         if not isinstance(record, dict) or not isinstance(record.get("pupil"), dict):
             raise InputError("must hold the pupil", path="record")

@@ -13,7 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -37,18 +37,22 @@ def main(argv: list[str]) -> int:
         "conventions": Conventions.of(getattr(extractor, "conventions", None)).to_mapping(),
         "reports": list(getattr(extractor, "reports", FEATURES)),
     }
-    _send(answers, greeting)
+    _send(answers, json.dumps(greeting))
     warm = False
     for line in sys.stdin:
         request = json.loads(line)
-        image, _ = read_image(request["image"])
-        if not warm:
-            extractor(image, request)  # the first call loads libraries and tables
-            warm = True
-        wall, cpu = time.perf_counter(), time.process_time()
-        record = extractor(image, request)
-        spent = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
-        _send(answers, {"id": request["id"], "record": record, **spent})
+        try:
+            image, _ = read_image(request["image"])
+            if not warm:
+                extractor(image, request)  # the first call loads libraries and tables
+                warm = True
+            wall, cpu = time.perf_counter(), time.process_time()
+            record = extractor(image, request)
+            spent = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
+            text = json.dumps({"id": request["id"], "record": record, **spent}, default=_plain)
+        except Exception as error:  # an extractor's defect on one image is that image's result
+            text = json.dumps({"id": request["id"], "error": f"{type(error).__name__}: {error}"})
+        _send(answers, text)
     return 0
 
 
@@ -63,8 +67,8 @@ def load(name: str) -> ExtractorCallable:
     return found  # type: ignore[no-any-return]
 
 
-def _send(stream: Any, data: Mapping[str, Any]) -> None:
-    stream.write(json.dumps(data, default=_plain) + "\n")
+def _send(stream: TextIO, line: str) -> None:
+    stream.write(line + "\n")
     stream.flush()
 
 
@@ -76,5 +80,4 @@ def _plain(value: object) -> Any:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, os.getcwd())
     sys.exit(main(sys.argv[1:]))

@@ -69,5 +69,5 @@ def export_scene(
         name = written.name
     files = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
     data = {"schema": "eyerender/export-scene/1", "path": str(folder), "scene": name, "files": files}
-    emit(data, f"{folder / name}\nrender it with: mitsuba -m llvm_mono {folder / name}", json)
+    emit(data, f"{folder / name}\nrender it with any stock integrator: mitsuba -m scalar_rgb {folder / name}", json)
     return 0

@@ -1,7 +1,7 @@
 """The Ray engine: an actor a worker, on one machine or many; one a GPU where Ray has GPUs.
 
-The folder must be one that every machine sees under the same path. Ray restarts an actor that dies; the shard it held
-is tried again. The driver puts shards in place, as with the local engine.
+The folder must be one that every machine sees under the same path. Ray restarts an actor that dies and has it
+make its shard again. The driver puts shards in place, as with the local engine.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class RayEngine:
         size = self.workers or gpus or max(1, cpus // self.job.threads)
         share = {"num_gpus": 1} if gpus else {"num_gpus": 0}
         remote = ray.remote(ShardActor).options(
-            num_cpus=min(self.job.threads, max(1, cpus // size)), max_restarts=-1, max_task_retries=0, **share
+            num_cpus=min(self.job.threads, max(1, cpus // size)), max_restarts=-1, max_task_retries=TRIES - 1, **share
         )
         size = min(size, len(pending))
         idle = [remote.remote(asdict(self.job)) for _ in range(size)]
@@ -145,7 +145,7 @@ class RayEngine:
                     idle.append(remote.remote(asdict(self.job)))
             for job in held.values():
                 if time.monotonic() - job.since > self._limit():
-                    # Ray starts it again; the task fails and comes back as an error above.
+                    # Ray starts it again, with its task.
                     job.since = time.monotonic()
                     ray.kill(job.actor, no_restart=False)
         return lost

@@ -19,6 +19,7 @@ from .shard import Staged
 from .worker import Job, work
 
 TRIES = 3
+HOPELESS = 3  # shards given up before any was made: the rest would fare alike
 RECYCLE_IMAGES = 2000
 
 
@@ -61,6 +62,7 @@ class LocalPool:
         self.recycle_images = recycle_images
         self._context = multiprocessing.get_context("spawn")
         self._workers: list[_Worker] = []
+        self._made = 0
 
     def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
         """Make shards; returns those that were given up, with the reason.
@@ -70,6 +72,7 @@ class LocalPool:
             EyerenderError: the disk is full or not writable.
         """
         pending, tries, lost = deque(shards), Counter[int](), dict[int, str]()
+        self._made = 0
         try:
             while pending or any(w.shard is not None for w in self._workers):
                 while pending and len(self._workers) < min(self.size, self._busy() + len(pending)):
@@ -93,6 +96,8 @@ class LocalPool:
                             raise EyerenderError(f"workers do not start: {reason}")
                     elif tries[key] >= TRIES:
                         lost[shard] = reason
+                        if len(lost) >= HOPELESS and not self._made:
+                            return lost
                     else:
                         pending.appendleft(shard)
                     events.retry(key, reason, tries[key])
@@ -151,6 +156,7 @@ class LocalPool:
             events.sample(*message[1:])
         elif kind == "done":
             events.staged(Staged(**message[1]), worker.name)
+            self._made += 1
             worker.shard = None
         elif kind == "failed" and message[1] == "backend":
             raise BackendError(message[2])

@@ -164,7 +164,7 @@ def _objection(spots: Spots, fit: SpotFit, i: int, prepared: Prepared, step_dn: 
     """Why spot i is no glint, or None."""
     if not fit.converged[i]:
         return "the spot's fit did not converge"
-    narrow, wide = float(fit.sigma_px[i].min()), float(fit.sigma_px[i].max())
+    wide = float(fit.sigma_px[i].max())
     moved = float(np.hypot(*(fit.xy_px[i] - spots.xy_px[i])))
     if moved > max(2.5, 2.0 * wide):
         return f"no spot: the fit moved {moved:.1f} px from the bright pixel"
@@ -174,7 +174,7 @@ def _objection(spots: Spots, fit: SpotFit, i: int, prepared: Prepared, step_dn: 
     if moments is not None:
         # A pixel's own 1/12 keeps a spot of one row of pixels from being a line.
         short, long = np.sqrt(np.linalg.eigvalsh(moments) + 1.0 / 12.0).tolist()
-        narrow, wide = min(narrow, short), max(wide, long)
+        wide = max(wide, long)
         if long > 2.0 * short:
             return f"elongated {long / short:.1f} : 1, as reflections off the sclera and wet lid margins are"
     if wide > widest(blur_px):

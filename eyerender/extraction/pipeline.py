@@ -12,10 +12,11 @@ from ..geometry.ellipse import signed_distance
 from .arcs import RimFit, curvature_at, fit_rim
 from .coarse import Candidate, find_candidates, find_inside, inspect_interior
 from .confidence import confidence
+from .covariance import SECTORS, edge_covariance, rim_deviation, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glints import Spots, detect_spots, judge_spots
 from .preprocess import DN, Prepared, invert, prepare
-from .refine import SECTORS, PixelFit, edge_covariance, refine, rim_deviation, sector_of
+from .refine import PixelFit, refine
 from .result import Extraction, GlintResult, Goodness, PupilResult, frozen
 from .rimmodel import Place, RimModel
 from .settings import ExtractionSettings

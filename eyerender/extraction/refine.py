@@ -9,16 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.ellipse import Ellipse
+from .covariance import SECTORS, SHAPE, distance_slopes, gram, project, sector_excess, sector_of, to_axes
 from .preprocess import Image
 from .rimmodel import Place, RimModel, blurred_edge, harmonics
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-SECTORS = 48
 ORDERS = (0, 2, 4, 6, 8)  # Fourier orders of the outer level that are tried
-SHAPE = 5  # the first parameters: cx, cy, and the change of the shape matrix in the ellipse's axes (aa, bb, ab)
-SELECTION = 1.6  # edge points are selected by their residual, which understates the scatter (development images)
 OUTLIER = 5.0  # pixels beyond this many standard deviations do not count
 
 
@@ -114,12 +112,6 @@ def _band(linear: Image, model: RimModel, masked: Mask) -> _Pixels:
     return _Pixels((column + x0).astype(np.float64), (row + y0).astype(np.float64), level)
 
 
-def sector_of(place: Place) -> NDArray[np.intp]:
-    """(n,) which of the SECTORS equal steps of the ellipse's parameter each point belongs to."""
-    share = np.arctan2(place.sin_t, place.cos_t) / (2.0 * np.pi) + 0.5
-    return (share * SECTORS).astype(np.intp) % SECTORS
-
-
 def _predict(model: RimModel, pixels: _Pixels) -> Array:
     return model.level(pixels.x, pixels.y)
 
@@ -128,7 +120,7 @@ def _jacobian(model: RimModel, place: Place) -> tuple[Array, Array]:
     """Model levels (n,) and their derivatives (n, 5 + 2 + 1 + 2 K): shape, sigma, inner, outer coefficients."""
     edge, by_distance, by_sigma = blurred_edge(place.distance, place.curvature, model.sigma_px)
     basis = harmonics(place.cos_t, place.sin_t, (model.outer.size - 1) // 2)
-    step = basis @ model.outer - model.inner_dn
+    step = np.einsum("nk,k->n", basis, model.outer) - model.inner_dn
     out = np.empty((place.distance.size, SHAPE + 2 + basis.shape[1]))
     out[:, :SHAPE] = (step * by_distance)[:, None] * distance_slopes(model.ellipse, place)
     out[:, 5] = step * by_sigma
@@ -154,13 +146,13 @@ def _gauss_newton(pixels: _Pixels, model: RimModel, prior: float, steps: int) ->
     place = Place.of(model.ellipse, pixels.x, pixels.y)
     value, jacobian = _jacobian(model, place)
     residual = pixels.level - value
-    cost = float(residual @ residual + prior * (model.outer[1:] @ model.outer[1:]))
+    cost = float(np.sum(residual * residual) + prior * (model.outer[1:] @ model.outer[1:]))
     damping = 1e-4
     held = np.arange(SHAPE + 3, jacobian.shape[1])
     for _ in range(steps):
-        matrix = jacobian.T @ jacobian
+        matrix = gram(jacobian)
         matrix[held, held] += prior
-        vector = jacobian.T @ residual
+        vector = project(jacobian, residual)
         vector[held] -= prior * model.outer[1:]
         scale = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
         system = matrix / np.outer(scale, scale) + damping * np.eye(scale.size)
@@ -172,7 +164,7 @@ def _gauss_newton(pixels: _Pixels, model: RimModel, prior: float, steps: int) ->
         trial_place = Place.of(trial.ellipse, pixels.x, pixels.y)
         trial_value, trial_jacobian = _jacobian(trial, trial_place)
         trial_residual = pixels.level - trial_value
-        trial_cost = float(trial_residual @ trial_residual + prior * (trial.outer[1:] @ trial.outer[1:]))
+        trial_cost = float(np.sum(trial_residual * trial_residual) + prior * (trial.outer[1:] @ trial.outer[1:]))
         if trial_cost <= cost:
             model, place, jacobian, residual = trial, trial_place, trial_jacobian, trial_residual
             gained, cost = cost - trial_cost, trial_cost
@@ -195,14 +187,14 @@ def _best_order(pixels: _Pixels, model: RimModel, noise_dn: float) -> int:
     full = RimModel(model.ellipse, model.inner_dn, _padded(model.outer, ORDERS[-1]), model.sigma_px)
     value, jacobian = _jacobian(full, Place.of(full.ellipse, pixels.x, pixels.y))
     residual = pixels.level - value
-    matrix, vector = jacobian.T @ jacobian, jacobian.T @ residual
+    matrix, vector = gram(jacobian), project(jacobian, residual)
     count = residual.size
     best, best_bic = 0, math.inf
     for order in ORDERS:
         size = SHAPE + 3 + 2 * order
         part = matrix[:size, :size] + 1e-9 * np.diag(np.diag(matrix)[:size] + 1e-9)
         drop = float(vector[:size] @ np.linalg.solve(part, vector[:size]))
-        chi2 = max(float(residual @ residual) - drop, 1e-9)
+        chi2 = max(float(np.sum(residual * residual)) - drop, 1e-9)
         bic = count * math.log(chi2 / count) + size * math.log(count)
         if bic < best_bic:
             best, best_bic = order, bic
@@ -245,77 +237,15 @@ def _sane(model: RimModel, start: RimModel) -> bool:
 def _report(result: tuple[RimModel, Array, Array, Place], prior: float, noise_dn: float, seen: Mask) -> PixelFit:
     model, residual, jacobian, place = result
     free = max(residual.size - jacobian.shape[1], 1)
-    variance = float(residual @ residual) / free
-    matrix = jacobian.T @ jacobian
+    variance = float(np.sum(residual * residual)) / free
+    matrix = gram(jacobian)
     held = np.arange(SHAPE + 3, jacobian.shape[1])
     matrix[held, held] += prior
-    inverse = np.linalg.inv(matrix + 1e-12 * np.diag(np.diag(matrix)))
+    inverse = np.asarray(np.linalg.inv(matrix + 1e-12 * np.diag(np.diag(matrix))), dtype=np.float64)
     plain = inverse[:SHAPE, :SHAPE] * variance
     # Texture leaves residuals that agree within a sector; their excess over white noise scales the covariance.
-    excess = sector_excess(plain, inverse[:SHAPE] @ (jacobian * residual[:, None]).T, sector_of(place))
+    excess = sector_excess(plain, inverse[:SHAPE], jacobian * residual[:, None], sector_of(place))
     covariance = plain * (excess if excess > 1.25 else 1.0)
     return PixelFit(
         model, to_axes(covariance, model.ellipse), variance / noise_dn**2, math.sqrt(variance), residual.size, seen
     )
-
-
-def sector_excess(plain: Array, influence: Array, bins: NDArray[np.intp]) -> float:
-    """How much more the parameters scatter than independent residuals would make them: trace(plain^-1 S) / 5, S the sum
-    over sectors of the outer square of the summed influences. plain (5, 5), influence (5, n), bins (n,).
-
-    Source: the cluster-robust ("sandwich") covariance, Liang and Zeger (1986), reduced to one factor.
-    """
-    summed = np.stack([np.bincount(bins, weights=row, minlength=SECTORS) for row in influence])
-    return float(np.trace(np.linalg.solve(plain, summed @ summed.T))) / SHAPE
-
-
-def distance_slopes(ellipse: Ellipse, place: Place) -> Array:
-    """(n, 5) derivatives of the signed distance by cx, cy and the shape matrix (aa, bb, ab) in the ellipse's axes."""
-    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-    return -np.stack(
-        [
-            place.nx * cos - place.ny * sin,
-            place.nx * sin + place.ny * cos,
-            place.nx * place.cos_t,
-            place.ny * place.sin_t,
-            place.nx * place.sin_t + place.ny * place.cos_t,
-        ],
-        axis=-1,
-    )
-
-
-def edge_covariance(ellipse: Ellipse, points: Array, residual_px: float) -> Array:
-    """(5, 5) covariance of (cx, cy, a, b, angle) of an ellipse fitted to edge points with this residual.
-
-    Neighbouring edge points share their noise (the filter's reach, the texture), which the sector excess measures.
-    """
-    place = Place.of(ellipse, points[:, 0], points[:, 1])
-    slopes = distance_slopes(ellipse, place)
-    matrix = slopes.T @ slopes
-    inverse = np.linalg.inv(matrix + 1e-9 * np.trace(matrix) * np.eye(SHAPE))
-    plain = inverse * max(residual_px, 1e-4) ** 2
-    # A third of the sectors, so that one is longer than the noise's reach; n / (n - 5) for the parameters fitted.
-    coarse = sector_of(place) // 3
-    groups = max(np.unique(coarse).size, SHAPE + 1)
-    excess = sector_excess(plain, inverse @ (slopes * place.distance[:, None]).T, coarse) * groups / (groups - SHAPE)
-    return to_axes(plain * max(excess, 1.0) * SELECTION, ellipse)
-
-
-def to_axes(covariance: Array, ellipse: Ellipse) -> Array:
-    """From the shape matrix's changes to (cx, cy, a, b, angle): d angle = d ab / (a - b), at most a uniform angle's."""
-    a, b = ellipse.semi_axes_px
-    jacobian = np.eye(SHAPE)
-    # The angle's deviation cannot exceed that of a uniform orientation, pi / sqrt(12).
-    floor = math.sqrt(covariance[4, 4] * 12.0) / math.pi
-    jacobian[4, 4] = 1.0 / max(float(a - b), floor, 1e-9)
-    return np.asarray(jacobian @ covariance @ jacobian.T)
-
-
-def rim_deviation(ellipse: Ellipse, covariance: Array) -> float:
-    """Root mean square, over the outline, of the rim's standard deviation along its normal, px."""
-    points = ellipse.points(32)
-    slopes = distance_slopes(ellipse, Place.of(ellipse, points[:, 0], points[:, 1]))
-    a, b = ellipse.semi_axes_px
-    # By the angle instead of the shape matrix's off-diagonal term: d ab = (a - b) d angle.
-    slopes[:, 4] *= float(a - b)
-    return math.sqrt(float(np.mean(np.einsum("ni,ij,nj->n", slopes, covariance, slopes))))

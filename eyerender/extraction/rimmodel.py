@@ -41,7 +41,8 @@ class RimModel:
         """Expected grey level at pixels (x, y) of any shape."""
         place = Place.of(self.ellipse, x.ravel(), y.ravel())
         edge = blurred_edge(place.distance, place.curvature, self.sigma_px)[0]
-        outer = harmonics(place.cos_t, place.sin_t, (self.outer.size - 1) // 2) @ self.outer
+        basis = harmonics(place.cos_t, place.sin_t, (self.outer.size - 1) // 2)
+        outer = np.einsum("nk,k->n", basis, self.outer)
         return np.asarray((self.inner_dn + (outer - self.inner_dn) * edge).reshape(x.shape))
 
 

@@ -200,7 +200,7 @@ def _normal(
     flat = (jacobian * weight[..., None]).reshape(n, -1, PARAMETERS)
     r = residual.reshape(n, -1)
     gradient = np.einsum("nkp,nk->np", flat, r)
-    matrix = np.einsum("nkp,nkq->npq", flat, flat, optimize=True) if n > 64 else flat.transpose(0, 2, 1) @ flat
+    matrix = flat.transpose(0, 2, 1) @ flat
     data_cost = (r * r).sum(axis=1)
     # Priors: nearly round (10 % each way per ... 0.3 in ln), and a background that is flat to within `slope`.
     round_weight, slope_weight = 1.0 / 0.3**2, 1.0 / slope**2

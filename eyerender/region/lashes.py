@@ -129,8 +129,7 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
     """
     if not points.size:
         return points[:, 1:]
-    root, points, straight = points[:, 0], points[:, 1:], straight[:, 1:]
-    stride = np.linalg.norm(points[:, 0] - root, axis=-1)
+    points, straight = points[:, 1:], straight[:, 1:]
     rows = slice(CONJUNCTIVA + MARGIN - 1, CONJUNCTIVA + MARGIN + LID + _REACH_ROWS)
     skin, normals = sheet.vertices[rows].reshape(-1, 3), sheet.normals[rows].reshape(-1, 3)
     tree = cKDTree(skin)
@@ -143,24 +142,20 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
         above = np.sum((at - skin[nearest]) * normals[nearest], axis=-1)
         return np.asarray(normals[nearest] * np.where(known, np.maximum(_ABOVE_MM - above, 0), 0)[..., None])
 
-    out += lift(out, np.inf)
+    push = lift(out, np.inf)
+    out += push / np.maximum(np.linalg.norm(push, axis=-1, keepdims=True) / 1.2, 1.0)
     active = np.arange(len(out))
     for turn in range(16):
         some = out[active]
         if turn >= 6:  # caught in a fold, where the nearest skin's normals disagree
             some = some + 0.35 * (straight[active] - some)
         middles = (2 * some[:, :-1] + some[:, 1:]) / 3, (some[:, :-1] + 2 * some[:, 1:]) / 3
-        push = lift(np.concatenate([some, *middles], axis=1), 1.0)
+        push = lift(np.concatenate([some, *middles], axis=1), 1.5)
         some = some + push[:, :k]
         for i in range(2):
             between = push[:, k + i * (k - 1) : k + (i + 1) * (k - 1)]
             some[:, :-1] += 0.7 * between
             some[:, 1:] += 0.7 * between
-        # A lifted lash keeps its length.
-        last = root[active]
-        for i in range(k):
-            piece = some[:, i] - last
-            last = some[:, i] = last + piece * (stride[active] / np.maximum(np.linalg.norm(piece, axis=-1), 1e-9))[:, None]
         out[active] = some
         active = active[np.abs(push).max(axis=(1, 2)) > 0.01]
         if not len(active):

@@ -118,8 +118,8 @@ def gaze_figure(scene: Scene, comparison: Comparison) -> str | None:
 
 def _pictures(scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry]) -> dict[str, list[dict[str, Any]]]:
     out: dict[str, list[dict[str, Any]]] = {}
-    # Matte parts stay below half of full scale, so that glints have room; for people half is white enough.
-    full = scene.spec.sensor.full_scale_dn / 2
+    # Matte parts stay well below full scale, so that glints have room; for people less than that is white enough.
+    full = 0.7 * scene.spec.sensor.full_scale_dn
     truth, found = comparison.truth, comparison.found
     for row, entry in enumerate(entries):
         image, _ = read_image(entry.path)

@@ -9,21 +9,12 @@ from scipy.stats import t as student
 
 from ..arrays import Floats
 from ..report.study import Card, Figure, Page, Section, Table
-from ..report.study_figures import clouds_figure, heads_figure, sets_figure, waterfall_figure
+from ..report.study_figures import clouds_figure, heads_figure, sets_figure
 from . import blignaut, guestrin
 from . import literature as lit
-from .observers_compared import FeatureDifference, GazeDifference
+from .page_parts import WHAT, Apart, departures_section, findings_section, number, observers_section, waterfall_section
 from .replicate import BlignautPart, GuestrinPart
-from .results import Departure, Erratum, Finding, WaterfallStep
-
-Apart = tuple[Sequence[FeatureDifference], Sequence[GazeDifference]]
-
-_WHAT = (
-    "'published' does what the authors' software did, with all its departures from the paper's text; 'corrected' "
-    "does what "
-    "the text and the cited algorithm say. 'Analytic' features come from ray optics, 'image' features from rendered"
-    " images."
-)
+from .results import Erratum, Finding
 
 
 def guestrin_page(
@@ -104,10 +95,10 @@ def guestrin_page(
                 )
             ],
         ),
-        *_observers_section(apart),
-        _findings_section(found),
-        *_waterfall_section([s for p in parts for s in p.waterfall], guestrin.DEPARTURES, ("H1", "H2"), log=False),
-        _departures_section(guestrin.DEPARTURES, faults),
+        *observers_section(apart),
+        findings_section(found),
+        *waterfall_section([s for p in parts for s in p.waterfall], guestrin.DEPARTURES, ("H1", "H2"), log=False),
+        departures_section(guestrin.DEPARTURES, faults),
         Section(
             "Calibrations and their spread",
             (
@@ -124,7 +115,7 @@ def guestrin_page(
         "Model-based gaze estimation with one camera and two lights: nine targets, a central head position (H1) and"
         " four "
         "others (H2), with eye models of rising complexity.",
-        _WHAT,
+        WHAT,
     )
     return Page("Guestrin & Eizenman (2006), replicated", lead, cards, sections)
 
@@ -180,19 +171,19 @@ def blignaut_page(
             ],
             [_best_table(parts, sets)],
         ),
-        *_observers_section(apart),
-        _findings_section(found),
-        *_waterfall_section(
+        *observers_section(apart),
+        findings_section(found),
+        *waterfall_section(
             [s for p in parts for s in p.waterfall], blignaut.DEPARTURES, ("C5", "C9", "C14", "C135"), log=True
         ),
-        _departures_section(blignaut.DEPARTURES, faults),
+        departures_section(blignaut.DEPARTURES, faults),
         Section("Every function and set", (), (), _function_tables(parts, sets)),
     ]
     lead = (
         "Interpolation-based gaze estimation: twelve pairs of regression functions of the pupil-glint vector, "
         "calibrated on "
         "5 to 135 of 135 targets, with eye models of rising complexity.",
-        _WHAT,
+        WHAT,
     )
     return Page("Blignaut (2014), replicated", lead, cards, sections)
 
@@ -232,7 +223,7 @@ def _guestrin_table(parts: Sequence[GuestrinPart]) -> Table:
             rows.append(
                 (
                     row.protocol, row.observer, row.variant or "", row.eye_model, row.eye, row.head or "",
-                    _number(row.mean_deg), _number(row.sd_deg), str(row.n), str(row.missing), str(row.in_image),
+                    number(row.mean_deg), number(row.sd_deg), str(row.n), str(row.missing), str(row.in_image),
                     printed,
                 )
             )  # fmt: skip
@@ -270,124 +261,6 @@ def _calibration_table(parts: Sequence[GuestrinPart]) -> Table:
     return Table(header, rows)
 
 
-def _observers_section(apart: Apart) -> list[Section]:
-    features, gaze = apart
-    if not features:
-        return []
-    feature_rows = [
-        (
-            f.protocol, f.eye_model, f.feature, str(f.n), str(f.missing), _number(f.bias_x_px), _number(f.bias_y_px),
-            _number(f.sd_x_px), _number(f.sd_y_px), _number(f.median_distance_px), _number(f.bias_mm), _number(f.sd_mm),
-        )
-        for f in features
-    ]  # fmt: skip
-    gaze_rows = [
-        (
-            g.protocol, g.eye_model, g.estimator, str(g.n), _number(g.analytic_deg), _number(g.image_deg),
-            _number(g.difference_deg), f"{g.low_deg:.4f} to {g.high_deg:.4f}",
-        )
-        for g in gaze
-    ]  # fmt: skip
-    return [
-        Section(
-            "The two observers",
-            ("Image-derived minus analytic features of the same frames, and the gaze errors they lead to.",),
-            (),
-            [
-                Table(
-                    (
-                        "protocol", "eye model", "feature", "n", "missing", "bias x (px)", "bias y (px)", "SD x (px)",
-                        "SD y (px)", "median distance (px)", "bias (mm at the eye)", "SD (mm at the eye)",
-                    ),
-                    feature_rows,
-                    "Features",
-                ),
-                Table(
-                    (
-                        "protocol", "eye model", "estimator", "n", "analytic (deg)", "image (deg)", "difference (deg)",
-                        "95 % interval",
-                    ),
-                    gaze_rows,
-                    "Gaze errors: paired differences, image minus analytic",
-                    folded=len(gaze_rows) > 30,
-                ),
-            ],
-        )
-    ]  # fmt: skip
-
-
-def _findings_section(found: Sequence[Finding]) -> Section:
-    rows = [
-        (
-            f.id, {True: "true", False: "false", None: "-"}[f.verdict], f.rule,
-            "-" if f.value is None else f"{f.value:.4g}", f.threshold, f.protocol, f.observer, f.detail,
-        )
-        for f in found
-    ]  # fmt: skip
-    header = ("id", "verdict", "statement: value", "value", "threshold", "protocol", "observer", "detail")
-    text = ("Each statement tested on this run's own data; the value stands beside its threshold.",)
-    return Section("Findings", text, (), [Table(header, rows, wide=(2, 5, 7))])
-
-
-def _waterfall_section(
-    steps: Sequence[WaterfallStep], departures: Sequence[Departure], measures: Sequence[str], *, log: bool
-) -> list[Section]:
-    if not steps:
-        return []
-    models = list(dict.fromkeys(s.eye_model for s in steps))
-    shown = [m for m in models if max(v or 0 for s in steps if s.eye_model == m for v in s.errors.values()) < 3]
-    titles = {d.id: d.title for d in departures}
-    names = ["published", *(d.id for d in departures)]
-    labels = ["published", *(f"{titles[n]} corrected" for n in names[1:])]
-    by = {(s.eye_model, s.departure): s for s in steps}
-    panels = {m: {e: [by[e, n].errors[m] for n in names] for e in shown} for m in measures}
-    rows = [
-        (
-            label,
-            *(
-                f"{_number(by[e, n].errors[m])}" + ("" if n == "published" else f" ({_number(by[e, n].alone[m])})")
-                for e in models
-                for m in measures
-            ),
-        )
-        for label, n in zip(labels, names, strict=True)
-    ]
-    header = ("corrected so far", *(f"{e} {m}" for e in models for m in measures))
-    caption = (
-        "Mean error (deg) after each correction; in brackets with that correction alone, all other departures left in."
-    )
-    return [
-        Section(
-            "From published to corrected",
-            ("Departures of the authors' software are corrected one after the other, from top to bottom.",),
-            [Figure(waterfall_figure(labels, panels, log=log), "Mean error after each correction, by eye model.")],
-            [Table(header, rows, caption, folded=True)],
-        )
-    ]
-
-
-def _departures_section(departures: Sequence[Departure], faults: Sequence[Erratum]) -> Section:
-    return Section(
-        "Errata",
-        ("What the authors' software does otherwise than the paper says, and what the paper misprints.",),
-        (),
-        [
-            Table(
-                ("departure", "the paper", "the authors' software", "corrected"),
-                [(d.title, d.paper, d.software, d.corrected) for d in departures],
-                "Departures of the software",
-                wide=(0, 1, 2, 3),
-            ),
-            Table(
-                ("where", "printed", "used", "effect"),
-                [(e.where, e.printed, e.used, e.effect) for e in faults],
-                "Misprints",
-                wide=(0, 1, 2, 3),
-            ),
-        ],
-    )
-
-
 def _best_deg(outcomes: Sequence[blignaut.Outcome], calibration: str) -> float:
     found = blignaut.best(list(outcomes), calibration)
     return np.nan if found is None or found.mean_deg is None else found.mean_deg
@@ -402,7 +275,7 @@ def _best_table(parts: Sequence[BlignautPart], sets: Sequence[str]) -> Table:
             cells = []
             for c in sets:
                 found = blignaut.best(outcomes, c)
-                cells.append("-" if found is None else f"{found.function} {_number(found.mean_deg)}")
+                cells.append("-" if found is None else f"{found.function} {number(found.mean_deg)}")
             rows.append((protocol, observer, variant, part.eye_model, *cells))
     rows.append(("experiment", "", "", "people", *("{} {:.2f}".format(*lit.blignaut_best(c)) for c in sets)))
     header = ("protocol", "observer", "variant", "eye model", *sets)
@@ -415,7 +288,7 @@ def _function_tables(parts: Sequence[BlignautPart], sets: Sequence[str]) -> list
         for (protocol, observer), outcomes in part.outcomes.items():
             by = {(o.function, o.calibration): o for o in outcomes}
             functions = list(dict.fromkeys(o.function for o in outcomes))
-            rows = [(f, *(_number(by[f, c].mean_deg) for c in sets)) for f in functions]
+            rows = [(f, *(number(by[f, c].mean_deg) for c in sets)) for f in functions]
             caption = (
                 f"{part.eye_model}, {protocol}, {observer}: mean error (deg); '-': the targets do not determine it"
             )
@@ -423,7 +296,3 @@ def _function_tables(parts: Sequence[BlignautPart], sets: Sequence[str]) -> list
     measured = [(f, *(f"{v:.2f}" for v in row)) for f, row in lit.BLIGNAUT_DEG.items()]
     out.append(Table(("function", *sets), measured, "the experiment (26 people): mean error (deg)", folded=True))
     return out
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None or not np.isfinite(value) else f"{value:.4f}"

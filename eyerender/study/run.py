@@ -21,6 +21,7 @@ from . import blignaut, clouds, conditions_page, errata, findings, guestrin, obs
 from .conditions import conditions_part
 from .literature import MODELS
 from .observing import ImageSettings, Observing
+from .page_parts import Apart
 from .replicate import BlignautPart, GuestrinPart, blignaut_part, guestrin_part
 from .results import Finding, Row, write_results, write_text
 
@@ -236,7 +237,7 @@ def _blignaut(
     return rows, found, more, pages.blignaut_page(parts, found, faults, apart)
 
 
-def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart]) -> pages.Apart:
+def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart]) -> Apart:
     """How the observers differ on the frames that both have seen."""
     features: list[observers_compared.FeatureDifference] = []
     gaze: list[observers_compared.GazeDifference] = []
@@ -256,7 +257,7 @@ def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart]) -> pages.Apar
     return features, gaze
 
 
-def _as_mappings(apart: pages.Apart) -> dict[str, Any]:
+def _as_mappings(apart: Apart) -> dict[str, Any]:
     features, gaze = apart
     if not features:
         return {}

@@ -15,6 +15,7 @@ import yaml
 from PIL import Image
 
 from eyerender.cli.app import run
+from eyerender.dataset.spec import shipped_datasets
 from eyerender.imagefile import write_png
 from eyerender.scene import shipped_scenes
 
@@ -46,6 +47,14 @@ def place(tmp_path, monkeypatch):
     colour = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
     Image.fromarray(colour).save("colour.png")
     write_png("good.png", np.zeros((64, 64), dtype=np.uint8))
+    dataset = yaml.safe_load(shipped_datasets()["dataset_quick"].read_text(encoding="utf-8"))
+    for name, key, value in (
+        ("draw.yaml", "wavelength_nm", {"draw": "gamma"}),
+        ("template.yaml", "colour", 1),
+        ("behind.yaml", "targets", {"world_mm": [[-500, 0, 0]]}),
+    ):
+        changed = {**dataset, "scene": {**dataset["scene"], key: value}}
+        Path(name).write_text(yaml.safe_dump(changed), encoding="utf-8")
     Path("hollow").mkdir()
     Path("taken").mkdir()
     (Path("taken") / "thesis.txt").write_text("years of work")
@@ -103,6 +112,44 @@ TABLE = [
     (["compare", "hollow"], 2, "hollow: holds no metadata.jsonl"),
     (["compare", "nowhere"], 2, "nowhere: no such folder"),
     (["compare"], 2, "DIR"),
+    (["export-scene", "nonsense", "out"], 2, "nonsense: no such scene file"),
+    (["export-scene", "quickstart", "taken"], 2, "taken: is not empty"),
+    (["export-scene", "quickstart", "out", "--frame", "9"], 2, "--frame: the scene has frames 0 to 8"),
+    (["export-scene", "quickstart", "out", "--side", "third"], 2, "--side: must be right or left"),
+    (["export-scene", "quickstart", "out", "--spp", "0"], 2, "--spp: must be >= 1"),
+    (["generate"], 2, "SPEC"),
+    (["generate", "dataset_quick"], 2, "DIR: give the folder to write"),
+    (["generate", "nonsense", "out"], 2, "nonsense: no such dataset file; shipped: dataset_quick"),
+    (["generate", "missing.yaml", "out"], 2, "missing.yaml: no such file"),
+    (["generate", "key.yaml", "out"], 2, "key.yaml: kind: is no dataset; write 'kind: dataset'"),
+    (["generate", "draw.yaml", "out"], 2, "draw.yaml: scene.wavelength_nm.draw: must be one of"),
+    (["generate", "template.yaml", "out"], 2, "template.yaml: sample 0 cannot be made"),
+    (["generate", "behind.yaml", "out"], 2, "behind.yaml: sample 0 cannot be made"),
+    (["generate", "dataset_quick", "taken"], 2, "taken: is not empty; give another folder or --overwrite"),
+    (["generate", "dataset_quick", "file"], 2, "file: exists and is not a folder"),
+    (["generate", "dataset_quick", "file/out"], 1, "file/out: cannot be written"),
+    (["generate", "dataset_quick", "out", "--shard", "3/2"], 2, "--shard: must be K/N with 1 <= K <= N"),
+    (["generate", "dataset_quick", "out", "--shard", "2"], 2, "--shard: must be K/N"),
+    (["generate", "dataset_quick", "out", "--shard", "1/2", "--overwrite"], 2, "--overwrite: cannot be given with"),
+    (["generate", "dataset_quick", "out", "--workers", "0"], 2, "--workers: must be >= 1"),
+    (["generate", "dataset_quick", "out", "--threads", "-1"], 2, "--threads: must be >= 1"),
+    (["generate", "dataset_quick", "out", "--timeout", "0"], 2, "--timeout: must be > 0"),
+    (["generate", "dataset_quick", "out", "--seed", "-1"], 2, "seed: must be >= 0"),
+    (["generate", "dataset_quick", "out", "--count", "0"], 2, "count: must be >= 1"),
+    (["generate", "dataset_quick", "out", "--engine", "spark"], 2, "--engine"),
+    (["sample", "dataset_quick"], 2, "I"),
+    (["sample", "dataset_quick", "-1"], 2, "I: must be 0 to"),
+    (["sample", "dataset_quick", "99999999"], 2, "I: must be 0 to"),
+    (["sample", "dataset_quick", "0", "-o", "taken"], 2, "taken: is not empty"),
+    (["preview", "dataset_quick"], 2, "--output"),
+    (["preview", "dataset_quick", "-o", "sheet.txt"], 2, "sheet.txt: must end with one of .png"),
+    (["preview", "nonsense", "-o", "sheet.png"], 2, "nonsense: no such scene file"),
+    (["preview", "dataset_quick", "-o", "sheet.png", "--eye", "E1"], 2, "--eye: a dataset's eyes are in its spec"),
+    (["validate", "hollow"], 2, "hollow: holds no metadata.jsonl"),
+    (["validate", "nowhere"], 2, "nowhere: no such folder"),
+    (["export-dataset", "hollow", "out", "--format", "coco"], 2, "hollow: holds no metadata.jsonl"),
+    (["export-dataset", "hollow", "out", "--format", "zip"], 2, "zip"),
+    (["export-dataset", "hollow", "out"], 2, "--format"),
     (["schema", "car"], 2, "car"),
     (["doctor", "extra"], 2, "extra"),
 ]

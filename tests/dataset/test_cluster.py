@@ -27,11 +27,12 @@ def test_the_same_bytes_as_the_local_engine(tiny, tmp_path):
 def test_a_killed_actor_is_started_again_and_nothing_is_lost(tmp_path):
     pytest.importorskip("ray")
     made = plan(shard_size=6)
-    retries, shards, killed = [], [], []
+    retries, shards, killed, workers = [], [], [], set()
 
     class Listener:
         def ready(self, backend, worker):
             pid = int(worker.rpartition(":")[2])
+            workers.add(pid)
             if not killed:
                 killed.append(pid)
                 # A moment later, when it is at work on its next shard.
@@ -52,6 +53,5 @@ def test_a_killed_actor_is_started_again_and_nothing_is_lost(tmp_path):
     lost = RayEngine(job, 1).run([0, 1, 2, 3], Listener())
     assert lost == {}
     assert sorted(shards) == [0, 1, 2, 3]
-    assert len(killed) == 1
-    assert len(retries) == 1
-    assert "Actor" in retries[0][1]
+    assert len(workers) == 2  # Ray started another in place of the killed one
+    assert retries == []  # and had it make the shard

@@ -1,4 +1,4 @@
-"""Glints to lights: the predicted layout against an independent ray tracer, and matching with missing and stray ones."""
+"""Glints to lights: the predicted layout against an independent ray tracer; matching with missing and stray ones."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def test_settings_are_checked():
 
 
 def test_images_without_an_eye(ideal):
-    """Letters and blobs can be ellipses; everything else is turned down, and no answer is a sure one but for letters."""
+    """Letters can be ellipses; everything else is turned down, and hardly an answer is a sure one."""
     sure = found = 0
     for seed in range(20_000, 20_060):
         pupil = extract(ideal.draw_no_eye(seed)).pupil

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.extraction import extract
-from eyerender.extraction import spotfit
+from eyerender.extraction import extract, spotfit
 
 SEEDS = range(20_000, 20_008)
 
@@ -47,8 +46,8 @@ def test_clipped_glints_say_so_and_keep_their_amplitude(ideal):
 def test_merged_pair_is_parted(ideal):
     """Two spots 3.5 px apart, sigma 1.2 px: one bright patch with a dent."""
     drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none", aspect=(0.95, 1.0)), SEEDS[0])
-    centre = np.array(drawing.label["pupil"]["centre_px"]) + [4.3, -2.6]
-    pair = [centre, centre + [2.8, 2.1]]
+    centre = np.array(drawing.label["pupil"]["centre_px"]) + np.array([4.3, -2.6])
+    pair = [centre, centre + np.array([2.8, 2.1])]
     image = drawing.image.astype(np.float64)
     for xy in pair:
         ideal._add_glint(image, {"xy": xy, "sigma": 1.2}, 200.0)
@@ -60,7 +59,8 @@ def test_merged_pair_is_parted(ideal):
 
 def test_elongated_reflection_is_rejected_with_the_reason(ideal):
     drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[1])
-    x, y = np.array(drawing.label["pupil"]["centre_px"]) + [0.0, 2.0 * drawing.label["pupil"]["semi_axes_px"][0]]
+    x, y = drawing.label["pupil"]["centre_px"]
+    y += 2.0 * drawing.label["pupil"]["semi_axes_px"][0]
     yy, xx = np.mgrid[: drawing.image.shape[0], : drawing.image.shape[1]]
     streak = 150.0 * np.exp(-0.5 * (((xx - x) / 5.0) ** 2 + ((yy - y) / 1.1) ** 2))
     found = extract(np.clip(drawing.image + streak, 0, 255).astype(np.uint8))

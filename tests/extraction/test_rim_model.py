@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 from scipy import integrate, ndimage, optimize, special
 
-from eyerender.extraction.refine import _jacobian, _moved, to_axes
+from eyerender.extraction.covariance import to_axes
+from eyerender.extraction.refine import _jacobian, _moved
 from eyerender.extraction.rimmodel import Place, RimModel, blurred_edge
 from eyerender.geometry.ellipse import Ellipse
 
 
 def test_blurred_edge_of_a_disc():
-    """Exact: 1 - int_0^R exp(-(r^2 + q^2) / 2 s^2) I0(r q / s^2) q dq / s^2 (Rice). The model's error is second order in
-    s / R: below (s / R)^2 / 4 of the step."""
+    """Exact: 1 - int_0^R exp(-(r^2 + q^2) / 2 s^2) I0(r q / s^2) q dq / s^2 (Rice).
+
+    The model's error is second order in s / R: below (s / R)^2 / 4 of the step.
+    """
     radius, sigma = 13.0, 1.04
     for offset in (-2.0, -0.7, 0.0, 0.4, 1.5, 3.0):
         r = radius + offset
@@ -54,9 +57,7 @@ def test_distance_is_the_nearest_points():
 def test_jacobian_is_the_models_slope():
     model = RimModel(Ellipse([40.2, 38.7], [21.0, 15.0], 0.8), 20.0, np.array([75.0, 6.0, -4.0, 3.0, 2.0]), 1.3)
     rng = np.random.default_rng(4)
-    t = rng.uniform(0.0, 2.0 * np.pi, 300)
     base = model.ellipse.points(300) + rng.normal(0.0, 1.0, (300, 2))
-    del t
     place = Place.of(model.ellipse, base[:, 0], base[:, 1])
     _, jacobian = _jacobian(model, place)
     for k in range(jacobian.shape[1]):

@@ -1,0 +1,94 @@
+"""Which extractors there are: installed names, Python callables, commands."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import sys
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+
+GROUP = "eyerender.extractors"
+_CALLABLE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+WORKER = "eyerender.benchmark.worker"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """An entry point's object for an extractor that is a program: how to run it, or why it cannot be run here."""
+
+    argv: tuple[str, ...] | None
+    missing: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Extractor:
+    """An extractor to be run: its label, what was asked for, and the command that runs it."""
+
+    name: str
+    given: str
+    argv: tuple[str, ...]
+
+
+def names() -> tuple[str, ...]:
+    """The names in the entry-point group `eyerender.extractors`, sorted."""
+    return tuple(sorted(_installed()))
+
+
+def resolve(given: str) -> Extractor:
+    """A name of the entry-point group, `module:callable`, or a command line, each perhaps after `LABEL=`.
+
+    Raises:
+        InputError: none of these, or a program that is not there.
+    """
+    label, _, rest = given.partition("=")
+    spec = rest.strip() if rest and re.fullmatch(r"[\w.-]+", label) else given.strip()
+    name = label if spec != given.strip() else ""
+    installed = _installed()
+    if spec in installed:
+        return _of_entry_point(name or spec, given, installed[spec])
+    if _CALLABLE.fullmatch(spec):
+        title = name or spec
+        return Extractor(title, given, (sys.executable, "-m", WORKER, spec, title))
+    try:
+        argv = shlex.split(spec)
+    except ValueError as error:
+        raise InputError(f"{given!r} is no command line ({error})", source="--extractor") from None
+    if not argv or shutil.which(argv[0]) is None:
+        known = ", ".join(sorted(installed))
+        raise InputError(f"{given!r} is no extractor ({known}), module:callable or command", source="--extractor")
+    return Extractor(name or Path(argv[0]).name, given, tuple(argv))
+
+
+def defaults() -> tuple[list[Extractor], dict[str, str]]:
+    """Every installed extractor that can be run here; and why the others cannot."""
+    ready, absent = [], {}
+    for name, entry in sorted(_installed().items(), key=lambda item: item[0]):
+        try:
+            ready.append(_of_entry_point(name, name, entry))
+        except InputError as error:
+            absent[name] = error.reason
+    return ready, absent
+
+
+def _installed() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def _of_entry_point(name: str, given: str, entry: EntryPoint) -> Extractor:
+    try:
+        found: Any = entry.load()
+    except Exception as error:  # whatever another package does when it is imported
+        raise InputError(f"cannot be loaded ({type(error).__name__}: {error})", source=f"--extractor {entry.name}") from None
+    if isinstance(found, Command):
+        if found.argv is None:
+            raise InputError(found.missing, source=f"--extractor {entry.name}")
+        return Extractor(name, given, found.argv)
+    if not callable(found):
+        raise InputError("is no callable", source=f"--extractor {entry.name}")
+    return Extractor(name, given, (sys.executable, "-m", WORKER, entry.value, name))

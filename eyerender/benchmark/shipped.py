@@ -1,0 +1,117 @@
+"""The extractors that come with the package: its own fast and refined, the contour baseline, Pupil Labs' detector."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..extraction import FAST, REFINED, Extraction, ExtractionSettings, extract, identify
+from ..rig.camera import Camera
+from .registry import Command
+
+PUPIL_LABS_PYTHON = "EYERENDER_PUPIL_DETECTORS"
+# How far the reflections of a real eye lie from those of a typical one that is placed by its pupil.
+_PLACE_MM = 1.5
+
+
+def own_fast(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
+    """This package's extractor: edges and an algebraic fit."""
+    return _own(FAST, image, request)
+
+
+def own_refined(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
+    """This package's extractor: a maximum-likelihood fit of the pixel model as well."""
+    return _own(REFINED, image, request)
+
+
+def opencv_contour(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
+    """The contour baseline."""
+    from ..extraction.baseline import contour_pupil
+
+    hints = request["hints"]
+    found = contour_pupil(image, bit_depth=request["bit_depth"], radius_px=hints["radius_px"])
+    if isinstance(found, str):
+        return {"pupil": {"status": "missing", "reason": found}}
+    (x, y), axes, degrees = found
+    return {"pupil": {"status": "ok", "centre_px": [x, y], "axes_px": list(axes), "angle": degrees}}
+
+
+opencv_contour.conventions = {"axes": "full", "angle_unit": "deg", "angle_of": "first"}  # type: ignore[attr-defined]
+opencv_contour.reports = ("pupil",)  # type: ignore[attr-defined]
+
+
+def pupil_labs_python() -> Path | None:
+    """The interpreter of the environment that holds `pupil-detectors`, where there is one.
+
+    EYERENDER_PUPIL_DETECTORS names it; else it is where scripts/setup_pupil_detectors.sh makes it.
+    """
+    given = os.environ.get(PUPIL_LABS_PYTHON)
+    if given:
+        return Path(given) if os.access(given, os.X_OK) else None
+    cache = os.environ.get("XDG_CACHE_HOME", "")
+    home = Path(cache) if os.path.isabs(cache) else Path(os.path.expanduser("~")) / ".cache"
+    python = home / "eyerender" / "pupil-detectors" / "bin" / "python"
+    return python if os.access(python, os.X_OK) else None
+
+
+def _pupil_labs() -> Command:
+    python = pupil_labs_python()
+    if python is None:
+        return Command(None, "not set up; scripts/setup_pupil_detectors.sh makes its environment")
+    return Command((str(python), str(Path(__file__).with_name("pupil_labs.py"))))
+
+
+def __getattr__(name: str) -> Command:
+    # Looked up at each use: the environment may have been made in the meantime.
+    if name == "pupil_detectors":
+        return _pupil_labs()
+    raise AttributeError(name)
+
+
+def _own(settings: ExtractionSettings, image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
+    hints = request["hints"]
+    changes: dict[str, Any] = {"polarity": hints["polarity"]}
+    if hints["radius_px"] is not None:
+        changes |= dict(zip(("radius_min_px", "radius_max_px"), hints["radius_px"], strict=True))
+    # A float image has a free scale.
+    depth = None if image.dtype.kind == "f" else request["bit_depth"]
+    found = extract(image, bit_depth=depth, gamma=hints["gamma"], settings=settings.model_copy(update=changes))
+    pupil, lights = found.pupil, _lights(found, hints["rig"])
+    out: dict[str, Any] = {"status": pupil.status, "reason": pupil.reason, "confidence": pupil.confidence}
+    if pupil.ellipse is not None:
+        out |= {
+            "centre_px": pupil.ellipse.centre_px.tolist(),
+            "semi_axes_px": pupil.ellipse.semi_axes_px.tolist(),
+            "angle_rad": pupil.ellipse.angle_rad,
+            "covariance": None if pupil.covariance is None else pupil.covariance.tolist(),
+        }
+    glints = [
+        {"status": "ok", "light": light, "xy_px": glint.xy_px.tolist()}
+        for glint, light in zip(found.glints, lights, strict=True)
+        if glint.status == "ok" and glint.xy_px is not None
+    ]
+    return {"pupil": out, "glints": glints}
+
+
+def _lights(found: Extraction, rig: Mapping[str, Any] | None) -> list[int | None]:
+    """The light of each glint, where the rig is told."""
+    if rig is None or not found.glints or found.pupil.ellipse is None:
+        return [None] * len(found.glints)
+    camera = Camera.of(rig["K"], rig["R"], rig["t_mm"], (1, 1), rig["distortion"])
+    spots = np.array([g.xy_px if g.xy_px is not None else [np.nan, np.nan] for g in found.glints])
+    assigned = identify(
+        camera.ideal(spots),
+        camera.ideal(found.pupil.ellipse.centre_px),
+        camera.K,
+        camera.R,
+        camera.t,
+        rig["lights_mm"],
+        rig["eye_mm"],
+        position_sd_mm=_PLACE_MM,
+    )
+    return [int(k) if k >= 0 else None for k in assigned.light]

@@ -1,0 +1,19 @@
+"""Bake the example meshes of meshes/: every surface of E2 and E5 as PLY, with a manifest (unit, frame, SHA-256).
+
+python scripts/bake_meshes.py [FOLDER]      (default: meshes)
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from eyerender import load_eye
+from eyerender.rendering.export import bake_meshes
+
+ROOT = Path(__file__).resolve().parent.parent
+
+if __name__ == "__main__":
+    out = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "meshes"
+    for name in ("E2", "E5"):
+        print(bake_meshes(load_eye(name).build(), out / name, rings=12, sectors=48))
