@@ -81,14 +81,12 @@ def _installed() -> dict[str, EntryPoint]:
 
 
 def _of_entry_point(name: str, given: str, entry: EntryPoint) -> Extractor:
-    try:
+    argv: tuple[str, ...] = (sys.executable, "-m", WORKER, entry.value, name)
+    # Another package's code is only ever loaded in the worker, which alone it can harm.
+    if entry.value.startswith("eyerender."):
         found: Any = entry.load()
-    except Exception as error:  # whatever another package does when it is imported
-        raise InputError(f"cannot be loaded ({type(error).__name__}: {error})", source=f"--extractor {entry.name}") from None
-    if isinstance(found, Command):
-        if found.argv is None:
-            raise InputError(found.missing, source=f"--extractor {entry.name}")
-        return Extractor(name, given, found.argv)
-    if not callable(found):
-        raise InputError("is no callable", source=f"--extractor {entry.name}")
-    return Extractor(name, given, (sys.executable, "-m", WORKER, entry.value, name))
+        if isinstance(found, Command):
+            if found.argv is None:
+                raise InputError(found.missing, source=f"--extractor {entry.name}")
+            argv = found.argv
+    return Extractor(name, given, argv)

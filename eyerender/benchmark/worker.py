@@ -2,7 +2,8 @@
 
 The callable takes (image, request): the image as (h, w) numbers as stored, the request as the mapping that was sent. It
 returns the record, {"pupil": {..}, "glints": [..]}. Its attributes `conventions` and `reports`, where it has them, are
-those of the greeting. What it prints goes to stderr.
+those of the greeting. What it prints goes to stderr. In place of a callable a `registry.Command` may
+stand, which is then run instead.
 """
 
 from __future__ import annotations
@@ -20,17 +21,24 @@ import numpy as np
 from ..imagefile import read_image
 from .conventions import Conventions
 from .protocol import FEATURES, SCHEMA
+from .registry import Command
 
 ExtractorCallable = Callable[[Any, Mapping[str, Any]], Mapping[str, Any]]
 
 
 def main(argv: list[str]) -> int:
     """Serve requests until the input ends."""
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    stdout = os.dup(1)
     # Nothing that a library or the callable prints may mix with the answers.
     os.dup2(2, 1)
     sys.stdout = sys.stderr
     extractor = load(argv[0])
+    if isinstance(extractor, Command):
+        if extractor.argv is None:
+            raise SystemExit(extractor.missing)
+        os.dup2(stdout, 1)
+        os.execvp(extractor.argv[0], extractor.argv)
+    answers = os.fdopen(stdout, "w", encoding="utf-8")
     greeting = {
         "schema": SCHEMA,
         "name": argv[1] if len(argv) > 1 else argv[0],
@@ -56,14 +64,14 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def load(name: str) -> ExtractorCallable:
+def load(name: str) -> ExtractorCallable | Command:
     """The object behind `module:attribute.attribute`."""
     module, _, path = name.partition(":")
     found: Any = importlib.import_module(module)
     for part in path.split("."):
         found = getattr(found, part)
-    if not callable(found):
-        raise TypeError(f"{name} is not callable")
+    if not (callable(found) or isinstance(found, Command)):
+        raise TypeError(f"{name} is neither a callable nor a Command")
     return found  # type: ignore[no-any-return]
 
 

@@ -20,7 +20,7 @@ from .lock import LOCK, final_lock, run_lock
 from .plan import Plan
 from .pool import Events, LocalPool
 from .realise import frames_of
-from .runfile import begin
+from .runfile import begin, refuse_taken
 from .shard import Staged, check_finished, commit, cpu_family, finished, read_done, remove_leftovers
 from .worker import Job
 
@@ -69,6 +69,8 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
         raise InputError("must be K/N with 1 <= K <= N", source="--shard")
     if folder.exists() and not folder.is_dir():
         raise InputError("exists and is not a folder", source=str(path))
+    if not options.overwrite:
+        refuse_taken(folder)
     frames = frames_of(plan)
     created = not folder.exists()
     try:

@@ -18,6 +18,16 @@ RUN = "run.json"
 _SHOWN = 4
 
 
+def refuse_taken(folder: Path) -> None:
+    """Raise `InputError` where a folder holds something else than a run, before anything is put into it."""
+    try:
+        taken = folder.is_dir() and any(not p.name.startswith((LOCK, STAGE)) for p in folder.iterdir())
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", source=str(folder)) from None
+    if taken and not (folder / RUN).is_file():
+        raise InputError("is not empty; give another folder or --overwrite", source=str(folder))
+
+
 def begin(folder: Path, plan: Plan) -> bool:
     """Claim a folder for a plan, or find that it was claimed for the same one before (True).
 
@@ -27,8 +37,7 @@ def begin(folder: Path, plan: Plan) -> bool:
     path = folder / RUN
     mine = {"schema": RUN_SCHEMA, "digest": plan.digest, **plan.to_mapping(), "versions": run_versions()}
     if not path.is_file():
-        if any(not p.name.startswith((LOCK, STAGE)) for p in folder.iterdir()):
-            raise InputError("is not empty; give another folder or --overwrite", source=str(folder))
+        refuse_taken(folder)
         write_json(path, mine)
         return False
     try:

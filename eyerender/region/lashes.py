@@ -122,7 +122,7 @@ def _at(angle: Floats, values: Floats) -> Floats:
 
 
 def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -> Floats:
-    """The points (n, k, 3) beyond the roots, lifted along the nearest skin's normal to `_ABOVE_MM` over it, and off the globe.
+    """The points (n, k, 3) beyond the roots, off the globe and lifted along the nearest skin's normal to `_ABOVE_MM`.
 
     Places between points count too: a straight piece must not cut through a fold. A lash that stays caught gives way
     towards `straight`, which stands off the lid.
@@ -160,5 +160,9 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
         active = active[np.abs(push).max(axis=(1, 2)) > 0.01]
         if not len(active):
             break
+    # Bent out of shape on the way: it had no room to curl.
+    pieces = np.diff(out, axis=1)
+    stretched = np.linalg.norm(pieces, axis=-1).max(axis=1) > 1.5 * np.linalg.norm(straight[:, 1] - straight[:, 0], axis=-1)
+    out[stretched] = straight[stretched]
     # And off the globe, for lashes that turn in.
     return globe.pushed_out(out, 0.3)

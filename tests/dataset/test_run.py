@@ -149,7 +149,7 @@ def test_overwrite_replaces_and_other_folders_are_left_alone(tmp_path):
     small = plan(count=2, subjects=2, shard_size=2)
     with pytest.raises(InputError, match="is not empty"):
         make(folder, small)
-    assert [p.name for p in folder.iterdir() if not p.name.startswith(".eyerender-lock")] == ["thesis.txt"]
+    assert [p.name for p in folder.iterdir()] == ["thesis.txt"]
     make(folder, small, overwrite=True)
     assert not (folder / "thesis.txt").exists()
     assert (folder / "dataset.json").is_file()

@@ -1,0 +1,246 @@
+"""A labelled folder as the bench sees it: images, true features in image coordinates, hints, what varies.
+
+Two kinds are read: what this package renders (CONTRACTS' folder of images), and folders of ideal images.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..geometry.ellipse import Ellipse
+from ..imagefile import read_image
+from ..imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
+from ..observation import OK, Observations
+from ..rig.camera import Camera
+from ..rig.rig import Rig
+from ..scene import Scene, SceneSpec
+
+IDEAL_SCHEMA = "eyerender/ideal-images/1"
+# Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens.
+_RADIUS_MM = (0.6, 5.0)
+
+
+@dataclass(frozen=True, slots=True)
+class TrueGlint:
+    """A glint that the image shows: its light, its place in px of the image."""
+
+    light: int
+    xy_px: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledImage:
+    """One image, one eye; places are relative to the image, pixel centres at integers.
+
+    pupil: None where the image shows none. outline_px (n, 2): of the pupil. visible: the share of the pupil that is
+    seen, None where unknown. glints: those the image shows. known: what the folder itself says of noise (DN), blur
+    (px) and step (DN). factors: what may explain an error, by name.
+    """
+
+    name: str
+    path: Path
+    bit_depth: int
+    size: tuple[int, int]
+    pupil: Ellipse | None
+    outline_px: Floats
+    visible: float | None
+    glints: tuple[TrueGlint, ...]
+    hints: Mapping[str, Any]
+    known: Mapping[str, float] = field(default_factory=dict)
+    factors: Mapping[str, float] = field(default_factory=dict)
+
+
+def load_labelled(folder: str | Path) -> list[LabelledImage]:
+    """Every image of a folder.
+
+    Raises:
+        InputError: it is no such folder, an image is missing or has another size, or holds other than one eye.
+    """
+    path = Path(folder)
+    if _is_ideal(path):
+        return _load_ideal(path)
+    images = ImageFolder.load(path)
+    truth = images.truth()
+    scene_rig = _rig_of(images)
+    out = []
+    row = 0
+    for k, entry in enumerate(images.entries):
+        count = len(entry.line["records"])
+        if count != 1:
+            raise InputError(
+                f"holds {count} eyes; the bench takes images of one", source=str(path / METADATA), path=f"line {k + 1}"
+            )
+        out.append(_rendered(entry, truth, row, scene_rig))
+        row += 1
+    return out
+
+
+def _rendered(entry: ImageEntry, truth: Observations, row: int, rig: Rig | None) -> LabelledImage:
+    image, stored = read_image(entry.path)
+    x0, y0, width, height = entry.window
+    if image.shape != (height, width):
+        raise InputError(f"is {image.shape[1]} x {image.shape[0]} px, its window is not", source=str(entry.path))
+    corner = np.array([x0, y0], dtype=np.float64)
+    labels = entry.line.get("labels") or {}
+    pupil, glints = truth.pupil, truth.glints
+    visible = _visible(labels)
+    there = bool(pupil.ok[row] and pupil.in_image[row]) and visible != 0.0
+    ellipse, outline = None, np.zeros((0, 2))
+    if there:
+        ellipse = Ellipse(pupil.centre_px[row] - corner, pupil.semi_axes_px[row], float(pupil.angle_rad[row]))
+        outline = pupil.points_px[row] - corner
+        outline = outline[np.isfinite(outline).all(axis=-1)]
+        if len(outline) < 6:
+            outline = ellipse.points(120)
+    shown = []
+    hidden = {g["light"] for g in labels.get("glints") or [] if not g.get("visible", True)}
+    for j in np.flatnonzero(glints.ok[row] & glints.in_image[row]):
+        x, y = glints.xy_px[row, j] - corner
+        light = int(glints.light[row, j])
+        if light not in hidden and -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5:
+            shown.append(TrueGlint(light, (float(x), float(y))))
+    factors: dict[str, float] = {}
+    azimuth, elevation = float(truth.pose.azimuth_rad[row]), float(truth.pose.elevation_rad[row])
+    if math.isfinite(azimuth + elevation):
+        factors["gaze_deg"] = math.degrees(math.acos(max(-1.0, min(1.0, math.cos(azimuth) * math.cos(elevation)))))
+    return LabelledImage(
+        str(entry.line["file_name"]),
+        entry.path,
+        int(entry.line.get("bit_depth") or stored),
+        (width, height),
+        ellipse,
+        outline,
+        visible,
+        tuple(shown),
+        _hints(entry.line, truth, row, rig, corner),
+        {},
+        factors | _ellipse_factors(ellipse, visible),
+    )
+
+
+def _visible(labels: Mapping[str, Any]) -> float | None:
+    pupil = labels.get("pupil")
+    value = pupil.get("visible_fraction") if isinstance(pupil, dict) else labels.get("pupil_visible_fraction")
+    return float(value) if value is not None else None
+
+
+def _ellipse_factors(pupil: Ellipse | None, visible: float | None) -> dict[str, float]:
+    out: dict[str, float] = {}
+    if pupil is not None:
+        a, b = pupil.semi_axes_px
+        x, y = pupil.centre_px % 1.0
+        out = {"pupil_px": math.sqrt(a * b), "aspect": b / a, "phase_x": float(x), "phase_y": float(y)}
+        if visible is not None:
+            out["occlusion"] = 1.0 - visible
+    return out
+
+
+def _hints(
+    line: Mapping[str, Any], truth: Observations, row: int, scene_rig: Rig | None, corner: Floats
+) -> dict[str, Any]:
+    """What an extractor may know: the rig, roughly where the eye is, and so the range of sizes; never the truth."""
+    eye_mm = truth.index.eye_position_mm[row] + truth.index.head_mm[row]
+    camera, lights = _camera_and_lights(line, int(truth.index.camera[row]), scene_rig)
+    hints: dict[str, Any] = {"polarity": "dark", "gamma": 1.0, "radius_px": None, "rig": None}
+    if camera is None or not np.isfinite(eye_mm).all():
+        return hints
+    scale = camera.scale_at(eye_mm)
+    K = np.array(camera.K)
+    K[:2, 2] -= corner
+    return hints | {
+        "radius_px": [max(_RADIUS_MM[0] * scale, 3.0), max(_RADIUS_MM[1] * scale, 8.0)],
+        "rig": {
+            "K": K.tolist(),
+            "R": camera.R.tolist(),
+            "t_mm": camera.t.tolist(),
+            "distortion": camera.distortion.tolist(),
+            "lights_mm": lights.tolist(),
+            "eye_mm": eye_mm.tolist(),
+        },
+    }
+
+
+def _camera_and_lights(line: Mapping[str, Any], camera: int, rig: Rig | None) -> tuple[Camera | None, Floats]:
+    """An image's own camera and lights where its labels hold them (datasets vary theirs), else the scene's."""
+    labels = line.get("labels") or {}
+    own, lights = labels.get("camera"), labels.get("lights_mm")
+    if own and lights is not None:
+        seen = Camera.of(own["K"], own["R"], own["t_mm"], tuple(own["resolution_px"]), own["distortion"])
+        return seen, np.asarray(lights, dtype=np.float64).reshape(-1, 3)
+    if rig is None or not 0 <= camera < len(rig.cameras):
+        return None, np.zeros((0, 3))
+    return rig.cameras[camera], np.array([light.position_mm for light in rig.lights]).reshape(-1, 3)
+
+
+def _rig_of(folder: ImageFolder) -> Rig | None:
+    """The rig of the scene that the folder was rendered from; None for a dataset, whose images carry their own."""
+    spec = folder.dataset.get("spec")
+    if not isinstance(spec, dict) or folder.dataset.get("kind") == "dataset":
+        return None
+    source = str(folder.path / DATASET)
+    return Scene.of(SceneSpec.from_mapping(spec, source=source), source=source).rig
+
+
+def _is_ideal(folder: Path) -> bool:
+    try:
+        found = json.loads((folder / DATASET).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(found, dict) and found.get("schema") == IDEAL_SCHEMA
+
+
+def _load_ideal(folder: Path) -> list[LabelledImage]:
+    source = str(folder / METADATA)
+    try:
+        lines = (folder / METADATA).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        raise InputError("cannot be read", source=source) from None
+    out = []
+    for k, raw in enumerate(lines):
+        try:
+            line = json.loads(raw)
+            name, record, said = line["file_name"], line["records"][0], line["parameters"]
+            if Path(name).is_absolute() or ".." in Path(name).parts:
+                raise ValueError
+            out.append(_ideal(folder, name, record, said))
+        except InputError:
+            raise
+        except (ValueError, KeyError, TypeError, IndexError, AttributeError):
+            raise InputError("is no image record", source=source, path=f"line {k + 1}") from None
+    if not out:
+        raise InputError("holds no images", source=source)
+    return out
+
+
+def _ideal(folder: Path, name: str, record: Mapping[str, Any], said: Mapping[str, Any]) -> LabelledImage:
+    image, _ = read_image(folder / name)
+    label = record["pupil"]
+    pupil = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"]) if label["status"] == OK else None
+    visible = said.get("visible_fraction")
+    if visible is None and not said["lid"]:
+        visible = 1.0
+    if visible == 0.0:
+        pupil = None
+    known = {"noise_dn": float(said["noise_dn"]), "blur_px": float(said["blur_px"]), "step_dn": float(said["step_dn"])}
+    return LabelledImage(
+        name,
+        folder / name,
+        int(said["bit_depth"]),
+        (image.shape[1], image.shape[0]),
+        pupil,
+        np.zeros((0, 2)) if pupil is None else pupil.points(120),
+        visible,
+        tuple(TrueGlint(int(g["light"]), tuple(g["xy_px"])) for g in record["glints"] if g["status"] == OK),
+        {"polarity": said["polarity"], "gamma": 1.0, "radius_px": None, "rig": None},
+        known,
+        _ellipse_factors(pupil, visible),
+    )
