@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -90,6 +91,7 @@ def render_windows(
                 "pupil_visible_fraction": _share(labels.visible_fraction(3)),
                 "iris_visible_fraction": _share(labels.visible_fraction(2)),
                 "failed_paths": done.failed_paths,
+                **_visibility(observations, row, done),
             },
             eyes[side],
             job.M,
@@ -155,21 +157,31 @@ def render_folder(
     threads: int | None = None,
     overwrite: bool = False,
     exr: bool = False,
+    noiseless: str | Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Render a scene into a folder of labelled images (CONTRACTS); complete or not at all.
 
+    `noiseless` is a second folder, of the same renderings exposed without the sensor's noise: what the scene with
+    `sensor.noise: false` gives.
+
     Returns:
         What was written: schema eyerender/render/1, path, number of images.
     """
-    refuse_non_empty(path, overwrite)  # before the work, not after it
+    scenes = {Path(path): scene}
+    if noiseless is not None:
+        scenes[Path(noiseless)] = without_noise(scene)
+    for place in scenes:
+        refuse_non_empty(place, overwrite)  # before the work, not after it
     truth = observe(scene)
     records = list(truth.records())
     lines: list[dict[str, Any]] = []
     spec = scene.spec
-    with staged(path, overwrite=overwrite) as folder:
-        (folder / "images").mkdir()
-        (folder / "masks").mkdir()
+    with ExitStack() as stack:
+        folders = [stack.enter_context(staged(place, overwrite=overwrite)) for place in scenes]
+        for folder in folders:
+            (folder / "images").mkdir()
+            (folder / "masks").mkdir()
         for image in render_windows(scene, truth, backend=backend, threads=threads, progress=progress):
             line: dict[str, Any] = {
                 "file_name": f"images/{image.name}.png",
@@ -187,16 +199,32 @@ def render_folder(
                     "camera": image.camera,
                 },
             }
-            write_png(folder / line["file_name"], image.dn)
-            write_png(folder / line["mask_file_name"], image.mask)
+            for folder, told in zip(folders, scenes.values(), strict=True):
+                write_png(folder / line["file_name"], image.dn if told is scene else _exposed(told, image))
+                write_png(folder / line["mask_file_name"], image.mask)
             if exr:
                 from .rendering.exr import write_exr
 
-                write_exr(folder / "images" / f"{image.name}.exr", image.irradiance)
+                write_exr(folders[0] / "images" / f"{image.name}.exr", image.irradiance)
             lines.append(line)
         statistics = {"images": len(lines), "observations": len(truth)}
-        write_dataset(folder, lines, spec=spec.to_mapping(), digest=scene.digest(), statistics=statistics)
+        for folder, told in zip(folders, scenes.values(), strict=True):
+            write_dataset(folder, lines, spec=told.spec.to_mapping(), digest=told.digest(), statistics=statistics)
     return {"schema": "eyerender/render/1", "path": str(path), "images": len(lines)}
+
+
+def without_noise(scene: Scene) -> Scene:
+    """The scene with a sensor that has no noise."""
+    sensor = scene.spec.sensor.model_copy(update={"noise": False})
+    return replace(scene, spec=scene.spec.model_copy(update={"sensor": sensor}))
+
+
+def _exposed(scene: Scene, image: WindowImage) -> NDArray[Any]:
+    """A rendered window as the noiseless sensor of a scene counts it."""
+    from .rendering.sensor import expose
+
+    dn = expose(scene.spec.sensor, image.irradiance.astype(float), scene.spec.wavelength_nm, scene.spec.seed)
+    return dn.astype(np.uint8) if scene.spec.sensor.bit_depth == 8 else dn
 
 
 def _motion(eye: Eye, observations: Observations, row: int) -> tuple[Floats, Floats]:
@@ -206,6 +234,26 @@ def _motion(eye: Eye, observations: Observations, row: int) -> tuple[Floats, Flo
         Poses(pose.azimuth_rad[row : row + 1], pose.elevation_rad[row : row + 1], pose.torsion_rad[row : row + 1]), eye
     )
     return M[0], t[0]
+
+
+def _visibility(observations: Observations, row: int, done: RenderedWindow) -> dict[str, Any]:
+    """What is seen of pupil and glints, and where the lids are; the same keys with and without an eye region."""
+    from .rendering.occlusion import visible_arcs_deg
+    from .rendering.renderer import PUPIL
+
+    assert done.labels is not None
+    points = observations.pupil.points_px[row]
+    arcs = None
+    if observations.pupil.ok[row] and len(points) > 2:
+        arcs = visible_arcs_deg(done.labels.part, PUPIL, points, done.window[:2])
+    return {
+        "pupil_visible_arcs_deg": arcs,
+        "glints": [
+            {"light": i, "reason": reason, "visible_share": float(share)}
+            for i, (reason, share) in enumerate(zip(done.glint_reasons, done.glints.share, strict=True))
+        ],
+        "lid_margins_px": done.lid_margins_px,
+    }
 
 
 def _share(value: float) -> float | None:

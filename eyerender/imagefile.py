@@ -6,6 +6,7 @@ Pixel values are linear sensor counts; nothing here scales or gamma-encodes them
 from __future__ import annotations
 
 import os
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,11 @@ def write_png(path: str | Path, image: NDArray[Any]) -> None:
     path = Path(path)
     part = path.with_name(f".{path.name}.part")
     try:
-        # Fast compression: noise does not compress, and writing must not cost more than rendering.
-        Image.fromarray(np.ascontiguousarray(image)).save(part, format="PNG", compress_level=1)
+        # Noise does not compress, and writing must not cost more than rendering: run lengths alone are faster and, for
+        # noise and for masks, smaller than zlib's search for repetitions.
+        Image.fromarray(np.ascontiguousarray(image)).save(
+            part, format="PNG", compress_level=1, compress_type=zlib.Z_RLE
+        )
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)

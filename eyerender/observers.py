@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from .capture import render_windows
 from .errors import InputError
 from .extraction import Extraction, ExtractionSettings, extract
 from .extraction.assignment import assign_lights, predict_glints
+from .eye.spec import EyeSpec
 from .imagefile import read_image
 from .imagefolder import DATASET, ImageFolder
 from .observation import MISSING, OK, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
@@ -155,7 +157,32 @@ def scene_of(folder: ImageFolder) -> Scene:
     spec = folder.dataset.get("spec")
     if not isinstance(spec, dict):
         raise InputError("missing", source=source, path="spec")
+    if folder.dataset.get("kind") == "dataset":
+        return _scene_of_samples(folder)
     return Scene.of(SceneSpec.from_mapping(spec, source=source), source=source)
+
+
+def _scene_of_samples(folder: ImageFolder) -> Scene:
+    """The scene of a generated dataset's first sample, whose cameras and places of lights all others must share."""
+    first: Scene | None = None
+    seen: set[str] = set()
+    for entry in folder.entries:
+        source = str(entry.path)
+        try:
+            text, eye = entry.line["parameters"]["scene_json"], entry.line["parameters"]["eye_json"]
+            rig = json.loads(text)["rig"]
+            key = json.dumps([rig["cameras"], [{**light, "intensity_mw_sr": 0} for light in rig["lights"]]])
+        except (KeyError, TypeError, ValueError):
+            raise InputError("has no parameters", source=source) from None
+        if first is None:
+            spec = SceneSpec.from_mapping(json.loads(text), source=source)
+            first = Scene(spec, EyeSpec.from_mapping(json.loads(eye), source=source), spec.rig.build())
+        seen.add(key)
+        if len(seen) > 1:
+            raise InputError("the rig differs from image to image; nothing can be calibrated", source=str(folder.path))
+    if first is None:
+        raise InputError("holds no images", source=str(folder.path))
+    return first
 
 
 def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: float) -> tuple[NDArray[Any], Floats]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -167,10 +168,8 @@ class Scene:
 
     def eye(self, side: Literal["right", "left"] | str) -> Eye:
         """The numeric eye of one side at the scene's wavelength and pupil size."""
-        return self.eye_spec.build(
-            eye="left" if side == "left" else "right",
-            wavelength_nm=self.spec.wavelength_nm,
-            pupil_diameter_mm=self.spec.eye.pupil_diameter_mm,
+        return _built_eye(
+            _Same(self.eye_spec), side == "left", self.spec.wavelength_nm, self.spec.eye.pupil_diameter_mm
         )
 
     def eye_position_mm(self, side: str) -> Floats:
@@ -271,6 +270,27 @@ class Scene:
                 "up": screen.up.tolist(),
             },
         }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Same:
+    """A spec that equals itself only: comparing the object costs nothing, comparing its content a millisecond."""
+
+    spec: EyeSpec
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.spec is self.spec
+
+    def __hash__(self) -> int:
+        return id(self.spec)
+
+
+@lru_cache(maxsize=32)
+def _built_eye(eye: _Same, left: bool, wavelength_nm: float, pupil_diameter_mm: float | None) -> Eye:
+    """A numeric eye; observers, renderer and labels ask for the same one again and again."""
+    return eye.spec.build(
+        eye="left" if left else "right", wavelength_nm=wavelength_nm, pupil_diameter_mm=pupil_diameter_mm
+    )
 
 
 def shipped_scenes() -> dict[str, Path]:

@@ -189,7 +189,8 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
     record = _record(pupil, glints, seed)
     parameters = {
         "condition": name, "seed": seed, "noise_dn": noise, "blur_px": blur, "step_dn": step, "texture_dn": texture,
-        "pupil_level_dn": pupil_level, "lid": lid is not None, "bit_depth": c.bit_depth,
+        "pupil_level_dn": pupil_level, "lid": lid is not None, "visible_fraction": _visible(pupil, lid),
+        "bit_depth": c.bit_depth,
         "pupil_contrast_to_noise": abs(step) / max(noise, 1e-9), "polarity": "bright" if c.bright_pupil else "dark",
     }  # fmt: skip
     return Drawing(np.clip(np.rint(data), 0, full).astype(dtype), record, parameters)
@@ -271,6 +272,17 @@ def _lid(c: Condition, pupil: _Conic, rng: np.random.Generator) -> Callable[[Arr
         return np.asarray((y - margin) / np.sqrt(1.0 + (tilt - 2.0 * bend * (t - middle)) ** 2))
 
     return distance
+
+
+def _visible(pupil: _Conic, lid: Callable[[Array, Array], Array] | None) -> float:
+    """The share of the pupil that the lid leaves to be seen, to about 0.001."""
+    if lid is None:
+        return 1.0
+    a = pupil.semi.max()
+    x, y = (np.linspace(-a, a, 401) + c for c in pupil.centre)
+    inside = pupil.distance(x[None, :], y[:, None]) < 0.0
+    seen = np.broadcast_to(lid(x[None, :], y[:, None]), inside.shape) > 0.0
+    return float(np.count_nonzero(inside & seen) / np.count_nonzero(inside))
 
 
 def _place_glints(c: Condition, pupil: _Conic, iris: _Conic, rng: np.random.Generator) -> list[dict[str, Any]]:

@@ -37,6 +37,7 @@ FLOORS = {
     "report": 7,
     "dataset": 7,
     "study": 8,
+    "benchmark": 8,
     "quickstart": 8,
     "cli": 9,
     "__init__": 10,

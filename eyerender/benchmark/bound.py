@@ -2,8 +2,8 @@
 
     sigma_c = (s / step) sqrt(2 sigma_b / (sqrt(pi) R)) per axis, sigma_b^2 = blur^2 + 1/12, R = sqrt(a b)
 
-for white noise s, all of the outline seen, and free centre. Of a centre with this standard deviation along both axes the
-distance from the truth has the median 1.177 sigma_c. Grey levels are DN of an 8-bit scale, whatever the depth.
+for white noise s, all of the outline seen, and free centre. Of a centre with this standard deviation along both axes
+the distance from the truth has the median 1.177 sigma_c. Grey levels are DN of an 8-bit scale, whatever the depth.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from ..geometry.ellipse import Ellipse, signed_distance
 
 MEDIAN_OF_RADIAL = math.sqrt(2.0 * math.log(2.0))
 _LEAST_VISIBLE = 0.98
+_GLINT_PX = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +65,29 @@ def measure_edge(grey_dn: Floats, pupil: Ellipse, glints_px: Floats, quantum_dn:
     """Noise, step and blur along a known outline.
 
     The levels inside and outside follow lines in the distance d from the outline, with an error function between them
-    (least squares over |d| < 6 px, or 0.6 of the smaller semi-axis); the noise is that of the differences between
-    neighbours' neighbours there, which neither slope nor texture enters: 1.4826 median|d| / 2, of
-    d = I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1), away from the edge. grey_dn (h, w); glints (n, 2) px are left out.
+    (robust least squares over |d| < 6 px, then over 5 sigma where the edge is wider). The noise is half the root mean
+    square of I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1) away from the edge, cut at 4 sigma: no slope enters.
+
+    grey_dn: (h, w). glints_px: (n, 2) places to leave out. quantum_dn: the least step of a stored value.
     """
-    reach = min(6.0, 0.6 * float(pupil.semi_axes_px[1]))
+    widest = 0.6 * float(pupil.semi_axes_px[1])
+    reach = min(6.0, widest)
+    fit = _profile(grey_dn, pupil, glints_px, reach)
+    if fit is not None and 5.0 * fit[1] > reach and widest > reach:
+        fit = _profile(grey_dn, pupil, glints_px, min(5.0 * fit[1], widest))
+    if fit is None:
+        return None
+    step, sigma, part, free = fit
+    noise = _noise(part, free, quantum_dn)
+    if not (0.1 < sigma < 10.0 and abs(step) > 1e-6 and math.isfinite(noise)):
+        return None
+    return Edge(max(noise, quantum_dn / math.sqrt(12.0)), step, sigma)
+
+
+def _profile(
+    grey_dn: Floats, pupil: Ellipse, glints_px: Floats, reach: float
+) -> tuple[float, float, Floats, NDArray[np.bool_]] | None:
+    """Step, sigma, the part of the image about the pupil, and its pixels off the edge and the glints."""
     x0, y0 = np.maximum(np.floor(pupil.centre_px - pupil.semi_axes_px[0] - reach - 2), 0).astype(int)
     x1, y1 = np.ceil(pupil.centre_px + pupil.semi_axes_px[0] + reach + 3).astype(int)
     part = grey_dn[y0:y1, x0:x1]
@@ -79,32 +98,32 @@ def measure_edge(grey_dn: Floats, pupil: Ellipse, glints_px: Floats, quantum_dn:
     distance = signed_distance(pupil, points)
     free = np.ones(part.shape, dtype=bool)
     for spot in glints_px:
-        free &= np.hypot(*np.moveaxis(points - spot, -1, 0)) > 8.0
+        free &= np.hypot(*np.moveaxis(points - spot, -1, 0)) > _GLINT_PX
     near = free & (np.abs(distance) < reach)
     if np.count_nonzero(near) < 40:
         return None
     d, value = distance[near], part[near]
+    dark, light = float(np.median(value[d < 0.0])), float(np.median(value[d > 0.0]))
+    scale = max(abs(light - dark), 1e-6)
 
-    def model(p: Floats) -> Floats:
+    def misfit(p: Floats) -> Floats:
         inside, step, slope_in, slope_out, log_sigma, shift = p
         t = d - shift
         rise = 0.5 * (1.0 + erf(t / (math.sqrt(2.0) * math.exp(log_sigma))))
         level_in, level_out = inside + slope_in * t, inside + step + slope_out * t
-        return np.asarray(level_in + (level_out - level_in) * rise)
+        return np.asarray((level_in + (level_out - level_in) * rise - value) / scale)
 
-    dark, light = np.median(value[d < -0.5 * reach]), np.median(value[d > 0.5 * reach])
     start = np.array([dark, light - dark, 0.0, 0.0, 0.0, 0.0])
-    scale = max(abs(float(light - dark)), 1e-6)
-    fit = least_squares(lambda p: (model(p) - value) / scale, start, loss="soft_l1", f_scale=0.1)
-    step, sigma = float(fit.x[1]), math.exp(float(fit.x[4]))
-    noise = _noise(part, free & (np.abs(distance) > 2.0 * sigma + 1.0))
-    if not (0.1 < sigma < 10.0 and abs(step) > 1e-6 and math.isfinite(noise)):
-        return None
-    return Edge(max(noise, quantum_dn / math.sqrt(12.0)), step, sigma)
+    fit = least_squares(misfit, start, loss="soft_l1", f_scale=0.1)
+    sigma = math.exp(min(float(fit.x[4]), 5.0))
+    return float(fit.x[1]), sigma, part, free & (np.abs(distance - fit.x[5]) > 2.5 * sigma + 1.0)
 
 
-def _noise(grey_dn: Floats, free: NDArray[np.bool_]) -> float:
+def _noise(grey_dn: Floats, free: NDArray[np.bool_], quantum_dn: float) -> float:
     whole = free[:-1, :-1] & free[1:, :-1] & free[:-1, 1:] & free[1:, 1:]
-    difference = grey_dn[:-1, :-1] - grey_dn[:-1, 1:] - grey_dn[1:, :-1] + grey_dn[1:, 1:]
-    values = np.abs(difference[whole])
-    return 0.7413 * float(np.median(values)) if values.size >= 20 else math.nan
+    difference = (grey_dn[:-1, :-1] - grey_dn[:-1, 1:] - grey_dn[1:, :-1] + grey_dn[1:, 1:])[whole]
+    if difference.size < 20:
+        return math.nan
+    size = np.abs(difference)
+    cut = 4.0 * max(1.4826 * float(np.median(size)), quantum_dn)
+    return 0.5 * math.sqrt(float(np.mean(size[size <= cut] ** 2)))

@@ -72,15 +72,14 @@ def load_labelled(folder: str | Path) -> list[LabelledImage]:
     truth = images.truth()
     scene_rig = _rig_of(images)
     out = []
-    row = 0
     for k, entry in enumerate(images.entries):
         count = len(entry.line["records"])
         if count != 1:
             raise InputError(
                 f"holds {count} eyes; the bench takes images of one", source=str(path / METADATA), path=f"line {k + 1}"
             )
-        out.append(_rendered(entry, truth, row, scene_rig))
-        row += 1
+        # One record an image: an image's row in the truth is its number.
+        out.append(_rendered(entry, truth, k, scene_rig))
     return out
 
 

@@ -35,7 +35,7 @@ class ExtractorProcess:
         self, argv: Sequence[str], *, start_timeout_s: float, timeout_s: float, env: Mapping[str, str] | None = None
     ) -> None:
         self._timeout_s = timeout_s
-        self._stderr: IO[bytes] = tempfile.TemporaryFile()
+        self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  (closed with the process)
         self._buffer = b""
         self._closed = False
         try:
@@ -130,7 +130,7 @@ class ExtractorProcess:
     def _died(self) -> Failed:
         """Why it ended: its exit status and the last line it wrote to stderr."""
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=2.0)
+            self._process.wait(timeout=0.5)
         code = self._process.poll()
         last = self._last_words()
         self.close()

@@ -87,7 +87,9 @@ class Reply:
         if data.get("id") != request_id:
             raise InputError(f"must be {request_id}, not {data.get('id')!r}", path="id")
         if data.get("error") is not None:
-            return cls(None, None, None, (), None, None, " ".join(str(data["error"]).split())[:200] or "no reason given")
+            return cls(
+                None, None, None, (), None, None, " ".join(str(data["error"]).split())[:200] or "no reason given"
+            )
         record = data.get("record")
         if not isinstance(record, dict) or not isinstance(record.get("pupil"), dict):
             raise InputError("must hold the pupil", path="record")

@@ -44,7 +44,18 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
-    from . import dataset, environment, export, eyes, gaze, images, observe, study  # noqa: F401  (they register their commands)
+    # Importing them registers their commands.
+    from . import (  # noqa: F401
+        benchmark,
+        dataset,
+        environment,
+        export,
+        eyes,
+        gaze,
+        images,
+        observe,
+        study,
+    )
 
     tokens = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in tokens

@@ -20,30 +20,34 @@ def study(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     protocol: Literal["corrected", "published", "both"] = "both",
-    observer: Literal["analytic", "image", "both"] = "analytic",
+    observer: Literal["analytic", "image", "both"] | None = None,
     eyes: str | None = None,
     workers: int | None = None,
     spp: int | None = None,
-    noise: bool = True,
+    noise: Literal["on", "off", "both"] = "both",
     backend: BackendName = "auto",
     threads: int | None = None,
     overwrite: bool = False,
     json: Json = None,
 ) -> int:
-    """Replicate a published study of gaze estimation, and test its findings on the replication's own data.
+    """Replicate a published study of gaze estimation, test its findings on its own data, or compare the observers.
 
-    Writes summary.json, findings.json, CSV of both and report.html. A folder of the same study is run again in place.
+    Writes summary.json, findings.json, CSV of both and report.html. A folder of the same study is run again in place;
+    images that it holds are used again.
 
     Parameters
     ----------
     name
-        guestrin2006, blignaut2014, or conditions (over the screen, head positions, pupil sizes, eye parameters).
+        guestrin2006 (model-based), blignaut2014 (interpolation-based), observers (analytic against image-derived
+        features on the head-mounted rig), or conditions (errors over the screen, head positions, pupil sizes and eye
+        parameters; analytic).
     output
         The folder to write.
     protocol
-        What the authors' software did (published), what the text says (corrected), or both.
+        guestrin2006, blignaut2014: what the authors' software did (published), what the text says (corrected), or both.
     observer
-        Features by ray optics (analytic), recovered from rendered images (image), or both.
+        Features by ray optics (analytic), recovered from rendered images (image), or both, which compares them.
+        Default: analytic; both for observers.
     eyes
         Eye models, separated by commas: names of the catalogue, or eye files (default: E1 to E5).
     workers
@@ -51,7 +55,7 @@ def study(
     spp
         Samples per pixel of the images (default: the scene's).
     noise
-        Sensor noise in the images.
+        Images with the sensor's noise (on), without it (off), or both, from one rendering.
     backend
         Where to render.
     threads
@@ -92,7 +96,7 @@ def _table(summary: dict[str, Any]) -> str:
     """The means that matter, one line each."""
     rows = summary["rows"]
     if summary["study"] == "blignaut2014":
-        lines = [f"{'protocol':<10} {'observer':<9} {'eye':<18} {'set':<5} {'best':<5} {'mean deg':>9}"]
+        lines = [f"{'protocol':<12} {'observer':<15} {'eye':<18} {'set':<5} {'best':<5} {'mean deg':>9}"]
         best: dict[tuple[str, ...], dict[str, Any]] = {}
         for row in rows:
             key = (row["protocol"], row["observer"], row["eye_model"], row["calibration"])
@@ -101,16 +105,16 @@ def _table(summary: dict[str, Any]) -> str:
             if key not in best or row["mean_deg"] < best[key]["mean_deg"]:
                 best[key] = row
         lines += [
-            f"{k[0]:<10} {k[1]:<9} {k[2]:<18} {k[3]:<5} {row['function']:<5} {row['mean_deg']:>9.4f}"
+            f"{k[0]:<12} {k[1]:<15} {k[2]:<18} {k[3]:<5} {row['function']:<5} {row['mean_deg']:>9.4f}"
             for k, row in best.items()
         ]
         return "\n".join(lines)
-    lines = [f"{'protocol':<10} {'observer':<9} {'eye':<18} {'side':<6} {'mean deg':>9} {'n':>4}  condition"]
+    lines = [f"{'protocol':<12} {'observer':<15} {'eye':<18} {'side':<6} {'mean deg':>9} {'n':>4}  condition"]
     for row in rows:
         mean = "-" if row["mean_deg"] is None else f"{row['mean_deg']:.4f}"
         condition = " ".join(str(v) for v in (row["head"], row["variant"]) if v)
         lines.append(
-            f"{row['protocol']:<10} {row['observer']:<9} {row['eye_model']:<18} {row['eye']:<6} {mean:>9} "
+            f"{row['protocol']:<12} {row['observer']:<15} {row['eye_model']:<18} {row['eye']:<6} {mean:>9} "
             f"{row['n']:>4}  {condition}"
         )
     return "\n".join(lines)

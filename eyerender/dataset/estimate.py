@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import time
+import zlib
 from typing import Any
 
 import numpy as np
@@ -63,5 +64,5 @@ def estimate(plan: Plan, options: Options) -> dict[str, Any]:
 
 def _bytes(image: Any) -> int:
     buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(image)).save(buffer, format="PNG", compress_level=1)
+    Image.fromarray(np.ascontiguousarray(image)).save(buffer, format="PNG", compress_level=1, compress_type=zlib.Z_RLE)
     return buffer.tell()

@@ -4,34 +4,31 @@ Every length is in mm, every angle in degrees. Defaults are those of a European 
 Sources, by the name used in the descriptions (means are theirs, ranges wider than theirs are chosen):
 
 - Hall: Hall, Gripp, Slavotinek 2007, Handbook of Physical Measurements (fissure length 28 to 32 mm, canthal tilt).
-- van den Bosch: van den Bosch, Leenders, Mulder 1999, Br J Ophthalmol 83, 347 (fissure 27 to 30 mm long, 8 to 11 mm high,
-  upper lid 4 mm above the pupil's centre, lower 5 to 6 mm below, both by age).
-- Becker: Becker and Fuchs 1988, Exp Brain Res 70, 397 (the upper lid turns nearly as far as the eye).
+- van den Bosch: van den Bosch, Leenders, Mulder 1999, Br J Ophthalmol 83, 347 (fissure 27 to 30 mm long, 8 to 11 mm
+  high, both margins above and below the pupil's centre, by sex and age).
+- Becker: Becker and Fuchs 1988, J Neurophysiol 60, 1227 (the upper lid turns nearly as far as the eye).
 - Evinger: Evinger, Manning, Sibony 1991, Invest Ophthalmol Vis Sci 32, 387 (lids in blinks).
 - Wolff: Bron, Tripathi, Tripathi 1997, Wolff's Anatomy of the Eye and Orbit (margin 2 mm thick; lashes in two to three
   rows, 100 to 150 above, 50 to 75 below, 8 to 12 and 6 to 8 mm long; caruncle 5 x 3 mm).
 - Na: Na et al. 2006, Br J Dermatol 155, 1170 (lash length, diameter, curl and number).
-- Price: Price et al. 2009, Orbit 28, 95 (upper crease 8 to 10 mm above the margin of the closed lid).
 - Mainstone: Mainstone, Bruce, Golding 1996, Curr Eye Res 15, 653 (meniscus radius and height 0.2 to 0.3 mm).
 - Farkas: Farkas 1994, Anthropometry of the Head and Face (brow, nose, orbit).
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field
-from pydantic.fields import FieldInfo
 
 from ..spec import Spec
 
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
-def _number(default: float, low: float, high: float, text: str) -> FieldInfo:
-    field: FieldInfo = Field(default=default, ge=low, le=high, description=f"{text}; {low:g} to {high:g}")
-    return field
+def _number(default: float, low: float, high: float, text: str) -> Any:
+    return Field(default=default, ge=low, le=high, description=f"{text}; {low:g} to {high:g}")
 
 
 class FissureSpec(Spec):
@@ -55,7 +52,7 @@ class LidSpec(Spec):
     film_mm: float = _number(0.02, 0.005, 0.05, "between the margin's inner edge and the globe (chosen)")
     upper_follows: float = _number(0.9, 0.6, 1.0, "turn of the upper lid per turn of the eye (Becker)")
     lower_follows: float = _number(0.35, 0.1, 0.6, "turn of the lower lid per turn of the eye (chosen after Evinger)")
-    crease_mm: float = _number(8.5, 5.0, 11.0, "crease above the margin of the closed lid (Price)")
+    crease_mm: float = _number(8.5, 5.0, 11.0, "crease above the margin of the closed lid (commonly 8 to 10; chosen)")
     show_mm: float = _number(3.2, 1.0, 5.5, "lid visible below the fold when open (chosen)")
     fold_mm: float = _number(1.3, 0.0, 2.2, "how far the fold stands above the crease (chosen)")
     bags_mm: float = _number(0.5, 0.0, 1.5, "fullness below the lower lid (chosen)")
@@ -103,7 +100,7 @@ class SkinSpec(Spec):
 
     albedo: float = _number(0.55, 0.30, 0.75, "of the skin (Cooksey, Allen, Tsai 2017: about 0.4 to 0.65 at 850 nm)")
     mottling: Share = Field(default=0.5, description="unevenness of the albedo (chosen)")
-    relief_mm: float = _number(0.032, 0.0, 0.12, "depth of the skin's fine furrows (Tchvialeva 2013: 20 to 100 um)")
+    relief_mm: float = _number(0.032, 0.0, 0.12, "depth of the skin's fine furrows (some tens of micrometres; chosen)")
     wrinkles: Share = Field(default=0.35, description="lines on and below the lids (chosen)")
     sheen: Share = Field(default=0.5, description="strength of the oily skin's rough mirror (chosen)")
     wet_albedo: float = _number(0.40, 0.2, 0.7, "of the margins and the caruncle (chosen)")
@@ -150,5 +147,5 @@ def _draw(kind: type[Spec], key: tuple[int, ...], spread: float) -> dict[str, ob
         u = np.random.default_rng((0x5EED, *key, i)).uniform(-spread, spread)
         default = float(field.default)
         value = default + u * ((high - default) if u > 0 else (default - low))
-        out[name] = int(round(value)) if field.annotation is int else float(value)
+        out[name] = round(value) if field.annotation is int else float(value)
     return out

@@ -1,8 +1,8 @@
 """The palpebral fissure: the inner edge of the lids' margin around the eye, on the globe and off it.
 
-Columns run once around the fissure: angle 0 at the medial canthus, 90 degrees in the middle of the upper lid, 180 at the
-lateral canthus, 270 in the middle of the lower lid. Along the chord between the canthi a = cos(angle) is -1 temporal and
-+1 nasal; a lid stands above or below the chord by
+Columns run once around the fissure: angle 0 at the medial canthus, 90 degrees in the middle of the upper lid, 180 at
+the lateral canthus, 270 in the middle of the lower lid. Along the chord between the canthi a = cos(angle) is -1
+temporal and +1 nasal; a lid stands above or below the chord by
 
     h(a) = H (1 + a)^p (1 - a)^q / max,
 
@@ -30,8 +30,9 @@ _GAP_MM = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contour(ArrayValue):
-    """Per column: `angle` (n,), `along` a (n,), `upper` 1 or -1, the inner edge `point` (n, 3), the `normal` (n, 3) of the globe
-    or its continuation, the direction `away` (n, 3) from the fissure along it, and `along_lid` (n, 3), towards the nose.
+    """Per column: `angle` (n,), `along` a (n,), `upper` 1 or -1, the inner edge `point` (n, 3), the `normal` (n, 3) of
+    the globe or its continuation, the direction `away` (n, 3) from the fissure along it, and `along_lid` (n, 3),
+    towards the nose.
 
     `openness` is 1 for lids as wide as straight ahead, 0 for closed ones.
     """
@@ -92,7 +93,7 @@ def _outline(spec: RegionSpec, globe: Globe, a: Floats, upper: Floats) -> tuple[
     chord = middle + a[:, None] * half
     middle_z = middle[1] + f.peak * half[1]
     reach = globe.radius_mm + 0.5
-    # Where the margins' middles stand, as angles about the globe's centre; the lids never quite touch unless they blink.
+    # Where the margins' middles stand, as angles about the globe's centre; lids never quite touch unless they blink.
     turn = globe.elevation_rad
 
     def height(rest_mm: float, follows: float) -> float:

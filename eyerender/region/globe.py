@@ -69,7 +69,7 @@ class Globe(ArrayValue):
     def radial(self, direction: Floats) -> Floats:
         """r (n,) mm along unit directions (n, 3) from the centre."""
         if self.cornea is None:
-            return np.full(np.shape(direction)[:-1], self.radius_mm)
+            return np.asarray(np.full(np.shape(direction)[:-1], self.radius_mm))
         local = self._mirror(direction) @ self.M
         polar = np.arccos(np.clip(local[..., 0], -1, 1))
         turn = np.arctan2(local[..., 2], local[..., 1]) / (2 * np.pi) % 1.0

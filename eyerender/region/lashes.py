@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..arrays import ArrayValue, Floats, frozen
+from ..arrays import ArrayValue, Floats, Ints, frozen
 from .anatomy import LashSpec, RegionSpec
 from .contour import step, unit
 from .globe import Globe
@@ -65,7 +65,7 @@ def _lid(spec: LashSpec, seed: int, upper: bool) -> tuple[Floats, ...]:
     start = -droop + 0.6 * spread * rng.normal(0, 1, count)
     curl = np.radians(spec.upper_curl_deg if upper else spec.lower_curl_deg) * rng.uniform(0.8, 1.15, count)
     # Clumps: groups of two to five share fan and curl towards their tips.
-    group = np.cumsum(rng.uniform(size=count) < 0.32)
+    group = np.cumsum((rng.uniform(size=count) < 0.32).astype(np.int64))
     for values in (fan, start, curl):
         for g in np.unique(group):
             members = group == g
@@ -76,7 +76,7 @@ def _lid(spec: LashSpec, seed: int, upper: bool) -> tuple[Floats, ...]:
     return angle, across, length, fan, start, curl
 
 
-def _lean(a: Floats, group: Floats, clumping: float, length: float) -> Floats:
+def _lean(a: Floats, group: Ints, clumping: float, length: float) -> Floats:
     """Turn of each lash towards the middle of its clump, so that tips meet."""
     out = np.zeros_like(a)
     for g in np.unique(group):
@@ -90,9 +90,7 @@ def lashes(spec: RegionSpec, globe: Globe, sheet: Sheet) -> Hairs:
     """The lashes of a posed sheet."""
     p = plan(spec.lashes, spec.seed)
     c = sheet.contour
-    inner, outer, n, m, t = (
-        _at(p.angle, v) for v in (c.point, sheet.lash_line, c.normal, c.away, c.along_lid)
-    )
+    inner, outer, n, m, t = (_at(p.angle, v) for v in (c.point, sheet.lash_line, c.normal, c.away, c.along_lid))
     root = inner + p.across[:, None] * (outer - inner)
     # With the lids shut there is less room between them.
     fold_back = step(1 - c.openness, 0.5, 1.0)
@@ -129,7 +127,7 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
     """
     if not points.size:
         return points[:, 1:]
-    points, straight = points[:, 1:], straight[:, 1:]
+    root, points, straight = points[:, :1], points[:, 1:], straight[:, 1:]
     rows = slice(CONJUNCTIVA + MARGIN - 1, CONJUNCTIVA + MARGIN + LID + _REACH_ROWS)
     skin, normals = sheet.vertices[rows].reshape(-1, 3), sheet.normals[rows].reshape(-1, 3)
     tree = cKDTree(skin)
@@ -160,9 +158,11 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
         active = active[np.abs(push).max(axis=(1, 2)) > 0.01]
         if not len(active):
             break
-    # Bent out of shape on the way: it had no room to curl.
+    # Bent out of shape on the way, for want of room: a stub remains.
     pieces = np.diff(out, axis=1)
-    stretched = np.linalg.norm(pieces, axis=-1).max(axis=1) > 1.5 * np.linalg.norm(straight[:, 1] - straight[:, 0], axis=-1)
-    out[stretched] = straight[stretched]
+    stretched = np.linalg.norm(pieces, axis=-1).max(axis=1) > 1.5 * np.linalg.norm(
+        straight[:, 1] - straight[:, 0], axis=-1
+    )
+    out[stretched] = root[stretched] + 0.1 * (straight[stretched] - root[stretched])
     # And off the globe, for lashes that turn in.
     return globe.pushed_out(out, 0.3)

@@ -2,8 +2,8 @@
 
 A grid of `ROWS` rows by columns once around the fissure (see `contour`); its topology never changes. Rows, inside out:
 
-    conjunctiva   from the globe (just below its surface, so that no gap shows) to the margin's inner edge; off the globe,
-                  beside the nose, it carries the plica and the caruncle
+    conjunctiva   from the globe (just below its surface, so that no gap shows) to the margin's inner edge; off the
+                  globe, beside the nose, it carries the plica and the caruncle
     margin        the lid's edge, `margin_mm` thick, its two edges rounded
     lid           from the lash line to the crease
     face          from the crease to far outside
@@ -118,7 +118,9 @@ def _conjunctiva(spec: RegionSpec, globe: Globe, c: Contour) -> Floats:
     plica = 0.45 * np.exp(-(((s - 0.22) / 0.14) ** 2)) * size
     caruncle = 1.5 * np.exp(-(((s - 0.55) / 0.2) ** 2)) * step(c.along, 0.9, 0.995)[None, :] * (1 - 0.6 * spec.blink)
     rows = rows + (plica + caruncle)[..., None] * c.normal
-    clear = globe.pushed_out(rows, np.where(u[..., 0] > 0, spec.lids.film_mm * on_globe + 0.05 * (1 - on_globe), -_DIP_MM))
+    clear = globe.pushed_out(
+        rows, np.where(u[..., 0] > 0, spec.lids.film_mm * on_globe + 0.05 * (1 - on_globe), -_DIP_MM)
+    )
     return np.asarray(clear)
 
 

@@ -62,9 +62,7 @@ def region_mesh(spec: RegionSpec, globe: Globe) -> RegionMesh:
     s = sheet(spec, globe)
     tears = meniscus(spec, globe, s)
     lash, hair = lashes(spec, globe, s), brow(spec)
-    vertices = np.concatenate(
-        [_closed(s.vertices), _closed(tears), lash.tubes(), _brow_tubes(spec)]
-    )
+    vertices = np.concatenate([_closed(s.vertices), _closed(tears), lash.tubes(), _brow_tubes(spec)])
     normals = np.concatenate(
         [_closed(s.normals), _closed(grid_normals(tears)), _round(lash, lash.tubes()), _brow_normals(spec)]
     )

@@ -30,16 +30,13 @@ def band(seed: int, size: int, across: tuple[float, float], up: tuple[float, flo
 
 @lru_cache(maxsize=8)
 def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Floats:
-    """Height 0 (furrow) to about 1 (plateau) over a periodic square of `cells` cells: the distance to the border between
-    the nearest two seeds. `stretch` > 1 draws cells out across.
+    """Height 0 (furrow) to about 1 (plateau) over a periodic square of `cells` cells: the distance to the border
+    between the nearest two seeds. `stretch` > 1 draws cells out across.
     """
     rng = np.random.default_rng((0xF0, seed))
-    seeds = rng.uniform(0, 1, (cells, 2)) * np.array([stretch, 1.0])
-    # Two thirds of the points settled for a while: cells of even size.
-    box = np.array([1.0 * stretch, 1.0])
-    seeds = seeds / np.array([stretch, 1.0]) * np.array([1.0, stretch])
-    box = np.array([1.0, stretch])
-    tree = cKDTree(seeds, boxsize=box)
+    # Distances count `stretch` times as much upwards.
+    seeds = rng.uniform(0, 1, (cells, 2)) * np.array([1.0, stretch])
+    tree = cKDTree(seeds, boxsize=np.array([1.0, stretch]))
     x, y = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size * stretch)
     wobble = 0.25 / np.sqrt(cells)
     x = (x + wobble * band(seed + 1, size, (0, 40), (0, 40))) % 1.0

@@ -87,13 +87,18 @@ def _relief(spec: RegionSpec, y: Floats, z: Floats, near: Floats) -> Floats:
     cells = (1 - lids) * coarse + lids * drawn
     grain = _field(spec.seed + 3, y, z, (60, 200), (60, 200))
     lines = _field(spec.seed + 11, y, z, (0, 5), (18, 46))
-    under = np.exp(-(((z + 11.0) / 6.0) ** 2)) + 0.7 * np.exp(-(((z - 8.0) / 4.0) ** 2)) + np.exp(-(((y + 21.0) / 5.0) ** 2))
+    under = (
+        np.exp(-(((z + 11.0) / 6.0) ** 2))
+        + 0.7 * np.exp(-(((z - 8.0) / 4.0) ** 2))
+        + np.exp(-(((y + 21.0) / 5.0) ** 2))
+    )
     amount = 0.05 * skin.wrinkles * np.exp(-((np.hypot(y / 26.0, z / 20.0)) ** 4)) * under
     return np.asarray(skin.relief_mm * (cells + 0.12 * grain) - amount * np.abs(lines))
 
 
 def _slopes(height: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
     """Gradient of the height over (y, z), from differences along rows and columns of the map."""
+
     def along_columns(v: Floats) -> Floats:
         return np.asarray((np.roll(v, -1, axis=1) - np.roll(v, 1, axis=1)) / 2)
 

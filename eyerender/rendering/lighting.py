@@ -75,7 +75,7 @@ def lamps(
     v: Any,
     glossy: tuple[Any, Any] | None = None,
 ) -> tuple[Any, Any, Any, Any]:
-    """Irradiance (mW/mm^2) of all lamps outside and inside, radiance of the sheen, and the number of failed light paths.
+    """Irradiance (mW/mm^2) of all lamps outside, radiance of the sheen, irradiance inside, number of failed paths.
 
     Args:
         point, normal: matte points in the air, where `outside`; the scene's own where `other`, else the globe's.
@@ -90,22 +90,24 @@ def lamps(
 
     sine, cosine_v = dr.sincos(v * (2 * dr.pi))
 
-    def more(i: Any, *_: Any) -> Any:
-        return i < lights.count
-
-    def body(i: Any, direct: Any, shine: Any, bent: Any, failures: Any) -> Any:
-        lamp: Lamp = lights[i]
-        source = lamp.point(u, sine, cosine_v)
+    def straight(lamp: Lamp, source: Any) -> tuple[Any, Any]:
+        """Irradiance of one lamp in the air, and the unit direction to it."""
         to = source - point
         inv2 = dr.rcp(dr.squared_norm(to))
         to *= dr.sqrt(inv2)
         cosine = dr.dot(to, normal)
         lit = outside & (cosine > 0)
         blocked = lamp_blocked(values, scene, point, source, other, True, lit)
-        arriving = dr.select(lit & ~blocked, lamp.radiant_intensity(-to) * cosine * inv2, 0)
-        direct += arriving
-        if glossy is not None:
-            shine += arriving * sheen(normal, to, *glossy)
+        return dr.select(lit & ~blocked, lamp.radiant_intensity(-to) * cosine * inv2, 0), to
+
+    def more(i: Any, *_: Any) -> Any:
+        return i < lights.count
+
+    def body(i: Any, direct: Any, bent: Any, failures: Any) -> Any:
+        lamp: Lamp = lights[i]
+        source = lamp.point(u, sine, cosine_v)
+        if glossy is None:
+            direct += straight(lamp, source)[0]
 
         def through_cornea(source: Any, inner: Any, aim: Any, bent: Any, failures: Any) -> Any:
             path = connect(values.surfaces, source, inner, n, aim, values["limbus_radius"], inside)
@@ -123,10 +125,19 @@ def lamps(
             through_cornea,
             lambda source, inner, aim, bent, failures: (bent, failures),
         )
-        return i + 1, direct, shine, bent, failures
+        return i + 1, direct, bent, failures
 
-    state = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0), mi.UInt32(0))
-    _, direct, shine, bent, failures = dr.while_loop(
-        state, more, body, labels=("i", "direct", "shine", "bent", "failures"), label="lamps"
+    direct, shine = mi.Float(0), mi.Float(0)
+    if glossy is not None:
+        # Skin fills the picture and every lamp costs a ray through the region: each sample sees one lamp, for all.
+        count = mi.Float(lights.count)
+        one = dr.minimum(mi.UInt32(u * count), lights.count - 1)
+        lamp: Lamp = lights[one]
+        direct, to = straight(lamp, lamp.point(u * count - mi.Float(one), sine, cosine_v))
+        direct *= count
+        shine = direct * sheen(normal, to, *glossy)
+    state = (mi.UInt32(0), direct, mi.Float(0), mi.UInt32(0))
+    _, direct, bent, failures = dr.while_loop(
+        state, more, body, labels=("i", "direct", "bent", "failures"), label="lamps"
     )
     return direct, shine, bent, failures

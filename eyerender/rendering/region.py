@@ -17,7 +17,7 @@ from ..arrays import Bools, Floats
 from ..eye.model import Eye
 from ..region.anatomy import RegionSpec
 from ..region.globe import Globe
-from ..region.mesh import RegionMesh, region_mesh
+from ..region.mesh import PARTS, RegionMesh, region_mesh
 from ..region.skin import skin_map
 from .surround import clear_between
 
@@ -60,8 +60,10 @@ class RegionScene:
         params.update()
         self.scene = mi.load_dict({"type": "scene", "region": mesh})
         self._params: Any = mi.traverse(self.scene)
-        texture: Any = mi.Texture2f
-        self.map = texture(mi.TensorXf(skin_map(spec)), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
+        texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
+        self.map = texture(
+            mi.TensorXf16(skin_map(spec).astype(np.float16)), use_accel=False, wrap_mode=dr.WrapMode.Repeat
+        )
         self.mirror = -1.0 if globe.mirrored else 1.0
         self._shown: tuple[RegionSpec, Globe] | None = (spec, globe)
         self.posed = posed
@@ -95,9 +97,20 @@ class Surface:
     gloss: Any
 
 
+def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:
+    """The first part of the region between points (n, 3) a and b of the scene's frame, None where there is none."""
+    length = np.linalg.norm(b - a, axis=-1)
+    ray = mi.Ray3f(mi.Point3f(*a.T.astype(np.float32)), mi.Vector3f(*((b - a) / length[:, None]).T.astype(np.float32)))
+    ray.maxt = mi.Float((length - 1e-3).astype(np.float32))  # type: ignore[assignment]
+    hit = place.scene.ray_intersect_preliminary(ray, coherent=False, active=True)
+    valid, face = hit.is_valid().numpy(), hit.prim_index.numpy()
+    which = np.searchsorted(place.posed.layout.face_ends, face, side="right")
+    return [PARTS[int(w)] if v else None for v, w in zip(valid, which, strict=True)]
+
+
 def surface(texture: Any, mirror: Any, interaction: Any, active: Any) -> Surface:
     """Read the map; the relief tilts the normal n by its slope g over the tangent plane: n - (g - n (n . g))."""
-    albedo, slope_y, slope_z, gloss = texture.eval(interaction.uv, active)
+    albedo, slope_y, slope_z, gloss = (mi.Float(c) for c in texture.eval(interaction.uv, active))
     n = mi.Vector3f(interaction.sh_frame.n)
     g = mi.Vector3f(0, mirror * slope_y, slope_z)
     return Surface(albedo, dr.normalize(n - (g - n * dr.dot(n, g))), gloss)

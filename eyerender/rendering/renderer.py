@@ -15,11 +15,12 @@ from ..arrays import ArrayValue, Bools, Floats, frozen
 from ..errors import InputError
 from . import psf, sensor
 from .frame import RenderJob, camera_numbers, eye_numbers, kinds, light_table, look_numbers, pose_numbers
-from .glints import POINT, GlintScene, GlintTable, Spots, glint_table, quadrature
+from .glints import POINT, GlintScene, GlintTable, Image, Spots, glint_table, quadrature
 from .integrator import integrator_class
 from .lighting import lamps
+from .occlusion import glint_reason, lid_margins_px
 from .purkinje import purkinje_images
-from .region import RegionScene, globe_of
+from .region import RegionScene, blockers, globe_of
 from .sampling import Sampler, camera_ray
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
@@ -57,7 +58,8 @@ class RenderedWindow(ArrayValue):
     """A rendered window: `irradiance` (height, width) W/m^2 of the sensor, `dn` after the sensor, labels, glints.
 
     `purkinje` holds (order, table) of the mirror images beyond the first that were asked for. `failed_paths` counts
-    light paths that did not converge (they are missing from the irradiance).
+    light paths that did not converge (they are missing from the irradiance). `glint_reasons` says of each
+    glint whether it is visible or what hides it; `lid_margins_px` holds landmarks along the lids where there are any.
     """
 
     window: tuple[int, int, int, int]
@@ -68,6 +70,8 @@ class RenderedWindow(ArrayValue):
     glints: GlintTable
     purkinje: tuple[tuple[int, GlintTable], ...]
     failed_paths: int
+    glint_reasons: tuple[str, ...] = ()
+    lid_margins_px: dict[str, list[list[float]]] | None = None
 
 
 class Renderer:
@@ -95,10 +99,17 @@ class Renderer:
         pad = psf.margin(job.sensor.psf_sigma_px)
         x0, y0, width, height = job.window
         radiance, failed = self._radiance(
-            self._place(job).scene, values, lights, (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad), spp or self.spp, job.seed
+            self._place(job).scene,
+            values,
+            lights,
+            (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad),
+            spp or self.spp,
+            job.seed,
         )
         blurred = psf.blur(radiance, job.sensor.psf_sigma_px).copy()
-        glints, others = self._add_glints(job, blurred)
+        glints, others, reasons = self._add_glints(job, blurred)
+        place = self._place(job)
+        margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
         irradiance = blurred * sensor.radiance_to_irradiance(job.sensor)
         dn = sensor.expose(job.sensor, irradiance, job.wavelength_nm, job.seed)
         labels = self._labels(job, values) if job.labels else None
@@ -111,6 +122,8 @@ class Renderer:
             glints,
             others,
             failed,
+            reasons,
+            margins,
         )
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
@@ -233,8 +246,11 @@ class Renderer:
             frozen(depth.numpy().reshape(shape), np.float32),
         )
 
-    def _add_glints(self, job: RenderJob, image: Floats) -> tuple[GlintTable, tuple[tuple[int, GlintTable], ...]]:
-        """Add the lamps' mirror images to the blurred picture: the glints' table, and those of further orders."""
+    def _add_glints(
+        self, job: RenderJob, image: Floats
+    ) -> tuple[GlintTable, tuple[tuple[int, GlintTable], ...], tuple[str, ...]]:
+        """Add the lamps' mirror images to the blurred picture: the glints' table, those of further orders, and why each
+        glint is seen or not."""
         eye, anchor, sigma = job.eye, job.anchor_mm, job.sensor.psf_sigma_px
 
         def clear(a: Floats, b: Floats) -> Bools:
@@ -245,6 +261,7 @@ class Renderer:
             float(eye.sclera.radius_mm), job.M, job.t, job.camera, clear,
         )  # fmt: skip
         tables = {}
+        reasons: tuple[str, ...] = ()
         for order in sorted({1, *job.purkinje}):
             if order == 1:
                 images = scene.images(job.lights, sigma)
@@ -253,9 +270,25 @@ class Renderer:
                 nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in job.lights]
                 images = purkinje_images(scene, eye, order, job.lights, nodes)
             tables[order], spots = glint_table(scene, images)
+            if order == 1:
+                reasons = tuple(self._reason(job, image) for image in images)
             if order in job.purkinje:
                 self._splat(job, image, spots)
-        return tables[1], tuple((order, table) for order, table in tables.items() if order > 1)
+        return tables[1], tuple((order, table) for order, table in tables.items() if order > 1), reasons
+
+    def _reason(self, job: RenderJob, image: Image) -> str:
+        """Why a lamp's glint is seen or not."""
+        place, anchor = self._place(job), job.anchor_mm
+        node = np.broadcast_to(job.camera.nodal_point_mm, image.exit_mm.shape)
+        ways = [(image.source_mm - anchor, image.entry_mm - anchor), (node - anchor, image.exit_mm - anchor)]
+        open_ = np.ones(len(node), dtype=bool)
+        if place.obstructed:
+            open_ = place.clear(*ways[0]) & place.clear(*ways[1])
+        names: list[str | None] = [None] * len(open_)
+        if isinstance(place, RegionScene) and not np.all(open_):
+            to_lamp, to_camera = (blockers(place, *way) for way in ways)
+            names = [c if c is not None else a for a, c in zip(to_lamp, to_camera, strict=True)]
+        return glint_reason(image.energy, open_, names)
 
     @staticmethod
     def _splat(job: RenderJob, image: Floats, images: Sequence[Spots]) -> None:

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..region.texture import iris_texture, sclera_texture
-from .region import surface
+from .region import surface as region_surface
 from .surfaces import fresnel
 from .values import Values
 
@@ -111,7 +111,7 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any, region: Any = 
     xs = oe + ts * de
     facing, albedo, gloss = mi.Vector3f(interaction.n), mi.Float(0), mi.Float(0)
     if region is not None:
-        skin = surface(region, values["region.mirror"], interaction, other)
+        skin = region_surface(region, values["region.mirror"], interaction, other)
         facing, albedo = skin.normal, skin.albedo
         gloss = dr.select(other, skin.gloss, 0.8)
     xo, no = values.point_to_eye(interaction.p), values.vector_to_eye(facing)
@@ -194,7 +194,9 @@ def iris_albedo(values: Values, textures: Textures, x: Any) -> Any:
 def outer_albedo(values: Values, textures: Textures, view: View, active: Any) -> Any:
     """Albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
     si = view.interaction
-    other = view.albedo if textures.region is not None else si.bsdf().eval_diffuse_reflectance(si, active & view.other)[0]
+    other = (
+        view.albedo if textures.region is not None else si.bsdf().eval_diffuse_reflectance(si, active & view.other)[0]
+    )
     return dr.if_stmt(
         (view.point, other),
         view.other,

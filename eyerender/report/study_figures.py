@@ -66,7 +66,14 @@ def heads_figure(
         (deg). interval: head -> 95 % confidence interval of the participants' mean (deg).
     """
     models = list(dict.fromkeys(m for by_model in own.values() for m in by_model))
-    styles = [("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9")]
+    styles = [
+        ("o", "#0072B2"),
+        ("D", "#D55E00"),
+        ("s", "#009E73"),
+        ("^", "#CC79A7"),
+        ("v", "#56B4E9"),
+        ("P", "#777777"),
+    ]
     highest = [v[h] for by_model in own.values() for v in by_model.values() for h in v]
     top = 1.08 * max([*highest, *(float(v.max()) for v in measured.values()), *(high for _, high in interval.values())])
     with figure(9.6, 4.2, 2) as (fig, axes):
@@ -81,7 +88,7 @@ def heads_figure(
             )  # fmt: skip
             for k, (label, by_model) in enumerate(own.items()):
                 marker, colour = styles[k % len(styles)]
-                shift = (k - (len(own) - 1) / 2) * 0.16
+                shift = (k - (len(own) - 1) / 2) * min(0.16, 0.8 / len(own))
                 at = [i for i, m in enumerate(models) if m in by_model]
                 values = [by_model[models[i]][head] for i in at]
                 ax.scatter(x[at] + shift, values, s=46, marker=marker, color=colour, label=label, zorder=3)
@@ -103,10 +110,14 @@ def sets_figure(
     sets: Sequence[str], own: Mapping[str, Mapping[str, Sequence[float]]], measured: Sequence[float]
 ) -> str:
     """Figure 5: the best function's error for each calibration set by eye model; a panel a label of `own`."""
-    with figure(max(5.4, 4.6 * len(own)), 4.2, len(own)) as (fig, axes):
-        panels = np.atleast_1d(axes)
+    columns = min(len(own), 3)
+    lines = -(-len(own) // columns)
+    with figure(max(5.4, 4.6 * columns), 0.5 + 3.7 * lines, columns, lines) as (fig, axes):
+        panels = np.atleast_1d(axes).ravel()
         top = 2.0 * max(measured)
-        for ax, (label, by_model) in zip(panels, own.items(), strict=True):
+        for empty in panels[len(own) :]:
+            empty.set_axis_off()
+        for ax, (label, by_model) in zip(panels, own.items(), strict=False):
             x = np.arange(len(sets))
             ax.plot(x, measured, color=_MEASURED, marker="x", lw=1.6, label="experiment (26 people)")
             for model, values in by_model.items():

@@ -26,8 +26,8 @@ _RC: dict[Any, Any] = {
 
 
 @contextmanager
-def figure(width: float, height: float, columns: int = 1) -> Iterator[tuple[Any, Any]]:
-    """A matplotlib figure (inches) with `columns` axes beside each other, in the shared style, never on a display."""
+def figure(width: float, height: float, columns: int = 1, rows: int = 1) -> Iterator[tuple[Any, Any]]:
+    """A matplotlib figure (inches) with `columns` by `rows` axes, in the shared style, never on a display."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -35,7 +35,7 @@ def figure(width: float, height: float, columns: int = 1) -> Iterator[tuple[Any,
     with mpl.rc_context(_RC):
         fig = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasSVG(fig)
-        yield fig, fig.subplots(1, columns)
+        yield fig, fig.subplots(rows, columns)
 
 
 def svg(fig: Any) -> str:

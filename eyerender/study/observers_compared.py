@@ -17,12 +17,15 @@ from ..comparison import feature_errors
 from ..observation import Observations
 from ..rig.rig import Rig
 
+ALL_GLINTS = "all glints"
+
 
 @dataclass(frozen=True, slots=True)
 class FeatureDifference:
     """Image-derived minus analytic of one kind of feature, in x and y px, and in mm at the eye."""
 
     protocol: str
+    observer: str
     eye_model: str
     feature: str
     n: int
@@ -45,6 +48,7 @@ class GazeDifference:
     """Paired difference of gaze errors (deg), image minus analytic, by estimator."""
 
     protocol: str
+    observer: str
     eye_model: str
     estimator: str
     n: int
@@ -60,7 +64,7 @@ class GazeDifference:
 
 
 def features(
-    truth: Observations, found: Observations, rig: Rig, protocol: str, eye_model: str
+    truth: Observations, found: Observations, rig: Rig, protocol: str, observer: str, eye_model: str
 ) -> list[FeatureDifference]:
     """Differences of the pupil's centre, its semi-axes (where both have them) and each light's glint."""
     errors = feature_errors(truth, found)
@@ -72,18 +76,24 @@ def features(
     # What is not in the image of the study's camera was seen by the same camera, turned: it counts all the same.
     moved = ~truth.pupil.in_image
     centre = np.where(moved[:, None], found.pupil.centre_px - truth.pupil.centre_px, errors.centre_px)
-    out = [_difference(protocol, eye_model, "pupil centre", centre, mm_per_px)]
+    out = [_difference(protocol, observer, eye_model, "pupil centre", centre, mm_per_px)]
     if np.isfinite(errors.semi_axes_px).any():
-        out.append(_difference(protocol, eye_model, "pupil semi-axes (a, b)", errors.semi_axes_px, mm_per_px))
+        out.append(_difference(protocol, observer, eye_model, "pupil semi-axes (a, b)", errors.semi_axes_px, mm_per_px))
+    every = []
     for light in range(len(rig.lights)):
         (a, seen), (b, got) = found.glints.of_light(light), truth.glints.of_light(light)
         vectors = np.where((seen & got)[:, None], a - b, np.nan)
-        out.append(_difference(protocol, eye_model, f"glint of light {light}", vectors, mm_per_px))
+        # A glint that ray optics does not have either is not missing.
+        every.append((vectors[got], mm_per_px[got]))
+        out.append(_difference(protocol, observer, eye_model, f"glint of light {light}", *every[-1]))
+    if len(every) > 1:
+        together = (np.concatenate(part) for part in zip(*every, strict=True))
+        out.append(_difference(protocol, observer, eye_model, ALL_GLINTS, *together))
     return out
 
 
 def gaze(
-    analytic_deg: Floats, image_deg: Floats, protocol: str, eye_model: str, estimator: str
+    analytic_deg: Floats, image_deg: Floats, protocol: str, observer: str, eye_model: str, estimator: str
 ) -> GazeDifference | None:
     """The paired difference over the frames that both observers have an estimate of; None for fewer than two."""
     both = np.isfinite(analytic_deg) & np.isfinite(image_deg)
@@ -94,21 +104,24 @@ def gaze(
     half = float(student.ppf(0.975, n - 1) * d.std(ddof=1) / np.sqrt(n))
     mean = float(d.mean())
     return GazeDifference(
-        protocol, eye_model, estimator, n, float(analytic_deg[both].mean()), float(image_deg[both].mean()),
+        protocol, observer, eye_model, estimator, n, float(analytic_deg[both].mean()), float(image_deg[both].mean()),
         mean, mean - half, mean + half,
     )  # fmt: skip
 
 
-def _difference(protocol: str, eye_model: str, feature: str, vectors: Floats, mm_per_px: Floats) -> FeatureDifference:
+def _difference(
+    protocol: str, observer: str, eye_model: str, feature: str, vectors: Floats, mm_per_px: Floats
+) -> FeatureDifference:
     good = np.isfinite(vectors).all(axis=1)
     v = vectors[good]
     n = len(v)
     if n < 2:
         nothing = (None,) * 7
-        return FeatureDifference(protocol, eye_model, feature, n, int((~good).sum()), *nothing)
+        return FeatureDifference(protocol, observer, eye_model, feature, n, int((~good).sum()), *nothing)
     at_eye = v * mm_per_px[good, None]
     return FeatureDifference(
         protocol,
+        observer,
         eye_model,
         feature,
         n,

@@ -26,17 +26,20 @@ from ..observation import EYES, Observations, concatenate
 from ..rig.camera import Camera
 from ..scene import Scene, SceneSpec
 
-Kind = Literal["analytic", "image"]
+Kind = Literal["analytic", "image", "image-noiseless"]
 Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class ImageSettings:
-    """How images are made: their folder, samples per pixel, sensor noise, and where to render."""
+    """How images are made: their folder, samples per pixel, and where to render.
+
+    With `paired` each rendering is exposed with and without the sensor's noise, so that the second costs no rendering.
+    """
 
     folder: Path
     spp: int | None = None
-    noise: bool = True
+    paired: bool = False
     backend: Literal["auto", "cuda", "llvm"] = "auto"
     threads: int | None = None
     progress: Progress | None = None
@@ -44,7 +47,10 @@ class ImageSettings:
 
 @dataclass(frozen=True, slots=True)
 class Observing:
-    """One of the two observers, ready for a study's scenes. Image settings are needed for images alone."""
+    """One of the observers, ready for a study's scenes: ray optics, or images with the sensor's noise or without it.
+
+    Image settings are needed for images alone.
+    """
 
     kind: Kind = "analytic"
     images: ImageSettings | None = None
@@ -61,31 +67,33 @@ class Observing:
             return observe(scene)
         if self.images is None:
             raise InputError("the image observer needs a folder for its images")
+        noise = self.kind == "image"
         if not facing:
-            return self._images(scene, name, self.images)
+            return self._images(scene, name, self.images, noise)
         parts, order = [], []
         index = scene.frames().index
         for head, place in enumerate(scene.spec.subject.head_positions_mm):
             for side in scene.spec.subject.eyes:
                 rows = np.flatnonzero((index.head == head) & (index.eye == EYES.index(side)))
                 turned = facing_scene(scene, place, side)
-                seen = self._images(turned, f"{name}-h{head}-{side}", self.images)
+                seen = self._images(turned, f"{name}-h{head}-{side}", self.images, noise)
                 parts.append(with_index_of(moved(seen, turned.rig.cameras[0], scene.rig.cameras[0]), scene, rows))
                 order.append(rows)
         return concatenate(parts).take(np.argsort(np.concatenate(order)))
 
     @staticmethod
-    def _images(scene: Scene, name: str, settings: ImageSettings) -> Observations:
+    def _images(scene: Scene, name: str, settings: ImageSettings, noise: bool) -> Observations:
         """Features of a scene's images, which are rendered unless the folder holds them already."""
-        from ..capture import render_folder
+        from ..capture import render_folder, without_noise
         from ..observers import ImageObserver
 
         data = scene.spec.to_mapping()
         if settings.spp is not None:
             data["image"]["spp"] = settings.spp
-        data["sensor"]["noise"] = settings.noise
-        scene = replace(scene, spec=SceneSpec.from_mapping(data))
-        path = settings.folder / name
+        noisy = replace(scene, spec=SceneSpec.from_mapping(data))
+        scene = noisy if noise else without_noise(noisy)
+        folders = {True: settings.folder / name, False: settings.folder / f"{name}-noiseless"}
+        path = folders[noise]
         progress = settings.progress
 
         def show(what: str) -> Progress | None:
@@ -99,6 +107,7 @@ class Observing:
                 threads=settings.threads,
                 # What lies there is a run of other settings of this very study, whose folder this is.
                 overwrite=True,
+                noiseless=folders[False] if noise and settings.paired else None,
                 progress=show("rendering"),
             )
         return ImageObserver().observe_folder(ImageFolder.load(path), scene, progress=show("extracting"))

@@ -8,64 +8,116 @@ import numpy as np
 
 from ..report.study import Figure, Section, Table
 from ..report.study_figures import waterfall_figure
-from .observers_compared import FeatureDifference, GazeDifference
+from ..report.study_observers import differences_figure, distances_figure
+from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
 from .results import Departure, Erratum, Finding, WaterfallStep
 
 Apart = tuple[Sequence[FeatureDifference], Sequence[GazeDifference]]
 
+OBSERVERS = (
+    "'Analytic' features come from ray optics, 'image' features from rendered images with the sensor's noise, "
+    "'image-noiseless' features from the same renderings exposed without it."
+)
 WHAT = (
-    "'published' does what the authors' software did, with all its departures from the paper's text; 'corrected' "
-    "does what "
-    "the text and the cited algorithm say. 'Analytic' features come from ray optics, 'image' features from rendered"
-    " images."
+    "'published' does what the authors' software did, with all its departures from the paper's text; 'corrected' does "
+    f"what the text and the cited algorithm say. {OBSERVERS}"
 )
 
 
-def observers_section(apart: Apart) -> list[Section]:
-    """How the two observers differ; nothing where only one has seen."""
+def observers_section(apart: Apart, shown: Sequence[str] = ()) -> list[Section]:
+    """How the observers differ; nothing where only one has seen. `shown` names the estimators drawn."""
     features, gaze = apart
     if not features:
         return []
-    feature_rows = [
+    series = list(dict.fromkeys((f.protocol, f.observer) for f in features))
+    # One light's glint stands for itself; of several lights the glints are drawn together.
+    drawn = list(dict.fromkeys(f.feature for f in features))
+    if ALL_GLINTS in drawn:
+        drawn = [name for name in drawn if not name.startswith("glint of light")]
+    distances = {
+        name: {
+            _label(key, series): {
+                f.eye_model: f.median_distance_px
+                for f in features
+                if (f.feature, f.protocol, f.observer) == (name, *key) and f.median_distance_px is not None
+            }
+            for key in series
+        }
+        for name in drawn
+    }
+    differences = {
+        name: {
+            _label(key, series): {
+                g.eye_model: (g.difference_deg, g.low_deg, g.high_deg)
+                for g in gaze
+                if (g.estimator, g.protocol, g.observer) == (name, *key)
+            }
+            for key in series
+        }
+        for name in shown
+        if any(g.estimator == name for g in gaze)
+    }
+    figures = [
+        Figure(
+            distances_figure(distances),
+            "Median distance of image-derived from analytic features, by eye model. (Semi-axes: length of the vector "
+            "of both differences.)",
+        )
+    ]
+    if differences:
+        figures.append(
+            Figure(
+                differences_figure(differences),
+                "What that does to the gaze error: mean of the paired differences, image minus analytic, with its 95 % "
+                "confidence interval. Above zero the images make it worse.",
+            )
+        )
+    text = (
+        "Image-derived minus analytic features of the same frames, and the gaze errors they lead to. Lengths at the "
+        "eye are pixels times distance over focal length.",
+    )
+    return [Section("The observers compared", text, figures, [_feature_table(features), _gaze_table(gaze)])]
+
+
+def _label(key: tuple[str, str], among: Sequence[tuple[str, str]]) -> str:
+    protocol, observer = key
+    return observer if len({p for p, _ in among}) == 1 else f"{protocol}, {observer}"
+
+
+def _feature_table(features: Sequence[FeatureDifference]) -> Table:
+    rows = [
         (
-            f.protocol, f.eye_model, f.feature, str(f.n), str(f.missing), number(f.bias_x_px), number(f.bias_y_px),
-            number(f.sd_x_px), number(f.sd_y_px), number(f.median_distance_px), number(f.bias_mm), number(f.sd_mm),
+            f.protocol, f.observer, f.eye_model, f.feature, str(f.n), str(f.missing), number(f.bias_x_px, 3),
+            number(f.bias_y_px, 3), number(f.sd_x_px, 3), number(f.sd_y_px, 3), number(f.median_distance_px, 3),
+            _micrometres(f.bias_mm), _micrometres(f.sd_mm),
         )
         for f in features
     ]  # fmt: skip
-    gaze_rows = [
+    header = (
+        "protocol", "observer", "eye model", "feature", "n", "missing", "bias x (px)", "bias y (px)", "SD x (px)",
+        "SD y (px)", "median distance (px)", "bias at the eye (µm)", "SD at the eye (µm)",
+    )  # fmt: skip
+    return Table(header, rows, "Features: bias and spread, in px and at the eye", folded=len(rows) > 30)
+
+
+def _gaze_table(gaze: Sequence[GazeDifference]) -> Table:
+    rows = [
         (
-            g.protocol, g.eye_model, g.estimator, str(g.n), number(g.analytic_deg), number(g.image_deg),
+            g.protocol, g.observer, g.eye_model, g.estimator, str(g.n), number(g.analytic_deg), number(g.image_deg),
             number(g.difference_deg), f"{g.low_deg:.4f} to {g.high_deg:.4f}",
         )
         for g in gaze
     ]  # fmt: skip
-    return [
-        Section(
-            "The two observers",
-            ("Image-derived minus analytic features of the same frames, and the gaze errors they lead to.",),
-            (),
-            [
-                Table(
-                    (
-                        "protocol", "eye model", "feature", "n", "missing", "bias x (px)", "bias y (px)", "SD x (px)",
-                        "SD y (px)", "median distance (px)", "bias (mm at the eye)", "SD (mm at the eye)",
-                    ),
-                    feature_rows,
-                    "Features",
-                ),
-                Table(
-                    (
-                        "protocol", "eye model", "estimator", "n", "analytic (deg)", "image (deg)", "difference (deg)",
-                        "95 % interval",
-                    ),
-                    gaze_rows,
-                    "Gaze errors: paired differences, image minus analytic",
-                    folded=len(gaze_rows) > 30,
-                ),
-            ],
-        )
-    ]  # fmt: skip
+    header = (
+        "protocol", "observer", "eye model", "estimator", "n", "analytic (deg)", "image (deg)", "difference (deg)",
+        "95 % interval",
+    )  # fmt: skip
+    caption = "Gaze errors: paired differences, image minus analytic"
+    return Table(header, rows, caption, folded=len(rows) > 30)
+
+
+def _micrometres(value: float | None) -> str:
+    return "-" if value is None else f"{1000 * value:.1f}"
 
 
 def findings_section(found: Sequence[Finding]) -> Section:
@@ -143,6 +195,6 @@ def departures_section(departures: Sequence[Departure], faults: Sequence[Erratum
     )
 
 
-def number(value: float | None) -> str:
-    """A number of a table, with four decimals; a dash for none."""
-    return "-" if value is None or not np.isfinite(value) else f"{value:.4f}"
+def number(value: float | None, decimals: int = 4) -> str:
+    """A number of a table; a dash for none."""
+    return "-" if value is None or not np.isfinite(value) else f"{value:.{decimals}f}"

@@ -95,7 +95,7 @@ def guestrin_page(
                 )
             ],
         ),
-        *observers_section(apart),
+        *observers_section(apart, ("model-based, index fixed", "model-based, index free")),
         findings_section(found),
         *waterfall_section([s for p in parts for s in p.waterfall], guestrin.DEPARTURES, ("H1", "H2"), log=False),
         departures_section(guestrin.DEPARTURES, faults),
@@ -171,7 +171,7 @@ def blignaut_page(
             ],
             [_best_table(parts, sets)],
         ),
-        *observers_section(apart),
+        *observers_section(apart, ("R2 on C5", "R4 on C9", "R8 on C14", "R8 on C135")),
         findings_section(found),
         *waterfall_section(
             [s for p in parts for s in p.waterfall], blignaut.DEPARTURES, ("C5", "C9", "C14", "C135"), log=True

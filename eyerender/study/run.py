@@ -17,16 +17,28 @@ from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
 from ..imagefolder import refuse_non_empty, write_json
 from ..report.study import Page, write_page
-from . import blignaut, clouds, conditions_page, errata, findings, guestrin, observers_compared, pages
+from . import (
+    blignaut,
+    clouds,
+    conditions_page,
+    errata,
+    findings,
+    guestrin,
+    head_mounted,
+    head_mounted_page,
+    observers_compared,
+    pages,
+)
 from .conditions import conditions_part
+from .head_mounted import HeadMountedPart, head_mounted_part
 from .literature import MODELS
-from .observing import ImageSettings, Observing
+from .observing import ImageSettings, Kind, Observing
 from .page_parts import Apart
 from .replicate import BlignautPart, GuestrinPart, blignaut_part, guestrin_part
 from .results import Finding, Row, write_results, write_text
 
 Progress = Callable[[int, int, str], None]
-STUDIES = ("guestrin2006", "blignaut2014", "conditions")
+STUDIES = ("guestrin2006", "blignaut2014", "observers", "conditions")
 VARIANTS = ("E5-published", "E5-published-stop")
 RUN_SCHEMA = "eyerender/study/1"
 MARKER, REPORT = "study.json", "report.html"
@@ -37,11 +49,11 @@ def run_study(
     folder: str | Path,
     *,
     protocol: Literal["corrected", "published", "both"] = "both",
-    observer: Literal["analytic", "image", "both"] = "analytic",
+    observer: Literal["analytic", "image", "both"] | None = None,
     eyes: Sequence[str] = MODELS,
     workers: int = 1,
     spp: int | None = None,
-    noise: bool = True,
+    noise: Literal["on", "off", "both"] = "both",
     backend: Literal["auto", "cuda", "llvm"] = "auto",
     threads: int | None = None,
     overwrite: bool = False,
@@ -52,13 +64,16 @@ def run_study(
     A folder of the same study is run again in place; images that it holds are used again.
 
     Args:
-        name: guestrin2006, blignaut2014, or conditions (what lies beyond the paper; analytic).
+        name: guestrin2006, blignaut2014, observers (both observers on the head-mounted rig), or conditions (what lies
+            beyond the paper; analytic).
         folder: where the results go.
         protocol: the authors' software's reading, the corrected one, or both.
-        observer: analytic features, features of rendered images, or both.
+        observer: analytic features, features of rendered images, or both. Default: both for `observers`, whose only
+            choice it is, else analytic.
         eyes: eye models (catalogue names or files). With E5 and `published`, its two published variants come along.
         workers: processes for the analytic part.
-        spp, noise, backend, threads: of the images.
+        spp, backend, threads: of the images.
+        noise: images with the sensor's noise, without it, or both, from one rendering.
         overwrite: replace what the folder holds.
         progress: called with (done, total, note).
 
@@ -74,8 +89,11 @@ def run_study(
         raise InputError("name each eye once", source="--eyes")
     for eye in eyes:
         load_eye(eye)
+    observer = observer or ("both" if name == "observers" else "analytic")
     if name == "conditions" and observer != "analytic":
         raise InputError("the study 'conditions' has the analytic observer only", source="--observer")
+    if name == "observers" and observer != "both":
+        raise InputError("the study 'observers' compares both observers", source="--observer")
     if workers < 1:
         raise InputError("must be >= 1", source="--workers")
     settings: dict[str, Any] = {"study": name, "protocol": protocol, "observer": observer, "eyes": list(eyes)}
@@ -89,15 +107,20 @@ def run_study(
             rows = [row for part in models for row in part.rows]
             found = conditions_page.findings(models)
             more, page = conditions_page.more(models), conditions_page.page(models, found)
+        elif name == "observers":
+            images = ImageSettings(folder / "images", spp, noise == "both", backend, threads, progress)
+            observings = [Observing(), *(Observing(kind, images) for kind in _image_kinds(noise))]
+            rows, found, more, page = _observers([head_mounted_part(eye, observings) for eye in eyes])
         else:
             protocols = ("published", "corrected") if protocol == "both" else (protocol,)
             parts: list[Any] = []
             if observer in ("analytic", "both"):
                 parts += _analytic(name, _models(name, eyes, protocols), workers, progress)
             if observer in ("image", "both"):
-                images = ImageSettings(folder / "images", spp, noise, backend, threads, progress)
+                images = ImageSettings(folder / "images", spp, noise == "both", backend, threads, progress)
                 function = guestrin_part if name == "guestrin2006" else blignaut_part
-                parts += [function(eye, protocols, Observing("image", images)) for eye in eyes]
+                kinds = _image_kinds(noise)
+                parts += [function(eye, protocols, Observing(kind, images)) for kind in kinds for eye in eyes]
             assemble = _guestrin if name == "guestrin2006" else _blignaut
             rows, found, more, page = assemble(parts, protocols)
         more = {"settings": settings, "seconds": round(time.monotonic() - start, 2), **more}
@@ -106,6 +129,12 @@ def run_study(
             write_text(folder / "waterfall.csv", _waterfall_csv(more["waterfall"]))
         write_page(folder / REPORT, page)
         return summary
+
+
+def _image_kinds(noise: str) -> list[Kind]:
+    """The observers of images; the one with noise first, whose rendering serves both."""
+    kinds: list[tuple[Kind, str]] = [("image", "off"), ("image-noiseless", "on")]
+    return [kind for kind, without in kinds if noise != without]
 
 
 @contextmanager
@@ -237,22 +266,29 @@ def _blignaut(
     return rows, found, more, pages.blignaut_page(parts, found, faults, apart)
 
 
-def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart]) -> Apart:
+def _observers(parts: Sequence[HeadMountedPart]) -> tuple[list[Row], list[Finding], dict[str, Any], Page]:
+    apart = _observers_apart(parts)
+    found = head_mounted.findings(*apart)
+    more = {**head_mounted.more(), **_as_mappings(apart)}
+    return [row for part in parts for row in part.rows], found, more, head_mounted_page.page(parts, found, apart)
+
+
+def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart | HeadMountedPart]) -> Apart:
     """How the observers differ on the frames that both have seen."""
     features: list[observers_compared.FeatureDifference] = []
     gaze: list[observers_compared.GazeDifference] = []
     seen = {(p.eye_model, *key): (p, key) for p in parts for key in p.seen}
-    for (model, protocol, observer), (part, key) in seen.items():
-        other = seen.get((model, protocol, "image"))
-        if observer != "analytic" or other is None:
+    for (model, protocol, observer), (other, key) in seen.items():
+        analytic = seen.get((model, protocol, "analytic"))
+        if observer == "analytic" or analytic is None:
             continue
-        rig, truth = part.seen[key]
-        found = other[0].seen[other[1]][1]
-        features += observers_compared.features(truth, found, rig, protocol, model)
-        mine, theirs = part.errors[key], other[0].errors[other[1]]
+        part, own = analytic
+        rig, truth = part.seen[own]
+        features += observers_compared.features(truth, other.seen[key][1], rig, protocol, observer, model)
+        mine, theirs = part.errors[own], other.errors[key]
         for name in mine:
             if name in theirs:
-                difference = observers_compared.gaze(mine[name], theirs[name], protocol, model, name)
+                difference = observers_compared.gaze(mine[name], theirs[name], protocol, observer, model, name)
                 gaze += [difference] if difference else []
     return features, gaze
 

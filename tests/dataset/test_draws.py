@@ -138,7 +138,11 @@ def test_the_order_of_keys_means_nothing():
         ("scene.wavelength_nm", {"draw": "choice", "values": []}, "needs at least 1 entries"),
         ("scene.wavelength_nm", {"draw": "choice", "values": [1], "weights": [1, 2]}, "one for each value"),
         ("scene.wavelength_nm", {"draw": "grid", "low": 1}, "give either low, high and steps, or values"),
-        ("scene.wavelength_nm", {"draw": "truncated_normal", "mean": 1, "sd": 0, "low": 0, "high": 2}, "sd: must be > 0"),
+        (
+            "scene.wavelength_nm",
+            {"draw": "truncated_normal", "mean": 1, "sd": 0, "low": 0, "high": 2},
+            "sd: must be > 0",
+        ),
         ("scene.eye.model", {"draw": "choice", "values": ["E1", "E9"]}, "E9"),
         ("scene.eye.model", {"draw": "choice", "per": "sample", "values": ["E2"]}, "drawn once a subject"),
         ("eye_parameters.E5", {}, "eye_parameters.E5: no sample looks with this eye"),
@@ -151,7 +155,7 @@ def test_the_order_of_keys_means_nothing():
     ],
 )
 def test_bad_specs_are_refused_with_their_path(path, node, words):
-    with pytest.raises(InputError, match="^") as caught:
+    with pytest.raises(InputError) as caught:
         plan(**{path: node})
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -126,7 +126,7 @@ def test_openeds_reads_it(tiny, exported):
     with open(folder / "files.csv", newline="") as file:
         origin = {row["file"]: row["from"] for row in csv.DictReader(file)}
     for split, count in SPLITS.items():
-        names = [f.strip(".png") for f in os.listdir(folder / split / "images") if f.endswith(".png")]  # noqa: B005
+        names = [f.strip(".png") for f in os.listdir(folder / split / "images") if f.endswith(".png")]
         assert len(names) == count
         for name in names:
             picture = Image.open(folder / split / "images" / f"{name}.png").convert("L")

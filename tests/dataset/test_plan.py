@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections import defaultdict
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -83,7 +84,7 @@ def test_splits_part_the_subjects_by_their_shares():
     names = [made.split_of(s) for s in range(1000)]
     assert [names.count(n) for n in ("train", "validation", "test")] == [500, 250, 250]
     # In random order: blocks of one split would be longer.
-    assert sum(a != b for a, b in zip(names, names[1:], strict=False)) > 500
+    assert sum(a != b for a, b in pairwise(names)) > 500
     other = plan(count=1000, subjects=1000)
     assert names == [other.split_of(s) for s in reversed(range(1000))][::-1]
 

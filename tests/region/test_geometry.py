@@ -100,7 +100,8 @@ def check(i):
     # notch of the limbus by a few micrometres).
     rim = np.concatenate([grid[0], (grid[0] + np.roll(grid[0], 1, axis=0)) / 2])
     inside = signed_distance(eye, globe, rim)
-    assert inside.max() < 0.02 and inside.min() > -INTO_MM, note
+    assert inside.max() < 0.02, note
+    assert inside.min() > -INTO_MM, note
     # And the margin rests on the globe where it stands before it.
     edge = grid[CONJUNCTIVA]
     front = np.hypot(*(edge - globe.centre * [1, -1 if globe.mirrored else 1, 1])[:, 1:].T) < 8.0
@@ -119,7 +120,8 @@ def check(i):
         assert signed_distance(eye, globe, shafts).min() > -INTO_MM, note
         paths = lashes.reshape(-1, 6, 3, 3).mean(axis=2)
         assert not np.any(crossings(paths[:, 1:-1].reshape(-1, 3), paths[:, 2:].reshape(-1, 3), skin)), note
-    assert np.all(np.isfinite(mesh.vertices)) and np.all(np.abs(np.linalg.norm(mesh.normals, axis=-1) - 1) < 1e-6), note
+    assert np.all(np.isfinite(mesh.vertices)), note
+    assert np.all(np.abs(np.linalg.norm(mesh.normals, axis=-1) - 1) < 1e-6), note
     assert len(mesh.layout.faces) < 60_000
 
 

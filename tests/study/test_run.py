@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import observe
+from eyerender.capture import render_folder, without_noise
 from eyerender.cli.app import run
 from eyerender.errors import InputError
-from eyerender.study import guestrin, observers_compared
+from eyerender.imagefile import read_image
+from eyerender.imagefolder import ImageFolder, same_run
+from eyerender.scene import Scene, SceneSpec, load_scene
+from eyerender.study import guestrin, head_mounted, observers_compared
 from eyerender.study.conditions import PARAMETERS, TRACKERS, conditions_part
 from eyerender.study.observing import ImageSettings, Observing, facing_scene, moved, with_index_of
 from eyerender.study.run import run_study
@@ -106,6 +110,8 @@ BAD = [
     (["study", "guestrin2006", "-o", "out", "--protocol", "mine"], 2, "--protocol"),
     (["study", "guestrin2006", "-o", "out", "--observer", "mine"], 2, "--observer"),
     (["study", "conditions", "-o", "out", "--observer", "image"], 2, "analytic observer only"),
+    (["study", "observers", "-o", "out", "--observer", "image"], 2, "compares both observers"),
+    (["study", "guestrin2006", "-o", "out", "--noise", "some"], 2, "--noise"),
     (["study", "guestrin2006", "-o", "out", "--workers", "0"], 2, "--workers: must be >= 1"),
     (["study", "guestrin2006", "-o", "out", "--spp", "0"], 2, "--spp: must be >= 1"),
     (["study", "guestrin2006", "-o", "taken"], 2, "taken: is not empty"),
@@ -152,7 +158,7 @@ def test_a_turned_camera_changes_no_ray():
 def test_turned_frames_come_back_in_the_scenes_order(monkeypatch):
     scene = guestrin.scene("E1", guestrin.CORRECTED)
     # The image part alone is replaced by the analytic one: what is tested is the order and the index.
-    monkeypatch.setattr(Observing, "_images", staticmethod(lambda s, name, settings: observe(s)))
+    monkeypatch.setattr(Observing, "_images", staticmethod(lambda s, name, settings, noise: observe(s)))
     seen = Observing("image", ImageSettings(folder=None)).observe(scene, "x", facing=True)
     direct = observe(scene)
     for name in ("frame", "fixation", "head", "eye", "target_mm"):
@@ -174,7 +180,7 @@ def test_known_feature_errors_and_paired_differences():
     truth = observe(scene)
     shift = np.array([0.3, -0.1])
     found = replace(truth, pupil=replace(truth.pupil, centre_px=frozen(truth.pupil.centre_px + shift)))
-    rows = {f.feature: f for f in observers_compared.features(truth, found, scene.rig, "c", "E2")}
+    rows = {f.feature: f for f in observers_compared.features(truth, found, scene.rig, "c", "image", "E2")}
     pupil = rows["pupil centre"]
     assert (pupil.n, pupil.missing) == (len(truth), 0)
     np.testing.assert_allclose([pupil.bias_x_px, pupil.bias_y_px], shift, atol=1e-9)
@@ -182,12 +188,13 @@ def test_known_feature_errors_and_paired_differences():
     # 640 mm away, 4667 px: 0.137 mm a pixel.
     assert pupil.bias_mm == pytest.approx(np.hypot(*shift) * 0.137, rel=0.03)
     assert rows["glint of light 1"].median_distance_px == 0
+    assert rows["all glints"].n == rows["glint of light 0"].n + rows["glint of light 1"].n
     a, b = np.array([1.0, 2, 3, np.nan]), np.array([1.5, 2.7, 3.3, 9.0])
-    d = observers_compared.gaze(a, b, "c", "E2", "x")
+    d = observers_compared.gaze(a, b, "c", "image", "E2", "x")
     assert (d.n, d.difference_deg) == (3, pytest.approx(0.5))
     # Student's t with 2 degrees of freedom: 4.3027 * SD / sqrt(3), SD = 0.2.
     assert d.high_deg - d.difference_deg == pytest.approx(4.3027 * 0.2 / np.sqrt(3), rel=1e-4)
-    assert observers_compared.gaze(a[:1], b[:1], "c", "E2", "x") is None
+    assert observers_compared.gaze(a[:1], b[:1], "c", "image", "E2", "x") is None
 
 
 def test_conditions():
@@ -227,7 +234,7 @@ def test_image_observer_resumes(tmp_path):
     arguments = {"observer": "both", "protocol": "corrected", "eyes": ("E2",), "spp": 4}
     first = run_study("guestrin2006", tmp_path / "out", **arguments)
     images = sorted((tmp_path / "out" / "images").rglob("*.png"))
-    assert len(images) == 2 * 90  # images and masks
+    assert len(images) == 2 * 2 * 90  # images and masks, with noise and without
     stamps = [p.stat().st_mtime_ns for p in images]
     again = run_study("guestrin2006", tmp_path / "out", **arguments)
     assert [p.stat().st_mtime_ns for p in images] == stamps
@@ -235,8 +242,92 @@ def test_image_observer_resumes(tmp_path):
     rows = {
         (r["observer"], r["head"]): r for r in first["rows"] if r["eye"] == "both" and r["variant"] == "index fixed"
     }
-    assert rows["image", "H1"]["missing"] == 0
-    assert rows["image", "H1"]["mean_deg"] < 0.5
-    pupil = next(f for f in first["observers"]["features"] if f["feature"] == "pupil centre")
-    assert pupil["n"] == 90
-    assert pupil["median_distance_px"] < 0.3
+    for observer in ("image", "image-noiseless"):
+        assert rows[observer, "H1"]["missing"] == 0
+        assert rows[observer, "H1"]["mean_deg"] < 0.5
+    pupils = {f["observer"]: f for f in first["observers"]["features"] if f["feature"] == "pupil centre"}
+    assert {f["n"] for f in pupils.values()} == {90}
+    assert max(f["median_distance_px"] for f in pupils.values()) < 0.3
+    assert {g["observer"] for g in first["observers"]["gaze"]} == {"image", "image-noiseless"}
+
+
+@pytest.mark.render
+def test_noiseless_images_are_those_of_a_noiseless_sensor(tmp_path):
+    """Exposed beside the noisy ones, or rendered on their own: the same images, and the same run to resume."""
+    scene = replace_image(head_mounted.scene("E2"), poses=1, window=(160, 120))
+    render_folder(scene, tmp_path / "noisy", noiseless=tmp_path / "beside")
+    quiet = without_noise(scene)
+    render_folder(quiet, tmp_path / "own")
+    assert same_run(tmp_path / "beside", quiet.digest())
+    assert not same_run(tmp_path / "noisy", quiet.digest())
+    noisy, beside, own = (
+        read_image(ImageFolder.load(tmp_path / n).entries[0].path)[0].astype(int) for n in ("noisy", "beside", "own")
+    )
+    # The irradiance is kept in single precision, which may turn a count that lies between two.
+    assert np.abs(beside - own).max() <= 1
+    assert np.mean(beside != own) < 0.01
+    assert np.std(noisy - beside) > 0.5
+
+
+def replace_image(scene, poses, window):
+    data = scene.spec.to_mapping()
+    data["poses"] = data["poses"][:poses]
+    data["image"] |= {"window_px": list(window), "spp": 1}
+    return Scene.of(SceneSpec.from_mapping(data))
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_observers_on_the_head_mounted_rig(tmp_path):
+    summary = run_study("observers", tmp_path / "out", eyes=("E2",), spp=4)
+    assert {(r["observer"], r["variant"]) for r in summary["rows"]} == {
+        (o, v) for o in ("analytic", "image", "image-noiseless") for v in head_mounted.FEATURES
+    }
+    features = {(f["observer"], f["feature"]): f for f in summary["observers"]["features"]}
+    for observer in ("image", "image-noiseless"):
+        pupil = features[observer, "pupil centre"]
+        assert (pupil["n"], pupil["missing"]) == (25, 0)
+        assert pupil["median_distance_px"] < 0.2
+        # 600 px at 35 mm from the apex: 0.058 mm a pixel.
+        assert pupil["sd_mm"] == pytest.approx(np.hypot(pupil["sd_x_px"], pupil["sd_y_px"]) * 0.0583, rel=0.05)
+        assert features[observer, "all glints"]["median_distance_px"] < 0.1
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("<svg") == 2
+
+
+def test_directions_of_the_head_mounted_rig():
+    scene = head_mounted.scene("E2")
+    seen = observe(scene)
+    np.testing.assert_allclose(
+        np.degrees([seen.pose.azimuth_rad, seen.pose.elevation_rad]).T, head_mounted.directions_deg(), atol=1e-9
+    )
+    learnt = head_mounted.calibration_rows()
+    assert learnt.sum() == 9
+    # The shipped scene's own directions are those that are learnt.
+    own = load_scene("head_mounted").spec.poses
+    assert {(p.azimuth_deg, p.elevation_deg) for p in own} == {tuple(d) for d in head_mounted.directions_deg()[learnt]}
+
+
+def test_a_polynomial_of_second_order_is_recovered_exactly():
+    """Directions that are such a polynomial of the feature come out to rounding; what is missing stays missing."""
+    rng = np.random.default_rng(7)
+    feature = np.array([320.0, 240.0]) + rng.uniform(-40, 40, (25, 2))
+    x, y = (feature - [320, 240]).T / 40
+    truth = np.stack([3 + 9 * x - 2 * y + x * x - 0.5 * x * y + 0.1 * y * y, 1 + x + 8 * y - 0.4 * x * y], axis=-1)
+    learnt = head_mounted.calibration_rows()
+    feature[1] = np.nan
+    error = head_mounted.direction_errors_deg(feature, truth, learnt)
+    assert np.isnan(error[learnt]).all()
+    assert np.isnan(error[1])
+    assert not learnt[1]
+    assert np.nanmax(error) < 1e-9
+    assert np.isfinite(error).sum() == 15
+    # A degree of azimuth at an elevation of 60 degrees is half a degree of direction.
+    moved = truth * 0
+    moved[:, 1] = 60.0
+    off = moved.copy()
+    off[~learnt, 0] += 1.0
+    feature[1] = [300, 200]
+    np.testing.assert_allclose(head_mounted.direction_errors_deg(feature, off, learnt)[~learnt], 0.5, atol=1e-4)
+    few = learnt & (np.cumsum(learnt) <= 5)
+    assert np.isnan(head_mounted.direction_errors_deg(feature, truth, few)).all()

@@ -1,0 +1,200 @@
+"""Scores of many images as figures: over all, and broken down by what varies."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from .bound import MEDIAN_OF_RADIAL
+from .folder import LabelledImage
+from .score import Score
+
+# name -> (what it is, unit)
+FACTORS = {
+    "noise_dn": ("noise", "DN of 8 bits"),
+    "blur_px": ("blur of the pupil's edge (sigma)", "px"),
+    "contrast_to_noise": ("pupil-iris step over noise", "1"),
+    "pupil_px": ("pupil size, sqrt(a b)", "px"),
+    "aspect": ("pupil's aspect, b / a", "1"),
+    "gaze_deg": ("gaze angle, optic axis from straight ahead", "deg"),
+    "occlusion": ("hidden share of the pupil", "1"),
+    "phase_x": ("sub-pixel phase, x", "px"),
+    "phase_y": ("sub-pixel phase, y", "px"),
+}
+_BINS = 4
+# A factor is worth a breakdown where it varies by more than this share of its largest value.
+_VARIES = {"noise_dn": 0.25, "blur_px": 0.25, "contrast_to_noise": 0.25, "pupil_px": 0.1, "aspect": 0.05}
+
+
+def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], reports_glints: bool) -> dict[str, Any]:
+    """The figures over some images; `sigmas_px`: the bound's sigma_c of each, None where it does not apply.
+
+    Errors are of the pupils found right (IoU > 0.9), `centre_px_of_all_found` of wrong ones too.
+    """
+    counts = Counter(s.outcome for s in scores)
+    shown = sum(counts[o] for o in ("right", "wrong", "none", "error"))
+    right = [s for s in scores if s.outcome == "right"]
+    offsets = np.array([s.offset_px for s in right]).reshape(-1, 2)
+    axes = np.array([s.axes_px for s in right]).reshape(-1, 2)
+    found = [c for s in scores if (c := s.centre_px) is not None]
+    return {
+        "images": len(scores),
+        "with_pupil": shown,
+        **{o: counts[o] for o in ("right", "wrong", "none", "error")},
+        "rates": {o: _ratio(counts[o], shown) for o in ("right", "wrong", "none", "error")},
+        "without_pupil": counts["absent"] + counts["false"],
+        "false": counts["false"],
+        "centre_px": _sizes(np.hypot(*offsets.T)),
+        "centre_bias_px": _vector(offsets),
+        "centre_bias_standard_error_px": _standard_error(offsets),
+        "centre_px_of_all_found": _sizes(np.array(found)),
+        "semi_axes_bias_px": _vector(axes),
+        "semi_axes_px": _sizes(np.abs(axes).max(axis=1) if len(axes) else np.zeros(0)),
+        "iou": _sizes(np.array([s.iou for s in right if s.iou is not None]), low=True),
+        "boundary_px": _sizes(np.array([s.boundary_px for s in right if s.boundary_px is not None])),
+        "efficiency": efficiency(scores, sigmas_px),
+        "glints": _glints(scores) if reports_glints else None,
+        "time": _times(scores),
+    }
+
+
+def efficiency(scores: Sequence[Score], sigmas_px: Sequence[float | None]) -> dict[str, Any]:
+    """1 / median of (centre error / 1.177 sigma_c) over the right ones; 1 reaches the Cramer-Rao bound."""
+    pairs = [
+        (c, MEDIAN_OF_RADIAL * sigma)
+        for s, sigma in zip(scores, sigmas_px, strict=True)
+        if s.outcome == "right" and sigma is not None and (c := s.centre_px) is not None
+    ]
+    if not pairs:
+        return {"n": 0, "value": None, "bound_median_px": None}
+    errors, bounds = np.array(pairs).T
+    middle = float(np.median(errors / bounds))
+    return {
+        "n": len(pairs),
+        "value": 1.0 / middle if middle > 0.0 else None,
+        "bound_median_px": float(np.median(bounds)),
+    }
+
+
+def failures(scores: Sequence[Score], images: Sequence[LabelledImage]) -> list[dict[str, Any]]:
+    """Every reason for a wrong, missing or unusable answer: how often, and where first."""
+    seen: dict[tuple[str, str], dict[str, Any]] = {}
+    for s, image in zip(scores, images, strict=True):
+        if s.outcome in ("right", "absent"):
+            continue
+        reason = "another ellipse than the pupil's" if s.outcome == "wrong" else s.reason or "gave no reason"
+        entry = seen.setdefault((s.outcome, reason), {"outcome": s.outcome, "reason": reason, "count": 0})
+        entry["count"] += 1
+        entry.setdefault("first", image.name)
+    return sorted(seen.values(), key=lambda e: (-e["count"], e["outcome"], e["reason"]))
+
+
+def bins(values: Sequence[float | None], name: str) -> list[tuple[float, float, list[int]]]:
+    """(low, high, members) of a factor: a bin each for up to six values, quarters of a pixel for a phase, else quarters
+    of the images. No bins where the factor hardly varies or is unknown for all."""
+    known = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+    there = np.flatnonzero(np.isfinite(known))
+    if not len(there):
+        return []
+    some = known[there]
+    # Measured figures differ by rounding at least.
+    single = np.unique(np.round(some, 6))
+    if name.startswith("phase"):
+        edges = np.linspace(0.0, 1.0, _BINS + 1)
+    elif len(single) <= 6:
+        if len(single) < 2:
+            return []
+        return [(float(v), float(v), [int(i) for i in there if abs(known[i] - v) < 1e-5]) for v in single]
+    elif np.ptp(some) <= _VARIES.get(name, 0.02) * np.abs(some).max():
+        return []
+    else:
+        edges = np.unique(np.quantile(some, np.linspace(0.0, 1.0, _BINS + 1)))
+    out = []
+    which = np.clip(np.searchsorted(edges, some, side="right") - 1, 0, len(edges) - 2)
+    for k in range(len(edges) - 1):
+        members = [int(i) for i in there[which == k]]
+        if members:
+            out.append((float(edges[k]), float(edges[k + 1]), members))
+    return out
+
+
+def breakdown(
+    scores: Sequence[Score],
+    sigmas_px: Sequence[float | None],
+    factors: Sequence[dict[str, float]],
+    reports_glints: bool,
+) -> dict[str, list[dict[str, Any]]]:
+    """The figures in every bin of every factor that varies, over the images that show a pupil."""
+    shown = [i for i, s in enumerate(scores) if s.outcome not in ("absent", "false")]
+    out: dict[str, list[dict[str, Any]]] = {}
+    for name in FACTORS:
+        rows = []
+        for low, high, members in bins([factors[i].get(name) for i in shown], name):
+            at = [shown[m] for m in members]
+            figures = summarise([scores[i] for i in at], [sigmas_px[i] for i in at], reports_glints)
+            middle = float(np.median([factors[i][name] for i in at]))
+            rows.append({"low": low, "high": high, "median": middle, **figures})
+        if rows:
+            out[name] = rows
+    return out
+
+
+def _glints(scores: Sequence[Score]) -> dict[str, Any]:
+    parts = [s.glints for s in scores if s.glints is not None]
+    true, reported = sum(g.true for g in parts), sum(g.reported for g in parts)
+    errors = np.array([e for g in parts for e in g.errors_px]).reshape(-1, 2)
+    named, swapped = sum(g.named for g in parts), sum(g.swapped for g in parts)
+    return {
+        "true": true,
+        "reported": reported,
+        "matched": len(errors),
+        "recall": _ratio(len(errors), true),
+        "precision": _ratio(len(errors), reported),
+        "named": named,
+        "swapped": swapped,
+        "swap_rate": _ratio(swapped, named),
+        "error_px": _sizes(np.hypot(*errors.T)),
+        "bias_px": _vector(errors),
+    }
+
+
+def _times(scores: Sequence[Score]) -> dict[str, Any]:
+    own = [s.cpu_s for s in scores if s.cpu_s is not None]
+    trips = [s.trip_s for s in scores if s.trip_s is not None]
+    return {
+        "cpu_ms": _sizes(1e3 * np.array(own)),
+        "wall_ms": _sizes(1e3 * np.array([s.wall_s for s in scores if s.wall_s is not None])),
+        "round_trip_ms": _sizes(1e3 * np.array(trips)),
+    }
+
+
+def _sizes(values: Floats, low: bool = False) -> dict[str, Any]:
+    """n, median, 95th percentile (5th where low is bad), worst."""
+    tail = "p5" if low else "p95"
+    if not len(values):
+        return {"n": 0, "median": None, tail: None, "worst": None}
+    return {
+        "n": len(values),
+        "median": float(np.median(values)),
+        tail: float(np.percentile(values, 5 if low else 95)),
+        "worst": float(values.min() if low else values.max()),
+    }
+
+
+def _vector(values: Floats) -> list[float] | None:
+    return [float(v) for v in values.mean(axis=0)] if len(values) else None
+
+
+def _standard_error(values: Floats) -> list[float] | None:
+    if len(values) < 2:
+        return None
+    return [float(v) for v in values.std(axis=0, ddof=1) / math.sqrt(len(values))]
+
+
+def _ratio(part: int, whole: int) -> float | None:
+    return part / whole if whole else None

@@ -1,0 +1,94 @@
+"""The command bench-extractors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from ..errors import InputError
+from .app import app
+from .output import Json, emit, progress, say
+
+
+@app.command(name="bench-extractors")
+def bench_extractors(
+    folder: Annotated[Path, Parameter(name="DIR")],
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    extractor: tuple[str, ...] = (),
+    timeout: float = 30.0,
+    overwrite: bool = False,
+    json: Json = None,
+) -> int:
+    """Run pupil and glint extractors over a folder of labelled images and measure each against the labels.
+
+    Writes report.html, results.json and results.csv. Each extractor runs in a process of its own: one that crashes,
+    hangs or prints nonsense costs its own result only, which says why.
+
+    Parameters
+    ----------
+    folder
+        A folder of labelled images: of quickstart, render or generate, or of ideal images.
+    output
+        The folder to write.
+    extractor
+        An installed extractor's name (own-fast, own-refined, opencv-contour, pupil-detectors, or a plug-in's), a Python
+        module:callable, or a command that speaks the protocol; NAME=... gives it a name. Repeat for several
+        (default: all that are installed).
+    timeout
+        Seconds an extractor may take for one image.
+    overwrite
+        Replace what the output folder holds.
+    json
+        Write the results as JSON to a file as well, or to stdout with '-'.
+    """
+    from ..benchmark.registry import defaults, resolve
+    from ..benchmark.run import REPORT, bench_extractors
+
+    if not 0 < timeout <= 86400:
+        raise InputError("must be above 0 and at most 86400 seconds", source="--timeout")
+    absent: dict[str, str] = {}
+    if extractor:
+        chosen = [resolve(given) for given in extractor]
+    else:
+        chosen, absent = defaults()
+        for name, reason in absent.items():
+            say(f"{name}: {reason}")
+    with progress("benching") as steps:
+        data = bench_extractors(
+            folder, output, chosen, timeout_s=timeout, overwrite=overwrite, absent=absent, progress=steps
+        )
+    emit(data, f"{_table(data)}\n\nreport: {output / REPORT}", json)
+    return 0
+
+
+def _table(data: dict[str, Any]) -> str:
+    """One line an extractor, then why any failed."""
+    lines = [
+        f"{'':<18} {'right':>5} {'wrong':>5} {'none':>5} {'error':>5} {'centre px':>10} {'p95':>8} {'bias x':>8} "
+        f"{'bias y':>8} {'eff.':>5} {'axis a':>8} {'axis b':>8} {'bound.':>7} {'IoU':>6} "
+        f"{'glints':>9} {'gl. px':>7} {'ms':>6}"
+    ]
+    for e in data["extractors"]:
+        s, g = e["summary"], e["summary"]["glints"]
+        bias, axes = s["centre_bias_px"] or (None, None), s["semi_axes_bias_px"] or (None, None)
+        time = s["time"]["cpu_ms"]["median"] or s["time"]["round_trip_ms"]["median"]
+        lines.append(
+            f"{e['name']:<18} {s['right']:>5} {s['wrong']:>5} {s['none']:>5} {s['error']:>5} "
+            f"{_f(s['centre_px']['median'], 4):>10} {_f(s['centre_px']['p95'], 4):>8} {_f(bias[0], 4):>8} "
+            f"{_f(bias[1], 4):>8} {_f(s['efficiency']['value'], 2):>5} {_f(axes[0], 4):>8} {_f(axes[1], 4):>8} "
+            f"{_f(s['boundary_px']['median'], 3):>7} {_f(s['iou']['median'], 3):>6} "
+            f"{'-' if g is None else '{}/{}'.format(g['matched'], g['true']):>9} "
+            f"{_f(g['error_px']['median'] if g else None, 4):>7} {_f(time, 1):>6}"
+        )
+    for e in data["extractors"]:
+        lines += [f"{e['name']}: {f['count']} x {f['outcome']}: {f['reason']}" for f in e["failures"][:3]]
+    lines += [f"{e['name']}: not run: {e['reason']}" for e in data["not_run"]]
+    return "\n".join(lines)
+
+
+def _f(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

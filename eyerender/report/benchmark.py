@@ -1,0 +1,349 @@
+"""The report of a bench of extractors: table, error plots, breakdowns, reasons; from the bench's own JSON and rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .study import Card, Figure, Page, Section, Table, write_page
+from .style import TARGET, figure, svg
+
+Row = dict[str, Any]
+
+# Okabe and Ito's colours; an extractor keeps its colour and marker in every figure.
+_LOOK = (
+    ("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "^"), ("#CC79A7", "D"), ("#E69F00", "v"), ("#56B4E9", "P"),
+    ("#777777", "X"), ("#000000", "*"),
+)  # fmt: skip
+_OUTCOMES = (("right", "#0072B2"), ("wrong", "#D55E00"), ("none", "#bbbbbb"), ("error", "#222222"))
+_PANELS = 4
+
+
+def write_bench_report(path: Path, data: Row, rows: Sequence[Row]) -> None:
+    """Write one self-contained HTML file from the bench's JSON and its rows, one an extractor and image."""
+    write_page(path, bench_page(data, rows))
+
+
+def bench_page(data: Row, rows: Sequence[Row]) -> Page:
+    """The page."""
+    entries, edge = data["extractors"], data["edge"]
+    best = [e for e in entries if e["summary"]["right"]]
+    cards = [Card(f"{data['with_pupil']} of {data['images']}", "images that show a pupil")]
+    if edge["n"]:
+        text = f"noise / pupil-iris step (DN of 8 bits) / sigma of the blurred edge (px), medians; {edge['source']}"
+        cards.append(Card(f"{edge['noise_dn']:.2f} / {edge['step_dn']:.1f} / {edge['sigma_px']:.2f}", text))
+    if best:
+        least = min(best, key=lambda e: e["summary"]["centre_px"]["median"])
+        cards.append(
+            Card(f"{least['summary']['centre_px']['median']:.4f} px", f"least median centre error: {least['name']}")
+        )
+        most = max(best, key=lambda e: e["summary"]["rates"]["right"])
+        cards.append(Card(_percent(most["summary"]["rates"]["right"]), f"most pupils right: {most['name']}"))
+    lead = [
+        "Every extractor looked at the same images, in a process of its own, and was told the same: the image, its bit "
+        "depth and, where the folder knows the rig, the rig and the range of likely pupil sizes; never the truth.",
+        "A pupil is right when its ellipse overlaps the true one with an intersection over union above 0.9; wrong when "
+        "it is another ellipse; none when the extractor said that there is none; error when it gave no usable answer. "
+        "Errors are those of the right ones.",
+    ]
+    sections = [
+        Section("Results", tables=(_pupil_table(entries), _rate_table(entries), _glint_table(entries))),
+        Section("Errors", figures=_error_figures(data, rows)),
+        Section(
+            "Broken down",
+            [
+                "Median centre error of the right ones, and the share of pupils that are right, over what varies in "
+                "this folder. Noise, blur and contrast are the folder's own figures where it has them, else measured "
+                "along the true outline."
+            ],
+            [f for name in data["factors"] for f in _factor_figure(data, name)],
+            [_factor_table(data, name) for name in data["factors"] if _has(entries, name)],
+        ),
+        Section("What went wrong", tables=(_failure_table(entries),)),
+        Section("How this was made", _how(data), tables=(_convention_table(entries),)),
+    ]
+    if data["not_run"]:
+        table = Table(("extractor", "why"), [(e["name"], e["reason"]) for e in data["not_run"]], "Not run", wide=(1,))
+        sections[3] = Section("What went wrong", tables=(_failure_table(entries), table))
+    return Page(f"{data['folder']}: extractors compared", lead, cards, sections)
+
+
+def look(names: Sequence[str], name: str) -> tuple[str, str]:
+    """Colour and marker of an extractor among those of the bench."""
+    return _LOOK[list(names).index(name) % len(_LOOK)]
+
+
+def cumulative_figure(data: Row, rows: Sequence[Row]) -> str:
+    """Share of the images with a pupil whose centre error is below x; failures never come below."""
+    names = [e["name"] for e in data["extractors"]]
+    with figure(9.0, 4.2) as (fig, ax):
+        for name in names:
+            mine = [r for r in rows if r["extractor"] == name and r["outcome"] not in ("absent", "false")]
+            errors = np.sort([r["centre_px"] for r in mine if r["centre_px"] is not None])
+            if len(errors):
+                share = np.arange(1, len(errors) + 1) / len(mine)
+                ax.step(np.maximum(errors, 1e-5), share, where="post", color=look(names, name)[0], lw=1.8, label=name)
+        bounds = np.array([r["bound_sigma_px"] for r in rows[: data["images"]] if r["bound_sigma_px"] is not None])
+        if len(bounds):
+            # A radial error of two equal normal components: P(e < x) = 1 - exp(-x^2 / (2 sigma^2)).
+            x = np.geomspace(bounds.min() * 0.05, bounds.max() * 5.0, 200)
+            share = (1.0 - np.exp(-0.5 * (x[:, None] / bounds) ** 2)).mean(axis=1)
+            ax.plot(x, share, color=TARGET, lw=1.2, ls="--", label="Cramér-Rao bound")
+        ax.set_xscale("log")
+        ax.set(xlabel="pupil centre error (px)", ylabel="share of the images", ylim=(0, 1.02))
+        if names:
+            fig.legend(loc="outside upper center", ncols=4, frameon=False)
+        return svg(fig)
+
+
+def outcome_figure(entries: Sequence[Row]) -> str:
+    """Right, wrong, none, error as shares of the images with a pupil."""
+    with figure(9.0, 1.2 + 0.4 * len(entries)) as (fig, ax):
+        y = np.arange(len(entries))
+        left = np.zeros(len(entries))
+        for outcome, colour in _OUTCOMES:
+            share = np.array([e["summary"]["rates"][outcome] or 0.0 for e in entries])
+            ax.barh(y, share, left=left, height=0.62, color=colour, label=outcome)
+            left += share
+        ax.set_yticks(y, [e["name"] for e in entries])
+        ax.set_ylim(len(entries) - 0.5, -0.5)
+        ax.grid(axis="y", visible=False)
+        ax.set(xlabel="share of the images with a pupil", xlim=(0, 1))
+        fig.legend(loc="outside upper center", ncols=4, frameon=False)
+        return svg(fig)
+
+
+def vector_figure(names: Sequence[str], everyone: Sequence[str], rows: Sequence[Row]) -> str:
+    """Centre errors as vectors, a panel an extractor, each on a scale of its own; up to four panels."""
+    with figure(11.0, 3.3, _PANELS) as (fig, axes):
+        for ax, name in zip(axes, names, strict=False):
+            colour, marker = look(everyone, name)
+            mine = [r for r in rows if r["extractor"] == name and r["outcome"] == "right"]
+            xy = np.array([(r["centre_x_px"], r["centre_y_px"]) for r in mine]).reshape(-1, 2)
+            limit = 1.15 * float(np.abs(xy).max()) if len(xy) else 1.0
+            limit = max(limit, 1e-3)
+            ax.axhline(0, color="#888888", lw=0.8)
+            ax.axvline(0, color="#888888", lw=0.8)
+            ax.scatter(*xy.T, s=20, color=colour, marker=marker, edgecolor="white", linewidth=0.4)
+            if len(xy):
+                ax.scatter(*xy.mean(axis=0), marker="+", s=130, color=TARGET)
+            ax.set(
+                xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", title=f"{name} (n = {len(xy)})",
+                xlabel="x (px)", ylabel="y (px, down)",
+            )  # fmt: skip
+            ax.locator_params(nbins=4)
+        for ax in axes[len(names) :]:
+            ax.axis("off")  # invisible axes would leave the layout
+        return svg(fig)
+
+
+def factor_figure(data: Row, name: str) -> str:
+    """Median centre error and share of right pupils over one factor."""
+    entries = data["extractors"]
+    names = [e["name"] for e in entries]
+    what = data["factors"][name]
+    with figure(11.0, 3.5, 2) as (fig, axes):
+        for entry in entries:
+            colour, marker = look(names, entry["name"])
+            bins = entry["breakdown"].get(name, [])
+            x = [b["median"] for b in bins]
+            shape = {"color": colour, "marker": marker, "ms": 6, "lw": 1.3, "label": entry["name"]}
+            errors = [np.nan if b["centre_px"]["median"] is None else max(b["centre_px"]["median"], 1e-5) for b in bins]
+            axes[0].plot(x, errors, **shape)
+            axes[1].plot(x, [b["rates"]["right"] for b in bins], **shape)
+        bins = entries[0]["breakdown"].get(name, [])
+        bound = _bounds(entries, name)
+        if any(b is not None for b in bound):
+            y = [np.nan if b is None else b for b in bound]
+            axes[0].plot([b["median"] for b in bins], y, color=TARGET, lw=1.2, ls="--", label="Cramér-Rao bound")
+        axes[0].set_yscale("log")
+        axes[0].set(ylabel="median centre error (px)")
+        axes[1].set(ylabel="share of pupils right", ylim=(-0.03, 1.05))
+        for ax in axes:
+            ax.set(xlabel=f"{what['what']} ({what['unit']})" if what["unit"] != "1" else what["what"])
+        handles, labels = axes[0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=5, frameon=False)
+        return svg(fig)
+
+
+def _bounds(entries: Sequence[Row], name: str) -> list[float | None]:
+    """The median bound in each bin: the same for all extractors, but each states it for the pupils it found right."""
+    columns = [[b["efficiency"]["bound_median_px"] for b in e["breakdown"].get(name, [])] for e in entries]
+    return [next((v for v in column if v is not None), None) for column in zip(*columns, strict=True)]
+
+
+def _error_figures(data: Row, rows: Sequence[Row]) -> list[Figure]:
+    entries = data["extractors"]
+    names = [e["name"] for e in entries]
+    out = [
+        Figure(outcome_figure(entries), "What became of each image that shows a pupil."),
+        Figure(
+            cumulative_figure(data, rows),
+            "Share of the images with a pupil whose centre is found to better than a given error; a curve that ends "
+            "below 1 lost the rest. Further left and up is better.",
+        ),
+    ]
+    for k in range(0, len(names), _PANELS):
+        some = names[k : k + _PANELS]
+        caption = (
+            "Centre errors, found minus true, of the right ones; the cross is their mean, the bias. Scales differ."
+        )
+        out.append(Figure(vector_figure(some, names, rows), caption if k + _PANELS >= len(names) else ""))
+    return out
+
+
+def _factor_figure(data: Row, name: str) -> list[Figure]:
+    if not _has(data["extractors"], name):
+        return []
+    return [Figure(factor_figure(data, name), f"By {data['factors'][name]['what']}.")]
+
+
+def _has(entries: Sequence[Row], name: str) -> bool:
+    return any(e["breakdown"].get(name) for e in entries)
+
+
+def _pupil_table(entries: Sequence[Row]) -> Table:
+    header = (
+        "extractor", "right", "centre error: median", "95 %", "bias x", "bias y", "efficiency", "bias a", "bias b",
+        "boundary", "IoU", "CPU ms",
+    )  # fmt: skip
+    rows = []
+    for e in entries:
+        s = e["summary"]
+        bias, axes = s["centre_bias_px"] or (None, None), s["semi_axes_bias_px"] or (None, None)
+        rows.append(
+            (
+                e["name"], f"{s['right']} of {s['with_pupil']}", _px(s["centre_px"]["median"]),
+                _px(s["centre_px"]["p95"]), *(_signed(v) for v in (*bias,)), _number(s["efficiency"]["value"], 2),
+                *(_signed(v) for v in (*axes,)), _px(s["boundary_px"]["median"]), _number(s["iou"]["median"], 4),
+                _time(s["time"]),
+            )
+        )  # fmt: skip
+    caption = (
+        "Pupil, in px, of the right ones. Efficiency: the Cramér-Rao bound over the error, median of their ratio; "
+        "1 reaches the bound. Boundary: mean distance of the true outline, median over the images. CPU: median "
+        "milliseconds an image on one core, the image already read; in brackets the round trip, where an extractor "
+        "does not tell its own."
+    )
+    return Table(header, rows, caption)
+
+
+def _rate_table(entries: Sequence[Row]) -> Table:
+    rows = []
+    for e in entries:
+        s = e["summary"]
+        rates = [_percent(s["rates"][o]) for o, _ in _OUTCOMES]
+        absent = f"{s['false']} of {s['without_pupil']}" if s["without_pupil"] else "-"
+        worst = s["centre_px_of_all_found"]
+        rows.append((e["name"], *rates, absent, _px(worst["p95"]), _px(worst["worst"])))
+    header = ("extractor", "right", "wrong", "none", "error", "pupil where none is", "all found: 95 %", "worst")
+    return Table(header, rows, "Rates, and the centre errors (px) with the wrong ones counted.")
+
+
+def _glint_table(entries: Sequence[Row]) -> Table:
+    rows = []
+    for e in entries:
+        g = e["summary"]["glints"]
+        if g is None:
+            rows.append((e["name"], *["-"] * 6))
+            continue
+        swaps = f"{g['swapped']} of {g['named']}" if g["named"] else "-"
+        rows.append(
+            (
+                e["name"], f"{g['matched']} of {g['true']}", _percent(g["recall"]), _percent(g["precision"]), swaps,
+                _px(g["error_px"]["median"]), _px(g["error_px"]["p95"]),
+            )
+        )  # fmt: skip
+    header = ("extractor", "found", "recall", "precision", "identity swaps", "error: median", "95 %")
+    return Table(
+        header,
+        rows,
+        "Glints: a reported one within 2 px of a true one is that one; errors in px. Swaps: matches that were given a "
+        "wrong light, of those given one. A dash: the extractor does not look for glints.",
+    )
+
+
+def _factor_table(data: Row, name: str) -> Table:
+    what = data["factors"][name]
+    rows = []
+    for e in data["extractors"]:
+        for b in e["breakdown"].get(name, []):
+            span = f"{b['low']:.4g}" if b["low"] == b["high"] else f"{b['low']:.4g} to {b['high']:.4g}"
+            bias = b["centre_bias_px"] or (None, None)
+            g = b["glints"]
+            rows.append(
+                (
+                    e["name"], span, str(b["with_pupil"]), *(_percent(b["rates"][o]) for o, _ in _OUTCOMES),
+                    _px(b["centre_px"]["median"]), _px(b["centre_px"]["p95"]), _signed(bias[0]), _signed(bias[1]),
+                    _number(b["efficiency"]["value"], 2), _px(b["boundary_px"]["median"]),
+                    _percent(g["recall"]) if g else "-",
+                )
+            )  # fmt: skip
+    header = (
+        "extractor", what["what"] if what["unit"] == "1" else f"{what['what']} ({what['unit']})", "images", "right",
+        "wrong", "none", "error", "centre: median", "95 %", "bias x", "bias y", "efficiency", "boundary",
+        "glint recall",
+    )  # fmt: skip
+    return Table(header, rows, f"By {what['what']}", folded=True)
+
+
+def _failure_table(entries: Sequence[Row]) -> Table:
+    rows = [
+        (e["name"], f["outcome"], str(f["count"]), f["reason"], f["first"])
+        for e in entries
+        for f in e["failures"]
+    ]  # fmt: skip
+    caption = "Every reason an image has no right pupil." if rows else "Every extractor found every pupil right."
+    return Table(("extractor", "outcome", "images", "reason", "first image"), rows, caption, wide=(3,))
+
+
+def _convention_table(entries: Sequence[Row]) -> Table:
+    rows = []
+    for e in entries:
+        c = e["conventions"]
+        words = "-" if c is None else (
+            f"(0, 0) is a pixel's {c['pixel_origin']}; {c['axes']} axes; angle of the {c['angle_of']} axis in "
+            f"{c['angle_unit']}, positive {c['angle_toward']}"
+        )  # fmt: skip
+        rows.append((e["name"], e["given"], e["says"] or "-", words))
+    return Table(
+        ("extractor", "given as", "calls itself", "declares"), rows, "Conventions, converted before judging.", wide=(3,)
+    )
+
+
+def _how(data: Row) -> list[str]:
+    versions = ", ".join(f"{name} {v}" for name, v in data["versions"].items())
+    return [
+        f"{data['machine']['processor']}; {data['machine']['system']}; one thread an extractor, one extractor at a "
+        f"time, {data['timeout_s']:g} s allowed for an image. {versions}.",
+        "Cramér-Rao bound of the centre, per axis: (s / step) sqrt(2 sigma_b / (sqrt(pi) sqrt(a b))), s the noise, "
+        "step from pupil to iris, sigma_b the edge's blur, pixel included; the median distance is 1.177 times it. It "
+        "holds for an outline that is seen whole. In rendered images the true outline is no exact ellipse and the "
+        "renderer has noise of its own, so the bound is not what limits there.",
+    ]
+
+
+def _px(value: float | None) -> str:
+    return _number(value, 4)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _signed(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.4f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.0f} %" if value in (0.0, 1.0) else f"{100 * value:.1f} %"
+
+
+def _time(times: Row) -> str:
+    if times["cpu_ms"]["median"] is not None:
+        return f"{times['cpu_ms']['median']:.1f}"
+    trip = times["round_trip_ms"]["median"]
+    return "-" if trip is None else f"({trip:.1f})"

@@ -1,0 +1,59 @@
+"""Figures of the observers' comparison: a panel a feature or estimator, a colour a reading and observer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from .style import figure, svg
+
+_STYLES = (("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9"), ("P", "#777777"))
+
+
+def distances_figure(panels: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
+    """Median distances (px) by eye model: feature -> series -> eye model -> px."""
+    models = list(dict.fromkeys(m for by in panels.values() for values in by.values() for m in values))
+    with figure(max(5.4, 3.5 * len(panels)), 3.7, len(panels)) as (fig, axes):
+        for k, (ax, (name, by)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
+            for i, (label, values) in enumerate(by.items()):
+                marker, colour = _STYLES[i % len(_STYLES)]
+                at = [j for j, m in enumerate(models) if m in values]
+                x = np.array(at) + _shift(i, len(by))
+                ax.scatter(x, [values[models[j]] for j in at], s=38, marker=marker, color=colour, label=label)
+            ax.set_xticks(range(len(models)), models)
+            ax.set_xlim(-0.5, len(models) - 0.5)
+            ax.set_ylim(0, 1.12 * max((v for values in by.values() for v in values.values()), default=1.0))
+            ax.grid(axis="x", visible=False)
+            ax.set(title=name, ylabel="median distance (px)" if k == 0 else "", xlabel="eye model")
+        handles, labels = np.atleast_1d(axes)[0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False)
+        return svg(fig)
+
+
+def differences_figure(panels: Mapping[str, Mapping[str, Mapping[str, tuple[float, float, float]]]]) -> str:
+    """Paired differences (deg) with their interval: estimator -> series -> eye model -> (mean, low, high)."""
+    models = list(dict.fromkeys(m for by in panels.values() for values in by.values() for m in values))
+    with figure(max(5.4, 3.3 * len(panels)), 3.7, len(panels)) as (fig, axes):
+        for k, (ax, (name, by)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
+            ax.axhline(0, color="#444444", lw=0.8)
+            for i, (label, values) in enumerate(by.items()):
+                marker, colour = _STYLES[i % len(_STYLES)]
+                at = [j for j, m in enumerate(models) if m in values]
+                mean, low, high = np.array([values[models[j]] for j in at]).reshape(-1, 3).T
+                ax.errorbar(
+                    np.array(at) + _shift(i, len(by)), mean, yerr=[mean - low, high - mean], fmt=marker, ms=6,
+                    color=colour, elinewidth=1.3, capsize=2.5, label=label,
+                )  # fmt: skip
+            ax.set_xticks(range(len(models)), models)
+            ax.set_xlim(-0.5, len(models) - 0.5)
+            ax.grid(axis="x", visible=False)
+            ax.set(title=name, ylabel="difference of the gaze error (deg)" if k == 0 else "", xlabel="eye model")
+        handles, labels = np.atleast_1d(axes)[0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False)
+        return svg(fig)
+
+
+def _shift(i: int, n: int) -> float:
+    """Where the i-th of n series stands beside a tick."""
+    return (i - (n - 1) / 2) * min(0.16, 0.7 / n)

@@ -1,0 +1,149 @@
+"""Both observers on a head-mounted rig: features of 25 directions of one eye, and the direction found from them.
+
+The direction of the optic axis, in degrees, is a polynomial of second order of a feature (x, y) in px,
+
+    azimuth = sum_k a_k m_k(x, y),   elevation = sum_k b_k m_k(x, y),   m = 1, x, y, x^2, xy, y^2
+
+fitted by least squares on the nine directions of the shipped scene and tested on the sixteen between them. The feature
+is the pupil's centre, or its vector from the mean of all glints. (There are no targets: poses are given, and the angle
+between two directions is the error.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Bools, Floats
+from ..gaze.estimate import angular_error_deg
+from ..observation import Observations
+from ..rig.rig import Rig
+from ..scene import Scene, SceneSpec, load_scene
+from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
+from .observing import Observing
+from .results import Finding, Row, mean_row
+
+SCENE, PROTOCOL = "head_mounted", "head-mounted"
+AZIMUTHS_DEG = (15.0, 7.5, 0.0, -7.5, -15.0)
+ELEVATIONS_DEG = (12.0, 6.0, 0.0, -6.0, -12.0)
+FEATURES = ("pupil-glint vector", "pupil centre")
+
+
+@dataclass(slots=True)
+class HeadMountedPart:
+    """What one eye model gave: rows; by (protocol, observer) the rig with what was observed, and errors (n,) deg."""
+
+    eye_model: str
+    rows: list[Row] = field(default_factory=list)
+    seen: dict[tuple[str, str], tuple[Rig, Observations]] = field(default_factory=dict)
+    errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
+
+
+def scene(eye: str) -> Scene:
+    """The shipped scene with more directions: 5 x 5 over the range of its own 3 x 3."""
+    loaded = load_scene(SCENE, eye=eye)
+    data = loaded.spec.to_mapping()
+    data["poses"] = [{"azimuth_deg": a, "elevation_deg": e} for e in ELEVATIONS_DEG for a in AZIMUTHS_DEG]
+    return Scene.of(SceneSpec.from_mapping(data, source=SCENE))
+
+
+def calibration_rows() -> Bools:
+    """Which of the 25 directions are the shipped scene's nine."""
+    a, e = AZIMUTHS_DEG[::2], ELEVATIONS_DEG[::2]
+    return np.array([x in a and y in e for y in ELEVATIONS_DEG for x in AZIMUTHS_DEG])
+
+
+def head_mounted_part(eye: str, observings: Sequence[Observing]) -> HeadMountedPart:
+    """One eye model seen by the given observers."""
+    own = scene(eye)
+    out = HeadMountedPart(eye)
+    learnt = calibration_rows()
+    for observing in observings:
+        seen = observing.observe(own, eye.replace("/", "_"))
+        key = PROTOCOL, observing.kind
+        out.seen[key] = own.rig, seen
+        out.errors[key] = {}
+        for name in FEATURES:
+            error = direction_errors_deg(feature(seen, name), directions_deg(), learnt)
+            out.errors[key][name] = error
+            out.rows.append(
+                mean_row(
+                    error[~learnt], protocol=PROTOCOL, observer=observing.kind, variant=name, eye_model=eye,
+                    eye="right", function="second order",
+                )
+            )  # fmt: skip
+    return out
+
+
+def directions_deg() -> Floats:
+    """Azimuth and elevation (25, 2) of the optic axis."""
+    return np.array([(a, e) for e in ELEVATIONS_DEG for a in AZIMUTHS_DEG])
+
+
+def feature(seen: Observations, name: str) -> Floats:
+    """The pupil's centre (n, 2) px, or its vector from the mean of all lights' glints; NaN where one is missing."""
+    centre = np.where(seen.pupil.ok[:, None], seen.pupil.centre_px, np.nan)
+    if name == "pupil centre":
+        return np.asarray(centre)
+    lights = np.unique(seen.glints.light[seen.glints.light >= 0])
+    places = []
+    for light in lights:
+        place, found = seen.glints.of_light(int(light))
+        places.append(np.where(found[:, None], place, np.nan))
+    return np.asarray(centre - np.mean(places, axis=0))
+
+
+def direction_errors_deg(feature_px: Floats, truth_deg: Floats, learnt: Bools) -> Floats:
+    """Angles (n,) between estimated and true directions; NaN for the rows `learnt` and where there is no estimate."""
+    usable = np.isfinite(feature_px).all(axis=1)
+    rows = learnt & usable
+    out = np.full(len(feature_px), np.nan)
+    if rows.sum() < 6:
+        return out
+    origin = feature_px[rows].mean(axis=0)
+    u = (feature_px - origin) / np.abs(feature_px[rows] - origin).max()
+    design = np.stack([np.ones(len(u)), u[:, 0], u[:, 1], u[:, 0] ** 2, u[:, 0] * u[:, 1], u[:, 1] ** 2], axis=1)
+    coefficients, *_ = np.linalg.lstsq(design[rows], truth_deg[rows], rcond=None)
+    test = usable & ~learnt
+    found = design[test] @ coefficients
+    out[test] = angular_error_deg(_unit(found), _unit(truth_deg[test]), np.zeros(3))
+    return out
+
+
+def _unit(angles_deg: Floats) -> Floats:
+    azimuth, elevation = np.radians(angles_deg).T
+    across = np.cos(elevation)
+    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)], axis=-1)
+
+
+def findings(features: Sequence[FeatureDifference], gaze: Sequence[GazeDifference]) -> list[Finding]:
+    """What images do to features and directions, as values; there is no published claim to hold them against."""
+    out = []
+    for f in features:
+        if f.feature in ("pupil centre", ALL_GLINTS):
+            name, rule = ("O1" if f.feature == "pupil centre" else "O2"), "median distance of image and ray optics (px)"
+            rule = f"{f.eye_model}, {f.feature}: {rule}"
+            detail = f"bias {_mm(f.bias_mm)}, SD {_mm(f.sd_mm)} at the eye; {f.missing} of {f.n + f.missing} missing"
+            out.append(Finding(name, f.protocol, f.observer, rule, f.median_distance_px, "none", None, detail))
+    for g in gaze:
+        rule = f"{g.eye_model}, {g.estimator}: error from images minus error from rays (deg)"
+        detail = f"95 % interval {g.low_deg:.4f} to {g.high_deg:.4f}; {g.analytic_deg:.4f} deg from rays"
+        out.append(Finding("O3", g.protocol, g.observer, rule, g.difference_deg, "none", None, detail))
+    return out
+
+
+def more() -> dict[str, Any]:
+    """What the summary holds beside its rows."""
+    return {
+        "scene": SCENE,
+        "directions_deg": {"azimuth": list(AZIMUTHS_DEG), "elevation": list(ELEVATIONS_DEG)},
+        "calibrated_on": int(calibration_rows().sum()),
+        "tested_on": int((~calibration_rows()).sum()),
+    }
+
+
+def _mm(value: float | None) -> str:
+    return "-" if value is None else f"{1000 * value:.1f} um"

@@ -1,0 +1,243 @@
+#!/usr/bin/env python3
+"""Bench of dataset runs: rate, what is not rendering, scaling over workers, memory, disk, runs killed at random.
+
+    bench_generate.py [--quick] [--json F] [--backend llvm|cuda]
+
+Images are 640 x 480 px at 4 samples a pixel, E2, two LEDs, with labels and files. Rates are taken after every worker
+has made its first samples, so that starting and compiling are not in them; what is not rendering is CPU time of the
+worker's own thread, so that other work on the machine counts as little as may be. --quick makes fewer images and kills.
+Exit 1 when a `must` is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import yaml  # noqa: E402
+
+from eyerender.dataset.maker import Maker  # noqa: E402
+from eyerender.dataset.plan import Plan  # noqa: E402
+from eyerender.dataset.pool import LocalPool  # noqa: E402
+from eyerender.dataset.realise import frames_of  # noqa: E402
+from eyerender.dataset.shard import Staged, write_shard  # noqa: E402
+from eyerender.dataset.spec import DatasetSpec, find_dataset  # noqa: E402
+from eyerender.dataset.worker import Job  # noqa: E402
+
+Row = dict[str, Any]
+
+
+def row(
+    name: str, value: float, unit: str, must: float | None = None, aim: float | None = None, *, at_least: bool = False
+) -> Row:
+    """A result; `must` and `aim` are upper bars, lower ones with `at_least`."""
+    bar = must if must is not None else aim
+    met = None if bar is None else bool(value >= bar if at_least else value <= bar)
+    return {"name": name, "value": float(value), "unit": unit, "must": must, "aim": aim, "met": met}
+
+
+def plan(count: int, shard_size: int, window: tuple[int, int] = (640, 480), spp: int = 4) -> Plan:
+    """The quick dataset at another size; few identities, whose textures cost a second or two each."""
+    data = DatasetSpec.load(find_dataset("dataset_quick")).to_mapping()
+    data |= {"count": count, "shard_size": shard_size, "subjects": min(8, count)}
+    data["scene"]["image"] = {"window_px": list(window), "spp": spp}
+    data["scene"]["look"]["iris_seed"] = 1
+    return Plan.of(DatasetSpec.from_mapping(data))
+
+
+class Clock:
+    """Events of an engine: when samples are made, by worker start-up left out."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        self.by_shard: dict[int, int] = {}
+        self.start: float | None = None
+        self.images = 0
+        self.end = 0.0
+
+    def ready(self, backend: dict[str, Any], worker: str) -> None:
+        """A worker can render."""
+
+    def sample(self, shard: int, samples: int, images: int) -> None:
+        """Count from the moment at which as many shards as workers have three samples."""
+        self.by_shard[shard] = samples
+        now = time.perf_counter()
+        if self.start is not None:
+            self.images += images
+            self.end = now
+        elif sum(n >= 3 for n in self.by_shard.values()) >= self.workers:
+            self.start = now
+
+    def staged(self, staged: Staged, worker: str) -> None:
+        """Nothing is kept."""
+        shutil.rmtree(staged.stage)
+
+    def retry(self, shard: int, reason: str, tries: int) -> None:
+        """No worker may die in a bench."""
+        raise RuntimeError(f"shard {shard}: {reason}")
+
+    @property
+    def rate(self) -> float:
+        """Images a second."""
+        return self.images / (self.end - (self.start or 0.0))
+
+
+class Bench:
+    """The measurements; `small` for --quick."""
+
+    def __init__(self, backend: str, small: bool) -> None:
+        self.backend, self.small = backend, small
+
+    def rows(self) -> Iterable[Row]:
+        """All rows, as they are measured."""
+        yield from self.apart()
+        yield from self.rates()
+        yield from self.memory()
+        yield from self.kills()
+
+    def rates(self) -> Iterable[Row]:
+        """Images a second of one and of two workers of one thread each."""
+        count = 24 if self.small else 96
+        rates = {}
+        for workers in (1, 2):
+            made = plan(count * workers, count)
+            with tempfile.TemporaryDirectory() as folder:
+                clock = Clock(workers)
+                job = Job(made.to_mapping(), frames_of(made), folder, self.backend, 1)
+                lost = LocalPool(job, workers).run(range(workers), clock)
+                if lost:
+                    raise RuntimeError(str(lost))
+                rates[workers] = clock.rate
+        yield row("one worker of one thread", rates[1], "images/s")
+        yield row("two workers of one thread each", rates[2], "images/s", aim=8.0, at_least=True)
+        yield row("two workers against one", rates[2] / rates[1], "ratio", must=1.8, at_least=True)
+
+    def apart(self) -> Iterable[Row]:
+        """What an image takes besides rendering, and bytes on disk."""
+        count = 20 if self.small else 60
+        made = plan(count, count)
+        maker = Maker(made, 1, backend=self.backend, threads=1)  # type: ignore[arg-type]
+        maker.make(0)
+        inside = [0.0, 0.0]
+        render = maker.renderer.render
+
+        def timed(*arguments: Any, **options: Any) -> Any:
+            start, cpu = time.perf_counter(), time.thread_time()
+            try:
+                return render(*arguments, **options)
+            finally:
+                inside[0] += time.perf_counter() - start
+                inside[1] += time.thread_time() - cpu
+
+        maker.renderer.render = timed  # type: ignore[method-assign]
+        with tempfile.TemporaryDirectory() as folder:
+            cpu = time.thread_time()
+            staged = write_shard(maker, Path(folder), 0, lambda *_: None)
+            apart = time.thread_time() - cpu - inside[1]
+            size = sum(p.stat().st_size for p in Path(staged.stage).rglob("*") if p.is_file())
+        n = staged.images
+        yield row("rendering, one thread", 1e3 * inside[0] / n, "ms/image")
+        yield row("everything but rendering", 1e3 * apart / n, "ms/image", must=35.0)
+        yield row("on disk, masks and labels included", size / n, "bytes")
+
+    def memory(self) -> Iterable[Row]:
+        """Growth of a worker's resident memory."""
+        count = 600 if self.small else 5000
+        made = plan(count, count, window=(96, 72), spp=1)
+        maker = Maker(made, 1, backend=self.backend, threads=1)  # type: ignore[arg-type]
+        with tempfile.TemporaryDirectory() as folder:
+            sizes: list[float] = []
+            write_shard(maker, Path(folder), 0, lambda k, _n: sizes.append(_resident_mb()) if k % 100 == 0 else None)
+        yield row("resident memory of a worker", sizes[-1], "MiB")
+        yield row(f"its growth over {count} images", sizes[-1] - sizes[1], "MiB", must=30.0)
+
+    def kills(self) -> Iterable[Row]:
+        """Runs killed at random instants; files that differ from an undisturbed run's."""
+        kills, seed = (3, 1) if self.small else (20, 1)
+        data = plan(64, 4, window=(96, 72), spp=1).spec.to_mapping()
+        draws = random.Random(seed)
+        with tempfile.TemporaryDirectory() as place:
+            spec = Path(place) / "spec.yaml"
+            spec.write_text(yaml.safe_dump(data), encoding="utf-8")
+            command = [sys.executable, "-m", "eyerender", "generate", str(spec), "--backend", self.backend]
+            command += ["--workers", "2"]
+            start = time.perf_counter()
+            subprocess.run([*command, f"{place}/whole"], check=True, capture_output=True)
+            length = time.perf_counter() - start
+            killed = 0
+            while killed < kills:
+                folder = f"{place}/killed{killed // 4}"  # each folder is killed four times, then finished
+                with subprocess.Popen([*command, folder], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
+                    try:
+                        run.wait(draws.uniform(0.0, length))
+                    except subprocess.TimeoutExpired:
+                        run.kill()
+                killed += 1
+            differ = 0
+            whole = _tree(Path(place) / "whole")
+            for k in range(-(-kills // 4)):
+                subprocess.run([*command, f"{place}/killed{k}"], check=True, capture_output=True)
+                other = _tree(Path(place) / f"killed{k}")
+                differ += sum(whole.get(name) != other.get(name) for name in {*whole, *other})
+        yield row(f"files that differ after {kills} kills", differ, "files", must=0)
+
+
+def _tree(folder: Path) -> dict[str, str]:
+    return {
+        str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in folder.rglob("*")
+        if p.is_file() and p.name not in ("log.jsonl", "done.json") and not p.name.startswith(".eyerender-lock")
+    }
+
+
+def _resident_mb() -> float:
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * resource.getpagesize() / 2**20
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def main() -> int:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer images and kills")
+    parser.add_argument("--json", metavar="F", help="write the result to a file")
+    parser.add_argument("--backend", choices=["auto", "llvm", "cuda"], default="auto")
+    options = parser.parse_args()
+    rows = []
+    for r in Bench(options.backend, options.quick).rows():
+        rows.append(r)
+        bars = "".join(f"  {k} {r[k]:g}" for k in ("must", "aim") if r[k] is not None)
+        mark = "" if r["met"] is None else ("  met" if r["met"] else "  MISSED")
+        print(f"{r['name']:<50} {r['value']:>11.4g} {r['unit']:<9}{bars}{mark}", flush=True)
+    if options.json:
+        result = {
+            "schema": "eyerender/bench/1",
+            "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
+            "versions": {n: version(n) for n in ("eyerender", "mitsuba", "drjit", "numpy", "pillow")},
+            "rows": rows,
+        }
+        Path(options.json).write_text(json.dumps(result, indent=1), encoding="utf-8")
+    return 1 if any(r["met"] is False and r["must"] is not None for r in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,55 @@
+"""Small labelled folders of both kinds: drawn, and rendered."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+from eyerender.capture import render_folder
+from eyerender.errors import BackendError
+from eyerender.scene import Scene, SceneSpec, shipped_scenes
+
+
+@pytest.fixture(scope="session")
+def ideal():
+    """The generator of ideal images, which lives with the scripts."""
+    path = Path(__file__).parents[2] / "scripts" / "make_ideal_images.py"
+    spec = importlib.util.spec_from_file_location("make_ideal_images", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["make_ideal_images"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def drawn(ideal, tmp_path_factory):
+    """Six ideal images of 200 x 160 px with noise between 1 and 4 DN."""
+    conditions = ideal.CONDITIONS
+    conditions["small"] = ideal.Condition(size=(200, 160), semi_axis=(14, 20), noise=(1, 4))
+    try:
+        folder = tmp_path_factory.mktemp("bench") / "drawn"
+        ideal.write(folder, "small", 6, 10_000)
+    finally:
+        del conditions["small"]
+    return folder
+
+
+@pytest.fixture(scope="session")
+def rendered(tmp_path_factory):
+    """Four rendered windows before a remote camera with two lights."""
+    spec = SceneSpec.load(shipped_scenes()["quickstart"])
+    data = spec.to_mapping()
+    data["targets"] = {"world_mm": [[800, 150, 0], [800, -200, -100]]}
+    data["rig"]["lights"] = [
+        {"position_mm": [560, side * 120.0, -250], "radius_mm": 2.5, "intensity_mw_sr": 100} for side in (1, -1)
+    ]
+    data["image"] = {**data["image"], "window_px": [200, 160], "spp": 8}
+    folder = tmp_path_factory.mktemp("bench") / "rendered"
+    try:
+        render_folder(Scene.of(SceneSpec.from_mapping(data, source="test"), source="test"), folder, backend="llvm")
+    except BackendError as error:
+        pytest.skip(f"nothing to render with: {error}")
+    return folder

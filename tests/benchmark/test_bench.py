@@ -1,0 +1,167 @@
+"""The bench end to end: the shipped extractors on drawn and rendered images, and what it writes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+
+from eyerender.benchmark import names, resolve
+from eyerender.benchmark.pupil_labs import eight_bits, pupil_of
+from eyerender.benchmark.registry import defaults
+from eyerender.benchmark.shipped import PUPIL_LABS_PYTHON, pupil_labs_python
+from eyerender.cli.app import run
+from eyerender.errors import InputError
+from eyerender.extraction.baseline import contour_pupil
+from eyerender.imagefile import write_png
+
+
+def test_the_shipped_extractors_are_installed():
+    assert {"own-fast", "own-refined", "opencv-contour", "pupil-detectors"} <= set(names())
+
+
+def test_what_is_given_may_have_a_name_of_its_own():
+    assert resolve("mine=own-fast").name == "mine"
+    assert resolve("a.b:c").name == "a.b:c"
+    command = resolve(f"{sys.executable} x.py --path 'a b' k=v")
+    assert command.argv == (sys.executable, "x.py", "--path", "a b", "k=v")
+    assert resolve(f"label={sys.executable} x.py").name == "label"
+    with pytest.raises(InputError, match=r"is no extractor \(.*own-fast"):
+        resolve("own_fast")
+
+
+def test_without_its_environment_pupil_detectors_is_named_but_not_run(monkeypatch):
+    monkeypatch.setenv(PUPIL_LABS_PYTHON, "/nonexistent/python")
+    ready, absent = defaults()
+    assert "pupil-detectors" not in [e.name for e in ready]
+    assert absent["pupil-detectors"].startswith("not set up; scripts/setup_pupil_detectors.sh")
+    with pytest.raises(InputError, match="--extractor pupil-detectors: not set up"):
+        resolve("pupil-detectors")
+
+
+@pytest.fixture(scope="module")
+def bench(drawn, tmp_path_factory):
+    """Own refined, the contour baseline and one that dies, over the drawn folder."""
+    out = tmp_path_factory.mktemp("bench") / "out"
+    dead = f"dead={sys.executable} -c 'import sys; sys.exit(\"no licence\")'"
+    chosen = [w for e in ("own-refined", "opencv-contour", dead) for w in ("--extractor", e)]
+    target = out.parent / "results.json"
+    assert run(["bench-extractors", str(drawn), "-o", str(out), *chosen, "--json", str(target)]) == 0
+    return out, json.loads(target.read_text())
+
+
+def test_the_figures_are_those_of_the_extractors(bench):
+    _, data = bench
+    assert data["schema"] == "eyerender/bench-extractors/1"
+    own, contour, dead = data["extractors"]
+    s = own["summary"]
+    assert (s["right"], s["with_pupil"]) == (6, 6)
+    assert s["centre_px"]["worst"] < 0.1  # six errors about a bound of some 0.01 px each
+    assert 0.3 < s["efficiency"]["value"] < 3.0  # the median of six errors scatters by a factor of two
+    assert s["glints"]["recall"] == s["glints"]["precision"] == 1.0
+    assert s["time"]["cpu_ms"]["median"] > 0
+    # A contour runs through the centres of the outermost dark pixels.
+    assert contour["summary"]["right"] == 6
+    assert all(-0.8 < b < -0.1 for b in contour["summary"]["semi_axes_bias_px"])
+    assert contour["summary"]["glints"] is None
+    assert contour["conventions"]["axes"] == "full"
+    assert dead["summary"]["rates"]["error"] == 1.0
+    assert dead["failures"] == [
+        {"outcome": "error", "reason": "ended with exit code 1: no licence", "count": 6, "first": own_first(data)}
+    ]
+    assert "noise_dn" in own["breakdown"]
+
+
+def own_first(data):
+    return "images/small-010000.png" if data["images"] == 6 else ""
+
+
+def test_the_folder_holds_report_table_and_json(bench):
+    out, data = bench
+    assert {p.name for p in out.iterdir()} == {"report.html", "results.json", "results.csv"}
+    assert json.loads((out / "results.json").read_text()) == data
+    with open(out / "results.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 18
+    mine = [float(r["centre_px"]) for r in rows if r["extractor"] == "own-refined"]
+    assert np.median(mine) == pytest.approx(data["extractors"][0]["summary"]["centre_px"]["median"])
+    page = (out / "report.html").read_text()
+    for words in ("own-refined", "opencv-contour", "ended with exit code 1: no licence", "identity swaps"):
+        assert words in page
+    # Self-contained: no address but the namespaces of SVG.
+    addresses = set(re.findall(r"https?://[^\s\"'<)]+", page))
+    assert {a for a in addresses if "w3.org" not in a and "purl.org" not in a and "creativecommons" not in a} <= {
+        "https://matplotlib.org/"
+    }
+    assert "<script" not in page
+
+
+def test_an_earlier_bench_is_replaced_and_other_files_are_not(bench, drawn, tmp_path, capsys):
+    out, _ = bench
+    dead = ["--extractor", f"{sys.executable} -c 0"]
+    assert run(["bench-extractors", str(drawn), "-o", str(out), *dead, "--json", "-"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert [e["summary"]["error"] for e in shown["extractors"]] == [6]
+    (tmp_path / "report.html").write_text("mine")
+    assert run(["bench-extractors", str(drawn), "-o", str(tmp_path), *dead]) == 2
+    assert (tmp_path / "report.html").read_text() == "mine"
+
+
+@pytest.mark.render
+def test_glints_of_rendered_images_are_named_by_light(rendered, tmp_path):
+    target = tmp_path / "results.json"
+    argv = ["bench-extractors", str(rendered), "-o", str(tmp_path / "out"), "--extractor", "own-fast"]
+    assert run([*argv, "--json", str(target)]) == 0
+    data = json.loads(target.read_text())
+    s = data["extractors"][0]["summary"]
+    assert (s["right"], s["error"]) == (4, 0)
+    assert (s["glints"]["true"], s["glints"]["matched"], s["glints"]["named"], s["glints"]["swapped"]) == (8, 8, 8, 0)
+    assert s["centre_px"]["worst"] < 0.2  # eight samples a pixel at a semi-axis of 13 px
+    assert data["edge"]["source"] == "measured along the true outline"
+    assert data["edge"]["n"] == 4
+
+
+def test_the_contour_baseline_on_a_plain_disc():
+    y, x = np.mgrid[:120, :160]
+    image = np.full((120, 160), 180, dtype=np.uint8)
+    image[np.hypot(x - 80, y - 60) < 45] = 90
+    image[np.hypot((x - 82.0) / 18, (y - 61.0) / 14) < 1] = 25
+    (cx, cy), axes, degrees = contour_pupil(image, bit_depth=8)
+    assert (cx, cy) == pytest.approx((82, 61), abs=0.1)
+    assert sorted(axes) == pytest.approx([2 * 14 - 1, 2 * 18 - 1], abs=0.8)
+    assert degrees == pytest.approx(90, abs=2)  # the minor axis comes first
+    assert contour_pupil(image.astype(np.uint16) * 257, bit_depth=16)[0] == pytest.approx((cx, cy), abs=0.01)
+    assert contour_pupil(np.zeros((120, 160), dtype=np.uint8), bit_depth=8) == "no dark region of a likely size"
+    assert contour_pupil(np.zeros((3, 3), dtype=np.uint8), bit_depth=8) == "the image is 3 x 3"
+
+
+def test_the_detector_s_answer_is_passed_on_as_it_is():
+    found = {"ellipse": {"center": (3.0, 4.0), "axes": (10.0, 12.0), "angle": 30.0}, "confidence": 0.9}
+    assert pupil_of(found)["axes_px"] == [10.0, 12.0]
+    assert pupil_of({**found, "confidence": 0.0})["status"] == "missing"
+    assert pupil_of({**found, "ellipse": {**found["ellipse"], "axes": (0.0, 0.0)}})["status"] == "missing"
+
+
+def test_deep_images_are_scaled_to_eight_bits(tmp_path):
+    deep = np.array([[0, 2000], [4095, 1000]], dtype=np.uint16)
+    write_png(tmp_path / "a.png", deep)
+    assert eight_bits(str(tmp_path / "a.png"), 12).tolist() == [[0, 125], [255, 62]]
+    assert eight_bits(str(tmp_path / "a.png"), 12).flags.writeable
+
+
+@pytest.mark.skipif(pupil_labs_python() is None, reason="scripts/setup_pupil_detectors.sh has not been run")
+def test_pupil_detectors_in_its_own_environment(drawn, tmp_path):
+    target = tmp_path / "results.json"
+    argv = ["bench-extractors", str(drawn), "-o", str(tmp_path / "out"), "--extractor", "pupil-detectors"]
+    assert run([*argv, "--json", str(target)]) == 0
+    entry = json.loads(target.read_text())["extractors"][0]
+    assert entry["says"].startswith("pupil-detectors ")
+    assert entry["summary"]["error"] == 0
+    assert entry["summary"]["right"] >= 4
+    # Wrong axes, angle or origin would show as errors of half a pixel and more.
+    assert entry["summary"]["centre_px"]["median"] < 0.2
+    assert entry["summary"]["boundary_px"]["median"] < 0.4

@@ -1,0 +1,223 @@
+"""Scores and figures against values worked out by hand or by simulation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from eyerender.benchmark.bound import Edge, edge_of, measure_edge
+from eyerender.benchmark.folder import LabelledImage, TrueGlint, load_labelled
+from eyerender.benchmark.protocol import Reply
+from eyerender.benchmark.score import GlintScore, Score, score, score_glints
+from eyerender.benchmark.summary import bins, breakdown, efficiency, failures, summarise
+from eyerender.errors import InputError
+from eyerender.geometry.ellipse import Ellipse, signed_distance
+from eyerender.imagefile import read_image
+
+PUPIL = Ellipse((50.0, 40.0), (20.0, 16.0), 0.4)
+IMAGE = LabelledImage(
+    "a.png", Path("a.png"), 8, (100, 80), PUPIL, PUPIL.points(120), 1.0,
+    (TrueGlint(0, (45.0, 40.0)), TrueGlint(1, (55.0, 40.0)), TrueGlint(2, (50.0, 30.0))), {},
+)  # fmt: skip
+
+
+def found(ellipse, glints=(), **more):
+    return Reply(ellipse, None, None, tuple(glints), None, None, **more)
+
+
+def test_outcomes():
+    both = ("pupil", "glints")
+    assert score(IMAGE, found(PUPIL.shifted((0.1, 0))), 0.1, both).outcome == "right"
+    assert score(IMAGE, found(PUPIL.scaled(2.2)), 0.1, both).outcome == "wrong"  # as of one that locked onto the iris
+    assert score(IMAGE, found(None), 0.1, both).outcome == "none"
+    assert score(IMAGE, found(None, error="broken"), 0.1, both).outcome == "error"
+    empty = replace(IMAGE, pupil=None)
+    assert score(empty, found(PUPIL), 0.1, both).outcome == "false"
+    assert score(empty, found(None), 0.1, both).outcome == "absent"
+
+
+def test_errors_of_a_known_difference():
+    got = score(IMAGE, found(Ellipse((50.3, 39.6), (20.2, 15.9), 0.4 + math.pi - 0.01)), 0.1, ("pupil",))
+    assert got.offset_px == pytest.approx((0.3, -0.4))
+    assert got.centre_px == pytest.approx(0.5)
+    assert got.axes_px == pytest.approx((0.2, -0.1))
+    assert got.angle_deg == pytest.approx(math.degrees(-0.01))
+    assert got.glints is None
+
+
+def test_boundary_error_is_that_of_a_grown_circle():
+    circle = Ellipse((50.0, 40.0), (20.0, 20.0), 0.0)
+    image = replace(IMAGE, pupil=circle, outline_px=circle.points(100))
+    got = score(image, found(circle.scaled(1.01)), 0.1, ("pupil",))
+    assert got.boundary_px == pytest.approx(0.2)
+    assert got.iou == pytest.approx(1 / 1.01**2, abs=1e-4)  # of the numeric IoU
+
+
+def test_glints_are_matched_one_to_one_and_swaps_are_counted():
+    reported = [((45.5, 40.0), 1), ((55.0, 40.2), 0), ((80.0, 70.0), None), ((45.0, 40.9), None)]
+    got = score_glints(IMAGE, found(PUPIL, reported))
+    assert (got.true, got.reported, len(got.errors_px)) == (3, 4, 2)
+    assert np.allclose(sorted(got.errors_px), [(0.0, 0.2), (0.5, 0.0)])  # the nearer of the two near the first
+    assert (got.named, got.swapped) == (2, 2)
+    right = score_glints(IMAGE, found(PUPIL, [((50.0, 30.0), 2), ((45.0, 40.0), None)]))
+    assert (right.named, right.swapped, len(right.errors_px)) == (1, 0, 2)
+    assert score_glints(IMAGE, found(PUPIL)) == GlintScore(3, 0)
+
+
+def test_rates_are_over_the_images_that_show_a_pupil():
+    scores = [Score("right", offset_px=(0.3, 0.4), axes_px=(0.1, -0.2), iou=0.98, boundary_px=0.2)] * 3
+    scores += [Score("wrong", "IoU", offset_px=(9, 12), axes_px=(3, 3), iou=0.3)]
+    scores += [Score("none", "dark"), Score("error", "crash"), Score("absent"), Score("false")]
+    got = summarise(scores, [None] * len(scores), False)
+    assert got["rates"] == {"right": 0.5, "wrong": 1 / 6, "none": 1 / 6, "error": 1 / 6}
+    assert (got["without_pupil"], got["false"]) == (2, 1)
+    assert got["centre_px"] == {"n": 3, "median": 0.5, "p95": 0.5, "worst": 0.5}
+    assert got["centre_px_of_all_found"]["worst"] == 15.0
+    assert got["centre_bias_px"] == pytest.approx([0.3, 0.4])
+    assert got["semi_axes_bias_px"] == pytest.approx([0.1, -0.2])
+    images = [replace(IMAGE, name=f"{k}.png") for k in range(len(scores))]
+    listed = {f["outcome"]: (f["count"], f["first"]) for f in failures(scores, images)}
+    assert listed == {"wrong": (1, "3.png"), "none": (1, "4.png"), "error": (1, "5.png"), "false": (1, "7.png")}
+
+
+def test_an_extractor_at_the_bound_has_efficiency_one():
+    rng = np.random.default_rng(3)
+    sigmas = rng.uniform(0.005, 0.05, 4000)
+    scores = [Score("right", offset_px=tuple(rng.normal(0.0, s, 2))) for s in sigmas]
+    value = efficiency(scores, sigmas.tolist())["value"]
+    # The median of 4000 Rayleigh draws scatters by 1 / (2 f sqrt(n)) = 1.3 %, f the density at it.
+    assert value == pytest.approx(1.0, abs=0.05)
+    far = [Score("right", offset_px=(2 * s.offset_px[0], 2 * s.offset_px[1])) for s in scores]
+    assert efficiency(far, sigmas.tolist())["value"] == pytest.approx(0.5 * value)
+    assert efficiency([Score("none")], [0.01])["value"] is None
+
+
+@pytest.mark.parametrize(("radius", "blur", "noise"), [(17.0, 1.0, 2.0), (40.0, 0.8, 1.0), (30.0, 2.5, 8.0)])
+def test_the_bound_is_the_inverse_of_the_fisher_information(radius, blur, noise):
+    """Of a blurred disc's x: sum over pixels of (dI/dx)^2 / s^2, the pixel's own extent by a difference of 0.01 px."""
+    step, x0, y0 = 55.0, 60.3, 60.6
+    y, x = np.mgrid[:121, :121].astype(float)
+    sigma = math.sqrt(blur**2 + 1 / 12)
+
+    def disc(cx):
+        return step * norm.cdf((np.hypot(x - cx, y - y0) - radius) / sigma)
+
+    slope = (disc(x0 + 0.01) - disc(x0 - 0.01)) / 0.02
+    exact = noise / math.sqrt(float(np.sum(slope**2)))
+    got = Edge(noise, step, sigma).centre_sigma_px(Ellipse((x0, y0), (radius, radius), 0.0))
+    assert got == pytest.approx(exact, rel=0.01)  # the formula neglects (sigma / R)^2
+
+
+@pytest.mark.parametrize(("blur", "noise", "a"), [(0.8, 1.0, 13.0), (1.0, 2.0, 30.0), (2.0, 4.0, 40.0)])
+def test_an_edge_is_measured_as_it_was_drawn(ideal, blur, noise, a):
+    condition = ideal.Condition(
+        size=(240, 200), blur=(blur, blur), noise=(noise, noise), semi_axis=(a, a), glints="isolated"
+    )
+    for seed in range(10_000, 10_003):
+        drawing = ideal.draw(condition, seed)
+        label = drawing.label["pupil"]
+        pupil = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"])
+        spots = np.array([g["xy_px"] for g in drawing.label["glints"]])
+        edge = measure_edge(drawing.image.astype(float), pupil, spots, 1.0)
+        assert edge.step_dn == pytest.approx(55.0, rel=0.03)
+        # The outline's curvature and the noise; the bound takes its square root.
+        assert edge.sigma_px == pytest.approx(math.sqrt(blur**2 + 1 / 12), rel=0.08)
+        # The root mean square of a few hundred differences at least; rounding adds 1/12.
+        assert edge.noise_dn == pytest.approx(math.sqrt(noise**2 + 1 / 12), rel=0.12)
+
+
+def test_the_bound_leaves_out_what_it_does_not_cover():
+    known = {"noise_dn": 0.0, "blur_px": 1.0, "step_dn": 55.0}
+    none = np.zeros((0, 2))
+    grey = np.zeros((80, 100))
+    assert edge_of(grey, 8, PUPIL, 1.0, none, known).noise_dn == pytest.approx(1 / math.sqrt(12))  # rounding
+    assert edge_of(grey, 8, PUPIL, 0.7, none, known) is None
+    assert edge_of(grey, 8, None, 1.0, none, known) is None
+    assert measure_edge(grey, PUPIL, none) is None  # an even image has no edge
+
+
+def test_bins():
+    assert bins([1.0, 2.0, 1.0, None], "noise_dn") == [(1.0, 1.0, [0, 2]), (2.0, 2.0, [1])]
+    assert bins([1.0] * 5, "noise_dn") == []
+    assert bins([], "noise_dn") == []
+    values = np.random.default_rng(0).uniform(1, 9, 101)
+    parts = bins(values.tolist(), "noise_dn")
+    assert sorted(i for _, _, members in parts for i in members) == list(range(101))
+    for low, high, members in parts:
+        assert 24 <= len(members) <= 27
+        assert all(low <= values[i] <= high for i in members)
+    phases = bins([0.1, 0.3, 0.99, 0.6, 0.0], "phase_x")
+    assert [members for _, _, members in phases] == [[0, 4], [1], [3], [2]]
+
+
+def test_a_breakdown_holds_every_image_with_a_pupil_once():
+    scores = [Score("right", offset_px=(0.1 * k, 0.0), axes_px=(0, 0), iou=1.0, boundary_px=0.0) for k in range(8)]
+    scores += [Score("absent"), Score("none", "dark")]
+    factors = [{"noise_dn": float(k % 2)} for k in range(9)] + [{}]
+    got = breakdown(scores, [None] * 10, factors, False)
+    assert list(got) == ["noise_dn"]
+    assert [b["with_pupil"] for b in got["noise_dn"]] == [4, 4]
+    assert [b["centre_px"]["median"] for b in got["noise_dn"]] == pytest.approx([0.3, 0.4])
+
+
+def test_an_ideal_folder_is_read_as_it_was_drawn(drawn):
+    images = load_labelled(drawn)
+    assert len(images) == 6
+    for image in images:
+        assert image.visible == 1.0
+        assert image.hints == {"polarity": "dark", "gamma": 1.0, "radius_px": None, "rig": None}
+        grey, _ = read_image(image.path)
+        y, x = np.mgrid[: grey.shape[0], : grey.shape[1]]
+        inside = signed_distance(image.pupil, np.stack([x, y], axis=-1)) < -3.0
+        assert np.median(grey[inside]) == pytest.approx(20, abs=1)  # as drawn
+        assert set(image.factors) == {"pupil_px", "aspect", "phase_x", "phase_y", "occlusion"}
+
+
+def test_a_lid_s_occlusion_is_what_it_covers(ideal):
+    condition = ideal.Condition(size=(200, 160), semi_axis=(30, 30), lid=(0.2, 1.2), glints="none")
+    for seed in range(10_000, 10_004):
+        drawing = ideal.draw(condition, seed)
+        dark = int(np.count_nonzero(drawing.image < 47))  # pupil 20, iris 75, lid 67 or more
+        a, b = drawing.label["pupil"]["semi_axes_px"]
+        # Pixels on the outline count whole or not at all.
+        assert drawing.parameters["visible_fraction"] == pytest.approx(dark / (math.pi * a * b), abs=0.02)
+
+
+@pytest.mark.render
+def test_a_rendered_folder_s_labels_and_hints_are_in_image_coordinates(rendered):
+    images = load_labelled(rendered)
+    assert len(images) == 4
+    for image in images:
+        grey = np.asarray(read_image(image.path)[0], dtype=float)
+        assert len(image.glints) == 2
+        for glint in image.glints:
+            x, y = np.rint(glint.xy_px).astype(int)
+            window = grey[y - 3 : y + 4, x - 3 : x + 4]
+            row, column = np.unravel_index(window.argmax(), window.shape)
+            assert math.hypot(x - 3 + column - glint.xy_px[0], y - 3 + row - glint.xy_px[1]) < 1.0
+        # The rough place of the eye, projected with the camera of the hints, is near the pupil: a typical radius away.
+        rig = {k: np.array(v) for k, v in image.hints["rig"].items()}
+        seen = rig["K"] @ (rig["R"] @ rig["eye_mm"] + rig["t_mm"])
+        low, high = image.hints["radius_px"]
+        assert low < image.pupil.semi_axes_px[1] < image.pupil.semi_axes_px[0] < high
+        assert np.hypot(*(seen[:2] / seen[2] - image.pupil.centre_px)) < 2 * high
+        assert image.visible == 1.0
+        assert 0 < image.factors["gaze_deg"] < 30
+
+
+def test_images_of_two_eyes_and_damaged_folders_are_refused(drawn, tmp_path):
+    (tmp_path / "dataset.json").write_text((drawn / "dataset.json").read_text())
+    (tmp_path / "metadata.jsonl").write_text("{}\n")
+    with pytest.raises(InputError, match="line 1: is no image record"):
+        load_labelled(tmp_path)
+    (tmp_path / "metadata.jsonl").write_text((drawn / "metadata.jsonl").read_text())
+    with pytest.raises(InputError, match="no such file"):
+        load_labelled(tmp_path)
+    (tmp_path / "metadata.jsonl").write_text("")
+    with pytest.raises(InputError, match="holds no images"):
+        load_labelled(tmp_path)

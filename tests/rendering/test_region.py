@@ -1,0 +1,150 @@
+"""The eye region in the picture: what it hides and shades, that labels say so, and that the bare eye stays itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from eyerender.analytic.observer import observe
+from eyerender.capture import make_renderer, render_windows
+from eyerender.region.anatomy import RegionSpec
+from eyerender.rendering.occlusion import glint_reason, visible_arcs_deg
+from eyerender.scene import Scene, SceneSpec
+
+pytestmark = pytest.mark.render
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return make_renderer("auto", 1)
+
+
+def scene(eyes=("right",), poses=((0.0, 0.0),), look=None, region=None, spp=4):
+    return Scene.of(
+        SceneSpec.from_mapping(
+            {
+                "format": 1,
+                "name": "region",
+                "subject": {"eyes": list(eyes), "ipd_mm": 63.0},
+                "rig": {
+                    "cameras": [
+                        {"position_mm": [600, 0, -120], "look_at_mm": [0, 0, 0], "focal_length_px": 4000,
+                         "resolution_px": [640, 320]}
+                    ],
+                    "lights": [{"position_mm": [600, 0, -60], "radius_mm": 2.5, "intensity_mw_sr": 100}],
+                },
+                "poses": [{"azimuth_deg": a, "elevation_deg": e} for a, e in poses],
+                "image": {"spp": spp, "window_px": [200, 160]},
+                **({"look": look} if look else {}),
+                **({"region": region} if region is not None else {}),
+            }
+        )
+    )  # fmt: skip
+
+
+def images(renderer, *args, **kwargs):
+    s = scene(*args, **kwargs)
+    return list(render_windows(s, observe(s), renderer=renderer))
+
+
+def test_the_eye_between_open_lids_is_the_bare_eye(renderer):
+    (bare,) = images(renderer)
+    (whole,) = images(renderer, region={"lashes": {"upper_count": 0, "lower_count": 0}})
+    a, b = bare.rendered.labels, whole.rendered.labels
+    assert np.array_equal(a.amodal, b.amodal)  # as if the eye stood alone
+    seen = b.part > 0
+    assert np.array_equal(b.part[seen], b.amodal[seen])
+    # The pupil and the iris well inside the opening are lit as without lids, which only take light away.
+    clear = ndimage.binary_erosion((b.part == 3) | ((b.part == 2) & (b.amodal == 2)), iterations=5)
+    assert np.count_nonzero(clear) > 1000
+    ratio = whole.irradiance[clear] / bare.irradiance[clear]
+    assert np.median(ratio) == pytest.approx(1.0, abs=2e-3)
+    assert np.percentile(ratio, 99) < 1.01
+    assert whole.labels["pupil_visible_fraction"] == 1.0
+    assert 0.7 < whole.labels["iris_visible_fraction"] < 1.0
+
+
+def test_a_shut_lid_hides_pupil_and_glint_and_says_so(renderer):
+    open_, half, shut = (
+        images(renderer, region={"blink": b, "lashes": {"upper_count": 0}})[0] for b in (0.0, 0.5, 1.0)
+    )
+    shares = [i.labels["pupil_visible_fraction"] for i in (open_, half, shut)]
+    assert shares[0] == 1.0
+    assert 0.0 < shares[1] < 1.0
+    assert shares[2] == 0.0
+    assert [i.labels["glints"][0]["reason"] for i in (open_, shut)] == ["visible", "occluded by lid"]
+    assert not shut.rendered.glints.visible.any()
+    assert open_.rendered.glints.visible.all()
+    assert open_.labels["pupil_visible_arcs_deg"] == [[0.0, 360.0]]
+    assert shut.labels["pupil_visible_arcs_deg"] == []
+    # What is left of a half hidden pupil is its lower part: image y runs down, so angles from 0 to 180.
+    ((start, end),) = half.labels["pupil_visible_arcs_deg"]
+    middle = (start + ((end - start) % 360) / 2) % 360
+    assert abs(middle - 90) < 25
+
+
+def test_left_is_the_mirror_image_of_right(renderer):
+    right, left = images(renderer, ("right", "left"), region={}, look={"iris_contrast": 0.0, "sclera_contrast": 0.0})
+    assert right.rendered.labels.visible_fraction(2) == pytest.approx(
+        left.rendered.labels.visible_fraction(2), abs=0.01
+    )
+    # The rig is symmetric about the middle of the face, so are the pictures, but for the lattice of samples.
+    a, b = right.irradiance, left.irradiance[:, ::-1]
+    shift = min(range(-2, 3), key=lambda k: float(np.abs(a - np.roll(b, k, axis=1))[:, 4:-4].mean()))
+    difference = np.abs(a - np.roll(b, shift, axis=1))[:, 4:-4]
+    assert np.median(difference) < 0.04 * np.median(a)
+
+
+def test_lid_margins_follow_the_blink(renderer):
+    open_, shut = (images(renderer, region={"blink": b})[0].labels["lid_margins_px"] for b in (0.0, 1.0))
+    height = [np.array(m["lower"])[8, 1] - np.array(m["upper"])[8, 1] for m in (open_, shut)]
+    assert height[0] > 8 * 4000 / 612 * 0.8  # about 9 mm at 6.5 px/mm
+    assert abs(height[1]) < 1.0
+
+
+def test_moving_lids_compile_nothing_new(renderer):
+    import drjit as dr
+
+    list(images(renderer, poses=((0, 0), (5, 5)), region={}))
+    before = dr.kernel_history() if dr.flag(dr.JitFlag.KernelHistory) else None
+    del before
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        list(images(renderer, poses=((10, -12), (-14, 8)), region={"blink": 0.3}))
+        missed = [k for k in dr.kernel_history() if k.get("type") == dr.KernelType.JIT and not k["cache_hit"]]
+    assert not missed
+
+
+def test_two_runs_are_the_same(renderer):
+    a, b = (images(renderer, region={})[0] for _ in range(2))
+    assert np.array_equal(a.dn, b.dn)
+    assert a.labels == b.labels
+
+
+def test_reasons_are_told_apart():
+    yes, no = np.array([True, True]), np.array([False, False])
+    energy = np.array([1.0, 1.0])
+    assert glint_reason(energy * 0, yes, [None, None]) == "off the cornea"
+    assert glint_reason(energy, yes, [None, None]) == "visible"
+    assert glint_reason(energy, no, ["lashes", "lashes"]) == "occluded by lash"
+    assert glint_reason(energy, np.array([True, False]), [None, "skin"]) == "partly occluded by lid"
+
+
+def test_arcs_of_a_half_hidden_disc():
+    y, x = np.mgrid[:100, :100]
+    part = np.where(np.hypot(x - 50, y - 50) < 20, 3, 2).astype(np.uint8)
+    part[:50] = 0
+    angle = 2 * np.pi * np.arange(72) / 72
+    points = np.stack([50 + 20 * np.cos(angle), 50 + 20 * np.sin(angle)], axis=1)
+    ((start, end),) = visible_arcs_deg(part, 3, points, (0, 0))
+    # Reaching 1.5 px beyond the edge of what hides it: asin(1.5 / 20), about one step of 5 degrees.
+    assert start > 350 or start <= 5
+    assert 175 <= end <= 190
+
+
+def test_drawn_subjects_are_valid_and_differ():
+    a, b, again = RegionSpec.drawn(1), RegionSpec.drawn(2), RegionSpec.drawn(1)
+    assert a == again
+    assert a != b
+    assert a.digest() == again.digest()
