@@ -76,7 +76,7 @@ def render_windows(
     for row in range(len(observations)):
         side, camera = EYES[index.eye[row]], int(index.camera[row])
         job = render_job(scene, observations, row, eyes[side])
-        done = renderer.render(job, spp=scene.spec.image.spp)
+        done = renderer.render(job, spp=scene.spec.image.spp, moments=moments(scene, observations, row, job))
         labels = done.labels
         assert labels is not None
         yield WindowImage(
@@ -121,10 +121,30 @@ def render_job(scene: Scene, observations: Observations, row: int, eye: Eye | No
         sensor=scene.spec.sensor,
         look=scene.spec.look,
         region=scene.spec.region,
+        lens=scene.spec.lens,
+        ambient=scene.spec.ambient,
         wavelength_nm=scene.spec.wavelength_nm,
         seed=image_seed(scene.spec.seed, int(index.frame[row]), int(index.eye[row])),
         apex_mm=apex,
     )
+
+
+def moments(scene: Scene, observations: Observations, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:
+    """The same window at even moments of the exposure, the eye and the head moving; none where nothing moves."""
+    motion = scene.spec.motion
+    if motion is None:
+        return ()
+    out = []
+    pose = observations.pose
+    for k in range(motion.steps):
+        time_s = ((k + 0.5) / motion.steps - 0.5) * scene.spec.sensor.exposure_ms * 1e-3
+        azimuth = pose.azimuth_rad[row] + np.radians(motion.eye_deg_s[0]) * time_s
+        elevation = pose.elevation_rad[row] + np.radians(motion.eye_deg_s[1]) * time_s
+        M, t = rigid_motion(Poses.listing([azimuth], [elevation]), middle.eye)
+        apex = middle.anchor_mm + np.array(motion.head_mm_s) * time_s
+        seed = int(np.random.SeedSequence([middle.seed, k]).generate_state(1, np.uint64)[0])
+        out.append(replace(middle, M=M[0], t=t[0] + apex, apex_mm=apex, seed=seed, labels=False))
+    return tuple(out)
 
 
 def check_windows(scene: Scene) -> None:

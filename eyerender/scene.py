@@ -22,6 +22,7 @@ from .eye.spec import EyeSpec
 from .observation import EYES, Index
 from .region.anatomy import RegionSpec
 from .region.look import LookSpec
+from .rig.imaging import AmbientSpec, LensSpec, MotionSpec
 from .rig.rig import Rig, RigSpec
 from .rig.sensor import SensorSpec
 from .spec import FileSpec, Positive, Spec, Vec2, Vec3
@@ -98,6 +99,9 @@ class SceneSpec(FileSpec):
     sensor: SensorSpec = SensorSpec()
     look: LookSpec = LookSpec()
     region: RegionSpec | None = None
+    lens: LensSpec = LensSpec()
+    motion: MotionSpec | None = None
+    ambient: AmbientSpec = AmbientSpec()
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
 
     @model_validator(mode="after")

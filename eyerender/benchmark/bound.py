@@ -116,7 +116,9 @@ def _profile(
     start = np.array([dark, light - dark, 0.0, 0.0, 0.0, 0.0])
     fit = least_squares(misfit, start, loss="soft_l1", f_scale=0.1)
     sigma = math.exp(min(float(fit.x[4]), 5.0))
-    return float(fit.x[1]), sigma, part, free & (np.abs(distance - fit.x[5]) > 2.5 * sigma + 1.0)
+    # Not far outside either, where the iris ends.
+    flat = free & (distance < reach) & (np.abs(distance - fit.x[5]) > 2.5 * sigma + 1.0)
+    return float(fit.x[1]), sigma, part, flat
 
 
 def _noise(grey_dn: Floats, free: NDArray[np.bool_], quantum_dn: float) -> float:

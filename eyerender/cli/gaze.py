@@ -43,7 +43,9 @@ def fit(
     records
         Records as `features` or `extract` write them (JSON), or one record a line (JSONL); each with its target_mm.
     estimator
-        Which estimator.
+        Which estimator: regression (polynomials of the pupil-glint vector; one light), homography (normalisation by
+        four lights), cross-ratio (four lights at the screen's corners, one at the camera), hennessey (one camera, two
+        lights), shih-wu-liu (two cameras, two lights), guestrin-eizenman (one camera, two lights).
     output
         The calibration file to write.
     scene

@@ -11,9 +11,11 @@ from .shard import run_versions
 _LABELS = """\
 - `records`: the analytic observer's record: pose, target, apparent pupil (ellipse and boundary points), glints.
 - `labels.pupil`, `labels.iris`: `amodal` ellipse of the outline as if nothing stood before the eye, `visible` ellipse
-  with the second moments of the visible pixels, and the visible share of the amodal pixels.
+  with the second moments of the visible pixels, and the visible share of the amodal pixels; the pupil's
+  `visible_arcs_deg` of its outline.
 - `labels.glints`: for each light the reflection's place by ray optics (`xy_px`), the energy-weighted place in the image
-  (`spot_xy_px`), whether it is visible and which share of the lamp's image is.
+  (`spot_xy_px`), whether it is visible, which share of the lamp's image is, and what hides it (`hidden_by`).
+- `labels.lid_margins_px`: landmarks along the lids, where the scene has lids.
 - `labels.space`: centres of rotation, globe, corneal curvature and pupil, corneal apex, optic axis, line of sight and
   target, in the world's and in the camera's frame (mm; unit vectors).
 - `labels.pose`: x_world = rotation x_eye + translation. `labels.camera`: K, R, t, distortion (OpenCV). `lights_mm`.

@@ -34,6 +34,7 @@ def image_labels(scene: Scene, observations: Observations, image: WindowImage) -
             "amodal": _ellipse_of_record(observations, row),
             "visible": moments_ellipse(part == PUPIL, window),
             "visible_fraction": image.labels["pupil_visible_fraction"],
+            "visible_arcs_deg": image.labels["pupil_visible_arcs_deg"],
         },
         "iris": {
             "amodal": iris_outline(scene, image, camera),
@@ -41,6 +42,7 @@ def image_labels(scene: Scene, observations: Observations, image: WindowImage) -
             "visible_fraction": image.labels["iris_visible_fraction"],
         },
         "glints": _glints(observations, image),
+        "lid_margins_px": image.labels["lid_margins_px"],
         "space": _space(scene, observations, image, camera),
         "globe_radius_mm": float(image.eye.sclera.radius_mm),
         "pose": {"rotation": image.M.tolist(), "translation_mm": image.t.tolist()},
@@ -128,6 +130,7 @@ def _glints(observations: Observations, image: WindowImage) -> list[dict[str, An
     """Each lamp's glint: where ray optics puts its centre, and what of it the camera gets."""
     glints, table, row = observations.glints, image.rendered.glints, image.row
     x0, y0, w, h = image.window
+    hidden = image.labels["glints"]
     out = []
     for k in range(len(table.energy)):
         xy, _ = glints.of_light(k)
@@ -144,6 +147,7 @@ def _glints(observations: Observations, image: WindowImage) -> list[dict[str, An
                 "xy_px": xy[row].tolist() if found else None,
                 "in_window": inside,
                 "visible": bool(table.visible[k]) and inside,
+                "hidden_by": hidden[k]["reason"],
                 "visible_share": float(table.share[k]),
                 "spot_xy_px": table.xy_px[k].tolist() if lit else None,
             }

@@ -28,7 +28,9 @@ from .draws import (
 )
 
 # What makes an identity: drawn once a subject unless the draw says otherwise.
-IDENTITY = ("eye.model", "look", "subject.ipd_mm", "subject.eyes", "eye_parameters")
+IDENTITY = ("eye.model", "look", "region", "subject.ipd_mm", "subject.eyes", "eye_parameters")
+# What of it changes from frame to frame.
+PASSING = ("region.blink",)
 # An eye does not change from frame to frame, whatever the draw says.
 FIXED_IDENTITY = ("eye.model", "eye_parameters")
 _BLOCK = 256
@@ -154,9 +156,9 @@ def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, pr
         shown = _join(prefix, path)
         draw = parse_draw(node, source=source, path=shown)
         bare = path.replace("#", ".")
-        identity = any(bare == p or bare.startswith(p + ".") for p in IDENTITY)
+        identity = _under(bare, IDENTITY) and not _under(bare, PASSING)
         unit: Unit = draw.per or ("subject" if identity else "sample")
-        if unit == "sample" and any(bare == p or bare.startswith(p + ".") for p in FIXED_IDENTITY):
+        if unit == "sample" and _under(bare, FIXED_IDENTITY):
             raise InputError("a subject's eye is drawn once a subject", source=source, path=f"{shown}.per")
         if isinstance(draw, SequenceDraw) and unit == "subject":
             raise InputError("a sequence runs over the frames of a subject", source=source, path=shown)
@@ -174,6 +176,10 @@ def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, pr
     elif isinstance(node, list | tuple):
         for k, value in enumerate(node):
             _collect(value, _join(path, k), draws, source, prefix)
+
+
+def _under(path: str, places: tuple[str, ...]) -> bool:
+    return any(path == place or path.startswith(place + ".") for place in places)
 
 
 def _join(path: str, key: object) -> str:

@@ -26,7 +26,7 @@ class ExtractionSettings(Spec):
         default=0.2, description="smallest share of the pupil's outline that must be seen"
     )
     min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.25, description="pupils less likely than this to be right (IoU > 0.9) are reported as missing"
+        default=0.5, description="pupils less likely than this to be right (IoU > 0.9) are reported as missing"
     )
     max_glints: Annotated[int, Field(ge=0, le=64)] = Field(default=16, description="most glints reported")
     glint_reach: Positive = Field(

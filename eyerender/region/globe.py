@@ -82,7 +82,7 @@ class Globe(ArrayValue):
         """Distance (n,) mm of points (n, 3) from the globe along the line from its centre; negative inside."""
         away = points - self.centre
         distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-9)
-        return distance - self.radial(away / distance[..., None])
+        return np.asarray(distance - self.radial(away / distance[..., None]))
 
     def pushed_out(self, points: Floats, clearance_mm: Floats | float) -> Floats:
         """The points, moved along the line from the globe's centre where they lie nearer to it than `clearance_mm`."""
@@ -90,7 +90,7 @@ class Globe(ArrayValue):
         distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-9)
         direction = away / distance[..., None]
         least = self.radial(direction) + clearance_mm
-        return self.centre + direction * np.maximum(distance, least)[..., None]
+        return np.asarray(self.centre + direction * np.maximum(distance, least)[..., None])
 
     def _mirror(self, vector: Floats) -> Floats:
         return vector * np.array([1.0, -1.0, 1.0]) if self.mirrored else np.asarray(vector)

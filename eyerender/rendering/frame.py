@@ -17,10 +17,11 @@ from ..geometry.surfaces_quadric import Quadric
 from ..region.anatomy import RegionSpec
 from ..region.look import LookSpec
 from ..rig.camera import Camera
+from ..rig.imaging import AmbientSpec, LensSpec
 from ..rig.light import Light
 from ..rig.sensor import SensorSpec
 
-_SENSOR, _LOOK = SensorSpec(), LookSpec()
+_SENSOR, _LOOK, _LENS, _AMBIENT = SensorSpec(), LookSpec(), LensSpec(), AmbientSpec()
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
 
@@ -48,6 +49,8 @@ class RenderJob(ArrayValue):
     purkinje: tuple[int, ...] = (1,)
     apex_mm: Floats | None = None
     region: RegionSpec | None = None
+    lens: LensSpec = _LENS
+    ambient: AmbientSpec = _AMBIENT
 
     @property
     def anchor_mm(self) -> Floats:
@@ -128,6 +131,29 @@ def camera_numbers(camera: Camera, anchor: Floats) -> dict[str, ArrayLike]:
         "camera.principal": (camera.K[0, 2], camera.K[1, 2]),
         "camera.distortion": camera.distortion,
     }
+
+
+def ambient_numbers(ambient: AmbientSpec) -> dict[str, ArrayLike]:
+    """The ambient light's part: irradiance in mW/mm^2."""
+    return {"ambient.irradiance": ambient.irradiance_w_m2 * 1e-3}
+
+
+def panel_table(ambient: AmbientSpec, anchor: Floats) -> Floats:
+    """The panels in the scene's frame, (n, 13): centre, normal to the origin, right, up (over half sizes), radiance.
+
+    A panel faces the origin; its width is level.
+    """
+    rows = []
+    for panel in ambient.panels:
+        centre = np.asarray(panel.centre_mm, dtype=float) - anchor
+        normal = -centre / np.linalg.norm(centre)
+        right = np.cross([0.0, 0.0, 1.0], normal)
+        size = np.linalg.norm(right)
+        right = right / size if size > 1e-9 else np.array([0.0, 1.0, 0.0])
+        up = np.cross(normal, right)
+        w, h = panel.size_mm
+        rows.append([*centre, *normal, *(2 / w * right), *(2 / h * up), panel.radiance_w_m2_sr * 1e-3])
+    return np.reshape(rows, (-1, 13))
 
 
 def light_table(lights: Sequence[Light], M: Floats, t: Floats) -> Floats:

@@ -24,6 +24,7 @@ from .values import Lights, Values
 from .view import EPSILON_MM, Textures, View, iris_albedo, look, outer_albedo
 
 NAME = "eyerender"
+_THROUGH = 0.7  # share of the outer hemisphere that the iris sees, times transmittance; chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +51,29 @@ def shade(
         lambda inner: mi.Float(values["pupil.albedo"]),
     )
     index = values["inner_index"]
+    if values.structure.ambient:
+        # Even light from all sides; through the cornea the iris sees n^2 times its radiance in a smaller cone.
+        outer += values["ambient.irradiance"]
+        inner += values["ambient.irradiance"] * _THROUGH * index * index
     through = view.passed * behind * inner / (index * index)
     seen = dr.select(view.cornea, view.opacity * albedo * outer + (1 - view.opacity) * through, albedo * outer)
     seen += dr.pi * shine * dr.select(view.cornea, view.opacity, 1)
+    if values.structure.ambient:
+        seen += view.mirrored * (1 - view.opacity) * dr.pi * _mirrored_ambient(values, textures.panels, scene, view, d)
     valid = view.cornea | view.sclera | view.other
     return Shaded(dr.select(valid, seen * dr.inv_pi, 0), view, albedo, failures)
+
+
+def _mirrored_ambient(values: Values, panels: Any, scene: Any, view: View, d: Any) -> Any:
+    """Radiance of the ambient light that the front cornea mirrors to the camera."""
+    normal = values.vector_to_scene(view.normal)
+    way = d - 2 * dr.dot(d, normal) * normal
+    start = values.point_to_scene(view.point) + EPSILON_MM * normal
+    seen = values["ambient.irradiance"] * dr.inv_pi + panels.radiance(start, way, view.cornea)
+    if values.structure.obstacles:
+        barred = scene.ray_test(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=view.cornea)
+        seen = dr.select(barred, 0, seen)
+    return dr.select(view.cornea, seen, 0)
 
 
 def onward(values: Values, shaded: Shaded, d: Any, u: Any, v: Any) -> tuple[Any, Any, Any, Any]:

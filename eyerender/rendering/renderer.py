@@ -13,8 +13,19 @@ from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Bools, Floats, frozen
 from ..errors import InputError
-from . import psf, sensor
-from .frame import RenderJob, camera_numbers, eye_numbers, kinds, light_table, look_numbers, pose_numbers
+from ..rig.imaging import AmbientSpec
+from . import imaging, psf, sensor
+from .frame import (
+    RenderJob,
+    ambient_numbers,
+    camera_numbers,
+    eye_numbers,
+    kinds,
+    light_table,
+    look_numbers,
+    panel_table,
+    pose_numbers,
+)
 from .glints import POINT, GlintScene, GlintTable, Image, Spots, glint_table, quadrature
 from .integrator import integrator_class
 from .lighting import lamps
@@ -23,12 +34,13 @@ from .purkinje import purkinje_images
 from .region import RegionScene, blockers, globe_of
 from .sampling import Sampler, camera_ray
 from .surround import Obstacle, Surround
-from .values import Lights, Structure, Values
+from .values import Lights, Panels, Structure, Values
 from .view import Textures, look
 
 if TYPE_CHECKING:
     from .backend import Backend
 
+Glints = tuple[GlintTable, tuple[tuple[int, GlintTable], ...], tuple[str, ...]]
 _LANES = 2**24  # samples in flight; more are rendered in several passes
 BACKGROUND, SCLERA, IRIS, PUPIL = 0, 1, 2, 3
 
@@ -93,21 +105,21 @@ class Renderer:
         self._textures: dict[int, Textures] = {}
         self._regions: dict[Any, RegionScene] = {}
 
-    def render(self, job: RenderJob, *, spp: int | None = None) -> RenderedWindow:
-        """Render one window."""
-        values, lights = self._bind(job)
-        pad = psf.margin(job.sensor.psf_sigma_px)
-        x0, y0, width, height = job.window
-        radiance, failed = self._radiance(
-            self._place(job).scene,
-            values,
-            lights,
-            (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad),
-            spp or self.spp,
-            job.seed,
-        )
-        blurred = psf.blur(radiance, job.sensor.psf_sigma_px).copy()
-        glints, others, reasons = self._add_glints(job, blurred)
+    def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()) -> RenderedWindow:
+        """Render one window.
+
+        `moments` are the same window at moments of the exposure: their mean is the picture, with the samples shared
+        among them; labels, glints and margins are those of `job`, the middle of the exposure.
+        """
+        shots = moments or (job,)
+        pictures, failed = [], 0
+        for shot in shots:
+            picture, table, misses = self._picture(shot, max(1, (spp or self.spp) // len(shots)))
+            pictures.append(picture)
+            failed += misses
+        blurred = np.mean(pictures, axis=0) * imaging.vignette(job.lens, job.camera, job.window)
+        glints, others, reasons = self._add_glints(job, np.zeros_like(blurred)) if moments else table
+        values, _ = self._bind(job)
         place = self._place(job)
         margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
         irradiance = blurred * sensor.radiance_to_irradiance(job.sensor)
@@ -125,6 +137,28 @@ class Renderer:
             reasons,
             margins,
         )
+
+    def _picture(self, job: RenderJob, spp: int) -> tuple[Floats, Glints, int]:
+        """Radiance of a window behind the lens, glints included; the glints; failed light paths."""
+        values, lights = self._bind(job)
+        depth = float(job.camera.R[2] @ (job.anchor_mm - job.camera.nodal_point_mm))
+        kernel = imaging.disc(imaging.confusion_px(job.lens, job.camera, job.sensor, depth))
+        x0, y0, width, height = job.window
+        reach = kernel.shape[0] // 2
+        sharp = replace(job, window=(x0 - reach, y0 - reach, width + 2 * reach, height + 2 * reach))
+        pad = psf.margin(job.sensor.psf_sigma_px)
+        x0, y0, width, height = sharp.window
+        radiance, failed = self._radiance(
+            self._place(job).scene,
+            values,
+            lights,
+            (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad),
+            spp,
+            job.seed,
+        )
+        blurred = psf.blur(radiance, job.sensor.psf_sigma_px).copy()
+        glints = self._add_glints(sharp, blurred)
+        return imaging.defocused(blurred, kernel), glints, failed
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
         """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), before lens and glints."""
@@ -152,7 +186,11 @@ class Renderer:
     def _bind(self, job: RenderJob) -> tuple[Values, Lights]:
         place = self._place(job)
         structure = Structure(
-            kinds(job.eye), bool(np.any(job.camera.distortion)), place.obstructed, isinstance(place, RegionScene)
+            kinds(job.eye),
+            bool(np.any(job.camera.distortion)),
+            place.obstructed,
+            isinstance(place, RegionScene),
+            job.ambient != AmbientSpec(),
         )
         anchor = job.anchor_mm
         numbers = {
@@ -160,11 +198,14 @@ class Renderer:
             **look_numbers(job.look),
             **pose_numbers(job.M, job.t, anchor),
             **camera_numbers(job.camera, anchor),
+            **ambient_numbers(job.ambient),
             "region.mirror": place.mirror if isinstance(place, RegionScene) else 1.0,
         }
         values = Values(structure, structure.pack(numbers))
         lights = Lights(light_table(job.lights, job.M, job.t))
         textures = self._textures_of(job)
+        if structure.ambient:
+            textures = replace(textures, panels=Panels(panel_table(job.ambient, anchor)))
         if isinstance(place, RegionScene):
             textures = replace(textures, region=place.map)
         else:
@@ -246,9 +287,7 @@ class Renderer:
             frozen(depth.numpy().reshape(shape), np.float32),
         )
 
-    def _add_glints(
-        self, job: RenderJob, image: Floats
-    ) -> tuple[GlintTable, tuple[tuple[int, GlintTable], ...], tuple[str, ...]]:
+    def _add_glints(self, job: RenderJob, image: Floats) -> Glints:
         """Add the lamps' mirror images to the blurred picture: the glints' table, those of further orders, and why each
         glint is seen or not."""
         eye, anchor, sigma = job.eye, job.anchor_mm, job.sensor.psf_sigma_px

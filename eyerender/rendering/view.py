@@ -51,6 +51,7 @@ class Textures:
     iris: Any
     sclera: Any
     region: Any = None
+    panels: Any = None
 
     @classmethod
     def of_seed(cls, seed: int) -> Textures:

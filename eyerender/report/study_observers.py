@@ -14,7 +14,7 @@ _STYLES = (("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"
 def distances_figure(panels: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
     """Median distances (px) by eye model: feature -> series -> eye model -> px."""
     models = list(dict.fromkeys(m for by in panels.values() for values in by.values() for m in values))
-    with figure(max(5.4, 3.5 * len(panels)), 3.7, len(panels)) as (fig, axes):
+    with figure(_width(panels), 3.9, len(panels)) as (fig, axes):
         for k, (ax, (name, by)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
             for i, (label, values) in enumerate(by.items()):
                 marker, colour = _STYLES[i % len(_STYLES)]
@@ -27,14 +27,14 @@ def distances_figure(panels: Mapping[str, Mapping[str, Mapping[str, float]]]) ->
             ax.grid(axis="x", visible=False)
             ax.set(title=name, ylabel="median distance (px)" if k == 0 else "", xlabel="eye model")
         handles, labels = np.atleast_1d(axes)[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False)
+        fig.legend(handles, labels, loc="outside upper center", ncols=4 if len(panels) > 2 else 2, frameon=False)
         return svg(fig)
 
 
 def differences_figure(panels: Mapping[str, Mapping[str, Mapping[str, tuple[float, float, float]]]]) -> str:
     """Paired differences (deg) with their interval: estimator -> series -> eye model -> (mean, low, high)."""
     models = list(dict.fromkeys(m for by in panels.values() for values in by.values() for m in values))
-    with figure(max(5.4, 3.3 * len(panels)), 3.7, len(panels)) as (fig, axes):
+    with figure(_width(panels), 3.9, len(panels)) as (fig, axes):
         for k, (ax, (name, by)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
             ax.axhline(0, color="#444444", lw=0.8)
             for i, (label, values) in enumerate(by.items()):
@@ -50,8 +50,13 @@ def differences_figure(panels: Mapping[str, Mapping[str, Mapping[str, tuple[floa
             ax.grid(axis="x", visible=False)
             ax.set(title=name, ylabel="difference of the gaze error (deg)" if k == 0 else "", xlabel="eye model")
         handles, labels = np.atleast_1d(axes)[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False)
+        fig.legend(handles, labels, loc="outside upper center", ncols=4 if len(panels) > 2 else 2, frameon=False)
         return svg(fig)
+
+
+def _width(panels: Mapping[str, object]) -> float:
+    """Inches."""
+    return max(5.4, min(4.4 * len(panels), 13.0))
 
 
 def _shift(i: int, n: int) -> float:

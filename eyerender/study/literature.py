@@ -14,6 +14,8 @@ import numpy as np
 from ..arrays import Floats
 
 MODELS: Final = ("E1", "E2", "E3", "E4", "E5")
+# What the authors' software made of E5.
+VARIANTS: Final = ("E5-published", "E5-published-stop")
 SPHERICAL: Final = ("E1", "E3")
 CONIC: Final = ("E2", "E4")
 

@@ -113,7 +113,7 @@ def _gaze_table(gaze: Sequence[GazeDifference]) -> Table:
         "95 % interval",
     )  # fmt: skip
     caption = "Gaze errors: paired differences, image minus analytic"
-    return Table(header, rows, caption, folded=len(rows) > 30)
+    return Table(header, rows, caption, folded=len(rows) > 20)
 
 
 def _micrometres(value: float | None) -> str:
@@ -121,17 +121,34 @@ def _micrometres(value: float | None) -> str:
 
 
 def findings_section(found: Sequence[Finding]) -> Section:
-    """Every finding, with its value beside its threshold."""
+    """Every finding, with its value beside its threshold; one row a statement where several observers tested it."""
+    told = {True: "true", False: "false", None: ""}
     rows = [
         (
-            f.id, {True: "true", False: "false", None: "-"}[f.verdict], f.rule,
-            "-" if f.value is None else f"{f.value:.4g}", f.threshold, f.protocol, f.observer, f.detail,
+            f.id, told[f.verdict] or "-", f.rule, "-" if f.value is None else f"{f.value:.4g}", f.threshold,
+            f.protocol, f.observer, f.detail,
         )
         for f in found
     ]  # fmt: skip
     header = ("id", "verdict", "statement: value", "value", "threshold", "protocol", "observer", "detail")
-    text = ("Each statement tested on this run's own data; the value stands beside its threshold.",)
-    return Section("Findings", text, (), [Table(header, rows, wide=(2, 5, 7))])
+    text = "Each statement tested on this run's own data; the value stands beside its threshold."
+    keys = list(dict.fromkeys((f.protocol, f.observer) for f in found))
+    if len(keys) < 3:
+        return Section("Findings", (text,), (), [Table(header, rows, wide=(2, 5, 7))])
+    by = {(f.id, f.rule, f.threshold, f.protocol, f.observer): f for f in found}
+    table = []
+    for statement in dict.fromkeys((f.id, f.rule, f.threshold) for f in found):
+        cells = []
+        for key in keys:
+            f = by.get((*statement, *key))
+            cells.append("" if f is None or f.value is None else f"{told[f.verdict]} {f.value:.3g}".strip())
+        table.append((*statement, *cells))
+    columns = ("id", "statement: value", "threshold", *(", ".join(key) for key in keys))
+    tables = [
+        Table(columns, table, wide=(1,)),
+        Table(header, rows, "Every finding with its details", wide=(2, 5, 7), folded=True),
+    ]
+    return Section("Findings", (text,), (), tables)
 
 
 def waterfall_section(

@@ -38,12 +38,13 @@ def guestrin_page(
     own = {label: means for label, means in shown.items() if means}
     measured = {h: lit.guestrin_deg(h) for h in guestrin.HEADS}
     interval = {h: _interval(v) for h, v in measured.items()}
-    cards = []
-    for (protocol, observer), label in zip(keys, shown, strict=True):
-        means = {p.eye_model: p.means[protocol, observer] for p in parts if (protocol, observer) in p.means}
-        listed: list[str] = [m for m in lit.MODELS if m in means] or list(means)
-        text = " ".join(f"{m}\u00a0{means[m]['H1']:.2f}/{means[m]['H2']:.2f}" for m in listed)
-        cards.append(Card(text, f"mean error at H1/H2 in degrees, {label}"))
+    by_key = {key: {p.eye_model: p.means[key] for p in parts if key in p.means} for key in keys}
+    cells = {
+        # The published variants of E5 are in the section's text and table.
+        key: {m: f"{v['H1']:.2f}/{v['H2']:.2f}" for m, v in means.items() if m not in lit.VARIANTS or len(means) == 1}
+        for key, means in by_key.items()
+    }
+    cards, overview = _overview(cells, "mean error at H1/H2 in degrees")
     sections = [
         Section(
             "Errors at both head positions",
@@ -66,7 +67,7 @@ def guestrin_page(
                 if own
                 else ()
             ),
-            [_guestrin_table(parts)],
+            [*overview, _guestrin_table(parts)],
         ),
         Section(
             "Tests against the experiment",
@@ -92,6 +93,8 @@ def guestrin_page(
                         )
                         for t in tests
                     ],
+                    "Every test" if len(tests) > 24 else "",
+                    folded=len(tests) > 24,
                 )
             ],
         ),
@@ -134,13 +137,11 @@ def blignaut_page(
         }
         for protocol, observer in keys
     }
-    cards = [
-        Card(
-            " ".join(f"{m}\u00a0{v[0]:.2f}/{v[1]:.2f}/{v[-1]:.3f}" for m, v in by_model.items()),
-            f"error of the best function with C5/C9/C135 in degrees, {label}",
-        )
-        for label, by_model in best.items()
-    ]
+    cells = {
+        key: {m: f"{v[0]:.2f}/{v[1]:.2f}/{v[-1]:.3f}" for m, v in by_model.items()}
+        for key, by_model in zip(keys, best.values(), strict=True)
+    }
+    cards, overview = _overview(cells, "error of the best function with C5/C9/C135 in degrees")
     observers = list(dict.fromkeys(key for part in parts for key in part.clouds))
     # One reading of the scene is enough to show the clouds; the corrected one where there is a choice.
     cloud_keys = [k for k in observers if k[0] == "corrected"] or observers
@@ -169,7 +170,7 @@ def blignaut_page(
                     "the experiment.",
                 )
             ],
-            [_best_table(parts, sets)],
+            [*overview, _best_table(parts, sets)],
         ),
         *observers_section(apart, ("R2 on C5", "R4 on C9", "R8 on C14", "R8 on C135")),
         findings_section(found),
@@ -188,10 +189,22 @@ def blignaut_page(
     return Page("Blignaut (2014), replicated", lead, cards, sections)
 
 
+def _overview(cells: dict[tuple[str, str], dict[str, str]], what: str) -> tuple[list[Card], list[Table]]:
+    """What the page says first, by (protocol, observer) and eye model: a card each, of more than four a table."""
+    if len(cells) <= 4:
+        return [
+            Card(" ".join(f"{m}\u00a0{v}" for m, v in by_model.items()), f"{what}, {', '.join(key)}")
+            for key, by_model in cells.items()
+        ], []
+    models = list(dict.fromkeys(m for by_model in cells.values() for m in by_model))
+    rows = [(*key, *(by_model.get(m, "-") for m in models)) for key, by_model in cells.items()]
+    return [], [Table(("protocol", "observer", *models), rows, what[0].upper() + what[1:])]
+
+
 def _about_e5(parts: Sequence[GuestrinPart]) -> list[str]:
     """What becomes of the paper's 'errors exceeding 11 deg'."""
-    means = {p.eye_model: p.means.get(("published", "analytic")) for p in parts}
-    told = {m: f"{v['H1']:.2f}/{v['H2']:.2f} deg" for m, v in means.items() if v and m.startswith("E5")}
+    means = {p.eye_model: p.means["published", "analytic"] for p in parts if ("published", "analytic") in p.means}
+    told = {m: f"{v['H1']:.2f}/{v['H2']:.2f} deg" for m, v in means.items() if m.startswith("E5")}
     if not {"E5", "E5-published", "E5-published-stop"} <= set(told):
         return []
     return [
@@ -279,7 +292,7 @@ def _best_table(parts: Sequence[BlignautPart], sets: Sequence[str]) -> Table:
             rows.append((protocol, observer, variant, part.eye_model, *cells))
     rows.append(("experiment", "", "", "people", *("{} {:.2f}".format(*lit.blignaut_best(c)) for c in sets)))
     header = ("protocol", "observer", "variant", "eye model", *sets)
-    return Table(header, rows, "Best function and its mean error (deg).")
+    return Table(header, rows, "Best function and its mean error (deg)", folded=len(rows) > 20)
 
 
 def _function_tables(parts: Sequence[BlignautPart], sets: Sequence[str]) -> list[Table]:

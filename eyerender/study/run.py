@@ -31,7 +31,7 @@ from . import (
 )
 from .conditions import conditions_part
 from .head_mounted import HeadMountedPart, head_mounted_part
-from .literature import MODELS
+from .literature import MODELS, VARIANTS
 from .observing import ImageSettings, Kind, Observing
 from .page_parts import Apart
 from .replicate import BlignautPart, GuestrinPart, blignaut_part, guestrin_part
@@ -39,7 +39,6 @@ from .results import Finding, Row, write_results, write_text
 
 Progress = Callable[[int, int, str], None]
 STUDIES = ("guestrin2006", "blignaut2014", "observers", "conditions")
-VARIANTS = ("E5-published", "E5-published-stop")
 RUN_SCHEMA = "eyerender/study/1"
 MARKER, REPORT = "study.json", "report.html"
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from eyerender.benchmark import names, resolve
 from eyerender.benchmark.pupil_labs import eight_bits, pupil_of
-from eyerender.benchmark.registry import defaults
+from eyerender.benchmark.registry import defaults, names, resolve
 from eyerender.benchmark.shipped import PUPIL_LABS_PYTHON, pupil_labs_python
 from eyerender.cli.app import run
 from eyerender.errors import InputError
@@ -165,3 +167,19 @@ def test_pupil_detectors_in_its_own_environment(drawn, tmp_path):
     # Wrong axes, angle or origin would show as errors of half a pixel and more.
     assert entry["summary"]["centre_px"]["median"] < 0.2
     assert entry["summary"]["boundary_px"]["median"] < 0.4
+
+
+def test_the_set_up_script_refuses_what_it_does_not_know(tmp_path):
+    script = Path(__file__).parents[2] / "scripts" / "setup_pupil_detectors.sh"
+    env = {"PATH": os.environ["PATH"], "XDG_CACHE_HOME": str(tmp_path)}
+    wrong = subprocess.run([script, "--farce"], env=env, capture_output=True, text=True)
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert "usage:" in wrong.stderr
+    # A Python that cannot make an environment leaves nothing that looks like one.
+    broken = tmp_path / "python"
+    broken.write_text('#!/bin/sh\n[ "$2" = pip ] && exit 0\nexit 1\n')
+    broken.chmod(0o755)
+    failed = subprocess.run([script], env={**env, "EYERENDER_PYTHON": str(broken)}, capture_output=True, text=True)
+    assert failed.returncode == 1
+    assert "cannot make an environment" in failed.stderr
+    assert not (tmp_path / "eyerender" / "pupil-detectors").exists()

@@ -199,7 +199,8 @@ def test_a_rendered_folder_s_labels_and_hints_are_in_image_coordinates(rendered)
             x, y = np.rint(glint.xy_px).astype(int)
             window = grey[y - 3 : y + 4, x - 3 : x + 4]
             row, column = np.unravel_index(window.argmax(), window.shape)
-            assert math.hypot(x - 3 + column - glint.xy_px[0], y - 3 + row - glint.xy_px[1]) < 1.0
+            # Clipped spots are flat; a wrong window would be off by hundreds of pixels.
+            assert math.hypot(x - 3 + column - glint.xy_px[0], y - 3 + row - glint.xy_px[1]) < 2.0
         # The rough place of the eye, projected with the camera of the hints, is near the pupil: a typical radius away.
         rig = {k: np.array(v) for k, v in image.hints["rig"].items()}
         seen = rig["K"] @ (rig["R"] @ rig["eye_mm"] + rig["t_mm"])

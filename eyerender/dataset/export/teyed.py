@@ -2,9 +2,10 @@
 
     NAME.mp4pupil_eli.txt, iris_eli.txt           FRAME;ANGLE;CENTER X;CENTER Y;WIDTH;HEIGHT;   degrees, full axes
     NAME.mp4pupil_lm_2D.txt, iris_lm_2D.txt       FRAME;AVG INACCURACY;X;Y;...;                 eight boundary points
+    NAME.mp4lid_lm_2D.txt                         the same, 17 points of the upper, then 17 of the lower lid's margin
     NAME.mp4gaze_vec.txt                          FRAME;X;Y;Z;       from the rotation centre to the pupil's, camera
     NAME.mp4eye_ball.txt                          FRAME;RADIUS;X;Y;Z;                           px, px, px, mm
-    NAME.mp4validity_pupil.txt, validity_iris.txt FRAME;VALIDITY;
+    NAME.mp4validity_pupil.txt, iris, lid         FRAME;VALIDITY;
     NAME.mp4pupil_seg_2D.mp4, iris_seg_2D.mp4     white where visible
 
 Frames count from 1, -1 stands where there is nothing. Fuhl, Kasneci and Kasneci (2021), "TEyeD". The videos hold PNG
@@ -27,15 +28,18 @@ from .mp4 import PngVideo
 _POINTS = 8
 _ELLIPSE = ("ANGLE", "CENTER X", "CENTER Y", "WIDTH", "HEIGHT")
 _LANDMARKS = ("AVG INACCURACY", *(f"LM{k} {axis}" for k in range(1, _POINTS + 1) for axis in "XY"))
+_LID_POINTS = 34
 _COLUMNS: dict[str, tuple[str, ...]] = {
     "pupil_eli": _ELLIPSE,
     "iris_eli": _ELLIPSE,
     "pupil_lm_2D": _LANDMARKS,
     "iris_lm_2D": _LANDMARKS,
+    "lid_lm_2D": ("AVG INACCURACY", *(f"LM{k} {axis}" for k in range(1, _LID_POINTS + 1) for axis in "XY")),
     "gaze_vec": ("X", "Y", "Z"),
     "eye_ball": ("RADIUS", "X", "Y", "Z"),
     "validity_pupil": ("VALIDITY",),
     "validity_iris": ("VALIDITY",),
+    "validity_lid": ("VALIDITY",),
 }
 
 
@@ -93,6 +97,12 @@ def rows_of(item: Item) -> dict[str, list[float]]:
         "gaze_vec": gaze.tolist(),
         "eye_ball": [radius, *item.pixel_of(globe).tolist(), float(globe[2])],
     }
+    lids = item.line["labels"]["lid_margins_px"]
+    points = np.array(lids["upper"] + lids["lower"], dtype=float) if lids else np.zeros((0, 2))
+    found = points.shape == (_LID_POINTS, 2)
+    places = (points - item.entry.window[:2]).ravel().tolist()
+    rows["lid_lm_2D"] = [0.0, *places] if found else [-1] * (1 + 2 * _LID_POINTS)
+    rows["validity_lid"] = [1 if found else -1]
     for part in ("pupil", "iris"):
         seen = item.visible(part)
         ellipse = item.ellipse(part) if seen else None

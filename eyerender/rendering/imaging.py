@@ -1,0 +1,65 @@
+"""Defocus and vignetting, applied to the finished picture, glints included.
+
+Defocus is one kernel for a window, that of the depth z of the unrotated eye's apex: the thin lens' circle of confusion,
+
+    c = (f / N) |z - s| / z * f / (s - f),
+
+f the focal length, N the f-number, s the distance in focus (Born & Wolf, section 6.1), a disc integrated over the
+pixels. A symmetric kernel leaves every centroid where it is, so labels need no change. Vignetting multiplies by
+1 - v (r / r_corner)^2.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import signal
+
+from ..arrays import Floats
+from ..rig.camera import Camera
+from ..rig.imaging import LensSpec
+from ..rig.sensor import SensorSpec
+
+_FINE = 9
+
+
+def confusion_px(lens: LensSpec, camera: Camera, sensor: SensorSpec, depth_mm: float) -> float:
+    """Diameter (px) of the circle of confusion of a point at a depth along the axis."""
+    if lens.focus_mm is None:
+        return 0.0
+    pitch_mm = sensor.pixel_pitch_um * 1e-3
+    focal_mm = float(camera.K[0, 0]) * pitch_mm
+    if lens.focus_mm <= focal_mm or depth_mm <= focal_mm:
+        return 0.0
+    blur = focal_mm / sensor.f_number * abs(depth_mm - lens.focus_mm) / depth_mm * focal_mm / (lens.focus_mm - focal_mm)
+    return float(blur / pitch_mm)
+
+
+def disc(diameter_px: float) -> Floats:
+    """The disc's share of each pixel, odd and square, sum 1; a single 1 where it is smaller than a tenth of a pixel."""
+    if diameter_px < 0.1:
+        return np.ones((1, 1))
+    reach = int(np.ceil(diameter_px / 2 - 0.5 + 1e-9))
+    n = (2 * reach + 1) * _FINE
+    at = (np.arange(n) + 0.5) / _FINE - (2 * reach + 1) / 2
+    inside = np.hypot(at[:, None], at[None, :]) <= diameter_px / 2
+    share = inside.reshape(2 * reach + 1, _FINE, 2 * reach + 1, _FINE).sum(axis=(1, 3)).astype(float)
+    return np.asarray(share / share.sum())
+
+
+def defocused(picture: Floats, kernel: Floats) -> Floats:
+    """The picture convolved with an odd kernel, smaller by its reach on every side."""
+    if kernel.shape == (1, 1):
+        return picture
+    return np.asarray(np.maximum(signal.fftconvolve(picture, kernel, mode="valid"), 0.0))
+
+
+def vignette(lens: LensSpec, camera: Camera, window: tuple[int, int, int, int]) -> Floats | float:
+    """What of the light is left at each pixel of a window."""
+    if lens.vignetting == 0:
+        return 1.0
+    x0, y0, width, height = window
+    cx, cy = camera.K[0, 2], camera.K[1, 2]
+    w, h = camera.resolution_px
+    corner = max(np.hypot(x - cx, y - cy) for x in (0, w - 1) for y in (0, h - 1))
+    x, y = np.arange(x0, x0 + width) - cx, np.arange(y0, y0 + height) - cy
+    return np.asarray(np.maximum(1 - lens.vignetting * (x[None, :] ** 2 + y[:, None] ** 2) / corner**2, 0.0))

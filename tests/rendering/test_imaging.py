@@ -1,0 +1,131 @@
+"""Defocus, vignetting, motion and ambient light: each against its own law; none of them moves a label."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from eyerender.analytic.observer import observe
+from eyerender.capture import make_renderer, render_windows
+from eyerender.rendering.imaging import confusion_px, defocused, disc, vignette
+from eyerender.rig.imaging import LensSpec
+from eyerender.rig.sensor import SensorSpec
+from eyerender.scene import Scene, SceneSpec
+
+pytestmark = pytest.mark.render
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return make_renderer("auto", 1)
+
+
+def shot(renderer, **more):
+    scene = Scene.of(
+        SceneSpec.from_mapping(
+            {
+                "format": 1,
+                "name": "imaging",
+                "subject": {"eyes": ["right"], "ipd_mm": 0.001},
+                "rig": {
+                    "cameras": [
+                        {"position_mm": [600, 0, 0], "look_at_mm": [0, 0, 0], "focal_length_px": 5000,
+                         "resolution_px": [640, 480]}
+                    ],
+                    "lights": [{"position_mm": [600, 100, 0], "radius_mm": 0, "intensity_mw_sr": 100}],
+                },
+                "poses": [{"azimuth_deg": 0, "elevation_deg": 0}],
+                "image": {"spp": 8, "window_px": [160, 160]},
+                "sensor": {"noise": False, "pixel_pitch_um": 5.0, "f_number": 4.0},
+                **more,
+            }
+        )
+    )  # fmt: skip
+    (image,) = render_windows(scene, observe(scene), renderer=renderer)
+    return image
+
+
+@pytest.mark.parametrize("diameter", [0.5, 1.0, 2.7, 6.0, 11.3])
+def test_the_disc_is_even_and_centred(diameter):
+    kernel = disc(diameter)
+    assert kernel.sum() == pytest.approx(1, abs=1e-12)
+    assert np.array_equal(kernel, kernel[::-1, ::-1])
+    n = np.arange(len(kernel)) - len(kernel) // 2
+    variance = float(np.sum(kernel * n[:, None] ** 2))
+    # A disc's variance along an axis is d^2 / 16; the pixel's own, 1/12, comes on top for all but the smallest.
+    if diameter > 2:
+        assert variance == pytest.approx(diameter**2 / 16 + 1 / 12, rel=0.02)
+
+
+def test_the_circle_of_confusion_follows_similar_triangles():
+    from eyerender.rig.camera import CameraSpec
+
+    camera = CameraSpec.from_mapping(
+        {"position_mm": [600, 0, 0], "look_at_mm": [0, 0, 0], "focal_length_px": 5000, "resolution_px": [640, 480]}
+    ).build()
+    sensor = SensorSpec(f_number=4.0, pixel_pitch_um=5.0)
+    focal, aperture, s, z = 25.0, 25.0 / 4, 650.0, 600.0
+    # The image of the plane in focus, and of the point, behind the lens: a cone from the aperture to the point's image.
+    image_s, image_z = 1 / (1 / focal - 1 / s), 1 / (1 / focal - 1 / z)
+    expected = aperture * abs(image_z - image_s) / image_z / 5e-3
+    assert confusion_px(LensSpec(focus_mm=s), camera, sensor, z) == pytest.approx(expected, rel=1e-9)
+    assert confusion_px(LensSpec(focus_mm=z), camera, sensor, z) == 0
+    corner = vignette(LensSpec(vignetting=0.4), camera, (0, 0, 640, 480))
+    assert corner[0, 0] == pytest.approx(0.6, abs=1e-9)
+    assert corner[239:241, 319:321].min() > 0.9999
+
+
+def test_defocus_keeps_energy_and_centroids(renderer):
+    sharp, soft = shot(renderer), shot(renderer, lens={"focus_mm": 660})
+    assert soft.irradiance.max() < 0.7 * sharp.irradiance.max()
+    assert soft.irradiance[30:-30, 30:-30].mean() == pytest.approx(sharp.irradiance[30:-30, 30:-30].mean(), rel=5e-3)
+    assert np.array_equal(sharp.mask, soft.mask)
+    spot = np.zeros((81, 81))
+    spot[40, 40], spot[40, 41] = 0.3, 0.7
+    out = defocused(spot, disc(7.3))
+    x = np.arange(out.shape[1]) + (81 - out.shape[1]) // 2
+    assert np.sum(out * x) / out.sum() == pytest.approx(40.7, abs=1e-9)
+
+
+def test_a_moving_head_smears_the_glint_about_its_place(renderer):
+    still = shot(renderer)
+    moved = shot(renderer, motion={"head_mm_s": [0, 100, 0], "steps": 16})  # 1.5 mm in 15 ms: 12.5 px
+    level = still.irradiance[:20].max() * 3
+
+    def spread(image):
+        y, x = np.nonzero(image.irradiance > level)
+        w = image.irradiance[y, x]
+        mean = np.sum(w * x) / w.sum()
+        return mean, np.sqrt(np.sum(w * (x - mean) ** 2) / w.sum())
+
+    (a, narrow), (b, wide) = spread(still), spread(moved)
+    assert b == pytest.approx(a, abs=0.3)
+    # Even over 12.5 px: 12.5 / sqrt(12) = 3.6 px.
+    assert wide == pytest.approx(12.5 / np.sqrt(12), abs=0.5)
+    assert narrow < 1.5
+    assert np.array_equal(still.mask, moved.mask)
+
+
+def test_a_panel_is_mirrored_where_a_lamp_at_its_middle_is(renderer):
+    plain = shot(renderer)
+    lit = shot(
+        renderer, ambient={"panels": [{"centre_mm": [600, 100, 0], "size_mm": [60, 30], "radiance_w_m2_sr": 500}]}
+    )
+    extra = lit.irradiance - plain.irradiance
+    y, x = np.mgrid[: extra.shape[0], : extra.shape[1]]
+    there = extra > 0.5 * extra.max()
+    xy = lit.rendered.glints.xy_px[0] - lit.window[:2]
+    assert np.allclose([x[there].mean(), y[there].mean()], xy, atol=0.5)
+    width, height = np.ptp(x[there]) + 1, np.ptp(y[there]) + 1
+    # A convex mirror of focal length R/2: the image of w at distance d is w (R/2) / d, here 60 mm at about 608 mm.
+    scale = 7.8 / 2 / 608 * 5000 / 603
+    assert width == pytest.approx(60 * scale, abs=1.1)
+    assert height == pytest.approx(30 * scale, abs=1.1)
+
+
+def test_even_light_adds_its_share_everywhere(renderer):
+    dark, bright = shot(renderer), shot(renderer, ambient={"irradiance_w_m2": 50.0})
+    extra = bright.irradiance - dark.irradiance
+    assert extra.min() > 0
+    # The sclera mirrors nothing: its gain over its albedo is the surround's over its own.
+    assert np.median(extra[dark.mask == 3]) < 0.3 * np.median(extra[dark.mask == 2])
