@@ -42,7 +42,7 @@ def draw(image, origin, white, truth, found, row, crop, path):
         )
         ax.plot(*seen.pupil.centre_px[row], marker, color=colour, ms=9, mew=1.5)
         xy = seen.glints.xy_px[row][seen.glints.ok[row]]
-        ax.plot(*xy.T, marker, color=colour, ms=13, mew=1.5, ls="none")
+        ax.plot(*xy.T, marker, color=colour, ms=9, mew=1.3, ls="none")
     at = 0.03
     for name, colour in (("analytic", ANALYTIC_ON_DARK), ("from the image", IMAGE_ON_DARK)):
         ax.text(at, 0.04, name, color=colour, transform=ax.transAxes, fontsize=13, weight="bold")
@@ -66,5 +66,5 @@ def picture(scene, fixation, eye, crop, white, path):
 if __name__ == "__main__":
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
     out.mkdir(parents=True, exist_ok=True)
-    picture(er.load_scene("head_mounted", spp=64), 4, 0, (420, 315), 1.0, out / "head_mounted.png")
-    picture(er.load_scene("quickstart", spp=64), 4, 0, (112, 84), 0.7, out / "remote.png")
+    picture(er.load_scene("headset", spp=64), 4, 0, (560, 420), 0.65, out / "head_mounted.png")
+    picture(er.load_scene("desktop_tracker", spp=64), 4, 0, (232, 174), 0.9, out / "remote.png")

@@ -1,7 +1,8 @@
 """What all tests share.
 
-The backend is chosen before any test module is imported: Dr.Jit loads a libLLVM when mitsuba is first imported, and keeps
-it. Without a backend the tests that render are skipped on a developer's machine and fail in continuous integration.
+The backend is chosen before any test module is imported: Dr.Jit loads a libLLVM when mitsuba is first imported, and
+keeps it. Without a backend the tests that render are skipped on a developer's machine and fail in continuous
+integration.
 """
 
 from __future__ import annotations

@@ -16,7 +16,16 @@ def quickstart():
 
 
 def test_shipped_scenes_load_and_come_back_from_their_own_yaml(tmp_path):
-    assert sorted(shipped_scenes()) == ["blignaut2014", "guestrin2006", "head_mounted", "quickstart"]
+    assert sorted(shipped_scenes()) == [
+        "blignaut2014",
+        "desktop_tracker",
+        "guestrin2006",
+        "head_mounted",
+        "headset",
+        "quickstart",
+        "stress",
+        "webcam",
+    ]
     for path in shipped_scenes().values():
         spec = SceneSpec.load(path)
         spec.dump(tmp_path / "copy.yaml")
@@ -104,7 +113,7 @@ def test_numbers_written_as_1e_3_are_numbers(tmp_path):
 
 
 def test_unknown_scene_names_the_shipped_ones():
-    with pytest.raises(InputError, match=r"nonsense: no such scene file; shipped scenes: blignaut2014, guestrin2006"):
+    with pytest.raises(InputError, match=r"nonsense: no such scene file; shipped scenes: blignaut2014, desktop"):
         load_scene("nonsense")
 
 

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from ..errors import InputError
 from .app import app
-from .output import Json, emit, progress, say
+from .output import Json, emit, progress
 
 
 @app.command(name="bench-extractors")
@@ -54,9 +54,7 @@ def bench_extractors(
     if extractor:
         chosen = [resolve(given) for given in extractor]
     else:
-        chosen, absent = defaults()
-        for name, reason in absent.items():
-            say(f"{name}: {reason}")
+        chosen, absent = defaults()  # what is absent stands in the result, with the reason
     with progress("benching") as steps:
         data = bench_extractors(
             folder, output, chosen, timeout_s=timeout, overwrite=overwrite, absent=absent, progress=steps

@@ -63,7 +63,8 @@ def export_scene(
     index = observed.index
     rows = [r for r in range(len(observed)) if index.frame[r] == frame and side in (None, EYES[index.eye[r]])]
     if not rows:
-        raise InputError(f"the scene has frames 0 to {int(index.frame.max())} of {', '.join(loaded.spec.subject.eyes)} eye", source="--frame")
+        shown = " and ".join(loaded.spec.subject.eyes)
+        raise InputError(f"the scene has frames 0 to {int(index.frame.max())}, eyes {shown}", source="--frame")
     with staged(folder, overwrite=overwrite) as stage:
         written = write_scene(render_job(loaded, observed, rows[0]), stage, spp=spp)
         name = written.name

@@ -47,7 +47,11 @@ def features(
         raise InputError("must be >= 6", source="--points")
     loaded = load_scene(scene, eye=eye)
     observed, seen = observe_in_detail(loaded, boundary_points=points, purkinje=purkinje or (1,))
-    data: dict[str, Any] = {"schema": "eyerender/features/1", "rig": loaded.rig_mapping(), "records": list(observed.records())}
+    data: dict[str, Any] = {
+        "schema": "eyerender/features/1",
+        "rig": loaded.rig_mapping(),
+        "records": list(observed.records()),
+    }
     if purkinje:
         data["purkinje"] = purkinje_records(observed, seen, (1, *sorted(set(purkinje) - {1})))
         data["non_ellipticity_px"] = [float(v) if np.isfinite(v) else None for v in seen.ellipse_residual_px]

@@ -158,11 +158,11 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
         active = active[np.abs(push).max(axis=(1, 2)) > 0.01]
         if not len(active):
             break
-    # Bent out of shape on the way, for want of room: a stub remains.
+    # Bent out of shape on the way, for want of room: it stays in its root.
     pieces = np.diff(out, axis=1)
     stretched = np.linalg.norm(pieces, axis=-1).max(axis=1) > 1.5 * np.linalg.norm(
         straight[:, 1] - straight[:, 0], axis=-1
     )
-    out[stretched] = root[stretched] + 0.1 * (straight[stretched] - root[stretched])
+    out[stretched] = root[stretched] + 0.01 * (straight[stretched] - root[stretched])
     # And off the globe, for lashes that turn in.
     return globe.pushed_out(out, 0.3)

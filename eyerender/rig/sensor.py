@@ -16,7 +16,6 @@ from pydantic import Field
 
 from ..spec import NonNegative, Positive, Spec
 
-
 # Converters end a little below the well: pixels that saturate then all read full scale, instead of a noisy plateau.
 _WELL_AT_FULL_SCALE = 0.98
 
@@ -35,7 +34,9 @@ class SensorSpec(Spec):
     )
     full_well_e: Positive = Field(default=6000.0, description="saturation capacity, electrons")
     read_noise_e: NonNegative = Field(default=3.0, description="temporal dark noise, electrons rms")
-    gain_dn_per_e: Positive | None = Field(default=None, description="system gain K; default: full scale at 98 % of the full well")
+    gain_dn_per_e: Positive | None = Field(
+        default=None, description="system gain K; default: full scale at 98 % of the full well"
+    )
     black_level_dn: NonNegative | None = Field(default=None, description="default: 1/256 of full scale")
     bit_depth: Literal[8, 10, 12, 16] = Field(default=16, description="of the stored numbers")
     psf_sigma_px: Annotated[float, Field(ge=0, le=20)] = Field(

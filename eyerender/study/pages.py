@@ -145,6 +145,8 @@ def blignaut_page(
     observers = list(dict.fromkeys(key for part in parts for key in part.clouds))
     # One reading of the scene is enough to show the clouds; the corrected one where there is a choice.
     cloud_keys = [k for k in observers if k[0] == "corrected"] or observers
+    # The sensor's noise does not show at this scale.
+    cloud_keys = [k for k in cloud_keys if k[1] != "image-noiseless" or (k[0], "image") not in cloud_keys]
     figures = [
         Figure(
             clouds_figure({p.eye_model: _points(p, key) for p in parts if key in p.clouds}),
