@@ -8,9 +8,15 @@ integration.
 from __future__ import annotations
 
 import os
+import signal
 
 from eyerender.errors import BackendError
 from eyerender.rendering.backend import choose_backend
+
+# A shell that starts the suite in the background ignores Ctrl-C for it, and the processes that tests interrupt would
+# inherit that.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 try:
     choose_backend("llvm")
