@@ -151,6 +151,9 @@ def check_windows(scene: Scene) -> None:
     """Raise `InputError` for a scene whose eyes cannot be rendered."""
     if scene.spec.image.window_px is None and len(scene.spec.subject.eyes) > 1:
         raise InputError("missing; both eyes are rendered in a window each", path="image.window_px")
+    if scene.eye_spec.stop.contour is not None:
+        # The renderer knows ellipses only, and an image whose pupil is not its label's would be worse than none.
+        raise InputError("a measured contour is not rendered yet; analytic features have it", path="stop.contour")
 
 
 def make_renderer(backend: BackendName = "auto", threads: int | None = None) -> Renderer:

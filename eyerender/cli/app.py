@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Sequence
 from types import FrameType
 from typing import Any
@@ -14,6 +15,7 @@ from cyclopts import App, CycloptsError, Parameter
 from ..errors import EyerenderError, InputError
 
 INTERRUPTED = 130
+_interrupted = threading.Event()
 
 app = App(
     name="eyerender",
@@ -91,6 +93,12 @@ def run(argv: Sequence[str] | None = None) -> int:
             raise
         name = f"{error.filename}: " if error.filename else ""
         return _fail(f"{name}{error.strerror or error}", 1)
+    except Exception:
+        # Libraries that call back into Python can turn the interrupt into an error of their own.
+        if debug or not _interrupted.is_set():
+            raise
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
@@ -102,15 +110,18 @@ def _fail(message: str, code: int) -> int:
 
 
 def _terminate_like_interrupt() -> dict[int, Any]:
-    """Let SIGTERM and SIGHUP unwind as Ctrl-C does, so that nothing half-written stays behind."""
+    """Let SIGTERM and SIGHUP unwind as Ctrl-C does, so nothing half-written stays behind; remember that one came."""
+    _interrupted.clear()
 
     def handler(_number: int, _frame: FrameType | None) -> None:
+        _interrupted.set()
         raise KeyboardInterrupt
 
     previous = {}
-    for name in ("SIGTERM", "SIGHUP"):
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
-        if number is not None:
+        # A shell or nohup that ignores a signal for us means it.
+        if number is not None and signal.getsignal(number) != signal.SIG_IGN:
             try:
                 previous[number] = signal.signal(number, handler)
             except ValueError:  # not the main thread

@@ -16,6 +16,7 @@ from PIL import Image
 
 from eyerender.cli.app import run
 from eyerender.dataset.spec import shipped_datasets
+from eyerender.eye.catalogue import load_eye
 from eyerender.imagefile import write_png
 from eyerender.scene import shipped_scenes
 
@@ -40,6 +41,9 @@ def place(tmp_path, monkeypatch):
     scene("eye.yaml", "eye.model", "E9")
     scene("pupil.yaml", "eye.pupil_diameter_mm", 14)
     scene("target.yaml", "targets", {"world_mm": [[-500, 0, 0]]})
+    contour = load_eye("E2").to_mapping()
+    contour["stop"]["contour"] = {"cosines": [0.0, 0.05], "sines": [0.0, 0.0]}
+    Path("contour.yaml").write_text(yaml.safe_dump(contour), encoding="utf-8")
     Path("text.yaml").write_text("format: 1\nname: [", encoding="utf-8")
     Path("binary.yaml").write_bytes(bytes(range(256)))
     Path("empty.png").write_bytes(b"")
@@ -92,6 +96,7 @@ TABLE = [
     (["view", "car", "E2", "-o", "eye.svg"], 2, "car"),
     (["render", "quickstart"], 2, "--output"),
     (["render", "missing.yaml", "-o", "out"], 2, "missing.yaml: no such file"),
+    (["render", "quickstart", "-o", "out", "--eye", "contour.yaml"], 2, "stop.contour: a measured contour is not"),
     (["render", "quickstart", "-o", "taken"], 2, "taken: is not empty; give another folder or --overwrite"),
     (["render", "quickstart", "-o", "file"], 2, "file: exists and is not a folder"),
     (["render", "quickstart", "-o", "out", "--spp", "0"], 2, "image.spp: must be >= 1"),
