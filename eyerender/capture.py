@@ -183,7 +183,7 @@ def render_folder(
     noiseless: str | Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Render a scene into a folder of labelled images (CONTRACTS); complete or not at all.
+    """Render a scene into a folder of labelled images (docs/formats.md); complete or not at all.
 
     `noiseless` is a second folder, of the same renderings exposed without the sensor's noise: what the scene with
     `sensor.noise: false` gives.

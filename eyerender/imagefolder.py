@@ -1,4 +1,4 @@
-"""A folder of labelled images (CONTRACTS): metadata.jsonl, images/, masks/, dataset.json.
+"""A folder of labelled images (docs/formats.md): metadata.jsonl, images/, masks/, dataset.json.
 
 A folder is staged and put in place when it is complete, so a run that is interrupted or runs out of disk
 leaves nothing that looks like a result.

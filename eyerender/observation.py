@@ -129,7 +129,7 @@ class Observations(ArrayValue):
         return Observations(part(self.index), part(self.pose), part(self.pupil), part(self.glints))
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """One record of CONTRACTS an observation; every key always present, null where it does not apply."""
+        """One record (docs/formats.md) an observation; every key always present, null where it does not apply."""
         for i in range(len(self)):
             yield self._record(i)
 

@@ -251,7 +251,7 @@ class Scene:
         return out
 
     def rig_mapping(self) -> dict[str, Any]:
-        """The rig as `features --json` writes it (CONTRACTS)."""
+        """The rig as `features --json` writes it (docs/formats.md)."""
         screen = self.rig.screen
         return {
             "cameras": [

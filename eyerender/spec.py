@@ -135,7 +135,7 @@ _UniqueKeyLoader.add_implicit_resolver(
 
 
 def _first_problem(error: ValidationError) -> tuple[str, str]:
-    """(dotted path, reason) of the first problem, in the words of CONTRACTS."""
+    """(dotted path, reason) of the first problem."""
     problems = error.errors(include_url=False)
     # The one deepest in the data tells most: what stands above it is often only its consequence.
     first = max(problems, key=lambda p: (len(p["loc"]), p["type"] != "missing"))

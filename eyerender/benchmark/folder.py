@@ -1,6 +1,6 @@
 """A labelled folder as the bench sees it: images, true features in image coordinates, hints, what varies.
 
-Two kinds are read: what this package renders (CONTRACTS' folder of images), and folders of ideal images.
+Two kinds are read: what this package renders (docs/formats.md), and folders of ideal images.
 """
 
 from __future__ import annotations
