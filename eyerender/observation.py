@@ -7,7 +7,6 @@ and null in the record; the reason says why.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -349,13 +348,6 @@ def _widened(a: Any, width: int) -> Any:
         return a
     fill = {"f": np.nan, "i": -1, "b": False, "O": ""}[a.dtype.kind]
     return np.concatenate([a, np.full((len(a), width - a.shape[1], *a.shape[2:]), fill, dtype=a.dtype)], axis=1)
-
-
-def write_jsonl(observations: Observations, path: str) -> None:
-    """Records, one a line."""
-    with open(path, "w", encoding="utf-8") as file:
-        for record in observations.records():
-            file.write(json.dumps(record, allow_nan=False) + "\n")
 
 
 def _numbers(values: Any) -> Any:

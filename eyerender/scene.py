@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from .arrays import ArrayValue, Floats, Ints, frozen
+from .arrays import ArrayValue, Floats, frozen
 from .errors import InputError
 from .eye.catalogue import load_eye
 from .eye.model import Eye
@@ -346,19 +346,3 @@ def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = N
             data["seed"] = seed
         spec = SceneSpec.from_mapping(data, source=str(path))
     return Scene.of(spec, base=path.parent, eye=eye, source=str(path))
-
-
-def eye_of(index: Index, row: int) -> str:
-    """'right' or 'left' of one observation."""
-    return EYES[int(index.eye[row])]
-
-
-def observations_by_view(index: Index) -> dict[tuple[int, int], Ints]:
-    """Rows of each (camera, eye): what can be computed in one call."""
-    out: dict[tuple[int, int], Ints] = {}
-    for camera in np.unique(index.camera):
-        for eye in np.unique(index.eye):
-            rows = np.flatnonzero((index.camera == camera) & (index.eye == eye))
-            if len(rows):
-                out[int(camera), int(eye)] = rows
-    return out

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import frozen
 from ..geometry.ellipse import Ellipse
 from .preprocess import DN, Image, Prepared, as_image
-from .result import GlintResult, frozen
+from .result import GlintResult
 from .settings import ExtractionSettings
 from .spotfit import SpotFit
 from .spotmend import patch_moments

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import frozen
 from ..geometry.ellipse import signed_distance
 from .arcs import RimFit, curvature_at, fit_rim
 from .coarse import Candidate, find_candidates, find_inside, inspect_interior
@@ -17,7 +18,7 @@ from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glints import Spots, detect_spots, judge_spots
 from .preprocess import DN, Prepared, invert, prepare
 from .refine import PixelFit, refine
-from .result import Extraction, GlintResult, Goodness, PupilResult, frozen
+from .result import Extraction, GlintResult, Goodness, PupilResult
 from .rimmodel import Place, RimModel
 from .settings import ExtractionSettings
 from .spotfit import fit_spots

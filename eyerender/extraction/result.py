@@ -8,18 +8,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import frozen
 from ..geometry.ellipse import Ellipse
 
 Array = NDArray[np.float64]
 
 Stage = Literal["input", "coarse search", "edges", "fit", "refinement"]
-
-
-def frozen(values: object) -> Array:
-    """A read-only float64 copy."""
-    array = np.array(values, dtype=np.float64)
-    array.setflags(write=False)
-    return array
 
 
 @dataclass(frozen=True, slots=True)
