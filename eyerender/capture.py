@@ -120,9 +120,9 @@ def render_job(scene: Scene, observations: Observations, row: int, eye: Eye | No
         lights=scene.rig.lights,
         sensor=scene.spec.sensor,
         look=scene.spec.look,
-        region=scene.spec.region,
+        region=scene.region,
         lens=scene.spec.lens,
-        ambient=scene.spec.ambient,
+        ambient=scene.ambient,
         wavelength_nm=scene.spec.wavelength_nm,
         seed=image_seed(scene.spec.seed, int(index.frame[row]), int(index.eye[row])),
         apex_mm=apex,
@@ -151,9 +151,6 @@ def check_windows(scene: Scene) -> None:
     """Raise `InputError` for a scene whose eyes cannot be rendered."""
     if scene.spec.image.window_px is None and len(scene.spec.subject.eyes) > 1:
         raise InputError("missing; both eyes are rendered in a window each", path="image.window_px")
-    if scene.eye_spec.stop.contour is not None:
-        # The renderer knows ellipses only, and an image whose pupil is not its label's would be worse than none.
-        raise InputError("a measured contour is not rendered yet; analytic features have it", path="stop.contour")
 
 
 def make_renderer(backend: BackendName = "auto", threads: int | None = None) -> Renderer:

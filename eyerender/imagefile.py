@@ -1,4 +1,4 @@
-"""Reading and writing image files: 16- and 8-bit greyscale PNG, any greyscale Pillow can read.
+"""Reading and writing image files: 16- and 8-bit greyscale PNG; greyscale of the usual formats is read.
 
 Pixel values are linear sensor counts; nothing here scales or gamma-encodes them, except `preview`, which is for people.
 """
@@ -6,18 +6,21 @@ Pixel values are linear sensor counts; nothing here scales or gamma-encodes them
 from __future__ import annotations
 
 import os
+import warnings
 import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from .errors import EyerenderError, InputError
 
-# A sensor of 65536 x 65536 is refused anyway; this bounds what a hostile file can make us allocate.
-MAX_PIXELS = 200_000_000
+# The largest window that can be rendered; this bounds what a hostile file can make us allocate.
+MAX_PIXELS = 8192 * 8192
+# Pillow knows many more, some of which start other programs.
+FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "GIF", "WEBP", "JPEG2000")
 
 
 def write_png(path: str | Path, image: NDArray[Any]) -> None:
@@ -43,33 +46,46 @@ def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
         (h, w) uint8 or uint16, or float32 for a float TIFF; bit depth (32 for float).
 
     Raises:
-        InputError: missing, unreadable, empty, or with more than one channel.
+        InputError: missing, unreadable, empty, too large, with real colour or transparency, or with several frames.
     """
     source = str(path)
     try:
         if os.path.getsize(path) == 0:
             raise InputError("is empty", source=source)
-        with Image.open(path) as file:
-            if file.width * file.height > MAX_PIXELS:
-                raise InputError(f"is too large ({file.width} x {file.height} pixels)", source=source)
-            mode = file.mode
-            if mode in ("RGB", "RGBA", "P", "LA", "CMYK", "YCbCr", "HSV", "LAB"):
-                grey = _same_channels(file)
-                if grey is None:
-                    raise InputError(
-                        f"has colour channels ({mode}); greyscale near-infrared images are read", source=source
-                    )
-                return grey, 8
-            file.load()
-            data = np.asarray(file)
+        # What Pillow warns of, it either reads all the same or fails at with an error.
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as file:
+            return _decoded(file, source)
     except InputError:
         raise
     except FileNotFoundError:
         raise InputError("no such file", source=source) from None
     except IsADirectoryError:
         raise InputError("is a folder, not an image", source=source) from None
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError):
+    except PermissionError:
+        raise InputError("may not be read", source=source) from None
+    except MemoryError:
+        raise InputError("needs more memory than there is", source=source) from None
+    except Exception:
+        # A damaged file makes Pillow's decoders raise whatever their arithmetic comes upon.
         raise InputError("is not a readable image", source=source) from None
+
+
+def _decoded(file: Image.Image, source: str) -> tuple[NDArray[Any], int]:
+    if file.width * file.height > MAX_PIXELS:
+        raise InputError(f"is too large ({file.width} x {file.height} pixels)", source=source)
+    frames = getattr(file, "n_frames", 1)
+    if frames > 1:
+        raise InputError(f"holds {frames} images; a file of one is read", source=source)
+    mode = file.mode
+    if mode in ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr", "HSV", "LAB"):
+        if file.has_transparency_data and np.asarray(file.convert("RGBA"))[..., 3].min() < 255:
+            raise InputError("has transparent pixels", source=source)
+        grey = _same_channels(file)
+        if grey is None:
+            raise InputError(f"has colour channels ({mode}); greyscale near-infrared images are read", source=source)
+        return grey, 8
+    file.load()
+    data = np.asarray(file)
     if mode == "1":
         return data.astype(np.uint8) * np.uint8(255), 8
     if mode == "L":

@@ -11,7 +11,7 @@ import os
 import platform
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -23,6 +23,7 @@ from .observation import Observations
 IMAGE_SCHEMA = "eyerender/image/1"
 DATASET_SCHEMA = "eyerender/dataset/1"
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
+RUN = "run.json"  # of a folder that `generate` fills, from its start
 STAGE = ".partial-"
 
 CONVENTIONS = {
@@ -74,6 +75,8 @@ class ImageFolder:
         folder = Path(path)
         if not folder.is_dir():
             raise InputError("no such folder", source=str(path))
+        if (folder / RUN).is_file() and not (folder / DATASET).is_file():
+            raise InputError("holds a run that is not finished; start generate again on it", source=str(path))
         if not (folder / METADATA).is_file():
             raise InputError(f"holds no {METADATA}; not a folder of images that this package wrote", source=str(path))
         dataset = _json_file(folder / DATASET)
@@ -198,7 +201,8 @@ def write_json(path: str | Path, data: dict[str, Any]) -> None:
         part.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         os.replace(part, path)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 

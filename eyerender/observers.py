@@ -19,7 +19,7 @@ from .extraction import Extraction, ExtractionSettings, extract
 from .extraction.assignment import assign_lights, predict_glints
 from .eye.spec import EyeSpec
 from .imagefile import read_image
-from .imagefolder import DATASET, ImageFolder
+from .imagefolder import DATASET, ImageEntry, ImageFolder
 from .observation import MISSING, OK, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
 from .rig.camera import Camera
 from .scene import Scene, SceneSpec
@@ -81,9 +81,14 @@ class ImageObserver:
 
     def observe_folder(self, folder: ImageFolder, scene: Scene, *, progress: Progress | None = None) -> Observations:
         """Extract the features of a folder's images, row by row as its records."""
-        index = folder.truth().index
+        return self.observe_entries(folder.entries, folder.truth().index, scene, progress=progress)
+
+    def observe_entries(
+        self, entries: Sequence[ImageEntry], index: Index, scene: Scene, *, progress: Progress | None = None
+    ) -> Observations:
+        """Extract the features of some images of a scene; `index` has a row for each of their records."""
         parts, row = [], 0
-        for k, entry in enumerate(folder.entries):
+        for k, entry in enumerate(entries):
             image, stored = read_image(entry.path)
             if image.shape != (entry.window[3], entry.window[2]):
                 raise InputError(
@@ -94,7 +99,7 @@ class ImageObserver:
             parts.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene))
             row = int(rows[-1]) + 1 if len(rows) else row
             if progress is not None:
-                progress(k + 1, len(folder.entries), "")
+                progress(k + 1, len(entries), "")
         return concatenate(parts)
 
     def observe_files(

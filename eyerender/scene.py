@@ -25,7 +25,7 @@ from .region.look import LookSpec
 from .rig.imaging import AmbientSpec, LensSpec, MotionSpec
 from .rig.rig import Rig, RigSpec
 from .rig.sensor import SensorSpec
-from .spec import FileSpec, Positive, Spec, Vec2, Vec3
+from .spec import FileSpec, Positive, Spec, Vec2, Vec3, file_digest
 
 Count = Annotated[int, Field(ge=1, le=1000)]
 
@@ -133,24 +133,33 @@ class Frames(ArrayValue):
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A scene ready to be observed: the spec, the eye's spec and the numeric rig."""
+    """A scene ready to be observed: the spec, the eye's spec and the numeric rig; `base` is what files of its pictures
+    (an HDR map, a head mesh) are relative to, by default the current folder."""
 
     spec: SceneSpec
     eye_spec: EyeSpec
     rig: Rig
+    base: Path | None = None
 
     @classmethod
     def of(cls, spec: SceneSpec, *, base: Path | None = None, eye: str | None = None, source: str = "") -> Scene:
-        """Compile a spec. `base` is the folder that eye files are relative to, `eye` replaces the scene's model."""
+        """Compile a spec. `base` is the folder that its files are relative to, `eye` replaces the scene's model.
+
+        Raises:
+            InputError: an eye that cannot be, or, where a `base` is given, a file that is not there.
+        """
         name = eye if eye is not None else spec.eye.model
         if eye is None and base is not None and name.endswith((".yaml", ".yml")):
             name = str(base / name)
         if eye is not None:
             spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": eye})})
         eye_spec = load_eye(name)
-        scene = cls(spec, eye_spec, spec.rig.build())
+        scene = cls(spec, eye_spec, spec.rig.build(), base)
         try:
             scene.eye("right")
+            for file in scene.files if base is not None else ():
+                if not file.is_file():
+                    raise InputError("no such file", source=str(file))
         except InputError as error:
             raise InputError(error.reason, source=error.source or source, path=error.path) from None
         return scene
@@ -167,8 +176,36 @@ class Scene:
 
     def digest(self) -> str:
         """SHA-256 of everything the scene's images depend on, the eye file's content included."""
-        both = self.spec.digest() + self.eye_spec.digest()
-        return hashlib.sha256(both.encode()).hexdigest()
+        parts = [self.spec.digest(), self.eye_spec.digest(), *(file_digest(file) for file in self.files)]
+        return hashlib.sha256("".join(parts).encode()).hexdigest()
+
+    @property
+    def ambient(self) -> AmbientSpec:
+        """The ambient light, its map's file as an absolute path."""
+        ambient = self.spec.ambient
+        if ambient.map is None:
+            return ambient
+        file = str((Path.cwd() if self.base is None else self.base.resolve()) / ambient.map.file)
+        return ambient.model_copy(update={"map": ambient.map.model_copy(update={"file": file})})
+
+    @property
+    def region(self) -> RegionSpec | None:
+        """The eye region, a head mesh's files as absolute paths."""
+        region = self.spec.region
+        if region is None or region.head is None:
+            return region
+        return region.model_copy(update={"head": region.head.resolved(self.base)})
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files besides the eye's that pictures depend on."""
+        ambient, region = self.ambient, self.region
+        named = [] if ambient.map is None else [ambient.map.file]
+        if self.spec.region is not None and self.spec.region.head is not None and self.spec.region.head.manifest:
+            named.append(str((Path.cwd() if self.base is None else self.base) / self.spec.region.head.files[0]))
+        if region is not None and region.head is not None:
+            named += [*region.head.files, *([] if region.head.texture is None else [region.head.texture])]
+        return tuple(Path(name) for name in named)
 
     def eye(self, side: Literal["right", "left"] | str) -> Eye:
         """The numeric eye of one side at the scene's wavelength and pupil size."""

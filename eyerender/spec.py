@@ -111,6 +111,14 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     return data
 
 
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's bytes; raises `InputError` where it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", source=str(path)) from None
+
+
 class _UniqueKeyLoader(yaml.SafeLoader):
     """The safe loader, but a key written twice is an error instead of a silent override."""
 

@@ -28,7 +28,8 @@ fingerprint() {
       cat "$root/pyproject.toml" "$root/constraints.txt"; } | checksum
 }
 
-# A stamp of the set-up with the extra `test` serves the plain one too.
+# There are three set-ups: run, test (the extra `test` too) and all (`test` and `ray`). Each leaves the stamps of those
+# that it holds.
 is_set_up() {
     [ -x "$venv/bin/python" ] && [ -f "$venv/.stamp-$1" ] && [ "$(cat "$venv/.stamp-$1")" = "$(fingerprint)" ]
 }
@@ -107,7 +108,7 @@ failure() {
     fi
 }
 
-# set_up run|test: returns at once where the stamp is right.
+# set_up run|test|all: returns at once where the stamp is right.
 set_up() {
     is_set_up "$1" && return
     [ -f "$root/constraints.txt" ] || die "$root/constraints.txt is missing"
@@ -122,8 +123,12 @@ set_up() {
     rm -f "$venv"/.stamp-* "$venv"/.llvm*
     printf '%s\n' "$root" >"$venv/.place" && : >"$venv/.incomplete" || die "cannot write to $venv"
     find_pip
-    case $1 in test) wanted="$root[test]" ;; *) wanted=$root ;; esac
-    say "setting up $venv (about 900 MB; later runs start at once) ..."
+    case $1 in
+        all) wanted="$root[test,ray]" stamps="all test run" size="1.6 GB" ;;
+        test) wanted="$root[test]" stamps="test run" size="1.3 GB" ;;
+        *) wanted=$root stamps=run size="900 MB" ;;
+    esac
+    say "setting up $venv (about $size; later runs start at once) ..."
     # Settings that would send the packages elsewhere than into .venv; all others stay as the machine has them.
     unset PIP_TARGET PIP_PREFIX PIP_ROOT PYTHONHOME
     export PIP_USER=0 PIP_DISABLE_PIP_VERSION_CHECK=1
@@ -138,8 +143,7 @@ set_up() {
     [ -n "$done_" ] || die "set-up failed: $(failure) (all of it: $log)"
     rm -f "$venv/.incomplete"
     now=$(fingerprint)
-    [ "$1" = run ] || printf '%s\n' "$now" >"$venv/.stamp-$1"
-    printf '%s\n' "$now" >"$venv/.stamp-run"
+    for stamp in $stamps; do printf '%s\n' "$now" >"$venv/.stamp-$stamp"; done
     trap - INT TERM HUP
     exec 8>&- 9>&-
     say "environment ready after $(($(date +%s) - began)) s"

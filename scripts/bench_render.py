@@ -73,7 +73,8 @@ class Bench:
         """All rows, as they are measured."""
         for part in (
             self.iris_against_path, self.iris_against_light_tracer, self.noise, self.glint_centroids, self.large_disc,
-            self.pupil_outline, self.cost, self.recompiles, self.fixed_cost, self.memory, self.determinism,
+            self.pupil_outline, self.cost, self.region_cost, self.recompiles, self.fixed_cost, self.memory,
+            self.determinism,
         ):  # fmt: skip
             yield from part()
 
@@ -87,7 +88,7 @@ class Bench:
         from render_oracles import RINGS_MM
 
         from eyerender.arrays import frozen
-        from eyerender.rendering.renderer import _pixels
+        from eyerender.rendering.film import pixels_of
         from eyerender.rendering.sampling import camera_ray
         from eyerender.rendering.view import look
         from eyerender.rig.camera import CameraSpec
@@ -109,8 +110,8 @@ class Bench:
         black = rigs.BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
         rig = rigs.LampRig(camera, tuple(lights))
         job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
-        values, _ = self.renderer._bind(job)
-        u, v = _pixels(dr.arange(mi.UInt32, n * n), job.window)
+        values = self.renderer._bind(job).values
+        u, v = pixels_of(dr.arange(mi.UInt32, n * n), job.window)
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
         view = look(values, self.renderer._surround.scene, o, d, True)
         inner = view.inner.numpy().T
@@ -329,6 +330,45 @@ class Bench:
         yield row("three coherent Embree rays a sample / our CPU", 3 * limit / cpu["E2"], "ratio")
         yield row("E4 / E2, CPU", cpu["E4"] / cpu["E2"], "ratio", 1.6)
         yield row("E5 / E2, CPU", cpu["E5"] / cpu["E2"], "ratio", 1.6)
+
+    def region_cost(self) -> Iterable[Row]:
+        """CPU time of an eye in its lids over that of the bare eye, 640 x 480, 16 spp, in turns; what a move costs."""
+        import yaml
+
+        from eyerender.analytic.observer import observe
+        from eyerender.capture import render_job
+        from eyerender.eye.pose import Poses, rigid_motion
+        from eyerender.region.anatomy import RegionSpec
+        from eyerender.scene import Scene, SceneSpec
+
+        rigs, region = self.rigs, RegionSpec(seed=11)
+        rig = rigs.remote_rig()
+        lamps = (rig.lights[0], replace(rig.lights[0], position_mm=rig.lights[0].position_mm + np.array([0, 80.0, 0])))
+        remote = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(640, 480), lights=lamps, labels=False)
+        spec = yaml.safe_load((ROOT / "scenes" / "headset.yaml").read_text(encoding="utf-8"))
+        spec["rig"]["lights"][0]["ring"]["count"] = 6
+        scene = Scene.of(SceneSpec.from_mapping(spec))
+        headset = replace(render_job(scene, observe(scene), 4), labels=False)
+        for name, job in (("2 lamps", remote), ("headset", headset)):
+            jobs = [replace(job, region=r) for r in (None, region)]
+            cpu: list[list[float]] = [[], []]
+            for k in range(4 if self.small else 9):
+                for times, one in zip(cpu, jobs, strict=True):
+                    start = time.process_time()
+                    self.renderer.render(one)
+                    if k:
+                        times.append(time.process_time() - start)
+            bare, whole = (float(np.median(times)) for times in cpu)
+            yield row(f"eye region against bare eye, {name}", whole / bare, "ratio", 1.5)
+            yield row(f"eye region, {name}: CPU", whole, "s")
+            moved = []
+            for k in range(6):
+                M, t = rigid_motion(Poses.from_degrees([2.0 * k], [1.0 * k]), job.eye)
+                turned = replace(jobs[1], M=M[0], t=t[0] + job.anchor_mm, apex_mm=job.anchor_mm)
+                start = time.process_time()
+                self.renderer.render(turned)
+                moved.append(time.process_time() - start)
+            yield row(f"eye region, {name}: more for a new pose, CPU", 1e3 * (np.median(moved) - whole), "ms")
 
     def _varied(self, count: int, seed: int = 0) -> Iterable[Any]:
         """Jobs of one structure whose every number varies."""

@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Bench of the analytic studies: time, how well the published figures come out, whether calibrations find one minimum.
+"""Bench of the studies: time, how well the published figures come out, whether calibrations find one minimum.
 
-    bench_studies.py [--quick] [--json F]
+    bench_studies.py [--quick] [--images] [--json F]
 
 Runs guestrin2006, blignaut2014 and conditions with E1 to E5 (quick: E1 and E2, without conditions) as the command does,
-with a process for every processor. Seconds are those of the clock, imports of the processes included. Exit 1 when a
-`must` is missed.
+with a process for every processor; with --images also both replications with rendered images, the sensor's noise on and
+off, at the scenes' samples per pixel: minutes. Seconds are those of the clock, imports of the processes included; their
+`must` is meant for two quiet cores. Exit 1 when a `must` is missed.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import json
 import os
 import platform
+import resource
 import sys
 import tempfile
 import time
@@ -31,8 +33,33 @@ def row(name: str, value: float, unit: str, must: float | None = None, aim: floa
     return {"name": name, "value": value, "unit": unit, "must": must, "aim": aim, "met": met}
 
 
+def measure_images(quick: bool) -> list[dict[str, Any]]:
+    """Both replications with both observers; by the clock, and what the processes took."""
+    eyes, rows, total = ("E1", "E2") if quick else MODELS, [], 0.0
+    with tempfile.TemporaryDirectory() as place:
+        for name in ("guestrin2006", "blignaut2014"):
+            start, before = time.monotonic(), _processor_seconds()
+            run_study(name, Path(place) / name, observer="both", eyes=eyes, workers=None, progress=_tell)
+            seconds = time.monotonic() - start
+            total += seconds
+            rows.append(row(f"{name} with images, {len(eyes)} models", seconds, "s"))
+            rows.append(row(f"{name} with images, processor time", _processor_seconds() - before, "s"))
+    return [*rows, row("both replications with images", total, "s", 1200)]
+
+
+def _processor_seconds() -> float:
+    """Of this process and of those that it has waited for."""
+    return sum(
+        t.ru_utime + t.ru_stime for t in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
+
+
+def _tell(done: int, total: int, note: str) -> None:
+    print(f"\r{done}/{total} {note:<70}", end="" if done < total else "\n", file=sys.stderr, flush=True)
+
+
 def measure(quick: bool) -> list[dict[str, Any]]:
-    """All rows."""
+    """All rows of the analytic studies."""
     eyes = ("E1", "E2") if quick else MODELS
     names = ("guestrin2006", "blignaut2014") if quick else ("guestrin2006", "blignaut2014", "conditions")
     workers = len(os.sched_getaffinity(0))
@@ -42,6 +69,8 @@ def measure(quick: bool) -> list[dict[str, Any]]:
             start = time.monotonic()
             summaries[name] = run_study(name, Path(place) / name, eyes=eyes, workers=workers)
             rows.append(row(f"{name}, {len(eyes)} models, {workers} processes", time.monotonic() - start, "s"))
+            if name == "blignaut2014" and not quick:
+                rows.append(row("both replications, analytic", rows[0]["value"] + rows[1]["value"], "s", 20))
             found[name] = json.loads((Path(place) / name / "findings.json").read_text(encoding="utf-8"))["findings"]
     values = {(f["id"], f["protocol"], f["rule"]): f["value"] for f in found["guestrin2006"]}
     rows.append(
@@ -73,9 +102,10 @@ def main() -> int:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--quick", action="store_true", help="two eye models, without the conditions")
+    parser.add_argument("--images", action="store_true", help="also with rendered images")
     parser.add_argument("--json", metavar="F", help="write the result to a file")
     options = parser.parse_args()
-    rows = measure(options.quick)
+    rows = measure(options.quick) + (measure_images(options.quick) if options.images else [])
     result = {
         "schema": "eyerender/bench/1",
         "machine": {"processor": platform.processor() or platform.machine(), "cores": len(os.sched_getaffinity(0))},

@@ -237,19 +237,26 @@ def draw_no_eye(seed: int, size: tuple[int, int] = (320, 240)) -> NDArray[np.uin
 
 
 def _iris_texture(iris: _Conic, sigma: float, x: Array, y: Array, rng: np.random.Generator) -> Array | float:
-    """Fibres: 24 harmonics of the angle, amplitude 1 / sqrt(1 + (n/4)^2), each slowly turning with the radius."""
+    """Fibres: 24 harmonics of the angle, amplitude 1 / sqrt(1 + (n/4)^2), each slowly turning with the radius.
+
+    Summed on a polar grid so fine that interpolating linearly in it is 2e-4 of the amplitude off.
+    """
     if sigma <= 0.0:
         return 0.0
-    u, v = iris.local(x[None, :], y[:, None])
-    angle, radius = np.arctan2(v, u), np.hypot(u, v)
     n = np.arange(1, 25)
     weight = 1.0 / np.sqrt(1.0 + (n / 4.0) ** 2)
     weight *= sigma * math.sqrt(2.0) / np.linalg.norm(weight)
     phase, twist = rng.uniform(0.0, 2.0 * np.pi, n.size), rng.normal(0.0, 2.0, n.size)
-    out = np.zeros_like(angle)
-    near = radius < 1.2
-    for i in range(n.size):
-        out[near] += weight[i] * np.cos(n[i] * angle[near] + phase[i] + twist[i] * radius[near])
+    turns, steps, end = 4096, 97, 1.2
+    angle, radius = np.arange(turns) * (2.0 * np.pi / turns), np.linspace(0.0, end, steps)
+    wave = np.exp(1j * n * angle[:, None])
+    table = (wave @ (weight * np.exp(1j * (phase + twist * radius[:, None]))).T).real
+    u, v = iris.local(x[None, :], y[:, None])
+    r = np.hypot(u, v)
+    near = r < end
+    place = [np.arctan2(v[near], u[near]) * (turns / (2.0 * np.pi)) % turns, r[near] * ((steps - 1) / end)]
+    out = np.zeros_like(r)
+    out[near] = ndimage.map_coordinates(np.concatenate([table, table[:1]]), place, order=1)
     return out
 
 

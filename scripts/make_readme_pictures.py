@@ -30,7 +30,7 @@ def draw(image, origin, white, truth, found, row, crop, path):
     ax = fig.add_axes((0, 0, 1, 1))
     h, w = image.shape
     extent = (origin[0] - 0.5, origin[0] + w - 0.5, origin[1] + h - 0.5, origin[1] - 0.5)
-    ax.imshow(preview(image, white), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="bicubic")
+    ax.imshow(preview(image, white, 1.6), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="bicubic")
     for seen, colour, dash, marker in (
         (truth, ANALYTIC_ON_DARK, "-", "+"),
         (found, IMAGE_ON_DARK, (0, (4, 4)), "x"),
@@ -66,5 +66,5 @@ def picture(scene, fixation, eye, crop, white, path):
 if __name__ == "__main__":
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
     out.mkdir(parents=True, exist_ok=True)
-    picture(er.load_scene("headset", spp=64), 4, 0, (560, 420), 0.65, out / "head_mounted.png")
-    picture(er.load_scene("desktop_tracker", spp=64), 4, 0, (232, 174), 0.9, out / "remote.png")
+    picture(er.load_scene("headset", spp=64), 4, 0, (624, 468), 0.54, out / "head_mounted.png")
+    picture(er.load_scene("desktop_tracker", spp=64), 4, 0, (312, 234), 0.75, out / "remote.png")

@@ -5,7 +5,8 @@
 #     sbatch --array=1-32 scripts/slurm_generate.sh SPEC DIR [OPTIONS OF eyerender generate]
 #
 # The folder must be on a file system that all nodes share. Set EYERENDER to the command where it is not on PATH, for
-# example EYERENDER="apptainer exec image.sif eyerender". On GPU nodes add --gres=gpu:1 and --backend cuda.
+# example EYERENDER="apptainer exec image.sif eyerender". On GPU nodes add --gres=gpu:1 and --backend cuda. To submit some
+# tasks alone again, say of how many they are: EYERENDER_PARTS=32 sbatch --array=7,9 (tasks counted from 1).
 #
 #SBATCH --job-name=eyerender
 #SBATCH --cpus-per-task=8
@@ -19,10 +20,14 @@ if [ $# -lt 2 ]; then
     exit 2
 fi
 : "${SLURM_ARRAY_TASK_ID:?is not set: submit this script with sbatch --array=1-N}"
-first=${SLURM_ARRAY_TASK_MIN:-1}
 spec=$1 folder=$2
 shift 2
-part=$((SLURM_ARRAY_TASK_ID - first + 1))/${EYERENDER_PARTS:-${SLURM_ARRAY_TASK_COUNT:-1}}
+if [ -n "${EYERENDER_PARTS:-}" ]; then
+    part=$SLURM_ARRAY_TASK_ID/$EYERENDER_PARTS
+else
+    first=${SLURM_ARRAY_TASK_MIN:-1} step=${SLURM_ARRAY_TASK_STEP:-1}
+    part=$(((SLURM_ARRAY_TASK_ID - first) / step + 1))/${SLURM_ARRAY_TASK_COUNT:-1}
+fi
 # exec: the signal before the time limit must reach the run itself, which then leaves only whole shards behind.
 # shellcheck disable=SC2086  (EYERENDER may be a command with arguments)
 exec ${EYERENDER:-eyerender} generate "$spec" "$folder" --shard "$part" --threads "${SLURM_CPUS_PER_TASK:-1}" "$@"

@@ -9,7 +9,8 @@ from cyclopts import Parameter
 
 from ..errors import EyerenderError, InputError
 from .app import app
-from .output import BackendName, Json, emit, progress, say
+from .options import Backend, Eye, Overwrite, Result, Seed, Threads, positive
+from .output import emit, progress, say
 
 
 @app.command(name="generate")
@@ -23,13 +24,14 @@ def generate(
     engine: Literal["local", "ray"] = "local",
     address: str | None = None,
     dry_run: bool = False,
-    seed: int | None = None,
+    eye: Eye = None,
+    seed: Seed = None,
     count: int | None = None,
-    backend: BackendName = "auto",
-    threads: int | None = None,
+    backend: Backend = "auto",
+    threads: Threads = None,
     timeout: float = 600.0,
-    overwrite: bool = False,
-    json: Json = None,
+    overwrite: Overwrite = False,
+    json: Result = None,
 ) -> int:
     """Make a labelled dataset; started again on the same folder, it makes what is missing.
 
@@ -49,29 +51,18 @@ def generate(
         The Ray cluster's address (default: one started on this machine).
     dry_run
         Only tell how long it would take and how much disk.
-    seed
-        Replace the spec's seed.
     count
         Replace the spec's number of samples.
-    backend
-        Where to render.
-    threads
-        Processor threads of all workers together (default: all).
     timeout
         Seconds without a sign of life after which a worker is ended and its shard tried again.
-    overwrite
-        Replace what the folder holds.
-    json
-        Write a summary as JSON to a file, or to stdout with '-'.
     """
     from ..dataset.plan import Plan
     from ..dataset.run import Options
     from ..dataset.run import generate as run
 
-    plan = Plan.load(spec, seed=seed, count=count)
-    for name, value in (("--workers", workers), ("--threads", threads)):
-        if value is not None and value < 1:
-            raise InputError(f"must be >= 1, not {value}", source=name)
+    plan = Plan.load(spec, eye=eye, seed=seed, count=count)
+    positive("--workers", workers)
+    positive("--threads", threads)
     if not timeout > 0:
         raise InputError("must be > 0", source="--timeout")
     options = Options(
@@ -107,8 +98,9 @@ def sample(
     /,
     *,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
-    seed: int | None = None,
-    json: Json = None,
+    eye: Eye = None,
+    seed: Seed = None,
+    json: Result = None,
 ) -> int:
     """Show sample I of a dataset: whose it is, what was drawn, and the scene and eye that come of it.
 
@@ -120,17 +112,13 @@ def sample(
         The sample, from 0.
     output
         A folder for scene.yaml and eye.yaml, which the other commands read.
-    seed
-        Replace the spec's seed.
-    json
-        Write the sample as JSON to a file, or to stdout with '-'.
     """
     import yaml
 
     from ..dataset.plan import Plan
     from ..dataset.realise import realise
 
-    plan = Plan.load(spec, seed=seed)
+    plan = Plan.load(spec, eye=eye, seed=seed)
     if not 0 <= index < plan.spec.count:
         raise InputError(f"must be 0 to {plan.spec.count - 1}, not {index}", source="I")
     found = realise(plan, index)
@@ -151,10 +139,10 @@ def preview(
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    eye: str | None = None,
-    seed: int | None = None,
-    backend: BackendName = "auto",
-    threads: int | None = None,
+    eye: Eye = None,
+    seed: Seed = None,
+    backend: Backend = "auto",
+    threads: Threads = None,
 ) -> int:
     """Render a contact sheet of 16 images of a scene or a dataset; for people, never to measure in.
 
@@ -164,15 +152,8 @@ def preview(
         A scene or a dataset: a file, or the bare name of a shipped one.
     output
         The picture to write.
-    eye
-        Replace a scene's eye model.
-    seed
-        Replace the seed.
-    backend
-        Where to render.
-    threads
-        Processor threads (default: all).
     """
+    positive("--threads", threads)
     from ..dataset.plan import Plan
     from ..dataset.sheet import FORMATS, write_sheet
     from ..dataset.spec import shipped_datasets
@@ -182,9 +163,7 @@ def preview(
         raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(output))
     what: Plan | Scene
     if spec in shipped_datasets() or is_dataset(Path(spec)):
-        if eye is not None:
-            raise InputError("a dataset's eyes are in its spec", source="--eye")
-        what = Plan.load(spec, seed=seed)
+        what = Plan.load(spec, eye=eye, seed=seed)
     else:
         what = load_scene(spec, eye=eye, seed=seed)
     with progress("rendering") as steps:
@@ -194,7 +173,7 @@ def preview(
 
 
 @app.command(name="validate")
-def validate(folder: Annotated[Path, Parameter(name="DIR")], /, *, quick: bool = False, json: Json = None) -> int:
+def validate(folder: Annotated[Path, Parameter(name="DIR")], /, *, quick: bool = False, json: Result = None) -> int:
     """Check a folder of images: checksums, ranges, masks against ellipses, records; and print its statistics.
 
     Exit code 1 where something is wrong.
@@ -205,8 +184,6 @@ def validate(folder: Annotated[Path, Parameter(name="DIR")], /, *, quick: bool =
         A folder that render, quickstart or generate wrote.
     quick
         Do not open the images.
-    json
-        Write the report as JSON to a file, or to stdout with '-'.
     """
     from ..dataset.validate import validate as check
 
@@ -223,8 +200,8 @@ def export_dataset(
     /,
     *,
     format: Literal["webdataset", "coco", "csv", "openeds", "ellseg", "teyed"],
-    overwrite: bool = False,
-    json: Json = None,
+    overwrite: Overwrite = False,
+    json: Result = None,
 ) -> int:
     """Write a generated dataset in a layout that existing training code reads.
 
@@ -236,10 +213,6 @@ def export_dataset(
         The folder to write.
     format
         The layout.
-    overwrite
-        Replace what OUT holds.
-    json
-        Write a summary as JSON to a file, or to stdout with '-'.
     """
     from ..dataset.export import export
 

@@ -9,7 +9,8 @@ from cyclopts import Parameter
 
 from ..errors import InputError
 from .app import app
-from .output import Json, emit
+from .options import Eye, Overwrite, Result, positive
+from .output import emit
 
 
 @app.command(name="export-scene")
@@ -18,12 +19,12 @@ def export_scene(
     folder: Annotated[Path, Parameter(name="DIR")],
     /,
     *,
-    eye: str | None = None,
+    eye: Eye = None,
     frame: int = 0,
     side: str | None = None,
     spp: int = 64,
-    overwrite: bool = False,
-    json: Json = None,
+    overwrite: Overwrite = False,
+    json: Result = None,
 ) -> int:
     """Write one frame as PLY meshes and a Mitsuba XML that the stock `mitsuba` command renders as it is.
 
@@ -33,18 +34,12 @@ def export_scene(
         A scene file, or the bare name of a shipped scene.
     folder
         The folder to write.
-    eye
-        Replace the scene's eye model: a name of the catalogue, or an eye file.
     frame
         Which frame of the scene.
     side
         Which eye, right or left; default: the first that the frame shows.
     spp
         Samples per pixel that the file asks for; the stock path integrator needs many.
-    overwrite
-        Replace what the folder holds.
-    json
-        Write a summary as JSON to a file, or to stdout with '-'.
     """
     from ..analytic.observer import observe
     from ..capture import check_windows, render_job
@@ -53,8 +48,7 @@ def export_scene(
     from ..rendering.export import export_scene as write_scene
     from ..scene import load_scene
 
-    if spp < 1:
-        raise InputError("must be >= 1", source="--spp")
+    positive("--spp", spp)
     loaded = load_scene(scene, eye=eye)
     check_windows(loaded)
     observed = observe(loaded)

@@ -71,7 +71,8 @@ def fit(
     json
         Write a summary as JSON to a file, or to stdout with '-'.
     """
-    from ..gaze.store import EstimatorSpec, fit_estimator, load_observations, save_estimator
+    from ..gaze.records import load_observations
+    from ..gaze.store import EstimatorSpec, fit_estimator, save_estimator
 
     if (terms_x is None) != (terms_y is None):
         raise InputError("give both --terms-x and --terms-y", source="--terms-x")
@@ -122,7 +123,8 @@ def predict(
     json
         Write the gaze points as JSON to a file, or to stdout with '-'.
     """
-    from ..gaze.store import load_estimator, load_observations, predictions
+    from ..gaze.records import load_observations
+    from ..gaze.store import load_estimator, predictions
 
     observations, rig = load_observations(records, scene)
     data = predictions(load_estimator(calibration), observations, rig)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,7 +9,7 @@ from cyclopts import Parameter
 
 from ..errors import InputError
 from .app import app
-from .output import BackendName, Json, emit, progress
+from .output import BackendName, Json, emit, progress, say
 
 
 @app.command(name="study")
@@ -32,8 +31,9 @@ def study(
 ) -> int:
     """Replicate a published study of gaze estimation, test its findings on its own data, or compare the observers.
 
-    Writes summary.json, findings.json, CSV of both and report.html. A folder of the same study is run again in place;
-    images that it holds are used again.
+    Writes summary.json, findings.json, CSV of both and report.html. A folder of the same study is run again in place.
+    Rendered images are a dataset in images/: a run that was stopped goes on where it was, and what is finished is used
+    again.
 
     Parameters
     ----------
@@ -51,15 +51,15 @@ def study(
     eyes
         Eye models, separated by commas: names of the catalogue, or eye files (default: E1 to E5).
     workers
-        Processes for the analytic part (default: all processors).
+        Processes (default: one a processor).
     spp
         Samples per pixel of the images (default: the scene's).
     noise
-        Images with the sensor's noise (on), without it (off), or both, from one rendering.
+        Images with the sensor's noise (on), without it (off), or both.
     backend
         Where to render.
     threads
-        Processor threads of the renderer (default: all).
+        Processor threads of all rendering processes together (default: all).
     overwrite
         Replace what the folder holds.
     json
@@ -80,13 +80,14 @@ def study(
             protocol=protocol,
             observer=observer,
             eyes=names,
-            workers=workers if workers is not None else len(os.sched_getaffinity(0)),
+            workers=workers,
             spp=spp,
             noise=noise,
             backend=backend,
             threads=threads,
             overwrite=overwrite,
             progress=steps,
+            say=say,
         )
     emit(summary, f"{_table(summary)}\n\nreport: {output / REPORT}", json)
     return 0

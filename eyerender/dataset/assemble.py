@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ..errors import EyerenderError
 from ..imagefolder import CONVENTIONS, DATASET, DATASET_SCHEMA, METADATA, write_json
 from .card import data_card
+from .columns import type_first
 from .croissant import CROISSANT, croissant
 from .plan import Plan
 from .shard import LINES, SHARDS, checksum, read_done, run_versions, shard_name
@@ -22,19 +24,21 @@ _PART = ".part"
 def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
     """Put the dataset together; the same shards give the same bytes. Returns its statistics."""
     statistics = Statistics()
-    with (
-        open(folder / (METADATA + _PART), "w", encoding="utf-8") as metadata,
-        open(folder / (FAILURES + _PART), "w", encoding="utf-8") as failures,
-    ):
-        for shard in range(plan.spec.shard_count):
+    shards = range(plan.spec.shard_count)
+    with open(folder / (FAILURES + _PART), "w", encoding="utf-8") as failures:
+        for shard in shards:
             done = read_done(folder, shard)
             statistics.take_shard(done)
             for rejection in done["rejections"]:
                 failures.write(json.dumps(rejection) + "\n")
-            with open(folder / SHARDS / shard_name(shard) / LINES, encoding="utf-8") as lines:
-                for line in lines:
-                    statistics.take_line(json.loads(line))
-                    metadata.write(line)
+
+    def lines() -> Iterator[str]:
+        for shard in shards:
+            with open(folder / SHARDS / shard_name(shard) / LINES, encoding="utf-8") as file:
+                yield from file
+
+    with open(folder / (METADATA + _PART), "w", encoding="utf-8") as metadata:
+        metadata.writelines(type_first(lines, statistics.take_line))
     found = statistics.to_mapping()
     if found["images"] == 0:
         raise EyerenderError(f"{folder}: no sample of this spec can be made; {FAILURES}{_PART} says why")

@@ -51,7 +51,8 @@ made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jso
 
 ## Labels
 `metadata.jsonl` has one line an image, with the same keys in every line; the column `split` says which split it is in.
-`datasets.load_dataset("imagefolder", data_dir=...)` reads the folder as it is.
+`datasets.load_dataset("imagefolder", data_dir=..., split="train", filters=[("split", "==", "test")])` reads a split of
+the folder as it is (the loader itself calls all images `train`), without `filters` all of it.
 
 {_LABELS.format(mask=CONVENTIONS["mask"])}
 

@@ -42,8 +42,11 @@ class ShardActor:
             staged = write_shard(self._maker, Path(self._job.folder), shard, lambda _s, images: counted.append(images))
         except BackendError as error:
             return {"ok": False, "kind": "backend", "reason": str(error)}
-        except (OSError, EyerenderError) as error:
-            return {"ok": False, "kind": "disk", "reason": getattr(error, "strerror", None) or str(error)}
+        except OSError as error:
+            reason = f"{self._job.folder}: cannot be written ({error.strerror or error})"
+            return {"ok": False, "kind": "disk", "reason": reason}
+        except EyerenderError as error:
+            return {"ok": False, "kind": "disk", "reason": str(error)}
         self._made += staged.images
         name = f"{os.uname().nodename}:{os.getpid()}"
         spent = self._made >= known
@@ -81,7 +84,7 @@ class RayEngine:
         try:
             ray: Any = import_module("ray")
         except ImportError:
-            raise InputError("Ray is not installed; run: pip install 'eyerender[ray]'", source="--engine") from None
+            raise InputError("needs Ray (the extra 'ray'); run: pip install ray", source="--engine") from None
         variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
         started = not ray.is_initialized()
         if started:
@@ -132,7 +135,7 @@ class RayEngine:
                 if not answer["ok"]:
                     if answer["kind"] == "backend":
                         raise BackendError(answer["reason"])
-                    raise EyerenderError(f"{self.job.folder}: cannot be written ({answer['reason']})")
+                    raise EyerenderError(answer["reason"])
                 if answer["worker"] not in known:
                     known.add(answer["worker"])
                     events.ready(answer["backend"], answer["worker"])

@@ -70,11 +70,18 @@ class Plan:
     source: str = ""
 
     @classmethod
-    def load(cls, path: str | Path, *, seed: int | None = None, count: int | None = None) -> Plan:
-        """From a file, or the bare name of a shipped dataset; raises `InputError` with one line."""
+    def load(
+        cls, path: str | Path, *, eye: str | None = None, seed: int | None = None, count: int | None = None
+    ) -> Plan:
+        """From a file, or the bare name of a shipped dataset; raises `InputError` with one line.
+
+        `eye`, `seed` and `count` replace the spec's; with another eye model, parameters of the others fall away.
+        """
         file = find_dataset(path)
         spec = DatasetSpec.load(file)
-        changes = {key: value for key, value in (("seed", seed), ("count", count)) if value is not None}
+        changes: dict[str, Any] = {k: v for k, v in (("seed", seed), ("count", count)) if v is not None}
+        if eye is not None:
+            changes |= _with_eye(spec, eye)
         if changes:
             spec = DatasetSpec.from_mapping(spec.to_mapping() | changes, source=str(file))
         return cls.of(spec, base=file.parent, source=str(file))
@@ -84,6 +91,8 @@ class Plan:
         """Check the template and read the eye files it names (relative to `base`)."""
         eyes: dict[str, Mapping[str, Any]] = {}
         eye_part = spec.scene.get("eye", {})
+        if is_draw(eye_part):
+            raise InputError("give its values draws of their own, not the whole eye", source=source, path="scene.eye")
         names = _possible(eye_part.get("model", "E2")) if isinstance(eye_part, Mapping) else ["E2"]
         for name in names:
             if not isinstance(name, str):
@@ -221,6 +230,18 @@ class Plan:
         # Another eye's parameters were not asked for.
         asked = {k: v if k.startswith(f"eye_parameters.{model}.") else None for k, v in drawn.items()}
         return eye, asked, bool(mine)
+
+
+def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
+    """The parts of a spec in which another eye model takes the place of its own."""
+    part = spec.scene.get("eye", {})
+    if not isinstance(part, Mapping) or is_draw(part):
+        raise InputError("the spec draws its whole eye; name the model there", source="--eye")
+    load_eye(eye)
+    # A file is meant from where the command runs, a name in a spec from where the spec lies.
+    model = eye if eye in catalogue_names() else str(Path(eye).resolve())
+    parameters = {name: values for name, values in spec.eye_parameters.items() if name == model}
+    return {"scene": {**spec.scene, "eye": {**part, "model": model}}, "eye_parameters": parameters}
 
 
 @lru_cache(maxsize=64)

@@ -161,7 +161,7 @@ class LocalPool:
         elif kind == "failed" and message[1] == "backend":
             raise BackendError(message[2])
         elif kind == "failed" and message[1] == "disk":
-            raise EyerenderError(f"{self.job.folder}: cannot be written ({message[2]})")
+            raise EyerenderError(message[2])
         else:
             return str(message[2])
         return None

@@ -85,6 +85,9 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
             return _Run(plan, folder, options, frames, progress, say).make(resumed)
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+    except KeyboardInterrupt:
+        say(f"{len(finished(folder))} of {plan.spec.shard_count} shards are finished; start again on {path} to go on")
+        raise
     finally:
         if created and folder.is_dir() and all(p.name.startswith(LOCK) for p in folder.iterdir()):
             shutil.rmtree(folder, ignore_errors=True)

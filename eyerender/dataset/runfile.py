@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..imagefolder import STAGE, write_json
+from ..imagefolder import RUN, STAGE, write_json
 from .lock import LOCK
 from .plan import Plan
 from .shard import run_versions
 
 RUN_SCHEMA = "eyerender/run/1"
-RUN = "run.json"
 _SHOWN = 4
 
 

@@ -22,7 +22,7 @@ from typing import Any
 from ..errors import EyerenderError, InputError
 from ..imagefile import write_png
 from ..imagefolder import IMAGE_SCHEMA, STAGE
-from .maker import Maker
+from .maker import MadeImage, Maker
 
 SHARD_SCHEMA = "eyerender/shard/1"
 DONE, SHARDS = "done.json", "shards"
@@ -67,30 +67,24 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
         for kind in kinds:
             (stage / kind).mkdir(parents=True)
         (stage / "shard").mkdir()
-        lines, rejections, given_up = [], [], []
-        for k, index in enumerate(samples):
-            made = maker.make(index)
-            rejections += [asdict(r) for r in made.rejections]
-            if not made.images:
-                given_up.append(index)
-            for image in made.images:
-                file = f"{image.name}.png"
-                write_png(stage / "images" / file, image.dn)
-                write_png(stage / "masks" / file, image.mask)
-                names = {"file_name": _place("images", shard, file), "mask_file_name": _place("masks", shard, file)}
-                if image.amodal is not None:
-                    write_png(stage / "amodal_masks" / file, image.amodal)
-                    names["amodal_mask_file_name"] = _place("amodal_masks", shard, file)
-                lines.append(json.dumps({"schema": IMAGE_SCHEMA, **names, **image.line}, allow_nan=False))
-            on_sample(k + 1, len(made.images))
-        text = "".join(line + "\n" for line in lines)
-        (stage / "shard" / LINES).write_text(text, encoding="utf-8")
+        count, rejections, given_up = 0, [], []
+        with open(stage / "shard" / LINES, "w", encoding="utf-8") as lines:
+            for k, index in enumerate(samples):
+                made = maker.make(index)
+                rejections += [asdict(r) for r in made.rejections]
+                if not made.images:
+                    given_up.append(index)
+                for image in made.images:
+                    names = _write_image(stage, shard, image)
+                    lines.write(json.dumps({"schema": IMAGE_SCHEMA, **names, **image.line}, allow_nan=False) + "\n")
+                count += len(made.images)
+                on_sample(k + 1, len(made.images))
         seconds = time.monotonic() - start
         done = {
             "schema": SHARD_SCHEMA,
             "shard": shard,
             "samples": [samples.start, samples.stop],
-            "images": len(lines),
+            "images": count,
             "digest": maker.plan.digest,
             "versions": run_versions(),
             "backend": maker.backend,
@@ -107,7 +101,19 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
     except BaseException:
         shutil.rmtree(stage, ignore_errors=True)
         raise
-    return Staged(shard, str(stage), len(lines), len(rejections), len(given_up), seconds)
+    return Staged(shard, str(stage), count, len(rejections), len(given_up), seconds)
+
+
+def _write_image(stage: Path, shard: int, image: MadeImage) -> dict[str, str]:
+    """Write an image and its masks; returns their names in the dataset."""
+    file = f"{image.name}.png"
+    write_png(stage / "images" / file, image.dn)
+    write_png(stage / "masks" / file, image.mask)
+    names = {"file_name": _place("images", shard, file), "mask_file_name": _place("masks", shard, file)}
+    if image.amodal is not None:
+        write_png(stage / "amodal_masks" / file, image.amodal)
+        names["amodal_mask_file_name"] = _place("amodal_masks", shard, file)
+    return names
 
 
 def commit(folder: Path, staged: Staged) -> None:

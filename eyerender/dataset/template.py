@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ PASSING = ("region.blink",)
 # An eye does not change from frame to frame, whatever the draw says.
 FIXED_IDENTITY = ("eye.model", "eye_parameters")
 _BLOCK = 256
+_CHOSEN = re.compile(r"#\d+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +157,7 @@ def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, pr
     if is_draw(node):
         shown = _join(prefix, path)
         draw = parse_draw(node, source=source, path=shown)
-        bare = path.replace("#", ".")
+        bare = _CHOSEN.sub("", path)  # a place means the same inside a choice
         identity = _under(bare, IDENTITY) and not _under(bare, PASSING)
         unit: Unit = draw.per or ("subject" if identity else "sample")
         if unit == "sample" and _under(bare, FIXED_IDENTITY):

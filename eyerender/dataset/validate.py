@@ -16,7 +16,6 @@ from ..imagefile import read_image
 from ..imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ..observation import OK, Observations
 from .labels import IRIS, PUPIL, moments_ellipse
-from .runfile import RUN
 from .shard import checksum, finished, read_done
 
 SHOWN = 50
@@ -35,8 +34,6 @@ def validate(path: str | Path, *, quick: bool = False, progress: Progress | None
         InputError: it is no folder of images, or a run that is not finished.
     """
     path = Path(path)
-    if (path / RUN).is_file() and not (path / DATASET).is_file():
-        raise InputError("holds a run that is not finished; start generate again on it", source=str(path))
     folder = ImageFolder.load(path)
     problems: list[str] = []
     total = len(folder.entries)
@@ -103,7 +100,7 @@ def _whole(folder: ImageFolder) -> Iterator[str]:
     """What concerns several lines at once."""
     names: set[str] = set()
     splits: dict[int, str] = {}
-    shape: Any = None
+    shape: tuple[set[str], set[str]] | None = None
     for k, entry in enumerate(folder.entries):
         line = entry.line
         if line["file_name"] in names:
@@ -112,21 +109,26 @@ def _whole(folder: ImageFolder) -> Iterator[str]:
         if "subject" in line:
             if splits.setdefault(line["subject"], line["split"]) != line["split"]:
                 yield f"{METADATA} line {k + 1}: subject {line['subject']} is in two splits"
-            keys = _keys(line)
-            shape = shape or keys
-            if keys != shape:
-                yield f"{METADATA} line {k + 1}: has other keys than line 1 ({', '.join(sorted(keys ^ shape)[:3])})"
+            nulls: set[str] = set()
+            keys = _keys(line, nulls)
+            shape = shape or (keys, nulls)
+            # What a null stands for in one of the two lines may be anything in the other.
+            other = sorted(key for key in keys ^ shape[0] if not any(key.startswith(n) for n in nulls | shape[1]))
+            if other:
+                yield f"{METADATA} line {k + 1}: has other keys than line 1 ({', '.join(other[:3])})"
     expected = folder.dataset.get("statistics", {}).get("images")
     if expected is not None and expected != len(folder.entries):
         yield f"{METADATA}: has {len(folder.entries)} lines, {DATASET} says {expected}"
 
 
-def _keys(node: Any, path: str = "") -> set[str]:
-    """The key paths of a line; lists count as one entry, null as nothing below."""
+def _keys(node: Any, nulls: set[str], path: str = "") -> set[str]:
+    """The key paths of a line; lists count as one entry; `nulls` gets the beginnings of what would be below a null."""
     if isinstance(node, dict):
-        return {path} | {p for key, value in node.items() for p in _keys(value, f"{path}.{key}")}
+        return {path} | {p for key, value in node.items() for p in _keys(value, nulls, f"{path}.{key}")}
     if isinstance(node, list) and node and isinstance(node[0], dict):
-        return {p for value in node for p in _keys(value, f"{path}[]")}
+        return {p for value in node for p in _keys(value, nulls, f"{path}[]")}
+    if node is None:
+        nulls |= {f"{path}.", f"{path}["}
     return {path}
 
 

@@ -58,8 +58,10 @@ def work(pipe: Connection, job: Job) -> None:
 
         try:
             pipe.send(("done", asdict(write_shard(maker, folder, shard, alive))))
-        except (OSError, EyerenderError) as error:
-            pipe.send(("failed", "disk", getattr(error, "strerror", None) or str(error)))
+        except OSError as error:
+            pipe.send(("failed", "disk", f"{folder}: cannot be written ({error.strerror or error})"))
+        except EyerenderError as error:
+            pipe.send(("failed", "disk", str(error)))
         except Exception as error:
             pipe.send(("failed", "error", f"{type(error).__name__}: {error}"))
 

@@ -31,13 +31,23 @@ class Candidate:
     score: float
 
 
-def find_candidates(prepared: Prepared, settings: ExtractionSettings, most: int = 4) -> list[Candidate]:
-    """Up to `most` places where a pupil may be, best first; empty where nothing dark and round stands out."""
+def find_candidates(
+    prepared: Prepared, settings: ExtractionSettings, most: int = 4, *, without_lines: bool = False
+) -> list[Candidate]:
+    """Up to `most` places where a pupil may be, best first; empty where nothing dark and round stands out.
+
+    without_lines: dark lines thinner than the smallest pupil are filled first: a lid's shadow and lashes are as dark
+    as the pupil that they touch, and one blob with it at every threshold.
+    """
     linear, noise_dn = prepared.linear, prepared.noise_dn
     factor = int(np.clip(settings.radius_min_px // 3.5, 1, 4))
     while factor < 8 and linear.size / factor**2 > 160_000:
         factor += 1
     small = _reduced(linear, factor, cv2.MORPH_CLOSE if prepared.inverted else cv2.MORPH_OPEN)
+    if without_lines:
+        width = 2 * max(1, round(0.7 * settings.radius_min_px / factor)) + 1
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+        small = as_image(cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel))
     noise = noise_dn / (1.5 * factor) + 0.1  # after averaging factor^2 pixels and a 3 x 3 Gaussian
     blobs = _sweep(small, factor, settings)
     if not blobs:

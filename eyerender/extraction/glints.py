@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 SMOOTH_PX = 0.7
 MAX_SIGMA_PX = 8.0
+RING_SHARE = 0.4  # of a glint's height above its darkest surroundings, that it has above its brightest
 MOST_PEAKS = 80  # maxima looked at, brightest first
 
 
@@ -71,8 +72,33 @@ def detect_spots(
             keep.append(i)
         if len(keep) >= settings.max_glints + 8:
             break
+    xy, width, height = xy[keep], width[keep], height[keep]
+    alone = _above_ring(smooth, xy, width) > RING_SHARE * height
+    patches = np.concatenate([patches, xy[~alone]])[: settings.max_glints]
     corner = np.array([x0, y0])
-    return Spots(xy[keep] + corner, width[keep], height[keep], patches + corner)
+    return Spots(xy[alone] + corner, width[alone], height[alone], patches + corner)
+
+
+def _above_ring(smooth: Image, xy: Array, width: Array) -> Array:
+    """(n,) how far each peak stands above the brightest tenth of a ring about it, the other spots left out.
+
+    Skin, lashes and the gaps between them have many peaks, and beside each others as bright.
+    """
+    out = np.full(width.size, np.inf)
+    for i, ((x, y), sigma) in enumerate(zip(xy.tolist(), width.tolist(), strict=True)):
+        reach = 3.5 * sigma + 2.0
+        x0, x1 = max(0, math.floor(x - reach)), min(smooth.shape[1], math.ceil(x + reach) + 1)
+        y0, y1 = max(0, math.floor(y - reach)), min(smooth.shape[0], math.ceil(y + reach) + 1)
+        columns, rows = np.arange(x0, x1)[None, :], np.arange(y0, y1)[:, None]
+        away = (columns - x) ** 2 + (rows - y) ** 2
+        ring = (away > (2.2 * sigma + 1.0) ** 2) & (away < reach**2)
+        whole = np.count_nonzero(ring)
+        apart = np.hypot(*(xy - xy[i]).T)
+        for k in np.nonzero((apart < 2.0 * reach + 2.5 * width) & (apart > 0.0))[0]:
+            ring &= (columns - xy[k, 0]) ** 2 + (rows - xy[k, 1]) ** 2 > (2.5 * width[k] + 1.0) ** 2
+        if np.count_nonzero(ring) > 0.25 * whole:
+            out[i] = float(smooth[int(y), int(x)]) - float(np.percentile(smooth[y0:y1, x0:x1][ring], 90.0))
+    return out
 
 
 def widest(blur_px: float) -> float:

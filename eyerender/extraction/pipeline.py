@@ -16,12 +16,12 @@ from .confidence import confidence
 from .covariance import SECTORS, edge_covariance, rim_deviation, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glints import Spots, detect_spots, judge_spots
-from .preprocess import DN, Prepared, invert, prepare
+from .preprocess import DN, Image, Prepared, invert, prepare
 from .refine import PixelFit, refine
-from .result import Extraction, GlintResult, Goodness, PupilResult
+from .result import Extraction, Goodness, PupilResult
 from .rimmodel import Place, RimModel
 from .settings import ExtractionSettings
-from .spotfit import fit_spots
+from .spotfit import SpotFit, fit_spots, spot_light
 from .spotmend import give_edges, split_blends
 
 Array = NDArray[np.float64]
@@ -55,15 +55,18 @@ def extract(
     model = _edge_model(found)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     pixel_fit: PixelFit | None = None
+    masked = _spot_mask(prepared, spots.xy_px, spots.width_px, spots.height_dn)
     if settings.method == "refined":
-        masked = _spot_mask(prepared, spots.xy_px, spots.width_px, spots.height_dn)
-        refined = refine(work.linear, model, _seen(found), masked, work.noise_dn)
-        if isinstance(refined, PixelFit) and _agrees(refined, found):
-            pixel_fit, model = refined, refined.model
+        pixel_fit = _refined(work.linear, model, found, masked, work.noise_dn)
+        model = model if pixel_fit is None else pixel_fit.model
+    spots, fit = _fit_spots(prepared, work, spots, model)
+    if settings.method == "refined" and not work.inverted:
+        again = _second_pass(prepared, model, found, spots, fit, masked)
+        pixel_fit, model = (pixel_fit, model) if again is None else (again, again.model)
     pupil = _pupil(found, work, model, pixel_fit, settings)
     if pupil.status == "missing":
         return Extraction(pupil, (), (), noise, size)
-    accepted, rejected = _glints(prepared, work, spots, model, settings)
+    accepted, rejected = judge_spots(spots, fit, prepared, abs(model.step_dn), model.sigma_px, settings)
     return Extraction(pupil, accepted, rejected, noise, size)
 
 
@@ -76,8 +79,16 @@ class _Found:
 
 
 def _search(work: Prepared, settings: ExtractionSettings) -> _Found | PupilResult:
-    """The best candidate by what its rim shows at full resolution."""
-    candidates = find_candidates(work, settings)
+    """The best candidate by what its rim shows at full resolution; where there is none, again without dark lines."""
+    found = _searched(work, settings, without_lines=False)
+    if isinstance(found, _Found) or work.inverted:
+        return found
+    again = _searched(work, settings, without_lines=True)
+    return again if isinstance(again, _Found) and again.rim.support > 0.5 else found
+
+
+def _searched(work: Prepared, settings: ExtractionSettings, *, without_lines: bool) -> _Found | PupilResult:
+    candidates = find_candidates(work, settings, without_lines=without_lines)
     if not candidates:
         return PupilResult.missing("coarse search", "no dark round region stands out of its surroundings")
     found, reason = _first_good(work, candidates, settings)
@@ -155,6 +166,51 @@ def _seen(found: _Found) -> NDArray[np.bool_]:
     return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
 
 
+def _refined(
+    linear: Image, start: RimModel, found: _Found, masked: NDArray[np.bool_], noise_dn: float
+) -> PixelFit | None:
+    """The pixel model's fit, if there is one that goes with the edges."""
+    fit = refine(linear, start, _seen(found), masked, noise_dn)
+    return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None
+
+
+def _second_pass(
+    prepared: Prepared, model: RimModel, found: _Found, spots: Spots, fit: SpotFit, masked: NDArray[np.bool_]
+) -> PixelFit | None:
+    """The pixel model fitted again with the glints' own light taken away; None where that frees hardly any pixels.
+
+    A glint's fit tells its flanks far better than the circle of the first pass; only where its light is more than three
+    times the noise is it left out.
+    """
+    told = fit.converged & (fit.residual_dn < 3.0 * prepared.noise_dn)
+    reach = float(model.ellipse.semi_axes_px[0]) + 10.0
+    offset = np.hypot(*(fit.xy_px - model.ellipse.centre_px).T)
+    near = told & (offset < reach + 8.0 * fit.sigma_px.max(axis=1, initial=0.0))
+    if not near.any():
+        return None
+    clear = _spot_mask(prepared, spots.xy_px[~told], spots.width_px[~told], spots.height_dn[~told])
+    linear = prepared.linear.copy()
+    for i in np.nonzero(near)[0]:
+        sigma = float(fit.sigma_px[i].max())
+        ratio = max(5.0 * float(fit.amplitude_dn[i]) / prepared.noise_dn, math.e)
+        radius = sigma * math.sqrt(2.0 * math.log(ratio)) + 1.0
+        rows, columns = _window(fit.xy_px[i], radius, linear.shape)
+        light = spot_light(fit.one(int(i)), np.arange(columns.start, columns.stop)[None, :].astype(np.float64),
+                           np.arange(rows.start, rows.stop)[:, None].astype(np.float64))  # fmt: skip
+        linear[rows, columns] -= light.astype(np.float32)
+        clear[rows, columns] |= light > 3.0 * prepared.noise_dn
+    freed = np.count_nonzero(masked & ~clear)
+    return None if freed < 20 else _refined(linear, model, found, clear, prepared.noise_dn)
+
+
+def _window(xy: Array, radius: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of an image within `radius` of a point, along each axis."""
+    x, y = xy
+    columns = slice(max(0, math.floor(x - radius)), min(shape[1], math.ceil(x + radius) + 1))
+    rows = slice(max(0, math.floor(y - radius)), min(shape[0], math.ceil(y + radius) + 1))
+    return slice(rows.start, max(rows.stop, rows.start)), slice(columns.start, max(columns.stop, columns.start))
+
+
 def _agrees(fit: PixelFit, found: _Found) -> bool:
     """Whether the refined rim still passes along the edges, and is no less certain than they make it.
 
@@ -177,10 +233,9 @@ def _spot_mask(prepared: Prepared, xy: Array, width: Array, height: Array) -> ND
     for (x, y), sigma, peak in zip(xy, width, height, strict=True):
         ratio = max(5.0 * peak / prepared.noise_dn, math.e)
         radius = 1.2 * sigma * math.sqrt(2.0 * math.log(ratio)) + 1.0
-        x0, x1 = max(0, math.floor(x - radius)), min(mask.shape[1], math.ceil(x + radius) + 1)
-        y0, y1 = max(0, math.floor(y - radius)), min(mask.shape[0], math.ceil(y + radius) + 1)
-        near = (np.arange(x0, x1)[None, :] - x) ** 2 + (np.arange(y0, y1)[:, None] - y) ** 2 < radius**2
-        mask[y0:y1, x0:x1] |= near
+        rows, columns = _window(np.array([x, y]), radius, mask.shape)
+        dx, dy = np.arange(columns.start, columns.stop) - x, np.arange(rows.start, rows.stop) - y
+        mask[rows, columns] |= dx[None, :] ** 2 + dy[:, None] ** 2 < radius**2
     return mask
 
 
@@ -211,9 +266,8 @@ def _pupil(
     return PupilResult("ok", None, None, ellipse, frozen(covariance), sure, goodness, contour)
 
 
-def _glints(
-    prepared: Prepared, work: Prepared, spots: Spots, model: RimModel, settings: ExtractionSettings
-) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
+def _fit_spots(prepared: Prepared, work: Prepared, spots: Spots, model: RimModel) -> tuple[Spots, SpotFit]:
+    """The spots fitted before the rim as the model has it; blends count as the spots they split into."""
     step = abs(model.step_dn)
 
     def known(x: Array, y: Array) -> Array:
@@ -225,5 +279,4 @@ def _glints(
     fit = fit_spots(prepared.linear, known, *starts, *limits)
     fit = give_edges(prepared.linear, known, starts, fit, model.sigma_px, limits)
     starts, fit = split_blends(prepared.linear, known, starts, fit, limits)
-    spots = Spots(*starts, spots.patches_px)
-    return judge_spots(spots, fit, prepared, step, model.sigma_px, settings)
+    return Spots(*starts, spots.patches_px), fit

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +11,18 @@ from numpy.typing import NDArray
 from ..geometry.ellipse import Ellipse
 from .covariance import SECTORS, SHAPE, distance_slopes, gram, project, sector_excess, sector_of, to_axes
 from .preprocess import Image
-from .rimmodel import Place, RimModel, blurred_edge, harmonics
+from .rimmodel import Place, Profile, RimModel, harmonics
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 ORDERS = (0, 2, 4, 6, 8)  # Fourier orders of the outer level that are tried
 OUTLIER = 5.0  # pixels beyond this many standard deviations do not count
+FIXED = SHAPE + 5  # parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, mean outer level
+# Standard deviations of what is about 0 beforehand: the harmonics of the outer level, in steps (nothing else holds them
+# under a lid); its change over a semi-axis b, in steps (lamps beside the camera bring it about); the blur's kurtosis.
+HARMONIC_SD, SLOPE_SD, KURTOSIS_SD = 0.3, 0.15, 1.0
+KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond them the edge would not be monotonic
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,14 +54,13 @@ def refine(linear: Image, start: RimModel, sectors: Mask, masked: Mask, noise_dn
     sectors that the model cannot explain (lids, lashes, reflections) are put aside, and the rest is fitted again.
     """
     model = start
-    # Harmonics of the outer level are 0 +- 0.3 steps beforehand: under a lid nothing else holds them.
-    prior = (noise_dn / (0.3 * max(start.step_dn, noise_dn))) ** 2
+    prior = _prior(start, noise_dn)
     pixels = _band(linear, model, masked)
     use = np.ones(pixels.x.size, dtype=bool)
     result: tuple[RimModel, Array, Array, Place] | None = None
     # The order of the outer level must not be learnt from a lid.
     seen = _clear_of_lids(sectors, start)
-    order_settled = False
+    order_settled = start.outer.size > 1  # a second pass keeps what the first one chose
     for turn in range(4):
         place = Place.of(model.ellipse, pixels.x, pixels.y)
         bins = sector_of(place)
@@ -69,7 +73,7 @@ def refine(linear: Image, start: RimModel, sectors: Mask, masked: Mask, noise_dn
         if not order_settled:
             order = _best_order(chosen, model, noise_dn)
             if order > 0:
-                model = RimModel(model.ellipse, model.inner_dn, _padded(model.outer, order), model.sigma_px)
+                model = replace(model, outer=_padded(model.outer, order))
                 result = _gauss_newton(chosen, model, prior, steps=4)
                 model = result[0]
             order_settled = True
@@ -117,16 +121,38 @@ def _predict(model: RimModel, pixels: _Pixels) -> Array:
 
 
 def _jacobian(model: RimModel, place: Place) -> tuple[Array, Array]:
-    """Model levels (n,) and their derivatives (n, 5 + 2 + 1 + 2 K): shape, sigma, inner, outer coefficients."""
-    edge, by_distance, by_sigma = blurred_edge(place.distance, place.curvature, model.sigma_px)
+    """Model levels (n,) and their derivatives (n, 9 + 1 + 2 K) by the parameters in the order of FIXED."""
+    profile = Profile.of(place.distance, place.curvature, model.sigma_px, model.kurtosis)
     basis = harmonics(place.cos_t, place.sin_t, (model.outer.size - 1) // 2)
     step = np.einsum("nk,k->n", basis, model.outer) - model.inner_dn
-    out = np.empty((place.distance.size, SHAPE + 2 + basis.shape[1]))
-    out[:, :SHAPE] = (step * by_distance)[:, None] * distance_slopes(model.ellipse, place)
-    out[:, 5] = step * by_sigma
-    out[:, 6] = 1.0 - edge
-    out[:, 7:] = basis * edge[:, None]
-    return model.inner_dn + step * edge, out
+    by_distance = step * profile.edge_by_distance + model.slope * profile.ramp_by_distance
+    out = np.empty((place.distance.size, FIXED - 1 + basis.shape[1]))
+    out[:, :SHAPE] = by_distance[:, None] * distance_slopes(model.ellipse, place)
+    out[:, 5] = step * profile.edge_by_sigma + model.slope * profile.ramp_by_sigma
+    out[:, 6] = 1.0 - profile.edge
+    out[:, 7] = profile.ramp
+    out[:, 8] = step * profile.edge_by_kurtosis
+    out[:, 9:] = basis * profile.edge[:, None]
+    return model.inner_dn + step * profile.edge + model.slope * profile.ramp, out
+
+
+def _prior(start: RimModel, noise_dn: float) -> Array:
+    """(3,) weights of the squares of slope, kurtosis and a harmonic beside those of a pixel's residual."""
+    step = max(start.step_dn, noise_dn)
+    slope = SLOPE_SD * step / float(start.ellipse.semi_axes_px[1])
+    return (noise_dn / np.array([slope, KURTOSIS_SD, HARMONIC_SD * step])) ** 2
+
+
+def _held(prior: Array, size: int) -> Array:
+    """(size,) the prior's weight of every parameter."""
+    out = np.zeros(size)
+    out[7], out[8], out[FIXED:] = prior
+    return out
+
+
+def _values(model: RimModel) -> Array:
+    """The parameters that a prior may hold, at their places; the others are 0."""
+    return np.concatenate([np.zeros(7), [model.slope, model.kurtosis, 0.0], model.outer[1:]])
 
 
 def _moved(model: RimModel, step: Array) -> RimModel:
@@ -138,22 +164,22 @@ def _moved(model: RimModel, step: Array) -> RimModel:
     axes = np.maximum(values[::-1], 0.5)
     sigma = float(np.clip(model.sigma_px + step[5], 0.5 * model.sigma_px, 2.0 * model.sigma_px))
     ellipse = Ellipse(model.ellipse.centre_px + step[:2], axes, angle)
-    return RimModel(ellipse, model.inner_dn + float(step[6]), model.outer + step[7:], max(sigma, 0.3))
+    inner, slope = model.inner_dn + float(step[6]), model.slope + float(step[7])
+    kurtosis = float(np.clip(model.kurtosis + step[8], *KURTOSIS_LIMITS))
+    return RimModel(ellipse, inner, model.outer + step[9:], max(sigma, 0.3), slope, kurtosis)
 
 
-def _gauss_newton(pixels: _Pixels, model: RimModel, prior: float, steps: int) -> tuple[RimModel, Array, Array, Place]:
-    """(model, residual, Jacobian, place) after at most `steps` steps; cost = sum r^2 + prior sum (harmonics)^2."""
+def _gauss_newton(pixels: _Pixels, model: RimModel, prior: Array, steps: int) -> tuple[RimModel, Array, Array, Place]:
+    """(model, residual, Jacobian, place) after at most `steps` steps; cost = sum r^2 + what the prior adds."""
     place = Place.of(model.ellipse, pixels.x, pixels.y)
     value, jacobian = _jacobian(model, place)
     residual = pixels.level - value
-    cost = float(np.sum(residual * residual) + prior * (model.outer[1:] @ model.outer[1:]))
+    held = _held(prior, jacobian.shape[1])
+    cost = float(np.sum(residual * residual) + held @ _values(model) ** 2)
     damping = 1e-4
-    held = np.arange(SHAPE + 3, jacobian.shape[1])
     for _ in range(steps):
-        matrix = gram(jacobian)
-        matrix[held, held] += prior
-        vector = project(jacobian, residual)
-        vector[held] -= prior * model.outer[1:]
+        matrix = gram(jacobian) + np.diag(held)
+        vector = project(jacobian, residual) - held * _values(model)
         scale = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
         system = matrix / np.outer(scale, scale) + damping * np.eye(scale.size)
         step = np.linalg.solve(system, vector / scale) / scale
@@ -164,7 +190,7 @@ def _gauss_newton(pixels: _Pixels, model: RimModel, prior: float, steps: int) ->
         trial_place = Place.of(trial.ellipse, pixels.x, pixels.y)
         trial_value, trial_jacobian = _jacobian(trial, trial_place)
         trial_residual = pixels.level - trial_value
-        trial_cost = float(np.sum(trial_residual * trial_residual) + prior * (trial.outer[1:] @ trial.outer[1:]))
+        trial_cost = float(np.sum(trial_residual * trial_residual) + held @ _values(trial) ** 2)
         if trial_cost <= cost:
             model, place, jacobian, residual = trial, trial_place, trial_jacobian, trial_residual
             gained, cost = cost - trial_cost, trial_cost
@@ -178,20 +204,21 @@ def _gauss_newton(pixels: _Pixels, model: RimModel, prior: float, steps: int) ->
 
 def _padded(outer: Array, order: int) -> Array:
     out = np.zeros(1 + 2 * order)
-    out[: outer.size] = outer
+    kept = min(out.size, outer.size)
+    out[:kept] = outer[:kept]
     return out
 
 
 def _best_order(pixels: _Pixels, model: RimModel, noise_dn: float) -> int:
     """Fourier order of the outer level by BIC, from one linear step with the largest order's columns."""
-    full = RimModel(model.ellipse, model.inner_dn, _padded(model.outer, ORDERS[-1]), model.sigma_px)
+    full = replace(model, outer=_padded(model.outer, ORDERS[-1]))
     value, jacobian = _jacobian(full, Place.of(full.ellipse, pixels.x, pixels.y))
     residual = pixels.level - value
     matrix, vector = gram(jacobian), project(jacobian, residual)
     count = residual.size
     best, best_bic = 0, math.inf
     for order in ORDERS:
-        size = SHAPE + 3 + 2 * order
+        size = FIXED + 2 * order
         part = matrix[:size, :size] + 1e-9 * np.diag(np.diag(matrix)[:size] + 1e-9)
         drop = float(vector[:size] @ np.linalg.solve(part, vector[:size]))
         chi2 = max(float(np.sum(residual * residual)) - drop, 1e-9)
@@ -234,13 +261,11 @@ def _sane(model: RimModel, start: RimModel) -> bool:
     return moved < 0.25 * float(b) + 1.0 and bool((ratio > 0.7).all() and (ratio < 1.4).all()) and model.step_dn > 0.0
 
 
-def _report(result: tuple[RimModel, Array, Array, Place], prior: float, noise_dn: float, seen: Mask) -> PixelFit:
+def _report(result: tuple[RimModel, Array, Array, Place], prior: Array, noise_dn: float, seen: Mask) -> PixelFit:
     model, residual, jacobian, place = result
     free = max(residual.size - jacobian.shape[1], 1)
     variance = float(np.sum(residual * residual)) / free
-    matrix = gram(jacobian)
-    held = np.arange(SHAPE + 3, jacobian.shape[1])
-    matrix[held, held] += prior
+    matrix = gram(jacobian) + np.diag(_held(prior, jacobian.shape[1]))
     inverse = np.asarray(np.linalg.inv(matrix + 1e-12 * np.diag(np.diag(matrix))), dtype=np.float64)
     plain = inverse[:SHAPE, :SHAPE] * variance
     # Texture leaves residuals that agree within a sector; their excess over white noise scales the covariance.

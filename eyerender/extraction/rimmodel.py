@@ -1,10 +1,13 @@
 """The pixel model of a pupil's rim: two levels and the blurred convex edge between them.
 
-    I = inner (1 - E) + outer(t) E,   E(d) = Phi(d / s) + (kappa s / 2) phi(d / s)
+    I = inner (1 - E) + outer(t) E + slope (d Phi(d / s) + s phi(d / s))
+    E(d) = Phi(z) + (kappa s / 2) phi(z) - (g / 24) (z^3 - 3 z) phi(z),   z = d / s
 
 d: signed distance to the ellipse (positive outside), kappa: curvature of the rim at the nearest point, s: sigma of the
 blur, pixel included (s^2 = optics^2 + 1/12), Phi and phi: the normal distribution and density. The second term is
-the first order of the blur of a disc in s kappa. outer(t) is a Fourier series in the ellipse's parameter t.
+the first order of the blur of a disc in s kappa; the third lets the blur have heavier tails than a normal distribution,
+g being its excess kurtosis (Edgeworth's series). outer(t) is a Fourier series in the ellipse's parameter t; the slope
+comes with a blurred ramp: the iris grows brighter or darker outwards, as lamps beside the camera make it.
 """
 
 from __future__ import annotations
@@ -25,12 +28,15 @@ _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimModel:
-    """ellipse; inner_dn; outer: (1 + 2 K,) Fourier coefficients (1, cos t, sin t, cos 2t, ...), DN; sigma_px."""
+    """ellipse; inner_dn; outer: (1 + 2 K,) Fourier coefficients (1, cos t, sin t, cos 2t, ...), DN; sigma_px; slope of
+    the outer level, DN per px; kurtosis of the blur beyond a Gaussian's 0."""
 
     ellipse: Ellipse
     inner_dn: float
     outer: Array
     sigma_px: float
+    slope: float = 0.0
+    kurtosis: float = 0.0
 
     @property
     def step_dn(self) -> float:
@@ -40,10 +46,11 @@ class RimModel:
     def level(self, x: Array, y: Array) -> Array:
         """Expected grey level at pixels (x, y) of any shape."""
         place = Place.of(self.ellipse, x.ravel(), y.ravel())
-        edge = blurred_edge(place.distance, place.curvature, self.sigma_px)[0]
+        profile = Profile.of(place.distance, place.curvature, self.sigma_px, self.kurtosis)
+        edge, ramp = profile.edge, profile.ramp
         basis = harmonics(place.cos_t, place.sin_t, (self.outer.size - 1) // 2)
         outer = np.einsum("nk,k->n", basis, self.outer)
-        return np.asarray((self.inner_dn + (outer - self.inner_dn) * edge).reshape(x.shape))
+        return np.asarray((self.inner_dn + (outer - self.inner_dn) * edge + self.slope * ramp).reshape(x.shape))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,15 +97,39 @@ class Place:
         return Place(distance, c, s, nx, ny, a * b / height**3)
 
 
-def blurred_edge(distance: Array, curvature: Array, sigma: float) -> tuple[Array, Array, Array]:
-    """E, dE/dd and dE/ds."""
-    z = distance / sigma
-    density = _DENSITY * np.exp(-0.5 * z * z)
-    half = 0.5 * curvature
-    edge = ndtr(z) + half * sigma * density
-    by_distance = density * (1.0 / sigma - half * z)
-    by_sigma = density * (half * (1.0 + z * z) - z / sigma)
-    return edge, by_distance, by_sigma
+@dataclass(frozen=True, slots=True, eq=False)
+class Profile:
+    """Across the rim, all (n,): `edge` E from 0 inside to 1 outside and `ramp` max(d, 0) blurred, with their
+    derivatives by the distance d (px), by sigma (px) and by the kurtosis."""
+
+    edge: Array
+    edge_by_distance: Array
+    edge_by_sigma: Array
+    edge_by_kurtosis: Array
+    ramp: Array
+    ramp_by_distance: Array
+    ramp_by_sigma: Array
+
+    @staticmethod
+    def of(distance: Array, curvature: Array, sigma: float, kurtosis: float = 0.0) -> Profile:
+        """distance, curvature: (n,) px and 1/px of the nearest point of the rim. sigma: px."""
+        z = distance / sigma
+        z2 = z * z
+        density = _DENSITY * np.exp(-0.5 * z2)
+        step = ndtr(z)
+        half = 0.5 * curvature
+        tails = z * (3.0 - z2) * density / 24.0
+        # The derivative of -(z^3 - 3 z) phi is He_4 phi.
+        bend = density * (1.0 + (kurtosis / 24.0) * (z2 * (z2 - 6.0) + 3.0))
+        return Profile(
+            step + half * sigma * density + kurtosis * tails,
+            bend / sigma - half * z * density,
+            half * (1.0 + z2) * density - z * bend / sigma,
+            tails,
+            distance * step + sigma * density,
+            step,
+            density,
+        )
 
 
 def harmonics(cos_t: Array, sin_t: Array, order: int) -> Array:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from scipy.special import erf
 
 from .preprocess import Image
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 
 PARAMETERS = 8  # x, y, ln A, ln sx, ln sy, b0, bx, by
 MAX_TURNS = 25
+LOST_PX = 12.0  # no glint's fit is as wide as that, or as far from where it began
 _ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
 
 
@@ -69,6 +71,10 @@ class _Windows:
     clip: NDArray[np.bool_]  # (n, k, k)
     centre: Array  # (n, 2)
 
+    def taken(self, index: NDArray[np.intp]) -> _Windows:
+        """The chosen spots'."""
+        return _Windows(*(getattr(self, one.name)[index] for one in fields(self)))
+
 
 def fit_spots(
     linear: Image,
@@ -85,29 +91,80 @@ def fit_spots(
     start_px (n, 2), width_px (n,), height_dn (n,): from detection.
     slope_dn: how steep the background may be beyond `known`, DN per px (standard deviation of its prior).
 
-    Spots closer than 5 sigma are fitted in turn, each on the image less the others, until they settle.
+    Spots that reach into each other's windows are fitted in turn, each on the image less the others, until they settle.
     """
-    count = start_px.shape[0]
-    if count == 0:
+    if start_px.shape[0] == 0:
         return _empty()
-    half = int(np.clip(math.ceil(3.2 * float(np.max(width_px)) + 1.0), 4, 20))
-    windows = _cut(linear, known, start_px, np.minimum(2.7 * width_px + 1.2, half), half, clip_dn)
-    theta = _start(windows, start_px, width_px, height_dn)
-    distance = np.hypot(*np.moveaxis(start_px[:, None] - start_px[None], -1, 0)) + 1e9 * np.eye(count)
-    crowded = bool((distance < 2.0 * half).any())
-    if not crowded:
-        theta, settled = _fit(windows, theta, np.zeros_like(windows.data), noise_dn, slope_dn)
+    parts, order = [], []
+    for members in _groups(start_px, width_px):
+        half = int(np.clip(math.ceil(3.2 * float(np.max(width_px[members])) + 1.0), 4, 20))
+        start, width = start_px[members], width_px[members]
+        windows = _cut(linear, known, start, np.minimum(window_radius(width), half), half, clip_dn)
+        theta = _start(windows, start, width, height_dn[members])
         others = np.zeros_like(windows.data)
-    else:
-        others = _others(windows, theta)
-        for _ in range(20):
-            previous = theta
-            theta, settled = _fit(windows, theta, others, noise_dn, slope_dn, turns=6)
-            others = _others(windows, theta)
-            if np.abs(theta[:, :2] - previous[:, :2]).max() < 1e-4:
-                break
-        settled |= np.abs(theta[:, :2] - previous[:, :2]).max(axis=1) < 0.02
-    return _report(windows, theta, settled, others, noise_dn, slope_dn)
+        if _touching(start, width).any():
+            theta, settled, others = _fit_in_turn(windows, theta, noise_dn, slope_dn)
+        else:
+            theta, settled = _fit(windows, theta, others, noise_dn, slope_dn)
+        parts.append(_report(windows, theta, settled, others, noise_dn, slope_dn))
+        order.append(members)
+    back = np.argsort(np.concatenate(order), kind="stable")
+    return joined(parts).taken(back)
+
+
+def joined(parts: list[SpotFit]) -> SpotFit:
+    """Batches one after the other."""
+    return SpotFit(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)))
+
+
+def window_radius(width: Array) -> Array:
+    """Radius, px, of the pixels that a spot of that sigma is fitted to."""
+    return 2.7 * width + 1.2
+
+
+def _touching(start: Array, width: Array) -> NDArray[np.bool_]:
+    """(n, n) whether one spot's light reaches into another's window."""
+    radius = window_radius(width)
+    distance = np.hypot(*np.moveaxis(start[:, None] - start[None], -1, 0))
+    return np.asarray((distance < 1.35 * (radius[:, None] + radius[None])) & ~np.eye(width.size, dtype=bool))
+
+
+def _groups(start: Array, width: Array) -> list[NDArray[np.intp]]:
+    """Spots that touch each other, group by group; lone ones together, the narrow and the wide apart."""
+    count, label = connected_components(_touching(start, width), directed=False)
+    alone = np.bincount(label, minlength=count)[label] == 1
+    groups = [np.nonzero(label == k)[0] for k in np.unique(label[~alone])]
+    narrow = width < 2.5
+    return [group for group in (np.nonzero(alone & narrow)[0], np.nonzero(alone & ~narrow)[0], *groups) if group.size]
+
+
+def _fit_in_turn(
+    windows: _Windows, theta: Array, noise_dn: float, slope_dn: float
+) -> tuple[Array, NDArray[np.bool_], Array]:
+    """(theta, settled, the others' light) of spots that share pixels.
+
+    A spot that has grown or moved beyond what a glint's could is given up: its light is nobody's background.
+    """
+    theta, start = theta.copy(), theta[:, :2]
+    settled, lost = np.zeros(theta.shape[0], dtype=bool), np.zeros(theta.shape[0], dtype=bool)
+    others = _others(windows, theta, lost)
+    for _ in range(10):
+        index = np.nonzero(~lost)[0]
+        found, done = _fit(windows.taken(index), theta[index], others[index], noise_dn, slope_dn, turns=4)
+        moved = np.abs(found[:, :2] - theta[index, :2]).max(axis=1)
+        theta[index] = found
+        settled[index] = done | (moved < 0.02)
+        lost |= _lost(theta, start)
+        others = _others(windows, theta, lost)
+        if lost.all() or moved.max() < 3e-4:
+            break
+    return theta, settled & ~lost, others
+
+
+def _lost(theta: Array, start: Array) -> NDArray[np.bool_]:
+    """(n,) which spots have grown or moved beyond what a glint's fit could."""
+    wide = theta[:, 3:5].max(axis=1) > math.log(LOST_PX)
+    return np.asarray(wide | (np.hypot(*(theta[:, :2] - start).T) > LOST_PX))
 
 
 def spot_light(fit: SpotFit, x: Array, y: Array) -> Array:
@@ -224,7 +281,7 @@ def _fit(
     """Levenberg-Marquardt on every spot side by side."""
     n = theta.shape[0]
     damping = np.full(n, 1e-2)
-    settled = np.zeros(n, dtype=bool)
+    settled, start = np.zeros(n, dtype=bool), theta[:, :2]
     cost, gradient, matrix, _ = _normal(windows, theta, others, noise, slope)
     diagonal = np.arange(PARAMETERS)
     for _ in range(turns):
@@ -246,16 +303,16 @@ def _fit(
         matrix = np.where(better[:, None, None], new_matrix, matrix)
         cost = np.where(better, new_cost, cost)
         damping = np.clip(np.where(better, 0.1 * damping, 8.0 * damping), 1e-7, 1e7)
-        settled |= damping > 1e5
+        settled |= (damping > 1e5) | _lost(theta, start)
         if settled.all():
             break
     return theta, settled
 
 
-def _others(windows: _Windows, theta: Array) -> Array:
+def _others(windows: _Windows, theta: Array, lost: NDArray[np.bool_]) -> Array:
     """(n, k, k): in every spot's window, the light of the other spots."""
     out = np.zeros_like(windows.data)
-    for i in range(theta.shape[0]):
+    for i in np.nonzero(~lost)[0]:
         gx = _profile(windows.x, theta[i, 0], math.exp(theta[i, 3]))[0]
         gy = _profile(windows.y, theta[i, 1], math.exp(theta[i, 4]))[0]
         spot = math.exp(theta[i, 2]) * gx * gy

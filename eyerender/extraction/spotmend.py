@@ -14,12 +14,13 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from .preprocess import Image
-from .spotfit import SpotFit, fit_spots, spot_light
+from .spotfit import SpotFit, fit_spots, joined, spot_light, window_radius
 
 Array = NDArray[np.float64]
 Background = Callable[[Array, Array], Array]
 
 UNEXPLAINED = 2.0
+MOST_NEAR = 4  # spots about one that is split: more are skin or lashes
 MOST = 12  # spots that are mended: where there are more, they are no glints
 
 
@@ -109,20 +110,30 @@ def split_blends(
             continue
         offset, across = axis
         xy, width, height = starts
-        rest = np.arange(width.size) != i
+        # Only the spots whose light reaches there are fitted anew.
+        reach = 3.0 * (window_radius(width) + window_radius(width[i]))
+        near = (np.hypot(*(xy - fit.xy_px[i]).T) < reach) & (np.arange(width.size) != i)
+        if np.count_nonzero(near) > MOST_NEAR:
+            continue
         trial = (
-            np.vstack([xy[rest], fit.xy_px[i] - offset, fit.xy_px[i] + offset]),
-            np.append(width[rest], [across, across]),
-            np.append(height[rest], [height[i], height[i]]),
+            np.vstack([xy[near], fit.xy_px[i] - offset, fit.xy_px[i] + offset]),
+            np.append(width[near], [across, across]),
+            np.append(height[near], [height[i], height[i]]),
         )
         again = fit_spots(linear, known, trial[0], trial[1], trial[2], *limits)
         halves = slice(-2, None)
         sigma = again.sigma_px[halves]
         good = bool(again.converged[halves].all()) and bool((sigma.max(axis=1) < 1.5 * sigma.min(axis=1)).all())
         if good and float(again.residual_dn[halves].max()) < 0.6 * float(fit.residual_dn[i]):
-            order = np.argsort(np.append(np.nonzero(rest)[0], [i, i]), kind="stable")
-            halved = (trial[0][order], trial[1][order], trial[2][order])
-            return split_blends(linear, known, halved, again.taken(order), limits)
+            far = ~near & (np.arange(width.size) != i)
+            order = np.argsort(np.concatenate([np.nonzero(far)[0], np.nonzero(near)[0], [i, i]]), kind="stable")
+            halved = (
+                np.vstack([xy[far], trial[0]])[order],
+                np.append(width[far], trial[1])[order],
+                np.append(height[far], trial[2])[order],
+            )
+            together = joined([fit.taken(np.nonzero(far)[0]), again]).taken(order)
+            return split_blends(linear, known, halved, together, limits)
     return starts, fit
 
 

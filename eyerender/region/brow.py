@@ -1,7 +1,7 @@
 """The brow: hairs in a band over the supraorbital ridge, lying on the skin.
 
 At its head, near the nose, hairs stand up; along the arch they turn to the temple, those of the upper border downwards,
-so that they meet in a line (Farkas 1994 for the band; directions as commonly described). The brow does not move.
+so that they meet in a line (directions as commonly described). The brow does not move.
 """
 
 from __future__ import annotations
@@ -25,18 +25,21 @@ def brow(spec: RegionSpec) -> Hairs:
     b = spec.brow
     rng = np.random.default_rng((0xB405, spec.seed))
     n = b.count
-    # 0 at the head, 1 at the tail; sparse at both ends.
-    s = np.clip(rng.beta(1.1, 1.3, n), 0.0, 1.0)
-    across = np.clip(rng.normal(0.5, 0.24, n), 0, 1)
+    # 0 at the head, 1 at the tail; thinning out at both ends and at both borders.
+    s = -0.04 + 1.1 * rng.beta(1.25, 1.55, n)
+    across = rng.beta(1.7, 1.7, n)
     y, low, high = _band(spec, s)
-    z = low + across * (high - low)
-    head = 1 - step(s, 0.0, 0.34)
-    upper = step(across, 0.35, 0.85)
-    # Direction from +z towards the temple (-y).
-    lean = np.radians(18 + 62 * (1 - head) + 38 * upper * (1 - 0.8 * head) + 18 * step(s, 0.6, 1.0))
-    lean = lean + np.radians(9.0) * rng.normal(0, 1, n)
-    length = b.length_mm * rng.uniform(0.55, 1.0, n) * (0.75 + 0.25 * np.sin(np.pi * s))
-    bend = np.radians(20.0) * rng.normal(0.9, 0.45, n) * (1 - 0.55 * head)
+    z = low + across * (high - low) + 0.5 * rng.normal(0, 1, n)
+    head = 1 - step(s, -0.02, 0.36)
+    upper = step(across, 0.3, 0.95)
+    # Direction from +z towards the temple (-y): up at the head, then along the band, from the upper border down to it.
+    along = 70.0 + 26.0 * step(s, 0.45, 0.95)
+    lean = np.radians(along + (14.0 - along) * head + 26.0 * (upper - 0.25) * (1 - 0.7 * head))
+    # Neighbours lie alike, a few stray.
+    drift = np.interp(s, np.linspace(-0.1, 1.1, 22), rng.normal(0, 1, 22))
+    lean = lean + np.radians(4.0) * drift + np.radians(9.0) * np.clip(rng.standard_t(5, n), -3, 3)
+    length = b.length_mm * rng.triangular(0.35, 0.85, 1.0, n) * (0.62 + 0.38 * np.sin(np.pi * np.clip(s, 0, 1) ** 0.8))
+    bend = np.radians(24.0) * rng.normal(0.9, 0.6, n) * (1 - 0.3 * head)
     points = np.empty((n, POINTS, 3))
     lift = 0.35 + 0.55 * rng.uniform(0, 1, n) + 0.5 * head
     for j in range(POINTS):
@@ -55,8 +58,8 @@ def _band(spec: RegionSpec, s: Floats) -> tuple[Floats, Floats, Floats]:
     b = spec.brow
     y = 21.0 - 46.0 * s
     arch = b.arch_mm * np.sin(np.pi * np.clip(s / 1.25, 0, 1)) ** 1.5
-    low = b.height_mm + arch - 5.5 * step(s, 0.62, 1.0) - 1.0 * (1 - step(s, 0.0, 0.2))
-    width = b.thickness_mm * (0.8 + 0.2 * step(s, 0.0, 0.2)) * (1 - 0.75 * step(s, 0.45, 1.0))
+    low = b.height_mm + arch - 3.6 * step(s, 0.62, 1.05) - 1.0 * (1 - step(s, 0.0, 0.2))
+    width = b.thickness_mm * (0.75 + 0.25 * step(s, -0.05, 0.2)) * (1 - 0.72 * step(s, 0.35, 1.05))
     return y, low, low + width
 
 

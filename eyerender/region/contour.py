@@ -24,7 +24,7 @@ from .anatomy import RegionSpec
 from .globe import Globe
 
 COLUMNS = 176
-_LATERAL, _MEDIAL, _VERTICAL = np.radians(58.0), np.radians(51.0), np.radians(62.0)
+LATERAL, _MEDIAL, _VERTICAL = np.radians(58.0), np.radians(51.0), np.radians(62.0)
 _GAP_MM = 0.01
 
 
@@ -105,10 +105,10 @@ def _outline(spec: RegionSpec, globe: Globe, a: Floats, upper: Floats) -> tuple[
     high = max(height(f.upper_mm, lids.upper_follows) - middle_z, low + 1.0)
     rest = f.upper_mm - middle_z
     shut = 0.8 * low + 0.2 * high if high < 0 else 0.8 * low
-    shape_up = _shape(a, f.peak, 0.78)
-    shape_low = _shape(a, -0.06, 0.80)
+    shape_up = _shape(a, f.peak, 0.98)
+    shape_low = _shape(a, -0.08, 0.92)
     # Beside the caruncle both lids run close together.
-    bay = 1 - 0.30 * np.exp(-(((1 - a) / 0.16) ** 2))
+    bay = 1 - 0.42 * np.exp(-(((1 - a) / 0.19) ** 2))
     closed = shut * shape_low
     b = spec.blink
     up = (1 - b) * high * shape_up * bay + b * (closed + _GAP_MM * shape_up)
@@ -132,7 +132,7 @@ def _support(globe: Globe, centre: Floats, yz: Floats) -> tuple[Floats, Floats]:
     e = d / rho[..., None]
     R = globe.radius_mm
     nasal, temporal = step(e[..., 0], 0.2, 0.85), step(-e[..., 0], 0.2, 0.85)
-    limit = _VERTICAL + nasal * (_MEDIAL - _VERTICAL) + temporal * (_LATERAL - _VERTICAL)
+    limit = _VERTICAL + nasal * (_MEDIAL - _VERTICAL) + temporal * (LATERAL - _VERTICAL)
     soft = 14.0 - 9.5 * nasal
     rho0 = R * np.sin(limit)
     past = np.maximum(rho - rho0, 0.0)

@@ -1,8 +1,9 @@
 """The face around the eye without its lids: how far forward (x, mm) the skin stands over (y nasal, z up).
 
-A smooth surface through a table of depths about the corneal apex: the lateral orbital rim lies 16 to 18 mm behind the
-apex (Hertel's exophthalmometry), the inner canthus about 8 mm, the nasion 8 to 10 mm before it, the supraorbital ridge
-5 mm before it (Farkas 1994); between those the depths are drawn by eye. Beyond the middle of the face it is mirrored.
+A smooth surface through a table of depths about the corneal apex. The lateral orbital rim lies 16 to 18 mm behind it
+(Hertel's exophthalmometry: means of 15.0 mm, Wu et al. 2015, and 15.7 mm, Karti et al. 2015, with 2 to 3 mm of spread);
+the inner canthus (8 mm behind), nasion (8 to 10 mm before), supraorbital ridge (5 mm before), tip of the nose (28 mm
+before) and all in between are drawn by eye. Beyond the middle of the face it is mirrored.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from .anatomy import FaceSpec
 
 MIDDLE_MM = 31.5
 _Y = np.array([-75.0, -60.0, -46.0, -36.0, -27.0, -19.0, -11.0, 0.0, 10.0, 16.5, 22.0, 27.0, 31.5])
-_Z = np.array([-62.0, -45.0, -32.0, -22.0, -14.0, -7.0, 0.0, 6.0, 12.0, 17.0, 22.0, 28.0, 38.0, 52.0, 68.0])
+_Z = np.array([-62.0, -53.0, -45.0, -32.0, -22.0, -14.0, -7.0, 0.0, 6.0, 12.0, 17.0, 22.0, 28.0, 38.0, 52.0, 68.0])
 # Rows z from below upwards, columns y from the temple to the middle of the nose.
 _DEPTH = np.array([
-    [-62, -44, -33, -25, -18, -13, -8.5, -3.0, 2.0, 6.0, 11.0, 16.0, 19.0],
-    [-58, -40, -29, -21, -14, -9.5, -6.0, -2.0, 2.5, 7.0, 14.0, 23.0, 27.0],
-    [-55, -38, -26, -18.5, -12.5, -8.8, -6.0, -3.2, 0.5, 4.5, 10.0, 18.0, 22.5],
-    [-54, -37, -26, -17.0, -11, -7.6, -5.2, -3.4, -1.8, 0.6, 5.5, 12.5, 17.0],
+    [-62, -44, -33, -25, -18, -13, -8.5, -3.0, 2.0, 6.5, 11.0, 14.0, 15.0],
+    [-60, -42, -31, -23, -16, -11, -7.2, -3.0, 1.5, 9.0, 14.0, 17.0, 18.5],
+    [-58, -40, -29, -21, -14, -9.5, -6.0, -2.4, 1.5, 11.0, 18.0, 25.5, 29.5],
+    [-55, -38, -26, -18.5, -12.5, -8.8, -6.0, -3.4, -0.3, 5.0, 11.5, 20.0, 24.5],
+    [-54, -37, -26, -17.0, -11, -7.6, -5.2, -3.6, -2.2, 0.6, 6.0, 13.5, 18.0],
     [-53, -37, -26, -17.5, -11.4, -8.0, -5.6, -4.2, -3.4, -2.4, 2.0, 8.5, 12.5],
     [-52, -37, -26.5, -18.5, -12.6, -9.2, -7.2, -6.4, -5.8, -5.0, -0.6, 6.0, 9.6],
     [-51, -37, -27, -19.5, -13.6, -10.4, -9.4, -10.0, -9.2, -7.2, -2.0, 4.2, 8.0],
@@ -40,7 +42,9 @@ _DEPTH = np.array([
 
 def face_depth(face: FaceSpec, y_mm: Floats, z_mm: Floats) -> Floats:
     """x (mm) of the face over points (y, z) of the region's frame."""
-    folded = MIDDLE_MM - np.sqrt((MIDDLE_MM - y_mm) ** 2 + 2.0**2) + 0.0  # mirrored, rounded on the bridge
+    off = MIDDLE_MM - y_mm
+    # Mirrored, and rounded where the halves meet: as far off as it was beyond a centimetre.
+    folded = MIDDLE_MM - (np.sqrt(off * off + 5.5**2) - 5.5 * np.exp(-((off / 9.0) ** 2)))
     spline = _spline(face)
     return np.asarray(spline.ev(np.clip(z_mm, _Z[0], _Z[-1]), np.clip(folded, _Y[0], _Y[-1])))
 

@@ -13,7 +13,7 @@ import numpy as np
 from ..arrays import ArrayValue, Floats, Ints, frozen
 from .contour import unit
 
-SEGMENTS = 5
+SEGMENTS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +52,6 @@ def tube_faces(count: int, points: int) -> Ints:
 
 
 def taper(length: Floats, root_mm: float, points: int) -> Floats:
-    """Radii (n, k): full at the root, thinning to a fifth at the tip."""
+    """Radii (n, k): full at the root, thinning to a tenth at the tip."""
     s = np.linspace(0, 1, points)
-    return np.asarray(np.broadcast_to(root_mm / 2 * (1 - 0.85 * s**1.5), (len(length), points)))
+    return np.asarray(np.broadcast_to(root_mm / 2 * (1 - 0.9 * s**1.4), (len(length), points)))

@@ -21,15 +21,17 @@ from .anatomy import LashSpec, RegionSpec
 from .contour import step, unit
 from .globe import Globe
 from .hairs import SEGMENTS, Hairs, taper
-from .lids import CONJUNCTIVA, LID, MARGIN, Sheet
+from .lids import CONJUNCTIVA, EDGE_MM, LID, MARGIN, Sheet
 
-_ABOVE_MM = 0.2
+_ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # of the points beyond the root; they start on the skin
 _REACH_ROWS = 16
+_CAUGHT_MM = 0.3  # a lash that still has so far to go is caught
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LashPlan(ArrayValue):
-    """What of the lashes does not move: column angle, place across the margin (0 to 1), length, fan, start and curl."""
+    """What of the lashes does not move: column angle, place across the margin (0 to 1), length, fan, start, curl and
+    thickness (1 for a full-grown upper lash)."""
 
     angle: Floats
     across: Floats
@@ -37,43 +39,48 @@ class LashPlan(ArrayValue):
     fan: Floats
     start: Floats
     curl: Floats
+    stout: Floats
 
 
 @lru_cache(maxsize=16)
 def plan(spec: LashSpec, seed: int) -> LashPlan:
     """The lashes of a subject; upper ones first."""
     parts = [_lid(spec, seed, True), _lid(spec, seed, False)]
-    return LashPlan(*(frozen(np.concatenate([p[i] for p in parts])) for i in range(6)))
+    return LashPlan(*(frozen(np.concatenate([p[i] for p in parts])) for i in range(7)))
 
 
 def _lid(spec: LashSpec, seed: int, upper: bool) -> tuple[Floats, ...]:
     rng = np.random.default_rng((0x1A5, seed, int(upper)))
     count = spec.upper_count if upper else spec.lower_count
-    low, high = (-0.955, 0.70) if upper else (-0.93, 0.62)
+    # Beside the nose, from the lacrimal puncta on, margins have none.
+    low, high = (-0.955, 0.62) if upper else (-0.93, 0.58)
     place = (np.arange(count) + 0.5 + rng.uniform(-0.45, 0.45, count)) / max(count, 1)
     # Denser towards the temple.
     a = low + (high - low) * place**1.08
-    across = rng.choice([0.60, 0.76, 0.92], count, p=[0.3, 0.4, 0.3]) + rng.normal(0, 0.03, count)
+    across = rng.choice([0.76, 0.87, 0.97], count, p=[0.25, 0.4, 0.35]) + rng.normal(0, 0.03, count)
     # Longest a little temporal of the middle, short at both ends.
     end = (a - low) / (high - low)
     profile = 0.45 + 0.55 * np.sin(np.pi * np.clip(end, 0, 1) ** 0.9) ** 0.6
     most = spec.upper_length_mm if upper else spec.lower_length_mm
-    length = most * profile * rng.triangular(0.45, 0.92, 1.0, count)
+    # Lashes of all ages stand side by side: most are grown, some are short.
+    length = most * profile * np.where(rng.uniform(size=count) < 0.22, rng.uniform(0.3, 0.7, count),
+                                       rng.triangular(0.6, 0.88, 1.0, count))  # fmt: skip
     spread = np.radians(spec.spread_deg)
-    fan = np.radians(38.0) * np.sin(1.35 * a) + spread * rng.normal(0, 1, count)
-    droop = np.radians(spec.upper_droop_deg) if upper else np.radians(14.0)
-    start = -droop + 0.6 * spread * rng.normal(0, 1, count)
-    curl = np.radians(spec.upper_curl_deg if upper else spec.lower_curl_deg) * rng.uniform(0.8, 1.15, count)
+    fan = np.radians(42.0) * np.sin(1.3 * (a + 0.04)) + (1.0 if upper else 1.5) * spread * rng.normal(0, 1, count)
+    droop = np.radians(spec.upper_droop_deg if upper else -8.0)
+    start = -droop + 0.8 * spread * rng.normal(0, 1, count)
+    curl = np.radians(spec.upper_curl_deg if upper else spec.lower_curl_deg) * rng.uniform(0.7, 1.2, count)
     # Clumps: groups of two to five share fan and curl towards their tips.
-    group = np.cumsum((rng.uniform(size=count) < 0.32).astype(np.int64))
+    group = np.cumsum((rng.uniform(size=count) < 0.36).astype(np.int64))
     for values in (fan, start, curl):
         for g in np.unique(group):
             members = group == g
             mean = values[members].mean()
-            values[members] += 0.5 * spec.clumping * (mean - values[members])
+            values[members] += 0.8 * spec.clumping * (mean - values[members])
     fan = fan + _lean(a, group, spec.clumping, float(np.mean(length)) if count else 1.0)
     angle = np.arccos(np.clip(a, -1, 1)) if upper else 2 * np.pi - np.arccos(np.clip(a, -1, 1))
-    return angle, across, length, fan, start, curl
+    stout = (1.0 if upper else 0.75) * np.clip(0.55 + 0.5 * length / most, 0.0, 1.0)
+    return angle, across, length, fan, start, curl, stout
 
 
 def _lean(a: Floats, group: Ints, clumping: float, length: float) -> Floats:
@@ -91,23 +98,28 @@ def lashes(spec: RegionSpec, globe: Globe, sheet: Sheet) -> Hairs:
     p = plan(spec.lashes, spec.seed)
     c = sheet.contour
     inner, outer, n, m, t = (_at(p.angle, v) for v in (c.point, sheet.lash_line, c.normal, c.away, c.along_lid))
-    root = inner + p.across[:, None] * (outer - inner)
+    # On the margin's surface, which stands out of the chord between its rounded edges.
+    width = np.linalg.norm(outer - inner, axis=-1)
+    swell = EDGE_MM / spec.lids.margin_mm * width * (1 - (2 * p.across - 1) ** 4)
+    root = inner + p.across[:, None] * (outer - inner) - swell[:, None] * m
     # With the lids shut there is less room between them.
     fold_back = step(1 - c.openness, 0.5, 1.0)
     start = p.start * (1 - 0.6 * fold_back)
     k = SEGMENTS + 1
+    # Shorter pieces where it bends most.
+    ends = np.linspace(0, 1, k) ** 1.25
     points = np.empty((len(root), k, 3))
-    points[:, 0] = root - 0.15 * n
+    points[:, 0] = root - 0.06 * n + 0.08 * m
     for j in range(1, k):
-        s = (j - 0.5) / SEGMENTS
-        b = start + p.curl * s**0.9
-        f = p.fan * (0.55 + 0.6 * s)
+        s = 0.5 * (ends[j - 1] + ends[j])
+        b = start + p.curl * s**1.15
+        f = p.fan * (0.5 + 0.7 * s)
         d = np.cos(f)[:, None] * (np.cos(b)[:, None] * n + np.sin(b)[:, None] * m) + np.sin(f)[:, None] * t
-        points[:, j] = points[:, j - 1] + (p.length_mm / SEGMENTS)[:, None] * d
+        points[:, j] = points[:, j - 1] + (p.length_mm * (ends[j] - ends[j - 1]))[:, None] * d
     ahead = unit(n + 0.4 * np.array([1.0, 0.0, 0.0]))
-    straight = root[:, None] + (p.length_mm[:, None] * np.linspace(0, 1, k))[..., None] * ahead[:, None]
+    straight = root[:, None] + (p.length_mm[:, None] * ends)[..., None] * ahead[:, None]
     points[:, 1:] = _out_of_skin(globe, sheet, points, straight)
-    return Hairs(frozen(points), frozen(taper(p.length_mm, spec.lashes.diameter_mm, k)))
+    return Hairs(frozen(points), frozen(taper(p.length_mm, spec.lashes.diameter_mm, k) * p.stout[:, None]))
 
 
 def _at(angle: Floats, values: Floats) -> Floats:
@@ -133,36 +145,36 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
     tree = cKDTree(skin)
     out, k = points.copy(), points.shape[1]
 
-    def lift(at: Floats, within: float) -> Floats:
+    def lift(at: Floats, within: float, least: Floats) -> Floats:
         distance, nearest = tree.query(at, distance_upper_bound=within)
         known = np.isfinite(distance)
         nearest = np.where(known, nearest, 0)
         above = np.sum((at - skin[nearest]) * normals[nearest], axis=-1)
-        return np.asarray(normals[nearest] * np.where(known, np.maximum(_ABOVE_MM - above, 0), 0)[..., None])
+        return np.asarray(normals[nearest] * np.where(known, np.maximum(least - above, 0), 0)[..., None])
 
-    push = lift(out, np.inf)
+    push = lift(out, np.inf, _ABOVE_MM)
+    everywhere = np.concatenate([_ABOVE_MM, _ABOVE_MM[:-1], _ABOVE_MM[1:]])
     out += push / np.maximum(np.linalg.norm(push, axis=-1, keepdims=True) / 1.2, 1.0)
-    active = np.arange(len(out))
+    active, left = np.arange(len(out)), np.zeros(len(out))
     for turn in range(16):
         some = out[active]
         if turn >= 6:  # caught in a fold, where the nearest skin's normals disagree
             some = some + 0.35 * (straight[active] - some)
         middles = (2 * some[:, :-1] + some[:, 1:]) / 3, (some[:, :-1] + 2 * some[:, 1:]) / 3
-        push = lift(np.concatenate([some, *middles], axis=1), 1.5)
+        push = lift(np.concatenate([some, *middles], axis=1), 1.5, everywhere)
         some = some + push[:, :k]
         for i in range(2):
             between = push[:, k + i * (k - 1) : k + (i + 1) * (k - 1)]
             some[:, :-1] += 0.7 * between
             some[:, 1:] += 0.7 * between
         out[active] = some
-        active = active[np.abs(push).max(axis=(1, 2)) > 0.01]
+        left[active] = np.abs(push).max(axis=(1, 2))
+        active = active[left[active] > 0.01]
         if not len(active):
             break
     # Bent out of shape on the way, for want of room: it stays in its root.
-    pieces = np.diff(out, axis=1)
-    stretched = np.linalg.norm(pieces, axis=-1).max(axis=1) > 1.5 * np.linalg.norm(
-        straight[:, 1] - straight[:, 0], axis=-1
-    )
-    out[stretched] = root[stretched] + 0.01 * (straight[stretched] - root[stretched])
+    pieces, rest = (np.linalg.norm(np.diff(v, axis=1), axis=-1) for v in (out, straight))
+    stretched = ((pieces / np.maximum(rest, 1e-9)).max(axis=1) > 1.7) | (left > _CAUGHT_MM)
+    out[stretched] = root[stretched] + 0.0005 * (straight[stretched] - root[stretched])
     # And off the globe, for lashes that turn in.
     return globe.pushed_out(out, 0.3)

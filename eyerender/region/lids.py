@@ -21,16 +21,18 @@ import numpy as np
 
 from ..arrays import ArrayValue, Floats, Ints, frozen
 from .anatomy import RegionSpec
-from .contour import COLUMNS, Contour, contour, step, unit
+from .contour import COLUMNS, LATERAL, Contour, contour, step, unit
 from .face import face_depth
 from .globe import Globe
 
 CONJUNCTIVA, MARGIN, LID, FACE = 7, 7, 16, 26
 ROWS = CONJUNCTIVA + MARGIN + LID + FACE
-_DIP_MM = 0.035
+_DIP_MM = 0.031
+EDGE_MM = 0.26  # how far the margin's rounded edges fall back
 _FAR_MM = (66.0, 58.0)
 _JOINT_MM = 2.4
 _SOFT_MM = 9.0
+_ON_GLOBE = (1.0, 0.8, 0.5, 0.2)  # share of the globe's normal in those of the conjunctiva's first rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +55,12 @@ def sheet(spec: RegionSpec, globe: Globe) -> Sheet:
     conjunctiva = _conjunctiva(spec, globe, c)
     skin = _skin(spec, globe, c, margin[-1], lash_line)
     vertices = np.concatenate([conjunctiva, margin, skin])
-    return Sheet(frozen(vertices), frozen(grid_normals(vertices)), c, frozen(lash_line))
+    normals = grid_normals(vertices)
+    # The conjunctiva leaves the globe without an edge.
+    for row, share in enumerate(_ON_GLOBE):
+        radial = unit(vertices[row] - globe.centre)
+        normals[row] = unit(share * radial + (1 - share) * normals[row])
+    return Sheet(frozen(vertices), frozen(normals), c, frozen(lash_line))
 
 
 @lru_cache(maxsize=4)
@@ -80,17 +87,25 @@ def grid_normals(vertices: Floats) -> Floats:
 
 
 def margin_width(spec: RegionSpec, c: Contour) -> Floats:
-    """Thickness of the margin (columns,): it thins towards the canthi."""
-    return np.asarray(spec.lids.margin_mm * (0.45 + 0.55 * step(np.abs(np.sin(c.angle)), 0.0, 0.55)))
+    """Thickness of the margin (columns,): it thins towards the canthi; the lower one is thinner (Zhu et al. 2022).
+
+    Shut, both are as thick, so that neither overhangs the other's lashes.
+    """
+    middle = spec.lids.margin_mm * np.where(c.upper > 0, 1.0, 1 - 0.2 * min(c.openness, 1.0))
+    return np.asarray(
+        0.45 * spec.lids.margin_mm + (middle - 0.45 * spec.lids.margin_mm) * step(np.abs(np.sin(c.angle)), 0.0, 0.55)
+    )
 
 
 def _margin(spec: RegionSpec, globe: Globe, c: Contour) -> tuple[Floats, Floats]:
-    tilt = np.radians(spec.lids.margin_tilt_deg) * (0.25 + 0.75 * min(c.openness, 1.0))
+    # The upper margin faces down and is seen edge-on from the front; the lower one opens upwards.
+    tilt = np.radians(np.where(c.upper > 0, 0.0, 1.0) * 16.0 + spec.lids.margin_tilt_deg)[:, None]
+    tilt = tilt * (0.25 + 0.75 * min(c.openness, 1.0))
     width = margin_width(spec, c)
     out = np.cos(tilt) * c.normal + np.sin(tilt) * c.away
     u = np.linspace(0, 1, MARGIN)[:, None, None]
     u = 0.5 - 0.5 * np.cos(np.pi * u) * (0.6 + 0.4 * np.cos(np.pi * u) ** 2)
-    rounding = 0.26 * (2 * u - 1) ** 4 * (width / spec.lids.margin_mm)[:, None]
+    rounding = EDGE_MM * (2 * u - 1) ** 4 * (width / spec.lids.margin_mm)[:, None]
     rows = c.point + width[:, None] * u * out + rounding * c.away
     rows = globe.pushed_out(rows, spec.lids.film_mm)
     # The two lids meet in the middle between them, never beyond.
@@ -102,26 +117,50 @@ def _conjunctiva(spec: RegionSpec, globe: Globe, c: Contour) -> Floats:
     away = c.point - globe.centre
     distance = np.linalg.norm(away, axis=-1)
     on_globe = step(distance - globe.radial(unit(away)), 0.6, 0.05)
-    end = c.point + 1.2 * on_globe[:, None] * c.away
-    end = globe.centre + unit(end - globe.centre) * (globe.radial(unit(end - globe.centre)) - _DIP_MM)[:, None]
-    # Beside the nose it reaches further on to the globe, to a crescent about the cornea: the plica.
-    nasal = step(c.along, 0.72, 0.93)
-    z = c.point[:, 2] - globe.centre[2]
-    crescent = np.stack([np.full_like(z, 5.2), 10.7 + 0.03 * z**2, 0.85 * z], axis=-1)
-    reach = unit((1 - nasal)[:, None] * unit(end - globe.centre) + nasal[:, None] * unit(crescent))
+    # It starts under the lids, and in the corners of the fissure on lines across them: beside the nose a crescent about
+    # the cornea, the plica; at the temple where the globe's tangent leads to the canthus, so that the white goes on
+    # without an edge.
+    y, z = (c.point[:, 1:] - globe.centre[1:]).T
+    y_fold = 9.5 + 2.5 * max(float(globe.axis[1]), 0.0)  # an eye that turns in draws the fold flat
+    y_temple = globe.radius_mm * np.sin(LATERAL)
+    line = np.where(y > 0, y_fold, y_temple)
+    t = np.abs(y) / line
+    z_line = np.where(y > 0, _spread(c, y, z, y_fold, True), _spread(c, y, z, -y_temple, False))
+    corner = step(t, 0.6, 1.05)
+    z_start = z + (1 - corner) * 0.8 * on_globe * c.away[:, 2] + corner * (z_line - z)
+    y_start = np.sign(y) * line * (1.2 * t - np.log1p(np.exp(12 * (1.2 * t - 1))) / 12)
+    y_start = y_start - 0.02 * corner * z_start**2 * (y > 0)
+    x_start = np.sqrt(np.maximum(globe.radius_mm**2 - y_start**2 - z_start**2, (0.4 * globe.radius_mm) ** 2))
+    reach = unit(np.stack([x_start, y_start, z_start], axis=-1))
     reach = globe.centre + reach * (globe.radial(reach) - _DIP_MM)[:, None]
     u = (np.arange(CONJUNCTIVA) / CONJUNCTIVA)[:, None, None]
     rows = reach + u * (c.point - reach)
     # Plica: a low crescent on the globe; caruncle: a mound off it.
     s = u[..., 0]
-    size = nasal[None, :] * (1 - spec.blink)
-    plica = 0.45 * np.exp(-(((s - 0.22) / 0.14) ** 2)) * size
-    caruncle = 1.5 * np.exp(-(((s - 0.55) / 0.2) ** 2)) * step(c.along, 0.9, 0.995)[None, :] * (1 - 0.6 * spec.blink)
+    size = step(c.along, 0.66, 0.9)[None, :] * (1 - spec.blink)
+    plica = 0.40 * np.exp(-(((s - 0.24) / 0.15) ** 2)) * size
+    caruncle = 1.2 * np.exp(-(((s - 0.6) / 0.2) ** 2)) * step(c.along, 0.86, 0.99)[None, :] * (1 - 0.6 * spec.blink)
     rows = rows + (plica + caruncle)[..., None] * c.normal
-    clear = globe.pushed_out(
-        rows, np.where(u[..., 0] > 0, spec.lids.film_mm * on_globe + 0.05 * (1 - on_globe), -_DIP_MM)
-    )
+    # Long pieces are chords of the globe (0.7 of its radius: of the cornea): so far out that their middles are, too.
+    sag = np.sum((c.point - reach) ** 2, axis=-1) / CONJUNCTIVA**2 / (8 * 0.7 * globe.radius_mm)
+    film = spec.lids.film_mm * on_globe + 0.05 * (1 - on_globe) + sag
+    clear = globe.pushed_out(rows, np.where(u[..., 0] > 0, film, -_DIP_MM))
     return np.asarray(clear)
+
+
+def _spread(c: Contour, y: Floats, z: Floats, y_line: float, nasal: bool) -> Floats:
+    """z (columns,) on a line across the corner of the fissure, evenly between where the lids cross it: near the
+    canthus, where the contour's own z crowd, their distances h from the canthus' go as the square root.
+    """
+    corner = 0 if nasal else len(z) // 2
+    h = np.abs(z - z[corner])
+    out = z.copy()
+    for side in (1.0, -1.0):
+        mine = np.flatnonzero((c.upper == side) & (c.along > 0 if nasal else c.along < 0))
+        most = h[mine][np.argmin(np.abs(y[mine] - y_line))]
+        near = mine[h[mine] < most]
+        out[near] = z[corner] + np.sign(z[near] - z[corner]) * np.sqrt(h[near] * most)
+    return out
 
 
 def _skin(spec: RegionSpec, globe: Globe, c: Contour, edge: Floats, lash_line: Floats) -> Floats:
@@ -190,7 +229,7 @@ def _fold(spec: RegionSpec, c: Contour, v: Floats, crease: Floats, strength: Flo
     height = lids.fold_mm * (0.25 + 0.75 * open_) * strength
     w = v - crease
     groove = -0.3 * np.exp(-((w / 0.5) ** 2)) * (0.4 + 0.6 * open_) * (lids.fold_mm > 0)
-    swell = step(w, -0.1, 1.5) * np.exp(-(np.maximum(w - 1.3, 0) ** 2) / 24.0)
+    swell = step(w, -0.2, 2.2) * np.exp(-(np.maximum(w - 1.6, 0) ** 2) / 30.0)
     lift = height * swell + groove * strength
     drop = 0.55 * height * step(w, 0.0, 0.7) * np.exp(-(np.maximum(w - 0.7, 0) ** 2) / 5.0)
     bags = np.where(c.upper < 0, 1.0, 0.0) * lids.bags_mm * np.exp(-(((v - 8.5) / 3.5) ** 2)) * np.abs(np.sin(c.angle))

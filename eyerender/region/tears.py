@@ -1,7 +1,7 @@
 """The tear meniscus: a concave strip of water between the globe and the inner edge of either margin.
 
 Its section is an arc that leaves the globe and the margin along their tangents, as tall as `height_mm` on the globe;
-the upper one is two thirds of the lower (Mainstone, Bruce and Golding 1996 for the height). Opaque here: what shows is
+the upper one is two thirds of the lower (Doughty et al. 2002 for the height). Opaque here: what shows is
 its line of light, not what it refracts.
 """
 
@@ -28,5 +28,5 @@ def meniscus(spec: RegionSpec, globe: Globe, sheet: Sheet) -> Floats:
     u = np.linspace(0, np.pi / 2, ROWS)[:, None]
     down, out = height * (1 - np.sin(u)), height * (1 - np.cos(u))
     rows = c.point - down[..., None] * c.away + out[..., None] * c.normal
-    # Under the surface at either end, so that no gap shows.
-    return globe.pushed_out(rows, np.where(np.arange(ROWS)[:, None] == 0, 0.002, 0.006) * np.ones_like(height))
+    # So far out of the globe that no chord between columns dips into it.
+    return globe.pushed_out(rows, np.where(np.arange(ROWS)[:, None] == 0, 0.010, 0.014) * np.ones_like(height))

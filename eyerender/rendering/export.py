@@ -3,7 +3,8 @@
     mitsuba -m scalar_rgb scene.xml        (or llvm_ad_rgb, cuda_ad_rgb)
 
 Lengths are mm, radiance is mW/mm^2/sr. What stock Mitsuba lacks is left out and said in the file: textures, the limbus'
-soft rim, lens distortion, the point-spread function, and lamps that are neither Lambertian discs nor isotropic points.
+soft rim, lens distortion, the point-spread function, ambient light, and lamps that are neither Lambertian discs nor
+isotropic points.
 """
 
 from __future__ import annotations
@@ -18,8 +19,13 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..eye.model import Eye
+from ..region.anatomy import RegionSpec
+from ..region.head import HEAD_PARTS, load_head, placed
+from ..region.mesh import region_mesh
+from ..rig.imaging import AmbientSpec
 from .frame import RenderJob
 from .meshes import Patch, eye_meshes
+from .region import globe_of
 
 _BACKDROP_HALF_MM = 500.0
 
@@ -65,7 +71,11 @@ def export_scene(
         _patch(root, folder, patch, motion, albedo.get(patch.name, 0.0))
     place = np.eye(4)
     place[:3, 3] = job.anchor_mm
-    _patch(root, folder, _backdrop(look.backdrop_distance_mm), place, look.backdrop_albedo)
+    if job.region is None:
+        _patch(root, folder, _backdrop(look.backdrop_distance_mm), place, look.backdrop_albedo)
+    else:
+        for patch, matte in _region(job, job.region):
+            _patch(root, folder, patch, place, matte)
     for k, lamp in enumerate(job.lights):
         _lamp(root, k, lamp.position_mm, lamp.axis, float(lamp.radius_mm), float(lamp.intensity_mw_sr))
     ET.indent(root)
@@ -120,6 +130,8 @@ def _notes(job: RenderJob) -> list[str]:
         notes.append("Lamps with a lobe other than cos^1 are shown as Lambertian discs.")
     if any(lamp.radius_mm == 0 for lamp in job.lights):
         notes.append("Point lamps: a path tracer cannot light what lies behind the cornea with them.")
+    if job.ambient != AmbientSpec():
+        notes.append("Ambient light, panels and the surrounding's map are left out.")
     notes.append("Textures, the limbus' soft rim and the point-spread function are left out.")
     return notes
 
@@ -183,6 +195,28 @@ def _lamp(root: ET.Element, k: int, position: Floats, axis: Floats, radius: floa
     _transform(shape, pose)
     emitter = ET.SubElement(shape, "emitter", type="area")
     _value(emitter, "rgb", "radiance", intensity / (np.pi * radius**2))
+
+
+def _region(job: RenderJob, spec: RegionSpec) -> list[tuple[Patch, float]]:
+    """The parts of the eye region or of the head mesh, each with its mean albedo; the sheen is left out."""
+    globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
+    mesh = region_mesh(spec, globe) if spec.head is None else placed(load_head(spec.head), globe)
+    skin = spec.skin
+    albedo = {"lashes": spec.lashes.albedo, "brow": spec.brow.albedo, "tears": 0.9 * skin.wet_albedo}
+    v, f = ([0, *ends.tolist()] for ends in (mesh.layout.vertex_ends, mesh.layout.face_ends))
+    return [
+        (
+            Patch(
+                f"region_{name}",
+                mesh.vertices[v[k] : v[k + 1]],
+                mesh.normals[v[k] : v[k + 1]],
+                mesh.layout.faces[f[k] : f[k + 1]] - v[k],
+            ),
+            albedo.get(name, skin.albedo),
+        )
+        for k, name in enumerate(HEAD_PARTS[: len(f) - 1])
+        if f[k + 1] > f[k]
+    ]
 
 
 def _backdrop(distance_mm: float) -> Patch:

@@ -1,7 +1,9 @@
-"""Writing OpenEXR files: linear irradiance in full float precision."""
+"""OpenEXR files: linear irradiance in full float precision."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +12,29 @@ from numpy.typing import NDArray
 from ..errors import EyerenderError
 
 
+@contextmanager
+def second_thread() -> Iterator[None]:
+    """Mitsuba's OpenEXR waits for ever where Dr.Jit has a single thread: lend it another."""
+    import drjit as dr
+
+    count = dr.thread_count()
+    if count > 1:
+        yield
+        return
+    dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(count)
+
+
 def write_exr(path: Path, image: NDArray[np.float32]) -> None:
     """Write (h, w) float32 as a one-channel EXR; raises `EyerenderError` where the disk refuses it."""
     import mitsuba as mi
 
     try:
         # A copy, because Mitsuba takes no read-only array.
-        mi.Bitmap(np.array(image, dtype=np.float32)[..., None]).write(str(path))
+        with second_thread():
+            mi.Bitmap(np.array(image, dtype=np.float32)[..., None]).write(str(path))
     except RuntimeError as error:
         raise EyerenderError(f"{path}: cannot be written ({str(error).splitlines()[0]})") from None

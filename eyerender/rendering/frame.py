@@ -99,6 +99,19 @@ def eye_numbers(eye: Eye) -> dict[str, ArrayLike]:
     return numbers
 
 
+def margin_waves(eye: Eye) -> Floats:
+    """Fourier coefficients (k, 2) of the pupil's relative radius over the angle in the stop's plane, as c_k and -s_k.
+
+    The stop's own angle runs the other way about for a left eye: f' = pi - f, cos(k f') = (-1)^k cos(k f),
+    sin(k f') = -(-1)^k sin(k f).
+    """
+    cosines, sines = np.asarray(eye.stop.contour, dtype=float)
+    if float(eye.stop.handed) < 0:
+        turned = (-1.0) ** np.arange(1, len(cosines) + 1)
+        cosines, sines = turned * cosines, -turned * sines
+    return np.stack([cosines, -sines], axis=1)
+
+
 def look_numbers(look: LookSpec) -> dict[str, ArrayLike]:
     """The look's part of a kernel's numbers."""
     return {

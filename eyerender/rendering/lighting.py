@@ -50,39 +50,64 @@ def _globe_blocks(values: Values, x: Any, r: Any, d: Any, distance: Any, sphere:
     return blocked | (met & cornea & (t > EPSILON_MM) & (t < distance))
 
 
+def straight(lamp: Lamp, source: Any, view: View, back: Any = None) -> tuple[Any, Any]:
+    """What a lamp gives matte points in the air when nothing stands in the way: irradiance (mW/mm^2), and the radiance
+    of their sheen towards the unit direction `back` (eye frame), if it is given.
+
+    `source` are points of the lamp.
+    """
+    to = source - view.point
+    inv2 = dr.rcp(dr.squared_norm(to))
+    to *= dr.sqrt(inv2)
+    cosine = dr.dot(to, view.normal)
+    received = dr.select(view.matte & (cosine > 0), lamp.radiant_intensity(-to) * cosine * inv2, 0)
+    return received, mi.Float(0) if back is None else received * sheen(view.normal, to, back, view.gloss)
+
+
 def light(
     values: Values, lights: Lights, scene: Any, view: View, back: Any, u: Any, v: Any
 ) -> tuple[Any, Any, Any, Any]:
-    """Irradiance (mW/mm^2) at the first surface where it is matte and in the plane of the iris, the radiance of its
-    sheen towards the unit direction `back` (eye frame), and failed paths."""
-    outside = (view.cornea & (view.opacity > 0)) | view.sclera | view.other
-    inside = view.cornea & (view.opacity < 1) & (view.passed > 0)
-    return lamps(values, lights, scene, view.point, view.normal, outside, view.other, view.inner, inside, u, v,
-                 (back, view.gloss) if values.structure.region else None)  # fmt: skip
+    """Irradiance (mW/mm^2) at the first surface where it is matte, the radiance of its sheen towards the unit direction
+    `back` (eye frame), the irradiance in the plane of the iris, and failed paths.
 
-
-def lamps(
-    values: Values,
-    lights: Lights,
-    scene: Any,
-    point: Any,
-    normal: Any,
-    outside: Any,
-    other: Any,
-    inner: Any,
-    inside: Any,
-    u: Any,
-    v: Any,
-    glossy: tuple[Any, Any] | None = None,
-) -> tuple[Any, Any, Any, Any]:
-    """Irradiance (mW/mm^2) of all lamps outside, radiance of the sheen, irradiance inside, number of failed paths.
-
-    Args:
-        point, normal: matte points in the air, where `outside`; the scene's own where `other`, else the globe's.
-        inner: points in the plane of the iris, where `inside`.
-        u, v: place on each lamp's disc, [0, 1).
-        glossy: unit direction to the viewer and gloss of the points outside, where they mirror at all.
+    u, v: place on each lamp's disc, [0, 1). The cornea is convex: where it faces a lamp it is not in its own way.
     """
+    if values.structure.region:
+        # Skin fills the picture and every lamp costs a ray through the region: each sample sees one lamp, for all.
+        count = mi.Float(lights.count)
+        one = dr.minimum(mi.UInt32(u * count), lights.count - 1)
+        lamp: Lamp = lights[one]
+        source = lamp.point(u * count - mi.Float(one), *dr.sincos(v * (2 * dr.pi)))
+        direct, shine = straight(lamp, source, view, back)
+        blocked = lamp_blocked(values, scene, view.point, source, view.other, ~view.cornea, direct > 0)
+        share = dr.select(blocked, 0, count)
+        bent, failures = through_cornea(values, lights, scene, view.inner, view.lit_inside, u, v)
+        return direct * share, shine * share, bent, failures
+
+    def onto_matte(lamp: Lamp, source: Any) -> Any:
+        direct, _ = straight(lamp, source, view)
+        blocked = lamp_blocked(values, scene, view.point, source, view.other, ~view.cornea, direct > 0)
+        return dr.select(blocked, 0, direct)
+
+    direct, bent, failures = _all_lamps(values, lights, scene, view.inner, view.lit_inside, u, v, onto_matte)
+    return direct, mi.Float(0), bent, failures
+
+
+def through_cornea(
+    values: Values, lights: Lights, scene: Any, inner: Any, inside: Any, u: Any, v: Any
+) -> tuple[Any, Any]:
+    """Irradiance (mW/mm^2) of all lamps at points `inner` in the plane of the iris, where `inside`; failed paths.
+
+    u, v: place on each lamp's disc, [0, 1).
+    """
+    _, bent, failures = _all_lamps(values, lights, scene, inner, inside, u, v, None)
+    return bent, failures
+
+
+def _all_lamps(
+    values: Values, lights: Lights, scene: Any, inner: Any, inside: Any, u: Any, v: Any, onto_matte: Any
+) -> tuple[Any, Any, Any]:
+    """Sum over the lamps of `onto_matte` (lamp, its points) and of the irradiance behind the cornea; failed paths."""
     n = values["stop.normal"]
     # The point's Gaussian image: where the straight line from a lamp must aim to be bent on to the point.
     scale, shift = values["image.scale"], values["image.shift"]
@@ -90,26 +115,16 @@ def lamps(
 
     sine, cosine_v = dr.sincos(v * (2 * dr.pi))
 
-    def straight(lamp: Lamp, source: Any) -> tuple[Any, Any]:
-        """Irradiance of one lamp in the air, and the unit direction to it."""
-        to = source - point
-        inv2 = dr.rcp(dr.squared_norm(to))
-        to *= dr.sqrt(inv2)
-        cosine = dr.dot(to, normal)
-        lit = outside & (cosine > 0)
-        blocked = lamp_blocked(values, scene, point, source, other, True, lit)
-        return dr.select(lit & ~blocked, lamp.radiant_intensity(-to) * cosine * inv2, 0), to
-
     def more(i: Any, *_: Any) -> Any:
         return i < lights.count
 
     def body(i: Any, direct: Any, bent: Any, failures: Any) -> Any:
         lamp: Lamp = lights[i]
         source = lamp.point(u, sine, cosine_v)
-        if glossy is None:
-            direct += straight(lamp, source)[0]
+        if onto_matte is not None:
+            direct += onto_matte(lamp, source)
 
-        def through_cornea(source: Any, inner: Any, aim: Any, bent: Any, failures: Any) -> Any:
+        def bend(source: Any, inner: Any, aim: Any, bent: Any, failures: Any) -> Any:
             path = connect(values.surfaces, source, inner, n, aim, values["limbus_radius"], inside)
             local = values.surfaces[0].point_in(path.entry)
             clear = 1 - opacity(values, dr.sqrt(local.y * local.y + local.z * local.z))
@@ -122,22 +137,13 @@ def lamps(
         bent, failures = dr.if_stmt(
             (source, inner, aim, bent, failures),
             inside,
-            through_cornea,
+            bend,
             lambda source, inner, aim, bent, failures: (bent, failures),
         )
         return i + 1, direct, bent, failures
 
-    direct, shine = mi.Float(0), mi.Float(0)
-    if glossy is not None:
-        # Skin fills the picture and every lamp costs a ray through the region: each sample sees one lamp, for all.
-        count = mi.Float(lights.count)
-        one = dr.minimum(mi.UInt32(u * count), lights.count - 1)
-        lamp: Lamp = lights[one]
-        direct, to = straight(lamp, lamp.point(u * count - mi.Float(one), sine, cosine_v))
-        direct *= count
-        shine = direct * sheen(normal, to, *glossy)
-    state = (mi.UInt32(0), direct, mi.Float(0), mi.UInt32(0))
+    state = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.UInt32(0))
     _, direct, bent, failures = dr.while_loop(
         state, more, body, labels=("i", "direct", "bent", "failures"), label="lamps"
     )
-    return direct, shine, bent, failures
+    return direct, bent, failures

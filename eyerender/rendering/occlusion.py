@@ -64,8 +64,11 @@ def visible_arcs_deg(part: NDArray[np.uint8], pupil: int, points_px: Floats, ori
     return [[float(angle[a]), float(angle[b - 1])] for a, b in edges.reshape(-1, 2)]
 
 
-def lid_margins_px(region: RegionMesh, camera: Camera, anchor_mm: Floats) -> dict[str, list[list[float]]]:
-    """Landmarks along the inner edges of both margins, canthus to canthus from temple to nose, full-sensor pixels."""
+def lid_margins_px(region: RegionMesh, camera: Camera, anchor_mm: Floats) -> dict[str, list[list[float]]] | None:
+    """Landmarks along the inner edges of both margins, canthus to canthus from temple to nose, full-sensor pixels; None
+    for a mesh of which none are known."""
+    if len(region.upper_margin) == 0:
+        return None
     out = {}
     for name, margin in (("upper", region.upper_margin), ("lower", region.lower_margin)):
         marks = margin[np.linspace(0, len(margin) - 1, _MARKS).round().astype(int)] + anchor_mm

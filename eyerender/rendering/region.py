@@ -12,17 +12,20 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats
 from ..eye.model import Eye
 from ..region.anatomy import RegionSpec
 from ..region.globe import Globe
+from ..region.head import file_states
 from ..region.mesh import PARTS, RegionMesh, region_mesh
 from ..region.skin import skin_map
 from .surround import clear_between
 
 _F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, about the same (n 1.40 and 1.33)
-_ROUGH_SKIN, _ROUGH_WET = 0.30, 0.04
+_ROUGH_SKIN, _ROUGH_WET = 0.19, 0.04
+_RIPPLE = 0.032  # slope of wet tissue
 
 
 def globe_of(eye: Eye, M: Floats, t: Floats) -> Globe:
@@ -43,10 +46,10 @@ class RegionScene:
     """The Mitsuba scene of one subject's eye region; `show` moves it."""
 
     obstructed = True
+    parts: tuple[str, ...] = PARTS
 
     def __init__(self, spec: RegionSpec, globe: Globe) -> None:
-        self._spec = spec
-        posed = region_mesh(spec, globe)
+        posed = self._posed(spec, globe)
         layout = posed.layout
         props = mi.Properties()
         props["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": 0.5})
@@ -62,26 +65,36 @@ class RegionScene:
         self._params: Any = mi.traverse(self.scene)
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
         self.map = texture(
-            mi.TensorXf16(skin_map(spec).astype(np.float16)), use_accel=False, wrap_mode=dr.WrapMode.Repeat
+            mi.TensorXf16(self._look(spec).astype(np.float16)), use_accel=False, wrap_mode=dr.WrapMode.Repeat
         )
         self.mirror = -1.0 if globe.mirrored else 1.0
         self._shown: tuple[RegionSpec, Globe] | None = (spec, globe)
         self.posed = posed
 
     @staticmethod
-    def key(spec: RegionSpec, globe: Globe) -> tuple[RegionSpec, bool]:
-        """What a scene is made for: a subject and a side."""
-        return spec.model_copy(update={"blink": 0.0}), globe.mirrored
+    def key(spec: RegionSpec, globe: Globe) -> tuple[Any, ...]:
+        """What a scene is made for: a subject and a side, and a head mesh's files as they are."""
+        files = () if spec.head is None else file_states(spec.head)
+        return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files
 
     def show(self, spec: RegionSpec, globe: Globe) -> RegionMesh:
         """Move lids and lashes to a pose and a blink."""
         if self._shown != (spec, globe):
-            self.posed = region_mesh(spec, globe)
-            self._params["region.vertex_positions"] = mi.Float(self.posed.vertices.astype(np.float32).ravel())
-            self._params["region.vertex_normals"] = mi.Float(self.posed.normals.astype(np.float32).ravel())
-            self._params.update()
+            posed = self._posed(spec, globe)
+            if posed is not self.posed:
+                self.posed = posed
+                self._params["region.vertex_positions"] = mi.Float(posed.vertices.astype(np.float32).ravel())
+                self._params["region.vertex_normals"] = mi.Float(posed.normals.astype(np.float32).ravel())
+                self._params.update()
             self._shown = (spec, globe)
         return self.posed
+
+    def _posed(self, spec: RegionSpec, globe: Globe) -> RegionMesh:
+        return region_mesh(spec, globe)
+
+    @staticmethod
+    def _look(spec: RegionSpec) -> NDArray[np.float32]:
+        return skin_map(spec)
 
     def clear(self, a: Floats, b: Floats) -> Bools:
         """Whether nothing of the region stands between points (n, 3) of the scene's frame; ends not included."""
@@ -105,7 +118,7 @@ def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:
     hit = place.scene.ray_intersect_preliminary(ray, coherent=False, active=True)
     valid, face = hit.is_valid().numpy(), hit.prim_index.numpy()
     which = np.searchsorted(place.posed.layout.face_ends, face, side="right")
-    return [PARTS[int(w)] if v else None for v, w in zip(valid, which, strict=True)]
+    return [place.parts[int(w)] if v else None for v, w in zip(valid, which, strict=True)]
 
 
 def surface(texture: Any, mirror: Any, interaction: Any, active: Any) -> Surface:
@@ -124,10 +137,14 @@ def sheen(normal: Any, to_lamp: Any, to_camera: Any, gloss: Any) -> Any:
     with h half way between lamp and camera (GGX: Walter et al. 2007; the visibility term: Kelemen, Szirmay-Kalos 2001;
     F: Schlick 1994).
     """
+    wet = gloss > 0.5
+    # The conjunctiva under the film is uneven: its highlights break up.
+    p, q = 71 * normal.y + 23 * normal.z, 67 * normal.z - 29 * normal.y
+    ripple = _RIPPLE * mi.Vector3f(0, dr.sin(p + 1.7 * dr.sin(q)), dr.sin(q + 1.7 * dr.sin(p)))
+    normal = dr.select(wet, dr.normalize(normal + ripple), normal)
     half = dr.normalize(to_lamp + to_camera)
     lh = dr.maximum(dr.dot(to_lamp, half), 0.05)
     nh = dr.maximum(dr.dot(normal, half), 0)
-    wet = gloss > 0.5
     a = dr.select(wet, _ROUGH_WET, _ROUGH_SKIN)
     weight = dr.select(wet, 2 * gloss - 1, gloss * (1 / 0.45))
     a2 = a * a

@@ -15,6 +15,8 @@ from ..arrays import ArrayValue, Bools, Floats, frozen
 from ..errors import InputError
 from ..rig.imaging import AmbientSpec
 from . import imaging, psf, sensor
+from .environment import Ambience, Maps
+from .film import Exposed, mean_radiance, pixels_of
 from .frame import (
     RenderJob,
     ambient_numbers,
@@ -23,25 +25,26 @@ from .frame import (
     kinds,
     light_table,
     look_numbers,
+    margin_waves,
     panel_table,
     pose_numbers,
 )
 from .glints import POINT, GlintScene, GlintTable, Image, Spots, glint_table, quadrature
+from .head import place_scene
 from .integrator import integrator_class
-from .lighting import lamps
+from .lighting import through_cornea
 from .occlusion import glint_reason, lid_margins_px
 from .purkinje import purkinje_images
 from .region import RegionScene, blockers, globe_of
-from .sampling import Sampler, camera_ray
+from .sampling import camera_ray
 from .surround import Obstacle, Surround
-from .values import Lights, Panels, Structure, Values
+from .values import Lights, Structure, Values
 from .view import Textures, look
 
 if TYPE_CHECKING:
     from .backend import Backend
 
 Glints = tuple[GlintTable, tuple[tuple[int, GlintTable], ...], tuple[str, ...]]
-_LANES = 2**24  # samples in flight; more are rendered in several passes
 BACKGROUND, SCLERA, IRIS, PUPIL = 0, 1, 2, 3
 
 
@@ -104,6 +107,7 @@ class Renderer:
         self._surround = Surround(obstacles)
         self._textures: dict[int, Textures] = {}
         self._regions: dict[Any, RegionScene] = {}
+        self._maps = Maps()
 
     def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()) -> RenderedWindow:
         """Render one window.
@@ -119,7 +123,7 @@ class Renderer:
             failed += misses
         blurred = np.mean(pictures, axis=0) * imaging.vignette(job.lens, job.camera, job.window)
         glints, others, reasons = self._add_glints(job, np.zeros_like(blurred)) if moments else table
-        values, _ = self._bind(job)
+        values = self._bind(job).values
         place = self._place(job)
         margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
         irradiance = blurred * sensor.radiance_to_irradiance(job.sensor)
@@ -140,7 +144,7 @@ class Renderer:
 
     def _picture(self, job: RenderJob, spp: int) -> tuple[Floats, Glints, int]:
         """Radiance of a window behind the lens, glints included; the glints; failed light paths."""
-        values, lights = self._bind(job)
+        shown = self._bind(job)
         depth = float(job.camera.R[2] @ (job.anchor_mm - job.camera.nodal_point_mm))
         kernel = imaging.disc(imaging.confusion_px(job.lens, job.camera, job.sensor, depth))
         x0, y0, width, height = job.window
@@ -148,42 +152,34 @@ class Renderer:
         sharp = replace(job, window=(x0 - reach, y0 - reach, width + 2 * reach, height + 2 * reach))
         pad = psf.margin(job.sensor.psf_sigma_px)
         x0, y0, width, height = sharp.window
-        radiance, failed = self._radiance(
-            self._place(job).scene,
-            values,
-            lights,
-            (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad),
-            spp,
-            job.seed,
-        )
+        padded = (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad)
+        radiance, failed = mean_radiance(self._integrator, shown, padded, spp, job.seed, len(job.lights))
         blurred = psf.blur(radiance, job.sensor.psf_sigma_px).copy()
         glints = self._add_glints(sharp, blurred)
         return imaging.defocused(blurred, kernel), glints, failed
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
         """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), before lens and glints."""
-        values, lights = self._bind(job)
-        return self._radiance(self._place(job).scene, values, lights, job.window, spp or self.spp, job.seed)[0]
+        shown = self._bind(job)
+        return mean_radiance(self._integrator, shown, job.window, spp or self.spp, job.seed, len(job.lights))[0]
 
     def iris_irradiance(self, job: RenderJob, points_mm: Floats) -> Floats:
         """Irradiance (n,) mW/mm^2 that points (n, 3) of the iris' plane (eye frame, mm) get from all lamps.
 
         A lamp of finite size is represented by its centre.
         """
-        values, lights = self._bind(job)
+        shown = self._bind(job)
         x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
-        no, yes = mi.Bool(False), dr.full(mi.Bool, True, len(points_mm))
         corner = mi.Float(0)  # of the unit square: the disc's centre
-        _, _, bent, _ = lamps(
-            values, lights, self._place(job).scene, mi.Vector3f(0), mi.Vector3f(1, 0, 0), no, no, x, yes, corner, corner
-        )
+        inside = dr.full(mi.Bool, True, len(points_mm))
+        bent, _ = through_cornea(shown.values, shown.lights, shown.scene, x, inside, corner, corner)
         return np.asarray(bent.numpy(), dtype=float)
 
     def labels(self, job: RenderJob) -> PartLabels:
         """The labels of a window alone."""
-        return self._labels(job, self._bind(job)[0])
+        return self._labels(job, self._bind(job).values)
 
-    def _bind(self, job: RenderJob) -> tuple[Values, Lights]:
+    def _bind(self, job: RenderJob) -> Exposed:
         place = self._place(job)
         structure = Structure(
             kinds(job.eye),
@@ -200,18 +196,21 @@ class Renderer:
             **camera_numbers(job.camera, anchor),
             **ambient_numbers(job.ambient),
             "region.mirror": place.mirror if isinstance(place, RegionScene) else 1.0,
+            "region.sheet": int(place.posed.layout.face_ends[0]) if isinstance(place, RegionScene) else 0,
         }
-        values = Values(structure, structure.pack(numbers))
+        values = Values(structure, structure.pack(numbers), margin_waves(job.eye))
         lights = Lights(light_table(job.lights, job.M, job.t))
         textures = self._textures_of(job)
         if structure.ambient:
-            textures = replace(textures, panels=Panels(panel_table(job.ambient, anchor)))
+            even = job.ambient.irradiance_w_m2 * 1e-3
+            ambience = Ambience(even, panel_table(job.ambient, anchor), job.ambient.map, self._maps)
+            textures = replace(textures, panels=ambience)
         if isinstance(place, RegionScene):
             textures = replace(textures, region=place.map)
         else:
             place.show(job.look)
         self._integrator.bind(values, lights, textures)
-        return values, lights
+        return Exposed(place.scene, values, lights, textures)
 
     def _place(self, job: RenderJob) -> Surround | RegionScene:
         """What stands around the job's eye: its region at the job's pose, or the surround."""
@@ -224,7 +223,7 @@ class Renderer:
         if key not in self._regions:
             if len(self._regions) >= 4:
                 self._regions.pop(next(iter(self._regions)))
-            self._regions[key] = RegionScene(job.region, globe)
+            self._regions[key] = place_scene(job.region, globe)
         place = self._regions[key]
         place.show(job.region, globe)
         return place
@@ -237,37 +236,9 @@ class Renderer:
             self._textures[seed] = Textures.of_seed(seed)
         return self._textures[seed]
 
-    def _radiance(
-        self, scene: Any, values: Values, lights: Lights, window: tuple[int, int, int, int], spp: int, seed: int
-    ) -> tuple[Floats, int]:
-        width, height = window[2:]
-        pixels = width * height
-        each = max(1, min(spp, _LANES // pixels))
-        total = np.zeros(pixels)
-        failed = 0
-        for first in range(0, spp, each):
-            count = min(each, spp - first)
-            index = dr.arange(mi.UInt32, pixels * count)
-            n = dr.opaque(mi.UInt32, count)
-            pixel = index // n
-            u, v = _pixels(pixel, window)
-            # A pixel's place on the whole sensor, so that a window shows the same samples wherever it lies.
-            place = (u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16))
-            sampler = Sampler(place, index - pixel * n + dr.opaque(mi.UInt32, first), spp, seed)
-            spot = sampler.in_pixel()
-            o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
-            ray = mi.Ray3f(mi.Point3f(o), d)
-            seen, _, _ = self._integrator.sample(scene, sampler, ray)
-            cosine = cosine * cosine
-            samples, failures = seen[0] * cosine * cosine, self._integrator.failures
-            dr.eval(samples, failures)  # together: a reduction of its own would trace everything anew
-            total += dr.block_sum(samples, count).numpy()
-            failed += int(dr.sum(failures).numpy()[0])
-        return (total / spp).reshape(height, width), failed
-
     def _labels(self, job: RenderJob, values: Values) -> PartLabels:
         width, height = job.window[2:]
-        u, v = _pixels(dr.arange(mi.UInt32, width * height), job.window)
+        u, v = pixels_of(dr.arange(mi.UInt32, width * height), job.window)
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
         view = look(values, self._place(job).scene, o, d, True)
         clear = view.amodal_cornea & (view.opacity < 0.5)
@@ -338,13 +309,3 @@ class Renderer:
                     spots.xy_px, spots.energy * cosine**4, job.sensor.psf_sigma_px, job.window
                 )
                 image[rows, columns] += patch
-
-
-def _pixels(pixel: Any, window: tuple[int, int, int, int]) -> tuple[Any, Any]:
-    """Full-sensor pixel coordinates, as signed integers, of the window's pixels in row order."""
-    width = dr.opaque(mi.UInt32, window[2])
-    row = pixel // width
-    column = pixel - row * width
-    u = mi.Int32(column) + dr.opaque(mi.Int32, window[0])
-    v = mi.Int32(row) + dr.opaque(mi.Int32, window[1])
-    return u, v

@@ -1,8 +1,10 @@
 """Camera rays and sample points of a window of the sensor, on Dr.Jit arrays.
 
-Places in the pixel: a rank-1 lattice, x = k / N, y = frac(k a / N), with the a of the largest smallest distance, tiled
-over the sensor without a shift of its own per pixel. The edges of a frame are thus sampled by one regular lattice,
-which places a contour far better than independent samples of the same number would (Sloan and Joe 1994, chapter 4).
+Places in the pixel: a rank-1 lattice, x = (k + 1/2) / N, y = frac((k a + 1/2) / N), with the a of the largest smallest
+distance, tiled over the sensor. The edges of a frame are thus sampled by one regular lattice, which places a contour
+far better than independent samples of the same number would (Sloan and Joe 1994, chapter 4). Its mean is the pixel's
+centre in every image: a random shift of the whole lattice would move the picture, but not the computed glints, by up to
+1 / (2 N) px.
 
 Places on the lamps: sample k at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018), the
 shift a hash of the pixel's place on the whole sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft
@@ -46,33 +48,44 @@ def lattice_generator(count: int) -> int:
     return found
 
 
+class Samples:
+    """The `count` samples of every pixel of a frame, for lanes with a place on the sensor (`pixel`)."""
+
+    def __init__(self, pixel: Any, count: int, seed: int, calls: int = 3) -> None:
+        self.pixel = pixel
+        self._n, self._a = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, lattice_generator(count))
+        self._keys = [
+            dr.opaque(mi.UInt32, int(np.random.SeedSequence([seed, call]).generate_state(1)[0]))
+            for call in range(calls)
+        ]
+
+    def in_pixel(self, k: Any) -> Any:
+        """Place of sample `k` in the pixel, [0, 1)^2."""
+        scale = dr.rcp(mi.Float(self._n))
+        return mi.Point2f((mi.Float(k) + 0.5) * scale, (mi.Float((k * self._a) % self._n) + 0.5) * scale)
+
+    def pair(self, k: Any, call: int) -> Any:
+        """Two further numbers of sample `k`, [0, 1)^2: each call of a pixel has a shift of its own."""
+        tea: Any = mi.sample_tea_32
+        return mi.Point2f(
+            *(
+                mi.Float((shift + k * mi.UInt32(alpha)) >> 8) * (2.0**-24)
+                for shift, alpha in zip(tea(self.pixel, self._keys[call]), _ALPHA, strict=True)
+            )
+        )
+
+
 class Sampler:
-    """Sample `k` of `count` in a pixel: its place in the pixel, and its place on the lamps."""
+    """Sample `k` as Mitsuba's integrators ask for it."""
 
-    def __init__(self, pixel: Any, k: Any, count: int, seed: int) -> None:
-        n, a = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, lattice_generator(count))
-        shift = np.random.default_rng(seed).uniform(size=2)
-        x = mi.Float(k) / mi.Float(n) + dr.opaque(mi.Float, float(shift[0]))
-        y = mi.Float((k * a) % n) / mi.Float(n) + dr.opaque(mi.Float, float(shift[1]))
-        self._place = mi.Point2f(x - dr.floor(x), y - dr.floor(y))
-        self._pixel, self._k, self._seed, self._calls = pixel, k, seed, 0
-
-    def in_pixel(self) -> Any:
-        """Place in the pixel, [0, 1)^2."""
-        return self._place
+    def __init__(self, samples: Samples, k: Any) -> None:
+        self._samples, self._k, self._calls = samples, k, 0
 
     def next_2d(self, active: Any = True) -> Any:
-        """The next pair, [0, 1)^2: each call of a sample has a shift of its own."""
+        """The next pair, [0, 1)^2."""
         del active
-        folded = int(np.random.SeedSequence([self._seed, self._calls]).generate_state(1)[0])
         self._calls += 1
-        tea: Any = mi.sample_tea_32
-        shifts = tea(self._pixel, dr.opaque(mi.UInt32, folded))
-        pair = [
-            mi.Float((shift + self._k * mi.UInt32(alpha)) >> 8) * (2.0**-24)
-            for shift, alpha in zip(shifts, _ALPHA, strict=True)
-        ]
-        return mi.Point2f(*pair)
+        return self._samples.pair(self._k, self._calls - 1)
 
 
 def camera_ray(values: Values, u: Any, v: Any) -> tuple[Any, Any, Any]:

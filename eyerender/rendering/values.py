@@ -76,6 +76,7 @@ class Structure:
             ("limbus.albedo", 1),
             ("backdrop.x", 1),
             ("region.mirror", 1),
+            ("region.sheet", 1),
             ("ambient.irradiance", 1),
         ]
         return tuple(rows)
@@ -92,13 +93,20 @@ class Structure:
 
 
 class Values:
-    """The packed numbers on the device: `values["stop.centre"]` is a Float, a Vector3f or a tuple of Floats."""
+    """The packed numbers on the device: `values["stop.centre"]` is a Float, a Vector3f or a tuple of Floats; `margin`
+    is the pupil's."""
 
-    def __init__(self, structure: Structure, packed: np.ndarray[Any, np.dtype[np.float32]]) -> None:
+    def __init__(
+        self,
+        structure: Structure,
+        packed: np.ndarray[Any, np.dtype[np.float32]],
+        waves: np.ndarray[Any, np.dtype[np.float64]],
+    ) -> None:
         buffer = mi.Float(packed)
         scalars = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in range(packed.size)]
         dr.eval(scalars)
         self.structure = structure
+        self.margin = Margin(waves)
         self._items: dict[str, Any] = {}
         at = 0
         for name, size in structure.layout:
@@ -129,6 +137,39 @@ class Values:
     def point_to_scene(self, x: Any) -> Any:
         """A point of the eye frame in the scene's frame: M x + t."""
         return self.vector_to_scene(x) + self["pose.shift"]
+
+
+HARMONICS = 32  # of the pupil's margin at most
+
+
+class Margin:
+    """The pupil's margin: relative radius r(f) = 1 + Re sum_k z_k e^(i k f), f the angle in the stop's plane.
+
+    `waves` (n, 2) are the z_k = c_k - i s_k, k from 1, as pairs. An ellipse has none, and costs nothing.
+    """
+
+    def __init__(self, waves: np.ndarray[Any, np.dtype[np.float64]]) -> None:
+        self.count = dr.opaque(mi.UInt32, len(waves))
+        table = np.zeros((HARMONICS, 2), np.float32)
+        table[: len(waves)] = waves
+        self._buffer = mi.Float(table.ravel())
+
+    def radius(self, x: Any, y: Any) -> Any:
+        """r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
+        inv = dr.rsqrt(dr.maximum(x * x + y * y, 1e-12))
+        c, s = x * inv, y * inv
+
+        def more(k: Any, *_: Any) -> Any:
+            return k > 0
+
+        def body(k: Any, re: Any, im: Any) -> Any:
+            k = k - 1
+            re = re + dr.gather(mi.Float, self._buffer, 2 * k)
+            im = im + dr.gather(mi.Float, self._buffer, 2 * k + 1)
+            return k, re * c - im * s, re * s + im * c
+
+        state = (mi.UInt32(self.count), mi.Float(0), mi.Float(0))
+        return 1 + dr.while_loop(state, more, body, labels=("k", "re", "im"), label="margin")[1]
 
 
 class Lights:

@@ -6,7 +6,7 @@ nearer counts. Through the clear cornea it goes on to the plane of the iris.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -20,6 +20,7 @@ from .values import Values
 
 EPSILON_MM = 2e-3  # lengths below are one and the same point in single precision
 _NEAR_MM = 20.0
+_WET = 0.8  # gloss of the sclera
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +43,21 @@ class View:
     amodal_sclera: Any
     albedo: Any  # of the region's mesh, where there is one
     gloss: Any  # likewise, and of the wet sclera
+
+    @property
+    def matte(self) -> Any:
+        """Whether the first surface is matte, at least in part."""
+        return (self.cornea & (self.opacity > 0)) | self.sclera | self.other
+
+    @property
+    def lit_inside(self) -> Any:
+        """Whether light behind the cornea is seen."""
+        return self.cornea & (self.opacity < 1) & (self.passed > 0)
+
+    @property
+    def met(self) -> Any:
+        """Whether the ray meets anything."""
+        return self.cornea | self.sclera | self.other
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +92,20 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any, region: Any = 
 
     `region` is the map of an eye region, whose normals and albedos then count.
     """
+    view, hit = meet(values, scene, o, d, active)
+    there = look_around(values, hit, o, d, view.other, region)
+    return replace(
+        view,
+        point=dr.select(view.other, there.point, view.point),
+        normal=dr.select(view.other, there.normal, view.normal),
+        interaction=there.interaction,
+        albedo=there.albedo,
+        gloss=there.gloss,
+    )
+
+
+def meet(values: Values, scene: Any, o: Any, d: Any, active: Any) -> tuple[View, Any]:
+    """The view of the globe along camera rays, and what Embree or OptiX hits: nothing is said yet of its surface."""
     hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True, active=active)
     # Single precision: start next to the eye.
     t0 = -dr.dot(o, d) - _NEAR_MM
@@ -96,46 +126,64 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any, region: Any = 
     on_eye = (amodal_cornea | amodal_sclera) & ~(hit.is_valid() & (hit.t < t_eye)) & active
     on_cornea &= on_eye
     on_sclera &= on_eye
-    other = hit.is_valid() & ~on_eye & active
-    flags = mi.RayFlags.Minimal | mi.RayFlags.UV
-    if region is not None:
-        flags = flags | mi.RayFlags.ShadingFrame
-    interaction = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(o), d), flags, other)
-
     normal, mirrored, passed, inner, pupil = dr.if_stmt(
         (yl, oe + tc * de, dl),
         amodal_cornea,
         lambda yl, y, dl: _refracted(values, yl, y, dl),
         lambda yl, y, dl: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Bool(False)),
     )
-    y = oe + tc * de
     xs = oe + ts * de
-    facing, albedo, gloss = mi.Vector3f(interaction.n), mi.Float(0), mi.Float(0)
+    view = View(
+        cornea=on_cornea,
+        sclera=on_sclera,
+        other=hit.is_valid() & ~on_eye & active,
+        distance=dr.select(on_eye, t_eye, hit.t),
+        point=dr.select(on_cornea, oe + tc * de, xs),
+        normal=dr.normalize(dr.select(on_cornea, normal, xs - values["sclera.centre"])),
+        opacity=dr.select(amodal_cornea, opacity(values, rho), 1),
+        mirrored=mirrored,
+        passed=passed,
+        inner=inner,
+        pupil=pupil,
+        interaction=None,
+        amodal_cornea=amodal_cornea,
+        amodal_sclera=amodal_sclera,
+        albedo=mi.Float(0),
+        gloss=mi.Float(_WET),
+    )
+    return view, hit
+
+
+def look_around(values: Values, hit: Any, o: Any, d: Any, other: Any, region: Any = None) -> View:
+    """The view of rays that meet something of the scene that is not the eye, where `other`."""
+    flags = mi.RayFlags.Minimal | mi.RayFlags.UV
+    if region is not None:
+        flags = flags | mi.RayFlags.ShadingFrame
+    interaction = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(o), d), flags, other)
+    facing, albedo, gloss = mi.Vector3f(interaction.n), mi.Float(0), mi.Float(_WET)
     if region is not None:
         skin = region_surface(region, values["region.mirror"], interaction, other)
-        facing, albedo = skin.normal, skin.albedo
-        gloss = dr.select(other, skin.gloss, 0.8)
-    xo, no = values.point_to_eye(interaction.p), values.vector_to_eye(facing)
-    no = dr.select(dr.dot(no, de) > 0, -no, no)
-    point = dr.select(on_cornea, y, dr.select(on_sclera, xs, xo))
-    normal = dr.select(on_cornea, normal, dr.select(on_sclera, xs - values["sclera.centre"], no))
+        facing, albedo, gloss = skin.normal, skin.albedo, dr.select(other, skin.gloss, _WET)
+    normal = values.vector_to_eye(facing)
+    normal = dr.select(dr.dot(normal, values.vector_to_eye(d)) > 0, -normal, normal)
+    no, nothing = mi.Bool(False), mi.Float(0)
     return View(
-        on_cornea,
-        on_sclera,
-        other,
-        dr.select(on_eye, t_eye, hit.t),
-        point,
-        dr.normalize(normal),
-        dr.select(amodal_cornea, opacity(values, rho), 1),
-        mirrored,
-        passed,
-        inner,
-        pupil,
-        interaction,
-        amodal_cornea,
-        amodal_sclera,
-        albedo,
-        gloss,
+        cornea=no,
+        sclera=no,
+        other=other,
+        distance=hit.t,
+        point=values.point_to_eye(interaction.p),
+        normal=dr.normalize(normal),
+        opacity=mi.Float(1),
+        mirrored=nothing,
+        passed=nothing,
+        inner=mi.Vector3f(0),
+        pupil=no,
+        interaction=interaction,
+        amodal_cornea=no,
+        amodal_sclera=no,
+        albedo=albedo,
+        gloss=gloss,
     )
 
 
@@ -161,11 +209,17 @@ def _refracted(values: Values, yl: Any, y: Any, dl: Any) -> tuple[Any, Any, Any,
     s = dr.dot(values["stop.centre"] - inside, n) / dr.dot(w, n)
     inner = inside + s * w
     reached &= s > 0
-    q = inner - values["stop.centre"]
-    a, b = values["stop.axes"]
-    pu, pv = dr.dot(q, values["stop.u"]) / a, dr.dot(q, values["stop.v"]) / b
-    pupil = reached & (pu * pu + pv * pv < 1)
+    pu, pv = _stop_coordinates(values, inner)
+    margin = values.margin.radius(pu, pv)
+    pupil = reached & (pu * pu + pv * pv < margin * margin)
     return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, pupil
+
+
+def _stop_coordinates(values: Values, x: Any) -> tuple[Any, Any]:
+    """Coordinates of points of the stop's plane along its semi-axes, in units of these."""
+    q = x - values["stop.centre"]
+    a, b = values["stop.axes"]
+    return dr.dot(q, values["stop.u"]) / a, dr.dot(q, values["stop.v"]) / b
 
 
 def meet_sphere(o: Any, d: Any, radius: Any) -> tuple[Any, Any]:
@@ -178,10 +232,9 @@ def meet_sphere(o: Any, d: Any, radius: Any) -> tuple[Any, Any]:
 
 def iris_albedo(values: Values, textures: Textures, x: Any) -> Any:
     """Albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
-    q = x - values["stop.centre"]
+    pu, pv = _stop_coordinates(values, x)
     a, b = values["stop.axes"]
-    pu, pv = dr.dot(q, values["stop.u"]) / a, dr.dot(q, values["stop.v"]) / b
-    beyond = (dr.sqrt(pu * pu + pv * pv) - 1) * dr.sqrt(a * b)
+    beyond = (dr.sqrt(pu * pu + pv * pv) - values.margin.radius(pu, pv)) * dr.sqrt(a * b)
     rho = dr.sqrt(x.y * x.y + x.z * x.z)
     left = values["iris_root"] - rho
     s = dr.clip(beyond / dr.maximum(beyond + dr.maximum(left, 0), 1e-4), 0, 1)

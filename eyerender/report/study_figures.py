@@ -135,11 +135,10 @@ def sets_figure(
         return svg(fig)
 
 
-def waterfall_figure(
-    labels: Sequence[str], panels: Mapping[str, Mapping[str, Sequence[float | None]]], *, log: bool = False
-) -> str:
+def waterfall_figure(labels: Sequence[str], panels: Mapping[str, Mapping[str, Sequence[float | None]]]) -> str:
     """From published to corrected: mean error after each correction, by eye model; a panel a measure."""
     with figure(max(7.0, 2.6 + 3.2 * len(panels)), 1.6 + 0.36 * len(labels), len(panels)) as (fig, axes):
+        fig.get_layout_engine().set(wspace=0.06)  # the last number of one panel stands beside the first of the next
         y = np.arange(len(labels))
         for k, (ax, (name, by_model)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
             for model, values in by_model.items():
@@ -148,10 +147,7 @@ def waterfall_figure(
                 ax.plot(line, y, color=colour, marker=marker, ms=5.5, lw=1.2, label=model)
             ax.set_ylim(len(labels) - 0.5, -0.5)
             ax.set_yticks(y, labels if k == 0 else [""] * len(labels))
-            if log:
-                ax.set_xscale("log")
-            else:
-                ax.set_xlim(left=0)
+            ax.set_xlim(left=0)
             ax.set(title=name, xlabel="mean error (deg)")
         handles, names = np.atleast_1d(axes)[0].get_legend_handles_labels()
         fig.legend(handles, names, loc="outside upper center", ncols=6, frameon=False)
@@ -191,18 +187,19 @@ def lines_figure(
         return svg(fig)
 
 
-def bars_figure(names: Sequence[str], values: Mapping[str, Sequence[float]], xlabel: str) -> str:
-    """Horizontal bars, grouped by name; a colour a key."""
-    colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-    with figure(9.0, 1.4 + 0.32 * len(names) * max(1, 0.6 * len(values))) as (fig, ax):
+def sensitivity_figure(names: Sequence[str], panels: Mapping[str, Mapping[str, Sequence[float]]], xlabel: str) -> str:
+    """Changes by one step of each parameter, a row each: panel -> eye model -> change by parameter (NaN: none)."""
+    with figure(11.0, 1.3 + 0.36 * len(names), len(panels)) as (fig, axes):
         y = np.arange(len(names))
-        height = 0.8 / len(values)
-        for k, (label, v) in enumerate(values.items()):
-            ax.barh(y + (k - (len(values) - 1) / 2) * height, v, height=0.9 * height, color=colours[k % 4], label=label)
-        ax.axvline(0, color="#444444", lw=0.8)
-        ax.set_yticks(y, names)
-        ax.set_ylim(len(names) - 0.5, -0.5)
-        ax.grid(axis="y", visible=False)
-        ax.set(xlabel=xlabel)
-        fig.legend(loc="outside upper center", ncols=4, frameon=False)
+        for k, (ax, (title, by_model)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
+            ax.axvline(0, color="#444444", lw=0.8)
+            for i, (model, values) in enumerate(by_model.items()):
+                colour, marker = look(model, list(by_model))
+                shift = (i - (len(by_model) - 1) / 2) * 0.13
+                ax.scatter(values, y + shift, s=30, marker=marker, color=colour, label=model, zorder=3)
+            ax.set_yticks(y, names if k == 0 else [""] * len(names))
+            ax.set_ylim(len(names) - 0.5, -0.5)
+            ax.set(title=title, xlabel=xlabel)
+        handles, labels = np.atleast_1d(axes)[0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=6, frameon=False)
         return svg(fig)

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from .style import figure, svg
 
 _STYLES = (("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9"), ("P", "#777777"))
+
+# Colour and hatch of the terms of an error budget: told apart in grey too.
+_TERMS = {
+    "algorithm": ("#999999", ""),
+    "eye model": ("#0072B2", ""),
+    "image": ("#E69F00", "///"),
+    "noise": ("#009E73", "..."),
+    "image and noise": ("#E69F00", "///"),
+}
+_ADDS = {term: term if term == "algorithm" else f"+ {term}" for term in _TERMS}
 
 
 def distances_figure(panels: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
@@ -51,6 +61,44 @@ def differences_figure(panels: Mapping[str, Mapping[str, Mapping[str, tuple[floa
             ax.set(title=name, ylabel="difference of the gaze error (deg)" if k == 0 else "", xlabel="eye model")
         handles, labels = np.atleast_1d(axes)[0].get_legend_handles_labels()
         fig.legend(handles, labels, loc="outside upper center", ncols=4 if len(panels) > 2 else 2, frameon=False)
+        return svg(fig)
+
+
+def budget_figure(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float, float, float]]]]) -> str:
+    """What an error is made of, step by step: estimator -> eye model -> (term, deg, low, high), then the sum."""
+    terms = list(dict.fromkeys(t for by in panels.values() for steps in by.values() for t, *_ in steps))
+    terms.sort(key=list(_TERMS).index)
+    columns = min(len(panels), 2)
+    lines = -(-len(panels) // columns)
+    width = 0.86 / (len(terms) + 1)
+    with figure(6.0 * columns if columns > 1 else 8.0, 0.6 + 3.1 * lines, columns, lines) as (fig, axes):
+        grid = np.atleast_1d(axes).ravel()
+        for empty in grid[len(panels) :]:
+            empty.set_axis_off()
+        for k, (ax, (name, by)) in enumerate(zip(grid, panels.items(), strict=False)):
+            for j, steps in enumerate(by.values()):
+                x0, level = j - 0.43 + width / 2, 0.0
+                for term, deg, low, high in steps:
+                    x = x0 + terms.index(term) * width
+                    colour, hatch = _TERMS[term]
+                    ax.bar(
+                        x, deg, 0.94 * width, bottom=level, color=colour, hatch=hatch, edgecolor="white", lw=0,
+                        label=_ADDS[term],
+                    )  # fmt: skip
+                    if low < high:
+                        y, ends = level + deg, [[deg - low], [high - deg]]
+                        ax.errorbar(x, y, yerr=ends, fmt="none", ecolor="#222222", elinewidth=1.1, capsize=2)
+                    level += deg
+                    ax.plot([x - width / 2, x + 1.5 * width], [level, level], color="#222222", lw=0.7)
+                x = x0 + len(terms) * width
+                ax.bar(x, level, 0.94 * width, color="white", edgecolor="#222222", lw=1.2, label="sum")
+            ax.set_xticks(range(len(by)), list(by))
+            ax.set_ylim(bottom=0)
+            ax.grid(axis="x", visible=False)
+            ax.set(title=name, ylabel="gaze error (deg)" if k % columns == 0 else "", xlabel="eye model")
+        handles = {t: h for ax in grid for h, t in zip(*ax.get_legend_handles_labels(), strict=True)}
+        order = [t for t in (*_ADDS.values(), "sum") if t in handles]
+        fig.legend([handles[t] for t in order], order, loc="outside upper center", ncols=len(order), frameon=False)
         return svg(fig)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -36,8 +36,34 @@ class PanelSpec(Spec):
     radiance_w_m2_sr: NonNegative = Field(description="within the camera's filter")
 
 
+class MapSpec(Spec):
+    """A surrounding, infinitely far away, as a picture over all directions (latitude and longitude, twice as wide as
+    high): its upper edge is straight up, its middle the forward direction, and it runs on to the subject's right."""
+
+    file: Annotated[str, Field(min_length=1)] = Field(
+        description="a linear picture, .hdr, .exr, .pfm or .npy (relative to the scene)"
+    )
+    scale_w_m2_sr: NonNegative = Field(
+        default=1.0, description="radiance of the value 1, within the camera's filter; varies the map's strength"
+    )
+    channel: Literal["red", "green", "blue", "luminance"] = Field(
+        default="red", description="what of a colour picture stands for the near infrared; red is nearest to it"
+    )
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
+        default=0.0, description="where the map's middle lies, from straight ahead (+x) to the subject's left"
+    )
+    elevation_deg: Annotated[float, Field(ge=-90, le=90)] = Field(default=0.0, description="of the map's middle, up")
+    roll_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
+        default=0.0, description="turn about the middle, clockwise as the subject sees it"
+    )
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = Field(
+        default=None, description="of the file; another file is refused"
+    )
+
+
 class AmbientSpec(Spec):
-    """Light that does not come from the lamps: even from all sides, and panels that face the head."""
+    """Light that does not come from the lamps: even from all sides, a surrounding, and panels that face the head."""
 
     irradiance_w_m2: NonNegative = Field(default=0.0, description="on a matte surface, within the camera's filter")
     panels: Annotated[tuple[PanelSpec, ...], Field(max_length=16)] = ()
+    map: MapSpec | None = Field(default=None, description="an HDR picture of what surrounds the head")

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..report.study import Card, Figure, Page, Section, Table
-from ..report.study_figures import bars_figure, lines_figure, map_figure
+from ..report.study_figures import lines_figure, map_figure, sensitivity_figure
 from . import conditions as c
 from .conditions import ConditionsPart
 from .results import Finding
@@ -74,6 +74,14 @@ def page(parts: Sequence[ConditionsPart], found: Sequence[Finding]) -> Page:
         )
         for t in c.TRACKERS
     ]
+    order = [name for name, *_ in c.PARAMETERS]
+    entries = sorted((e for p in parts for e in p.sensitivity), key=lambda e: order.index(e["parameter"]))
+    names = list(dict.fromkeys(_label(e) for e in entries))
+    steps = {(p.eye_model, _label(e)): e for p in parts for e in p.sensitivity}
+    changes = {
+        t: {m: [_thousandths(steps[m, n][t]["per_step"]) if (m, n) in steps else np.nan for n in names] for m in models}
+        for t in c.TRACKERS
+    }
     sections = [
         Section(
             "Over the screen",
@@ -134,15 +142,10 @@ def page(parts: Sequence[ConditionsPart], found: Sequence[Finding]) -> Page:
             ),
             [
                 Figure(
-                    bars_figure(
-                        [_label(e) for e in p.sensitivity],
-                        {t: [_thousandths(e[t]["per_step"]) for e in p.sensitivity] for t in c.TRACKERS},
-                        f"{p.eye_model}: change of the mean error (thousandths of a degree)",
-                    ),
-                    f"{p.eye_model}. {_failed(p)}",
+                    sensitivity_figure(names, changes, "change of the mean error (thousandths of a degree)"),
+                    "A row a parameter, its step in brackets. Parameters that a model has not (asphericity of a "
+                    f"sphere, a posterior cornea) have no marker. {'; '.join(_failed(p) for p in parts if _failed(p))}",
                 )
-                for p in parts
-                if p.sensitivity
             ],
         ),
         Section(
@@ -215,7 +218,7 @@ def _thousandths(value: float | None) -> float:
 
 def _failed(part: ConditionsPart) -> str:
     lost = {e["parameter"]: e[t]["reason"] for e in part.sensitivity for t in c.TRACKERS if e[t]["reason"]}
-    return "; ".join(f"{name}: none ({reason})" for name, reason in lost.items())
+    return "; ".join(f"{part.eye_model}, {name}: none ({reason})" for name, reason in lost.items())
 
 
 def _listed(values: Floats) -> list[list[float | None]]:

@@ -62,7 +62,7 @@ def head_mounted_part(eye: str, observings: Sequence[Observing]) -> HeadMountedP
     out = HeadMountedPart(eye)
     learnt = calibration_rows()
     for observing in observings:
-        seen = observing.observe(own, eye.replace("/", "_"))
+        seen = observing.observe(own)
         key = PROTOCOL, observing.kind
         out.seen[key] = own.rig, seen
         out.errors[key] = {}

@@ -6,12 +6,15 @@ from collections.abc import Sequence
 
 from ..report.study import Card, Page, Section, Table
 from . import head_mounted as h
+from .budget import Budget
 from .head_mounted import HeadMountedPart
-from .page_parts import OBSERVERS, Apart, findings_section, number, observers_section
+from .page_parts import OBSERVERS, Apart, budget_section, findings_section, number, observers_section
 from .results import Finding
 
 
-def page(parts: Sequence[HeadMountedPart], found: Sequence[Finding], apart: Apart) -> Page:
+def page(
+    parts: Sequence[HeadMountedPart], found: Sequence[Finding], apart: Apart, made_of: Sequence[Budget] = ()
+) -> Page:
     """The report."""
     features, _ = apart
     cards = []
@@ -20,6 +23,7 @@ def page(parts: Sequence[HeadMountedPart], found: Sequence[Finding], apart: Apar
         text = " ".join(f"{m}\u00a0{number(f.median_distance_px, 3)}" for m, f in values.items())
         cards.append(Card(text, f"median distance of the pupil's centre from ray optics (px), {observer}"))
     sections = [
+        *budget_section(made_of, h.FEATURES, "the polynomial"),
         *observers_section(apart, h.FEATURES),
         Section(
             "Errors of the direction",

@@ -10,12 +10,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as student
 
 from ..arrays import Floats
 from ..comparison import feature_errors
 from ..observation import Observations
 from ..rig.rig import Rig
+from .budget import paired
 
 ALL_GLINTS = "all glints"
 
@@ -74,11 +74,11 @@ def features(
         [1.0 / rig.cameras[max(int(c), 0)].scale_at(p) for c, p in zip(index.camera, place, strict=True)]
     )
     # What is not in the image of the study's camera was seen by the same camera, turned: it counts all the same.
-    moved = ~truth.pupil.in_image
-    centre = np.where(moved[:, None], found.pupil.centre_px - truth.pupil.centre_px, errors.centre_px)
+    moved = ~truth.pupil.in_image[:, None]
+    centre = np.where(moved, found.pupil.centre_px - truth.pupil.centre_px, errors.centre_px)
+    axes = np.where(moved, found.pupil.semi_axes_px - truth.pupil.semi_axes_px, errors.semi_axes_px)
     out = [_difference(protocol, observer, eye_model, "pupil centre", centre, mm_per_px)]
-    if np.isfinite(errors.semi_axes_px).any():
-        out.append(_difference(protocol, observer, eye_model, "pupil semi-axes (a, b)", errors.semi_axes_px, mm_per_px))
+    out.append(_difference(protocol, observer, eye_model, "pupil semi-axes (a, b)", axes, mm_per_px))
     every = []
     for light in range(len(rig.lights)):
         (a, seen), (b, got) = found.glints.of_light(light), truth.glints.of_light(light)
@@ -101,11 +101,9 @@ def gaze(
     if n < 2:
         return None
     d = image_deg[both] - analytic_deg[both]
-    half = float(student.ppf(0.975, n - 1) * d.std(ddof=1) / np.sqrt(n))
-    mean = float(d.mean())
     return GazeDifference(
         protocol, observer, eye_model, estimator, n, float(analytic_deg[both].mean()), float(image_deg[both].mean()),
-        mean, mean - half, mean + half,
+        *paired(d),
     )  # fmt: skip
 
 

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..report.study import Figure, Section, Table
+from ..report.study import Card, Figure, Section, Table
 from ..report.study_figures import waterfall_figure
-from ..report.study_observers import differences_figure, distances_figure
+from ..report.study_observers import budget_figure, differences_figure, distances_figure
+from .budget import ALGORITHM, BOTH, EYE, IMAGE, NOISE, Budget, Term
 from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
 from .results import Departure, Erratum, Finding, WaterfallStep
 
@@ -77,6 +78,88 @@ def observers_section(apart: Apart, shown: Sequence[str] = ()) -> list[Section]:
         "eye are pixels times distance over focal length.",
     )
     return [Section("The observers compared", text, figures, [_feature_table(features), _gaze_table(gaze)])]
+
+
+def overview(cells: dict[tuple[str, str], dict[str, str]], what: str) -> tuple[list[Card], list[Table]]:
+    """What the page says first, by (protocol, observer) and eye model: a card each, of more than four a table."""
+    if len(cells) <= 4:
+        return [
+            Card(" ".join(f"{m}\u00a0{v}" for m, v in by_model.items()), f"{what}, {', '.join(key)}")
+            for key, by_model in cells.items()
+        ], []
+    models = list(dict.fromkeys(m for by_model in cells.values() for m in by_model))
+    rows = [(*key, *(by_model.get(m, "-") for m in models)) for key, by_model in cells.items()]
+    return [], [Table(("protocol", "observer", *models), rows, what[0].upper() + what[1:])]
+
+
+def budget_section(made_of: Sequence[Budget], shown: Sequence[str], who: str) -> list[Section]:
+    """What the gaze error is made of; `shown` names the estimators drawn, `who` says in words what the algorithm is."""
+    if not any(len(b.terms) > 1 for b in made_of):
+        return []
+    protocols = list(dict.fromkeys(b.protocol for b in made_of))
+    protocol = "corrected" if "corrected" in protocols else protocols[0]
+    drawn = [b for b in made_of if b.protocol == protocol and b.estimator in shown]
+    terms = [t for t in (ALGORITHM, EYE, IMAGE, NOISE, BOTH) if any(b.term(t) for b in made_of)]
+    panels = {
+        name: {b.eye_model: [_bar(t) for t in b.terms] for b in drawn if b.estimator == name}
+        for name in shown
+        if any(b.estimator == name for b in drawn)
+    }
+    reference = made_of[0].reference
+    means = {
+        ALGORITHM: f"'Algorithm' is the error of {who} on exact features of {reference}, the simplest eye of this run",
+        EYE: f"'eye model' what exact features of the model add to that of {reference}",
+        IMAGE: "'image' what forming an image and finding the features in it add",
+        NOISE: "'noise' what the sensor's noise adds",
+        BOTH: "'image and noise' what noisy images add to exact features",
+    }
+    text = (
+        "; ".join(means[t] for t in terms) + ". From left to right the terms add up to the sum.",
+        *(_in_words(name, [b for b in drawn if b.estimator == name], terms) for name in panels),
+    )
+    reading = f" ({protocol} reading)" if protocol in ("corrected", "published") else ""
+    caption = (
+        f"The gaze error of each eye model and what it is made of{reading}. Whiskers: 95 % interval of the "
+        "mean paired difference over the frames."
+    )
+    rows = [
+        (
+            b.protocol, b.estimator, b.eye_model, str(b.n),
+            *(_told(b.term(term)) for term in terms),
+            number(b.total_deg),
+        )
+        for b in made_of
+        if b.estimator in shown
+    ]  # fmt: skip
+    header = ("protocol", "estimator", "eye model", "n", *(f"{t} (deg)" for t in terms), "sum (deg)")
+    table = Table(header, rows, "Every term ± half its 95 % interval", folded=len(rows) > 6)
+    return [Section("What the gaze error is made of", text, [Figure(budget_figure(panels), caption)], [table])]
+
+
+def _bar(term: Term) -> tuple[str, float, float, float]:
+    """Name, height and ends of the whisker, which has no length for what is no difference."""
+    low, high = term.low_deg, term.high_deg
+    return term.name, term.deg, term.deg if low is None else low, term.deg if high is None else high
+
+
+def _told(term: Term | None) -> str:
+    if term is None:
+        return "-"
+    if term.low_deg is None or term.high_deg is None:
+        return number(term.deg)
+    return f"{term.deg:+.4f} ± {(term.high_deg - term.low_deg) / 2:.4f}"
+
+
+def _in_words(name: str, made_of: Sequence[Budget], terms: Sequence[str]) -> str:
+    """A sentence on one estimator: the ranges of the terms over the eye models."""
+    parts = []
+    for term in terms[1:]:
+        values = [t.deg for b in made_of if (t := b.term(term)) is not None]
+        if values:
+            low, high = f"{min(values):+.3f}", f"{max(values):+.3f}"
+            parts.append(f"{term} {low}" if low == high else f"{term} {low} to {high}")
+    own = next(b.terms[0].deg for b in made_of)
+    return f"{name}: the algorithm's own error is {own:.3f} deg; over the eye models, {', '.join(parts)} deg."
 
 
 def _label(key: tuple[str, str], among: Sequence[tuple[str, str]]) -> str:
@@ -152,7 +235,7 @@ def findings_section(found: Sequence[Finding]) -> Section:
 
 
 def waterfall_section(
-    steps: Sequence[WaterfallStep], departures: Sequence[Departure], measures: Sequence[str], *, log: bool
+    steps: Sequence[WaterfallStep], departures: Sequence[Departure], measures: Sequence[str]
 ) -> list[Section]:
     """The waterfall from published to corrected; nothing where only one protocol was run."""
     if not steps:
@@ -183,7 +266,7 @@ def waterfall_section(
         Section(
             "From published to corrected",
             ("Departures of the authors' software are corrected one after the other, from top to bottom.",),
-            [Figure(waterfall_figure(labels, panels, log=log), "Mean error after each correction, by eye model.")],
+            [Figure(waterfall_figure(labels, panels), "Mean error after each correction, by eye model.")],
             [Table(header, rows, caption, folded=True)],
         )
     ]

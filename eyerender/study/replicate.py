@@ -19,8 +19,6 @@ from .literature import CALIBRATION_SETS
 from .observing import Observing
 from .results import Row, WaterfallStep
 
-PROTOCOLS = {"guestrin2006": guestrin.PUBLISHED, "blignaut2014": blignaut.PUBLISHED}
-
 
 @dataclass(slots=True)
 class GuestrinPart:
@@ -68,14 +66,24 @@ class _Scenes:
         key = self.module.scene_key(departures)
         if key not in self._seen:
             scene = self.module.scene(self.eye, key)
-            name = "-".join([self.eye.replace("/", "_"), *(sorted(key) or ["corrected"])])
-            self._seen[key] = scene, self.observing.observe(scene, name, facing=self.module is guestrin)
+            self._seen[key] = scene, self.observing.observe(scene, facing=facing(self.module))
         return self._seen[key]
 
 
 def departures_of(module: Any, protocol: str) -> frozenset[str]:
     """The departures of a protocol by name."""
     return frozenset(module.PUBLISHED if protocol == "published" else module.CORRECTED)
+
+
+def facing(module: Any) -> bool:
+    """Whether a study's cameras are turned to the eyes for their images."""
+    return module is guestrin
+
+
+def scenes_of(module: Any, eyes: Sequence[str], protocols: Sequence[str]) -> list[Scene]:
+    """The scenes that a study observes in images."""
+    keys = dict.fromkeys(module.scene_key(departures_of(module, protocol)) for protocol in protocols)
+    return [module.scene(eye, key) for eye in eyes for key in keys]
 
 
 def guestrin_part(
@@ -173,7 +181,7 @@ def _misprints(eye: str) -> dict[str, dict[str, Any]]:
     for name, changes in cases.items():
         try:
             scene = guestrin.scene(eye, guestrin.CORRECTED, changes)
-            seen = Observing().observe(scene, name)
+            seen = Observing().observe(scene)
             done = guestrin.run(seen, scene.rig, guestrin.CORRECTED)
         except InputError as error:
             out[name] = {"H1": None, "H2": None, "reason": str(error)}

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -16,31 +16,28 @@ from typing import Any, Literal
 from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
 from ..imagefolder import refuse_non_empty, write_json
-from ..report.study import Page, write_page
-from . import (
-    blignaut,
-    clouds,
-    conditions_page,
-    errata,
-    findings,
-    guestrin,
-    head_mounted,
-    head_mounted_page,
-    observers_compared,
-    pages,
-)
+from ..report.study import write_page
+from ..scene import Scene
+from . import blignaut, guestrin, head_mounted, together
 from .conditions import conditions_part
-from .head_mounted import HeadMountedPart, head_mounted_part
+from .head_mounted import head_mounted_part
+from .images import ImageSettings, StudyImages, make_images
 from .literature import MODELS, VARIANTS
-from .observing import ImageSettings, Kind, Observing
-from .page_parts import Apart
-from .replicate import BlignautPart, GuestrinPart, blignaut_part, guestrin_part
-from .results import Finding, Row, write_results, write_text
+from .observing import Kind, Observing
+from .replicate import blignaut_part, facing, guestrin_part, scenes_of
+from .results import write_results, write_text
 
 Progress = Callable[[int, int, str], None]
 STUDIES = ("guestrin2006", "blignaut2014", "observers", "conditions")
 RUN_SCHEMA = "eyerender/study/1"
-MARKER, REPORT = "study.json", "report.html"
+MARKER, REPORT, IMAGES = "study.json", "report.html", "images"
+_MODULES = {"guestrin2006": guestrin, "blignaut2014": blignaut}
+_TOGETHER: dict[str, Callable[..., together.Results]] = {
+    "guestrin2006": together.guestrin_results,
+    "blignaut2014": together.blignaut_results,
+    "observers": together.observers_results,
+    "conditions": together.conditions_results,
+}
 
 
 def run_study(
@@ -50,17 +47,19 @@ def run_study(
     protocol: Literal["corrected", "published", "both"] = "both",
     observer: Literal["analytic", "image", "both"] | None = None,
     eyes: Sequence[str] = MODELS,
-    workers: int = 1,
+    workers: int | None = 1,
     spp: int | None = None,
     noise: Literal["on", "off", "both"] = "both",
     backend: Literal["auto", "cuda", "llvm"] = "auto",
     threads: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Run a study and write summary.json, findings.json, CSV of both and report.html into a folder.
 
-    A folder of the same study is run again in place; images that it holds are used again.
+    A folder of the same study is run again in place. Its images are a dataset in `images/`, which goes on where it was
+    stopped and is used again when it is finished.
 
     Args:
         name: guestrin2006, blignaut2014, observers (both observers on the head-mounted rig), or conditions (what lies
@@ -70,17 +69,18 @@ def run_study(
         observer: analytic features, features of rendered images, or both. Default: both for `observers`, whose only
             choice it is, else analytic.
         eyes: eye models (catalogue names or files). With E5 and `published`, its two published variants come along.
-        workers: processes for the analytic part.
-        spp, backend, threads: of the images.
-        noise: images with the sensor's noise, without it, or both, from one rendering.
+        workers: processes; None: one a processor.
+        spp, backend, threads: of the images; threads are those of all workers together.
+        noise: images with the sensor's noise, without it, or both.
         overwrite: replace what the folder holds.
-        progress: called with (done, total, note).
+        progress: called with (done, total, note). say: called with what goes wrong on the way.
 
     Returns:
         The summary that was written.
 
     Raises:
         InputError: an unknown study, eye or choice, or a folder that holds something else.
+        BackendError: there is nothing to render the images with.
     """
     if name not in STUDIES:
         raise InputError(f"{name!r} is no study; there are {', '.join(STUDIES)}")
@@ -93,35 +93,28 @@ def run_study(
         raise InputError("the study 'conditions' has the analytic observer only", source="--observer")
     if name == "observers" and observer != "both":
         raise InputError("the study 'observers' compares both observers", source="--observer")
-    if workers < 1:
+    if workers is not None and workers < 1:
         raise InputError("must be >= 1", source="--workers")
     settings: dict[str, Any] = {"study": name, "protocol": protocol, "observer": observer, "eyes": list(eyes)}
     if observer != "analytic":
         settings |= {"spp": spp, "sensor_noise": noise}
     folder = Path(folder)
+    protocols = ("published", "corrected") if protocol == "both" else (protocol,)
+    kinds = _kinds(observer, noise)
     with _claimed(folder, settings, overwrite):
         start = time.monotonic()
-        if name == "conditions":
-            models = _collected(conditions_part, list(eyes), list(eyes), workers, progress)
-            rows = [row for part in models for row in part.rows]
-            found = conditions_page.findings(models)
-            more, page = conditions_page.more(models), conditions_page.page(models, found)
-        elif name == "observers":
-            images = ImageSettings(folder / "images", spp, noise == "both", backend, threads, progress)
-            observings = [Observing(), *(Observing(kind, images) for kind in _image_kinds(noise))]
-            rows, found, more, page = _observers([head_mounted_part(eye, observings) for eye in eyes])
-        else:
-            protocols = ("published", "corrected") if protocol == "both" else (protocol,)
-            parts: list[Any] = []
-            if observer in ("analytic", "both"):
-                parts += _analytic(name, _models(name, eyes, protocols), workers, progress)
-            if observer in ("image", "both"):
-                images = ImageSettings(folder / "images", spp, noise == "both", backend, threads, progress)
-                function = guestrin_part if name == "guestrin2006" else blignaut_part
-                kinds = _image_kinds(noise)
-                parts += [function(eye, protocols, Observing(kind, images)) for kind in kinds for eye in eyes]
-            assemble = _guestrin if name == "guestrin2006" else _blignaut
-            rows, found, more, page = assemble(parts, protocols)
+        images = None
+        if any(kind != "analytic" for kind in kinds):
+            made = ImageSettings(folder / IMAGES, spp, workers, backend, threads, _noted(progress), say)
+            images = _images(name, eyes, protocols, kinds, made)
+        jobs = [
+            (observings, eye, told)
+            for observings in _observings(name, kinds, images)
+            for eye, told in _models(name, eyes, protocols, observings)
+        ]
+        count = workers or len(os.sched_getaffinity(0))
+        parts = _collected(partial(_job, name), jobs, [_told(job) for job in jobs], count, progress)
+        rows, found, more, page = _TOGETHER[name](parts, protocols)
         more = {"settings": settings, "seconds": round(time.monotonic() - start, 2), **more}
         summary = write_results(folder, name, rows, found, more)
         if "waterfall" in more:
@@ -130,10 +123,88 @@ def run_study(
         return summary
 
 
-def _image_kinds(noise: str) -> list[Kind]:
-    """The observers of images; the one with noise first, whose rendering serves both."""
-    kinds: list[tuple[Kind, str]] = [("image", "off"), ("image-noiseless", "on")]
-    return [kind for kind, without in kinds if noise != without]
+def _kinds(observer: str, noise: str) -> list[Kind]:
+    """The observers of a run."""
+    kinds: list[Kind] = []
+    if observer != "image":
+        kinds.append("analytic")
+    if observer != "analytic":
+        kinds += [kind for kind, without in (("image", "off"), ("image-noiseless", "on")) if noise != without]  # type: ignore[misc]
+    return kinds
+
+
+def _noted(progress: Progress | None) -> Progress | None:
+    """What a dataset run tells, as a study tells it."""
+    if progress is None:
+        return None
+    return lambda done, total, note: progress(done, total, note.replace("samples", "samples of images", 1))
+
+
+def _images(
+    name: str, eyes: Sequence[str], protocols: Sequence[str], kinds: Sequence[Kind], settings: ImageSettings
+) -> StudyImages:
+    """The images of every scene of a study, made where they are missing."""
+    module = _MODULES.get(name)
+    scenes: list[Scene]
+    if module is None:
+        scenes, turned = [head_mounted.scene(eye) for eye in eyes], False
+    else:
+        scenes, turned = scenes_of(module, eyes, protocols), facing(module)
+    shots = [s for scene in scenes for k in kinds for s in Observing(k).shots(scene, facing=turned, spp=settings.spp)]
+    return make_images(name, [shot.scene for shot in shots], settings)
+
+
+def _observings(name: str, kinds: Sequence[Kind], images: StudyImages | None) -> list[tuple[Observing, ...]]:
+    """The observers of each job: one by one, or all together where they are compared within it."""
+    every = [Observing(kind, None if kind == "analytic" else images) for kind in kinds]
+    return [tuple(every)] if name == "observers" else [(one,) for one in every]
+
+
+def _models(
+    name: str, eyes: Sequence[str], protocols: Sequence[str], observings: Sequence[Observing]
+) -> list[tuple[str, tuple[str, ...]]]:
+    """Eye models with their protocols; the published variants of E5 stand under their own names, never as E5."""
+    out = [(eye, tuple(protocols)) for eye in eyes]
+    if name == "guestrin2006" and observings[0].kind == "analytic" and "E5" in eyes and "published" in protocols:
+        out += [(v, ("published",)) for v in VARIANTS if v not in eyes]
+    return out
+
+
+def _told(job: tuple[tuple[Observing, ...], str, tuple[str, ...]]) -> str:
+    """What progress says of a job."""
+    return f"{job[1]}, {' and '.join(o.kind for o in job[0])}"
+
+
+def _job(name: str, job: tuple[tuple[Observing, ...], str, tuple[str, ...]]) -> Any:
+    observings, eye, protocols = job
+    if name == "conditions":
+        return conditions_part(eye)
+    if name == "observers":
+        return head_mounted_part(eye, observings)
+    return (guestrin_part if name == "guestrin2006" else blignaut_part)(eye, protocols, observings[0])
+
+
+def _collected(
+    job: Callable[[Any], Any], items: list[Any], names: Sequence[str], workers: int, progress: Progress | None
+) -> list[Any]:
+    """The results of a job for each item, in order."""
+    out = []
+    with _mapper(min(workers, len(items))) as mapped:
+        for k, part in enumerate(mapped(job, items)):
+            out.append(part)
+            if progress is not None:
+                progress(k + 1, len(items), names[k])
+    return out
+
+
+@contextmanager
+def _mapper(workers: int) -> Iterator[Callable[..., Any]]:
+    """`map`, or that of a pool of processes; those start afresh, for a fork would take the parent's threads along."""
+    if workers <= 1:
+        yield map
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield pool.map
 
 
 @contextmanager
@@ -162,141 +233,13 @@ def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterato
         done = True
     finally:
         if not done and not same:
-            for empty in (folder / "images",):
+            for empty in (folder / IMAGES,):
                 if empty.is_dir() and not any(empty.iterdir()):
                     empty.rmdir()
             if [p.name for p in folder.iterdir()] == [MARKER]:
                 (folder / MARKER).unlink()
             if created and not any(folder.iterdir()):
                 folder.rmdir()
-
-
-def _models(name: str, eyes: Sequence[str], protocols: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
-    """Eye models with their protocols; the published variants of E5 stand under their own names, never as E5."""
-    out = [(eye, tuple(protocols)) for eye in eyes]
-    if name == "guestrin2006" and "E5" in eyes and "published" in protocols:
-        out += [(v, ("published",)) for v in VARIANTS if v not in eyes]
-    return out
-
-
-def _analytic(
-    name: str, models: Sequence[tuple[str, tuple[str, ...]]], workers: int, progress: Progress | None
-) -> list[Any]:
-    return _collected(partial(_job, name), list(models), [eye for eye, _ in models], workers, progress)
-
-
-def _collected(
-    job: Callable[[Any], Any], items: list[Any], names: Sequence[str], workers: int, progress: Progress | None
-) -> list[Any]:
-    """The results of a job for each item, in order."""
-    out = []
-    with _mapper(min(workers, len(items))) as mapped:
-        for k, part in enumerate(mapped(job, items)):
-            out.append(part)
-            if progress is not None:
-                progress(k + 1, len(items), names[k])
-    return out
-
-
-def _job(name: str, model: tuple[str, tuple[str, ...]]) -> GuestrinPart | BlignautPart:
-    eye, protocols = model
-    return (guestrin_part if name == "guestrin2006" else blignaut_part)(eye, protocols, Observing())
-
-
-@contextmanager
-def _mapper(workers: int) -> Iterator[Callable[..., Any]]:
-    """`map`, or that of a pool of processes; those start afresh, for a fork would take the parent's threads along."""
-    if workers <= 1:
-        yield map
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield pool.map
-
-
-def _guestrin(
-    parts: Sequence[GuestrinPart], protocols: Sequence[str]
-) -> tuple[list[Row], list[Finding], dict[str, Any], Page]:
-    rows = [row for part in parts for row in part.rows]
-    found, tests = [], []
-    keys = list(dict.fromkeys(key for part in parts for key in part.means))
-    for key in keys:
-        means = {p.eye_model: p.means[key] for p in parts if key in p.means}
-        errors = {p.eye_model: p.h1_errors[key] for p in parts if key in p.h1_errors}
-        found += findings.guestrin(means, errors, *key)
-        tests += [{"protocol": key[0], "observer": key[1], **t} for t in findings.t_tests(means)]
-    misprints = {p.eye_model: p.misprints for p in parts if p.misprints}
-    steps = [asdict(step) for part in parts for step in part.waterfall]
-    faults = errata.guestrin(misprints)
-    apart = _observers_apart(parts)
-    more = {
-        "optimiser": guestrin.optimiser_settings(protocols),
-        "calibrations": [c for part in parts for c in part.calibrations],
-        "t_tests": tests,
-        "departures": [asdict(d) for d in guestrin.DEPARTURES],
-        "errata": [asdict(e) for e in faults],
-        "misprints": misprints,
-        "waterfall": steps,
-        **_as_mappings(apart),
-    }
-    return rows, found, more, pages.guestrin_page(parts, found, tests, faults, apart)
-
-
-def _blignaut(
-    parts: Sequence[BlignautPart], protocols: Sequence[str]
-) -> tuple[list[Row], list[Finding], dict[str, Any], Page]:
-    rows = [row for part in parts for row in part.rows]
-    found: list[Finding] = []
-    keys = list(dict.fromkeys(key for part in parts for key in part.outcomes))
-    for protocol, observer in keys:
-        here = {p.eye_model: p for p in parts if (protocol, observer) in p.outcomes}
-        found += findings.blignaut({m: p.outcomes[protocol, observer] for m, p in here.items()}, protocol, observer)
-        found += clouds.findings({m: p.clouds[protocol, observer] for m, p in here.items()}, protocol, observer)
-        if protocol == "corrected":
-            centred = {m: p.centred[protocol, observer] for m, p in here.items()}
-            found += findings.blignaut(centred, "corrected, centred vector", observer)
-    faults = errata.blignaut()
-    apart = _observers_apart(parts)
-    more = {
-        "departures": [asdict(d) for d in blignaut.DEPARTURES],
-        "errata": [asdict(e) for e in faults],
-        "waterfall": [asdict(step) for part in parts for step in part.waterfall],
-        **_as_mappings(apart),
-    }
-    return rows, found, more, pages.blignaut_page(parts, found, faults, apart)
-
-
-def _observers(parts: Sequence[HeadMountedPart]) -> tuple[list[Row], list[Finding], dict[str, Any], Page]:
-    apart = _observers_apart(parts)
-    found = head_mounted.findings(*apart)
-    more = {**head_mounted.more(), **_as_mappings(apart)}
-    return [row for part in parts for row in part.rows], found, more, head_mounted_page.page(parts, found, apart)
-
-
-def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart | HeadMountedPart]) -> Apart:
-    """How the observers differ on the frames that both have seen."""
-    features: list[observers_compared.FeatureDifference] = []
-    gaze: list[observers_compared.GazeDifference] = []
-    seen = {(p.eye_model, *key): (p, key) for p in parts for key in p.seen}
-    for (model, protocol, observer), (other, key) in seen.items():
-        analytic = seen.get((model, protocol, "analytic"))
-        if observer == "analytic" or analytic is None:
-            continue
-        part, own = analytic
-        rig, truth = part.seen[own]
-        features += observers_compared.features(truth, other.seen[key][1], rig, protocol, observer, model)
-        mine, theirs = part.errors[own], other.errors[key]
-        for name in mine:
-            if name in theirs:
-                difference = observers_compared.gaze(mine[name], theirs[name], protocol, observer, model, name)
-                gaze += [difference] if difference else []
-    return features, gaze
-
-
-def _as_mappings(apart: Apart) -> dict[str, Any]:
-    features, gaze = apart
-    if not features:
-        return {}
-    return {"observers": {"features": [f.to_mapping() for f in features], "gaze": [g.to_mapping() for g in gaze]}}
 
 
 def _waterfall_csv(steps: Sequence[dict[str, Any]]) -> str:

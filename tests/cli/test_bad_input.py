@@ -42,7 +42,7 @@ def place(tmp_path, monkeypatch):
     scene("pupil.yaml", "eye.pupil_diameter_mm", 14)
     scene("target.yaml", "targets", {"world_mm": [[-500, 0, 0]]})
     contour = load_eye("E2").to_mapping()
-    contour["stop"]["contour"] = {"cosines": [0.0, 0.05], "sines": [0.0, 0.0]}
+    contour["stop"]["contour"] = {"cosines": [0.0, 1.5], "sines": [0.0, 0.0]}
     Path("contour.yaml").write_text(yaml.safe_dump(contour), encoding="utf-8")
     Path("text.yaml").write_text("format: 1\nname: [", encoding="utf-8")
     Path("binary.yaml").write_bytes(bytes(range(256)))
@@ -96,7 +96,7 @@ TABLE = [
     (["view", "car", "E2", "-o", "eye.svg"], 2, "car"),
     (["render", "quickstart"], 2, "--output"),
     (["render", "missing.yaml", "-o", "out"], 2, "missing.yaml: no such file"),
-    (["render", "quickstart", "-o", "out", "--eye", "contour.yaml"], 2, "stop.contour: a measured contour is not"),
+    (["render", "quickstart", "-o", "out", "--eye", "contour.yaml"], 2, "stop.contour: the margin's radius must"),
     (["render", "quickstart", "-o", "taken"], 2, "taken: is not empty; give another folder or --overwrite"),
     (["render", "quickstart", "-o", "file"], 2, "file: exists and is not a folder"),
     (["render", "quickstart", "-o", "out", "--spp", "0"], 2, "image.spp: must be >= 1"),
@@ -149,7 +149,8 @@ TABLE = [
     (["preview", "dataset_quick"], 2, "--output"),
     (["preview", "dataset_quick", "-o", "sheet.txt"], 2, "sheet.txt: must end with one of .png"),
     (["preview", "nonsense", "-o", "sheet.png"], 2, "nonsense: no such scene file"),
-    (["preview", "dataset_quick", "-o", "sheet.png", "--eye", "E1"], 2, "--eye: a dataset's eyes are in its spec"),
+    (["preview", "dataset_quick", "-o", "sheet.png", "--eye", "E9"], 2, "E9: no such eye; the catalogue holds"),
+    (["generate", "dataset_quick", "out", "--eye", "missing.yaml"], 2, "missing.yaml: no such file"),
     (["validate", "hollow"], 2, "hollow: holds no metadata.jsonl"),
     (["validate", "nowhere"], 2, "nowhere: no such folder"),
     (["export-dataset", "hollow", "out", "--format", "coco"], 2, "hollow: holds no metadata.jsonl"),

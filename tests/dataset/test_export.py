@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import sys
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,8 @@ import pytest
 from PIL import Image
 from scipy.io import loadmat
 
+from eyerender.cli.app import run
+from eyerender.dataset.columns import type_first
 from eyerender.dataset.export import FORMATS, export
 from eyerender.dataset.export.coco import run_lengths
 from eyerender.dataset.export.mp4 import PngVideo
@@ -52,7 +55,8 @@ def local(line, xy):
 
 
 def test_webdataset_reads_it(tiny, exported, lines):
-    wds = pytest.importorskip("webdataset")
+    import webdataset as wds
+
     folder = exported("webdataset")
     for split, count in SPLITS.items():
         url = f"{folder}/{split}-000000.tar"
@@ -69,7 +73,8 @@ def test_webdataset_reads_it(tiny, exported, lines):
 
 
 def test_coco_masks_come_back(tiny, exported, lines):
-    coco = pytest.importorskip("pycocotools.coco")
+    from pycocotools import coco
+
     folder = exported("coco")
     for split, count in SPLITS.items():
         data = coco.COCO(folder / "annotations" / f"instances_{split}.json")
@@ -139,7 +144,8 @@ def test_openeds_reads_it(tiny, exported):
 
 def test_ellseg_reads_it(tiny, exported, lines):
     """As EllSeg's loader goes about it: key files name archives, archives are read by index."""
-    h5py = pytest.importorskip("h5py")
+    import h5py
+
     folder = exported("ellseg")
     keys = sorted(os.listdir(folder / "MasterKey"))
     assert keys == [f"tiny_{s}.mat" for s in sorted(SPLITS)]
@@ -215,7 +221,8 @@ def test_videos_are_lossless(tmp_path):
 
 def test_hugging_face_reads_the_folder_as_it_is(tiny, tmp_path, monkeypatch, lines):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    datasets = pytest.importorskip("datasets")
+    import datasets
+
     read = datasets.load_dataset("imagefolder", data_dir=str(tiny), cache_dir=str(tmp_path))
     assert list(read) == ["train"]  # one split as files go; the column tells the dataset's own
     rows = read["train"]
@@ -227,8 +234,54 @@ def test_hugging_face_reads_the_folder_as_it_is(tiny, tmp_path, monkeypatch, lin
         np.testing.assert_array_equal(np.asarray(row["mask"]), read_image(tiny / line["mask_file_name"])[0])
 
 
+def test_hugging_face_reads_one_split_by_its_column(tiny, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    import datasets
+
+    subjects = {}
+    for name, count in SPLITS.items():
+        rows = datasets.load_dataset(
+            "imagefolder",
+            data_dir=str(tiny),
+            cache_dir=str(tmp_path),
+            split="train",
+            filters=[("split", "==", name)],
+        )
+        assert rows["split"][:] == [name] * count
+        assert np.asarray(rows[0]["image"]).shape == (72, 96)
+        subjects[name] = set(rows["subject"])
+    assert [len(s) for s in subjects.values()] == [2, 1, 1]
+    assert len(set.union(*subjects.values())) == 4
+
+
+def test_hugging_face_reads_a_reason_that_comes_late(tiny, tmp_path, monkeypatch):
+    """Its column types are those of the first 10 MB of lines, where nothing has hidden a glint yet."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    import datasets
+
+    folder = tmp_path / "long"
+    folder.mkdir()
+    for kind in ("images", "masks"):
+        (folder / kind).symlink_to(tiny / kind)
+    lines = (tiny / "metadata.jsonl").read_text().splitlines(keepends=True)
+    lines *= 1 + int(11e6 / sum(len(line) for line in lines))
+    last = json.loads(lines[-1])
+    assert last["records"][0]["glints"][1]["reason"] is None
+    last["records"][0]["glints"][1]["reason"] = "behind the lid"
+    lines[-1] = json.dumps(last) + "\n"
+    taken = []
+    (folder / "metadata.jsonl").write_text("".join(type_first(lambda: lines, taken.append)))
+    assert [json.dumps(line) + "\n" for line in taken] == lines
+    rows = datasets.load_dataset("imagefolder", data_dir=str(folder), cache_dir=str(tmp_path / "cache"))["train"]
+    reasons = [record[0]["glints"][1]["reason"] for record in rows["records"]]
+    assert len(reasons) == len(lines)
+    assert reasons[:2] == [None, "behind the lid"]
+    assert set(reasons[2:]) == {None}
+
+
 def test_mlcroissant_validates_and_reads_the_description(tiny, lines):
-    mlcroissant = pytest.importorskip("mlcroissant")
+    import mlcroissant
+
     described = mlcroissant.Dataset(jsonld=str(tiny / "croissant.json"))
     assert not described.metadata.ctx.issues.errors
     records = list(described.records("images"))
@@ -236,6 +289,15 @@ def test_mlcroissant_validates_and_reads_the_description(tiny, lines):
     for record, line in zip(records, lines.values(), strict=True):
         assert record["images/sample"] == line["sample"]
         assert record["images/file_name"] in (line["file_name"], line["file_name"].encode())
+
+
+def test_ellseg_without_its_library_is_one_line(tiny, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    assert run(["export-dataset", str(tiny), str(tmp_path / "out"), "--format", "ellseg"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        "error: --format ellseg: needs h5py (the extra 'ellseg'); run: pip install h5py"
+    )
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_cannot_be_exported_is_refused(tiny, tmp_path):

@@ -20,7 +20,7 @@ from eyerender.scene import SceneSpec
 
 
 def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
-    assert sorted(shipped_datasets()) == ["dataset_quick"]
+    assert sorted(shipped_datasets()) == ["dataset_quick", "dataset_region"]
     for name, path in shipped_datasets().items():
         spec = DatasetSpec.load(path)
         spec.dump(tmp_path / "copy.yaml")
@@ -28,6 +28,42 @@ def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
         made = Plan.load(name)
         assert spec.shard_count >= 8
         assert realise(made, spec.count - 1, frames_of(made)).sample is not None
+
+
+def test_another_eye_takes_the_place_of_the_specs_own(tmp_path, monkeypatch):
+    own, other = Plan.load("dataset_quick"), Plan.load("dataset_quick", eye="E4")
+    assert own.digest != other.digest
+    a, b = own.draw(5), other.draw(5)
+    assert (a.eye["name"], b.eye["name"]) == ("E2 of subject 0", "E4")
+    # Nothing else changes, but that E2's parameters are not asked for.
+    assert {k: v for k, v in a.draws.items() if not k.startswith("eye_parameters")} == b.draws
+    load_eye("E4").model_copy(update={"name": "mine"}).dump(tmp_path / "mine.yaml")
+    monkeypatch.chdir(tmp_path)
+    assert Plan.load("dataset_quick", eye="mine.yaml").draw(5).build().eye_spec.name == "mine"
+
+
+def test_blinks_pass_and_lids_stay_also_inside_a_choice():
+    lids = {
+        "seed": {"draw": "integer", "low": 1, "high": 10**6},
+        "blink": {"draw": "uniform", "low": 0.0, "high": 0.5},
+    }
+    made = plan(scene__region={"draw": "choice", "values": [None, lids]})
+    regions = defaultdict(list)
+    for i in range(24):
+        sample = made.draw(i)
+        regions[sample.turn.subject].append(sample.scene["region"])
+    kinds = {subject: {region is None for region in mine} for subject, mine in regions.items()}
+    assert sorted(map(len, kinds.values())) == [1, 1, 1, 1]
+    lidded = [mine for mine in regions.values() if mine[0] is not None]
+    assert lidded
+    for mine in lidded:
+        assert len({region["seed"] for region in mine}) == 1
+        assert len({region["blink"] for region in mine}) == 6
+
+
+def test_an_eye_drawn_as_a_whole_is_refused():
+    with pytest.raises(InputError, match="draws of their own"):
+        plan(scene__eye={"draw": "choice", "values": [{"model": "E1"}, {"model": "E2"}]}, eye_parameters={})
 
 
 def test_a_sample_depends_on_nothing_but_spec_and_index():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -241,6 +242,7 @@ def test_an_interrupted_run_says_so_and_can_go_on(tiny, tmp_path, number):
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert err.splitlines()[-1] == "interrupted"
+    assert re.fullmatch(r"\d of 8 shards are finished; start again on .* to go on", err.splitlines()[-2])
     assert "Traceback" not in err
     assert not list(folder.glob(".partial-*"))
     assert make(folder, plan())["complete"]

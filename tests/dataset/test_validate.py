@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from dataset_specs import mapping
 
+from eyerender.dataset.export import export
 from eyerender.dataset.validate import validate
 from eyerender.errors import InputError
 from eyerender.imagefile import read_image, write_png
@@ -52,6 +53,11 @@ def test_every_line_has_the_same_keys(tiny):
     lines = [json.loads(line) for line in (tiny / "metadata.jsonl").read_text().splitlines()]
     assert len(lines) == mapping()["count"]
     assert all(shape(line) == shape(lines[0]) for line in lines)
+
+
+def test_a_part_that_only_some_scenes_have_is_null_elsewhere(copy):
+    edit(copy, 4, lambda line: line["labels"].update(lid_margins_px={"upper": [[1.0, 2.0]]}))
+    assert problems(copy, quick=True) == []
 
 
 def test_a_changed_byte_is_found(copy):
@@ -101,5 +107,7 @@ def test_what_is_no_finished_dataset_is_refused(copy, tmp_path):
     (copy / "dataset.json").unlink()
     with pytest.raises(InputError, match="not finished"):
         validate(copy)
+    with pytest.raises(InputError, match="not finished"):
+        export(copy, tmp_path / "out", "csv")
     with pytest.raises(InputError, match="no such folder"):
         validate(tmp_path / "nowhere")

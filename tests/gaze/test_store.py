@@ -11,13 +11,12 @@ from gaze_helpers import ets_observations, ets_rig, load
 from eyerender.analytic.observer import observe
 from eyerender.cli.app import run
 from eyerender.errors import InputError
+from eyerender.gaze.records import load_observations, rig_from_mapping
 from eyerender.gaze.store import (
     EstimatorSpec,
     fit_estimator,
     load_estimator,
-    load_observations,
     predictions,
-    rig_from_mapping,
     save_estimator,
 )  # fmt: skip
 from eyerender.scene import load_scene

@@ -13,6 +13,7 @@ from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.region.anatomy import RegionSpec
 from eyerender.region.globe import Globe
+from eyerender.region.hairs import SEGMENTS
 from eyerender.region.lids import CONJUNCTIVA, ROWS
 from eyerender.region.mesh import region_mesh
 
@@ -117,9 +118,9 @@ def check(i):
     # Lashes: beyond their roots none is under the skin or in the globe.
     lashes = np.asarray(mesh.part("lashes").vertices)
     if len(lashes):
-        shafts = lashes.reshape(-1, 6, 3, 3)[:, 1:].mean(axis=2).reshape(-1, 3)
+        shafts = lashes.reshape(-1, SEGMENTS + 1, 3, 3)[:, 1:].mean(axis=2).reshape(-1, 3)
         assert signed_distance(eye, globe, shafts).min() > -INTO_MM, note
-        paths = lashes.reshape(-1, 6, 3, 3).mean(axis=2)
+        paths = lashes.reshape(-1, SEGMENTS + 1, 3, 3).mean(axis=2)
         assert not np.any(crossings(paths[:, 1:-1].reshape(-1, 3), paths[:, 2:].reshape(-1, 3), skin)), note
     assert np.all(np.isfinite(mesh.vertices)), note
     assert np.all(np.abs(np.linalg.norm(mesh.normals, axis=-1) - 1) < 1e-6), note

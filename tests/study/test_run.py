@@ -18,7 +18,8 @@ from eyerender.imagefolder import ImageFolder, same_run
 from eyerender.scene import Scene, SceneSpec, load_scene
 from eyerender.study import guestrin, head_mounted, observers_compared
 from eyerender.study.conditions import PARAMETERS, TRACKERS, conditions_part
-from eyerender.study.observing import ImageSettings, Observing, facing_scene, moved, with_index_of
+from eyerender.study.images import StudyImages, facing_scene
+from eyerender.study.observing import Observing, moved, with_index_of
 from eyerender.study.run import run_study
 
 
@@ -149,8 +150,9 @@ def test_a_turned_camera_changes_no_ray():
         back = with_index_of(moved(seen, turned.rig.cameras[0], scene.rig.cameras[0]), scene, rows)
         np.testing.assert_array_equal(back.index.target_mm, index.target_mm[rows])
         np.testing.assert_allclose(back.glints.xy_px, direct.glints.xy_px[rows], atol=1e-8)
-        # The centre of an ellipse is not the image of a centre: some thousandths of a pixel.
-        np.testing.assert_allclose(back.pupil.centre_px, direct.pupil.centre_px[rows], atol=0.02)
+        # The outline is not quite an ellipse in either camera, so the fits differ by some millionths of a pixel.
+        np.testing.assert_allclose(back.pupil.centre_px, direct.pupil.centre_px[rows], atol=2e-5)
+        np.testing.assert_allclose(back.pupil.semi_axes_px, direct.pupil.semi_axes_px[rows], atol=2e-5)
         np.testing.assert_array_equal(back.pupil.in_image, direct.pupil.in_image[rows])
     assert outside > 0  # some frames do need the turn
 
@@ -158,17 +160,20 @@ def test_a_turned_camera_changes_no_ray():
 def test_turned_frames_come_back_in_the_scenes_order(monkeypatch):
     scene = guestrin.scene("E1", guestrin.CORRECTED)
     # The image part alone is replaced by the analytic one: what is tested is the order and the index.
-    monkeypatch.setattr(Observing, "_images", staticmethod(lambda s, name, settings, noise: observe(s)))
-    seen = Observing("image", ImageSettings(folder=None)).observe(scene, "x", facing=True)
+    monkeypatch.setattr(StudyImages, "observe", lambda self, s: observe(s))
+    seen = Observing("image", StudyImages({})).observe(scene, facing=True)
     direct = observe(scene)
     for name in ("frame", "fixation", "head", "eye", "target_mm"):
         np.testing.assert_array_equal(getattr(seen.index, name), getattr(direct.index, name))
     np.testing.assert_allclose(seen.glints.xy_px, direct.glints.xy_px, atol=1e-8)
 
 
-def test_images_need_a_folder():
-    with pytest.raises(InputError, match="needs a folder"):
-        Observing("image").observe(guestrin.scene("E1", set()), "x")
+def test_images_that_are_not_there_are_refused():
+    scene = guestrin.scene("E1", set())
+    with pytest.raises(InputError, match="needs images"):
+        Observing("image").observe(scene)
+    with pytest.raises(InputError, match="not in the study's dataset"):
+        Observing("image", StudyImages({})).observe(scene)
 
 
 def test_known_feature_errors_and_paired_differences():
@@ -226,29 +231,6 @@ def test_conditions_of_all_models(tmp_path):
     assert [m["eye_model"] for m in summary["models"]] == ["E1", "E2", "E3", "E4", "E5"]
     lost = [e for m in summary["models"] for e in m["sensitivity"] for t in TRACKERS if e[t]["reason"]]
     assert lost == []
-
-
-@pytest.mark.render
-@pytest.mark.slow
-def test_image_observer_resumes(tmp_path):
-    arguments = {"observer": "both", "protocol": "corrected", "eyes": ("E2",), "spp": 4}
-    first = run_study("guestrin2006", tmp_path / "out", **arguments)
-    images = sorted((tmp_path / "out" / "images").rglob("*.png"))
-    assert len(images) == 2 * 2 * 90  # images and masks, with noise and without
-    stamps = [p.stat().st_mtime_ns for p in images]
-    again = run_study("guestrin2006", tmp_path / "out", **arguments)
-    assert [p.stat().st_mtime_ns for p in images] == stamps
-    assert again["rows"] == first["rows"]
-    rows = {
-        (r["observer"], r["head"]): r for r in first["rows"] if r["eye"] == "both" and r["variant"] == "index fixed"
-    }
-    for observer in ("image", "image-noiseless"):
-        assert rows[observer, "H1"]["missing"] == 0
-        assert rows[observer, "H1"]["mean_deg"] < 0.5
-    pupils = {f["observer"]: f for f in first["observers"]["features"] if f["feature"] == "pupil centre"}
-    assert {f["n"] for f in pupils.values()} == {90}
-    assert max(f["median_distance_px"] for f in pupils.values()) < 0.3
-    assert {g["observer"] for g in first["observers"]["gaze"]} == {"image", "image-noiseless"}
 
 
 @pytest.mark.render

@@ -23,7 +23,7 @@ def write(items: Items, out: Path) -> None:
     try:
         h5py: Any = import_module("h5py")
     except ImportError:
-        raise InputError("needs h5py; run: pip install h5py", source="--format ellseg") from None
+        raise InputError("needs h5py (the extra 'ellseg'); run: pip install h5py", source="--format ellseg") from None
     sizes = {entry.window[2:] for entry in items.folder.entries}
     if len(sizes) > 1:
         raise InputError("needs images of one size", source="--format ellseg")

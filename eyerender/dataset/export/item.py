@@ -100,13 +100,13 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Items:
-    """The images of a dataset in order; going through them tells how far it is."""
+    """The images of a dataset in the order of its samples; going through them tells how far it is."""
 
     folder: ImageFolder
     step: Callable[[int], None]
 
     def __iter__(self) -> Iterator[Item]:
-        for k, entry in enumerate(self.folder.entries):
+        for k, entry in enumerate(sorted(self.folder.entries, key=lambda entry: int(entry.line["sample"]))):
             yield Item(entry)
             self.step(k + 1)
 

@@ -1,0 +1,25 @@
+"""Options that mean the same in several commands, with their help."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from ..errors import InputError
+
+Eye = Annotated[str | None, Parameter(help="Replace the eye model: a name of the catalogue, or an eye file.")]
+Seed = Annotated[int | None, Parameter(help="Replace the seed.")]
+Backend = Annotated[Literal["auto", "cuda", "llvm"], Parameter(help="Where to render.")]
+Threads = Annotated[int | None, Parameter(help="Processor threads in all (default: all there are).")]
+Overwrite = Annotated[bool, Parameter(help="Replace what the folder holds.")]
+Result = Annotated[
+    str | None,
+    Parameter(name="--json", allow_leading_hyphen=True, help="Write the result as JSON to a file, or to stdout (-)."),
+]
+
+
+def positive(name: str, value: float | None) -> None:
+    """Raise `InputError` where a count that was given is below 1."""
+    if value is not None and value < 1:
+        raise InputError(f"must be >= 1, not {value}", source=name)

@@ -1,0 +1,288 @@
+"""A user's own head mesh: read, checked, placed about an eye, and its looks as a map like the procedural region's.
+
+The mesh keeps still: neither gaze nor blink moves it. With the files' coordinates q, unit s, axes R (rows forward,
+left, up) and the globe's centre c there, it stands in the frame of the unrotated eye at
+
+    x = s R (q - c) + g,
+
+g the centre of the eye's globe. An eye whose centre is not given gets the other's mesh, mirrored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from ..arrays import ArrayValue, Floats, Ints, frozen
+from ..errors import InputError
+from ..spec import file_digest
+from .anatomy import RegionSpec
+from .globe import Globe
+from .headspec import HeadSpec
+from .mesh import PARTS, RegionLayout, RegionMesh
+
+HEAD_PARTS = (*PARTS, "head")
+_UNIT_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+# A patch around one eye, and a head with shoulders: outside of it the unit is wrong.
+_SMALLEST_MM, _LARGEST_MM = 15.0, 1500.0
+_NEAR_MM = 40.0
+_PAD, _BAND, _PLAIN = 4, 8, 8
+_TEXTURE = 2048
+_HAIR_GLOSS = 0.12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadMesh(ArrayValue):
+    """A head about its own origin, mm, +x where the face looks, +y to its left, +z up.
+
+    `vertices`, unit `normals` (n, 3), `faces` (m, 3), `uv` (n, 2; NaN where the file has none), `vertex_ends` and
+    `face_ends` of the parts in the order of `HEAD_PARTS`, and the globes' centres (3,), NaN where they are not given.
+    """
+
+    vertices: Floats
+    normals: Floats
+    faces: Ints
+    uv: Floats
+    vertex_ends: Ints
+    face_ends: Ints
+    right_eye: Floats
+    left_eye: Floats
+
+
+def load_head(spec: HeadSpec) -> HeadMesh:
+    """Read and check the files of a spec with absolute paths (`HeadSpec.resolved`); kept while they do not change.
+
+    Raises:
+        InputError: a file that is missing, not readable, or not the one that its check sum belongs to; a part that is
+            not there; numbers that are not finite; a size that the unit cannot have given.
+    """
+    if spec.manifest:
+        raise InputError("is a manifest; resolve it first", source=spec.files[0])
+    return _loaded(spec, file_states(spec))
+
+
+def file_states(spec: HeadSpec) -> tuple[tuple[int, int], ...]:
+    """Time of change and size of each file of a spec with absolute paths; raises `InputError` where one is missing."""
+    states = []
+    for file in (*spec.files, *(() if spec.texture is None else (spec.texture,))):
+        try:
+            state = Path(file).stat()
+        except OSError:
+            raise InputError("no such file", source=file) from None
+        states.append((state.st_mtime_ns, state.st_size))
+    return tuple(states)
+
+
+@lru_cache(maxsize=4)
+def _loaded(spec: HeadSpec, states: tuple[tuple[int, int], ...]) -> HeadMesh:
+    del states
+    source = spec.files[0]
+    for file, wanted in zip(spec.files, spec.sums, strict=False):
+        if file_digest(Path(file)) != wanted:
+            raise InputError("is not the file that sha256 belongs to", source=file)
+    objects: dict[str, list[trimesh.Trimesh]] = {}
+    for file in spec.files:
+        for name, mesh in _objects(Path(file)).items():
+            objects.setdefault(name, []).append(mesh)
+    scale, axes = _UNIT_MM[spec.unit or "mm"], _axes(spec, source)
+    vertices, normals, faces, uv, vertex_ends, face_ends = [], [], [], [], [], []
+    count = triangles = 0
+    for part in HEAD_PARTS:
+        names = _named(spec, part, objects, source)
+        for mesh in (m for name in names for m in objects[name]):
+            v = np.asarray(mesh.vertices, dtype=float)
+            vertices.append(scale * v @ axes.T)
+            normals.append(_smooth(vertices[-1], np.asarray(mesh.faces)))
+            faces.append(np.asarray(mesh.faces) + count)
+            uv.append(_uv(mesh))
+            count += len(v)
+            triangles += len(mesh.faces)
+        vertex_ends.append(count)
+        face_ends.append(triangles)
+    if not faces:
+        raise InputError("names no object of the mesh", source=source, path="parts")
+    joined = np.concatenate(vertices)
+    size = float(np.linalg.norm(np.ptp(joined, axis=0)))
+    if not _SMALLEST_MM <= size <= _LARGEST_MM:
+        raise InputError(f"{spec.unit} makes the mesh {size:.1f} mm large", source=source, path="unit")
+    eyes = [np.full(3, np.nan) if e is None else scale * axes @ np.array(e) for e in (spec.right_eye, spec.left_eye)]
+    for name, eye in zip(("right_eye", "left_eye"), eyes, strict=True):
+        if np.all(np.isfinite(eye)) and (gap := float(np.min(np.linalg.norm(joined - eye, axis=1)))) > _NEAR_MM:
+            raise InputError(f"lies {gap:.1f} mm from the nearest vertex", source=source, path=name)
+    return HeadMesh(
+        frozen(joined),
+        frozen(np.concatenate(normals)),
+        frozen(np.concatenate(faces), np.int64),
+        frozen(np.concatenate(uv)),
+        frozen(vertex_ends, np.int64),
+        frozen(face_ends, np.int64),
+        frozen(eyes[0]),
+        frozen(eyes[1]),
+    )
+
+
+def placed(head: HeadMesh, globe: Globe, texture: int = 0) -> RegionMesh:
+    """The head about an eye at rest, as the procedural region is given; it has no lid margins of its own.
+
+    `texture` is the number of rows of its texture, 0 without one.
+    """
+    eyes = (head.left_eye, head.right_eye) if globe.mirrored else (head.right_eye, head.left_eye)
+    flipped = not bool(np.all(np.isfinite(eyes[0])))
+    mirror = np.array([1.0, -1.0 if flipped else 1.0, 1.0])
+    vertices = (head.vertices - eyes[1 if flipped else 0]) * mirror + globe.centre_mm
+    faces = head.faces[:, ::-1] if flipped else head.faces
+    layout = RegionLayout(frozen(faces, np.int64), frozen(_map_uv(head, texture)), head.vertex_ends, head.face_ends)
+    nothing = frozen(np.zeros((0, 3)))
+    return RegionMesh(frozen(vertices), frozen(head.normals * mirror), layout, nothing, nothing)
+
+
+def head_map(spec: RegionSpec, head: HeadMesh) -> NDArray[np.float32]:
+    """The map (rows, columns, 4) of a head: albedo, two slopes (0), gloss; the texture, then a band for each part.
+
+    The texture's red channel counts, made linear and relative to its mean over the skin's vertices: the level is that
+    of `skin.albedo`.
+    """
+    skin = spec.skin
+    picture = np.ones((_PLAIN, _PLAIN))
+    if spec.head is not None and spec.head.texture is not None:
+        picture = _picture(Path(spec.head.texture), Path(spec.head.texture).stat().st_mtime_ns)
+        uv = head.uv[: int(head.vertex_ends[0])]
+        uv = uv[np.isfinite(uv).all(axis=1)]
+        if len(uv) == 0:
+            raise InputError("the skin has no texture coordinates", source=spec.head.texture)
+        h, w = picture.shape
+        row = np.clip(((1 - uv[:, 1]) * h).astype(int), 0, h - 1)
+        picture = picture / max(float(np.mean(picture[row, (uv[:, 0] * w).astype(int) % w])), 1e-6)
+    h, w = picture.shape
+    out = np.zeros((_rows(h), w, 4), np.float32)
+    out[: h + 2 * _PAD, :, 0] = np.pad(np.clip(skin.albedo * picture, 0.02, 0.95), ((_PAD, _PAD), (0, 0)), "edge")
+    looks = {
+        "skin": (skin.albedo, 0.0),
+        "lashes": (spec.lashes.albedo, _HAIR_GLOSS),
+        "brow": (spec.brow.albedo, _HAIR_GLOSS),
+        "tears": (0.9 * skin.wet_albedo, 1.0),
+        "head": (skin.albedo, 0.0),
+    }
+    for k, part in enumerate(HEAD_PARTS):
+        start = h + 2 * _PAD + k * _BAND
+        out[start : start + _BAND, :, 0], out[start : start + _BAND, :, 3] = looks[part]
+    return out
+
+
+def _rows(texture_rows: int) -> int:
+    return texture_rows + 2 * _PAD + len(HEAD_PARTS) * _BAND
+
+
+def _map_uv(head: HeadMesh, texture: int) -> Floats:
+    """Places in the map; `texture` is the number of the texture's rows, 0 without one."""
+    h = texture or _PLAIN
+    rows = _rows(h)
+    part = np.searchsorted(head.vertex_ends, np.arange(len(head.vertices)), side="right")
+    band = (h + 2 * _PAD + (part + 0.5) * _BAND) / rows
+    of_texture = (part == 0) & np.isfinite(head.uv).all(axis=1) & (texture > 0)
+    u = np.where(of_texture, head.uv[:, 0], 0.5)
+    v = np.where(of_texture, (_PAD + (1 - np.clip(np.nan_to_num(head.uv[:, 1]), 0, 1)) * h) / rows, band)
+    return np.stack([u, v], axis=-1)
+
+
+def texture_rows(spec: HeadSpec) -> int:
+    """Rows of the texture as the map holds it, 0 without one."""
+    return 0 if spec.texture is None else len(_picture(Path(spec.texture), Path(spec.texture).stat().st_mtime_ns))
+
+
+@lru_cache(maxsize=2)
+def _picture(path: Path, changed_ns: int) -> Floats:
+    """The red channel of a picture, linear, 0 to 1, at most 2048 rows and columns."""
+    del changed_ns
+    try:
+        with Image.open(path) as file:
+            file.thumbnail((_TEXTURE, _TEXTURE))
+            data = np.asarray(file if file.mode.startswith(("I", "F", "L")) else file.convert("RGB"))
+    except FileNotFoundError:
+        raise InputError("no such file", source=str(path)) from None
+    except (OSError, UnidentifiedImageError, ValueError) as error:
+        raise InputError(f"is not a readable picture ({error})", source=str(path)) from None
+    values = (data[..., 0] if data.ndim == 3 else data).astype(float)
+    if data.dtype != np.uint8:
+        return frozen(values / (65535.0 if data.dtype.kind in "iu" else max(float(values.max()), 1e-9)))
+    # 8 bits are taken for sRGB (IEC 61966-2-1).
+    s = values / 255
+    return frozen(np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4))
+
+
+def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
+    """The named objects of a file: an OBJ's objects, or its groups where it has none; a PLY under its stem."""
+    source, kind = str(path), path.suffix.lower()
+    if kind not in (".obj", ".ply"):
+        raise InputError("must end with .obj or .ply", source=source)
+    options: dict[str, Any] = {}
+    try:
+        if kind == ".obj":
+            text = "\n" + path.read_text(encoding="utf-8", errors="replace")
+            divided = "split_objects" if "\no " in text else "split_groups"
+            options = {"skip_materials": True, "group_material": False, divided: True}
+            if "\no " not in text and "\ng " not in text:
+                options.pop(divided)
+        scene = trimesh.load_scene(path, process=False, **options)
+        found = {name: g for name, g in scene.geometry.items() if isinstance(g, trimesh.Trimesh) and len(g.faces)}
+    except Exception as error:
+        # Readers of meshes raise whatever a broken file makes of them.
+        detail = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"is not a readable mesh ({detail})", source=source) from None
+    if not found:
+        raise InputError("holds no triangles", source=source)
+    for name, mesh in found.items():
+        v, f = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+        if not np.all(np.isfinite(v)):
+            raise InputError(f"object {name!r} holds coordinates that are not finite", source=source)
+        if f.min() < 0 or f.max() >= len(v):
+            raise InputError(f"object {name!r} has faces without vertices", source=source)
+    if kind == ".ply" or not options.keys() & {"split_objects", "split_groups"}:
+        return {path.stem: next(iter(found.values()))}
+    return found
+
+
+def _named(spec: HeadSpec, part: str, objects: dict[str, Any], source: str) -> tuple[str, ...]:
+    if spec.parts is None:
+        return tuple(objects) if part == "skin" else ()
+    names: tuple[str, ...] = getattr(spec.parts, part)
+    for name in names:
+        if name not in objects:
+            raise InputError(
+                f"no object {name!r}; there are {', '.join(sorted(objects))}", source=source, path=f"parts.{part}"
+            )
+    return names
+
+
+def _axes(spec: HeadSpec, source: str) -> Floats:
+    forward, up = np.array(spec.forward), np.array(spec.up)
+    left = np.cross(up, forward)
+    if np.linalg.norm(left) <= 1e-6 * np.linalg.norm(up) * np.linalg.norm(forward):
+        raise InputError("must not lie along forward, nor be zero", source=source, path="up")
+    forward, left = forward / np.linalg.norm(forward), left / np.linalg.norm(left)
+    return np.stack([forward, left, np.cross(forward, left)])
+
+
+def _smooth(vertices: Floats, faces: Ints) -> Floats:
+    """Unit normals of the vertices, those of one place alike, so that seams of a texture do not show."""
+    _, first, same = np.unique(np.round(vertices, 6), axis=0, return_index=True, return_inverse=True)
+    same = np.ravel(same)
+    merged = trimesh.Trimesh(vertices[first], same[faces], process=False)
+    normals = np.array(merged.vertex_normals)[same]
+    # A place without any area about it has no normal.
+    lost = ~(np.linalg.norm(normals, axis=1) > 0.5)
+    normals[lost] = (1.0, 0.0, 0.0)
+    return normals
+
+
+def _uv(mesh: trimesh.Trimesh) -> Floats:
+    uv = getattr(mesh.visual, "uv", None)
+    none = np.full((len(mesh.vertices), 2), np.nan)
+    return none if uv is None or np.shape(uv) != none.shape else np.asarray(uv, dtype=float)

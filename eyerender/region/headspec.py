@@ -1,0 +1,110 @@
+"""A user's own head mesh as a person writes it: which files, their unit and frame, what their parts are, where the eyes
+stand. It may stand in the scene, or in a manifest beside the mesh that the scene names (docs/formats.md)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from ..errors import InputError
+from ..spec import NonNegative, Spec, Vec3
+
+SCHEMA = "eyerender/head/1"
+Name = Annotated[str, Field(min_length=1)]
+Names = tuple[Name, ...]
+Sum = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+class HeadPartsSpec(Spec):
+    """What the mesh's objects are: names of an OBJ's objects (or groups, where it has none), of a PLY its file's stem.
+
+    What stands in no list is left out, such as the head's own eyeballs.
+    """
+
+    skin: Names = Field(default=(), description="lids and face: 'occluded by lid'")
+    lashes: Names = ()
+    brow: Names = ()
+    tears: Names = ()
+    head: Names = Field(default=(), description="hair, glasses' frames and other things: 'occluded by head'")
+
+
+class HeadSpec(Spec):
+    """A head mesh in place of the procedural lids, lashes, brow and skin. It does not move with the eye."""
+
+    file: Name | Annotated[tuple[Name, ...], Field(min_length=1)] = Field(
+        description="an .obj or .ply file, several of them, or a .json manifest that holds all of these keys"
+    )
+    unit: Literal["mm", "cm", "m"] | None = Field(default=None, description="of the files' coordinates")
+    licence: Name | None = Field(default=None, description="under which the mesh is used")
+    sha256: Sum | tuple[Sum, ...] | None = Field(default=None, description="of the files, in their order")
+    parts: HeadPartsSpec | None = Field(default=None, description="default: everything is skin")
+    forward: Vec3 = Field(default=(0.0, 0.0, 1.0), description="where the face looks, in the files' axes")
+    up: Vec3 = Field(default=(0.0, 1.0, 0.0), description="the vertical, in the files' axes")
+    right_eye: Vec3 | None = Field(default=None, description="centre of the globe, in the files' coordinates")
+    left_eye: Vec3 | None = Field(default=None, description="likewise; the eye not given is the other's mirror image")
+    texture: Name | None = Field(default=None, description="picture of the skin over its texture coordinates")
+    tolerance_mm: NonNegative = Field(
+        default=0.3, description="how deep the mesh may reach into the cornea in any pose; deeper is refused"
+    )
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files as they are written."""
+        return (self.file,) if isinstance(self.file, str) else self.file
+
+    @property
+    def manifest(self) -> bool:
+        """Whether all else stands in a manifest."""
+        return isinstance(self.file, str) and self.file.lower().endswith(".json")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.manifest:
+            for name, field in type(self).model_fields.items():
+                if name != "file" and getattr(self, name) != field.default:
+                    raise ValueError(f"{name}: stands in the manifest, not here")
+            return self
+        for name in ("unit", "licence"):
+            if getattr(self, name) is None:
+                raise ValueError(f"{name}: missing")
+        if self.right_eye is None and self.left_eye is None:
+            raise ValueError("right_eye: missing; give it or left_eye")
+        if self.sha256 is not None and len(self.sums) != len(self.files):
+            raise ValueError("sha256: needs one for each file")
+        return self
+
+    @property
+    def sums(self) -> tuple[str, ...]:
+        """The check sums that are given."""
+        return () if self.sha256 is None else (self.sha256,) if isinstance(self.sha256, str) else self.sha256
+
+    def resolved(self, base: Path | None) -> HeadSpec:
+        """The same with absolute paths (relative ones start at `base`, or the current folder), a manifest read."""
+        base = Path.cwd() if base is None else base.resolve()
+        if self.manifest:
+            path = base / self.files[0]
+            return _read_manifest(path).resolved(path.parent)
+        files = tuple(str(base / f) for f in self.files)
+        texture = None if self.texture is None else str(base / self.texture)
+        return self.model_copy(update={"file": files, "texture": texture})
+
+
+def _read_manifest(path: Path) -> HeadSpec:
+    source = str(path)
+    try:
+        data: Any = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError("no such file", source=source) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"is not a readable manifest ({error})", source=source) from None
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        raise InputError(f"is no manifest of a head; its schema must be {SCHEMA}", source=source)
+    if "sha256" not in data:
+        raise InputError("missing; a manifest holds the check sums of its files", source=source, path="sha256")
+    spec = HeadSpec.from_mapping({k: v for k, v in data.items() if k != "schema"}, source=source)
+    if spec.manifest:
+        raise InputError("names another manifest", source=source, path="file")
+    return spec

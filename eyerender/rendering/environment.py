@@ -1,0 +1,280 @@
+"""Light that does not come from the lamps: even light, emitting panels, and a surrounding given as an HDR map.
+
+All of it is mirrored in the front cornea by exact rays (the integrator's), and lights matte surfaces by its irradiance,
+without shadows. A map is infinitely far away; its irradiance is its cosine convolution in spherical harmonics up to
+order 2 (Ramamoorthi and Hanrahan 2001, equations 4 to 12; on average within a few per cent of the integral),
+
+    E(n) = sum_lm A_l L_lm Y_lm(n),    A = (pi, 2 pi / 3, pi / 4),    L_lm = integral of L Y_lm over all directions.
+
+A panel's irradiance is Lambert's formula for a polygon, cut at the horizon of the lit surface,
+
+    E(n) = L / 2 sum_k theta_k n . g_k,
+
+theta_k the angle under which its edge k is seen and g_k the unit normal of the plane of edge and eye point (Lambert
+1760; Arvo 1995, equation 2.9).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..arrays import ArrayValue, Floats, frozen
+from ..errors import InputError
+from ..rig.imaging import MapSpec
+from ..spec import file_digest
+from .exr import second_thread
+from .values import PANEL_WIDTH, Panels
+
+_WIDTH, _HEIGHT = 1024, 512
+_FINE = 256
+_FORMATS = (".hdr", ".exr", ".pfm", ".npy")
+# Rec. 709.
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+_KEPT = 4
+_ENTRIES = 21  # even irradiance, 9 of the rotation, scale, rows, 9 of the irradiance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surrounding(ArrayValue):
+    """A map as it is used: `values` (h, w) float32, and `harmonics` (9,) of the irradiance per unit of its values."""
+
+    values: Any
+    harmonics: Floats
+
+
+def read_map(path: str | Path, channel: str = "red") -> Floats:
+    """The values (h, w) of a latitude-longitude map; w = 2 h.
+
+    Args:
+        path: Radiance .hdr, OpenEXR .exr, .pfm, or a NumPy array .npy of shape (h, w) or (h, w, channels).
+        channel: what of a colour map counts: red, green, blue, or luminance (Rec. 709).
+
+    Raises:
+        InputError: it is missing, not readable, of another shape, or holds negative or non-finite values.
+    """
+    source, path = str(path), Path(path)
+    if path.suffix.lower() not in _FORMATS:
+        raise InputError(f"must end with one of {', '.join(_FORMATS)}", source=source)
+    if not path.is_file():
+        raise InputError("no such file", source=source)
+    try:
+        if path.suffix.lower() == ".npy":
+            data = np.load(path, allow_pickle=False)
+        else:
+            with second_thread():
+                bitmap = mi.Bitmap(str(path))
+            data = np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
+    except (RuntimeError, OSError, ValueError, EOFError) as error:
+        detail = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"is not a readable map ({detail})", source=source) from None
+    if data.dtype.kind not in "fiu" or data.ndim not in (2, 3):
+        raise InputError("must hold numbers (height, width) or (height, width, channels)", source=source)
+    if data.ndim == 3:
+        if data.shape[2] < 3:
+            data = data[..., 0]
+        elif channel == "luminance":
+            data = data[..., :3] @ _LUMINANCE
+        else:
+            data = data[..., ("red", "green", "blue").index(channel)]
+    values: Floats = np.asarray(data, dtype=np.float64)
+    height, width = values.shape
+    if width != 2 * height or height < 4:
+        raise InputError(f"is {width} x {height}; a map over all directions is twice as wide as high", source=source)
+    if not np.all(np.isfinite(values)) or np.min(values) < 0:
+        raise InputError("holds values that are negative or not finite", source=source)
+    return values
+
+
+def surrounding(values: Floats) -> Surrounding:
+    """A map (h, 2 h) made ready: averaged down to at most 1024 x 512, and its irradiance."""
+    reduced = _reduced(values)
+    return Surrounding(frozen(reduced, np.float32), frozen(irradiance_harmonics(reduced)))
+
+
+def irradiance_harmonics(values: Floats) -> Floats:
+    """A_l L_lm c_lm of the map (9,): E(n) is their sum with 1, y, z, x, xy, yz, 3 z^2 - 1, xz, x^2 - y^2 of n."""
+    fold = max(1, -(-_FINE // len(values)))
+    h, w = len(values) * fold, values.shape[1] * fold
+    edges = np.cos(np.pi * np.arange(h + 1) / h)
+    # Solid angle of a texel in each row; the map's texels are even in themselves.
+    weight = (edges[:-1] - edges[1:]) * (2 * np.pi / w)
+    polar = np.pi * (np.arange(h) + 0.5) / h
+    turn = 2 * np.pi * (0.5 - (np.arange(w) + 0.5) / w)
+    # Over the columns first: each basis function is a product of one of the row and one of the column.
+    rows = np.repeat(values, fold, axis=0)
+
+    def along(f: Floats) -> Floats:
+        out: Floats = rows @ f.reshape(-1, fold).sum(axis=1) * weight
+        return out
+
+    c, s, c2, s2 = (along(f) for f in (np.cos(turn), np.sin(turn), np.cos(2 * turn), np.sin(2 * turn)))
+    one = along(np.ones(w))
+    st, ct = np.sin(polar), np.cos(polar)
+    moments = np.array(
+        [
+            np.sum(one),
+            np.sum(s * st),
+            np.sum(one * ct),
+            np.sum(c * st),
+            np.sum(0.5 * s2 * st * st),
+            np.sum(s * st * ct),
+            np.sum(one * (3 * ct * ct - 1)),
+            np.sum(c * st * ct),
+            np.sum(c2 * st * st),
+        ]
+    )
+    y0, y1, y2, y20, y22 = 1 / (4 * np.pi), 3 / (4 * np.pi), 15 / (4 * np.pi), 5 / (16 * np.pi), 15 / (16 * np.pi)
+    squares = np.array([y0, y1, y1, y1, y2, y2, y20, y2, y22])
+    band = np.pi * np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])
+    return np.asarray(moments * squares * band, dtype=np.float64)
+
+
+def map_rotation(spec: MapSpec) -> Floats:
+    """M (3, 3) from the map's frame (x its middle, y to the left of it, z up) to the world: Rz(az) Ry(-el) Rx(roll)."""
+    az, el, roll = np.radians([spec.azimuth_deg, spec.elevation_deg, spec.roll_deg])
+    (ca, sa), (ce, se), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (az, el, roll))
+    Rz = np.array([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1.0]])
+    Ry = np.array([[ce, 0, -se], [0, 1.0, 0], [se, 0, ce]])
+    Rx = np.array([[1.0, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    return np.asarray(Rz @ Ry @ Rx)
+
+
+class Maps:
+    """The maps in use, on the device; each is read and sent there once."""
+
+    def __init__(self) -> None:
+        self._kept: dict[Any, tuple[Any, Surrounding]] = {}
+        self._none = self._sent(Surrounding(frozen(np.zeros((2, 4)), np.float32), frozen(np.zeros(9))))
+
+    def of(self, spec: MapSpec | None) -> tuple[Any, Surrounding]:
+        """Texture and map of a spec (its file's path absolute or relative to the current folder)."""
+        if spec is None:
+            return self._none
+        path = Path(spec.file)
+        try:
+            state = path.stat()
+        except OSError:
+            raise InputError("no such file", source=spec.file) from None
+        key = (spec.file, spec.channel, spec.sha256, state.st_mtime_ns, state.st_size)
+        if key not in self._kept:
+            if len(self._kept) >= _KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            if spec.sha256 is not None and file_digest(path) != spec.sha256:
+                raise InputError("is not the file that sha256 belongs to", source=spec.file)
+            self._kept[key] = self._sent(surrounding(read_map(path, spec.channel)))
+        return self._kept[key]
+
+    @staticmethod
+    def _sent(made: Surrounding) -> tuple[Any, Surrounding]:
+        # Repeated, so that the columns wrap; the poles are kept apart by rows of their own.
+        rows = np.concatenate([made.values[:1], made.values, made.values[-1:]])
+        texture: Any = mi.Texture2f
+        return texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat), made
+
+
+class Ambience:
+    """Even light, panels and a surrounding, as the integrator asks for them; kernels depend on none of the numbers."""
+
+    def __init__(
+        self, even_mw_mm2: float, panels: np.ndarray[Any, np.dtype[np.float64]], spec: MapSpec | None, maps: Maps
+    ) -> None:
+        """`panels` (n, 13) as `frame.panel_table` has them; the map's rays are those of the world's axes."""
+        self._panels = Panels(panels)
+        self._count = dr.opaque(mi.UInt32, len(panels))
+        table = np.ascontiguousarray(panels, dtype=np.float32).reshape(-1)
+        self._table = mi.Float(table if table.size else np.zeros(PANEL_WIDTH, np.float32))
+        self._texture, made = maps.of(spec)
+        scale = 0.0 if spec is None else spec.scale_w_m2_sr * 1e-3
+        M = np.eye(3) if spec is None else map_rotation(spec)
+        numbers = [even_mw_mm2, *M.T.ravel(), scale, len(made.values), *(made.harmonics * scale)]
+        buffer = mi.Float(np.array(numbers, dtype=np.float32))
+        n = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in range(_ENTRIES)]
+        dr.eval(n)
+        self._even, self._scale, self._rows, self._harmonics = n[0], n[10], n[11], n[12:]
+        self._axes = tuple(mi.Vector3f(*n[k : k + 3]) for k in (1, 4, 7))
+
+    def _in_map(self, v: Any) -> Any:
+        return mi.Vector3f(*(dr.dot(axis, v) for axis in self._axes))
+
+    def radiance(self, o: Any, d: Any, active: Any) -> Any:
+        """Radiance (mW/mm^2/sr) that rays of the scene's frame meet, even light left out; panels that overlap add up
+        and do not hide the map behind them."""
+        w = self._in_map(d)
+        u = 0.5 - dr.atan2(w.y, w.x) * (0.5 * dr.inv_pi)
+        v = dr.acos(dr.clip(w.z, -1, 1)) * dr.inv_pi
+        place = mi.Point2f(u, (1 + v * self._rows) / (self._rows + 2))
+        return self._panels.radiance(o, d, active) + self._scale * self._texture.eval(place, active)[0]
+
+    def irradiance(self, x: Any, n: Any) -> Any:
+        """Irradiance (mW/mm^2) of a matte surface at points x with unit normals n of the scene's frame, unshadowed."""
+        w = self._in_map(n)
+        h = self._harmonics
+        far = h[0] + h[1] * w.y + h[2] * w.z + h[3] * w.x
+        far += h[4] * w.x * w.y + h[5] * w.y * w.z + h[6] * (3 * w.z * w.z - 1) + h[7] * w.x * w.z
+        far += h[8] * (w.x * w.x - w.y * w.y)
+
+        def more(i: Any, *_: Any) -> Any:
+            return i < self._count
+
+        def body(i: Any, total: Any) -> Any:
+            row = [dr.gather(mi.Float, self._table, i * PANEL_WIDTH + k) for k in range(PANEL_WIDTH)]
+            centre, normal = mi.Vector3f(*row[0:3]), mi.Vector3f(*row[3:6])
+            right, up = mi.Vector3f(*row[6:9]), mi.Vector3f(*row[9:12])
+            right, up = right / dr.squared_norm(right), up / dr.squared_norm(up)
+            middle = centre - x
+            seen = polygon_irradiance(
+                [middle - right - up, middle + right - up, middle + right + up, middle - right + up], n
+            )
+            return i + 1, total + dr.select(dr.dot(middle, normal) < 0, row[12] * seen, 0)
+
+        state = (mi.UInt32(0), mi.Float(0) * n.x)
+        near = dr.while_loop(state, more, body, labels=("i", "total"), label="panel light")[1]
+        return self._even + dr.maximum(far, 0) + near
+
+
+def polygon_irradiance(corners: list[Any], n: Any) -> Any:
+    """Irradiance per radiance of a convex polygon, its corners given from the lit point, on a surface of normal n.
+
+    What lies below the horizon is cut off: the edges' parts above it and the arc of the horizon between them remain.
+    """
+    total = mi.Float(0)
+    leave, enter = mi.Vector3f(0), mi.Vector3f(0)
+    for a, b in zip(corners, [*corners[1:], corners[0]], strict=True):
+        ha, hb = dr.dot(n, a), dr.dot(n, b)
+        above_a, above_b = ha > 0, hb > 0
+        crossing = above_a != above_b
+        cut = a + dr.select(crossing, ha / dr.select(crossing, ha - hb, 1), 0) * (b - a)
+        leave = dr.select(above_a & ~above_b, cut, leave)
+        enter = dr.select(above_b & ~above_a, cut, enter)
+        total += dr.select(above_a | above_b, _arc(dr.select(above_a, a, cut), dr.select(above_b, b, cut), n), 0)
+    total += dr.select(dr.squared_norm(leave) > 0, _arc(leave, enter, n), 0)
+    return 0.5 * dr.abs(total)
+
+
+def _arc(a: Any, b: Any, n: Any) -> Any:
+    """The angle between two directions times n . unit(a x b)."""
+    c = dr.cross(a, b)
+    s = dr.norm(c)
+    return dr.atan2(s, dr.dot(a, b)) * dr.dot(n, c) / dr.maximum(s, 1e-20)
+
+
+def _reduced(values: Floats) -> Floats:
+    """The map averaged down by whole texels, or by linear resampling of its running sum, to at most 1024 x 512."""
+    if values.shape[0] <= _HEIGHT:
+        return values
+    return _averaged(_averaged(values, _HEIGHT).T, _WIDTH).T
+
+
+def _averaged(values: Floats, count: int) -> Floats:
+    """Means of rows over `count` even stretches."""
+    running = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    at = np.linspace(0, len(values), count + 1)
+    low = np.minimum(at.astype(int), len(values) - 1)
+    sums = running[low] + (at - low)[:, None] * values[low]
+    return np.asarray(np.diff(sums, axis=0) * (count / len(values)))

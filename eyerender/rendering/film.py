@@ -1,0 +1,159 @@
+"""The film: a window's pixels, their samples, and the mean radiance of each pixel.
+
+Before an eye region, which fills the picture, matte surfaces see one lamp a sample, and `shade_group` lets several
+samples of a pixel share one shadow ray. The groups of a pixel take the lamps in turn; a lamp that c of G groups look at
+counts G / c times, so that every lamp has its exact share in every pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..arrays import Floats
+from .integrator import shade_group
+from .sampling import Sampler, Samples, camera_ray
+from .values import Lights, Values
+from .view import Textures
+
+Window = tuple[int, int, int, int]
+_LANES = 2**24  # samples in flight; more are rendered in several passes
+_LARGEST_GROUP = 4
+_PACKET = 16
+_LEAST_SHADOW_RAYS = 4  # a pixel
+_FEW_LAMPS = 2  # whose shadows are dark: they are sampled finely
+
+
+@dataclass(frozen=True, slots=True)
+class Exposed:
+    """What a window's pixels see of a bound frame: its Mitsuba scene, its numbers, its lamps and its textures."""
+
+    scene: Any
+    values: Values
+    lights: Lights
+    textures: Textures
+
+
+def pixels_of(pixel: Any, window: Window) -> tuple[Any, Any]:
+    """Full-sensor pixel coordinates, as signed integers, of the window's pixels in row order."""
+    width = dr.opaque(mi.UInt32, window[2])
+    row = pixel // width
+    column = pixel - row * width
+    u = mi.Int32(column) + dr.opaque(mi.Int32, window[0])
+    v = mi.Int32(row) + dr.opaque(mi.Int32, window[1])
+    return u, v
+
+
+def group_size(spp: int, lamps: int) -> int:
+    """How many samples of a pixel share a shadow ray: few enough that every lamp is looked at in every pixel."""
+    size = _LARGEST_GROUP
+    while size > 1 and (spp % size or spp // size < max(min(_LEAST_SHADOW_RAYS, spp // 2), lamps)):
+        size //= 2
+    return size
+
+
+def mean_radiance(
+    integrator: Any, shown: Exposed, window: Window, spp: int, seed: int, lamps: int
+) -> tuple[Floats, int]:
+    """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
+    width, height = window[2:]
+    grouped = shown.values.structure.region and integrator.bounces == 0
+    size = group_size(spp, lamps) if grouped else 1
+    total, failed = np.zeros(width * height), 0
+    each = max(1, min(spp // size, _LANES // (width * height * size)))
+    for first in range(0, spp // size, each):
+        count = min(each, spp // size - first)
+        if grouped:
+            seen, failures = _groups(shown, window, spp, seed, first, count, size)
+        else:
+            seen, failures = _singles(integrator, shown, window, spp, seed, first, count)
+        total += seen
+        failed += failures
+    return (total / spp).reshape(height, width), failed
+
+
+def _samples(u: Any, v: Any, spp: int, seed: int) -> Samples:
+    # A pixel's place on the whole sensor, so that a window shows the same samples wherever it lies.
+    return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), spp, seed)
+
+
+def _singles(
+    integrator: Any, shown: Exposed, window: Window, spp: int, seed: int, first: int, count: int
+) -> tuple[Floats, int]:
+    """Sums over `count` samples of each pixel, one a lane."""
+    index = dr.arange(mi.UInt32, window[2] * window[3] * count)
+    n = dr.opaque(mi.UInt32, count)
+    pixel = index // n
+    u, v = pixels_of(pixel, window)
+    samples = _samples(u, v, spp, seed)
+    k = index - pixel * n + dr.opaque(mi.UInt32, first)
+    spot = samples.in_pixel(k)
+    o, d, cosine = camera_ray(shown.values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
+    seen, _, _ = integrator.sample(shown.scene, Sampler(samples, k), mi.Ray3f(mi.Point3f(o), d))
+    cosine = cosine * cosine
+    lanes, failures = seen[0] * cosine * cosine, integrator.failures
+    dr.eval(lanes, failures)  # together: a reduction of its own would trace everything anew
+    return dr.block_sum(lanes, count).numpy().astype(float), int(dr.sum(failures).numpy()[0])
+
+
+def _groups(
+    shown: Exposed, window: Window, spp: int, seed: int, first: int, count: int, size: int
+) -> tuple[Floats, int]:
+    """Sums over `count` groups of each pixel, one group a lane; sample j of group g is number g size + j."""
+    pixels = window[2] * window[3]
+    # Sixteen neighbouring lanes, which Embree traces together: a few groups of a few pixels, so that their rays to the
+    # camera stay close and those to the lamps go few ways.
+    wide = next(w for w in (4, 2, 1) if count % w == 0)
+    tall = _PACKET // wide
+    blocks = -(-pixels // tall)  # the last may reach beyond the window
+    index = dr.arange(mi.UInt32, blocks * tall * count)
+    n = dr.opaque(mi.UInt32, tall * count)
+    block = index // n
+    within = index - block * n
+    packet = within // _PACKET
+    lane = within - packet * _PACKET
+    across = dr.opaque(mi.UInt32, wide)
+    step = lane // across
+    u, v = pixels_of(block * dr.opaque(mi.UInt32, tall) + step, window)
+    group = packet * across + (lane - step * across) + dr.opaque(mi.UInt32, first)
+    samples = _samples(u, v, spp, seed)
+    groups = dr.opaque(mi.UInt32, spp // size)
+    # With fewer groups than lamps, chance says with which a pixel begins.
+    lamps = shown.lights.count
+    few = groups < lamps
+    start = dr.select(few, mi.UInt32(samples.pair(mi.UInt32(0), 1).x * mi.Float(lamps)), 0)
+    which = (group + start) % lamps
+    lamp = shown.lights[which]
+    share = dr.select(few, mi.Float(lamps), mi.Float(groups) / mi.Float((groups + lamps - 1 - which) // lamps))
+
+    samples_each = dr.opaque(mi.UInt32, size)
+
+    def number(j: Any) -> Any:
+        return group * samples_each + j
+
+    def ray(j: Any) -> tuple[Any, Any, Any]:
+        spot = samples.in_pixel(number(j))
+        o, d, cosine = camera_ray(shown.values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
+        cosine = cosine * cosine
+        return o, d, cosine * cosine
+
+    rest, direct, failures = shade_group(
+        shown.values,
+        shown.lights,
+        shown.textures,
+        shown.scene,
+        ray,
+        lambda j: samples.pair(number(j), 0),
+        samples_each,
+        lamp,
+        lamps <= _FEW_LAMPS,
+    )
+    lanes = rest + direct * share
+    failures = dr.select(block * dr.opaque(mi.UInt32, tall) + step < dr.opaque(mi.UInt32, pixels), failures, 0)
+    dr.eval(lanes, failures)
+    seen = dr.block_sum(lanes, wide).numpy().reshape(blocks, count // wide, tall).sum(axis=1, dtype=float)
+    return seen.reshape(-1)[:pixels], int(dr.sum(failures).numpy()[0])

@@ -1,0 +1,126 @@
+"""What the gaze error is made of: the algorithm, the eye model, the images, their noise; paired, frame by frame.
+
+    error from noisy images of eye M = A + (E - A) + (I - E) + (N - I)
+
+    A   the algorithm's own: exact features of the simplest eye of the run (E1 where it is there)
+    E   exact features of eye M:                               E - A is what the eye model adds
+    I   features of M's images exposed without noise:          I - E is what forming and reading an image adds
+    N   features of the same images with the sensor's noise:   N - I is what the noise adds
+
+each a mean over the frames that all four have an estimate of, so the terms add up exactly. A difference has its 95 %
+interval (Student's t of the paired differences). The frames are a design, not a sample, and a rig that is symmetric
+shows each with its mirror image, so the interval of E - A is narrower than independent frames would make it, by 2^1/2
+at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.stats import t as student
+
+from ..arrays import Floats
+
+ALGORITHM, EYE, IMAGE, NOISE, BOTH = "algorithm", "eye model", "image", "noise", "image and noise"
+# The observers that may follow ray optics, in this order.
+_STEPS = ("image-noiseless", "image")
+
+
+class Part(Protocol):
+    """What a study has of one eye model: errors (n,) deg by (protocol, observer) and name of the estimator."""
+
+    eye_model: str
+    errors: dict[tuple[str, str], dict[str, Floats]]
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """A contribution in degrees, with its interval where it is a difference."""
+
+    name: str
+    deg: float
+    low_deg: float | None = None
+    high_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """The terms of one eye model's error with one estimator; they add up to `total_deg`."""
+
+    protocol: str
+    estimator: str
+    eye_model: str
+    reference: str
+    n: int
+    terms: tuple[Term, ...]
+    total_deg: float
+
+    def term(self, name: str) -> Term | None:
+        """A term by its name."""
+        return next((term for term in self.terms if term.name == name), None)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """For JSON."""
+        return {**asdict(self), "terms": [asdict(term) for term in self.terms]}
+
+
+def budgets(parts: Sequence[Part]) -> list[Budget]:
+    """The budget of each protocol, estimator and eye model; none where there are no errors by ray optics.
+
+    The reference is the first eye model of the run, which is E1 unless other models were asked for.
+    """
+    errors: dict[tuple[str, str, str, str], Floats] = {
+        (protocol, name, part.eye_model, observer): found
+        for part in parts
+        for (protocol, observer), by_name in part.errors.items()
+        for name, found in by_name.items()
+    }
+    models = list(dict.fromkeys(part.eye_model for part in parts))
+    reference = "E1" if "E1" in models else models[0]
+    out = []
+    for protocol, name, model in dict.fromkeys(key[:3] for key in errors):
+        first = errors.get((protocol, name, reference, "analytic"))
+        own = {observer: errors.get((protocol, name, model, observer)) for observer in ("analytic", *_STEPS)}
+        steps = {observer: found for observer, found in own.items() if found is not None}
+        if first is None or "analytic" not in steps or any(len(v) != len(first) for v in steps.values()):
+            continue
+        budget = _budget(protocol, name, model, reference, first, steps)
+        if budget is not None:
+            out.append(budget)
+    return out
+
+
+def _budget(
+    protocol: str, name: str, model: str, reference: str, first: Floats, steps: Mapping[str, Floats]
+) -> Budget | None:
+    rows = np.isfinite(first) & np.all([np.isfinite(v) for v in steps.values()], axis=0)
+    n = int(rows.sum())
+    if n < 2:
+        return None
+    before = first[rows]
+    terms = [Term(ALGORITHM, float(before.mean()))]
+    for observer, errors in steps.items():
+        after = errors[rows]
+        if observer != "analytic" or model != reference:
+            terms.append(Term(_name(observer, steps), *paired(after - before)))
+        before = after
+    return Budget(protocol, name, model, reference, n, tuple(terms), float(before.mean()))
+
+
+def _name(observer: str, steps: Mapping[str, Floats]) -> str:
+    """What the step to an observer adds."""
+    if observer == "analytic":
+        return EYE
+    if observer == "image-noiseless":
+        return IMAGE
+    return NOISE if "image-noiseless" in steps else BOTH
+
+
+def paired(differences: Floats) -> tuple[float, float, float]:
+    """Mean of paired differences (n,), n >= 2, and its 95 % interval."""
+    n, mean = len(differences), float(differences.mean())
+    half = float(student.ppf(0.975, n - 1) * differences.std(ddof=1) / np.sqrt(n))
+    return mean, mean - half, mean + half

@@ -1,0 +1,231 @@
+"""A study's images: one dataset run, in which a subject is an eye model and a sample one eye at one head position.
+
+A camera that the eye leaves is turned about its nodal point to face it, in a sample of its own. Everything in which the
+samples differ is a `sequence` of the dataset's spec, so a study's images are a dataset like any other: made by several
+workers, shard by shard, gone on with after a kill, and valid (`eyerender validate`). Images are found again by what
+they show, the scene and the eye file, so a finished dataset also serves a study that needs a part of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ..arrays import Ints, frozen
+from ..errors import InputError
+from ..imagefolder import DATASET, METADATA, RUN, ImageEntry
+from ..observation import EYES, Observations
+from ..scene import Scene, SceneSpec
+
+Progress = Callable[[int, int, str], None]
+_SHARD_IMAGES = 27  # two or three seconds of work: what a kill costs at most
+_PATIENCE_S = 60.0  # an image, before a worker that says nothing is taken for dead
+
+
+@dataclass(frozen=True, slots=True)
+class ImageSettings:
+    """How images are made: the dataset's folder, samples per pixel (None: the scene's), and where to render."""
+
+    folder: Path
+    spp: int | None = None
+    workers: int | None = None
+    backend: Literal["auto", "cuda", "llvm"] = "auto"
+    threads: int | None = None
+    progress: Progress | None = None
+    say: Callable[[str], None] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A scene whose images make one sample, and which observations (n,) of the study's own scene they are."""
+
+    scene: Scene
+    rows: Ints
+
+
+@dataclass(frozen=True, slots=True)
+class StudyImages:
+    """The images of a finished dataset, in frame order, by a digest of what they show."""
+
+    entries: Mapping[str, tuple[ImageEntry, ...]]
+    spp: int | None = None
+
+    def holds(self, scene: Scene) -> bool:
+        """Whether every image of a shot's scene is there."""
+        found = self.entries.get(_digest(scene), ())
+        return len(found) == len(scene.frames()) and all(entry.path.is_file() for entry in found)
+
+    def observe(self, scene: Scene) -> Observations:
+        """The features of a shot's images; raises `InputError` where they are not there."""
+        from ..observers import ImageObserver
+
+        if not self.holds(scene):
+            raise InputError("its images are not in the study's dataset", source=scene.name)
+        return ImageObserver().observe_entries(self.entries[_digest(scene)], scene.frames().index, scene)
+
+
+def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[Shot]:
+    """One shot an eye; with `facing` one an eye and head position, the cameras turned to the eye."""
+    data = scene.spec.to_mapping()
+    data["sensor"]["noise"] = noise
+    if spp is not None:
+        data["image"]["spp"] = spp
+    index, out = scene.frames().index, []
+    heads = scene.spec.subject.head_positions_mm
+    for head in range(len(heads)) if facing else (None,):
+        for side in sorted(scene.spec.subject.eyes, key=EYES.index):
+            rows = index.eye == EYES.index(side)
+            data["subject"]["eyes"] = [side]
+            one = replace(scene, spec=SceneSpec.from_mapping(data))
+            if head is not None:
+                rows = rows & (index.head == head)
+                one = facing_scene(one, heads[head], side)
+            out.append(Shot(one, frozen(np.flatnonzero(rows), np.int64)))
+    return out
+
+
+def facing_scene(scene: Scene, head_mm: tuple[float, float, float], side: str) -> Scene:
+    """The scene of one head position and one eye, with every camera turned about its nodal point to face that eye."""
+    data = scene.spec.to_mapping()
+    apex = scene.eye_position_mm(side) + np.array(head_mm)
+    data["subject"]["eyes"] = [side]
+    data["subject"]["head_positions_mm"] = [list(head_mm)]
+    for camera in data["rig"]["cameras"]:
+        if camera.get("calibration"):
+            raise InputError("a calibrated camera cannot be turned", path="rig.cameras")
+        for key in ("pan_deg", "tilt_deg"):
+            camera.pop(key, None)
+        camera["look_at_mm"] = [float(v) for v in apex]
+    spec = SceneSpec.from_mapping(data)
+    return replace(scene, spec=spec, rig=spec.rig.build())
+
+
+def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) -> StudyImages:
+    """The images of all shots' scenes, from the folder's dataset; what is missing of it is made.
+
+    The folder is the study's own: a dataset of other settings or of another version of the package is replaced.
+
+    Raises:
+        BackendError: there is nothing to render with.
+        EyerenderError: the disk is full, or a worker died again and again.
+    """
+    from ..dataset.plan import Plan
+    from ..dataset.run import Options, generate
+
+    scenes = list({_digest(scene): scene for scene in scenes}.values())
+    found = read_images(settings.folder)
+    if found is None or not all(found.holds(scene) for scene in scenes):
+        plan = Plan.of(dataset_spec(study, scenes, settings.spp), source=str(settings.folder))
+        options = Options(
+            workers=settings.workers,
+            backend=settings.backend,
+            threads=settings.threads,
+            timeout_s=600.0 + _PATIENCE_S * len(scenes[0].frames()),
+            overwrite=not _begun(settings.folder, plan),
+        )
+        generate(
+            plan,
+            settings.folder,
+            options,
+            progress=settings.progress or (lambda done, total, note: None),
+            say=settings.say or (lambda text: None),
+        )
+        found = read_images(settings.folder)
+    if found is None or not all(found.holds(scene) for scene in scenes):
+        raise InputError("its dataset lacks images of this study", source=str(settings.folder))
+    return replace(found, spp=settings.spp)
+
+
+def dataset_spec(study: str, scenes: Sequence[Scene], spp: int | None = None) -> Any:
+    """The spec of a dataset of scenes, the same ones for each eye model: a grid of models, a sequence of scenes."""
+    from ..dataset.spec import DatasetSpec
+
+    by_model: dict[str, list[dict[str, Any]]] = {}
+    for scene in scenes:
+        data = scene.spec.to_mapping()
+        by_model.setdefault(data["eye"].pop("model"), []).append(data)
+    sequences = list(by_model.values())
+    if any(sequence != sequences[0] for sequence in sequences):
+        raise InputError("the eye models' scenes differ", source=study)
+    template = in_sequence(sequences[0])
+    template["eye"]["model"] = {"draw": "grid", "per": "subject", "values": list(by_model)}
+    return DatasetSpec.from_mapping(
+        {
+            "format": 1,
+            "kind": "dataset",
+            "name": f"{study}, images",
+            "description": "What the image observer of a study sees. A subject is an eye model; a sample is one eye at "
+            "one head position, all its fixations, with the sensor's noise or without it.",
+            "count": len(scenes),
+            "subjects": len(by_model),
+            "shard_size": max(1, _SHARD_IMAGES // len(scenes[0].frames())),
+            "splits": {"study": 1.0},
+            "require": "nothing",
+            "attempts": 1,
+            "scene": template,
+        }
+    )
+
+
+def in_sequence(values: Sequence[Any]) -> Any:
+    """A template that gives the values one after the other: plain where they agree, else a `sequence`, leaf by leaf."""
+    first = values[0]
+    if all(json.dumps(v) == json.dumps(first) for v in values):
+        return first
+    if all(isinstance(v, dict) and v.keys() == first.keys() for v in values):
+        return {key: in_sequence([v[key] for v in values]) for key in first}
+    if all(isinstance(v, list) and len(v) == len(first) for v in values):
+        return [in_sequence([v[k] for v in values]) for k in range(len(first))]
+    return {"draw": "sequence", "per": "sample", "values": list(values)}
+
+
+def read_images(folder: Path) -> StudyImages | None:
+    """The images of a finished dataset that this version made; None where there is none."""
+    from ..dataset.shard import run_versions
+
+    try:
+        if json.loads((folder / DATASET).read_text(encoding="utf-8"))["versions"] != run_versions():
+            return None
+        found: dict[str, list[tuple[int, ImageEntry]]] = {}
+        with open(folder / METADATA, encoding="utf-8") as lines:
+            for text in lines:
+                line = json.loads(text)
+                shown = line["parameters"]
+                # Only what extraction reads is kept: a line's labels take many times as much memory.
+                kept = {key: line[key] for key in ("file_name", "window_px", "bit_depth")} | {"records": [{}]}
+                key = _digest_of(shown["scene_json"], shown["eye_json"])
+                found.setdefault(key, []).append((line["records"][0]["frame"], ImageEntry(folder, kept)))
+    except (OSError, ValueError, KeyError, TypeError, IndexError):
+        return None
+    # A dataset's lines need not stand in the order of its samples.
+    in_order = {key: sorted(those, key=lambda pair: pair[0]) for key, those in found.items()}
+    return StudyImages({key: tuple(entry for _, entry in those) for key, those in in_order.items()})
+
+
+def _begun(folder: Path, plan: Any) -> bool:
+    """Whether a folder holds a run of this very plan and version, or nothing yet."""
+    from ..dataset.shard import run_versions
+
+    if not folder.exists():
+        return True
+    try:
+        found = json.loads((folder / RUN).read_text(encoding="utf-8"))
+        return bool(found["digest"] == plan.digest and found["versions"] == run_versions())
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def _digest(scene: Scene) -> str:
+    """A digest of what a scene's images show, as a dataset's lines of metadata tell it."""
+    eye = {key: value for key, value in scene.eye_spec.to_mapping().items() if key != "sources"}
+    return _digest_of(json.dumps(scene.spec.to_mapping(), sort_keys=True), json.dumps(eye, sort_keys=True))
+
+
+def _digest_of(scene_json: str, eye_json: str) -> str:
+    return hashlib.sha256(f"{scene_json}\n{eye_json}".encode()).hexdigest()

@@ -1,0 +1,183 @@
+"""Damaged and odd image files through `eyerender extract`, as a user gives them: a record or one line of error, never a
+traceback, never a wrong pupil, never more memory than an image of the allowed size takes."""
+
+from __future__ import annotations
+
+import io
+import json
+import resource
+import struct
+import zlib
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from eyerender.cli.app import run
+from eyerender.geometry.ellipse import Ellipse, iou
+
+Mutation = Callable[[bytes, np.random.Generator], bytes]
+
+
+def _encoded(image: np.ndarray, kind: str) -> bytes:
+    """The image in one of the formats, unharmed."""
+    out = io.BytesIO()
+    if kind == "npy":
+        np.save(out, image)
+        return out.getvalue()
+    deep = (image.astype(np.uint16) * 257) if image.dtype == np.uint8 else image
+    grey, colour = Image.fromarray(image), np.repeat(image[..., None], 3, axis=2)
+    match kind:
+        case "png":
+            grey.save(out, "PNG")
+        case "png16":
+            Image.fromarray(deep).save(out, "PNG")
+        case "pgm":
+            grey.save(out, "PPM")
+        case "jpeg":
+            grey.save(out, "JPEG", quality=95)
+        case "tiff":
+            grey.save(out, "TIFF")
+        case "tiff16":
+            Image.fromarray(deep).save(out, "TIFF", compression="tiff_lzw")
+        case "bmp":
+            grey.save(out, "BMP")
+        case "rgb":
+            Image.fromarray(colour).save(out, "PNG")
+        case "tinted":
+            colour[..., 0] //= 2
+            Image.fromarray(colour).save(out, "PNG")
+        case "alpha":
+            alpha = np.full((*image.shape, 4), 255, np.uint8)
+            alpha[..., :3] = colour
+            alpha[: image.shape[0] // 2, :, 3] = 0
+            Image.fromarray(alpha).save(out, "PNG")
+        case "palette":
+            grey.convert("P").save(out, "PNG")
+        case "animated":
+            grey.save(out, "GIF", save_all=True, append_images=[Image.fromarray(255 - image)])
+        case "one":
+            Image.fromarray(image[:1, :1]).save(out, "PNG")
+    return out.getvalue()
+
+
+KINDS = (
+    "png", "png16", "pgm", "jpeg", "tiff", "tiff16", "bmp", "npy", "rgb", "tinted", "alpha", "palette", "animated",
+    "one",
+)  # fmt: skip
+PIXELS_KEPT = ("png", "png16", "pgm", "jpeg", "tiff", "tiff16", "bmp", "rgb", "palette")  # one grey image, all of it
+
+
+def _whole(data: bytes, rng: np.random.Generator) -> bytes:
+    return data
+
+
+def _truncated(data: bytes, rng: np.random.Generator) -> bytes:
+    return data[: int(rng.integers(0, len(data)))]
+
+
+def _flipped(data: bytes, rng: np.random.Generator) -> bytes:
+    out = bytearray(data)
+    for place in rng.integers(0, len(out), int(rng.integers(1, 40))):
+        out[place] ^= int(rng.integers(1, 256))
+    return bytes(out)
+
+
+def _header(data: bytes, rng: np.random.Generator) -> bytes:
+    out = bytearray(data)
+    for place in rng.integers(0, min(len(out), 64), int(rng.integers(1, 6))):
+        out[place] = int(rng.integers(0, 256))
+    return bytes(out)
+
+
+def _magic(data: bytes, rng: np.random.Generator) -> bytes:
+    """Another format's first bytes."""
+    start = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0", b"II*\x00", b"P5\n", b"BM", b"GIF89a", b"RIFF", b"%!PS")
+    other = start[int(rng.integers(0, len(start)))]
+    return other + data[len(other) :]
+
+
+def _doubled(data: bytes, rng: np.random.Generator) -> bytes:
+    cut = int(rng.integers(0, len(data)))
+    return data[:cut] + data[int(rng.integers(0, len(data))) :]
+
+
+def _huge(data: bytes, rng: np.random.Generator) -> bytes:
+    """A few bytes that claim to be a large image."""
+    width, height = (int(v) for v in rng.choice([1, 9000, 60_000, 2**31 - 1], 2))
+    if rng.random() < 0.5:
+        return b"P5\n%d %d\n255\n" % (width, height) + data[:1000]
+    depth, colour = (8, 16)[int(rng.integers(2))], (0, 2, 6)[int(rng.integers(3))]
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    body = b"IDAT" + zlib.compress(data[:1000])
+    chunks = (struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part)) for part in (header, body))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+MUTATIONS: tuple[Mutation, ...] = (_whole, _truncated, _flipped, _flipped, _header, _magic, _doubled, _huge)
+
+
+def _fuzz(ideal, tmp_path, capfd, count: int, first: int) -> None:
+    condition = ideal.Condition(size=(180, 140), semi_axis=(14, 20), noise=(2, 2), glints="edge")
+    sources = []
+    for drawing in (ideal.draw(condition, 20_300 + i) for i in range(3)):
+        sources.append(({kind: _encoded(drawing.image, kind) for kind in KINDS}, _pupil(drawing.label)))
+    answered = right = 0
+    path = tmp_path / "eye"
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for seed in range(first, first + count):
+        rng = np.random.default_rng([seed, 31])
+        files, truth = sources[seed % len(sources)]
+        kind = KINDS[int(rng.integers(0, len(KINDS)))]
+        mutation = MUTATIONS[int(rng.integers(0, len(MUTATIONS)))]
+        path.write_bytes(mutation(files[kind], rng))
+        code = run(["extract", str(path), "--json", "-"])
+        out, err = capfd.readouterr()
+        told = f"seed {seed}, {kind}, {mutation.__name__}: {err}"
+        assert "Traceback" not in err, told
+        if code != 0:
+            assert code == 2, told
+            # libtiff writes lines of its own before.
+            assert err.splitlines()[-1].startswith(f"error: {path}: "), told
+            assert err.count("error: ") == 1, told
+            assert not (mutation is _whole and kind in PIXELS_KEPT), told
+            continue
+        assert not (mutation is _whole and kind not in (*PIXELS_KEPT, "one")), told
+        record = _only_record(out)
+        pupil = record["pupil"]
+        if pupil["status"] != "ok":
+            assert pupil["reason"], told
+            assert not (mutation is _whole and kind in PIXELS_KEPT), told
+            continue
+        answered += 1
+        right += iou(_pupil(record), truth) > 0.9
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert grown < 1_500_000  # kB: 8192^2 pixels of four channels, decoded and converted
+    assert answered > 0.1 * count
+    # A file that decodes is an image; where damage moves its rows, its pupil truly lies elsewhere.
+    assert right >= 0.95 * answered
+
+
+def _pupil(record: dict) -> Ellipse:
+    pupil = record["pupil"]
+    return Ellipse(pupil["centre_px"], pupil["semi_axes_px"], pupil["angle_rad"])
+
+
+def _only_record(text: str) -> dict:
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} in the output")
+
+    data = json.loads(text, parse_constant=refuse)
+    (record,) = data["records"] if isinstance(data, dict) and "records" in data else data
+    return record
+
+
+def test_sixty_damaged_files(ideal, tmp_path, capfd):
+    _fuzz(ideal, tmp_path, capfd, 60, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_thousand_damaged_files(ideal, tmp_path, capfd):
+    _fuzz(ideal, tmp_path, capfd, 1000, 1000)

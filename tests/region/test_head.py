@@ -1,0 +1,114 @@
+"""A head mesh read and placed: units, axes, mirrored eyes, parts; without a renderer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from eyerender.errors import InputError
+from eyerender.region.anatomy import RegionSpec
+from eyerender.region.globe import Globe
+from eyerender.region.head import HEAD_PARTS, head_map, load_head, placed
+from eyerender.region.headspec import HeadSpec
+
+CENTRE_MM = np.array([-13.0, 0.4, 0.1])
+
+
+def globe(left: bool = False) -> Globe:
+    centre = CENTRE_MM * (1, -1, 1) if left else CENTRE_MM
+    return Globe(None, 0.0, centre, 12.0, np.eye(3), np.zeros(3), left)
+
+
+def shell(path, scale: float = 1.0) -> trimesh.Trimesh:
+    """An open ellipsoid shell in a file whose x looks forward and whose y is up; z is then to the right."""
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    mesh.apply_scale([90.0 * scale, 110.0 * scale, 70.0 * scale])
+    mesh.export(path)
+    return mesh
+
+
+def spec_of(tmp_path, **more) -> HeadSpec:
+    keys = {"file": "shell.ply", "unit": "mm", "licence": "CC0", "forward": [1, 0, 0], "up": [0, 1, 0],
+            "right_eye": [72.0, 20.0, 31.0]}  # fmt: skip
+    return HeadSpec.from_mapping({**keys, **more}).resolved(tmp_path)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1.0), ("cm", 0.1), ("m", 0.001)])
+def test_the_globe_stands_where_the_file_has_it(tmp_path, unit, scale):
+    mesh = shell(tmp_path / "shell.ply", scale)
+    eye = [72.0 * scale, 20.0 * scale, 31.0 * scale]
+    got = placed(load_head(spec_of(tmp_path, unit=unit, right_eye=eye)), globe())
+    away = (np.asarray(mesh.vertices) - eye) / scale
+    # Forward is x; up is y; left is up x forward, -z.
+    expected = np.column_stack([away[:, 0], -away[:, 2], away[:, 1]]) + CENTRE_MM
+    np.testing.assert_allclose(got.vertices, expected, atol=2e-5)  # single precision at 100 mm
+    outward = np.sum(got.normals * (got.vertices - got.vertices.mean(axis=0)), axis=1)
+    assert outward.min() > 0
+
+
+def test_the_other_eye_is_the_mirror_image_or_its_own(tmp_path):
+    shell(tmp_path / "shell.ply")
+    alone, both = (load_head(spec_of(tmp_path, **k)) for k in ({}, {"left_eye": [72.0, 20.0, -31.0]}))
+    right, left, own = placed(alone, globe()), placed(alone, globe(True)), placed(both, globe(True))
+    np.testing.assert_allclose(left.vertices, right.vertices * (1, -1, 1), atol=1e-12)
+    np.testing.assert_array_equal(left.layout.faces, right.layout.faces[:, ::-1])
+    # A symmetric head: its own left eye sees the same surface as the mirror image, in other vertices.
+    bounds = [np.stack([m.vertices.min(axis=0), m.vertices.max(axis=0)]) for m in (left, own)]
+    np.testing.assert_allclose(*bounds, atol=1e-4)
+    for mesh in (left, own):
+        whole = trimesh.Trimesh(mesh.vertices, mesh.layout.faces, process=False)
+        assert whole.volume > 0  # faces look outwards
+
+
+def test_normals_do_not_see_seams(tmp_path):
+    # Two triangles that meet at an edge whose vertices are written twice.
+    lines = ["o a", "v 0 0 0", "v 40 0 0", "v 0 40 0", "v 0 0 0", "v 40 0 0", "v 0 -40 20", "f 1 2 3", "f 5 4 6"]
+    (tmp_path / "two.obj").write_text("\n".join(lines) + "\n")
+    head = load_head(spec_of(tmp_path, file="two.obj", right_eye=[0, 0, 0]))
+    at = {tuple(np.round(v, 6)): [] for v in head.vertices}
+    for v, n in zip(head.vertices, head.normals, strict=True):
+        at[tuple(np.round(v, 6))].append(n)
+    shared = [n for n in at.values() if len(n) == 2]
+    assert len(shared) == 2
+    for a, b in shared:
+        np.testing.assert_allclose(a, b)
+
+
+def test_groups_name_parts_where_there_are_no_objects(tmp_path):
+    lines = [
+        "v 0 0 0",
+        "v 40 0 0",
+        "v 0 40 0",
+        "v 0 0 30",
+        "g face",
+        "f 1 2 3",
+        "g hair",
+        "f 1 2 4",
+        "g face",
+        "f 2 3 4",
+    ]
+    (tmp_path / "groups.obj").write_text("\n".join(lines) + "\n")
+    parts = {"skin": ["face"], "head": ["hair"]}
+    head = load_head(spec_of(tmp_path, file="groups.obj", right_eye=[0, 0, 0], parts=parts))
+    counts = dict(zip(HEAD_PARTS, np.diff([0, *head.face_ends]), strict=True))
+    assert counts == {"skin": 2, "tears": 0, "lashes": 0, "brow": 0, "head": 1}
+
+
+def test_each_part_has_its_look(tmp_path):
+    shell(tmp_path / "shell.ply")
+    spec = spec_of(tmp_path, parts={"lashes": ["shell"]})
+    region = RegionSpec.from_mapping({"lashes": {"albedo": 0.3}, "skin": {"albedo": 0.6}}).model_copy(
+        update={"head": spec}
+    )
+    head = load_head(spec)
+    looks, uv = head_map(region, head), placed(head, globe()).layout.uv
+    row = (uv[:, 1] * len(looks)).astype(int)
+    np.testing.assert_allclose(looks[row, 0, 0], 0.3)
+    assert looks[0, 0, 0] == pytest.approx(0.6)
+
+
+def test_an_eye_far_from_the_mesh_is_refused(tmp_path):
+    shell(tmp_path / "shell.ply")
+    with pytest.raises(InputError, match=r"left_eye: lies .* mm from the nearest vertex"):
+        load_head(spec_of(tmp_path, left_eye=[72.0, 20.0, -310.0]))

@@ -1,0 +1,77 @@
+"""What the gaze error is made of: terms that add up, paired intervals, and what the report says of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from scipy.stats import ttest_rel
+
+from eyerender.study.budget import ALGORITHM, BOTH, EYE, IMAGE, NOISE, budgets
+from eyerender.study.page_parts import budget_section
+from eyerender.study.run import run_study
+
+
+@dataclass
+class Seen:
+    """As a part of a study has it."""
+
+    eye_model: str
+    errors: dict = field(default_factory=dict)
+
+
+def drawn(observers=("analytic", "image", "image-noiseless"), models=("E1", "E2", "E3"), n=40):
+    rng = np.random.default_rng(12)
+    return [Seen(m, {("corrected", o): {"a": rng.gamma(3.0, 0.05, n)} for o in observers}) for m in models]
+
+
+def test_terms_add_up_and_intervals_are_those_of_paired_t_tests():
+    parts = drawn()
+    parts[1].errors["corrected", "image"]["a"][[3, 9]] = np.nan
+    parts[0].errors["corrected", "analytic"]["a"][5] = np.nan
+    found = {b.eye_model: b for b in budgets(parts)}
+    assert [t.name for t in found["E1"].terms] == [ALGORITHM, IMAGE, NOISE]  # E1 adds nothing to itself
+    e2 = found["E2"]
+    assert [t.name for t in e2.terms] == [ALGORITHM, EYE, IMAGE, NOISE]
+    assert e2.n == 37  # frames that every step has an estimate of
+    for budget in found.values():
+        assert sum(t.deg for t in budget.terms) == pytest.approx(budget.total_deg, abs=1e-12)
+    rows = np.setdiff1d(np.arange(40), [3, 5, 9])
+    first = parts[0].errors["corrected", "analytic"]["a"][rows]
+    steps = [first, *(parts[1].errors["corrected", o]["a"][rows] for o in ("analytic", "image-noiseless", "image"))]
+    for term, before, after in zip(e2.terms[1:], steps, steps[1:], strict=False):
+        test = ttest_rel(after, before).confidence_interval(0.95)
+        np.testing.assert_allclose([term.low_deg, term.high_deg], [test.low, test.high], atol=1e-12)
+        assert term.deg == pytest.approx((after - before).mean(), abs=1e-12)
+
+
+def test_what_was_not_observed_has_no_term():
+    assert budgets(drawn(("image", "image-noiseless"))) == []
+    (one,) = budgets(drawn(("analytic",), ("E1",)))
+    assert [t.name for t in one.terms] == [ALGORITHM]
+    assert budget_section([one], ["a"], "it") == []  # a sum of one term says nothing
+    (noisy,) = budgets(drawn(("analytic", "image"), ("E4",)))
+    assert (noisy.reference, [t.name for t in noisy.terms]) == ("E4", [ALGORITHM, BOTH])
+    other = drawn(("analytic",), ("E1", "E2"))
+    other[1].errors["corrected", "analytic"]["a"] = np.zeros(7)  # other frames cannot be paired
+    assert [b.eye_model for b in budgets(other)] == ["E1"]
+
+
+def test_the_report_says_what_the_summary_holds(tmp_path):
+    """Also against the rows: without images a model's sum is the mean of its rows over all frames."""
+    summary = run_study("guestrin2006", tmp_path, eyes=("E1", "E4"), protocol="corrected")
+    assert json.loads((tmp_path / "summary.json").read_text())["error_budget"] == summary["error_budget"]
+    budget = next(
+        b for b in summary["error_budget"] if (b["eye_model"], b["estimator"]) == ("E4", "model-based, index fixed")
+    )
+    rows = [r for r in summary["rows"] if (r["eye_model"], r["eye"], r["variant"]) == ("E4", "both", "index fixed")]
+    mean = sum(r["mean_deg"] * r["n"] for r in rows) / sum(r["n"] for r in rows)
+    assert budget["total_deg"] == pytest.approx(mean, abs=1e-12)
+    page = (tmp_path / "report.html").read_text()
+    assert "What the gaze error is made of" in page
+    algorithm, eye = budget["terms"]
+    assert f"the algorithm&#39;s own error is {algorithm['deg']:.3f} deg" in page
+    assert f"eye model {eye['deg']:+.3f} deg" in page
+    assert f"{eye['deg']:+.4f} ± {(eye['high_deg'] - eye['low_deg']) / 2:.4f}" in page

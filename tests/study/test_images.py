@@ -1,0 +1,190 @@
+"""A study's images: a dataset that resumes after a kill, is used again, and shows what the study's scenes say."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eyerender.analytic.observer import observe
+from eyerender.dataset.plan import Plan
+from eyerender.dataset.validate import validate
+from eyerender.imagefile import read_image
+from eyerender.scene import Scene, SceneSpec
+from eyerender.study import blignaut, guestrin
+from eyerender.study.images import ImageSettings, dataset_spec, in_sequence, make_images, read_images, shots
+from eyerender.study.observing import Observing
+from eyerender.study.replicate import facing, scenes_of
+from eyerender.study.run import run_study
+
+
+def small_scenes(eyes=("E1", "E2")):
+    """Three targets, both eyes, with and without noise: twelve windows a model."""
+    out = []
+    for eye in eyes:
+        data = guestrin.scene(eye, guestrin.CORRECTED).spec.to_mapping()
+        data["targets"] = {"grid": [3, 1]}
+        data["image"] = {"window_px": [160, 120], "spp": 4}
+        data["subject"]["head_positions_mm"] = [[0, 0, 0]]
+        scene = Scene.of(SceneSpec.from_mapping(data))
+        out += [s.scene for noise in (True, False) for s in shots(scene, noise=noise, facing=True)]
+    return out
+
+
+@pytest.mark.parametrize("module", [guestrin, blignaut])
+def test_the_dataset_says_exactly_what_the_study_observes(module):
+    """Every sample of the plan, in order, is one of the study's own shots: scene, eye file, seed and all."""
+    scenes = scenes_of(module, ("E1", "E5"), ("published", "corrected"))
+    wanted = [
+        shot.scene
+        for scene in scenes
+        for kind in ("image", "image-noiseless")
+        for shot in Observing(kind).shots(scene, facing=facing(module), spp=4)
+    ]
+    spec = dataset_spec("study", wanted, 4)
+    plan = Plan.of(spec)
+    assert spec.count == len(wanted) == 2 * 2 * (15 if module is guestrin else 4)
+    for k, scene in enumerate(wanted):
+        sample = plan.draw(k)
+        assert sample.scene == scene.spec.to_mapping()
+        assert sample.eye["name"] == scene.eye_spec.name
+        assert sample.turn.subject == k // (len(wanted) // 2)
+    assert {w.spec.image.spp for w in wanted} == {4}
+    assert {len(w.frames()) for w in wanted} == {9 if module is guestrin else 135}
+
+
+def test_shots_cover_every_observation_once():
+    scene = guestrin.scene("E2", guestrin.CORRECTED)
+    for turned, count in ((True, 10), (False, 2)):
+        parts = shots(scene, noise=True, facing=turned)
+        assert len(parts) == count
+        rows = np.concatenate([p.rows for p in parts])
+        assert sorted(rows) == list(range(len(scene.frames())))
+        index = scene.frames().index
+        for part in parts:
+            own = part.scene.frames().index
+            np.testing.assert_array_equal(own.target_mm, index.target_mm[part.rows])
+            np.testing.assert_array_equal(own.head_mm, index.head_mm[part.rows])
+            np.testing.assert_array_equal(own.eye, index.eye[part.rows])
+
+
+def test_a_sequence_stands_where_values_differ_and_nowhere_else():
+    values = [{"a": 1.0, "b": [1, {"c": k}], "d": {"x": 0} if k else {"y": 0}} for k in (0, 1)]
+    found = in_sequence(values)
+    assert found["a"] == 1.0
+    assert found["b"] == [1, {"c": {"draw": "sequence", "per": "sample", "values": [0, 1]}}]
+    assert found["d"] == {"draw": "sequence", "per": "sample", "values": [{"y": 0}, {"x": 0}]}
+
+
+@pytest.mark.render
+def test_images_are_made_once_and_a_part_of_them_serves_too(tmp_path):
+    scenes = small_scenes()
+    made = make_images("small", scenes, ImageSettings(tmp_path / "images", workers=1))
+    report = validate(tmp_path / "images")
+    assert (report["ok"], report["images"]) == (True, len(scenes) * 3)
+    stamps = {p: p.stat().st_mtime_ns for p in (tmp_path / "images").rglob("*")}
+    again = make_images("small", scenes[:2], ImageSettings(tmp_path / "images", workers=1))
+    assert again == made
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "images").rglob("*")} == stamps
+    lines = tmp_path / "images" / "metadata.jsonl"
+    lines.write_text("".join(reversed(lines.read_text().splitlines(keepends=True))))  # their order means nothing
+    assert read_images(tmp_path / "images") == made
+    # An image is the one that its scene says: pupil and glints lie where ray optics has them.
+    for scene in scenes[:2]:
+        truth, seen = observe(scene), made.observe(scene)
+        np.testing.assert_allclose(seen.pupil.centre_px, truth.pupil.centre_px, atol=0.5)
+    # Noise is all that tells the two exposures apart: the same places within what single pixels vary by.
+    noisy, quiet = (read_image(made.entries[key][0].path)[0] / 257 for key in list(made.entries)[0:3:2])
+    assert 0.3 < np.std(noisy - quiet) < 10
+    assert abs(np.mean(noisy - quiet)) < 0.5
+
+
+KILLED = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from test_images import ImageSettings, make_images, small_scenes
+make_images("small", small_scenes(), ImageSettings(Path({folder!r}), workers=1))
+"""
+
+
+@pytest.mark.render
+def test_a_killed_run_goes_on_where_it_was(tmp_path):
+    folder = tmp_path / "killed"
+    script = KILLED.format(tests=str(Path(__file__).parent), folder=str(folder))
+    process = subprocess.Popen([sys.executable, "-c", script], start_new_session=True)
+    first = folder / "shards" / "00000"
+    while process.poll() is None and not first.is_dir():
+        time.sleep(0.002)
+    process.kill()
+    process.wait()
+    stamps = {p: p.stat().st_mtime_ns for p in (folder / "images" / "00000").glob("*.png")}
+    assert stamps
+    assert read_images(folder) is None or process.returncode == 0
+    scenes = small_scenes()
+    after = make_images("small", scenes, ImageSettings(folder, workers=1))
+    undisturbed = make_images("small", scenes, ImageSettings(tmp_path / "whole", workers=1))
+    assert {p: p.stat().st_mtime_ns for p in stamps} == stamps  # what was finished was not made again
+    for scene in scenes:
+        assert list(after.observe(scene).records()) == list(undisturbed.observe(scene).records())
+    assert validate(folder)["ok"]
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_image_study_resumes(tmp_path):
+    arguments = {"observer": "both", "protocol": "corrected", "eyes": ("E2",), "spp": 4}
+    first = run_study("guestrin2006", tmp_path / "out", **arguments)
+    images = sorted((tmp_path / "out" / "images").rglob("*.png"))
+    assert len(images) == 2 * 2 * 90  # images and masks, with noise and without
+    stamps = [p.stat().st_mtime_ns for p in images]
+    again = run_study("guestrin2006", tmp_path / "out", **arguments)
+    assert [p.stat().st_mtime_ns for p in images] == stamps
+    assert again["rows"] == first["rows"]
+    noisy = run_study("guestrin2006", tmp_path / "out", **arguments, noise="on")
+    assert [p.stat().st_mtime_ns for p in images] == stamps
+    assert noisy["rows"] == [row for row in first["rows"] if row["observer"] != "image-noiseless"]
+    rows = {
+        (r["observer"], r["head"]): r for r in first["rows"] if r["eye"] == "both" and r["variant"] == "index fixed"
+    }
+    for observer in ("image", "image-noiseless"):
+        assert rows[observer, "H1"]["missing"] == 0
+        assert rows[observer, "H1"]["mean_deg"] < 0.5
+    pupils = {f["observer"]: f for f in first["observers"]["features"] if f["feature"] == "pupil centre"}
+    assert {f["n"] for f in pupils.values()} == {90}
+    assert max(f["median_distance_px"] for f in pupils.values()) < 0.3
+    assert {g["observer"] for g in first["observers"]["gaze"]} == {"image", "image-noiseless"}
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_a_study_killed_again_and_again_ends_with_the_same_summary(tmp_path):
+    command = [sys.executable, "-m", "eyerender", "study", "guestrin2006", "--observer", "both", "--eyes", "E2"]
+    command += ["--protocol", "published", "--spp", "1", "--workers", "2"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    subprocess.run([*command, "-o", str(tmp_path / "whole")], check=True, **quiet)
+    when, kills, code = random.Random(5), 0, None
+    while code != 0:
+        process = subprocess.Popen([*command, "-o", str(tmp_path / "killed")], start_new_session=True, **quiet)
+        try:
+            # The first runs are killed somewhere on their way, in a random one of their phases; then one may finish.
+            code = process.wait(timeout=when.uniform(1.0, 12.0) if kills < 5 else 600)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL) if when.random() < 0.5 else process.kill()
+            process.wait()
+            kills += 1
+        assert code in (None, 0)
+    assert kills
+    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "killed")]
+    for summary in summaries:
+        del summary["seconds"]
+    assert summaries[0] == summaries[1]
+    assert validate(tmp_path / "killed" / "images")["ok"]
