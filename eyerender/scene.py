@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from .arrays import ArrayValue, Floats, frozen
 from .errors import InputError
 from .eye.catalogue import load_eye
+from .eye.margin import PupilMarginSpec
 from .eye.model import Eye
 from .eye.spec import EyeSpec
 from .observation import EYES, Index
@@ -36,6 +37,7 @@ class EyeChoiceSpec(Spec):
     model: str = Field(default="E2", description="a name of the catalogue, or an eye file (relative to the scene)")
     pupil_diameter_mm: Positive | None = Field(default=None, description="of the anatomical pupil; default: the eye's")
     line_of_sight: Literal["chief_ray", "entrance_window"] = "chief_ray"
+    margin: PupilMarginSpec | None = Field(default=None, description="of the pupil; default: the eye's")
 
 
 class SubjectSpec(Spec):
@@ -208,10 +210,10 @@ class Scene:
         return tuple(Path(name) for name in named)
 
     def eye(self, side: Literal["right", "left"] | str) -> Eye:
-        """The numeric eye of one side at the scene's wavelength and pupil size."""
-        return _built_eye(
-            _Same(self.eye_spec), side == "left", self.spec.wavelength_nm, self.spec.eye.pupil_diameter_mm
-        )
+        """The numeric eye of one side at the scene's wavelength, with its pupil's size and margin."""
+        eye = self.spec.eye
+        same = _Same(self.eye_spec)
+        return _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
 
     def eye_position_mm(self, side: str) -> Floats:
         """Apex of the unrotated eye in the world, (3,) mm, head at its reference position."""
@@ -327,11 +329,12 @@ class _Same:
 
 
 @lru_cache(maxsize=32)
-def _built_eye(eye: _Same, left: bool, wavelength_nm: float, pupil_diameter_mm: float | None) -> Eye:
+def _built_eye(
+    eye: _Same, left: bool, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMarginSpec | None
+) -> Eye:
     """A numeric eye; observers, renderer and labels ask for the same one again and again."""
-    return eye.spec.build(
-        eye="left" if left else "right", wavelength_nm=wavelength_nm, pupil_diameter_mm=pupil_diameter_mm
-    )
+    spec = eye.spec if margin is None else margin.applied(eye.spec)
+    return spec.build(eye="left" if left else "right", wavelength_nm=wavelength_nm, pupil_diameter_mm=pupil_diameter_mm)
 
 
 def shipped_scenes() -> dict[str, Path]:

@@ -50,14 +50,19 @@ def test_labels_agree_with_the_pixels(folder):
     # The mask's pupil and the analytic ellipse are made by two programs: rays of the renderer, and Newton's method.
     images = ImageFolder.load(folder)
     truth = images.truth()
+    whole = 0
     for row, entry in enumerate(images.entries):
         mask, _ = read_image(entry.mask_path)
         ys, xs = np.nonzero(mask == 3)
         centre = np.array([xs.mean(), ys.mean()]) + entry.window[:2]
         a, b = truth.pupil.semi_axes_px[row]
+        seen = entry.line["labels"]["pupil_visible_fraction"]
         # A mask of about 500 pixels has a centroid good to about .05 px, an area good to its outline's pixels.
-        np.testing.assert_allclose(centre, truth.pupil.centre_px[row], atol=0.1)
-        assert len(xs) == pytest.approx(np.pi * a * b, rel=0.03)
+        assert len(xs) == pytest.approx(seen * np.pi * a * b, rel=0.03)
+        if seen == 1:
+            np.testing.assert_allclose(centre, truth.pupil.centre_px[row], atol=0.1)
+            whole += 1
+    assert 9 <= whole < len(images.entries)  # the lids reach over the pupil when it looks down
 
 
 def test_both_observers_agree_within_a_fraction_of_a_pixel(folder):
@@ -96,7 +101,8 @@ def test_extract_of_the_folder_gives_records(folder, capsys):
     first = data["records"][0]
     assert first["pupil"]["status"] == "ok"
     assert first["pose"]["azimuth_deg"] is None  # the image observer does not know the truth
-    assert [g["light"] for g in first["glints"] if g["status"] == "ok"] == [0]
+    assert [g["light"] for g in first["glints"] if g["light"] is not None] == [0]  # highlights of wet lids have none
+    assert first["glints"][0]["status"] == "ok"
 
 
 class Page(HTMLParser):

@@ -29,11 +29,11 @@ from .draws import (
 )
 
 # What makes an identity: drawn once a subject unless the draw says otherwise.
-IDENTITY = ("eye.model", "look", "region", "subject.ipd_mm", "subject.eyes", "eye_parameters")
+IDENTITY = ("eye.model", "eye.margin", "look", "region", "subject.ipd_mm", "subject.eyes", "eye_parameters")
 # What of it changes from frame to frame.
 PASSING = ("region.blink",)
 # An eye does not change from frame to frame, whatever the draw says.
-FIXED_IDENTITY = ("eye.model", "eye_parameters")
+FIXED_IDENTITY = ("eye.model", "eye.margin", "eye_parameters")
 _BLOCK = 256
 _CHOSEN = re.compile(r"#\d+")
 

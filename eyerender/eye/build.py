@@ -150,8 +150,10 @@ def stop_of(spec: EyeSpec, diameter_mm: float) -> Stop:
     """The right eye's stop at a diameter."""
     stop = spec.stop
     change = diameter_mm - stop.diameter_mm
-    centre = np.array(stop.position_mm) + np.array([0.0, *stop.shift_mm_per_mm]) * change
     rotation = tilt_rotation(np.radians(stop.tilt_deg)) @ rotation_x(np.radians(stop.axis_deg))
+    # In the plane of the iris, which stays: a pupil that left it would sink into a lens that is tilted with it.
+    depth = -float(rotation[1:, 0] @ stop.shift_mm_per_mm) / float(rotation[0, 0])
+    centre = np.array(stop.position_mm) + np.array([depth, *stop.shift_mm_per_mm]) * change
     ratio = np.sqrt(1.0 - stop.ellipticity)
     semi_axes = 0.5 * diameter_mm * np.array([1.0 / ratio, ratio])
     if stop.contour is None:

@@ -173,8 +173,8 @@ class StopSpec(Spec):
     """The anatomical pupil: an ellipse in a plane, or a `contour` about one.
 
     `ellipticity` = 1 - b/a at the area of the circle of `diameter_mm`; the long axis lies `axis_deg` from nasal
-    towards up. A pupil of another diameter d is centred at position_mm + (0, s_y, s_z) (d - diameter_mm), s =
-    `shift_mm_per_mm`.
+    towards up. A pupil of another diameter d is centred at position_mm + (s_x, s_y, s_z) (d - diameter_mm), (s_y, s_z)
+    = `shift_mm_per_mm`, s_x so that it stays in its plane.
     """
 
     diameter_mm: Positive

@@ -262,7 +262,8 @@ def test_mitsuba_imported_before_without_a_library_is_a_clear_error(good: Path) 
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("3 mitsuba was imported earlier")
     named = re.search(rf"{ENVIRONMENT}=(\S+)", done.stdout)  # any that is good: a machine may hold several
-    assert named is not None and Path(named[1]).is_file()
+    assert named is not None
+    assert Path(named[1]).is_file()
 
 
 def test_importing_the_room_loads_no_mitsuba() -> None:
