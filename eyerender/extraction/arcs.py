@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -39,12 +40,19 @@ class RimFit:
     residual_px: float
 
 
+# How far a margin is from an ellipse, in its radius (rms; Wyatt 1995: 1.7 %, of which an ellipse takes about half);
+# with less room only a part of an uneven margin would be fitted.
+UNEVEN = 0.01
+
+
 def fit_rim(
     edges: EdgePoints, candidate: Candidate, settings: ExtractionSettings, expected_noise_px: float
 ) -> RimFit | str:
     """The rim of the pupil among `edges`, or the reason why there is none."""
     if edges.points_px.shape[0] < 8:
         return f"only {edges.points_px.shape[0]} edge points around the darkest blob"
+    uneven = UNEVEN * float(np.sqrt(np.prod(candidate.ellipse.semi_axes_px)))
+    expected_noise_px = float(np.hypot(expected_noise_px, uneven))
     tolerance = float(np.clip(3.5 * expected_noise_px, 0.35, 2.5))
     start = _consensus(edges, candidate, settings, tolerance)
     if start is None:
@@ -66,34 +74,68 @@ def _without_lid(edges: EdgePoints, rim: RimFit, expected_noise_px: float) -> El
     Every window of an eighth to nearly a half of the outline is left out in turn; the best is taken when the rest then
     fits 1.4 times better and the edges left out lie inside the new ellipse.
     """
+    best, best_rms = None, rim.residual_px / 1.4
+    for cut in _cuts(edges, rim, 12, (0.12, 0.2, 0.3, 0.42), 1.6):
+        if cut.residual_px < best_rms and cut.hidden_px < -max(2.0 * cut.residual_px, expected_noise_px):
+            best, best_rms = cut.ellipse, cut.residual_px
+    return best
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cut:
+    """An ellipse through a rim's points without a stretch: its width as a share of the outline, the rest's root mean
+    square distance, and the median signed distance of the points left out (negative inside)."""
+
+    ellipse: Ellipse
+    width: float
+    residual_px: float
+    hidden_px: float
+
+
+def _cuts(edges: EdgePoints, rim: RimFit, least: int, shares: tuple[float, ...], largest: float) -> Iterator[_Cut]:
+    """Every stretch of these widths left out of a rim in turn, if `least` points are left and the ellipse stays alike:
+    its longer axis below `largest` times the rim's."""
     points = edges.points_px[rim.inliers]
     cos_t, sin_t = _parameter(rim.ellipse, points)
     order = np.argsort(np.arctan2(sin_t, cos_t), kind="stable")
     points = points[order]
     turn = (np.arctan2(sin_t, cos_t)[order] / (2.0 * np.pi) + 0.5) % 1.0
-    starts, widths = np.meshgrid(np.arange(24) / 24.0, np.array([0.12, 0.2, 0.3, 0.42]))
-    outside = ((turn[None, :] - starts.reshape(-1, 1)) % 1.0) >= widths.reshape(-1, 1)
+    starts, widths = (part.reshape(-1, 1) for part in np.meshgrid(np.arange(24) / 24.0, np.array(shares)))
+    outside = ((turn[None, :] - starts) % 1.0) >= widths
     left = outside.sum(axis=1)
-    enough = (left >= 12) & (left < points.shape[0] - 3)
-    outside, left = outside[enough], left[enough]
+    enough = (left >= least) & (left < points.shape[0] - 3)
+    outside, left, widths = outside[enough], left[enough], widths[enough]
     if left.size == 0:
-        return None
+        return
     ranks = np.argsort(~outside, axis=1, kind="stable")  # the points kept, in order, come first
     take = (np.arange(40)[None, :] * left[:, None] / 40.0).astype(np.intp)
     fits = fit_ellipse_direct(points[np.take_along_axis(ranks, take, axis=1)])
-    best, best_rms = None, rim.residual_px / 1.4
     a, b = rim.ellipse.semi_axes_px
     for i in np.nonzero(fits.ok)[0]:
         axes = fits.semi_axes_px[i]
-        if axes[0] > 1.6 * a or axes[1] < 0.7 * b:
+        if axes[0] > largest * a or axes[1] < 0.7 * b:
             continue
         ellipse = Ellipse(fits.centre_px[i], axes, float(fits.angle_rad[i]))
         distance = signed_distance(ellipse, points)
         rms = float(np.sqrt(np.mean(distance[outside[i]] ** 2)))
-        hidden = float(np.median(distance[~outside[i]]))
-        if rms < best_rms and hidden < -max(2.0 * rms, expected_noise_px):
-            best, best_rms = ellipse, rms
-    return best
+        yield _Cut(ellipse, float(widths[i, 0]), rms, float(np.median(distance[~outside[i]])))
+
+
+def rims_without_stretch(
+    edges: EdgePoints, rim: RimFit, settings: ExtractionSettings, expected_noise_px: float
+) -> list[RimFit]:
+    """Rims to look at when the one found is none: for every width of a stretch left out, the best that remains.
+
+    What is left out must lie inside, as a lid's margin does that crosses the pupil.
+    """
+    best: dict[float, _Cut] = {}
+    for cut in _cuts(edges, rim, 8, (0.2, 0.3, 0.42, 0.52), 2.0):
+        known = best.get(cut.width)
+        if cut.hidden_px < -2.0 * cut.residual_px and (known is None or cut.residual_px < known.residual_px):
+            best[cut.width] = cut
+    tolerance = max(0.35, 3.5 * expected_noise_px)
+    rims = (_polished(edges, cut.ellipse, settings, tolerance, free=True) for cut in best.values())
+    return [one for one in rims if isinstance(one, RimFit)]
 
 
 def _consensus(

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from ..arrays import frozen
 from ..geometry.ellipse import Ellipse
+from .bellshape import bell_shaped
+from .fittedspots import SpotFit
 from .preprocess import DN, Image, Prepared, as_image
 from .result import GlintResult
 from .settings import ExtractionSettings
-from .spotfit import SpotFit
 from .spotmend import patch_moments
 
 Array = NDArray[np.float64]
@@ -28,12 +29,14 @@ MOST_PEAKS = 80  # maxima looked at, brightest first
 @dataclass(frozen=True, slots=True, eq=False)
 class Spots:
     """Detected spots: xy_px (n, 2) of the peak pixels, width_px (n,) sigma guessed from the area above half height,
-    height_dn (n,) above the surroundings. patches_px (k, 2): peaks of bright places that are no spots."""
+    height_dn (n,) above the surroundings. patches_px (k, 2): peaks of bright places that are no spots. clutter: of the
+    spots that no bell explains, likewise xy, width and height; they are not fitted, and no rim is fitted there."""
 
     xy_px: Array
     width_px: Array
     height_dn: Array
     patches_px: Array
+    clutter: tuple[Array, Array, Array]
 
 
 def detect_spots(
@@ -74,9 +77,14 @@ def detect_spots(
             break
     xy, width, height = xy[keep], width[keep], height[keep]
     alone = _above_ring(smooth, xy, width) > RING_SHARE * height
-    patches = np.concatenate([patches, xy[~alone]])[: settings.max_glints]
+    bell = alone & bell_shaped(crop, xy, width, height, prepared.noise_dn, prepared.clip_dn)
+    patches = np.concatenate([patches, xy[~bell]])[: settings.max_glints]
     corner = np.array([x0, y0])
-    return Spots(xy[alone] + corner, width[alone], height[alone], patches + corner)
+    clutter = alone & ~bell
+    return Spots(
+        xy[bell] + corner, width[bell], height[bell], patches + corner,
+        (xy[clutter] + corner, width[clutter], height[clutter]),
+    )  # fmt: skip
 
 
 def _above_ring(smooth: Image, xy: Array, width: Array) -> Array:
@@ -137,7 +145,8 @@ def _parted(smooth: Image, first: Array, second: Array, dip: float, size: int) -
 
 
 def _no_spots() -> Spots:
-    return Spots(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 2)))
+    none = (np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    return Spots(*none, np.zeros((0, 2)), none)
 
 
 def _opening(smooth: Image, size: int) -> Image:

@@ -15,8 +15,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
-from scipy.special import erf
 
+from .fittedspots import SpotFit, joined, no_spots, profile
 from .preprocess import Image
 
 Array = NDArray[np.float64]
@@ -24,41 +24,7 @@ Array = NDArray[np.float64]
 PARAMETERS = 8  # x, y, ln A, ln sx, ln sy, b0, bx, by
 MAX_TURNS = 25
 LOST_PX = 12.0  # no glint's fit is as wide as that, or as far from where it began
-_ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SpotFit:
-    """A batch of fitted spots. xy_px (n, 2), covariance (n, 2, 2), amplitude_dn (n,), sigma_px (n, 2) along x and y,
-    background_dn (n,) at the spot, residual_dn (n,) root mean square over the window, clipped (n,) number of pixels
-    at the clip level, converged (n,).
-    """
-
-    xy_px: Array
-    covariance: Array
-    amplitude_dn: Array
-    sigma_px: Array
-    background_dn: Array
-    residual_dn: Array
-    clipped: NDArray[np.intp]
-    converged: NDArray[np.bool_]
-
-    def taken(self, index: NDArray[np.intp]) -> SpotFit:
-        """The chosen spots."""
-        return SpotFit(*(getattr(self, one.name)[index] for one in fields(self)))
-
-    def one(self, i: int) -> SpotFit:
-        """A batch of spot i alone."""
-        return self.taken(np.array([i]))
-
-    def replaced(self, i: int, other: SpotFit) -> SpotFit:
-        """Spot i replaced by the only one of `other`."""
-        parts = []
-        for one in fields(self):
-            values = getattr(self, one.name).copy()
-            values[i] = getattr(other, one.name)[0]
-            parts.append(values)
-        return SpotFit(*parts)
+PATIENCE, WANDERING_PX = 4, 0.3  # turns after which a spot that still moves by more is given up
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +60,7 @@ def fit_spots(
     Spots that reach into each other's windows are fitted in turn, each on the image less the others, until they settle.
     """
     if start_px.shape[0] == 0:
-        return _empty()
+        return no_spots()
     parts, order = [], []
     for members in _groups(start_px, width_px):
         half = int(np.clip(math.ceil(3.2 * float(np.max(width_px[members])) + 1.0), 4, 20))
@@ -110,11 +76,6 @@ def fit_spots(
         order.append(members)
     back = np.argsort(np.concatenate(order), kind="stable")
     return joined(parts).taken(back)
-
-
-def joined(parts: list[SpotFit]) -> SpotFit:
-    """Batches one after the other."""
-    return SpotFit(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)))
 
 
 def window_radius(width: Array) -> Array:
@@ -143,17 +104,20 @@ def _fit_in_turn(
 ) -> tuple[Array, NDArray[np.bool_], Array]:
     """(theta, settled, the others' light) of spots that share pixels.
 
-    A spot that has grown or moved beyond what a glint's could is given up: its light is nobody's background.
+    A spot that has grown or moved beyond what a glint's could, or wanders on when others have settled, is given up:
+    its light is nobody's background.
     """
     theta, start = theta.copy(), theta[:, :2]
     settled, lost = np.zeros(theta.shape[0], dtype=bool), np.zeros(theta.shape[0], dtype=bool)
     others = _others(windows, theta, lost)
-    for _ in range(10):
+    for turn in range(10):
         index = np.nonzero(~lost)[0]
         found, done = _fit(windows.taken(index), theta[index], others[index], noise_dn, slope_dn, turns=4)
         moved = np.abs(found[:, :2] - theta[index, :2]).max(axis=1)
         theta[index] = found
         settled[index] = done | (moved < 0.02)
+        if turn + 1 >= PATIENCE:
+            lost[index[moved > WANDERING_PX]] = True
         lost |= _lost(theta, start)
         others = _others(windows, theta, lost)
         if lost.all() or moved.max() < 3e-4:
@@ -165,13 +129,6 @@ def _lost(theta: Array, start: Array) -> NDArray[np.bool_]:
     """(n,) which spots have grown or moved beyond what a glint's fit could."""
     wide = theta[:, 3:5].max(axis=1) > math.log(LOST_PX)
     return np.asarray(wide | (np.hypot(*(theta[:, :2] - start).T) > LOST_PX))
-
-
-def spot_light(fit: SpotFit, x: Array, y: Array) -> Array:
-    """The light of the first spot of a batch at pixels (x, y)."""
-    gx = _profile(x, float(fit.xy_px[0, 0]), float(fit.sigma_px[0, 0]))[0]
-    gy = _profile(y, float(fit.xy_px[0, 1]), float(fit.sigma_px[0, 1]))[0]
-    return np.asarray(fit.amplitude_dn[0] * gx * gy)
 
 
 def _cut(
@@ -217,19 +174,11 @@ def _start(windows: _Windows, start: Array, width: Array, height: Array) -> Arra
     return theta
 
 
-def _profile(x: Array, centre: Array | float, sigma: Array | float) -> tuple[Array, Array, Array]:
-    """Mean over the pixel of exp(-(x - c)^2 / (2 s^2)), and its derivatives by c and by ln s."""
-    low, high = (x - 0.5 - centre) / sigma, (x + 0.5 - centre) / sigma
-    tail_low, tail_high = np.exp(-0.5 * low * low), np.exp(-0.5 * high * high)
-    value = sigma * _ROOT_HALF_PI * (erf(high / math.sqrt(2.0)) - erf(low / math.sqrt(2.0)))
-    return value, tail_low - tail_high, value - sigma * (high * tail_high - low * tail_low)
-
-
 def _model(windows: _Windows, theta: Array) -> tuple[Array, Array]:
     """Spot plus fitted background plane (n, k, k), and its Jacobian (n, k, k, PARAMETERS)."""
     p = theta[:, :, None, None]
-    gx, gx_c, gx_s = _profile(windows.x, p[:, 0], np.exp(p[:, 3]))
-    gy, gy_c, gy_s = _profile(windows.y, p[:, 1], np.exp(p[:, 4]))
+    gx, gx_c, gx_s = profile(windows.x, p[:, 0], np.exp(p[:, 3]))
+    gy, gy_c, gy_s = profile(windows.y, p[:, 1], np.exp(p[:, 4]))
     amplitude = np.exp(p[:, 2])
     spot = amplitude * gx * gy
     jacobian = np.empty((*spot.shape, PARAMETERS))
@@ -313,8 +262,8 @@ def _others(windows: _Windows, theta: Array, lost: NDArray[np.bool_]) -> Array:
     """(n, k, k): in every spot's window, the light of the other spots."""
     out = np.zeros_like(windows.data)
     for i in np.nonzero(~lost)[0]:
-        gx = _profile(windows.x, theta[i, 0], math.exp(theta[i, 3]))[0]
-        gy = _profile(windows.y, theta[i, 1], math.exp(theta[i, 4]))[0]
+        gx = profile(windows.x, theta[i, 0], math.exp(theta[i, 3]))[0]
+        gy = profile(windows.y, theta[i, 1], math.exp(theta[i, 4]))[0]
         spot = math.exp(theta[i, 2]) * gx * gy
         spot[i] = 0.0
         out += spot
@@ -347,10 +296,3 @@ def _report(
         windows.clip.sum(axis=(1, 2)),
         settled & np.isfinite(theta).all(axis=1) & (pixels >= 12),
     )
-
-
-def _empty() -> SpotFit:
-    return SpotFit(
-        np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2)), np.zeros(0), np.zeros(0),
-        np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool),
-    )  # fmt: skip

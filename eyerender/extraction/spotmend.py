@@ -13,13 +13,17 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
+from .fittedspots import SpotFit, joined, spot_light
 from .preprocess import Image
-from .spotfit import SpotFit, fit_spots, joined, spot_light, window_radius
+from .spotfit import fit_spots, window_radius
 
 Array = NDArray[np.float64]
 Background = Callable[[Array, Array], Array]
 
 UNEXPLAINED = 2.0
+PROMISING = 0.9  # of the residual: where the first edge beside a spot leaves more, further turns change little
+# Two equal spots 2.5 sigma apart deviate by sqrt(1 + 1.25^2) = 1.6 sigma along their line; with some room:
+LONGEST, LONGEST_FIT = 1.8, 2.5
 MOST_NEAR = 4  # spots about one that is split: more are skin or lashes
 MOST = 12  # spots that are mended: where there are more, they are no glints
 
@@ -30,18 +34,20 @@ def give_edges(
     starts: tuple[Array, Array, Array],
     fit: SpotFit,
     blur_px: float,
+    widest_px: float,
     limits: tuple[float, float, float],
 ) -> SpotFit:
     """The fit with unexplained single spots refitted beside a straight blurred edge (the limbus, a lid's margin).
 
-    B gains c + h Phi((x cos p + y sin p - o) / blur): edge and spot are fitted in turn, three times, and the result
-    is taken when the residual falls to 70 %. limits: noise, clip level and background slope, as for `fit_spots`.
+    B gains c + h Phi((x cos p + y sin p - o) / blur): edge and spot are fitted in turn, three times (once where that
+    hardly helps), and the result is taken when the residual falls to 70 %. widest_px: the largest sigma of a glint.
+    limits: noise, clip level and background slope, as for `fit_spots`.
     """
     noise, clip, _ = limits
     for i in np.nonzero(fit.converged & (fit.residual_dn > UNEXPLAINED * noise))[0][:MOST]:
         apart = np.hypot(*(fit.xy_px - fit.xy_px[i]).T)
         wide = float(fit.sigma_px[i].max())
-        if np.sum(apart < 5.0 * wide + 3.0) > 1:
+        if np.sum(apart < 5.0 * wide + 3.0) > 1 or wide > LONGEST * widest_px:
             continue
         start = tuple(part[i : i + 1] for part in starts)
         x, y, data = _window(linear, start[0][0], math.ceil(2.7 * float(start[1][0]) + 3.0))
@@ -57,6 +63,8 @@ def give_edges(
                 return known(x, y) + _edge_level(edge, x - at[0], y - at[1], blur_px)
 
             current = fit_spots(linear, background, start[0], start[1], start[2], *limits)
+            if not current.residual_dn[0] < PROMISING * best.residual_dn[0]:
+                break
         if current.converged[0] and current.residual_dn[0] < 0.7 * best.residual_dn[0]:
             fit = fit.replaced(int(i), current)
     return fit
@@ -84,7 +92,17 @@ def _edge(x: Array, y: Array, level: Array, use: NDArray[np.bool_], at: Array, b
     plane = np.linalg.lstsq(np.stack([np.ones_like(dx), dx, dy], axis=-1), value, rcond=None)[0]
     low, high = np.percentile(value, (10.0, 90.0))
     start = np.array([low, high - low, math.atan2(plane[2], plane[1]), 0.0])
-    found = least_squares(lambda p: _edge_level(p, dx, dy, blur_px) - value, start, method="lm", max_nfev=60)
+
+    def misfit(p: Array) -> Array:
+        return np.asarray(_edge_level(p, dx, dy, blur_px) - value)
+
+    def slopes(p: Array) -> Array:
+        cos, sin = math.cos(p[2]), math.sin(p[2])
+        t = (dx * cos + dy * sin - p[3]) / blur_px
+        bell = p[1] / (blur_px * math.sqrt(2.0 * math.pi)) * np.exp(-0.5 * t * t)
+        return np.stack([np.ones_like(t), ndtr(t), bell * (dy * cos - dx * sin), -bell], axis=-1)
+
+    found = least_squares(misfit, start, slopes, method="lm", max_nfev=15)
     return np.asarray(found.x) if np.isfinite(found.x).all() else None
 
 
@@ -93,6 +111,7 @@ def split_blends(
     known: Background,
     starts: tuple[Array, Array, Array],
     fit: SpotFit,
+    widest_px: float,
     limits: tuple[float, float, float],
 ) -> tuple[tuple[Array, Array, Array], SpotFit]:
     """(starts, fit) with every unexplained spot replaced by two, where two fit it much better.
@@ -100,7 +119,7 @@ def split_blends(
     starts: xy (n, 2), width (n,), height (n,), as given to `fit_spots`. Two spots less than 2.5 sigma apart have one
     maximum; their patch is longer than wide, and one Gaussian leaves a residual of several times the noise. The halves
     start at one deviation either way along the patch's longer axis; they must come out round and cut the residual to
-    60 %.
+    60 %. widest_px: the largest sigma of a glint; a patch longer or narrower than two such make is left alone.
     """
     if fit.converged.size > MOST:
         return starts, fit
@@ -109,6 +128,9 @@ def split_blends(
         if axis is None:
             continue
         offset, across = axis
+        sigma = fit.sigma_px[i]
+        if math.hypot(*offset) > LONGEST * widest_px or float(sigma.max()) > LONGEST_FIT * float(sigma.min()):
+            continue
         xy, width, height = starts
         # Only the spots whose light reaches there are fitted anew.
         reach = 3.0 * (window_radius(width) + window_radius(width[i]))
@@ -133,7 +155,7 @@ def split_blends(
                 np.append(height[far], trial[2])[order],
             )
             together = joined([fit.taken(np.nonzero(far)[0]), again]).taken(order)
-            return split_blends(linear, known, halved, together, limits)
+            return split_blends(linear, known, halved, together, widest_px, limits)
     return starts, fit
 
 

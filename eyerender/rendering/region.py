@@ -21,7 +21,7 @@ from ..region.globe import Globe
 from ..region.head import file_states
 from ..region.mesh import PARTS, RegionMesh, region_mesh
 from ..region.skin import skin_map
-from .surround import clear_between
+from .surround import clear_between, rays_between
 
 _F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, about the same (n 1.40 and 1.33)
 _ROUGH_SKIN, _ROUGH_WET = 0.19, 0.04
@@ -112,10 +112,7 @@ class Surface:
 
 def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:
     """The first part of the region between points (n, 3) a and b of the scene's frame, None where there is none."""
-    length = np.linalg.norm(b - a, axis=-1)
-    ray = mi.Ray3f(mi.Point3f(*a.T.astype(np.float32)), mi.Vector3f(*((b - a) / length[:, None]).T.astype(np.float32)))
-    ray.maxt = mi.Float((length - 1e-3).astype(np.float32))  # type: ignore[assignment]
-    hit = place.scene.ray_intersect_preliminary(ray, coherent=False, active=True)
+    hit = place.scene.ray_intersect_preliminary(rays_between(a, b), coherent=False, active=True)
     valid, face = hit.is_valid().numpy(), hit.prim_index.numpy()
     which = np.searchsorted(place.posed.layout.face_ends, face, side="right")
     return [place.parts[int(w)] if v else None for v, w in zip(valid, which, strict=True)]

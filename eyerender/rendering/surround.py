@@ -72,16 +72,20 @@ class Surround:
 
 def clear_between(scene: Any, a: Floats, b: Floats) -> Bools:
     """Whether nothing of a Mitsuba scene stands between points (n, 3) of its frame; ends not included."""
+    return ~np.asarray(scene.ray_test(rays_between(a, b)).numpy(), dtype=bool)
+
+
+def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> Any:
+    """Rays from points (n, 3) towards points b, both ends left out by `margin_mm`."""
     length = np.linalg.norm(b - a, axis=-1)
     d = (b - a) / length[:, None]
-    margin = 1e-3
-    table = np.column_stack([a + margin * d, d, length - 2 * margin]).astype(np.float32)
+    table = np.column_stack([a + margin_mm * d, d, length - 2 * margin_mm]).astype(np.float32)
     # Gathered from one buffer: the kernel would depend on the alignment of every array that NumPy owns.
     buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 7
     o = [dr.gather(mi.Float, buffer, row + k) for k in range(7)]
     ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:6]))
     ray.maxt = o[6]  # type: ignore[assignment]
-    return ~np.asarray(scene.ray_test(ray).numpy(), dtype=bool)
+    return ray
 
 
 def _corners(distance_mm: float) -> Floats:

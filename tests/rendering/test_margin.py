@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.path import Path
@@ -90,3 +92,62 @@ def test_other_margins_compile_nothing(renderer):
             renderer.render(job_of(eye, rig, (300, 220, 32, 32)), spp=1)
             hashes.append({kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])})
     assert hashes[0] == hashes[1] == hashes[2]
+
+
+def drawn_scene(rig_name, side, seed, pupil_mm=4.0):
+    """A study's scene of one eye with a drawn margin: a single direction, noise-free, the iris even."""
+    from eyerender.scene import Scene, SceneSpec, load_scene
+
+    data = load_scene(rig_name).spec.to_mapping()
+    data["eye"] = {"model": "E2", "pupil_diameter_mm": pupil_mm, "margin": {"seed": seed}}
+    data["subject"]["eyes"] = [side]
+    data.pop("targets", None)
+    data["poses"] = [{"azimuth_deg": 6.0, "elevation_deg": 4.0}]
+    data["image"]["window_px"] = [96, 96] if rig_name == "blignaut2014" else [320, 240]
+    data["image"]["spp"] = 64
+    data["sensor"]["noise"] = False
+    return Scene.of(SceneSpec.from_mapping(data))
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_both_observers_have_the_margin_of_a_scene(renderer, side):
+    from eyerender.analytic.observer import observe
+    from eyerender.capture import render_job
+
+    # The margin of the picture, as above, but with what a scene's key gives both observers.
+    scene = drawn_scene("blignaut2014", side, 5, 5.0)
+    polygon = observe(scene, boundary_points=720).pupil.points_px[0]
+    job = render_job(scene, observe(scene), 0)
+    black, grey = (
+        renderer.radiance(replace(job, look=PLAIN.model_copy(update={"pupil_albedo": albedo})), spp=64)
+        for albedo in (0.0, PLAIN.iris_albedo)
+    )
+    share = 1 - black / grey
+    assert contour_error(share, polygon, job.window) < 0.02
+    bare = scene.spec.model_copy(update={"eye": scene.spec.eye.model_copy(update={"margin": None})})
+    plain = observe(replace(scene, spec=bare), boundary_points=720).pupil.points_px[0]
+    assert contour_error(share, plain, job.window) > 0.2
+
+
+@pytest.mark.parametrize("rig_name", ["blignaut2014", "head_mounted"])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_ellipse_of_the_picture_is_that_of_the_analytic_observer(renderer, rig_name, seed):
+    import cv2
+    from skimage.measure import find_contours
+
+    from eyerender.analytic.observer import observe
+    from eyerender.capture import render_job
+
+    scene = drawn_scene(rig_name, "right", seed)
+    truth = observe(scene)
+    job = render_job(scene, truth, 0)
+    black, grey = (
+        renderer.radiance(replace(job, look=PLAIN.model_copy(update={"pupil_albedo": albedo})), spp=64)
+        for albedo in (0.0, PLAIN.iris_albedo)
+    )
+    # The line along which half of a pixel is pupil, of all edges the longest; OpenCV's fit sees nothing else.
+    edge = max(find_contours(np.array(1 - black / grey), 0.5), key=len)[:, ::-1]
+    centre, axes, _ = cv2.fitEllipseDirect(edge.astype(np.float32))
+    error = np.array(centre) + job.window[:2] - truth.pupil.centre_px[0]
+    assert np.hypot(*error) < 0.1
+    assert np.sort(axes)[::-1] / 2 == pytest.approx(truth.pupil.semi_axes_px[0], abs=0.1)

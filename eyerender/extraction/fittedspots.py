@@ -1,0 +1,76 @@
+"""What a fit of bright spots gives, as a batch; and the light of one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+Array = NDArray[np.float64]
+
+_ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpotFit:
+    """A batch of fitted spots. xy_px (n, 2), covariance (n, 2, 2), amplitude_dn (n,), sigma_px (n, 2) along x and y,
+    background_dn (n,) at the spot, residual_dn (n,) root mean square over the window, clipped (n,) number of pixels
+    at the clip level, converged (n,).
+    """
+
+    xy_px: Array
+    covariance: Array
+    amplitude_dn: Array
+    sigma_px: Array
+    background_dn: Array
+    residual_dn: Array
+    clipped: NDArray[np.intp]
+    converged: NDArray[np.bool_]
+
+    def taken(self, index: NDArray[np.intp]) -> SpotFit:
+        """The chosen spots."""
+        return SpotFit(*(getattr(self, one.name)[index] for one in fields(self)))
+
+    def one(self, i: int) -> SpotFit:
+        """A batch of spot i alone."""
+        return self.taken(np.array([i]))
+
+    def replaced(self, i: int, other: SpotFit) -> SpotFit:
+        """Spot i replaced by the only one of `other`."""
+        parts = []
+        for one in fields(self):
+            values = getattr(self, one.name).copy()
+            values[i] = getattr(other, one.name)[0]
+            parts.append(values)
+        return SpotFit(*parts)
+
+
+def joined(parts: list[SpotFit]) -> SpotFit:
+    """Batches one after the other."""
+    return SpotFit(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)))
+
+
+def no_spots() -> SpotFit:
+    """An empty batch."""
+    return SpotFit(
+        np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2)), np.zeros(0), np.zeros(0),
+        np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool),
+    )  # fmt: skip
+
+
+def spot_light(fit: SpotFit, x: Array, y: Array) -> Array:
+    """The light of the first spot of a batch at pixels (x, y)."""
+    gx = profile(x, float(fit.xy_px[0, 0]), float(fit.sigma_px[0, 0]))[0]
+    gy = profile(y, float(fit.xy_px[0, 1]), float(fit.sigma_px[0, 1]))[0]
+    return np.asarray(fit.amplitude_dn[0] * gx * gy)
+
+
+def profile(x: Array, centre: Array | float, sigma: Array | float) -> tuple[Array, Array, Array]:
+    """Mean over the pixel of exp(-(x - c)^2 / (2 s^2)), and its derivatives by c and by ln s."""
+    low, high = (x - 0.5 - centre) / sigma, (x + 0.5 - centre) / sigma
+    tail_low, tail_high = np.exp(-0.5 * low * low), np.exp(-0.5 * high * high)
+    value = sigma * _ROOT_HALF_PI * (erf(high / math.sqrt(2.0)) - erf(low / math.sqrt(2.0)))
+    return value, tail_low - tail_high, value - sigma * (high * tail_high - low * tail_low)

@@ -1,0 +1,111 @@
+"""From candidates to the rim: which dark blob's outline is the pupil's, by what its edges show at full resolution."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .arcs import RimFit, fit_rim
+from .coarse import Candidate, find_candidates, find_inside, inspect_interior
+from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
+from .preprocess import Prepared
+from .result import PupilResult
+from .rimmodel import RimModel
+from .settings import ExtractionSettings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """A candidate, the edge points about it, the rim through them, and how much of it is seen and how clearly."""
+
+    candidate: Candidate
+    edges: EdgePoints
+    rim: RimFit
+    quality: float
+
+
+def search(work: Prepared, settings: ExtractionSettings) -> Found | PupilResult:
+    """The best candidate by what its rim shows at full resolution; where there is none, again without dark lines."""
+    found = _searched(work, settings, without_lines=False)
+    if isinstance(found, Found) or work.inverted:
+        return found
+    again = _searched(work, settings, without_lines=True)
+    return again if isinstance(again, Found) and again.rim.support > 0.5 else found
+
+
+def _searched(work: Prepared, settings: ExtractionSettings, *, without_lines: bool) -> Found | PupilResult:
+    candidates = find_candidates(work, settings, without_lines=without_lines)
+    if not candidates:
+        return PupilResult.missing("coarse search", "no dark round region stands out of its surroundings")
+    found, reason = _first_good(work, candidates, settings)
+    if found is None:
+        return PupilResult.missing("edges", reason)
+    return _without_core(work, found, settings)
+
+
+def _first_good(work: Prepared, candidates: list[Candidate], settings: ExtractionSettings) -> tuple[Found | None, str]:
+    """The first candidate with a well-seen rim, else the best-seen one; and the first one's objection."""
+    poor: list[Found] = []
+    reason = ""
+    for candidate in candidates:
+        found = rim_about(work, candidate, settings)
+        if isinstance(found, str):
+            reason = reason or found
+            continue
+        # The ranking knows what lies inside what; a later candidate must only stand in for a failed one.
+        if found.rim.support > 0.45:
+            return next((earlier for earlier in poor if _holds(found, earlier)), found), reason
+        poor.append(found)
+    return max(poor, key=lambda one: one.quality, default=None), reason
+
+
+def _holds(outer: Found, inner: Found) -> bool:
+    """Whether a smaller rim found earlier, however little of it is seen, lies inside."""
+    ratio = inner.rim.ellipse.area_px2 / outer.rim.ellipse.area_px2
+    apart = math.dist(inner.rim.ellipse.centre_px, outer.rim.ellipse.centre_px)
+    return ratio < 0.7 and apart < 0.7 * float(outer.rim.ellipse.semi_axes_px[1])
+
+
+def _without_core(work: Prepared, found: Found, settings: ExtractionSettings) -> Found | PupilResult:
+    """The same rim if its inside is even; what lies inside it if there is a darker core, as an iris has."""
+    for _ in range(2):
+        if not has_core(work, found):
+            return found
+        inner, _ = _first_good(work, find_inside(work, found.rim.ellipse, settings), settings)
+        if inner is None or inner.rim.ellipse.area_px2 > 0.8 * found.rim.ellipse.area_px2:
+            reason = "the dark region has a darker core, as an iris has, but no rim was found in it"
+            return PupilResult.missing("edges", reason)
+        found = inner
+    return found
+
+
+def has_core(work: Prepared, found: Found) -> bool:
+    """Whether a rim's middle is darker than its outer part, as an iris' is."""
+    inside = inspect_interior(work.linear, found.rim.ellipse, edge_model(found).sigma_px, work.noise_dn)
+    return not inside.darker_dn < max(4.0 * inside.error_dn, 0.15 * found.candidate.step_dn)
+
+
+def rim_about(work: Prepared, candidate: Candidate, settings: ExtractionSettings) -> Found | str:
+    bright = candidate.inside_dn + 4.0 * candidate.step_dn
+    b = float(candidate.ellipse.semi_axes_px[1])
+    sigma = filter_sigma(candidate.step_dn, work.noise_dn, b)
+    edges = find_edges(work.linear, candidate, work.noise_dn, bright, sigma, band=0.4)
+    blur = math.sqrt(max(edges.sigma_px**2 - sigma**2, 0.0))
+    if blur > 1.7 * sigma:  # a filter much sharper than the image only collects noise
+        sigma = min(blur, max(1.0, 0.2 * b))
+        edges = find_edges(work.linear, candidate, work.noise_dn, bright, sigma, band=0.4)
+    expected = edge_noise_px(candidate.step_dn, work.noise_dn, sigma, edges.sigma_px)
+    rim = fit_rim(edges, candidate, settings, expected)
+    if isinstance(rim, str):
+        return rim
+    return Found(candidate, edges, rim, rim.support * min(1.0, 4.0 * candidate.score))
+
+
+def edge_model(found: Found) -> RimModel:
+    """The pixel model's parameters as far as the edges tell them."""
+    candidate = found.candidate
+    sigma = math.sqrt(max(found.edges.sigma_px**2 - found.edges.filter_px**2, 0.25))
+    outer = np.array([candidate.inside_dn + candidate.step_dn])
+    return RimModel(found.rim.ellipse, candidate.inside_dn, outer, sigma)

@@ -1,0 +1,102 @@
+"""Eyes in lids: rims that a lid cuts, answers to refuse, and bright places of skin that are not worth a fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from eyerender.extraction import FAST, REFINED, ExtractionSettings, extract
+from eyerender.extraction.arcs import RimFit, ams_fit, rims_without_stretch
+from eyerender.extraction.bellshape import bell_shaped
+from eyerender.extraction.edges import EdgePoints
+from eyerender.geometry.ellipse import Ellipse, iou
+
+
+def _truth(drawing) -> Ellipse:
+    pupil = drawing.label["pupil"]
+    return Ellipse(pupil["centre_px"], pupil["semi_axes_px"], pupil["angle_rad"])
+
+
+@pytest.mark.parametrize("settings", [FAST, REFINED], ids=["fast", "refined"])
+@pytest.mark.parametrize("seed", [137, 230])
+def test_a_refused_outline_gets_a_second_look(ideal, seed, settings):
+    # A lid's margin in the outline (137), and a blur that leaves the first candidate's edges unlikely (230).
+    drawing = ideal.draw("mixed", seed)
+    found = extract(drawing.image, settings=settings).pupil
+    assert found.status == "ok", found.reason
+    assert iou(found.ellipse, _truth(drawing)) > 0.9
+
+
+@pytest.mark.parametrize("seed", [13, 26, 30, 102, 120, 136, 158, 193, 237, 260])
+def test_the_second_look_does_not_take_the_iris(ideal, seed):
+    # Faint pupils in irises that stand out: what is reported at all is the pupil.
+    drawing = ideal.draw("mixed", seed)
+    found = extract(drawing.image).pupil
+    assert found.status == "missing" or iou(found.ellipse, _truth(drawing)) > 0.9
+
+
+def test_no_second_look_finds_a_pupil_where_no_eye_is(ideal):
+    sure = [extract(ideal.draw_no_eye(seed)).pupil.confidence > 0.8 for seed in range(12)]
+    assert not any(sure)
+
+
+@pytest.mark.parametrize("covered", [0.25, 0.4])
+@pytest.mark.parametrize("seed", range(4))
+def test_an_outline_without_the_lids_margin(covered, seed):
+    rng = np.random.default_rng(seed)
+    truth = Ellipse(np.array([60.0, 50.0]), np.array([16.0, rng.uniform(13.0, 16.0)]), rng.uniform(0.0, np.pi))
+    turn = np.linspace(0.0, 2.0 * np.pi, 120, endpoint=False)
+    cos, sin = np.cos(truth.angle_rad), np.sin(truth.angle_rad)
+    u, v = truth.semi_axes_px[0] * np.cos(turn), truth.semi_axes_px[1] * np.sin(turn)
+    points = truth.centre_px + np.stack([u * cos - v * sin, u * sin + v * cos], axis=-1)
+    slope = np.stack([np.cos(turn) / truth.semi_axes_px[0], np.sin(turn) / truth.semi_axes_px[1]], axis=-1)
+    normals = slope @ np.array([[cos, sin], [-sin, cos]])
+    normals /= np.hypot(*normals.T)[:, None]
+    # The lid's margin: a chord from rim to rim in place of the arc above it.
+    height = np.quantile(points[:, 1], covered)
+    hidden = points[:, 1] < height
+    points[hidden, 1] = height
+    points += rng.normal(0.0, 0.05, points.shape)
+    normals[hidden] = [0.0, -1.0]
+    edges = EdgePoints(points, normals, np.ones(120), np.zeros(120, dtype=np.intp), 1.0, 1.0)
+    through_all = ams_fit(points)
+    assert through_all is not None
+    assert iou(through_all, truth) < 0.9
+    rim = RimFit(through_all, np.ones(120, dtype=bool), points, 1.0, 0.0, 1.0)
+    rims = rims_without_stretch(edges, rim, ExtractionSettings(), 0.1)
+    # The points are shifted outward by the curvature of a blurred edge, sigma^2 / (2 r) = 0.03 px: 0.5 % of the area.
+    assert max(iou(one.ellipse, truth) for one in rims) > 0.95
+
+
+def _spots(rng: np.random.Generator, sigma: float, height: float, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """An image of spots at random phases on a slope, and their peak pixels."""
+    y, x = np.mgrid[:60, :300].astype(float)
+    image = 40.0 + 0.1 * x + rng.normal(0.0, noise, x.shape)
+    places = np.stack([np.arange(30, 300, 40), np.full(7, 30)], axis=-1) + rng.uniform(-0.5, 0.5, (7, 2))
+    for cx, cy in places:
+        image += height * np.exp(-0.5 * ((x - cx) ** 2 + (y - cy) ** 2) / sigma**2)
+    return image.astype(np.float32), np.rint(places)
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.5, 3.0])
+@pytest.mark.parametrize("guess", [0.8, 1.25])
+def test_glints_are_bell_shaped(sigma, guess):
+    # Widths are guessed from the area above half height, good to some 20 %.
+    image, places = _spots(np.random.default_rng(5), sigma, 100.0, 2.0)
+    width, height = np.full(7, guess * sigma), np.full(7, 95.0)
+    assert bell_shaped(image, places, width, height, 2.0, 250.0).all()
+
+
+def test_grains_of_skin_are_not_bell_shaped():
+    # The tops of correlated noise, with widths larger than its own grain, as detection sees them.
+    rng = np.random.default_rng(6)
+    image = (60.0 + rng.normal(0.0, 15.0, (60, 300))).astype(np.float32)
+    places = np.stack([np.arange(30, 300, 40), np.full(7, 30)], axis=-1).astype(float)
+    assert not bell_shaped(image, places, np.full(7, 2.5), np.full(7, 40.0), 1.0, 250.0).any()
+
+
+def test_clipped_spots_are_not_judged():
+    image, places = _spots(np.random.default_rng(7), 2.0, 600.0, 2.0)
+    # Two spots run into each other, and all that is left of the tops is a plateau.
+    image = np.minimum(np.maximum(image, np.roll(image, 3, axis=1)), np.float32(255.0))
+    assert bell_shaped(image, places, np.full(7, 4.0), np.full(7, 215.0), 2.0, 250.0).all()
