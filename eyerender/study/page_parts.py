@@ -17,7 +17,7 @@ Apart = tuple[Sequence[FeatureDifference], Sequence[GazeDifference]]
 
 OBSERVERS = (
     "'Analytic' features come from ray optics, 'image' features from rendered images with the sensor's noise, "
-    "'image-noiseless' features from the same renderings exposed without it."
+    "'image-noiseless' features from renderings of the same seed exposed without it."
 )
 WHAT = (
     "'published' does what the authors' software did, with all its departures from the paper's text; 'corrected' does "
