@@ -52,29 +52,31 @@ def fit_rim(
     if edges.points_px.shape[0] < 8:
         return f"only {edges.points_px.shape[0]} edge points around the darkest blob"
     uneven = UNEVEN * float(np.sqrt(np.prod(candidate.ellipse.semi_axes_px)))
-    expected_noise_px = float(np.hypot(expected_noise_px, uneven))
-    tolerance = float(np.clip(3.5 * expected_noise_px, 0.35, 2.5))
-    start = _consensus(edges, candidate, settings, tolerance)
+    expected_px = float(np.hypot(expected_noise_px, uneven))
+    start = _consensus(edges, candidate, settings, float(np.clip(3.5 * expected_px, 0.35, 2.5)))
     if start is None:
         return "no ellipse passes through the edges around the darkest blob"
-    rim = _polished(edges, start, settings, tolerance)
+    rim = _polished(edges, start, settings, float(np.clip(3.5 * expected_px, 0.35, 2.5)))
     if isinstance(rim, str) or rim.residual_px < 1.3 * expected_noise_px:
         return rim
-    freed = _without_lid(edges, rim, expected_noise_px)
+    # Parts of an uneven margin fit an ellipse better than the whole, but not as well as the edges' noise allows.
+    freed, allowed = _without_lid(edges, rim, expected_noise_px, 0.7 * expected_noise_px), expected_noise_px
+    if freed is None and rim.residual_px >= 1.3 * expected_px:
+        freed, allowed = _without_lid(edges, rim, expected_px), expected_px
     if freed is None:
         return rim
-    again = _polished(edges, freed, settings, max(0.35, 3.5 * expected_noise_px), free=True)
+    again = _polished(edges, freed, settings, max(0.35, 3.5 * allowed), free=True)
     return rim if isinstance(again, str) or again.residual_px > 0.8 * rim.residual_px else again
 
 
-def _without_lid(edges: EdgePoints, rim: RimFit, expected_noise_px: float) -> Ellipse | None:
+def _without_lid(edges: EdgePoints, rim: RimFit, expected_noise_px: float, within_px: float = np.inf) -> Ellipse | None:
     """The ellipse without the stretch of rim that is a lid's margin, if there is one.
 
     A margin that crosses the pupil gives edges inside the true rim, and an ellipse drawn through both fits neither.
     Every window of an eighth to nearly a half of the outline is left out in turn; the best is taken when the rest then
-    fits 1.4 times better and the edges left out lie inside the new ellipse.
+    fits 1.4 times better, and within `within_px`, and the edges left out lie inside the new ellipse.
     """
-    best, best_rms = None, rim.residual_px / 1.4
+    best, best_rms = None, min(rim.residual_px / 1.4, within_px)
     for cut in _cuts(edges, rim, 12, (0.12, 0.2, 0.3, 0.42), 1.6):
         if cut.residual_px < best_rms and cut.hidden_px < -max(2.0 * cut.residual_px, expected_noise_px):
             best, best_rms = cut.ellipse, cut.residual_px
