@@ -93,9 +93,12 @@ stop_ticker() {
     printf '\r                              \r' >&2
 }
 
-# The build backend is installed first and used without isolation: it is pinned too, and fetched once.
+# The build backends are installed first and used without isolation: they are pinned too, and fetched once. Setuptools is
+# for the one package of the tests (jsonpath-rw) that has no wheel.
 install() {
-    pip install --no-input --progress-bar off -c "$root/constraints.txt" hatchling editables &&
+    case $1 in *test*) backends="hatchling editables setuptools" ;; *) backends="hatchling editables" ;; esac
+    # shellcheck disable=SC2086
+    pip install --no-input --progress-bar off -c "$root/constraints.txt" $backends &&
         pip install --no-input --progress-bar off -c "$root/constraints.txt" --no-build-isolation -e "$1"
 }
 

@@ -274,7 +274,7 @@ def test_observers_on_the_head_mounted_rig(tmp_path):
         assert pupil["sd_mm"] == pytest.approx(np.hypot(pupil["sd_x_px"], pupil["sd_y_px"]) * 0.0583, rel=0.05)
         assert features[observer, "all glints"]["median_distance_px"] < 0.1
     page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("<svg") == 2
+    assert page.count("<svg") == 3
 
 
 def test_directions_of_the_head_mounted_rig():
