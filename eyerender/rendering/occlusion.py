@@ -45,11 +45,13 @@ def visible_arcs_deg(part: NDArray[np.uint8], pupil: int, points_px: Floats, ori
     """
     height, width = part.shape
     x, y = points_px[:, 0] - origin_px[0], points_px[:, 1] - origin_px[1]
-    away = ndimage.distance_transform_edt(part != pupil) if np.any(part == pupil) else np.full(part.shape, np.inf)
+    k = int(reach_px)
+    ball = np.hypot(*np.mgrid[-k : k + 1, -k : k + 1]) <= reach_px
+    near = ndimage.binary_dilation(part == pupil, structure=ball)
     column, row = np.rint(x).astype(int), np.rint(y).astype(int)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     seen = np.zeros(len(x), dtype=bool)
-    seen[inside] = away[row[inside], column[inside]] <= reach_px
+    seen[inside] = near[row[inside], column[inside]]
     centre = points_px.mean(axis=0)
     angle = np.degrees(np.arctan2(points_px[:, 1] - centre[1], points_px[:, 0] - centre[0])) % 360
     order = np.argsort(angle)
