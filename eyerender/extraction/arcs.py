@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -53,48 +52,57 @@ def fit_rim(
         return f"only {edges.points_px.shape[0]} edge points around the darkest blob"
     uneven = UNEVEN * float(np.sqrt(np.prod(candidate.ellipse.semi_axes_px)))
     expected_px = float(np.hypot(expected_noise_px, uneven))
-    start = _consensus(edges, candidate, settings, float(np.clip(3.5 * expected_px, 0.35, 2.5)))
+    tolerance = float(np.clip(3.5 * expected_px, 0.35, 2.5))
+    start = _consensus(edges, candidate, settings, tolerance)
     if start is None:
         return "no ellipse passes through the edges around the darkest blob"
-    rim = _polished(edges, start, settings, float(np.clip(3.5 * expected_px, 0.35, 2.5)))
+    rim = _polished(edges, start, settings, tolerance)
     if isinstance(rim, str) or rim.residual_px < 1.3 * expected_noise_px:
         return rim
     # Parts of an uneven margin fit an ellipse better than the whole, but not as well as the edges' noise allows.
-    freed, allowed = _without_lid(edges, rim, expected_noise_px, 0.7 * expected_noise_px), expected_noise_px
+    cuts = _cuts(edges, rim, 12, (0.12, 0.2, 0.3, 0.42), 1.6)
+    freed, allowed = _without_lid(cuts, rim, expected_noise_px, 0.7 * expected_noise_px), expected_noise_px
     if freed is None and rim.residual_px >= 1.3 * expected_px:
-        freed, allowed = _without_lid(edges, rim, expected_px), expected_px
+        freed, allowed = _without_lid(cuts, rim, expected_px), expected_px
     if freed is None:
         return rim
     again = _polished(edges, freed, settings, max(0.35, 3.5 * allowed), free=True)
     return rim if isinstance(again, str) or again.residual_px > 0.8 * rim.residual_px else again
 
 
-def _without_lid(edges: EdgePoints, rim: RimFit, expected_noise_px: float, within_px: float = np.inf) -> Ellipse | None:
+def _without_lid(cuts: _Cuts, rim: RimFit, noise_px: float, within_px: float = np.inf) -> Ellipse | None:
     """The ellipse without the stretch of rim that is a lid's margin, if there is one.
 
     A margin that crosses the pupil gives edges inside the true rim, and an ellipse drawn through both fits neither.
-    Every window of an eighth to nearly a half of the outline is left out in turn; the best is taken when the rest then
-    fits 1.4 times better, and within `within_px`, and the edges left out lie inside the new ellipse.
+    Of the `cuts`, which leave every eighth to nearly a half of the outline out in turn, the best is taken when the rest
+    then fits 1.4 times better, and within `within_px`, and the edges left out lie inside the new ellipse.
     """
-    best, best_rms = None, min(rim.residual_px / 1.4, within_px)
-    for cut in _cuts(edges, rim, 12, (0.12, 0.2, 0.3, 0.42), 1.6):
-        if cut.residual_px < best_rms and cut.hidden_px < -max(2.0 * cut.residual_px, expected_noise_px):
-            best, best_rms = cut.ellipse, cut.residual_px
-    return best
+    good = cuts.residual_px < min(rim.residual_px / 1.4, within_px)
+    return cuts.best(good & (cuts.hidden_px < -np.maximum(2.0 * cuts.residual_px, noise_px)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Cut:
-    """An ellipse through a rim's points without a stretch: its width as a share of the outline, the rest's root mean
-    square distance, and the median signed distance of the points left out (negative inside)."""
+class _Cuts:
+    """Ellipses through a rim's points without a stretch, (m,) each but centre and axes (m, 2): the stretch's width as a
+    share of the outline, the rest's root mean square distance, and the median signed distance of the points left out
+    (negative inside)."""
 
-    ellipse: Ellipse
-    width: float
-    residual_px: float
-    hidden_px: float
+    centre_px: Array
+    semi_axes_px: Array
+    angle_rad: Array
+    width: Array
+    residual_px: Array
+    hidden_px: Array
+
+    def best(self, which: Mask) -> Ellipse | None:
+        """Of `which`, the one that the rest fits best."""
+        if not which.any():
+            return None
+        i = int(np.argmin(np.where(which, self.residual_px, np.inf)))
+        return Ellipse(self.centre_px[i], self.semi_axes_px[i], float(self.angle_rad[i]))
 
 
-def _cuts(edges: EdgePoints, rim: RimFit, least: int, shares: tuple[float, ...], largest: float) -> Iterator[_Cut]:
+def _cuts(edges: EdgePoints, rim: RimFit, least: int, shares: tuple[float, ...], largest: float) -> _Cuts:
     """Every stretch of these widths left out of a rim in turn, if `least` points are left and the ellipse stays alike:
     its longer axis below `largest` times the rim's."""
     points = edges.points_px[rim.inliers]
@@ -108,19 +116,32 @@ def _cuts(edges: EdgePoints, rim: RimFit, least: int, shares: tuple[float, ...],
     enough = (left >= least) & (left < points.shape[0] - 3)
     outside, left, widths = outside[enough], left[enough], widths[enough]
     if left.size == 0:
-        return
+        return _Cuts(np.zeros((0, 2)), np.zeros((0, 2)), *np.zeros((4, 0)))
     ranks = np.argsort(~outside, axis=1, kind="stable")  # the points kept, in order, come first
     take = (np.arange(40)[None, :] * left[:, None] / 40.0).astype(np.intp)
     fits = fit_ellipse_direct(points[np.take_along_axis(ranks, take, axis=1)])
     a, b = rim.ellipse.semi_axes_px
-    for i in np.nonzero(fits.ok)[0]:
-        axes = fits.semi_axes_px[i]
-        if axes[0] > largest * a or axes[1] < 0.7 * b:
-            continue
-        ellipse = Ellipse(fits.centre_px[i], axes, float(fits.angle_rad[i]))
-        distance = signed_distance(ellipse, points)
-        rms = float(np.sqrt(np.mean(distance[outside[i]] ** 2)))
-        yield _Cut(ellipse, float(widths[i, 0]), rms, float(np.median(distance[~outside[i]])))
+    with np.errstate(invalid="ignore"):
+        alike = fits.ok & (fits.semi_axes_px[:, 0] <= largest * a) & (fits.semi_axes_px[:, 1] >= 0.7 * b)
+    outside, left = outside[alike], left[alike]
+    placed = (fits.centre_px[alike], fits.semi_axes_px[alike], fits.angle_rad[alike])
+    distance = _distances(points, *placed)
+    residual = np.sqrt(np.einsum("mn,mn,mn->m", distance, distance, outside) / left)
+    # The median of the points left out: in every row they come first when the others are moved to the end.
+    hidden = np.sort(np.where(outside, np.inf, distance), axis=1)
+    low, high = (points.shape[0] - left - 1) // 2, (points.shape[0] - left) // 2
+    row = np.arange(left.size)
+    return _Cuts(*placed, widths[alike, 0], residual, 0.5 * (hidden[row, low] + hidden[row, high]))
+
+
+def _distances(points: Array, centre: Array, axes: Array, angle: Array) -> Array:
+    """(m, n) signed distances, as `signed_distance`, of points (n, 2) to ellipses: centre, axes (m, 2), angle (m,)."""
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    a, b = axes[:, :1], axes[:, 1:]
+    dx, dy = points[None, :, 0] - centre[:, :1], points[None, :, 1] - centre[:, 1:]
+    p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
+    radius = np.sqrt(p * p + q * q)
+    return np.asarray((radius - 1.0) * radius / np.maximum(np.sqrt((p / a) ** 2 + (q / b) ** 2), 1e-12))
 
 
 def rims_without_stretch(
@@ -130,13 +151,11 @@ def rims_without_stretch(
 
     What is left out must lie inside, as a lid's margin does that crosses the pupil.
     """
-    best: dict[float, _Cut] = {}
-    for cut in _cuts(edges, rim, 8, (0.2, 0.3, 0.42, 0.52), 2.0):
-        known = best.get(cut.width)
-        if cut.hidden_px < -2.0 * cut.residual_px and (known is None or cut.residual_px < known.residual_px):
-            best[cut.width] = cut
+    cuts = _cuts(edges, rim, 8, (0.2, 0.3, 0.42, 0.52), 2.0)
+    inside = cuts.hidden_px < -2.0 * cuts.residual_px
+    best = (cuts.best(inside & (cuts.width == width)) for width in np.unique(cuts.width))
     tolerance = max(0.35, 3.5 * expected_noise_px)
-    rims = (_polished(edges, cut.ellipse, settings, tolerance, free=True) for cut in best.values())
+    rims = (_polished(edges, one, settings, tolerance, free=True) for one in best if one is not None)
     return [one for one in rims if isinstance(one, RimFit)]
 
 
