@@ -209,6 +209,10 @@ class Scene:
             named += [*region.head.files, *([] if region.head.texture is None else [region.head.texture])]
         return tuple(Path(name) for name in named)
 
+    def located(self) -> SceneSpec:
+        """The spec with its files as absolute paths, a head's manifest read: it means the same in every folder."""
+        return self.spec.model_copy(update={"ambient": self.ambient, "region": self.region})
+
     def eye(self, side: Literal["right", "left"] | str) -> Eye:
         """The numeric eye of one side at the scene's wavelength, with its pupil's size and margin."""
         eye = self.spec.eye

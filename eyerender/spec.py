@@ -115,6 +115,8 @@ def file_digest(path: Path) -> str:
     """SHA-256 of a file's bytes; raises `InputError` where it cannot be read."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
+    except FileNotFoundError:
+        raise InputError("no such file", source=str(path)) from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", source=str(path)) from None
 

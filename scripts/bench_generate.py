@@ -120,7 +120,7 @@ class Bench:
             made = plan(count * workers, count)
             with tempfile.TemporaryDirectory() as folder:
                 clock = Clock(workers)
-                job = Job(made.to_mapping(), frames_of(made), folder, self.backend, 1)
+                job = Job.of(made, frames_of(made), Path(folder), self.backend, 1)
                 lost = LocalPool(job, workers).run(range(workers), clock)
                 if lost:
                     raise RuntimeError(str(lost))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -11,6 +11,9 @@ from ..errors import EyerenderError, InputError
 from .app import app
 from .options import Backend, Eye, Overwrite, Result, Seed, Threads, positive
 from .output import emit, progress, say
+
+if TYPE_CHECKING:
+    from ..scene import Scene
 
 
 @app.command(name="generate")
@@ -122,12 +125,12 @@ def sample(
     if not 0 <= index < plan.spec.count:
         raise InputError(f"must be 0 to {plan.spec.count - 1}, not {index}", source="I")
     found = realise(plan, index)
-    if found.sample is None:
+    if found.sample is None or found.scene is None:
         raise InputError(f"sample {index} is given up: {found.rejections[-1].reason}", source=plan.source)
     data = {"schema": "eyerender/sample/1", **found.sample.to_mapping()}
     data["rejections"] = [f"{r.of}, attempt {r.attempt}: {r.reason}" for r in found.rejections]
     if output is not None:
-        _write_sample(output, data)
+        _write_sample(output, found.scene)
     text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100).rstrip()
     emit(data, text, json)
     return 0
@@ -157,7 +160,7 @@ def preview(
     from ..dataset.plan import Plan
     from ..dataset.sheet import FORMATS, write_sheet
     from ..dataset.spec import shipped_datasets
-    from ..scene import Scene, is_dataset, load_scene
+    from ..scene import is_dataset, load_scene
 
     if output.suffix.lower() not in FORMATS:
         raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(output))
@@ -231,17 +234,16 @@ def _part(text: str | None) -> tuple[int, int]:
     return int(k), int(n)
 
 
-def _write_sample(folder: Path, data: dict[str, Any]) -> None:
-    from ..eye.spec import EyeSpec
+def _write_sample(folder: Path, scene: Scene) -> None:
     from ..imagefolder import refuse_non_empty
-    from ..scene import SceneSpec
 
     refuse_non_empty(folder, False)
-    scene = {**data["scene"], "eye": {**data["scene"].get("eye", {}), "model": "eye.yaml"}}
+    spec = scene.located()
+    spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": "eye.yaml"})})
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        EyeSpec.from_mapping(data["eye"]).dump(folder / "eye.yaml")
-        SceneSpec.from_mapping(scene).dump(folder / "scene.yaml")
+        scene.eye_spec.dump(folder / "eye.yaml")
+        spec.dump(folder / "scene.yaml")
     except OSError as error:
         raise EyerenderError(f"{folder}: cannot be written ({error.strerror or error})") from None
 

@@ -24,6 +24,8 @@ from .worker import Job
 # What finds a libLLVM or a GPU's driver on the driver's machine finds it on the others, installed alike.
 PASSED_ON = ("DRJIT_LIBLLVM_PATH", "DRJIT_LIBCUDA_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "XDG_CACHE_HOME")
 
+_FAILURES = {"backend": BackendError, "input": InputError, "disk": EyerenderError}
+
 
 class ShardActor:
     """A worker on a cluster; Ray makes it an actor."""
@@ -45,6 +47,8 @@ class ShardActor:
         except OSError as error:
             reason = f"{self._job.folder}: cannot be written ({error.strerror or error})"
             return {"ok": False, "kind": "disk", "reason": reason}
+        except InputError as error:
+            return {"ok": False, "kind": "input", "reason": str(error)}
         except EyerenderError as error:
             return {"ok": False, "kind": "disk", "reason": str(error)}
         self._made += staged.images
@@ -78,7 +82,7 @@ class RayEngine:
         """Make shards; returns those that were given up, with the reason.
 
         Raises:
-            InputError: Ray is not installed, or the cluster cannot be reached.
+            InputError: Ray is not installed, or the cluster cannot be reached; or as the local engine.
             BackendError, EyerenderError: as the local engine.
         """
         try:
@@ -133,9 +137,7 @@ class RayEngine:
                     self._again(job.shard, reason, pending, tries, lost, events)
                     continue
                 if not answer["ok"]:
-                    if answer["kind"] == "backend":
-                        raise BackendError(answer["reason"])
-                    raise EyerenderError(answer["reason"])
+                    raise _FAILURES[answer["kind"]](answer["reason"])
                 if answer["worker"] not in known:
                     known.add(answer["worker"])
                     events.ready(answer["backend"], answer["worker"])

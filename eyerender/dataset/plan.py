@@ -19,8 +19,9 @@ from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
 from ..scene import Scene, SceneSpec
 from .draws import is_draw, unit_number
+from .files import check_files, sums_of_files
 from .spec import DatasetSpec, find_dataset
-from .template import Template, Turn
+from .template import Template, Turn, possible
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Sample:
     """One sample as drawn: a plain mapping `scene` that `SceneSpec` validates, and the eye file it looks with.
 
     `eye` is the eye file's mapping; `modified` tells whether it differs from the model's own. `draws`: every draw of
-    the spec by its path, None where it was not asked for.
+    the spec by its path, None where it was not asked for. `base` is what files that the scene names are relative to.
     """
 
     turn: Turn
@@ -37,11 +38,12 @@ class Sample:
     eye: dict[str, Any]
     modified: bool
     draws: dict[str, Any]
+    base: Path
 
     def build(self) -> Scene:
         """The scene ready to be observed; raises `InputError` where the drawn values do not go together."""
         spec = SceneSpec.from_mapping(self.scene, source=f"sample {self.turn.sample}")
-        scene = Scene(spec, _eye(json.dumps(self.eye, sort_keys=True)), spec.rig.build())
+        scene = Scene(spec, _eye(json.dumps(self.eye, sort_keys=True)), spec.rig.build(), self.base)
         scene.eye("right")
         return scene
 
@@ -63,10 +65,15 @@ class Sample:
 
 @dataclass(frozen=True)
 class Plan:
-    """A dataset spec with the eye files it names."""
+    """A dataset spec with the eye files it names, and check sums of the other files that its scenes name.
+
+    `files`: SHA-256 by name, relative to the folder `base`, in which a run finds them wherever its workers are.
+    """
 
     spec: DatasetSpec
     eyes: Mapping[str, Mapping[str, Any]]
+    files: Mapping[str, str]
+    base: Path
     source: str = ""
 
     @classmethod
@@ -88,12 +95,15 @@ class Plan:
 
     @classmethod
     def of(cls, spec: DatasetSpec, *, base: Path | None = None, source: str = "") -> Plan:
-        """Check the template and read the eye files it names (relative to `base`)."""
+        """Check the template, read the eye files it names and sum up its other files.
+
+        All are relative to `base`, by default the current folder. Raises `InputError` where one cannot be read.
+        """
         eyes: dict[str, Mapping[str, Any]] = {}
         eye_part = spec.scene.get("eye", {})
         if is_draw(eye_part):
             raise InputError("give its values draws of their own, not the whole eye", source=source, path="scene.eye")
-        names = _possible(eye_part.get("model", "E2")) if isinstance(eye_part, Mapping) else ["E2"]
+        names = possible(eye_part.get("model", "E2")) if isinstance(eye_part, Mapping) else ["E2"]
         for name in names:
             if not isinstance(name, str):
                 raise InputError(f"must be names of eyes, not {name!r}", source=source, path="scene.eye.model")
@@ -104,7 +114,8 @@ class Plan:
                 if error.source == file and error.reason.startswith("no such"):
                     raise InputError(f"{name!r}: {error.reason}", source=source, path="scene.eye.model") from None
                 raise
-        plan = cls(spec, eyes, source)
+        folder = (Path.cwd() if base is None else base).resolve()
+        plan = cls(spec, eyes, sums_of_files(spec.scene, folder), folder, source)
         for name in spec.eye_parameters:
             if name not in eyes:
                 raise InputError("no sample looks with this eye", source=source, path=f"eye_parameters.{name}")
@@ -126,18 +137,23 @@ class Plan:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the spec and of the eye files it names."""
-        text = json.dumps({"spec": self.spec.to_mapping(), "eyes": self.eyes}, sort_keys=True, separators=(",", ":"))
+        """SHA-256 of the spec and of the content of every file it names."""
+        text = json.dumps(self.to_mapping(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
     def to_mapping(self) -> dict[str, Any]:
-        """What `from_mapping` reads back, without files."""
-        return dict(_sorted({"spec": self.spec.to_mapping(), "eyes": self.eyes}))
+        """What `from_mapping` reads back, without the eye files; `files` only where there are any."""
+        data: dict[str, Any] = {"spec": self.spec.to_mapping(), "eyes": self.eyes}
+        return dict(_sorted(data | ({"files": self.files} if self.files else {})))
 
     @classmethod
-    def from_mapping(cls, data: Mapping[str, Any]) -> Plan:
-        """The plan that another process has."""
-        return cls(DatasetSpec.from_mapping(data["spec"]), data["eyes"])
+    def from_mapping(cls, data: Mapping[str, Any], base: Path) -> Plan:
+        """The plan that another process has, its files relative to `base`."""
+        return cls(DatasetSpec.from_mapping(data["spec"]), data["eyes"], data.get("files", {}), base)
+
+    def check_files(self) -> None:
+        """Raise `InputError` where a file that the scenes name is no longer what it was when the plan was made."""
+        check_files(self.files, self.base)
 
     @cached_property
     def _splits(self) -> dict[int, str] | None:
@@ -186,7 +202,7 @@ class Plan:
         if "seed" not in tree:
             tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
         eye, eye_drawn, modified = self._eye_of(tree, turn)
-        return Sample(turn, self.split_of(subject), tree, eye, modified, drawn | eye_drawn)
+        return Sample(turn, self.split_of(subject), tree, eye, modified, drawn | eye_drawn, self.base)
 
     @cached_property
     def _identities(self) -> dict[int, tuple[int, tuple[str, ...]]]:
@@ -248,15 +264,6 @@ def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
 def _eye(text: str) -> EyeSpec:
     """An eye file from its JSON; the frames of a subject share it, and with it what was computed for it."""
     return EyeSpec.from_mapping(json.loads(text))
-
-
-def _possible(node: Any) -> list[Any]:
-    """Every value a node of the template can take."""
-    if not is_draw(node):
-        return [node]
-    kind = node.get("draw")
-    values = [node.get("value")] if kind == "fixed" else node.get("values") or []
-    return [leaf for value in values for leaf in _possible(value)]
 
 
 def _sorted(node: Any) -> Any:

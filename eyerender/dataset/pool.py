@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
-from ..errors import BackendError, EyerenderError
+from ..errors import BackendError, EyerenderError, InputError
 from .shard import Staged
 from .worker import Job, work
 
@@ -69,6 +69,7 @@ class LocalPool:
 
         Raises:
             BackendError: a worker has nothing to render with.
+            InputError: a file that the scenes name cannot be used, or has changed.
             EyerenderError: the disk is full or not writable.
         """
         pending, tries, lost = deque(shards), Counter[int](), dict[int, str]()
@@ -160,6 +161,8 @@ class LocalPool:
             worker.shard = None
         elif kind == "failed" and message[1] == "backend":
             raise BackendError(message[2])
+        elif kind == "failed" and message[1] == "input":
+            raise InputError(message[2])
         elif kind == "failed" and message[1] == "disk":
             raise EyerenderError(message[2])
         else:

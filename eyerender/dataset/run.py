@@ -59,7 +59,8 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
         A summary: schema eyerender/generate/1.
 
     Raises:
-        InputError: the folder is taken, held by another run, or of another spec or version; the spec makes no sample.
+        InputError: the folder is taken, held by another run, or of another spec or version; the spec makes no sample;
+            a file that its scenes name cannot be used, or has changed.
         BackendError: there is nothing to render with.
         EyerenderError: the disk is full or not writable, or shards were given up after repeated tries.
     """
@@ -82,7 +83,12 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
             if options.overwrite and n == 1:
                 _clear(folder)
             resumed = begin(folder, plan)
-            return _Run(plan, folder, options, frames, progress, say).make(resumed)
+            try:
+                return _Run(plan, folder, options, frames, progress, say).make(resumed)
+            except InputError:
+                if not resumed and n == 1 and not finished(folder):
+                    _clear(folder)  # nothing can come of it
+                raise
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
     except KeyboardInterrupt:
@@ -174,7 +180,7 @@ class _Run:
     def _engine(self, shards: int) -> Engine:
         options = self.options
         workers, threads = worker_count(options, shards)
-        job = Job(self.plan.to_mapping(), self.frames, str(self.folder.resolve()), options.backend, threads)
+        job = Job.of(self.plan, self.frames, self.folder, options.backend, threads)
         if options.engine == "ray":
             from .cluster import RayEngine
 

@@ -46,8 +46,10 @@ def begin(folder: Path, plan: Plan) -> bool:
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError("does not describe a run of this version", source=str(path)) from None
     # Python's own version shapes no byte; it may differ from machine to machine.
-    skip = ("versions.python",)
-    changes = [c for c in differences(found, json.loads(json.dumps(mine))) if not c.startswith((*skip, "digest:"))]
+    skip = ("versions.python:", "digest:", "files.", "files:")
+    changes = [c for c in differences(found, json.loads(json.dumps(mine))) if not c.startswith(skip)]
+    old = found.get("files", {})
+    changes = [f"{name}: other content" for name, content in plan.files.items() if old.get(name) != content] + changes
     if changes:
         more = f"; and {len(changes) - _SHOWN} more" if len(changes) > _SHOWN else ""
         raise InputError(

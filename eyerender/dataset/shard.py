@@ -58,10 +58,12 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
 
     Raises:
         OSError, EyerenderError: the disk is full or not writable.
+        InputError: a file that the scenes name cannot be used, or is not what it was when the plan was made.
     """
     start = time.monotonic()
     stage = folder / f"{STAGE}{shard_name(shard)}-{uuid.uuid4().hex[:12]}"
     try:
+        maker.plan.check_files()
         samples = maker.plan.spec.shard_samples(shard)
         kinds = KINDS if maker.plan.spec.labels.amodal_masks else KINDS[:2]
         for kind in kinds:
@@ -79,6 +81,7 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
                     lines.write(json.dumps({"schema": IMAGE_SCHEMA, **names, **image.line}, allow_nan=False) + "\n")
                 count += len(made.images)
                 on_sample(k + 1, len(made.images))
+        maker.plan.check_files()  # a shard is of one state of them
         seconds = time.monotonic() - start
         done = {
             "schema": SHARD_SCHEMA,

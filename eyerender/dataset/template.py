@@ -124,6 +124,14 @@ class Template:
         raise KeyError(path)
 
 
+def possible(node: Any) -> list[Any]:
+    """Every value that a node of a template can take; none for numbers that are drawn at random."""
+    if not is_draw(node):
+        return [node]
+    values = [node.get("value")] if node.get("draw") == "fixed" else node.get("values") or []
+    return [leaf for value in values for leaf in possible(value)]
+
+
 def _label(draw: Draw, value: Any, k: int) -> Any:
     """How a drawn value is recorded, of one type for every sample: the value, or which it is of unlike ones."""
     if isinstance(draw, FixedDraw):

@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from ..errors import BackendError, EyerenderError
+from ..errors import BackendError, EyerenderError, InputError
 from .maker import Maker
 from .plan import Plan
 from .shard import write_shard
@@ -19,23 +19,30 @@ from .shard import write_shard
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What every worker of a run is told: the plan, frames a sample, the folder, where and with how many threads."""
+    """What every worker of a run is told: the plan and the folder of its files, frames a sample, the folder to write,
+    where and with how many threads. Folders are absolute, for a worker may be started in any."""
 
     plan: dict[str, Any]
+    base: str
     frames: int
     folder: str
     backend: str
     threads: int
 
+    @classmethod
+    def of(cls, plan: Plan, frames: int, folder: Path, backend: str, threads: int) -> Job:
+        """The job of a plan."""
+        return cls(plan.to_mapping(), str(plan.base), frames, str(folder.resolve()), backend, threads)
+
     def maker(self) -> Maker:
         """The worker's maker."""
-        plan = Plan.from_mapping(self.plan)
+        plan = Plan.from_mapping(self.plan, Path(self.base))
         return Maker(plan, self.frames, backend=self.backend, threads=self.threads)  # type: ignore[arg-type]
 
 
 def work(pipe: Connection, job: Job) -> None:
     """The worker's life. Messages out: ("ready", backend), ("sample", shard, samples, images), ("done", summary),
-    ("failed", kind, reason) with kind backend, disk or error. In: a shard's number, or None to end."""
+    ("failed", kind, reason) with kind backend, input, disk or error. In: a shard's number, or None to end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     threading.Thread(target=_die_with_parent, daemon=True).start()
     try:
@@ -60,6 +67,8 @@ def work(pipe: Connection, job: Job) -> None:
             pipe.send(("done", asdict(write_shard(maker, folder, shard, alive))))
         except OSError as error:
             pipe.send(("failed", "disk", f"{folder}: cannot be written ({error.strerror or error})"))
+        except InputError as error:
+            pipe.send(("failed", "input", str(error)))
         except EyerenderError as error:
             pipe.send(("failed", "disk", str(error)))
         except Exception as error:

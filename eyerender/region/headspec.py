@@ -4,6 +4,7 @@ stand. It may stand in the scene, or in a manifest beside the mesh that the scen
 from __future__ import annotations
 
 import json
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -58,7 +59,7 @@ class HeadSpec(Spec):
     @property
     def manifest(self) -> bool:
         """Whether all else stands in a manifest."""
-        return isinstance(self.file, str) and self.file.lower().endswith(".json")
+        return isinstance(self.file, str) and is_manifest(self.file)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -86,18 +87,38 @@ class HeadSpec(Spec):
         base = Path.cwd() if base is None else base.resolve()
         if self.manifest:
             path = base / self.files[0]
-            return _read_manifest(path).resolved(path.parent)
+            return read_manifest(path).resolved(path.parent)
         files = tuple(str(base / f) for f in self.files)
         texture = None if self.texture is None else str(base / self.texture)
         return self.model_copy(update={"file": files, "texture": texture})
 
 
-def _read_manifest(path: Path) -> HeadSpec:
+def is_manifest(name: str) -> bool:
+    """Whether a file name is that of a manifest, not of a mesh."""
+    return name.lower().endswith(".json")
+
+
+def read_manifest(path: Path) -> HeadSpec:
+    """What a manifest says, its paths relative to it; read again when the file has changed.
+
+    Raises:
+        InputError: it is missing, not readable, or no manifest of a head.
+    """
+    try:
+        state = path.stat()
+    except FileNotFoundError:
+        raise InputError("no such file", source=str(path)) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", source=str(path)) from None
+    return _manifest(path, (state.st_mtime_ns, state.st_size))
+
+
+@lru_cache(maxsize=16)
+def _manifest(path: Path, state: tuple[int, int]) -> HeadSpec:
+    del state
     source = str(path)
     try:
         data: Any = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError("no such file", source=source) from None
     except (OSError, ValueError) as error:
         raise InputError(f"is not a readable manifest ({error})", source=source) from None
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:

@@ -49,7 +49,7 @@ def test_a_killed_actor_is_started_again_and_nothing_is_lost(tmp_path):
         def retry(self, shard, reason, tries):
             retries.append((shard, reason))
 
-    job = Job(made.to_mapping(), frames_of(made), str(tmp_path), "auto", 1)
+    job = Job.of(made, frames_of(made), tmp_path, "auto", 1)
     lost = RayEngine(job, 1).run([0, 1, 2, 3], Listener())
     assert lost == {}
     assert sorted(shards) == [0, 1, 2, 3]

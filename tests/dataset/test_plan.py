@@ -71,7 +71,7 @@ def test_a_sample_depends_on_nothing_but_spec_and_index():
     again = plan()
     backwards = [again.draw(i).to_mapping() for i in reversed(range(24))]
     assert backwards[::-1] == forwards
-    sent = Plan.from_mapping(pickle.loads(pickle.dumps(plan().to_mapping())))
+    sent = Plan.from_mapping(pickle.loads(pickle.dumps(plan().to_mapping())), plan().base)
     assert sent.digest == plan().digest
     assert sent.draw(11).to_mapping() == forwards[11]
     assert plan(seed=6).draw(11).draws != forwards[11]["draws"]

@@ -57,7 +57,7 @@ class Listener:
 
 def pool(folder, workers=1, **options):
     made = plan()
-    return LocalPool(Job(made.to_mapping(), frames_of(made), str(folder), "auto", 1), workers, **options)
+    return LocalPool(Job.of(made, frames_of(made), folder, "auto", 1), workers, **options)
 
 
 def test_the_folder_is_as_agreed(tiny):

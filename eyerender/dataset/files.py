@@ -1,0 +1,72 @@
+"""The files that a dataset's scenes name, HDR maps and head meshes: which they are, and what they hold.
+
+Their content shapes the images as the spec does, so its check sums are a part of what a run is, by the names that the
+spec gives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..region.headspec import is_manifest, read_manifest
+from ..spec import file_digest
+from .template import possible
+
+
+def sums_of_files(scene: Mapping[str, Any], base: Path) -> dict[str, str]:
+    """Name -> SHA-256 of every file that a scene of the template may name, a manifest's own files included.
+
+    Names are as they are written, those in a manifest as seen from `base`, which all are relative to.
+
+    Raises:
+        InputError: one is missing or cannot be read.
+    """
+    return {name: _sum(base / name) for name in sorted(set(_names(scene, base)))}
+
+
+def check_files(files: Mapping[str, str], base: Path) -> None:
+    """Raise `InputError` where a file holds something else than its sum says; cheap while no file changes."""
+    for name, wanted in files.items():
+        if _sum(base / name) != wanted:
+            raise InputError("has changed since the run began", source=str(base / name))
+
+
+def _names(scene: Mapping[str, Any], base: Path) -> Iterator[str]:
+    yield from _texts(scene, "ambient", "map", "file")
+    yield from _texts(scene, "region", "head", "texture")
+    for name in _texts(scene, "region", "head", "file"):
+        yield name
+        if is_manifest(name):
+            head = read_manifest(base / name)
+            inside = (*head.files, *(() if head.texture is None else (head.texture,)))
+            yield from (str(Path(name).parent / file) for file in inside)
+
+
+def _texts(node: Any, *keys: str) -> Iterator[str]:
+    """Every text that may stand at a place of a template, or in a list there."""
+    for value in possible(node):
+        if keys and isinstance(value, Mapping):
+            yield from _texts(value.get(keys[0]), *keys[1:])
+        elif not keys and isinstance(value, str):
+            yield value
+        elif not keys and isinstance(value, list | tuple):
+            for entry in value:
+                yield from _texts(entry)
+
+
+def _sum(path: Path) -> str:
+    try:
+        state = path.stat()
+    except OSError:
+        return file_digest(path)  # says what is wrong with it
+    return _kept_sum(path, (state.st_mtime_ns, state.st_size, state.st_ino))
+
+
+@lru_cache(maxsize=256)
+def _kept_sum(path: Path, state: tuple[int, int, int]) -> str:
+    del state
+    return file_digest(path)
