@@ -61,7 +61,8 @@ class RegionScene:
         params["vertex_positions"] = mi.Float(posed.vertices.astype(np.float32).ravel())
         params["vertex_normals"] = mi.Float(posed.normals.astype(np.float32).ravel())
         params.update()
-        self.scene = mi.load_dict({"type": "scene", "region": mesh})
+        # Without robust intersections rays slip between the triangles of a large face, on some processors.
+        self.scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "region": mesh})
         self._params: Any = mi.traverse(self.scene)
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
         self.map = texture(

@@ -36,7 +36,8 @@ class Surround:
     """The Mitsuba scene of the surround; `show` changes its look in place."""
 
     def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
-        parts: dict[str, Any] = {"type": "scene", "backdrop": self._backdrop()}
+        # Without robust intersections rays slip between neighbouring triangles, on some processors.
+        parts: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True, "backdrop": self._backdrop()}
         for i, body in enumerate(obstacles):
             material = _matte(mi.TensorXf(np.full((1, 1, 1), body.albedo, np.float32)))
             parts[f"obstacle{i}"] = _mesh(f"obstacle{i}", body.vertices_mm, body.faces, None, material)
