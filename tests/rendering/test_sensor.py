@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import ndimage
+from scipy import ndimage, special, stats
 
 from eyerender.rendering import psf
-from eyerender.rendering.sensor import electrons, expose, radiance_to_irradiance
+from eyerender.rendering.sensor import electrons, expose, photon_counts, radiance_to_irradiance
 from eyerender.rig.sensor import SensorSpec
 
 
@@ -47,6 +47,25 @@ def test_noise_belongs_to_the_seed():
     image = np.full((20, 20), 0.01)
     assert np.array_equal(expose(sensor, image, 850.0, 5), expose(sensor, image, 850.0, 5))
     assert not np.array_equal(expose(sensor, image, 850.0, 5), expose(sensor, image, 850.0, 6))
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.02, 1.0, 7.5, 11.99, 12.0, 20.0, 150.0, 6000.0, 33000.0])
+def test_photon_counts_are_quantiles_of_poisson(mean):
+    normal = np.linspace(-4.0, 4.0, 40001)
+    expected = stats.poisson.ppf(special.ndtr(normal), mean) if mean else np.zeros(40001)
+    counts = photon_counts(np.full(40001, mean), normal)
+    # The expansion's error moves a count where a quantile falls on a whole number: rarely, and by one at 4 sigma.
+    assert np.abs(counts - expected).max() <= 1
+    assert np.mean((counts != expected) * stats.norm.pdf(normal)) < 1e-3 * np.mean(stats.norm.pdf(normal))
+
+
+def test_a_pixel_does_not_move_the_noise_of_others():
+    rng = np.random.default_rng(1)
+    image = rng.uniform(0.0, 0.02, (40, 30))
+    other = image.copy()
+    other[7, 11] *= 1.5
+    changed = expose(SensorSpec(), image, 850.0, 5) != expose(SensorSpec(), other, 850.0, 5)
+    assert np.argwhere(changed).tolist() == [[7, 11]]
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.7, 1.5, 4.0])
