@@ -9,7 +9,7 @@ import os
 import warnings
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,15 +28,18 @@ def write_png(path: str | Path, image: NDArray[Any]) -> None:
     path = Path(path)
     part = path.with_name(f".{path.name}.part")
     try:
-        # Noise does not compress, and writing must not cost more than rendering: run lengths alone are faster and, for
-        # noise and for masks, smaller than zlib's search for repetitions.
-        Image.fromarray(np.ascontiguousarray(image)).save(
-            part, format="PNG", compress_level=1, compress_type=zlib.Z_RLE
-        )
+        encode_png(part, image)
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def encode_png(target: Path | BinaryIO, image: NDArray[Any]) -> None:
+    """Write an image as `write_png` has it, to a file or a buffer."""
+    # Noise does not compress, and writing must not cost more than rendering: run lengths alone are faster and, for
+    # noise and for masks, smaller than zlib's search for repetitions.
+    Image.fromarray(np.ascontiguousarray(image)).save(target, format="PNG", compress_level=1, compress_type=zlib.Z_RLE)
 
 
 def read_image(path: str | Path) -> tuple[NDArray[Any], int]:

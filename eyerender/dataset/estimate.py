@@ -5,12 +5,11 @@ from __future__ import annotations
 import io
 import json
 import time
-import zlib
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
+from ..imagefile import encode_png
 from .maker import Maker
 from .plan import Plan
 from .realise import frames_of
@@ -41,7 +40,8 @@ def estimate(plan: Plan, options: Options) -> dict[str, Any]:
                 continue
             began = time.perf_counter()
             made = maker.make(sample)
-            size = sum(_bytes(image.dn) + _bytes(image.mask) + len(json.dumps(image.line)) for image in made.images)
+            pictures = [picture for image in made.images for picture in image.pictures.values()]
+            size = sum(map(_bytes, pictures)) + sum(len(json.dumps(image.line)) for image in made.images)
             times.append(time.perf_counter() - began)
             sizes.append(size)
             images.append(len(made.images))
@@ -64,5 +64,5 @@ def estimate(plan: Plan, options: Options) -> dict[str, Any]:
 
 def _bytes(image: Any) -> int:
     buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(image)).save(buffer, format="PNG", compress_level=1, compress_type=zlib.Z_RLE)
+    encode_png(buffer, image)
     return buffer.tell()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import io
 from typing import Any
 
@@ -67,7 +68,12 @@ def eye_picture(
             )
             parts.append(_cross(seen.pupil.centre_px[row] - shift, 2.2, diagonal=name == "found"))
         for j in np.flatnonzero(seen.glints.ok[row]):
-            parts.append(_cross(seen.glints.xy_px[row, j] - shift, 3.2, diagonal=name == "found"))
+            place, diagonal = seen.glints.xy_px[row, j] - shift, name == "found"
+            if seen.glints.light[row, j] >= 0:
+                parts.append(_cross(place, 3.2, diagonal=diagonal))
+            else:  # seen, but of no light: small and faint, with the reason
+                reason = html.escape(str(seen.glints.reason[row, j] or "of no known light"))
+                parts.append(f'<g opacity=".6"><title>{reason}</title>{_cross(place, 1.6, diagonal=diagonal)}</g>')
         parts.append("</g>")
     parts.append("</svg>")
     return "".join(parts)
