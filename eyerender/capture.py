@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -84,7 +83,7 @@ def render_windows(
             row,
             camera,
             done.window,
-            done.dn.astype(np.uint8) if scene.spec.sensor.bit_depth == 8 else done.dn,
+            _stored(scene, done.dn),
             done.irradiance,
             labels.part,
             {
@@ -177,31 +176,21 @@ def render_folder(
     threads: int | None = None,
     overwrite: bool = False,
     exr: bool = False,
-    noiseless: str | Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Render a scene into a folder of labelled images (docs/formats.md); complete or not at all.
 
-    `noiseless` is a second folder, of the same renderings exposed without the sensor's noise: what the scene with
-    `sensor.noise: false` gives.
-
     Returns:
         What was written: schema eyerender/render/1, path, number of images.
     """
-    scenes = {Path(path): scene}
-    if noiseless is not None:
-        scenes[Path(noiseless)] = without_noise(scene)
-    for place in scenes:
-        refuse_non_empty(place, overwrite)  # before the work, not after it
+    refuse_non_empty(path, overwrite)  # before the work, not after it
     truth = observe(scene)
     records = list(truth.records())
     lines: list[dict[str, Any]] = []
     spec = scene.spec
-    with ExitStack() as stack:
-        folders = [stack.enter_context(staged(place, overwrite=overwrite)) for place in scenes]
-        for folder in folders:
-            (folder / "images").mkdir()
-            (folder / "masks").mkdir()
+    with staged(path, overwrite=overwrite) as folder:
+        (folder / "images").mkdir()
+        (folder / "masks").mkdir()
         for image in render_windows(scene, truth, backend=backend, threads=threads, progress=progress):
             line: dict[str, Any] = {
                 "file_name": f"images/{image.name}.png",
@@ -219,31 +208,28 @@ def render_folder(
                     "camera": image.camera,
                 },
             }
-            for folder, told in zip(folders, scenes.values(), strict=True):
-                write_png(folder / line["file_name"], image.dn if told is scene else _exposed(told, image))
-                write_png(folder / line["mask_file_name"], image.mask)
+            write_png(folder / line["file_name"], image.dn)
+            write_png(folder / line["mask_file_name"], image.mask)
             if exr:
                 from .rendering.exr import write_exr
 
-                write_exr(folders[0] / "images" / f"{image.name}.exr", image.irradiance)
+                write_exr(folder / "images" / f"{image.name}.exr", image.irradiance)
             lines.append(line)
         statistics = {"images": len(lines), "observations": len(truth)}
-        for folder, told in zip(folders, scenes.values(), strict=True):
-            write_dataset(folder, lines, spec=told.spec.to_mapping(), digest=told.digest(), statistics=statistics)
+        write_dataset(folder, lines, spec=spec.to_mapping(), digest=scene.digest(), statistics=statistics)
     return {"schema": "eyerender/render/1", "path": str(path), "images": len(lines)}
 
 
-def without_noise(scene: Scene) -> Scene:
-    """The scene with a sensor that has no noise."""
-    sensor = scene.spec.sensor.model_copy(update={"noise": False})
-    return replace(scene, spec=scene.spec.model_copy(update={"sensor": sensor}))
-
-
-def _exposed(scene: Scene, image: WindowImage) -> NDArray[Any]:
-    """A rendered window as the noiseless sensor of a scene counts it."""
+def noiseless(scene: Scene, image: WindowImage) -> NDArray[Any]:
+    """A rendering of a scene exposed once more, without the sensor's noise: what `sensor.noise: false` gives."""
     from .rendering.sensor import expose
 
-    dn = expose(scene.spec.sensor, image.irradiance.astype(float), scene.spec.wavelength_nm, scene.spec.seed)
+    sensor = scene.spec.sensor.model_copy(update={"noise": False})
+    return _stored(scene, expose(sensor, image.irradiance.astype(float), scene.spec.wavelength_nm, 0))
+
+
+def _stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
+    """Counts in the type that they are written with."""
     return dn.astype(np.uint8) if scene.spec.sensor.bit_depth == 8 else dn
 
 

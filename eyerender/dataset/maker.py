@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import BackendName, make_renderer, render_windows
+from ..capture import BackendName, WindowImage, make_renderer, noiseless, render_windows
 from ..observation import EYES
+from ..scene import Scene
 from .labels import image_labels
 from .plan import Plan
 from .realise import Realised, Rejection, realise
@@ -22,12 +23,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MadeImage:
-    """An image of a sample: its name without ending, sensor counts, masks, and its line of metadata (without files)."""
+    """An image of a sample: its name without ending, its pictures by kind (`LabelsSpec.pictures`), and its line of
+    metadata (without files)."""
 
     name: str
-    dn: NDArray[Any]
-    mask: NDArray[np.uint8]
-    amodal: NDArray[np.uint8] | None
+    pictures: dict[str, NDArray[Any]]
     line: dict[str, Any]
 
 
@@ -97,11 +97,19 @@ class Maker:
                     "eye_json": json.dumps({k: v for k, v in sample.eye.items() if k != "sources"}, sort_keys=True),
                 },
             }
-            amodal = image.rendered.labels
-            yield MadeImage(
-                name,
-                image.dn,
-                image.mask,
-                amodal.amodal if self.plan.spec.labels.amodal_masks and amodal is not None else None,
-                line,
-            )
+            kinds = self.plan.spec.labels.pictures
+            yield MadeImage(name, {kind: _PICTURES[kind](scene, image) for kind in kinds}, line)
+
+
+def _amodal(scene: Scene, image: WindowImage) -> NDArray[np.uint8]:
+    labels = image.rendered.labels
+    assert labels is not None
+    return labels.amodal
+
+
+_PICTURES: dict[str, Callable[[Scene, WindowImage], NDArray[Any]]] = {
+    "images": lambda _, image: image.dn,
+    "masks": lambda _, image: image.mask,
+    "amodal_masks": _amodal,
+    "noiseless": noiseless,
+}

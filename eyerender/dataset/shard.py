@@ -28,7 +28,13 @@ SHARD_SCHEMA = "eyerender/shard/1"
 DONE, SHARDS = "done.json", "shards"
 # Not called metadata.jsonl: loaders of image folders would read it besides the dataset's own.
 LINES = "lines.jsonl"
-KINDS = ("images", "masks", "amodal_masks")
+# Kind of picture -> what a line of metadata calls its file.
+KINDS = {
+    "images": "file_name",
+    "masks": "mask_file_name",
+    "amodal_masks": "amodal_mask_file_name",
+    "noiseless": "noiseless_file_name",
+}
 # The rooms and modules that a sample's bytes come from.
 SHAPING = {
     "analytic", "arrays", "capture", "dataset", "eye", "geometry", "imagefile", "imagefolder", "observation", "optics",
@@ -65,7 +71,7 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
     try:
         maker.plan.check_files()
         samples = maker.plan.spec.shard_samples(shard)
-        kinds = KINDS if maker.plan.spec.labels.amodal_masks else KINDS[:2]
+        kinds = maker.plan.spec.labels.pictures
         for kind in kinds:
             (stage / kind).mkdir(parents=True)
         (stage / "shard").mkdir()
@@ -108,15 +114,11 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
 
 
 def _write_image(stage: Path, shard: int, image: MadeImage) -> dict[str, str]:
-    """Write an image and its masks; returns their names in the dataset."""
+    """Write an image's pictures; returns their names in the dataset."""
     file = f"{image.name}.png"
-    write_png(stage / "images" / file, image.dn)
-    write_png(stage / "masks" / file, image.mask)
-    names = {"file_name": _place("images", shard, file), "mask_file_name": _place("masks", shard, file)}
-    if image.amodal is not None:
-        write_png(stage / "amodal_masks" / file, image.amodal)
-        names["amodal_mask_file_name"] = _place("amodal_masks", shard, file)
-    return names
+    for kind, picture in image.pictures.items():
+        write_png(stage / kind / file, picture)
+    return {KINDS[kind]: _place(kind, shard, file) for kind in image.pictures}
 
 
 def commit(folder: Path, staged: Staged) -> None:

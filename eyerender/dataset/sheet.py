@@ -90,7 +90,7 @@ def _of_plan(plan: Plan, backend: BackendName, threads: int | None) -> Iterator[
             raise InputError(f"sample {made.index} cannot be made: {made.rejections[-1].reason}", source=plan.source)
         image = made.images[0]
         caption = f"{image.line['split']} sample {made.index} subject {image.line['subject']}"
-        yield count, _tile(image.dn, image.line["bit_depth"], caption)
+        yield count, _tile(image.pictures["images"], image.line["bit_depth"], caption)
 
 
 def _of_scene(scene: Scene, backend: BackendName, threads: int | None) -> Iterator[tuple[int, Tile]]:

@@ -20,6 +20,13 @@ class LabelsSpec(Spec):
 
     boundary_points: Annotated[int, Field(ge=6, le=360)] = Field(default=30, description="of the pupil, in the record")
     amodal_masks: bool = Field(default=False, description="also masks of the eye as if nothing stood before it")
+    noiseless: bool = Field(default=False, description="also each image without the sensor's noise, of one rendering")
+
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """The kinds of pictures that every image has; each kind has a folder of its own."""
+        more = {"amodal_masks": self.amodal_masks, "noiseless": self.noiseless}
+        return ("images", "masks", *(kind for kind, wanted in more.items() if wanted))
 
 
 class DatasetSpec(FileSpec):

@@ -152,6 +152,10 @@ def _image(entry: ImageEntry, quick: bool, tally: _Tally) -> Iterator[str]:
     if float(image.max()) > full:
         yield f"has values above {full:g}"
     tally.take(image, full)
+    if line.get("noiseless_file_name"):
+        quiet, _ = read_image(entry.folder / line["noiseless_file_name"])
+        if quiet.shape != image.shape or float(quiet.max()) > full:
+            yield "its noiseless image has another shape or values above its range"
     if entry.mask_path is None:
         return
     mask, _ = read_image(entry.mask_path)

@@ -126,12 +126,13 @@ class Renderer:
         values = self._bind(job).values
         place = self._place(job)
         margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
-        irradiance = blurred * sensor.radiance_to_irradiance(job.sensor)
-        dn = sensor.expose(job.sensor, irradiance, job.wavelength_nm, job.seed)
+        irradiance = frozen(blurred * sensor.radiance_to_irradiance(job.sensor), np.float32)
+        # Of the irradiance as it is given away, so that exposing that again gives the same counts.
+        dn = sensor.expose(job.sensor, irradiance.astype(float), job.wavelength_nm, job.seed)
         labels = self._labels(job, values) if job.labels else None
         return RenderedWindow(
             job.window,
-            frozen(irradiance, np.float32),
+            irradiance,
             frozen(dn, np.uint16),
             job.sensor.bit_depth,
             labels,

@@ -3,7 +3,8 @@
 A camera that the eye leaves is turned about its nodal point to face it, in a sample of its own. Everything in which the
 samples differ is a `sequence` of the dataset's spec, so a study's images are a dataset like any other: made by several
 workers, shard by shard, gone on with after a kill, and valid (`eyerender validate`). Images are found again by what
-they show, the scene and the eye file, so a finished dataset also serves a study that needs a part of it.
+they show, the scene and the eye file, so a finished dataset also serves a study that needs a part of it. Rendering is
+what costs: a scene that is wanted with the sensor's noise and without it is rendered once, and exposed twice.
 """
 
 from __future__ import annotations
@@ -56,9 +57,13 @@ class StudyImages:
     entries: Mapping[str, tuple[ImageEntry, ...]]
     spp: int | None = None
 
+    def of(self, scene: Scene) -> tuple[ImageEntry, ...]:
+        """The images of a shot's scene, in frame order; none where they were not made."""
+        return self.entries.get(_digest(scene), ())
+
     def holds(self, scene: Scene) -> bool:
         """Whether every image of a shot's scene is there."""
-        found = self.entries.get(_digest(scene), ())
+        found = self.of(scene)
         return len(found) == len(scene.frames()) and all(entry.path.is_file() for entry in found)
 
     def observe(self, scene: Scene) -> Observations:
@@ -67,7 +72,7 @@ class StudyImages:
 
         if not self.holds(scene):
             raise InputError("its images are not in the study's dataset", source=scene.name)
-        return ImageObserver().observe_entries(self.entries[_digest(scene)], scene.frames().index, scene)
+        return ImageObserver().observe_entries(self.of(scene), scene.frames().index, scene)
 
 
 def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[Shot]:
@@ -121,7 +126,7 @@ def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) ->
     scenes = list({_digest(scene): scene for scene in scenes}.values())
     found = read_images(settings.folder)
     if found is None or not all(found.holds(scene) for scene in scenes):
-        plan = Plan.of(dataset_spec(study, scenes, settings.spp), source=str(settings.folder))
+        plan = Plan.of(dataset_spec(study, scenes), source=str(settings.folder))
         options = Options(
             workers=settings.workers,
             backend=settings.backend,
@@ -142,10 +147,16 @@ def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) ->
     return replace(found, spp=settings.spp)
 
 
-def dataset_spec(study: str, scenes: Sequence[Scene], spp: int | None = None) -> Any:
-    """The spec of a dataset of scenes, the same ones for each eye model: a grid of models, a sequence of scenes."""
+def dataset_spec(study: str, scenes: Sequence[Scene]) -> Any:
+    """The spec of a dataset of scenes, the same ones for each eye model: a grid of models, a sequence of scenes.
+
+    A scene without noise that is also wanted with noise is no sample of its own: its images stand beside the others.
+    """
     from ..dataset.spec import DatasetSpec
 
+    wanted = len(scenes)
+    beside = {_digest(without_noise(scene)) for scene in scenes if scene.spec.sensor.noise}
+    scenes = [scene for scene in scenes if scene.spec.sensor.noise or _digest(scene) not in beside]
     by_model: dict[str, list[dict[str, Any]]] = {}
     for scene in scenes:
         data = scene.spec.to_mapping()
@@ -161,13 +172,14 @@ def dataset_spec(study: str, scenes: Sequence[Scene], spp: int | None = None) ->
             "kind": "dataset",
             "name": f"{study}, images",
             "description": "What the image observer of a study sees. A subject is an eye model; a sample is one eye at "
-            "one head position, all its fixations, with the sensor's noise or without it.",
+            "one head position, all its fixations.",
             "count": len(scenes),
             "subjects": len(by_model),
             "shard_size": max(1, _SHARD_IMAGES // len(scenes[0].frames())),
             "splits": {"study": 1.0},
             "require": "nothing",
             "attempts": 1,
+            "labels": {"noiseless": len(scenes) < wanted},
             "scene": template,
         }
     )
@@ -196,11 +208,12 @@ def read_images(folder: Path) -> StudyImages | None:
         with open(folder / METADATA, encoding="utf-8") as lines:
             for text in lines:
                 line = json.loads(text)
-                shown = line["parameters"]
+                eye, frame = line["parameters"]["eye_json"], line["records"][0]["frame"]
                 # Only what extraction reads is kept: a line's labels take many times as much memory.
-                kept = {key: line[key] for key in ("file_name", "window_px", "bit_depth")} | {"records": [{}]}
-                key = _digest_of(shown["scene_json"], shown["eye_json"])
-                found.setdefault(key, []).append((line["records"][0]["frame"], ImageEntry(folder, kept)))
+                kept = {key: line[key] for key in ("window_px", "bit_depth")} | {"records": [{}]}
+                for scene, name in _exposures(line):
+                    entry = ImageEntry(folder, {"file_name": name, **kept})
+                    found.setdefault(_digest_of(scene, eye), []).append((frame, entry))
     except (OSError, ValueError, KeyError, TypeError, IndexError):
         return None
     # A dataset's lines need not stand in the order of its samples.
@@ -219,6 +232,23 @@ def _begun(folder: Path, plan: Any) -> bool:
         return bool(found["digest"] == plan.digest and found["versions"] == run_versions())
     except (OSError, ValueError, KeyError, TypeError):
         return False
+
+
+def without_noise(scene: Scene) -> Scene:
+    """The scene with a sensor that has no noise."""
+    sensor = scene.spec.sensor.model_copy(update={"noise": False})
+    return replace(scene, spec=scene.spec.model_copy(update={"sensor": sensor}))
+
+
+def _exposures(line: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The scenes, as JSON, that a line of metadata has an image of, each with the image's name."""
+    scene = line["parameters"]["scene_json"]
+    out = [(scene, line["file_name"])]
+    if line.get("noiseless_file_name"):
+        data = json.loads(scene)
+        data["sensor"]["noise"] = False
+        out.append((json.dumps(data, sort_keys=True), line["noiseless_file_name"]))
+    return out
 
 
 def _digest(scene: Scene) -> str:

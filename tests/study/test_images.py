@@ -20,7 +20,15 @@ from eyerender.dataset.validate import validate
 from eyerender.imagefile import read_image
 from eyerender.scene import Scene, SceneSpec
 from eyerender.study import blignaut, guestrin
-from eyerender.study.images import ImageSettings, dataset_spec, in_sequence, make_images, read_images, shots
+from eyerender.study.images import (
+    ImageSettings,
+    dataset_spec,
+    in_sequence,
+    make_images,
+    read_images,
+    shots,
+    without_noise,
+)
 from eyerender.study.observing import Observing
 from eyerender.study.replicate import facing, scenes_of
 from eyerender.study.run import run_study
@@ -41,23 +49,35 @@ def small_scenes(eyes=("E1", "E2")):
 
 @pytest.mark.parametrize("module", [guestrin, blignaut])
 def test_the_dataset_says_exactly_what_the_study_observes(module):
-    """Every sample of the plan, in order, is one of the study's own shots: scene, eye file, seed and all."""
+    """Every sample of the plan, in order, is one of the study's own noisy shots: scene, eye file, seed and all; the
+    others are the same without noise, and exposed beside them."""
     scenes = scenes_of(module, ("E1", "E5"), ("published", "corrected"))
-    wanted = [
-        shot.scene
-        for scene in scenes
-        for kind in ("image", "image-noiseless")
-        for shot in Observing(kind).shots(scene, facing=facing(module), spp=4)
-    ]
-    spec = dataset_spec("study", wanted, 4)
+
+    def wanted_by(*kinds):
+        return [
+            shot.scene
+            for scene in scenes
+            for kind in kinds
+            for shot in Observing(kind).shots(scene, facing=facing(module), spp=4)
+        ]
+
+    wanted, quiet = wanted_by("image"), wanted_by("image-noiseless")
+    spec = dataset_spec("study", wanted_by("image", "image-noiseless"))
     plan = Plan.of(spec)
-    assert spec.count == len(wanted) == 2 * 2 * (15 if module is guestrin else 4)
+    assert spec.labels.noiseless
+    assert [s.spec for s in quiet] == [without_noise(s).spec for s in wanted]
+    assert spec.count == len(wanted) == 2 * 2 * (15 if module is guestrin else 4) / 2
     for k, scene in enumerate(wanted):
         sample = plan.draw(k)
         assert sample.scene == scene.spec.to_mapping()
         assert sample.eye["name"] == scene.eye_spec.name
         assert sample.turn.subject == k // (len(wanted) // 2)
     assert {w.spec.image.spp for w in wanted} == {4}
+    # One of them alone is a dataset without the other.
+    for alone in (wanted, quiet):
+        spec = dataset_spec("study", alone)
+        assert (spec.count, spec.labels.noiseless) == (len(alone), False)
+        assert Plan.of(spec).draw(0).scene == alone[0].spec.to_mapping()
     assert {len(w.frames()) for w in wanted} == {9 if module is guestrin else 135}
 
 
@@ -89,22 +109,28 @@ def test_images_are_made_once_and_a_part_of_them_serves_too(tmp_path):
     scenes = small_scenes()
     made = make_images("small", scenes, ImageSettings(tmp_path / "images", workers=1))
     report = validate(tmp_path / "images")
-    assert (report["ok"], report["images"]) == (True, len(scenes) * 3)
+    assert (report["ok"], report["images"]) == (True, len(scenes) // 2 * 3)
     stamps = {p: p.stat().st_mtime_ns for p in (tmp_path / "images").rglob("*")}
-    again = make_images("small", scenes[:2], ImageSettings(tmp_path / "images", workers=1))
-    assert again == made
+    for part in (scenes[:2], [s for s in scenes if not s.spec.sensor.noise]):
+        assert make_images("small", part, ImageSettings(tmp_path / "images", workers=1)) == made
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "images").rglob("*")} == stamps
     lines = tmp_path / "images" / "metadata.jsonl"
     lines.write_text("".join(reversed(lines.read_text().splitlines(keepends=True))))  # their order means nothing
     assert read_images(tmp_path / "images") == made
     # An image is the one that its scene says: pupil and glints lie where ray optics has them.
-    for scene in scenes[:2]:
+    for scene in scenes[:4]:
         truth, seen = observe(scene), made.observe(scene)
         np.testing.assert_allclose(seen.pupil.centre_px, truth.pupil.centre_px, atol=0.5)
     # Noise is all that tells the two exposures apart: the same places within what single pixels vary by.
-    noisy, quiet = (read_image(made.entries[key][0].path)[0] / 257 for key in list(made.entries)[0:3:2])
+    noisy, quiet = (read_image(made.of(scene)[0].path)[0] / 257 for scene in scenes[0:3:2])
+    assert scenes[2].spec == without_noise(scenes[0]).spec
     assert 0.3 < np.std(noisy - quiet) < 10
     assert abs(np.mean(noisy - quiet)) < 0.5
+    # Made on their own, the noiseless ones are the same images.
+    alone = make_images("small", scenes[2:4], ImageSettings(tmp_path / "alone", workers=1))
+    for scene in scenes[2:4]:
+        for own, beside in zip(alone.of(scene), made.of(scene), strict=True):
+            assert own.path.read_bytes() == beside.path.read_bytes()
 
 
 KILLED = """
@@ -144,7 +170,7 @@ def test_image_study_resumes(tmp_path):
     arguments = {"observer": "both", "protocol": "corrected", "eyes": ("E2",), "spp": 4}
     first = run_study("guestrin2006", tmp_path / "out", **arguments)
     images = sorted((tmp_path / "out" / "images").rglob("*.png"))
-    assert len(images) == 2 * 2 * 90  # images and masks, with noise and without
+    assert len(images) == 3 * 90  # images with noise and without it, and masks
     stamps = [p.stat().st_mtime_ns for p in images]
     again = run_study("guestrin2006", tmp_path / "out", **arguments)
     assert [p.stat().st_mtime_ns for p in images] == stamps

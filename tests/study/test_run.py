@@ -10,12 +10,9 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import observe
-from eyerender.capture import render_folder, without_noise
 from eyerender.cli.app import run
 from eyerender.errors import InputError
-from eyerender.imagefile import read_image
-from eyerender.imagefolder import ImageFolder, same_run
-from eyerender.scene import Scene, SceneSpec, load_scene
+from eyerender.scene import load_scene
 from eyerender.study import guestrin, head_mounted, observers_compared
 from eyerender.study.conditions import PARAMETERS, TRACKERS, conditions_part
 from eyerender.study.images import StudyImages, facing_scene
@@ -231,31 +228,6 @@ def test_conditions_of_all_models(tmp_path):
     assert [m["eye_model"] for m in summary["models"]] == ["E1", "E2", "E3", "E4", "E5"]
     lost = [e for m in summary["models"] for e in m["sensitivity"] for t in TRACKERS if e[t]["reason"]]
     assert lost == []
-
-
-@pytest.mark.render
-def test_noiseless_images_are_those_of_a_noiseless_sensor(tmp_path):
-    """Exposed beside the noisy ones, or rendered on their own: the same images, and the same run to resume."""
-    scene = replace_image(head_mounted.scene("E2"), poses=1, window=(160, 120))
-    render_folder(scene, tmp_path / "noisy", noiseless=tmp_path / "beside")
-    quiet = without_noise(scene)
-    render_folder(quiet, tmp_path / "own")
-    assert same_run(tmp_path / "beside", quiet.digest())
-    assert not same_run(tmp_path / "noisy", quiet.digest())
-    noisy, beside, own = (
-        read_image(ImageFolder.load(tmp_path / n).entries[0].path)[0].astype(int) for n in ("noisy", "beside", "own")
-    )
-    # The irradiance is kept in single precision, which may turn a count that lies between two.
-    assert np.abs(beside - own).max() <= 1
-    assert np.mean(beside != own) < 0.01
-    assert np.std(noisy - beside) > 0.5
-
-
-def replace_image(scene, poses, window):
-    data = scene.spec.to_mapping()
-    data["poses"] = data["poses"][:poses]
-    data["image"] |= {"window_px": list(window), "spp": 1}
-    return Scene.of(SceneSpec.from_mapping(data))
 
 
 @pytest.mark.render

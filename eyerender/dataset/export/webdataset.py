@@ -1,6 +1,6 @@
 """WebDataset: tar files of at most 1000 images a split; NAME.png, NAME.mask.png and NAME.json make a sample.
 
-Where the dataset has amodal masks, NAME.amodal.png too."""
+Where the dataset has amodal masks or noiseless images, NAME.amodal.png or NAME.noiseless.png too."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def write(items: Items, out: Path) -> None:
             _add(tars[split], f"{item.name}.png", item.entry.path.read_bytes())
             if item.entry.mask_path is not None:
                 _add(tars[split], f"{item.name}.mask.png", item.entry.mask_path.read_bytes())
-            if item.line.get("amodal_mask_file_name"):
-                whole = item.entry.folder / item.line["amodal_mask_file_name"]
-                _add(tars[split], f"{item.name}.amodal.png", whole.read_bytes())
+            for ending, key in (("amodal", "amodal_mask_file_name"), ("noiseless", "noiseless_file_name")):
+                if item.line.get(key):
+                    _add(tars[split], f"{item.name}.{ending}.png", (item.entry.folder / item.line[key]).read_bytes())
             _add(tars[split], f"{item.name}.json", json.dumps(item.line).encode())
     finally:
         for tar in tars.values():
