@@ -29,6 +29,7 @@ from ..errors import InputError
 from ..rig.imaging import MapSpec
 from ..spec import file_digest
 from .exr import second_thread
+from .lidshade import LidShade
 from .values import PANEL_WIDTH, Panels
 
 _WIDTH, _HEIGHT = 1024, 512
@@ -182,9 +183,16 @@ class Ambience:
     """Even light, panels and a surrounding, as the integrator asks for them; kernels depend on none of the numbers."""
 
     def __init__(
-        self, even_mw_mm2: float, panels: np.ndarray[Any, np.dtype[np.float64]], spec: MapSpec | None, maps: Maps
+        self,
+        even_mw_mm2: float,
+        panels: np.ndarray[Any, np.dtype[np.float64]],
+        spec: MapSpec | None,
+        maps: Maps,
+        lids: LidShade | None = None,
     ) -> None:
-        """`panels` (n, 13) as `frame.panel_table` has them; the map's rays are those of the world's axes."""
+        """`panels` (n, 13) as `frame.panel_table` has them; the map's rays are those of the world's axes; `lids` of a
+        scene with an eye region."""
+        self.lids = lids
         self._panels = Panels(panels)
         self._count = dr.opaque(mi.UInt32, len(panels))
         table = np.ascontiguousarray(panels, dtype=np.float32).reshape(-1)

@@ -72,8 +72,14 @@ def _radiance(
         scene_of = values.point_to_scene
         axis = values.vector_to_scene(values["stop.normal"])
         even = textures.panels.irradiance(scene_of(view.point), values.vector_to_scene(view.normal))
+        within = textures.panels.irradiance(scene_of(view.inner), axis) * _THROUGH * index * index
+        if values.structure.region:
+            reaching = textures.panels.lids.share(scene_of(view.point))
+            # Of the region only what is wet lies between the lids.
+            even *= 1 - dr.clip(10 * view.gloss - 4.5, 0, 1) * (1 - reaching)
+            within *= reaching
         rest += cover * albedo * even * dr.inv_pi
-        inner += textures.panels.irradiance(scene_of(view.inner), axis) * _THROUGH * index * index
+        inner += within
         rest += view.mirrored * (1 - cover) * _mirrored_ambient(values, textures.panels, scene, view, d)
     behind = dr.if_stmt(
         (view.inner,),

@@ -32,6 +32,7 @@ from .frame import (
 from .glints import POINT, GlintScene, GlintTable, Image, Spots, glint_table, quadrature
 from .head import place_scene
 from .integrator import integrator_class
+from .lidshade import LidShade
 from .lighting import through_cornea
 from .occlusion import glint_reason, lid_margins_px
 from .purkinje import purkinje_images
@@ -204,7 +205,10 @@ class Renderer:
         textures = self._textures_of(job)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
-            ambience = Ambience(even, panel_table(job.ambient, anchor), job.ambient.map, self._maps)
+            lids = None
+            if isinstance(place, RegionScene) and job.region is not None:
+                lids = LidShade(place.posed, job.region.lids.margin_mm)
+            ambience = Ambience(even, panel_table(job.ambient, anchor), job.ambient.map, self._maps, lids)
             textures = replace(textures, panels=ambience)
         if isinstance(place, RegionScene):
             textures = replace(textures, region=place.map)
