@@ -11,18 +11,14 @@ when a `must` is missed.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import sys
 import time
 import tracemalloc
+from collections.abc import Iterator
 from dataclasses import fields
-from importlib.metadata import version
-from typing import Any
 
 import numpy as np
+from _bench import Report, Row, options_of, row
 
 from eyerender.analytic.features import Features, features, fixations
 from eyerender.eye.catalogue import load_eye
@@ -56,48 +52,40 @@ def cost_us(name: str, frames: int, runs: int) -> float:
     return min(observe(name, frames, seed)[0] for seed in range(runs)) / (2 * frames) * 1e6
 
 
-def row(name: str, value: float, unit: str, must: float | None = None, aim: float | None = None) -> dict[str, Any]:
-    """One line of the result; smaller is better everywhere here."""
-    met = None if must is None else bool(value <= must)
-    return {"name": name, "value": value, "unit": unit, "must": must, "aim": aim, "met": met}
-
-
-def measure(quick: bool) -> list[dict[str, Any]]:
-    """All rows."""
+def measure(quick: bool) -> Iterator[Row]:
+    """All rows, as they are measured."""
     frames, runs, most = (2_000, 4, 10_000) if quick else (10_000, 8, 100_000)
     for name in EYES:
         observe(name, 100)
     cost = {name: cost_us(name, frames, runs) for name in EYES}
-    rows = [
-        row("E2, fixation + 30 points + glint", cost["E2"], "us/frame and eye", 25.0, 10.0),
-        row("E4 / E2", cost["E4"] / cost["E2"], "ratio", 2.0),
-        row("E5 / E2", cost["E5"] / cost["E2"], "ratio", 3.0),
-        row("E4", cost["E4"], "us/frame and eye"),
-        row("E5", cost["E5"], "us/frame and eye"),
-    ]
+    yield row("E2, fixation + 30 points + glint", cost["E2"], "us/frame and eye", 25.0, 10.0)
+    yield row("E4 / E2", cost["E4"] / cost["E2"], "ratio", 2.0)
+    yield row("E5 / E2", cost["E5"] / cost["E2"], "ratio", 3.0)
+    yield row("E4", cost["E4"], "us/frame and eye")
+    yield row("E5", cost["E5"], "us/frame and eye")
     growth: dict[int, float] = {}
     for _ in range(5):
         # In turns, so that a busy spell of the machine falls on all sizes alike.
         for n in sorted({1_000, 10_000, most}):
             growth[n] = min(growth.get(n, np.inf), cost_us("E2", n, max(1, 20_000 // n)))
-    rows += [row(f"E2, {n} frames", c, "us/frame and eye") for n, c in growth.items()]
-    rows.append(
-        row(f"E2, slowest / fastest, 1000 to {most} frames", max(growth.values()) / min(growth.values()), "ratio", 1.2)
-    )
-    rows += [memory("E2"), memory("E5")]
+    for n, c in growth.items():
+        yield row(f"E2, {n} frames", c, "us/frame and eye")
+    spread = max(growth.values()) / min(growth.values())
+    yield row(f"E2, slowest / fastest, 1000 to {most} frames", spread, "ratio", 1.2)
+    yield memory("E2")
+    yield memory("E5")
     for name in EYES:
         _, seen, fixation = observe(name, 1_000, seed=99)
         bad = int(np.count_nonzero(seen.point_status) + np.count_nonzero(seen.glint_status))
-        rows.append(row(f"{name}, points and glints without a ray", bad, "count", 0))
-        rows.append(row(f"{name}, worst residual of a boundary point", float(seen.point_residual_mm.max()), "mm", 1e-9))
-        rows.append(row(f"{name}, worst residual of a glint", float(seen.glint_residual_mm.max()), "mm", 1e-9))
-        rows.append(row(f"{name}, worst residual of a fixation", fixation, "mm", 1e-6))
+        yield row(f"{name}, points and glints without a ray", bad, "count", 0)
+        yield row(f"{name}, worst residual of a boundary point", seen.point_residual_mm.max(), "mm", 1e-9)
+        yield row(f"{name}, worst residual of a glint", seen.glint_residual_mm.max(), "mm", 1e-9)
+        yield row(f"{name}, worst residual of a fixation", fixation, "mm", 1e-6)
     for quoted in QUOTED_MS:
-        rows.append(row(f"quoted {quoted} ms of another Python simulator / E2", quoted * 1e3 / cost["E2"], "ratio"))
-    return rows
+        yield row(f"quoted {quoted} ms of another Python simulator / E2", quoted * 1e3 / cost["E2"], "ratio")
 
 
-def memory(name: str) -> dict[str, Any]:
+def memory(name: str) -> Row:
     """How peak memory grows with the batch, over how the result does: little above 1 where chunks bound the work."""
     peaks = []
     for count in (4_000, 12_000):
@@ -114,25 +102,10 @@ def memory(name: str) -> dict[str, Any]:
 
 def main() -> int:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--quick", action="store_true", help="fewer frames and runs")
-    parser.add_argument("--json", metavar="F", help="write the result to a file")
-    options = parser.parse_args()
-    rows = measure(options.quick)
-    for r in rows:
-        bars = "".join(f"  {k} {r[k]:g}" for k in ("must", "aim") if r[k] is not None)
-        mark = "" if r["met"] is None else ("  met" if r["met"] else "  MISSED")
-        print(f"{r['name']:<58} {r['value']:>12.4g} {r['unit']:<17}{bars}{mark}")
-    if options.json:
-        result = {
-            "schema": "eyerender/bench/1",
-            "machine": {"platform": platform.platform(), "processor": platform.processor(), "cpus": os.cpu_count()},
-            "versions": {"python": platform.python_version(), **{p: version(p) for p in ("eyerender", "numpy")}},
-            "rows": rows,
-        }
-        with open(options.json, "w", encoding="utf-8") as file:
-            json.dump(result, file, indent=1)
-    return 1 if any(r["met"] is False for r in rows) else 0
+    options = options_of(__doc__, "fewer frames and runs").parse_args()
+    report = Report()
+    report.extend(measure(options.quick))
+    return report.finish(options.json, ("eyerender", "numpy", "scipy"))
 
 
 if __name__ == "__main__":

@@ -11,25 +11,20 @@ Exit 1 when a `must` is missed.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
-import json
-import os
-import platform
 import random
-import resource
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
+from _bench import Report, Row, options_of, resident_mib, row, single_threaded
+
+single_threaded()
 
 import yaml  # noqa: E402
 
@@ -40,17 +35,6 @@ from eyerender.dataset.realise import frames_of  # noqa: E402
 from eyerender.dataset.shard import Staged, write_shard  # noqa: E402
 from eyerender.dataset.spec import DatasetSpec, find_dataset  # noqa: E402
 from eyerender.dataset.worker import Job  # noqa: E402
-
-Row = dict[str, Any]
-
-
-def row(
-    name: str, value: float, unit: str, must: float | None = None, aim: float | None = None, *, at_least: bool = False
-) -> Row:
-    """A result; `must` and `aim` are upper bars, lower ones with `at_least`."""
-    bar = must if must is not None else aim
-    met = None if bar is None else bool(value >= bar if at_least else value <= bar)
-    return {"name": name, "value": float(value), "unit": unit, "must": must, "aim": aim, "met": met}
 
 
 def plan(count: int, shard_size: int, window: tuple[int, int] = (640, 480), spp: int = 4) -> Plan:
@@ -164,7 +148,7 @@ class Bench:
         maker = Maker(made, 1, backend=self.backend, threads=1)  # type: ignore[arg-type]
         with tempfile.TemporaryDirectory() as folder:
             sizes: list[float] = []
-            write_shard(maker, Path(folder), 0, lambda k, _n: sizes.append(_resident_mb()) if k % 100 == 0 else None)
+            write_shard(maker, Path(folder), 0, lambda k, _n: sizes.append(resident_mib()) if k % 100 == 0 else None)
         yield row("resident memory of a worker", sizes[-1], "MiB")
         yield row(f"its growth over {count} images", sizes[-1] - sizes[1], "MiB", must=30.0)
 
@@ -207,36 +191,14 @@ def _tree(folder: Path) -> dict[str, str]:
     }
 
 
-def _resident_mb() -> float:
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        return pages * resource.getpagesize() / 2**20
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
 def main() -> int:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer images and kills")
-    parser.add_argument("--json", metavar="F", help="write the result to a file")
+    parser = options_of(__doc__, "fewer images and kills")
     parser.add_argument("--backend", choices=["auto", "llvm", "cuda"], default="auto")
     options = parser.parse_args()
-    rows = []
-    for r in Bench(options.backend, options.quick).rows():
-        rows.append(r)
-        bars = "".join(f"  {k} {r[k]:g}" for k in ("must", "aim") if r[k] is not None)
-        mark = "" if r["met"] is None else ("  met" if r["met"] else "  MISSED")
-        print(f"{r['name']:<50} {r['value']:>11.4g} {r['unit']:<9}{bars}{mark}", flush=True)
-    if options.json:
-        result = {
-            "schema": "eyerender/bench/1",
-            "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
-            "versions": {n: version(n) for n in ("eyerender", "mitsuba", "drjit", "numpy", "pillow")},
-            "rows": rows,
-        }
-        Path(options.json).write_text(json.dumps(result, indent=1), encoding="utf-8")
-    return 1 if any(r["met"] is False and r["must"] is not None for r in rows) else 0
+    report = Report()
+    report.extend(Bench(options.backend, options.quick).rows())
+    return report.finish(options.json, ("eyerender", "mitsuba", "drjit", "numpy", "pillow"))
 
 
 if __name__ == "__main__":

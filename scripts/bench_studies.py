@@ -11,40 +11,33 @@ off, at the scenes' samples per pixel: minutes. Seconds are those of the clock, 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import platform
 import resource
 import sys
 import tempfile
 import time
-from importlib.metadata import version
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+
+from _bench import Report, Row, options_of, row
 
 from eyerender.study.literature import MODELS
 from eyerender.study.run import run_study
 
 
-def row(name: str, value: float, unit: str, must: float | None = None, aim: float | None = None) -> dict[str, Any]:
-    """One line of the result; smaller is better everywhere here."""
-    met = None if must is None else bool(value <= must)
-    return {"name": name, "value": value, "unit": unit, "must": must, "aim": aim, "met": met}
-
-
-def measure_images(quick: bool) -> list[dict[str, Any]]:
+def measure_images(quick: bool) -> Iterator[Row]:
     """Both replications with both observers; by the clock, and what the processes took."""
-    eyes, rows, total = ("E1", "E2") if quick else MODELS, [], 0.0
+    eyes, total = ("E1", "E2") if quick else MODELS, 0.0
     with tempfile.TemporaryDirectory() as place:
         for name in ("guestrin2006", "blignaut2014"):
             start, before = time.monotonic(), _processor_seconds()
             run_study(name, Path(place) / name, observer="both", eyes=eyes, workers=None, progress=_tell)
             seconds = time.monotonic() - start
             total += seconds
-            rows.append(row(f"{name} with images, {len(eyes)} models", seconds, "s"))
-            rows.append(row(f"{name} with images, processor time", _processor_seconds() - before, "s"))
-    return [*rows, row("both replications with images", total, "s", 1200)]
+            yield row(f"{name} with images, {len(eyes)} models", seconds, "s")
+            yield row(f"{name} with images, processor time", _processor_seconds() - before, "s")
+    yield row("both replications with images", total, "s", 1200)
 
 
 def _processor_seconds() -> float:
@@ -58,67 +51,49 @@ def _tell(done: int, total: int, note: str) -> None:
     print(f"\r{done}/{total} {note:<70}", end="" if done < total else "\n", file=sys.stderr, flush=True)
 
 
-def measure(quick: bool) -> list[dict[str, Any]]:
-    """All rows of the analytic studies."""
+def measure(quick: bool) -> Iterator[Row]:
+    """All rows of the analytic studies, as they are measured."""
     eyes = ("E1", "E2") if quick else MODELS
     names = ("guestrin2006", "blignaut2014") if quick else ("guestrin2006", "blignaut2014", "conditions")
     workers = len(os.sched_getaffinity(0))
-    rows, found, summaries = [], {}, {}
+    seconds, found, summaries = {}, {}, {}
     with tempfile.TemporaryDirectory() as place:
         for name in names:
             start = time.monotonic()
             summaries[name] = run_study(name, Path(place) / name, eyes=eyes, workers=workers)
-            rows.append(row(f"{name}, {len(eyes)} models, {workers} processes", time.monotonic() - start, "s"))
+            seconds[name] = time.monotonic() - start
+            yield row(f"{name}, {len(eyes)} models, {workers} processes", seconds[name], "s")
             if name == "blignaut2014" and not quick:
-                rows.append(row("both replications, analytic", rows[0]["value"] + rows[1]["value"], "s", 20))
+                yield row("both replications, analytic", sum(seconds.values()), "s", 20)
             found[name] = json.loads((Path(place) / name / "findings.json").read_text(encoding="utf-8"))["findings"]
     values = {(f["id"], f["protocol"], f["rule"]): f["value"] for f in found["guestrin2006"]}
-    rows.append(
-        row(
-            "published means of E1 to E4, largest difference from the paper",
-            next(v for k, v in values.items() if k[0] == "P1"),
-            "deg",
-            0.02,
-            0.0055,
-        )
-    )
+    farthest = next(v for k, v in values.items() if k[0] == "P1")
+    yield row("published means of E1 to E4, largest difference from the paper", farthest, "deg", 0.02, 0.0055)
     spread = [c["restarts"] for c in summaries["guestrin2006"]["calibrations"]]
     missed = sum(s["count"] - s["within_1e-4_of_the_lowest_cost"] for s in spread)
-    rows.append(row(f"random starts of {sum(s['count'] for s in spread)} that end elsewhere", missed, "count", 0))
+    yield row(f"random starts of {sum(s['count'] for s in spread)} that end elsewhere", missed, "count", 0)
     widest = max(s["h1_mean_deg"]["max"] - s["h1_mean_deg"]["min"] for s in spread)
-    rows.append(row("widest spread of the H1 error over 20 starts", widest, "deg", 1e-3))
+    yield row("widest spread of the H1 error over 20 starts", widest, "deg", 1e-3)
     if not quick:
         low = [v for k, v in values.items() if k[0] == "P2" and k[2].startswith("E5-published")]
-        rows.append(row("published variants of E5 that stay below 11 deg", sum(v <= 11 for v in low), "count", 0))
+        yield row("published variants of E5 that stay below 11 deg", sum(v <= 11 for v in low), "count", 0)
         lost = [
             e for m in summaries["conditions"]["models"] for e in m["sensitivity"] for t in e.values()
             if isinstance(t, dict) and t["reason"]
         ]  # fmt: skip
-        rows.append(row("changed eyes without a result", len(lost), "count", 0))
-    return rows
+        yield row("changed eyes without a result", len(lost), "count", 0)
 
 
 def main() -> int:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--quick", action="store_true", help="two eye models, without the conditions")
+    parser = options_of(__doc__, "two eye models, without the conditions")
     parser.add_argument("--images", action="store_true", help="also with rendered images")
-    parser.add_argument("--json", metavar="F", help="write the result to a file")
     options = parser.parse_args()
-    rows = measure(options.quick) + (measure_images(options.quick) if options.images else [])
-    result = {
-        "schema": "eyerender/bench/1",
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": len(os.sched_getaffinity(0))},
-        "versions": {n: version(n) for n in ("eyerender", "numpy", "scipy", "matplotlib")},
-        "rows": rows,
-    }
-    for r in rows:
-        verdict = "" if r["met"] is None else ("  ok" if r["met"] else "  MISSED")
-        bar = "" if r["must"] is None else f"  (must {r['must']:g})"
-        print(f"{r['name']:<75} {r['value']:>12.5g} {r['unit']}{bar}{verdict}")
-    if options.json:
-        Path(options.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    return 1 if any(r["met"] is False for r in rows) else 0
+    report = Report()
+    report.extend(measure(options.quick))
+    if options.images:
+        report.extend(measure_images(options.quick))
+    return report.finish(options.json, ("eyerender", "numpy", "scipy", "matplotlib"))
 
 
 if __name__ == "__main__":
