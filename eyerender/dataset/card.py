@@ -19,9 +19,14 @@ _LABELS = """\
 - `labels.space`: centres of rotation, globe, corneal curvature and pupil, corneal apex, optic axis, line of sight and
   target, in the world's and in the camera's frame (mm; unit vectors).
 - `labels.pose`: x_world = rotation x_eye + translation. `labels.camera`: K, R, t, distortion (OpenCV). `lights_mm`.
-- `mask_file_name`: {mask}.
+- `mask_file_name`: {mask}.{more}
 - `parameters`: every drawn value by its path in the spec (`draws`), the whole scene and eye as JSON text.
 - `subject`, `split`, `sample`, `sequence_index` (place in the subject's sequence of frames), `window_px`."""
+
+_MORE = {
+    "amodal_masks": "\n- `amodal_mask_file_name`: the same as if nothing stood before the eye.",
+    "noiseless": "\n- `noiseless_file_name`: the same rendering exposed without the sensor's noise.",
+}
 
 
 def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
@@ -54,7 +59,7 @@ made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jso
 `datasets.load_dataset("imagefolder", data_dir=..., split="train", filters=[("split", "==", "test")])` reads a split of
 the folder as it is (the loader itself calls all images `train`), without `filters` all of it.
 
-{_LABELS.format(mask=CONVENTIONS["mask"])}
+{_LABELS.format(mask=CONVENTIONS["mask"], more="".join(_MORE.get(kind, "") for kind in spec.labels.pictures))}
 
 ## Conventions
 - World frame: {CONVENTIONS["world_frame"]}.
