@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..arrays import frozen
 from ..geometry.ellipse import Ellipse
-from .bellshape import bell_shaped
+from .bellshape import about, bell_shaped
 from .fittedspots import SpotFit
 from .preprocess import DN, Image, Prepared, as_image
 from .result import GlintResult
@@ -70,14 +70,16 @@ def detect_spots(
     patches = xy[~spot & (height > 1.5 * threshold)][: settings.max_glints]
     xy, width, height = xy[spot], width[spot], height[spot]
     keep: list[int] = []
+    close = np.hypot(*np.moveaxis(xy[:, None] - xy[None], -1, 0)) <= size  # far apart they are two anyway
     for i in range(height.size):  # flat tops of clipped spots give several maxima, and so does noise on wide ones
-        if all(_parted(smooth, xy[i], xy[j], 4.0 * noise, size) for j in keep):
+        if all(_parted(smooth, xy[i], xy[j], 4.0 * noise) for j in keep if close[i, j]):
             keep.append(i)
         if len(keep) >= settings.max_glints + 8:
             break
     xy, width, height = xy[keep], width[keep], height[keep]
     alone = _above_ring(smooth, xy, width) > RING_SHARE * height
-    bell = alone & bell_shaped(crop, xy, width, height, prepared.noise_dn, prepared.clip_dn)
+    bell = alone.copy()
+    bell[alone] = bell_shaped(crop, xy, width, height, alone, prepared.noise_dn, prepared.clip_dn)
     patches = np.concatenate([patches, xy[~bell]])[: settings.max_glints]
     corner = np.array([x0, y0])
     clutter = alone & ~bell
@@ -92,20 +94,27 @@ def _above_ring(smooth: Image, xy: Array, width: Array) -> Array:
 
     Skin, lashes and the gaps between them have many peaks, and beside each others as bright.
     """
+    spots, disc = np.zeros(smooth.shape, np.uint8), 2.5 * width + 1.0
+    for (x, y), radius in zip(xy.astype(int).tolist(), disc.tolist(), strict=True):
+        n = math.floor(radius)
+        step = np.arange(-n, n + 1)
+        inside = step[None, :] ** 2 + step[:, None] ** 2 <= radius**2
+        y0, x0 = max(0, y - n), max(0, x - n)
+        part = spots[y0 : y + n + 1, x0 : x + n + 1]
+        part += inside[y0 - y + n :, x0 - x + n :][: part.shape[0], : part.shape[1]]
+    reach = 3.5 * width + 2.0
+    column, row, away2, within = about(xy, reach, smooth.shape)
+    ring = within & (away2 > ((2.2 * width + 1.0) ** 2)[:, None]) & (away2 < (reach**2)[:, None])
+    free = ring & (spots[row, column] <= (away2 <= (disc**2)[:, None]))  # no spot's but its own
+    level = np.sort(np.where(free, smooth[row, column], np.float32(np.inf)), axis=1)
+    count = free.sum(axis=1)
+    told = np.nonzero(count > 0.25 * ring.sum(axis=1))[0]
+    at = 0.9 * (count[told] - 1)
+    low = np.floor(at).astype(np.intp)
+    lower, upper = level[told, low].astype(np.float64), level[told, np.ceil(at).astype(np.intp)].astype(np.float64)
     out = np.full(width.size, np.inf)
-    for i, ((x, y), sigma) in enumerate(zip(xy.tolist(), width.tolist(), strict=True)):
-        reach = 3.5 * sigma + 2.0
-        x0, x1 = max(0, math.floor(x - reach)), min(smooth.shape[1], math.ceil(x + reach) + 1)
-        y0, y1 = max(0, math.floor(y - reach)), min(smooth.shape[0], math.ceil(y + reach) + 1)
-        columns, rows = np.arange(x0, x1)[None, :], np.arange(y0, y1)[:, None]
-        away = (columns - x) ** 2 + (rows - y) ** 2
-        ring = (away > (2.2 * sigma + 1.0) ** 2) & (away < reach**2)
-        whole = np.count_nonzero(ring)
-        apart = np.hypot(*(xy - xy[i]).T)
-        for k in np.nonzero((apart < 2.0 * reach + 2.5 * width) & (apart > 0.0))[0]:
-            ring &= (columns - xy[k, 0]) ** 2 + (rows - xy[k, 1]) ** 2 > (2.5 * width[k] + 1.0) ** 2
-        if np.count_nonzero(ring) > 0.25 * whole:
-            out[i] = float(smooth[int(y), int(x)]) - float(np.percentile(smooth[y0:y1, x0:x1][ring], 90.0))
+    peak = smooth[xy[told, 1].astype(np.intp), xy[told, 0].astype(np.intp)]
+    out[told] = peak - (lower + (at - low) * (upper - lower))
     return out
 
 
@@ -133,12 +142,9 @@ def _compact(smooth: Image, xy: Array, width: Array, height: Array) -> NDArray[n
     return np.asarray(fallen.sum(axis=1) >= 9)
 
 
-def _parted(smooth: Image, first: Array, second: Array, dip: float, size: int) -> bool:
-    """Whether the level between two maxima falls `dip` below the lower one; far apart they are two anyway."""
-    distance = float(np.hypot(*(first - second)))
-    if distance > size:
-        return True
-    t = np.linspace(0.0, 1.0, max(3, round(2.0 * distance)))[:, None]
+def _parted(smooth: Image, first: Array, second: Array, dip: float) -> bool:
+    """Whether the level between two maxima falls `dip` below the lower one."""
+    t = np.linspace(0.0, 1.0, max(3, round(2.0 * math.dist(first, second))))[:, None]
     x, y = np.rint(first + t * (second - first)).astype(np.intp).T
     between = smooth[y, x]
     return float(between.min()) < float(min(between[0], between[-1])) - dip

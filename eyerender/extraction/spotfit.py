@@ -10,36 +10,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
-from .fittedspots import SpotFit, joined, no_spots, profile
+from .fittedspots import SpotFit, no_spots
 from .preprocess import Image
+from .spotpixels import Grid, SpotPixels, cut, light_between, profile, window_radius
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 PARAMETERS = 8  # x, y, ln A, ln sx, ln sy, b0, bx, by
-MAX_TURNS = 25
+MOST_STEPS = 12
 LOST_PX = 12.0  # no glint's fit is as wide as that, or as far from where it began
-PATIENCE, WANDERING_PX = 4, 0.3  # turns after which a spot that still moves by more is given up
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Windows:
-    x: Array  # (n, 1, k) pixel coordinates
-    y: Array  # (n, k, 1)
-    data: Array  # (n, k, k)
-    known: Array  # (n, k, k) B
-    weight: Array  # (n, k, k) 1 inside the image, else 0
-    clip: NDArray[np.bool_]  # (n, k, k)
-    centre: Array  # (n, 2)
-
-    def taken(self, index: NDArray[np.intp]) -> _Windows:
-        """The chosen spots'."""
-        return _Windows(*(getattr(self, one.name)[index] for one in fields(self)))
+# Spots whose light reaches into each other's windows: turns of STEPS steps each, with the others' light as the turn
+# before left it; after PATIENCE turns a spot that still moves by WANDERING_PX is given up. The second numbers are for
+# twins, which overlap, and so must push each other apart.
+TURNS, STEPS, PATIENCE, WANDERING_PX = (4, 10), 4, (2, 4), 0.3
+STILL_PX, SAME_LIGHT = 3e-4, 0.01  # no further turn: movement, and change of the others' light in noises
+ROUND_SD = 0.3  # standard deviation of ln sx - ln sy: glints are nearly round
 
 
 def fit_spots(
@@ -52,164 +43,131 @@ def fit_spots(
     clip_dn: float,
     slope_dn: float,
 ) -> SpotFit:
-    """Fit all spots. linear: image (DN). known: B at pixels (x, y).
+    """Fit all spots. linear: image (DN). known: B at pixels (x, y), each (k,).
 
     start_px (n, 2), width_px (n,), height_dn (n,): from detection.
     slope_dn: how steep the background may be beyond `known`, DN per px (standard deviation of its prior).
 
     Spots that reach into each other's windows are fitted in turn, each on the image less the others, until they settle.
-    """
-    if start_px.shape[0] == 0:
-        return no_spots()
-    parts, order = [], []
-    for members in _groups(start_px, width_px):
-        half = int(np.clip(math.ceil(3.2 * float(np.max(width_px[members])) + 1.0), 4, 20))
-        start, width = start_px[members], width_px[members]
-        windows = _cut(linear, known, start, np.minimum(window_radius(width), half), half, clip_dn)
-        theta = _start(windows, start, width, height_dn[members])
-        others = np.zeros_like(windows.data)
-        if _touching(start, width).any():
-            theta, settled, others = _fit_in_turn(windows, theta, noise_dn, slope_dn)
-        else:
-            theta, settled = _fit(windows, theta, others, noise_dn, slope_dn)
-        parts.append(_report(windows, theta, settled, others, noise_dn, slope_dn))
-        order.append(members)
-    back = np.argsort(np.concatenate(order), kind="stable")
-    return joined(parts).taken(back)
-
-
-def window_radius(width: Array) -> Array:
-    """Radius, px, of the pixels that a spot of that sigma is fitted to."""
-    return 2.7 * width + 1.2
-
-
-def _touching(start: Array, width: Array) -> NDArray[np.bool_]:
-    """(n, n) whether one spot's light reaches into another's window."""
-    radius = window_radius(width)
-    distance = np.hypot(*np.moveaxis(start[:, None] - start[None], -1, 0))
-    return np.asarray((distance < 1.35 * (radius[:, None] + radius[None])) & ~np.eye(width.size, dtype=bool))
-
-
-def _groups(start: Array, width: Array) -> list[NDArray[np.intp]]:
-    """Spots that touch each other, group by group; lone ones together, the narrow and the wide apart."""
-    count, label = connected_components(_touching(start, width), directed=False)
-    alone = np.bincount(label, minlength=count)[label] == 1
-    groups = [np.nonzero(label == k)[0] for k in np.unique(label[~alone])]
-    narrow = width < 2.5
-    return [group for group in (np.nonzero(alone & narrow)[0], np.nonzero(alone & ~narrow)[0], *groups) if group.size]
-
-
-def _fit_in_turn(
-    windows: _Windows, theta: Array, noise_dn: float, slope_dn: float
-) -> tuple[Array, NDArray[np.bool_], Array]:
-    """(theta, settled, the others' light) of spots that share pixels.
-
     A spot that has grown or moved beyond what a glint's could, or wanders on when others have settled, is given up:
     its light is nobody's background.
     """
-    theta, start = theta.copy(), theta[:, :2]
-    settled, lost = np.zeros(theta.shape[0], dtype=bool), np.zeros(theta.shape[0], dtype=bool)
-    others = _others(windows, theta, lost)
-    for turn in range(10):
-        index = np.nonzero(~lost)[0]
-        found, done = _fit(windows.taken(index), theta[index], others[index], noise_dn, slope_dn, turns=4)
-        moved = np.abs(found[:, :2] - theta[index, :2]).max(axis=1)
-        theta[index] = found
-        settled[index] = done | (moved < 0.02)
-        if turn + 1 >= PATIENCE:
-            lost[index[moved > WANDERING_PX]] = True
-        lost |= _lost(theta, start)
-        others = _others(windows, theta, lost)
-        if lost.all() or moved.max() < 3e-4:
+    if start_px.shape[0] == 0:
+        return no_spots()
+    pixels = cut(linear, known, start_px, width_px, clip_dn)
+    theta = _start(pixels, start_px, width_px, height_dn)
+    begun, touching, twin = theta[:, :2].copy(), _touching(start_px, width_px), _twin(start_px, width_px)
+    paired: Mask = np.asarray(touching.any(axis=1))
+    patience, turns = np.where(twin, PATIENCE[1], PATIENCE[0]), np.where(twin, TURNS[1], TURNS[0])
+    settled, lost = np.zeros(paired.size, dtype=bool), np.zeros(paired.size, dtype=bool)
+    others = light_between(pixels, theta, touching, noise_dn)
+    live = np.arange(paired.size)
+    for turn in range(TURNS[1]):
+        steps = np.where(paired[live], STEPS, MOST_STEPS)
+        found, done = _fit(pixels.taken(live), theta[live], others[pixels.rows(live)], steps, noise_dn, slope_dn)
+        moved, restless = np.zeros(paired.size), np.zeros(paired.size, dtype=bool)
+        moved[live] = np.abs(found[:, :2] - theta[live, :2]).max(axis=1)
+        theta[live] = found
+        settled[live] = done | (paired[live] & (moved[live] < 0.02))
+        restless[live] = ~done & (moved[live] > STILL_PX)
+        lost |= paired & (_lost(theta, begun) | ((moved > WANDERING_PX) & (turn + 1 >= patience)))
+        before, others = others, light_between(pixels, theta, touching & ~lost, noise_dn)
+        brighter = pixels.total(np.abs(others - before) > SAME_LIGHT * noise_dn) > 0
+        live = np.nonzero(paired & ~lost & (restless | brighter) & (turn + 1 < turns))[0]
+        if live.size == 0:
             break
-    return theta, settled & ~lost, others
+    return _report(pixels, theta, settled & ~lost, others, noise_dn, slope_dn)
 
 
-def _lost(theta: Array, start: Array) -> NDArray[np.bool_]:
+def _touching(start: Array, width: Array) -> Mask:
+    """(n, n) whether one spot's light reaches into another's window."""
+    radius = window_radius(width)
+    return np.asarray(_distance(start) < 1.35 * (radius[:, None] + radius[None]))
+
+
+def _twin(start: Array, width: Array) -> Mask:
+    """(n,) whether a spot overlaps another."""
+    return np.asarray((_distance(start) < 1.6 * (width[:, None] + width[None])).any(axis=1))
+
+
+def _distance(start: Array) -> Array:
+    """(n, n) between spots; infinite from one to itself."""
+    out: Array = np.hypot(*np.moveaxis(start[:, None] - start[None], -1, 0))
+    np.fill_diagonal(out, np.inf)
+    return out
+
+
+def _lost(theta: Array, start: Array) -> Mask:
     """(n,) which spots have grown or moved beyond what a glint's fit could."""
     wide = theta[:, 3:5].max(axis=1) > math.log(LOST_PX)
     return np.asarray(wide | (np.hypot(*(theta[:, :2] - start).T) > LOST_PX))
 
 
-def _cut(
-    linear: Image, known: Callable[[Array, Array], Array], start: Array, radius: Array, half: int, clip_dn: float
-) -> _Windows:
-    centre = np.rint(start).astype(np.intp)
-    step = np.arange(-half, half + 1)
-    x, y = centre[:, :1] + step, centre[:, 1:] + step
-    height, width = linear.shape
-    inside = ((x >= 0) & (x < width))[:, None, :] & ((y >= 0) & (y < height))[:, :, None]
-    row, column = np.clip(y, 0, height - 1)[:, :, None], np.clip(x, 0, width - 1)[:, None, :]
-    # Round windows, each as wide as its spot needs: the less of the limbus and of other edges is in them.
-    away = np.hypot(x[:, None, :] - start[:, 0, None, None], y[:, :, None] - start[:, 1, None, None])
-    inside &= away <= radius[:, None, None]
-    data = linear[row, column].astype(np.float64)
-    return _Windows(
-        x[:, None, :].astype(np.float64),
-        y[:, :, None].astype(np.float64),
-        data,
-        known(*(part.astype(np.float64) for part in np.broadcast_arrays(x[:, None, :], y[:, :, None]))),
-        inside.astype(np.float64),
-        data >= clip_dn,
-        centre.astype(np.float64),
-    )
-
-
-def _start(windows: _Windows, start: Array, width: Array, height: Array) -> Array:
-    n = start.shape[0]
+def _start(pixels: SpotPixels, start: Array, width: Array, height: Array) -> Array:
+    n, spot = width.size, pixels.spot
     theta = np.zeros((n, PARAMETERS))
     theta[:, :2] = start
-    clipped = windows.clip.sum(axis=(1, 2))
-    for i in np.nonzero(clipped > 2)[0]:  # a flat top's centre is its mean, its pixel of first maximum is anywhere
-        distance = np.hypot(windows.x[i] - start[i, 0], windows.y[i] - start[i, 1])
-        weight = windows.clip[i] & (distance < 3.0 + 2.5 * width[i])
-        theta[i, 0] = (windows.x[i] * weight).sum() / max(weight.sum(), 1)
-        theta[i, 1] = (windows.y[i] * weight).sum() / max(weight.sum(), 1)
-    amplitude = np.maximum(height, 1.0) * np.where(clipped > 2, 2.0, 1.3)
-    theta[:, 2] = np.log(amplitude)
-    theta[:, 3:5] = np.log(width * np.where(clipped > 2, 0.8, 1.0))[:, None]
-    excess = windows.data - windows.known
-    border = np.concatenate([excess[:, 0], excess[:, -1], excess[:, :, 0], excess[:, :, -1]], axis=1)
-    theta[:, 5] = np.median(border, axis=1)
+    away = np.hypot(*((pixels.centre - start)[spot] + np.stack([pixels.dx, pixels.dy], axis=-1)).T)
+    flat = pixels.total(pixels.clip) > 2
+    if flat.any():  # a flat top's centre is its mean, its pixel of first maximum is anywhere
+        top = pixels.clip & (away < 3.0 + 2.5 * width[spot])
+        share = top / np.maximum(pixels.total(top), 1.0)[spot]
+        mean = pixels.centre + np.stack([pixels.total(share * pixels.dx), pixels.total(share * pixels.dy)], axis=-1)
+        theta[flat, :2] = mean[flat]
+    theta[:, 2] = np.log(np.maximum(height, 1.0) * np.where(flat, 2.0, 1.3))
+    theta[:, 3:5] = np.log(width * np.where(flat, 0.8, 1.0))[:, None]
+    # The background: the median along the window's rim.
+    ring = np.nonzero(away > pixels.radius[spot] - 1.0)[0]
+    excess = (pixels.data - pixels.known)[ring]
+    ordered = excess[np.lexsort((excess, spot[ring]))]
+    size = np.bincount(spot[ring], minlength=n)
+    some = size > 0
+    theta[some, 5] = ordered[(np.cumsum(size) - size + size // 2)[some]]
     return theta
 
 
-def _model(windows: _Windows, theta: Array) -> tuple[Array, Array]:
-    """Spot plus fitted background plane (n, k, k), and its Jacobian (n, k, k, PARAMETERS)."""
-    p = theta[:, :, None, None]
-    gx, gx_c, gx_s = profile(windows.x, p[:, 0], np.exp(p[:, 3]))
-    gy, gy_c, gy_s = profile(windows.y, p[:, 1], np.exp(p[:, 4]))
-    amplitude = np.exp(p[:, 2])
-    spot = amplitude * gx * gy
-    jacobian = np.empty((*spot.shape, PARAMETERS))
-    jacobian[..., 0] = amplitude * gx_c * gy
-    jacobian[..., 1] = amplitude * gx * gy_c
-    jacobian[..., 2] = spot
-    jacobian[..., 3] = amplitude * gx_s * gy
-    jacobian[..., 4] = amplitude * gx * gy_s
-    jacobian[..., 5] = 1.0
-    jacobian[..., 6] = windows.x - windows.centre[:, 0, None, None]
-    jacobian[..., 7] = windows.y - windows.centre[:, 1, None, None]
-    value = spot + p[:, 5] + p[:, 6] * jacobian[..., 6] + p[:, 7] * jacobian[..., 7]
-    return value, jacobian
+def _slopes(pixels: SpotPixels, grid: Grid, theta: Array, rest: Array) -> Array:
+    """(PARAMETERS + 1, P): the model's derivatives at every pixel and, last, the residual.
+
+    rest (P,): image less all that is not fitted."""
+    owner = grid.owner
+    at = (theta[:, :2] - pixels.centre)[owner]
+    sigma = np.exp(theta[:, 3:5])[owner]
+    gx, gx_c, gx_s = profile(grid.edges, at[:, 0], sigma[:, 0])
+    gy, gy_c, gy_s = profile(grid.edges, at[:, 1], sigma[:, 1])
+    amplitude = np.exp(theta[:, 2])[owner[:-1]]
+    across, along = (amplitude * gx)[grid.column], gy[grid.row]
+    out = np.empty((PARAMETERS + 1, pixels.dx.size))
+    np.multiply((amplitude * gx_c)[grid.column], along, out=out[0])
+    np.multiply(across, gy_c[grid.row], out=out[1])
+    np.multiply(across, along, out=out[2])
+    np.multiply((amplitude * gx_s)[grid.column], along, out=out[3])
+    np.multiply(across, gy_s[grid.row], out=out[4])
+    out[5], out[6], out[7] = 1.0, pixels.dx, pixels.dy
+    plane = theta[:, 5:][pixels.spot]
+    out[8] = rest - out[2] - plane[:, 0] - plane[:, 1] * pixels.dx - plane[:, 2] * pixels.dy
+    return out
 
 
-def _normal(
-    windows: _Windows, theta: Array, others: Array, noise: float, slope: float
-) -> tuple[Array, Array, Array, Array]:
-    """(cost, gradient, normal matrix, squared residual of the data alone) in units of the noise."""
-    value, jacobian = _model(windows, theta)
-    total = value + windows.known + others
-    weight = windows.weight * ~(windows.clip & (total >= windows.data)) / noise
-    residual = (windows.data - total) * weight
-    n = theta.shape[0]
-    flat = (jacobian * weight[..., None]).reshape(n, -1, PARAMETERS)
-    r = residual.reshape(n, -1)
-    gradient = np.einsum("nkp,nk->np", flat, r)
-    matrix = flat.transpose(0, 2, 1) @ flat
-    data_cost = (r * r).sum(axis=1)
-    # Priors: nearly round (10 % each way per ... 0.3 in ln), and a background that is flat to within `slope`.
-    round_weight, slope_weight = 1.0 / 0.3**2, 1.0 / slope**2
+def _gram(pixels: SpotPixels, grid: Grid, theta: Array, rest: Array, noise: float) -> tuple[Array, Mask]:
+    """(n, PARAMETERS + 1, PARAMETERS + 1): products of `_slopes`, summed over every spot's pixels, in units of the
+    noise; and which pixels count: not the clipped ones where the model is brighter."""
+    rows = _slopes(pixels, grid, theta, rest)
+    counts = ~(pixels.clip & (rows[-1] <= 0.0))
+    if not counts.all():
+        rows *= counts
+    out = np.empty((theta.shape[0], PARAMETERS + 1, PARAMETERS + 1))
+    for product, (begin, end) in zip(out, pairwise(pixels.first.tolist()), strict=True):
+        np.matmul(rows[:, begin:end], rows[:, begin:end].T, out=product)
+    out *= 1.0 / noise**2
+    return out, counts
+
+
+def _normal(gram: Array, theta: Array, slope: float) -> tuple[Array, Array, Array]:
+    """(cost, gradient, normal matrix) in units of the noise, priors included: a nearly round spot, and a background
+    that is flat to within `slope`."""
+    gradient, matrix = gram[:, :-1, -1].copy(), gram[:, :-1, :-1].copy()
+    round_weight, slope_weight = 1.0 / ROUND_SD**2, 1.0 / slope**2
     gap = theta[:, 3] - theta[:, 4]
     gradient[:, 3] -= round_weight * gap
     gradient[:, 4] += round_weight * gap
@@ -220,79 +178,75 @@ def _normal(
     gradient[:, 6:] -= slope_weight * theta[:, 6:]
     matrix[:, 6, 6] += slope_weight
     matrix[:, 7, 7] += slope_weight
-    cost = data_cost + round_weight * gap**2 + slope_weight * (theta[:, 6:] ** 2).sum(axis=1)
-    return cost, gradient, matrix, data_cost
+    cost = gram[:, -1, -1] + round_weight * gap**2 + slope_weight * (theta[:, 6:] ** 2).sum(axis=1)
+    return cost, gradient, matrix
+
+
+_LEAST = np.array([-np.inf, -np.inf, -5.0, math.log(0.2), math.log(0.2), -np.inf, -np.inf, -np.inf])
+_MOST = np.array([np.inf, np.inf, 15.0, math.log(30.0), math.log(30.0), np.inf, np.inf, np.inf])
+_STRIDE = np.array([1.5, 1.5, 0.7, 0.7, 0.7, np.inf, np.inf, np.inf])  # largest step
 
 
 def _fit(
-    windows: _Windows, theta: Array, others: Array, noise: float, slope: float, turns: int = MAX_TURNS
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Levenberg-Marquardt on every spot side by side."""
-    n = theta.shape[0]
-    damping = np.full(n, 1e-2)
-    settled, start = np.zeros(n, dtype=bool), theta[:, :2]
-    cost, gradient, matrix, _ = _normal(windows, theta, others, noise, slope)
+    pixels: SpotPixels, theta: Array, others: Array, steps: NDArray[np.intp], noise: float, slope: float
+) -> tuple[Array, Mask]:
+    """(theta, settled) by Levenberg-Marquardt on every spot side by side, each for at most its `steps` steps."""
+    out, start = theta.copy(), theta[:, :2].copy()
+    settled = np.zeros(theta.shape[0], dtype=bool)
+    live = np.arange(theta.shape[0])  # the spots that are not settled; what follows holds these alone
+    damping = np.full(live.size, 1e-2)
+    rest, grid = pixels.data - pixels.known - others, Grid.of(pixels)
+    cost, gradient, matrix = _normal(_gram(pixels, grid, theta, rest, noise)[0], theta, slope)
     diagonal = np.arange(PARAMETERS)
-    for _ in range(turns):
+    for turn in range(int(steps.max())):
         damped = matrix.copy()
         damped[:, diagonal, diagonal] *= 1.0 + damping[:, None]
         damped[:, diagonal, diagonal] += 1e-9
         step = np.linalg.solve(damped, gradient[..., None])[..., 0]
-        step[:, :2] = np.clip(step[:, :2], -1.5, 1.5)
-        step[:, 2:5] = np.clip(step[:, 2:5], -0.7, 0.7)
-        trial = theta + step
-        trial[:, 3:5] = np.clip(trial[:, 3:5], math.log(0.2), math.log(30.0))
-        trial[:, 2] = np.clip(trial[:, 2], -5.0, 15.0)
-        new_cost, new_gradient, new_matrix, _ = _normal(windows, trial, others, noise, slope)
+        step = np.minimum(np.maximum(step, -_STRIDE), _STRIDE)
+        trial = np.minimum(np.maximum(theta + step, _LEAST), _MOST)
+        new_cost, new_gradient, new_matrix = _normal(_gram(pixels, grid, trial, rest, noise)[0], trial, slope)
         better = new_cost <= cost * (1.0 + 1e-12)
-        small = np.abs(step[:, :2]).max(axis=1) < 2e-4
-        settled |= better & small & (np.abs(step[:, 2:5]).max(axis=1) < 2e-3)
+        size = np.abs(step)
+        small = (size[:, :2].max(axis=1) < 2e-4) & (size[:, 2:5].max(axis=1) < 2e-3)
         theta = np.where(better[:, None], trial, theta)
         gradient = np.where(better[:, None], new_gradient, gradient)
         matrix = np.where(better[:, None, None], new_matrix, matrix)
         cost = np.where(better, new_cost, cost)
-        damping = np.clip(np.where(better, 0.1 * damping, 8.0 * damping), 1e-7, 1e7)
-        settled |= (damping > 1e5) | _lost(theta, start)
-        if settled.all():
+        damping = np.minimum(np.maximum(np.where(better, 0.1 * damping, 8.0 * damping), 1e-7), 1e7)
+        out[live] = theta
+        done = (better & small) | (damping > 1e5) | _lost(theta, start[live])
+        settled[live[done]] = True
+        done |= steps[live] <= turn + 1
+        if done.all():
             break
-    return theta, settled
+        if done.any():
+            keep = np.nonzero(~done)[0]
+            rest = rest[pixels.rows(keep)]
+            pixels = pixels.taken(keep)
+            grid = Grid.of(pixels)
+            live, theta, cost, damping = live[keep], theta[keep], cost[keep], damping[keep]
+            gradient, matrix = gradient[keep], matrix[keep]
+    return out, settled
 
 
-def _others(windows: _Windows, theta: Array, lost: NDArray[np.bool_]) -> Array:
-    """(n, k, k): in every spot's window, the light of the other spots."""
-    out = np.zeros_like(windows.data)
-    for i in np.nonzero(~lost)[0]:
-        gx = profile(windows.x, theta[i, 0], math.exp(theta[i, 3]))[0]
-        gy = profile(windows.y, theta[i, 1], math.exp(theta[i, 4]))[0]
-        spot = math.exp(theta[i, 2]) * gx * gy
-        spot[i] = 0.0
-        out += spot
-    return out
-
-
-def _report(
-    windows: _Windows, theta: Array, settled: NDArray[np.bool_], others: Array, noise: float, slope: float
-) -> SpotFit:
-    _, _, matrix, data_cost = _normal(windows, theta, others, noise, slope)
-    value, _ = _model(windows, theta)
-    used = windows.weight * ~(windows.clip & (value + windows.known + others >= windows.data))
-    pixels = used.sum(axis=(1, 2))
-    free = np.maximum(pixels - PARAMETERS, 1.0)
+def _report(pixels: SpotPixels, theta: Array, settled: Mask, others: Array, noise: float, slope: float) -> SpotFit:
+    gram, counts = _gram(pixels, Grid.of(pixels), theta, pixels.data - pixels.known - others, noise)
+    _, _, matrix = _normal(gram, theta, slope)
+    data_cost, used = gram[:, -1, -1], pixels.total(counts)
     diagonal = np.arange(PARAMETERS)
     matrix[:, diagonal, diagonal] += 1e-9
     inverse = np.linalg.inv(matrix)
-    scale = np.maximum(data_cost / free, 1.0)  # what the noise does not explain counts as noise
-    covariance = inverse[:, :2, :2] * scale[:, None, None]
-    at = theta[:, :2] - windows.centre
-    background = theta[:, 5] + (theta[:, 6:] * at).sum(axis=1)
-    middle = windows.known.shape[1] // 2
+    # What the noise does not explain counts as noise.
+    scale = np.maximum(data_cost / np.maximum(used - PARAMETERS, 1.0), 1.0)
+    at = theta[:, :2] - pixels.centre
     return SpotFit(
         theta[:, :2].copy(),
-        covariance,
+        np.asarray(inverse[:, :2, :2] * scale[:, None, None], dtype=np.float64),
         np.exp(theta[:, 2]),
         np.exp(theta[:, 3:5]),
-        background + windows.known[:, middle, middle],
-        np.sqrt(data_cost / np.maximum(pixels, 1.0)) * noise,
-        windows.clip.sum(axis=(1, 2)),
-        settled & np.isfinite(theta).all(axis=1) & (pixels >= 12),
+        theta[:, 5] + (theta[:, 6:] * at).sum(axis=1) + pixels.middle_dn,
+        np.sqrt(data_cost / np.maximum(used, 1.0)) * noise,
+        pixels.total(pixels.clip).astype(np.intp),
+        settled & np.isfinite(theta).all(axis=1) & (used >= 12),
     )

@@ -1,6 +1,7 @@
 """Spots that one Gaussian on the expected background does not explain: two in one, or one beside an edge of its own.
 
-A spot counts as unexplained when its residual is more than twice the image's noise.
+A spot counts as unexplained when its residual is more than twice the image's noise, and more than what a light that
+is no point, and lenses whose blur is no Gaussian, leave of its height.
 """
 
 from __future__ import annotations
@@ -14,16 +15,22 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from .fittedspots import SpotFit, joined, spot_light
-from .preprocess import Image
-from .spotfit import fit_spots, window_radius
+from .fittedspots import profile as pixel_profile
+from .preprocess import DN, Image
+from .spotfit import fit_spots
+from .spotpixels import SpotPixels, cut, window_radius
 
 Array = NDArray[np.float64]
 Background = Callable[[Array, Array], Array]
 
-UNEXPLAINED = 2.0
+UNEXPLAINED, UNLIKE_BELL = 2.0, 0.005
+# What an edge beside a glint leaves of the glint's height, and a second glint: more is no glint's.
+BESIDE_EDGE, BESIDE_TWIN = 0.1, 0.17
+LEAST_SHARE = 0.5  # of the squared residual, taken by an edge: the fit beside it must take as much
 PROMISING = 0.9  # of the residual: where the first edge beside a spot leaves more, further turns change little
-# Two equal spots 2.5 sigma apart deviate by sqrt(1 + 1.25^2) = 1.6 sigma along their line; with some room:
-LONGEST, LONGEST_FIT = 1.8, 2.5
+# Two equal spots 2.5 sigma apart deviate by sqrt(1 + 1.25^2) = 1.6 sigma along their line; with some room. Of what
+# stands above a third of their height, the moments along and across differ by up to 8 : 1.
+LONGEST, LONGEST_FIT, LONGEST_PATCH = 1.8, 2.5, 8.0
 MOST_NEAR = 4  # spots about one that is split: more are skin or lashes
 MOST = 12  # spots that are mended: where there are more, they are no glints
 
@@ -44,12 +51,14 @@ def give_edges(
     limits: noise, clip level and background slope, as for `fit_spots`.
     """
     noise, clip, _ = limits
-    for i in np.nonzero(fit.converged & (fit.residual_dn > UNEXPLAINED * noise))[0][:MOST]:
+    for i in np.nonzero(_unexplained(fit, noise, BESIDE_EDGE))[0][:MOST]:
         apart = np.hypot(*(fit.xy_px - fit.xy_px[i]).T)
         wide = float(fit.sigma_px[i].max())
         if np.sum(apart < 5.0 * wide + 3.0) > 1 or wide > LONGEST * widest_px:
             continue
         start = tuple(part[i : i + 1] for part in starts)
+        if _edge_share(cut(linear, known, start[0], start[1], clip), fit.one(int(i)), blur_px) < LEAST_SHARE:
+            continue
         x, y, data = _window(linear, start[0][0], math.ceil(2.7 * float(start[1][0]) + 3.0))
         best = fit.one(int(i))
         current = best
@@ -70,13 +79,50 @@ def give_edges(
     return fit
 
 
-def _window(linear: Image, centre: Array, half: int) -> tuple[Array, Array, Array]:
+def _unexplained(fit: SpotFit, noise_dn: float, most: float) -> NDArray[np.bool_]:
+    """(n,) which spots leave more than they should, and no more than `most` of their height."""
+    least = np.maximum(UNEXPLAINED * noise_dn, UNLIKE_BELL * fit.amplitude_dn)
+    most_dn = most * np.minimum(fit.amplitude_dn, DN)
+    return np.asarray(fit.converged & (fit.residual_dn > least) & (fit.residual_dn < most_dn))
+
+
+def _edge_share(pixels: SpotPixels, spot: SpotFit, blur_px: float) -> float:
+    """Share of a spot's squared residual that the best of many straight edges takes away, to first order in the rest.
+
+    12 directions and 9 offsets; the edges less what the spot's and its background's own parameters could do as well.
+    """
+    dx, dy = (pixels.centre - spot.xy_px + np.stack([pixels.dx, pixels.dy], axis=-1)).T
+    (gx, gx_c, gx_s), (gy, gy_c, gy_s) = (
+        pixel_profile(part, 0.0, float(sigma)) for part, sigma in ((dx, spot.sigma_px[0, 0]), (dy, spot.sigma_px[0, 1]))
+    )
+    own = np.stack([np.ones_like(dx), dx, dy, gx * gy, gx_c * gy, gx * gy_c, gx_s * gy, gx * gy_s], axis=-1)
+    direction = np.arange(12) * (np.pi / 12.0)
+    along = dx[:, None] * np.cos(direction) + dy[:, None] * np.sin(direction)
+    offset = np.linspace(-0.8, 0.8, 9) * pixels.radius[0]
+    edges = ndtr((along[:, :, None] - offset) / blur_px).reshape(dx.size, -1)
+    rest = pixels.data - pixels.known - spot.amplitude_dn[0] * own[:, 3]
+    seen = ~pixels.clip
+    if np.count_nonzero(seen) < 20:
+        return 0.0
+    basis = np.linalg.qr(own[seen])[0]
+    edges, rest = edges[seen], rest[seen]
+    edges, rest = edges - basis @ (basis.T @ edges), rest - basis @ (basis.T @ rest)
+    taken = (rest @ edges) ** 2 / (np.einsum("pe,pe->e", edges, edges) + 1e-6)
+    return float(taken.max() / max(float(rest @ rest), 1e-12))
+
+
+def _span(linear: Image, centre: Array, half: int) -> tuple[slice, slice]:
+    """Columns and rows of the pixels within `half` of a place, along each axis."""
     cx, cy = (round(float(v)) for v in centre)
     cx, cy = int(np.clip(cx, 0, linear.shape[1] - 1)), int(np.clip(cy, 0, linear.shape[0] - 1))
-    columns = np.arange(max(0, cx - half), min(linear.shape[1], cx + half + 1))
-    rows = np.arange(max(0, cy - half), min(linear.shape[0], cy + half + 1))
-    x, y = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
-    return x, y, linear[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].astype(np.float64)
+    columns = slice(max(0, cx - half), min(linear.shape[1], cx + half + 1))
+    return columns, slice(max(0, cy - half), min(linear.shape[0], cy + half + 1))
+
+
+def _window(linear: Image, centre: Array, half: int) -> tuple[Array, Array, Array]:
+    columns, rows = _span(linear, centre, half)
+    y, x = np.mgrid[rows, columns].astype(np.float64)
+    return x, y, linear[rows, columns].astype(np.float64)
 
 
 def _edge_level(edge: Array, x: Array, y: Array, blur_px: float) -> Array:
@@ -123,7 +169,7 @@ def split_blends(
     """
     if fit.converged.size > MOST:
         return starts, fit
-    for i in np.nonzero(fit.converged & (fit.residual_dn > UNEXPLAINED * limits[0]))[0]:
+    for i in np.nonzero(_unexplained(fit, limits[0], BESIDE_TWIN))[0]:
         axis = _long_axis(linear, fit, int(i))
         if axis is None:
             continue
@@ -165,7 +211,7 @@ def _long_axis(linear: Image, fit: SpotFit, i: int) -> tuple[Array, float] | Non
     if moments is None:
         return None
     values, vectors = np.linalg.eigh(moments)
-    if values[1] <= 1.3 * max(float(values[0]), 0.01):
+    if values[1] <= 1.3 * max(float(values[0]), 0.01) or values[1] > LONGEST_PATCH * (float(values[0]) + 0.05):
         return None
     across = float(np.clip(1.3 * math.sqrt(max(float(values[0]), 0.1)), 0.5, 8.0))
     return np.asarray(vectors[:, 1] * math.sqrt(values[1])), across
@@ -174,11 +220,13 @@ def _long_axis(linear: Image, fit: SpotFit, i: int) -> tuple[Array, float] | Non
 def patch_moments(linear: Image, fit: SpotFit, i: int) -> Array | None:
     """(2, 2) second moments, px^2, of what stands above a third of spot i's height, the other spots taken away."""
     half = math.ceil(3.0 * float(fit.sigma_px[i].max()) + 1.0)
-    x, y, data = _window(linear, fit.xy_px[i], half)
-    patch = data - fit.background_dn[i]
-    for k in range(fit.amplitude_dn.size):
-        if k != i and fit.converged[k] and math.dist(fit.xy_px[k], fit.xy_px[i]) < 3.0 * half:
-            patch = patch - spot_light(fit.one(k), x, y)
+    columns, rows = _span(linear, fit.xy_px[i], half)
+    x, y = np.arange(columns.start, columns.stop)[None, :] + 0.0, np.arange(rows.start, rows.stop)[:, None] + 0.0
+    patch = linear[rows, columns] - fit.background_dn[i]
+    near = fit.converged & (np.hypot(*(fit.xy_px - fit.xy_px[i]).T) < 3.0 * half)
+    for k in np.nonzero(near)[0]:
+        if k != i:
+            patch = patch - spot_light(fit.one(int(k)), x, y)
     weight = np.maximum(patch - 0.35 * patch.max(initial=0.0), 0.0)
     total = float(weight.sum())
     if total <= 0.0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.extraction import extract, spotfit
+from eyerender.extraction import extract, fittedspots, spotfit, spotpixels
 
 SEEDS = range(20_000, 20_008)
 
@@ -87,18 +87,41 @@ def test_pupil_does_not_feel_a_glint_on_its_edge(ideal):
 
 def test_spot_jacobian_is_the_models_slope():
     rng = np.random.default_rng(0)
-    windows = spotfit._cut(
+    pixels = spotpixels.cut(
         np.zeros((40, 40), np.float32),
         lambda x, y: np.zeros(x.shape),
-        np.array([[20.2, 19.7]]),
-        np.array([9.0]),
-        8,
+        np.array([[20.2, 19.7], [11.8, 12.1]]),
+        np.array([3.0, 1.1]),
         255.0,
     )
-    theta = np.array([[20.2, 19.7, 4.0, 0.2, 0.4, 10.0, 0.3, -0.2]]) + rng.normal(0.0, 0.02, (1, 8))
-    _, jacobian = spotfit._model(windows, theta)
+    assert pixels.count.tolist() == [np.count_nonzero(pixels.spot == i) for i in range(2)]
+    grid, rest = spotpixels.Grid.of(pixels), np.zeros(pixels.data.size)
+    theta = np.array([[20.2, 19.7, 4.0, 0.2, 0.4, 10.0, 0.3, -0.2], [11.6, 12.3, 5.0, 0.1, 0.3, 20.0, -0.1, 0.2]])
+    theta += rng.normal(0.0, 0.02, theta.shape)
+    slopes = spotfit._slopes(pixels, grid, theta, rest)
     for k in range(spotfit.PARAMETERS):
         step = np.zeros_like(theta)
-        step[0, k] = 1e-5
-        slope = (spotfit._model(windows, theta + step)[0] - spotfit._model(windows, theta - step)[0]) / 2e-5
-        np.testing.assert_allclose(jacobian[..., k], slope, atol=1e-6 * max(1.0, np.abs(slope).max()))
+        step[:, k] = 1e-5
+        less, more = (spotfit._slopes(pixels, grid, theta + d, rest)[-1] for d in (-step, step))
+        slope = (less - more) / 2e-5  # the last row is the residual, -model
+        np.testing.assert_allclose(slopes[k], slope, atol=1e-6 * max(1.0, np.abs(slope).max()))
+
+
+def test_spots_light_in_each_others_windows():
+    """As the product of the two profiles, pixel by pixel, and none where it is not asked for."""
+    start, width = np.array([[15.3, 14.8], [20.1, 17.4], [40.0, 30.0]]), np.array([1.2, 1.6, 1.0])
+    pixels = spotpixels.cut(np.zeros((60, 60), np.float32), lambda x, y: np.zeros(x.shape), start, width, 255.0)
+    theta = np.zeros((3, 8))
+    theta[:, :2], theta[:, 2], theta[:, 3:5] = start, np.log([90.0, 70.0, 50.0]), np.log(width)[:, None]
+    light = spotpixels.light_between(pixels, theta, ~np.eye(3, dtype=bool), 1.0)
+    x, y = (pixels.centre[pixels.spot] + np.stack([pixels.dx, pixels.dy], axis=-1)).T
+    for i, j in ((0, 1), (1, 0)):
+        own = pixels.spot == i
+        expected = (
+            fittedspots.profile(x[own], start[j, 0], width[j])[0]
+            * fittedspots.profile(y[own], start[j, 1], width[j])[0]
+        )
+        np.testing.assert_allclose(light[own], np.exp(theta[j, 2]) * expected, atol=1e-9)
+    assert light[pixels.spot != 2].max() > 1.0
+    assert not light[pixels.spot == 2].any()
+    assert not spotpixels.light_between(pixels, theta, np.zeros((3, 3), dtype=bool), 1.0).any()
