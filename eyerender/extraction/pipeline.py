@@ -64,21 +64,21 @@ def _explained(prepared: Prepared, work: Prepared, found: Found, settings: Extra
     size = (int(prepared.linear.shape[0]), int(prepared.linear.shape[1]))
     noise = prepared.noise_dn / DN
     model = edge_model(found)
-    if settings.method == "fast":  # no glint moves its pupil
-        pupil = pupil_of(found, work, model, None, settings)
-        if pupil.status == "missing":
-            return Extraction(pupil, (), (), noise, size)
+    refined = settings.method == "refined"
+    pupil = None if refined else pupil_of(found, work, model, None, settings)  # no glint moves a fast one
+    if pupil is not None and pupil.status == "missing":
+        return Extraction(pupil, (), (), noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     pixel_fit: PixelFit | None = None
-    masked = _spot_mask(prepared, spots)
-    if settings.method == "refined":
+    if refined:
+        masked = _spot_mask(prepared, spots)
         pixel_fit = _refined(work.linear, model, found, masked, work.noise_dn)
         model = model if pixel_fit is None else pixel_fit.model
     spots, fit = _fit_spots(prepared, work, spots, model)
-    if settings.method == "refined" and not work.inverted:
+    if refined and not work.inverted:
         again = _second_pass(prepared, model, found, spots, fit, masked)
         pixel_fit, model = (pixel_fit, model) if again is None else (again, again.model)
-    pupil = pupil_of(found, work, model, pixel_fit, settings)
+    pupil = pupil or pupil_of(found, work, model, pixel_fit, settings)
     if pupil.status == "missing":
         return Extraction(pupil, (), (), noise, size)
     accepted, rejected = judge_spots(spots, fit, prepared, abs(model.step_dn), model.sigma_px, settings)
