@@ -9,7 +9,8 @@ from cyclopts import Parameter
 
 from ..errors import InputError
 from .app import app
-from .output import Json, emit, progress
+from .options import Overwrite, Result
+from .output import emit, progress
 
 
 @app.command(name="bench-extractors")
@@ -20,8 +21,8 @@ def bench_extractors(
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     extractor: tuple[str, ...] = (),
     timeout: float = 30.0,
-    overwrite: bool = False,
-    json: Json = None,
+    overwrite: Overwrite = False,
+    json: Result = None,
 ) -> int:
     """Run pupil and glint extractors over a folder of labelled images and measure each against the labels.
 
@@ -40,10 +41,6 @@ def bench_extractors(
         (default: all that are installed).
     timeout
         Seconds an extractor may take for one image.
-    overwrite
-        Replace what the output folder holds.
-    json
-        Write the results as JSON to a file as well, or to stdout with '-'.
     """
     from ..benchmark.registry import defaults, resolve
     from ..benchmark.run import REPORT, bench_extractors

@@ -7,18 +7,13 @@ import json as jsonlib
 from typing import Literal
 
 from .app import app
-from .output import Json, emit, say
+from .options import Result
+from .output import emit, say
 
 
 @app.command(name="doctor")
-def doctor(*, json: Json = None) -> int:
-    """Tell what can render here, and what would mend what cannot; exit code 0 only where rendering works.
-
-    Parameters
-    ----------
-    json
-        Write the report as JSON to a file, or to stdout with '-'.
-    """
+def doctor(*, json: Result = None) -> int:
+    """Tell what can render here, and what would mend what cannot; exit code 0 only where rendering works."""
     from ..rendering.backend import doctor_report
 
     report = doctor_report()

@@ -9,21 +9,20 @@ from cyclopts import Parameter
 
 from ..errors import EyerenderError, InputError
 from .app import app
-from .output import Json, emit
+from .options import Result
+from .output import emit
 
 _FORMATS = (".svg", ".pdf", ".png")
 
 
 @app.command(name="eyes")
-def eyes(name: str | None = None, /, *, json: Json = None) -> int:
+def eyes(name: str | None = None, /, *, json: Result = None) -> int:
     """List the eye models of the catalogue, or print one as an eye file.
 
     Parameters
     ----------
     name
         A name of the catalogue, or an eye file.
-    json
-        Write the result as JSON to a file, or to stdout with '-'.
     """
     from ..eye.catalogue import catalogue_names, load_eye
 

@@ -9,7 +9,8 @@ from cyclopts import App, Parameter
 
 from ..errors import InputError
 from .app import app
-from .output import Json, emit
+from .options import Result
+from .output import emit
 
 gaze = App(name="gaze", help="Estimate gaze from records of features, those of real images too.")
 app.command(gaze)
@@ -34,7 +35,7 @@ def fit(
     index: float | None = None,
     recalibration: Literal["angle", "screen", "none"] = "angle",
     fixations: str | None = None,
-    json: Json = None,
+    json: Result = None,
 ) -> int:
     """Calibrate a gaze estimator on records of known targets, and write the calibration.
 
@@ -68,8 +69,6 @@ def fit(
         hennessey, shih-wu-liu: what the correcting polynomial works on.
     fixations
         Calibrate on these fixations only, counted from 0: '0,4,8'.
-    json
-        Write a summary as JSON to a file, or to stdout with '-'.
     """
     from ..gaze.records import load_observations
     from ..gaze.store import EstimatorSpec, fit_estimator, save_estimator
@@ -108,7 +107,7 @@ def predict(
     *,
     calibration: Annotated[Path, Parameter(name=["--calibration", "-c"])],
     scene: str | None = None,
-    json: Json = None,
+    json: Result = None,
 ) -> int:
     """Estimate gaze points with a calibration that `gaze fit` wrote; where targets are known, their errors too.
 
@@ -120,8 +119,6 @@ def predict(
         The calibration file.
     scene
         A scene file or the name of a shipped one, for its rig; default: the rig in the records' file.
-    json
-        Write the gaze points as JSON to a file, or to stdout with '-'.
     """
     from ..gaze.records import load_observations
     from ..gaze.store import load_estimator, predictions

@@ -9,7 +9,8 @@ from cyclopts import Parameter
 
 from .app import app
 from .observe import comparison_text
-from .output import BackendName, Json, emit, progress
+from .options import Backend, Eye, Overwrite, Result, Seed, Threads
+from .output import emit, progress
 
 
 @app.command(name="render")
@@ -18,14 +19,14 @@ def render(
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    eye: str | None = None,
+    eye: Eye = None,
     spp: int | None = None,
-    seed: int | None = None,
-    backend: BackendName = "auto",
-    threads: int | None = None,
+    seed: Seed = None,
+    backend: Backend = "auto",
+    threads: Threads = None,
     exr: bool = False,
-    overwrite: bool = False,
-    json: Json = None,
+    overwrite: Overwrite = False,
+    json: Result = None,
 ) -> int:
     """Render a scene into a folder of labelled near-infrared images.
 
@@ -35,22 +36,10 @@ def render(
         A scene file, or the bare name of a shipped scene.
     output
         The folder to write.
-    eye
-        Replace the scene's eye model: a name of the catalogue, or an eye file.
     spp
         Replace the scene's samples per pixel.
-    seed
-        Replace the scene's seed.
-    backend
-        Where to render.
-    threads
-        Processor threads (default: all).
     exr
         Also write the noise-free linear irradiance as EXR.
-    overwrite
-        Replace what the folder holds.
-    json
-        Write a summary as JSON to a file, or to stdout with '-'.
     """
     from ..capture import render_folder
     from ..scene import load_scene
@@ -69,11 +58,11 @@ def quickstart(
     folder: Annotated[Path, Parameter(name="DIR")],
     /,
     *,
-    eye: str | None = None,
-    backend: BackendName = "auto",
-    threads: int | None = None,
-    overwrite: bool = False,
-    json: Json = None,
+    eye: Eye = None,
+    backend: Backend = "auto",
+    threads: Threads = None,
+    overwrite: Overwrite = False,
+    json: Result = None,
 ) -> int:
     """Do the main job: fixate, render, extract, calibrate, compare; and write a report to look at.
 
@@ -81,16 +70,6 @@ def quickstart(
     ----------
     folder
         The folder to write.
-    eye
-        Replace the eye model: a name of the catalogue, or an eye file.
-    backend
-        Where to render.
-    threads
-        Processor threads (default: all).
-    overwrite
-        Replace what the folder holds.
-    json
-        Write the comparison as JSON to a file, or to stdout with '-'.
     """
     from ..quickstart import run_quickstart
 

@@ -11,7 +11,8 @@ from cyclopts import Parameter
 from ..errors import InputError
 from ..observation import EYES, Observations
 from .app import app
-from .output import Json, emit, progress
+from .options import Eye, Result
+from .output import emit, progress
 
 
 @app.command(name="features")
@@ -19,10 +20,10 @@ def features(
     scene: str,
     /,
     *,
-    eye: str | None = None,
+    eye: Eye = None,
     points: int = 30,
     purkinje: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (),
-    json: Json = None,
+    json: Result = None,
 ) -> int:
     """Compute the apparent pupil and the glints of a scene by ray optics; needs no renderer.
 
@@ -30,14 +31,10 @@ def features(
     ----------
     scene
         A scene file, or the bare name of a shipped scene.
-    eye
-        Replace the scene's eye model: a name of the catalogue, or an eye file.
     points
         Boundary points of the pupil.
     purkinje
         Also compute these Purkinje images (1 to 4) and how far the pupil is from an ellipse; in the JSON.
-    json
-        Write the features as JSON to a file, or to stdout with '-'.
     """
     # Not through `observers`, which would load OpenCV for nothing.
     from ..analytic.observer import observe_in_detail, purkinje_records
@@ -64,7 +61,7 @@ def extract(
     *images: Path,
     scene: str | None = None,
     gamma: float = 1.0,
-    json: Json = None,
+    json: Result = None,
 ) -> int:
     """Recover the pupil ellipse and the glints from images; a pupil that is not found is a result, not an error.
 
@@ -76,8 +73,6 @@ def extract(
         A scene whose rig identifies the glints by light.
     gamma
         Encoding gamma of the images' values; 1 is linear.
-    json
-        Write the records as JSON to a file, or to stdout with '-'.
     """
     from ..observers import ImageObserver
     from ..scene import load_scene
@@ -101,7 +96,7 @@ def compare(
     /,
     *,
     function: str = "R3",
-    json: Json = None,
+    json: Result = None,
 ) -> int:
     """Extract the features of a folder of images and compare them with its analytic ones, in pixels and in gaze.
 
@@ -111,8 +106,6 @@ def compare(
         A folder that render, quickstart or generate wrote.
     function
         Regression function of the gaze estimator, R1 to R12.
-    json
-        Write the comparison as JSON to a file, or to stdout with '-'.
     """
     from ..quickstart import compare_folder
 

@@ -7,15 +7,9 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any, Literal
-
-from cyclopts import Parameter
+from typing import Any
 
 from ..imagefolder import write_json
-
-# Options that several commands share.
-Json = Annotated[str | None, Parameter(name="--json", allow_leading_hyphen=True)]
-BackendName = Literal["auto", "cuda", "llvm"]
 
 
 def say(text: str) -> None:

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from ..errors import InputError
 from .app import app
-from .output import BackendName, Json, emit, progress, say
+from .options import Backend, Overwrite, Result, Threads, positive
+from .output import emit, progress, say
 
 
 @app.command(name="study")
@@ -24,10 +24,10 @@ def study(
     workers: int | None = None,
     spp: int | None = None,
     noise: Literal["on", "off", "both"] = "both",
-    backend: BackendName = "auto",
-    threads: int | None = None,
-    overwrite: bool = False,
-    json: Json = None,
+    backend: Backend = "auto",
+    threads: Threads = None,
+    overwrite: Overwrite = False,
+    json: Result = None,
 ) -> int:
     """Replicate a published study of gaze estimation, test its findings on its own data, or compare the observers.
 
@@ -56,22 +56,12 @@ def study(
         Samples per pixel of the images (default: the scene's).
     noise
         Images with the sensor's noise (on), without it (off), or both.
-    backend
-        Where to render.
-    threads
-        Processor threads of all rendering processes together (default: all).
-    overwrite
-        Replace what the folder holds.
-    json
-        Write the summary as JSON to a file, or to stdout with '-'.
     """
     from ..study.literature import MODELS
     from ..study.run import REPORT, run_study
 
-    if spp is not None and spp < 1:
-        raise InputError("must be >= 1", source="--spp")
-    if threads is not None and threads < 1:
-        raise InputError("must be >= 1", source="--threads")
+    positive("--spp", spp)
+    positive("--threads", threads)
     names = MODELS if eyes is None else tuple(e.strip() for e in eyes.split(",") if e.strip())
     with progress(f"study {name}") as steps:
         summary = run_study(
