@@ -29,6 +29,17 @@ class _Draw(Spec):
     per: Unit | None = Field(default=None, description="drawn for each sample or once a subject; default: by the path")
 
 
+class _RangeDraw(_Draw):
+    low: float
+    high: float
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.low < self.high:
+            raise ValueError("low must be < high")
+        return self
+
+
 class FixedDraw(_Draw):
     """The value itself; lets `per` and comments stand beside it."""
 
@@ -36,45 +47,26 @@ class FixedDraw(_Draw):
     value: Any
 
 
-class UniformDraw(_Draw):
+class UniformDraw(_RangeDraw):
     """low + (high - low) u."""
 
     draw: Literal["uniform"]
-    low: float
-    high: float
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        _order(self.low, self.high)
-        return self
 
 
-class IntegerDraw(_Draw):
+class IntegerDraw(_RangeDraw):
     """A whole number from low to high, both included."""
 
     draw: Literal["integer"]
     low: int
     high: int
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        _order(self.low, self.high)
-        return self
 
-
-class NormalDraw(_Draw):
+class NormalDraw(_RangeDraw):
     """A normal distribution cut off at `low` and `high` and scaled to 1 in between."""
 
     draw: Literal["truncated_normal"]
     mean: float
     sd: Positive
-    low: float
-    high: float
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        _order(self.low, self.high)
-        return self
 
 
 class ChoiceDraw(_Draw):
@@ -122,17 +114,10 @@ class GridDraw(_Draw):
         return tuple(self.low + (self.high - self.low) * (k / (self.steps - 1)) for k in range(self.steps))
 
 
-class SobolDraw(_Draw):
+class SobolDraw(_RangeDraw):
     """low + (high - low) s, s one dimension of the joint Sobol sequence of all such draws."""
 
     draw: Literal["sobol"]
-    low: float
-    high: float
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        _order(self.low, self.high)
-        return self
 
 
 class SequenceDraw(_Draw):
@@ -209,8 +194,3 @@ def truncated_normal(u: float, mean: float, sd: float, low: float, high: float) 
     r = math.exp(log_a - log_b)
     x = mean + sd * float(ndtri_exp(log_b + math.log(r + u * (1 - r))))
     return min(max(x, low), high)
-
-
-def _order(low: float, high: float) -> None:
-    if not low < high:
-        raise ValueError("low must be < high")
