@@ -10,24 +10,19 @@ reported without one. Exit 1 when a `must` is missed.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
-import json
-import os
-import platform
-import resource
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
+from _bench import Report, Row, options_of, resident_mib, row, single_threaded
+
+single_threaded()
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "rendering"))
 
@@ -35,16 +30,7 @@ import numpy as np  # noqa: E402
 
 from eyerender.rendering.backend import choose_backend  # noqa: E402
 
-Row = dict[str, Any]
 MODELS = ("E1", "E2", "E3", "E4", "E5")
-
-
-def row(name: str, value: float, unit: str, must: float | None = None, aim: float | None = None) -> Row:
-    """A result; `must` and `aim` are upper bars."""
-    met = None if must is None and aim is None else bool(value <= (must if must is not None else aim))
-    if must is None:
-        met = None
-    return {"name": name, "value": float(value), "unit": unit, "must": must, "aim": aim, "met": met}
 
 
 def cpu_of(work: Callable[[], Any], runs: int) -> tuple[float, float]:
@@ -433,8 +419,8 @@ class Bench:
         for k, job in enumerate(self._varied(last + 1, seed=1)):
             self.renderer.render(job, spp=4)
             if k == first:
-                at = _resident_mb()
-        yield row(f"resident memory, frame {last} - frame {first}", _resident_mb() - at, "MB", 30)
+                at = resident_mib()
+        yield row(f"resident memory, frame {last} - frame {first}", resident_mib() - at, "MB", 30)
 
     def determinism(self) -> Iterable[Row]:
         """Differing digests of one job: here, with other threads, and in a fresh process with two threads."""
@@ -464,40 +450,19 @@ def _digest(done: Any) -> str:
     return hashlib.sha256(done.irradiance.tobytes() + done.dn.tobytes()).hexdigest()
 
 
-def _resident_mb() -> float:
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        return pages * resource.getpagesize() / 2**20
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
 def main() -> int:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer samples and poses")
-    parser.add_argument("--json", metavar="F", help="write the result to a file")
+    parser = options_of(__doc__, "fewer samples and poses")
     parser.add_argument("--backend", choices=["auto", "llvm", "cuda"], default="llvm")
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     backend = choose_backend(options.backend, options.threads)
-    rows = []
-    for r in Bench(backend, options.quick).rows():
-        rows.append(r)
-        bars = "".join(f"  {k} {r[k]:g}" for k in ("must", "aim") if r[k] is not None)
-        mark = "" if r["met"] is None else ("  met" if r["met"] else "  MISSED")
-        print(f"{r['name']:<62} {r['value']:>11.4g} {r['unit']:<8}{bars}{mark}", flush=True)
+    report = Report()
+    report.extend(Bench(backend, options.quick).rows())
     if backend.name != "cuda":
         print("physics on a GPU: not measured, no GPU here")
-    if options.json:
-        result = {
-            "schema": "eyerender/bench/1",
-            "machine": {"platform": platform.platform(), "device": backend.device, "threads": backend.threads},
-            "versions": {"python": platform.python_version(), "eyerender": version("eyerender"), **backend.versions},
-            "rows": rows,
-        }
-        Path(options.json).write_text(json.dumps(result, indent=1), encoding="utf-8")
-    return 1 if any(r["met"] is False for r in rows) else 0
+    machine = {"device": backend.device, "threads": backend.threads}
+    return report.finish(options.json, ("eyerender", "numpy"), machine=machine, versions=backend.versions)
 
 
 if __name__ == "__main__":
