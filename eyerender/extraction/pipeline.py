@@ -145,7 +145,8 @@ def _agrees(fit: PixelFit, found: Found) -> bool:
     """
     rim = found.rim
     by_edges = rim_deviation(rim.ellipse, edge_covariance(rim.ellipse, rim.points_px, rim.residual_px))
-    if rim_deviation(fit.model.ellipse, fit.covariance) > 1.5 * by_edges:
+    # Both are estimates from a few dozen sectors, which scatter by a fifth and more.
+    if rim_deviation(fit.model.ellipse, fit.covariance) > 2.0 * by_edges:
         return False
     points = found.edges.points_px[found.rim.inliers]
     ellipse = fit.model.ellipse

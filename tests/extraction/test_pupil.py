@@ -18,9 +18,9 @@ def _truth(drawing) -> Ellipse:
     return Ellipse(pupil["centre_px"], pupil["semi_axes_px"], pupil["angle_rad"])
 
 
-def _errors(ideal, condition: str, settings: ExtractionSettings) -> tuple[np.ndarray, np.ndarray]:
+def _errors(ideal, condition: str, settings: ExtractionSettings, seeds: range = SEEDS) -> tuple[np.ndarray, np.ndarray]:
     centre, axes = [], []
-    for seed in SEEDS:
+    for seed in seeds:
         drawing = ideal.draw(condition, seed)
         found = extract(drawing.image, settings=settings).pupil
         assert found.status == "ok", found.reason
@@ -32,7 +32,8 @@ def _errors(ideal, condition: str, settings: ExtractionSettings) -> tuple[np.nda
 
 
 # Allowed medians: those of the full bench (40 images a row). Of six images the median scatters by about a quarter, the
-# refined fit is a third below the bar or better, so a failure is a defect.
+# refined fit is a third below the bar or better, so a failure is a defect; at 16 DN it is a quarter below, which takes
+# twenty.
 @pytest.mark.parametrize(
     ("condition", "median"),
     [
@@ -41,8 +42,29 @@ def _errors(ideal, condition: str, settings: ExtractionSettings) -> tuple[np.nda
     ],
 )  # fmt: skip
 def test_refined_centre_error(ideal, condition, median):
-    centre, _ = _errors(ideal, condition, REFINED)
+    seeds = range(20_000, 20_020) if condition == "noise16" else SEEDS
+    centre, _ = _errors(ideal, condition, REFINED, seeds)
     assert np.median(centre) <= median
+
+
+def test_light_from_one_side_does_not_move_a_noisy_pupil(ideal):
+    """Lamps beside the camera make one side of the iris brighter by less than the noise lets anyone see.
+
+    Five hundredths over a semi-axis each way move the fit of one outer level by 0.06 to 0.09 px, against images of
+    even light with the same noise.
+    """
+    drawing = ideal.draw("clean", 20_000)
+    truth = _truth(drawing)
+    x = np.arange(drawing.image.shape[1]) - truth.centre_px[0]
+    light = 1.0 + 0.05 * np.clip(x / truth.semi_axes_px[0], -3.0, 3.0)
+    rng = np.random.default_rng(20_000)
+    moved = []
+    for _ in range(8):
+        noise = rng.normal(0.0, 16.0, drawing.image.shape)
+        images = (np.clip(np.rint(drawing.image * level + noise), 0, 255).astype(np.uint8) for level in (light, 1.0))
+        lit, even = (extract(image).pupil.ellipse for image in images)
+        moved.append(lit.centre_px - even.centre_px)
+    assert np.abs(np.mean(moved, axis=0)).max() < 0.035
 
 
 @pytest.mark.parametrize(("condition", "median"), [("clean", 0.005), ("noise2", 0.03), ("noise2-13px", 0.04)])
