@@ -15,41 +15,25 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import platform
 import sys
 import time
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from multiprocessing import Pool
 from pathlib import Path
 from typing import Any
 
+import bench_rendered_rows
 import cv2
 import make_ideal_images as ideal
 import numpy as np
-import rendered_eyes
+from extraction_tally import CENTRE, Tally, compare
 from numpy.typing import NDArray
 
-from eyerender.extraction import FAST, REFINED, Extraction, ExtractionSettings, extract
-from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.extraction import FAST, REFINED, ExtractionSettings, extract
 
 Array = NDArray[np.float64]
-MATCH_PX = 2.0  # a glint within this of a true one is that one
-
-# condition -> centre error allowed: median, 95th percentile, px
-CENTRE = {
-    "clean": (0.005, 0.01),
-    "noise2": (0.015, 0.03),
-    "noise2-17px": (0.018, 0.04),
-    "noise2-13px": (0.021, 0.045),
-    "noise8": (0.05, 0.10),
-    "noise16": (0.09, 0.20),
-    "blur4": (0.04, 0.08),
-    "texture6": (0.04, 0.08),
-    "edge-glint": (0.02, 0.04),
-    "lid": (0.15, 0.5),
-}
 REPORTED = ("saturated-glint", "bright-pupil", "remote", "head-mounted")
 # condition, which glints of an image (first: on the edge), median error allowed, px
 GLINTS = (
@@ -57,44 +41,9 @@ GLINTS = (
     ("saturated-glint", slice(None), "saturated", 0.010),
     ("edge-glint", slice(0, 1), "on the edge", 0.020),
 )
-# Rows on rendered images: name -> noise DN, blur px, condition whose bars hold for the close rig, for the remote one.
-RENDERED: dict[str, tuple[float, float, str, str | None]] = {
-    "no added noise": (0.0, 1.0, "clean", None),
-    "noise 2": (2.0, 1.0, "noise2", "noise2-13px"),
-    "noise 8": (8.0, 1.0, "noise8", None),
-    "noise 16": (16.0, 1.0, "noise16", None),
-    "blur 4, noise 2": (2.0, 4.0, "blur4", None),
-}
 # Chi-squared quantiles at the probabilities of 1, 2 and 3 sigma, for 2 and 5 degrees of freedom.
 LEVELS = (0.6827, 0.9545, 0.9973)
 QUANTILES = {2: (2.2957, 6.1801, 11.8292), 5: (5.8876, 11.3139, 18.2053)}
-
-
-@dataclass(slots=True)
-class Tally:
-    """What one row of images gave."""
-
-    centre: list[float] = field(default_factory=list)
-    offset: list[Array] = field(default_factory=list)
-    bound: list[float] = field(default_factory=list)
-    axes: list[Array] = field(default_factory=list)
-    iou: list[float] = field(default_factory=list)
-    distance: dict[int, list[float]] = field(default_factory=lambda: {2: [], 5: []})
-    glint: list[tuple[int, float]] = field(default_factory=list)
-    glint_distance: list[float] = field(default_factory=list)
-    glints_true: int = 0
-    glints_found: int = 0
-    confidence: list[float] = field(default_factory=list)
-    missing: int = 0
-    cpu_s: list[float] = field(default_factory=list)
-
-    @property
-    def images(self) -> int:
-        return self.missing + len(self.iou)
-
-    @property
-    def right(self) -> int:
-        return sum(value > 0.9 for value in self.iou)
 
 
 @dataclass(slots=True)
@@ -133,7 +82,7 @@ def run(condition: str, count: int, first: int, settings: ExtractionSettings) ->
         start = time.process_time()
         found = extract(drawing.image, settings=chosen)
         tally.cpu_s.append(time.process_time() - start)
-        _compare(tally, found, drawing)
+        compare(tally, found, drawing)
     return tally
 
 
@@ -145,51 +94,6 @@ def _drawing(condition: str, seed: int) -> ideal.Drawing:
     if key not in _cache:
         _cache[key] = ideal.draw(condition, seed)
     return _cache[key]
-
-
-def _compare(tally: Tally, found: Extraction, drawing: ideal.Drawing) -> None:
-    label, parameters = drawing.label["pupil"], drawing.parameters
-    truth = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"])
-    ellipse = found.pupil.ellipse
-    if ellipse is None:
-        tally.missing += 1
-        tally.confidence.append(0.0)
-        return
-    tally.confidence.append(found.pupil.confidence)
-    tally.iou.append(iou(ellipse, truth))
-    offset = ellipse.centre_px - truth.centre_px
-    tally.offset.append(offset)
-    tally.centre.append(float(np.hypot(*offset)))
-    tally.axes.append(ellipse.semi_axes_px - truth.semi_axes_px)
-    noise = math.hypot(parameters["noise_dn"], 1.0 / math.sqrt(12.0) if parameters["bit_depth"] == 8 else 0.0)
-    blur = math.sqrt(parameters["blur_px"] ** 2 + 1.0 / 12.0)
-    radius = math.sqrt(float(truth.semi_axes_px.prod()))
-    tally.bound.append(noise / abs(parameters["step_dn"]) * math.sqrt(2.0 * blur / (math.sqrt(math.pi) * radius)))
-    if found.pupil.covariance is not None:
-        full = found.pupil.covariance
-        tally.distance[2].append(float(offset @ np.linalg.solve(full[:2, :2], offset)))
-        error, covariance = _shape_error(ellipse, truth, full)
-        tally.distance[5].append(float(error @ np.linalg.solve(covariance, error)))
-    true_glints = [g["xy_px"] for g in drawing.label["glints"] if g["status"] == "ok"]
-    tally.glints_true += len(true_glints)
-    tally.glints_found += len(found.glints)
-    for index, xy in enumerate(true_glints):
-        near = [g for g in found.glints if g.xy_px is not None and np.hypot(*(g.xy_px - xy)) < MATCH_PX]
-        if near and near[0].xy_px is not None and near[0].covariance is not None:
-            error = near[0].xy_px - xy
-            tally.glint.append((index, float(np.hypot(*error))))
-            tally.glint_distance.append(float(error @ np.linalg.solve(near[0].covariance, error)))
-
-
-def _shape_error(ellipse: Ellipse, truth: Ellipse, covariance: Array) -> tuple[Array, Array]:
-    """Error and covariance of (cx, cy, shape matrix aa, bb, ab in the found axes), well defined for circles too."""
-    turn = truth.angle_rad - ellipse.angle_rad
-    rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    shape = rotation @ np.diag(truth.semi_axes_px) @ rotation.T
-    a, b = ellipse.semi_axes_px
-    error = np.array([*(ellipse.centre_px - truth.centre_px), a - shape[0, 0], b - shape[1, 1], -shape[0, 1]])
-    scale = np.diag([1.0, 1.0, 1.0, 1.0, max(float(a - b), 1e-9)])
-    return error, scale @ covariance @ scale
 
 
 def accuracy(table: Table, count: int, first: int) -> dict[str, Tally]:
@@ -265,7 +169,7 @@ def _judged(seed: int) -> list[tuple[float | None, bool]]:
         found = extract(image, settings=settings)
         tally = Tally()
         if drawing is not None:
-            _compare(tally, found, drawing)
+            compare(tally, found, drawing)
         out.append((None if found.pupil.ellipse is None else found.pupil.confidence, tally.right > 0))
     return out
 
@@ -297,106 +201,13 @@ def reliability(table: Table, count: int, first: int, processes: int) -> None:
         table.add(f"{name}: confidence > 0.9, of those wrong", float(1.0 - np.mean(right[certain])), "1")
 
 
-def rendered(table: Table, count: int, first: int) -> None:
-    """The rows on images of the package's own renderer, by rig and eye model."""
-    from eyerender.capture import make_renderer
-
-    renderer = make_renderer()
-    for rig in rendered_eyes.RIGS:
-        tallies: dict[str, Tally] = {}
-        for model in rendered_eyes.MODELS:
-            own: dict[str, Tally] = {}
-            for seed in range(first, first + count):
-                _rendered_image(own, renderer, model, rig, seed, few=seed - first < max(count // 5, 2))
-            for row, tally in own.items():
-                _rendered_row(table, f"rendered {model}, {rig}, {row}", tally, rig, row)
-                _merge(tallies.setdefault(row, Tally()), tally)
-        for row, tally in tallies.items():
-            _rendered_row(table, f"rendered E1 to E5, {rig}, {row}", tally, rig, row, barred=True)
-
-
-def _rendered_image(tallies: dict[str, Tally], renderer: Any, model: str, rig: str, seed: int, *, few: bool) -> None:
-    """All rows of one seed; those with a moved lamp or with lids for `few` of them only."""
-    even = rendered_eyes.scene_of(model, rig, seed, contrast=0.0)
-    # Every eye model has noise of its own: pooled rows would else count the same draw five times.
-    noise_seed = 10 * (len(rendered_eyes.MODELS) * seed + rendered_eyes.MODELS.index(model))
-    shot = rendered_eyes.photograph(renderer, even)
-    for k, (row, (noise, blur, *_)) in enumerate(RENDERED.items()):
-        drawing = rendered_eyes.developed(shot, noise_seed + k, noise_dn=noise, blur_px=blur)
-        _extracted(tallies.setdefault(row, Tally()), drawing)
-    textured = rendered_eyes.scene_of(model, rig, seed, contrast=1.0)
-    drawing = rendered_eyes.developed(rendered_eyes.photograph(renderer, textured), noise_seed + 7, noise_dn=2.0)
-    _extracted(tallies.setdefault("textured iris, noise 2", Tally()), drawing)
-    if not few:
-        return
-    shot = rendered_eyes.photograph(renderer, rendered_eyes.with_edge_glint(even, seed))
-    drawing = rendered_eyes.developed(shot, noise_seed + 8, noise_dn=2.0)
-    _extracted(tallies.setdefault("glint on the edge, noise 2", Tally()), drawing)
-    region = {"seed": seed, "blink": float(np.random.default_rng([seed, 6]).uniform(0.0, 0.45))}
-    shot = rendered_eyes.photograph(renderer, rendered_eyes.scene_of(model, rig, seed, contrast=1.0, region=region))
-    if shot.visible > 0.6:
-        drawing = rendered_eyes.developed(shot, noise_seed + 9, noise_dn=2.0)
-        _extracted(tallies.setdefault("lids and lashes, textured, noise 2", Tally()), drawing)
-
-
-def _extracted(tally: Tally, drawing: ideal.Drawing) -> None:
-    start = time.process_time()
-    found = extract(drawing.image)
-    tally.cpu_s.append(time.process_time() - start)
-    _compare(tally, found, drawing)
-
-
-def _merge(into: Tally, other: Tally) -> None:
-    for one in fields(Tally):
-        mine, theirs = getattr(into, one.name), getattr(other, one.name)
-        if isinstance(mine, list):
-            mine.extend(theirs)
-        elif isinstance(mine, dict):
-            for key, values in theirs.items():
-                mine[key].extend(values)
-        else:
-            setattr(into, one.name, mine + theirs)
-
-
-def _rendered_row(table: Table, name: str, tally: Tally, rig: str, row: str, *, barred: bool = False) -> None:
-    """One row: errors of centre, semi-axes and glints. The bars are those of the ideal images."""
-    condition = {"textured iris, noise 2": "texture6", "glint on the edge, noise 2": "edge-glint"}.get(row)
-    if row in RENDERED:
-        condition = RENDERED[row][2 if rig == "close" else 3]
-    if rig == "remote" and condition == "edge-glint":
-        condition = None  # that bar is for semi-axes of 28 px and more
-    median, p95 = CENTRE[condition] if barred and condition is not None else (None, None)
-    if not tally.iou:
-        table.add(f"{name}: found", 0.0, "1", least=1.0 if barred else None)
-        return
-    table.add(f"{name}: centre error, median", float(np.median(tally.centre)), "px", most=median)
-    table.add(f"{name}: centre error, 95th percentile", float(np.percentile(tally.centre, 95)), "px", most=p95)
-    table.add(f"{name}: IoU > 0.9", tally.right / tally.images, "1", least=1.0 if median is not None else None)
-    for axis, bias in zip("ab", np.mean(tally.axes, axis=0), strict=True):
-        limit = 0.01 if barred and row == "noise 2" and rig == "close" else None
-        # The bar is on the size; the sign is told by the row of the same name without one.
-        table.add(f"{name}: semi-axis {axis}, mean error", float(bias), "px")
-        if limit is not None:
-            table.add(f"{name}: semi-axis {axis}, bias", abs(float(bias)), "px", most=limit)
-    if tally.glint:
-        errors = np.array([error for _, error in tally.glint])
-        most = {"noise 2": 0.010, "glint on the edge, noise 2": 0.020}.get(row) if barred else None
-        if row == "glint on the edge, noise 2":
-            errors = np.array([error for index, error in tally.glint if index == 0])
-        table.add(f"{name}: glint error, median", float(np.median(errors)), "px", most=most)
-        table.add(f"{name}: glint error, 95th percentile", float(np.percentile(errors, 95)), "px")
-        table.add(f"{name}: glint recall", len(tally.glint) / tally.glints_true, "1")
-    if barred:
-        table.add(f"{name}: CPU an image, median", 1e3 * float(np.median(tally.cpu_s)), "ms", aim=40.0)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="10 images a row, 200 for the confidence")
     parser.add_argument("--json", type=Path, help="write the rows here")
     parser.add_argument("--seed", type=int, default=10_000, help="first seed")
     parser.add_argument("--count", type=int, help="images a row (default 40; --quick: 10)")
-    parser.add_argument("--processes", type=int, default=2, help="for the confidence's images")
+    parser.add_argument("--processes", type=int, default=2, help="for the confidence and the rendered images")
     parser.add_argument("--only", choices=("ideal", "confidence", "rendered"), help="one part of the table")
     options = parser.parse_args()
     cv2.setNumThreads(1)
@@ -410,7 +221,7 @@ def main() -> int:
         coverage(table, tallies, "refined")
         coverage(table, tallies, "fast")
     if "rendered" in parts:
-        rendered(table, count, options.seed)
+        bench_rendered_rows.add(table, count, options.seed, options.processes)
     if "confidence" in parts:
         reliability(table, many, options.seed, options.processes)
     missed = [row["name"] for row in table.rows if row["met"] is False]

@@ -54,7 +54,9 @@ class Photograph:
     visible: float
 
 
-def scene_of(model: str, rig: str, seed: int, *, contrast: float, region: dict[str, Any] | None = None) -> Scene:
+def scene_of(
+    model: str, rig: str, seed: int, *, contrast: float, region: dict[str, Any] | None = None, spp: int = SPP
+) -> Scene:
     """One frame of a right eye."""
     rng = np.random.default_rng([seed, zlib.crc32(rig.encode())])
     about = RIGS[rig]
@@ -69,7 +71,7 @@ def scene_of(model: str, rig: str, seed: int, *, contrast: float, region: dict[s
             "lights": [{"position_mm": place, **about["lamp"]} for place in about["lamps"]],
         },
         "poses": [{"azimuth_deg": float(azimuth), "elevation_deg": float(elevation)}],
-        "image": {"window_px": about["window"], "spp": SPP},
+        "image": {"window_px": about["window"], "spp": spp},
         "sensor": {"psf_sigma_px": PSF_PX, "noise": False},
         "look": {"iris_contrast": contrast, "iris_seed": seed},
         "seed": seed,
