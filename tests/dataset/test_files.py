@@ -221,6 +221,17 @@ def test_an_actor_in_another_folder_makes_the_same_shard(made, tmp_path, monkeyp
 
 
 @pytest.mark.render
+@pytest.mark.slow
+def test_a_ray_run_makes_the_same_bytes(made, tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.chdir(made)
+    plan = Plan.load("spec/spec.yaml")
+    monkeypatch.chdir(tmp_path)
+    make(tmp_path / "ray", plan, engine="ray", workers=2, threads=2)
+    assert tree(tmp_path / "ray") == tree(made / "out")
+
+
+@pytest.mark.render
 def test_a_sample_written_as_a_scene_renders_the_datasets_image(made, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lines = [json.loads(line) for line in (made / "out" / "metadata.jsonl").read_text().splitlines()]
