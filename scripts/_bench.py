@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import platform
 import resource
@@ -75,9 +76,10 @@ class Report:
                     **{name: version(name) for name in packages},
                     **(versions or {}),
                 },
-                "rows": self.rows,
+                # JSON has no word for what is not a number.
+                "rows": [{**r, "value": r["value"] if math.isfinite(r["value"]) else None} for r in self.rows],
             }
-            path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+            path.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         return 1 if missed else 0
 
 

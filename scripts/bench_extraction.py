@@ -13,21 +13,16 @@ missed.
 
 from __future__ import annotations
 
-import argparse
-import json
-import platform
 import sys
 import time
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from multiprocessing import Pool
-from pathlib import Path
-from typing import Any
 
 import bench_rendered_rows
 import cv2
 import make_ideal_images as ideal
 import numpy as np
+from _bench import Report, options_of, row
 from extraction_tally import CENTRE, Tally, compare
 from numpy.typing import NDArray
 
@@ -48,27 +43,16 @@ QUANTILES = {2: (2.2957, 6.1801, 11.8292), 5: (5.8876, 11.3139, 18.2053)}
 
 @dataclass(slots=True)
 class Table:
-    """The rows of the report."""
+    """The rows of the bench; a bar is the `most` or the `least` that a value may be."""
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    report: Report = field(default_factory=Report)
 
     def add(
         self, name: str, value: float, unit: str, *, most: float | None = None, least: float | None = None,
         aim: float | None = None,
     ) -> None:  # fmt: skip
         must = most if most is not None else least
-        met = None
-        if most is not None:
-            met = bool(value <= most)
-        elif least is not None:
-            met = bool(value >= least)
-        self.rows.append({"name": name, "value": value, "unit": unit, "must": must, "aim": aim, "met": met})
-        mark = {True: "met", False: "MISSED", None: ""}[met]
-        print(f"{name:62s} {value:9.4f} {unit:5s} must {_text(must):>8s}  aim {_text(aim):>8s}  {mark}", flush=True)
-
-
-def _text(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
+        self.report.add(row(name, value, unit, must, aim, at_least=least is not None))
 
 
 def run(condition: str, count: int, first: int, settings: ExtractionSettings) -> Tally:
@@ -202,9 +186,7 @@ def reliability(table: Table, count: int, first: int, processes: int) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="10 images a row, 200 for the confidence")
-    parser.add_argument("--json", type=Path, help="write the rows here")
+    parser = options_of(__doc__, "10 images a row, 200 for the confidence")
     parser.add_argument("--seed", type=int, default=10_000, help="first seed")
     parser.add_argument("--count", type=int, help="images a row (default 40; --quick: 10)")
     parser.add_argument("--processes", type=int, default=2, help="for the confidence and the rendered images")
@@ -224,17 +206,7 @@ def main() -> int:
         bench_rendered_rows.add(table, count, options.seed, options.processes)
     if "confidence" in parts:
         reliability(table, many, options.seed, options.processes)
-    missed = [row["name"] for row in table.rows if row["met"] is False]
-    print(f"{len(table.rows)} rows, {len(missed)} missed" + "".join(f"\n  {name}" for name in missed))
-    if options.json is not None:
-        report = {
-            "schema": "eyerender/bench/1",
-            "machine": {"system": platform.platform(), "processor": platform.machine()},
-            "versions": {name: version(name) for name in ("eyerender", "numpy", "opencv-python-headless")},
-            "rows": table.rows,
-        }
-        options.json.write_text(json.dumps(report, indent=1, allow_nan=False))
-    return 1 if missed else 0
+    return table.report.finish(options.json, ("eyerender", "numpy", "opencv-python-headless"))
 
 
 if __name__ == "__main__":

@@ -48,11 +48,13 @@ def test_a_row_is_met_by_what_it_must(bench, capsys, value, must, aim, at_least,
 def test_the_report_holds_rows_machine_and_versions(bench, tmp_path):
     report = bench.Report()
     report.extend(bench.row(name, np.float64(k), "px", 1) for k, name in enumerate("abc"))
+    report.add(bench.row("d", float("nan"), "px", 1))
     status = report.finish(tmp_path / "f.json", ("numpy",), machine={"device": "x"}, versions={"llvm": "1.2"})
-    assert status == 1  # c is 2, and must be 1
+    assert status == 1  # c is 2 and d is no number, and they must be 1
     found = json.loads((tmp_path / "f.json").read_text())
     assert found["schema"] == "eyerender/bench/1"
-    assert [row["met"] for row in found["rows"]] == [True, True, False]
+    assert [row["met"] for row in found["rows"]] == [True, True, False, False]
+    assert [row["value"] for row in found["rows"]] == [0.0, 1.0, 2.0, None]
     assert set(found["rows"][0]) == {"name", "value", "unit", "must", "aim", "met"}
     assert found["versions"] == {"python": sys.version.split()[0], "numpy": np.__version__, "llvm": "1.2"}
     assert found["machine"]["device"] == "x"
