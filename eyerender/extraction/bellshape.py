@@ -37,10 +37,10 @@ def about(xy: Array, reach: Array, shape: tuple[int, ...]) -> tuple[Index, Index
 
 
 def bell_shaped(
-    linear: Image, xy: Array, width: Array, height: Array, which: Mask, noise_dn: float, clip_dn: float
+    linear: Image, xy: Array, width: Array, height: Array, noise_dn: float, clip_dn: float, which: Mask | None = None
 ) -> Mask:
-    """(m,) bool, for each of `which`: False where no bell explains the pixels about a spot, as with skin, lashes and
-    the gaps between them.
+    """(m,) bool, for each of `which` (all): False where no bell explains the pixels about a spot, as with skin,
+    lashes and the gaps between them.
 
     Linear least squares of the level about the peak, within 2.2 sigma + 1 px and nearer to it than to any other spot:
 
@@ -50,7 +50,7 @@ def bell_shaped(
     the pixels' scatter, and stands as high as it was detected. Spots that the sensor clipped are not judged.
     xy (n, 2) peak pixels, width (n,) sigma, height (n,) DN.
     """
-    index = np.nonzero(which)[0]
+    index = np.arange(width.size) if which is None else np.nonzero(which)[0]
     sigma, tall = np.maximum(width[index], NARROWEST_PX), height[index]  # a narrower one is mostly its pixel
     reach = 2.2 * sigma + 1.0
     column, row, away2, use = about(xy[index], reach, linear.shape)

@@ -93,7 +93,8 @@ def _sweep(small: Image, factor: int, settings: ExtractionSettings) -> list[tupl
         mask = (small <= level).view(np.uint8)
         contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
         # A contour's length in pixels is at least half its ellipse's perimeter; holes have a parent.
-        for contour, (_, _, _, parent) in zip(contours, hierarchy[0] if contours else (), strict=True):
+        parents = hierarchy[0, :, 3].tolist() if contours else []
+        for contour, parent in zip(contours, parents, strict=True):
             if parent >= 0 or not 3.0 * least < contour.shape[0] < 15.0 * most:
                 continue
             x, y, w, h = cv2.boundingRect(contour)

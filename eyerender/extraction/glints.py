@@ -79,7 +79,7 @@ def detect_spots(
     xy, width, height = xy[keep], width[keep], height[keep]
     alone = _above_ring(smooth, xy, width) > RING_SHARE * height
     bell = alone.copy()
-    bell[alone] = bell_shaped(crop, xy, width, height, alone, prepared.noise_dn, prepared.clip_dn)
+    bell[alone] = bell_shaped(crop, xy, width, height, prepared.noise_dn, prepared.clip_dn, alone)
     patches = np.concatenate([patches, xy[~bell]])[: settings.max_glints]
     corner = np.array([x0, y0])
     clutter = alone & ~bell

@@ -23,12 +23,12 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 PARAMETERS = 8  # x, y, ln A, ln sx, ln sy, b0, bx, by
-MOST_STEPS = 12
 LOST_PX = 12.0  # no glint's fit is as wide as that, or as far from where it began
-# Spots whose light reaches into each other's windows: turns of STEPS steps each, with the others' light as the turn
-# before left it; after PATIENCE turns a spot that still moves by WANDERING_PX is given up. The second numbers are for
-# twins, which overlap, and so must push each other apart.
+# Turns of STEPS steps each, with the light of others in a spot's window as the turn before left it; after PATIENCE
+# turns a spot that still moves by WANDERING_PX is given up. The second numbers are for twins, which overlap, and so
+# must push each other apart, and for spots that the fit explains to within ROUGH noises.
 TURNS, STEPS, PATIENCE, WANDERING_PX = (4, 10), 4, (2, 4), 0.3
+ROUGH = 3.0
 STILL_PX, SAME_LIGHT = 3e-4, 0.01  # no further turn: movement, and change of the others' light in noises
 ROUND_SD = 0.3  # standard deviation of ln sx - ln sy: glints are nearly round
 
@@ -58,22 +58,23 @@ def fit_spots(
     theta = _start(pixels, start_px, width_px, height_dn)
     begun, touching, twin = theta[:, :2].copy(), _touching(start_px, width_px), _twin(start_px, width_px)
     paired: Mask = np.asarray(touching.any(axis=1))
-    patience, turns = np.where(twin, PATIENCE[1], PATIENCE[0]), np.where(twin, TURNS[1], TURNS[0])
+    hopeful = np.ones(paired.size, dtype=bool)
     settled, lost = np.zeros(paired.size, dtype=bool), np.zeros(paired.size, dtype=bool)
     others = light_between(pixels, theta, touching, noise_dn)
     live = np.arange(paired.size)
     for turn in range(TURNS[1]):
-        steps = np.where(paired[live], STEPS, MOST_STEPS)
-        found, done = _fit(pixels.taken(live), theta[live], others[pixels.rows(live)], steps, noise_dn, slope_dn)
+        found, done, misfit = _fit(pixels.taken(live), theta[live], others[pixels.rows(live)], noise_dn, slope_dn)
         moved, restless = np.zeros(paired.size), np.zeros(paired.size, dtype=bool)
         moved[live] = np.abs(found[:, :2] - theta[live, :2]).max(axis=1)
         theta[live] = found
         settled[live] = done | (paired[live] & (moved[live] < 0.02))
+        hopeful[live] = twin[live] | (misfit < ROUGH)
+        patience, turns = (np.where(hopeful, part[1], part[0]) for part in (PATIENCE, TURNS))
         restless[live] = ~done & (moved[live] > STILL_PX)
         lost |= paired & (_lost(theta, begun) | ((moved > WANDERING_PX) & (turn + 1 >= patience)))
         before, others = others, light_between(pixels, theta, touching & ~lost, noise_dn)
         brighter = pixels.total(np.abs(others - before) > SAME_LIGHT * noise_dn) > 0
-        live = np.nonzero(paired & ~lost & (restless | brighter) & (turn + 1 < turns))[0]
+        live = np.nonzero(~lost & (restless | brighter) & (turn + 1 < turns))[0]
         if live.size == 0:
             break
     return _report(pixels, theta, settled & ~lost, others, noise_dn, slope_dn)
@@ -187,18 +188,17 @@ _MOST = np.array([np.inf, np.inf, 15.0, math.log(30.0), math.log(30.0), np.inf, 
 _STRIDE = np.array([1.5, 1.5, 0.7, 0.7, 0.7, np.inf, np.inf, np.inf])  # largest step
 
 
-def _fit(
-    pixels: SpotPixels, theta: Array, others: Array, steps: NDArray[np.intp], noise: float, slope: float
-) -> tuple[Array, Mask]:
-    """(theta, settled) by Levenberg-Marquardt on every spot side by side, each for at most its `steps` steps."""
+def _fit(pixels: SpotPixels, theta: Array, others: Array, noise: float, slope: float) -> tuple[Array, Mask, Array]:
+    """(theta, settled, root mean square misfit in noises) by at most STEPS steps of Levenberg-Marquardt on every spot
+    side by side."""
     out, start = theta.copy(), theta[:, :2].copy()
     settled = np.zeros(theta.shape[0], dtype=bool)
     live = np.arange(theta.shape[0])  # the spots that are not settled; what follows holds these alone
-    damping = np.full(live.size, 1e-2)
+    damping, size, misfit = np.full(live.size, 1e-2), pixels.count, np.zeros(live.size)
     rest, grid = pixels.data - pixels.known - others, Grid.of(pixels)
     cost, gradient, matrix = _normal(_gram(pixels, grid, theta, rest, noise)[0], theta, slope)
     diagonal = np.arange(PARAMETERS)
-    for turn in range(int(steps.max())):
+    for _ in range(STEPS):
         damped = matrix.copy()
         damped[:, diagonal, diagonal] *= 1.0 + damping[:, None]
         damped[:, diagonal, diagonal] += 1e-9
@@ -207,17 +207,16 @@ def _fit(
         trial = np.minimum(np.maximum(theta + step, _LEAST), _MOST)
         new_cost, new_gradient, new_matrix = _normal(_gram(pixels, grid, trial, rest, noise)[0], trial, slope)
         better = new_cost <= cost * (1.0 + 1e-12)
-        size = np.abs(step)
-        small = (size[:, :2].max(axis=1) < 2e-4) & (size[:, 2:5].max(axis=1) < 2e-3)
+        stride = np.abs(step)
+        small = (stride[:, :2].max(axis=1) < 2e-4) & (stride[:, 2:5].max(axis=1) < 2e-3)
         theta = np.where(better[:, None], trial, theta)
         gradient = np.where(better[:, None], new_gradient, gradient)
         matrix = np.where(better[:, None, None], new_matrix, matrix)
         cost = np.where(better, new_cost, cost)
         damping = np.minimum(np.maximum(np.where(better, 0.1 * damping, 8.0 * damping), 1e-7), 1e7)
-        out[live] = theta
+        out[live], misfit[live] = theta, cost
         done = (better & small) | (damping > 1e5) | _lost(theta, start[live])
         settled[live[done]] = True
-        done |= steps[live] <= turn + 1
         if done.all():
             break
         if done.any():
@@ -227,7 +226,7 @@ def _fit(
             grid = Grid.of(pixels)
             live, theta, cost, damping = live[keep], theta[keep], cost[keep], damping[keep]
             gradient, matrix = gradient[keep], matrix[keep]
-    return out, settled
+    return out, settled, np.sqrt(misfit / np.maximum(size, 1))
 
 
 def _report(pixels: SpotPixels, theta: Array, settled: Mask, others: Array, noise: float, slope: float) -> SpotFit:
