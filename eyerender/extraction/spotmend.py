@@ -23,7 +23,7 @@ from .spotpixels import SpotPixels, cut, window_radius
 Array = NDArray[np.float64]
 Background = Callable[[Array, Array], Array]
 
-UNEXPLAINED, UNLIKE_BELL = 2.0, 0.005
+UNEXPLAINED, UNLIKE_BELL = 2.0, 0.002
 # What an edge beside a glint leaves of the glint's height, and a second glint: more is no glint's.
 BESIDE_EDGE, BESIDE_TWIN = 0.1, 0.17
 LEAST_SHARE = 0.5  # of the squared residual, taken by an edge: the fit beside it must take as much
