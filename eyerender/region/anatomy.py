@@ -61,6 +61,7 @@ class LidSpec(Spec):
     crease_mm: float = _number(8.0, 5.0, 11.0, "crease above the margin of the closed lid (Cartwright; others 8 to 10)")
     show_mm: float = _number(2.6, 1.2, 5.0, "lid visible below the fold when open (Cartwright)")
     fold_mm: float = _number(1.0, 0.0, 1.9, "how far the fold stands above the crease (chosen)")
+    fill_mm: float = _number(2.1, 0.0, 3.5, "how far the hollow above the lid fills as it shuts (chosen)")
     bags_mm: float = _number(0.5, 0.0, 1.5, "fullness below the lower lid (chosen)")
 
 
@@ -88,8 +89,8 @@ class BrowSpec(Spec):
     height_mm: float = _number(15.5, 10.0, 24.0, "lower border above the pupil (chosen)")
     thickness_mm: float = _number(8.5, 3.0, 12.0, "height of the band at its head (chosen)")
     arch_mm: float = _number(3.5, 0.0, 8.0, "rise from head to arch (chosen)")
-    diameter_mm: float = _number(0.085, 0.05, 0.14, "at the root (chosen)")
-    albedo: float = _number(0.13, 0.02, 0.6, "at 850 nm (chosen)")
+    diameter_mm: float = _number(0.075, 0.05, 0.14, "at the root (chosen)")
+    albedo: float = _number(0.18, 0.02, 0.6, "at 850 nm (chosen)")
 
 
 class FaceSpec(Spec):
@@ -108,8 +109,10 @@ class SkinSpec(Spec):
     mottling: Share = Field(default=0.5, description="unevenness of the albedo (chosen)")
     relief_mm: float = _number(0.032, 0.0, 0.12, "depth of the skin's fine furrows (some tens of micrometres; chosen)")
     wrinkles: Share = Field(default=0.35, description="lines on and below the lids (chosen)")
+    pores: Share = Field(default=0.5, description="depth of the pores beyond the lids (chosen)")
+    veins: Share = Field(default=0.35, description="of the veins that show through the lids' thin skin (chosen)")
     sheen: Share = Field(default=0.5, description="strength of the oily skin's rough mirror (chosen)")
-    wet_albedo: float = _number(0.40, 0.2, 0.7, "of the margins and the caruncle (chosen)")
+    wet_albedo: float = _number(0.40, 0.25, 0.55, "of the margins and the caruncle (chosen)")
 
 
 class TearSpec(Spec):

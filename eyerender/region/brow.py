@@ -28,7 +28,7 @@ def brow(spec: RegionSpec) -> Hairs:
     # 0 at the head, 1 at the tail; thinning out at both ends and at both borders.
     s = -0.04 + 1.1 * rng.beta(1.25, 1.55, n)
     across = rng.beta(1.7, 1.7, n)
-    y, low, high = _band(spec, s)
+    y, low, high = brow_band(spec, s)
     z = low + across * (high - low) + 0.5 * rng.normal(0, 1, n)
     head = 1 - step(s, -0.02, 0.36)
     upper = step(across, 0.3, 0.95)
@@ -37,9 +37,9 @@ def brow(spec: RegionSpec) -> Hairs:
     lean = np.radians(along + (14.0 - along) * head + 26.0 * (upper - 0.25) * (1 - 0.7 * head))
     # Neighbours lie alike, a few stray.
     drift = np.interp(s, np.linspace(-0.1, 1.1, 22), rng.normal(0, 1, 22))
-    lean = lean + np.radians(4.0) * drift + np.radians(9.0) * np.clip(rng.standard_t(5, n), -3, 3)
+    lean = lean + np.radians(5.0) * drift + np.radians(6.0) * np.clip(rng.standard_t(5, n), -3.5, 3.5)
     length = b.length_mm * rng.triangular(0.35, 0.85, 1.0, n) * (0.62 + 0.38 * np.sin(np.pi * np.clip(s, 0, 1) ** 0.8))
-    bend = np.radians(24.0) * rng.normal(0.9, 0.6, n) * (1 - 0.3 * head)
+    bend = np.radians(26.0) * rng.normal(1.0, 0.45, n) * (1 - 0.3 * head)
     points = np.empty((n, POINTS, 3))
     lift = 0.35 + 0.55 * rng.uniform(0, 1, n) + 0.5 * head
     for j in range(POINTS):
@@ -53,7 +53,7 @@ def brow(spec: RegionSpec) -> Hairs:
     return Hairs(frozen(points), frozen(taper(length, b.diameter_mm, POINTS)))
 
 
-def _band(spec: RegionSpec, s: Floats) -> tuple[Floats, Floats, Floats]:
+def brow_band(spec: RegionSpec, s: Floats) -> tuple[Floats, Floats, Floats]:
     """(y, lower z, upper z) of the band at s."""
     b = spec.brow
     y = 21.0 - 46.0 * s

@@ -104,7 +104,9 @@ def _outline(spec: RegionSpec, globe: Globe, a: Floats, upper: Floats) -> tuple[
     low = min(low, -0.6)
     high = max(height(f.upper_mm, lids.upper_follows) - middle_z, low + 1.0)
     rest = f.upper_mm - middle_z
-    shut = 0.8 * low + 0.2 * high if high < 0 else 0.8 * low
+    # Shut, they meet near the lower lid's place; one that stands very low comes up to meet the other.
+    shut = 0.92 * low + 0.08 * min(high, 0.0)
+    shut = max(shut, -3.2 + 0.5 * (shut + 3.2))
     shape_up = _shape(a, f.peak, 0.98)
     shape_low = _shape(a, -0.08, 0.92)
     # Beside the caruncle both lids run close together.

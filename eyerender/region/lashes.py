@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..arrays import ArrayValue, Floats, Ints, frozen
+from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
 from .anatomy import LashSpec, RegionSpec
 from .contour import step, unit
 from .globe import Globe
@@ -26,6 +26,8 @@ from .lids import CONJUNCTIVA, EDGE_MM, LID, MARGIN, Sheet
 _ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # of the points beyond the root; they start on the skin
 _REACH_ROWS = 16
 _CAUGHT_MM = 0.3  # a lash that still has so far to go is caught
+_NEAR_COLUMNS = 6
+_KINK = 0.45  # cosine of the sharpest bend between two pieces, sharper than any lash's curl
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,6 +107,9 @@ def lashes(spec: RegionSpec, globe: Globe, sheet: Sheet) -> Hairs:
     # With the lids shut there is less room between them.
     fold_back = step(1 - c.openness, 0.5, 1.0)
     start = p.start * (1 - 0.6 * fold_back)
+    # Beyond the other lid's edge they hang down over it.
+    hang = np.where(p.angle < np.pi, -np.radians(44.0), -np.radians(6.0)) * fold_back
+    hang = hang * step(np.abs(np.sin(p.angle)), 0.3, 0.8)  # at the corners there is no room for that
     k = SEGMENTS + 1
     # Shorter pieces where it bends most.
     ends = np.linspace(0, 1, k) ** 1.25
@@ -112,14 +117,46 @@ def lashes(spec: RegionSpec, globe: Globe, sheet: Sheet) -> Hairs:
     points[:, 0] = root - 0.06 * n + 0.08 * m
     for j in range(1, k):
         s = 0.5 * (ends[j - 1] + ends[j])
-        b = start + p.curl * s**1.15
+        b = start + hang * min(s / 0.3, 1.0) + p.curl * s**1.15
         f = p.fan * (0.5 + 0.7 * s)
         d = np.cos(f)[:, None] * (np.cos(b)[:, None] * n + np.sin(b)[:, None] * m) + np.sin(f)[:, None] * t
         points[:, j] = points[:, j - 1] + (p.length_mm * (ends[j] - ends[j - 1]))[:, None] * d
     ahead = unit(n + 0.4 * np.array([1.0, 0.0, 0.0]))
     straight = root[:, None] + (p.length_mm[:, None] * ends)[..., None] * ahead[:, None]
     points[:, 1:] = _out_of_skin(globe, sheet, points, straight)
+    if fold_back > 0.2:
+        # In the corners of shut lids the nearest skin tells little: what still goes through it stays in its root.
+        corner = np.flatnonzero(np.abs(np.sin(p.angle)) < 0.75)
+        stuck = corner[_through_skin(sheet, p.angle[corner], points[corner, 1:])] if len(corner) else corner
+        points[stuck, 1:] = points[stuck, :1] + 0.0005 * (straight[stuck, 1:] - points[stuck, :1])
     return Hairs(frozen(points), frozen(taper(p.length_mm, spec.lashes.diameter_mm, k) * p.stout[:, None]))
+
+
+def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
+    """Whether the first pieces of curves (n, k, 3) cross the sheet about their roots, on either lid (n,): Moeller and
+    Trumbore's test.
+    """
+    n = sheet.vertices.shape[1]
+    across = np.rint(angle / (2 * np.pi) * n).astype(int)[:, None] + np.arange(-_NEAR_COLUMNS, _NEAR_COLUMNS + 1)
+    columns = np.concatenate([across, n - across], axis=1) % n
+    rows = sheet.vertices[CONJUNCTIVA + 2 : CONJUNCTIVA + MARGIN + LID - 3]
+    left, right = np.moveaxis(rows[:, columns], 0, 1), np.moveaxis(rows[:, (columns + 1) % n], 0, 1)
+    a, b, c, d = left[:, :-1], right[:, :-1], left[:, 1:], right[:, 1:]
+    corner = np.concatenate([a, a], axis=1)
+    e1, e2 = np.concatenate([c - a, d - a], axis=1), np.concatenate([d - a, b - a], axis=1)
+    corner, e1, e2 = (np.reshape(v, (len(angle), -1, 3)) for v in (corner, e1, e2))
+    normal = np.cross(e1, e2)
+    out = np.zeros(len(angle), dtype=bool)
+    for j in range(min(3, points.shape[1] - 1)):
+        o, way = points[:, j, None], (points[:, j + 1] - points[:, j])[:, None]
+        det = -np.sum(way * normal, axis=-1)
+        det = np.where(np.abs(det) < 1e-12, 1e-12, det)
+        s = o - corner
+        t = np.sum(s * normal, axis=-1) / det
+        moment = np.cross(s, way)
+        u, v = np.sum(e2 * moment, axis=-1) / det, -np.sum(e1 * moment, axis=-1) / det
+        out |= np.any((t >= 0) & (t <= 1) & (u >= 0) & (v >= 0) & (u + v <= 1), axis=1)
+    return out
 
 
 def _at(angle: Floats, values: Floats) -> Floats:
@@ -173,8 +210,11 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
         if not len(active):
             break
     # Bent out of shape on the way, for want of room: it stays in its root.
-    pieces, rest = (np.linalg.norm(np.diff(v, axis=1), axis=-1) for v in (out, straight))
-    stretched = ((pieces / np.maximum(rest, 1e-9)).max(axis=1) > 1.7) | (left > _CAUGHT_MM)
-    out[stretched] = root[stretched] + 0.0005 * (straight[stretched] - root[stretched])
+    way = np.diff(out, axis=1)
+    pieces, rest = (np.linalg.norm(v, axis=-1) for v in (way, np.diff(straight, axis=1)))
+    spoilt = ((pieces / np.maximum(rest, 1e-9)).max(axis=1) > 1.7) | (left > _CAUGHT_MM)
+    along = np.sum(way[:, 1:] * way[:, :-1], axis=-1)
+    spoilt |= np.any(along < _KINK * pieces[:, 1:] * pieces[:, :-1], axis=1)
+    out[spoilt] = root[spoilt] + 0.0005 * (straight[spoilt] - root[spoilt])
     # And off the globe, for lashes that turn in.
     return globe.pushed_out(out, 0.3)

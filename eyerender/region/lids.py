@@ -21,7 +21,7 @@ import numpy as np
 
 from ..arrays import ArrayValue, Floats, Ints, frozen
 from .anatomy import RegionSpec
-from .contour import COLUMNS, LATERAL, Contour, contour, step, unit
+from .contour import COLUMNS, LATERAL, Contour, canthi, contour, step, unit
 from .face import face_depth
 from .globe import Globe
 
@@ -165,23 +165,43 @@ def _spread(c: Contour, y: Floats, z: Floats, y_line: float, nasal: bool) -> Flo
 
 def _skin(spec: RegionSpec, globe: Globe, c: Contour, edge: Floats, lash_line: Floats) -> Floats:
     """Rows from the lash line (exclusive) outwards."""
-    y0, z0 = lash_line[:, 1], lash_line[:, 2]
-    border_y, border_z = _border(c)
-    dy, dz = border_y - y0, border_z - z0
-    length = np.hypot(dy, dz)
     crease = _crease(spec, c)
-    v = _distances(crease, length)
-    q = v / length
-    y, z = y0 + dy * q, z0 + dz * q
-    x = skin_depth(spec, globe, y, z)
-    start = lash_line[:, 0] - skin_depth(spec, globe, y0, z0)
-    x = x + start * np.exp(-((v / 2.2) ** 2))
+    v, y, z = _spokes(c, crease, lash_line)
+    # Lids move their own skin, and that of the brow and the cheek the less, the further it is.
+    held = step(np.arange(LID + FACE, dtype=float), LID + 0.25 * FACE, LID + 0.72 * FACE)[:, None]
+    y_rest, z_rest = _at_rest(spec.model_copy(update={"blink": 0.0}))
+    y, z = y + held * (y_rest - y), z + held * (z_rest - z)
+    x = skin_depth(spec, globe, y, z) + _fullness(spec, c, y, z)
+    start = lash_line[:, 0] - skin_depth(spec, globe, lash_line[:, 1], lash_line[:, 2])
+    # Where the lids leave the globe, the canthi lie in a hollow: the deeper, the wider.
+    x = x + start * np.exp(-((v / (2.2 + 0.8 * np.maximum(-start - 1.2, 0))) ** 2))
     strength = _fold_strength(c)
     lift, drop = _fold(spec, c, v, crease, strength)
     x = x + lift
     z = z - drop * c.upper
     rows = np.stack([x, y, z], axis=-1)
     return globe.pushed_out(rows, 0.4)
+
+
+def _spokes(c: Contour, crease: Floats, lash_line: Floats) -> tuple[Floats, Floats, Floats]:
+    """Distance from the lash line, y and z (rows, columns) of places on straight lines out to the border."""
+    y0, z0 = lash_line[:, 1], lash_line[:, 2]
+    border_y, border_z = _border(c)
+    dy, dz = border_y - y0, border_z - z0
+    length = np.hypot(dy, dz)
+    v = _distances(crease, length)
+    q = v / length
+    return v, y0 + dy * q, z0 + dz * q
+
+
+@lru_cache(maxsize=8)
+def _at_rest(spec: RegionSpec) -> tuple[Floats, Floats]:
+    """y and z (rows, columns) of the skin with the eye open and straight ahead."""
+    globe = Globe.sphere()
+    c = contour(spec, globe)
+    _, lash_line = _margin(spec, globe, c)
+    _, y, z = _spokes(c, _crease(spec, c), lash_line)
+    return frozen(y), frozen(z)
 
 
 def _border(c: Contour) -> tuple[Floats, Floats]:
@@ -226,15 +246,26 @@ def _fold(spec: RegionSpec, c: Contour, v: Floats, crease: Floats, strength: Flo
     """What the fold adds to the depth, and how far it hangs over the crease (both rows x columns, mm)."""
     lids = spec.lids
     open_ = min(max(c.openness, 0.0), 1.15)
-    height = lids.fold_mm * (0.25 + 0.75 * open_) * strength
+    height = lids.fold_mm * (0.4 + 0.6 * open_) * strength
     w = v - crease
     groove = -0.3 * np.exp(-((w / 0.5) ** 2)) * (0.4 + 0.6 * open_) * (lids.fold_mm > 0)
     swell = step(w, -0.2, 2.2) * np.exp(-(np.maximum(w - 1.6, 0) ** 2) / 30.0)
     lift = height * swell + groove * strength
     drop = 0.55 * height * step(w, 0.0, 0.7) * np.exp(-(np.maximum(w - 0.7, 0) ** 2) / 5.0)
+    # What the fold holds when open lies in shallow pleats above the crease of the closed lid.
+    shut = max(1.0 - open_, 0.0)
+    for place, depth in ((2.3, 0.16), (4.1, 0.11)) if shut > 0 else ():
+        off = w - place - 0.5 * np.cos(2 * c.angle + place) - 0.35 * np.cos(c.angle)
+        lift = lift - depth * shut * strength * np.exp(-((off / 0.55) ** 2)) * (lids.fold_mm > 0)
     bags = np.where(c.upper < 0, 1.0, 0.0) * lids.bags_mm * np.exp(-(((v - 8.5) / 3.5) ** 2)) * np.abs(np.sin(c.angle))
     line = np.where(c.upper < 0, -0.22, 0.0) * np.exp(-(((v - crease) / 0.7) ** 2)) * np.abs(np.sin(c.angle))
     return lift + bags + line, drop
+
+
+def _fullness(spec: RegionSpec, c: Contour, y: Floats, z: Floats) -> Floats:
+    """How far the hollow above the lid fills (mm) as the lid comes down and brings its skin and fat along."""
+    shut = 1 - min(c.openness, 1.0)
+    return np.asarray(spec.lids.fill_mm * shut * np.exp(-(((z - 10.5) / 6.0) ** 2) - ((y - 1.0) / 18.0) ** 4))
 
 
 def skin_depth(spec: RegionSpec, globe: Globe, y: Floats, z: Floats) -> Floats:
@@ -242,15 +273,29 @@ def skin_depth(spec: RegionSpec, globe: Globe, y: Floats, z: Floats) -> Floats:
     centre = 0.5 * (globe.centre + globe.rest)
     dy, dz = y - centre[1], z - centre[2]
     outer = globe.radius_mm + spec.lids.thickness_mm
-    # Past 46 degrees from the front the shell leaves the sphere along its tangent and flattens: the orbit's fat.
-    rho, limit = np.hypot(dy, dz), np.radians(46.0)
+    # Past 42 degrees from the front the shell leaves the sphere along its tangent and flattens: the orbit's fat.
+    rho, limit = np.hypot(dy, dz), np.radians(42.0)
     rho0 = outer * np.sin(limit)
     past = np.maximum(rho - rho0, 0.0)
     over = np.sqrt(outer * outer - np.minimum(rho, rho0) ** 2)
     shell = centre[0] + over - np.tan(limit) * _SOFT_MM * (1 - np.exp(-past / _SOFT_MM)) - 0.2 * past
+    # Towards the canthi, whose tendons hold them back, it falls faster.
+    sideways = dy / np.maximum(rho, 1e-9)
+    shell = shell - 2.4 * step(-sideways, 0.45, 1.0) * step(rho, 7.5, 16.0)
+    shell = shell - 1.8 * step(sideways, 0.5, 1.0) * step(rho, 8.0, 16.5)
     shell = shell + _bulge(globe, y, z, outer)
     face = face_depth(spec.face, y, z)
-    return np.asarray(np.maximum(shell, face) + _JOINT_MM * np.log1p(np.exp(-np.abs(shell - face) / _JOINT_MM)))
+    joined = np.maximum(shell, face) + _JOINT_MM * np.log1p(np.exp(-np.abs(shell - face) / _JOINT_MM))
+    return np.asarray(joined - _canthal_hollow(spec, y, z))
+
+
+def _canthal_hollow(spec: RegionSpec, y: Floats, z: Floats) -> Floats:
+    """How far the canthal tendons hold the skin about either canthus back, mm."""
+    middle, half = canthi(spec)
+    out = np.zeros_like(y)
+    for end, depth, wide in ((middle - half, 2.2, 4.2), (middle + half, 1.4, 3.5)):
+        out = out + depth * np.exp(-(((y - end[0]) / wide) ** 2) - ((z - end[1]) / 4.2) ** 2)
+    return out
 
 
 def _bulge(globe: Globe, y: Floats, z: Floats, outer: float) -> Floats:

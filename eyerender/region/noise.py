@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from ..arrays import Floats, frozen
@@ -49,5 +48,11 @@ def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Floats:
 def sampled(tile: Floats, x: Floats, y: Floats, period_mm: float) -> Floats:
     """A periodic square tile at (x, y) mm, linear in between."""
     n = len(tile)
-    place = np.stack([np.ravel(y), np.ravel(x)]) / period_mm * n
-    return np.asarray(ndimage.map_coordinates(tile, place, order=1, mode="grid-wrap").reshape(np.shape(x)))
+    flat = np.pad(tile, (0, 1), mode="wrap").astype(np.float32).ravel()
+    u, v = np.asarray(x) * (n / period_mm), np.asarray(y) * (n / period_mm)
+    i, j = np.floor(u), np.floor(v)
+    du, dv = (u - i).astype(np.float32), (v - j).astype(np.float32)
+    at = np.mod(j, n).astype(np.intp) * (n + 1) + np.mod(i, n).astype(np.intp)
+    low = flat[at] + du * (flat[at + 1] - flat[at])
+    high = flat[at + n + 1] + du * (flat[at + n + 2] - flat[at + n + 1])
+    return np.asarray(low + dv * (high - low), dtype=float)

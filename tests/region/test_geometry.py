@@ -133,6 +133,7 @@ def test_seeded_instances_hold():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_five_hundred_instances_hold():
     for i in range(500):
         check(i)

@@ -1,0 +1,76 @@
+"""The lids in motion and the skin's map: what moves, what keeps still, and what each strength does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from eyerender.region.anatomy import RegionSpec
+from eyerender.region.globe import Globe
+from eyerender.region.lashes import lashes
+from eyerender.region.lids import CONJUNCTIVA, FACE, LID, MARGIN, ROWS, sheet
+from eyerender.region.skin import SHEET_ROWS, sheet_v, skin_map
+
+
+def at(blink, **more):
+    spec = RegionSpec.from_mapping({"seed": 5, "blink": blink, **more})
+    return spec, sheet(spec, Globe.sphere())
+
+
+def test_a_blink_moves_the_lid_and_not_the_brow():
+    (_, open_), (_, shut) = at(0.0), at(1.0)
+    moved = np.linalg.norm(open_.vertices - shut.vertices, axis=-1)
+    lash_line, middle = CONJUNCTIVA + MARGIN - 1, open_.vertices.shape[1] // 4
+    assert moved[lash_line, middle] > 8.0
+    held = slice(ROWS - FACE // 4, ROWS)
+    assert moved[held].max() < 0.05
+    assert np.all(np.abs(open_.vertices[held, middle, 2]) > 14.0)
+
+
+def test_the_hollow_above_the_lid_fills_as_it_shuts():
+    (spec, full), (_, flat) = at(1.0), at(1.0, lids={"fill_mm": 0.0})
+    (_, open_), (_, open_flat) = at(0.0), at(0.0, lids={"fill_mm": 0.0})
+    assert np.array_equal(open_.vertices, open_flat.vertices)
+    more = (full.vertices - flat.vertices)[..., 0]
+    assert more.min() >= -1e-9
+    assert more.max() == pytest.approx(spec.lids.fill_mm, rel=0.1)
+
+
+def test_shut_upper_lashes_hang_down_and_open_ones_rise():
+    rise = []
+    for blink in (0.0, 1.0):
+        spec, s = at(blink, lashes={"lower_count": 0})
+        p = lashes(spec, Globe.sphere(), s).points
+        middle = (np.abs(p[:, 0, 1]) < 6) & (np.linalg.norm(p[:, -1] - p[:, 0], axis=-1) > 2)
+        rise.append(p[middle, -1, 2] - p[middle, 0, 2])
+    assert np.mean(rise[0]) > 0.5
+    assert np.mean(rise[1]) < -1.0
+    assert np.mean(rise[1] < 0) > 0.9
+
+
+def test_texels_are_fine_enough_everywhere():
+    _, s = at(0.3)
+    v = sheet_v(np.linspace(0, 1, ROWS))
+    assert np.all(np.diff(v) > 0)
+    height = v[-1] / (SHEET_ROWS - 0.5)  # of a texel
+    size = np.linalg.norm(np.diff(s.vertices, axis=0), axis=-1).mean(axis=1) / (np.diff(v) / height)
+    assert size[CONJUNCTIVA + MARGIN : CONJUNCTIVA + MARGIN + LID].max() < 0.05  # mm
+    assert size.max() < 0.2
+
+
+def test_the_map_is_its_specs_and_strengths_darken_their_own_places():
+    spec = RegionSpec.from_mapping({"seed": 6, "skin": {"pores": 1.0, "veins": 1.0}})
+    bare = RegionSpec.from_mapping({"seed": 6, "skin": {"pores": 0.0, "veins": 0.0}})
+    full, none = skin_map(spec), skin_map(bare)
+    skin_map.cache_clear()
+    assert np.array_equal(skin_map(spec), full)
+    assert not full.flags.writeable
+    rows = (sheet_v(np.linspace(0, 1, ROWS)) * len(full)).astype(int)
+    share = full[:SHEET_ROWS, :, 0] / none[:SHEET_ROWS, :, 0]
+    assert share.max() < 1 + 1e-5
+    lid = share[rows[CONJUNCTIVA + MARGIN + 2] : rows[CONJUNCTIVA + MARGIN + LID], 300:460]
+    far = share[rows[ROWS - 8] : rows[ROWS - 1]]
+    assert 0.8 < lid.mean() < 0.995  # veins
+    assert 0.8 < far.mean() < 0.995  # pores: pits between plateaus
+    assert np.median(far) > 0.97
+    assert far.min() < 0.9
