@@ -96,10 +96,11 @@ class Bench:
         black = rigs.BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
         rig = rigs.LampRig(camera, tuple(lights))
         job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
-        values = self.renderer._bind(job).values
+        shown, place = self.renderer.bind(job)
+        values = shown.values
         u, v = pixels_of(dr.arange(mi.UInt32, n * n), job.window)
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
-        view = look(values, self.renderer._surround.scene, o, d, True)
+        view = look(values, place.scene, o, d, True)
         inner = view.inner.numpy().T
         rho = np.hypot(inner[:, 1], inner[:, 2]).reshape(n, n)
         cornea = view.cornea.numpy().astype(bool).reshape(n, n)

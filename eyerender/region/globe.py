@@ -68,15 +68,17 @@ class Globe(ArrayValue):
 
     def radial(self, direction: Floats) -> Floats:
         """r (n,) mm along unit directions (n, 3) from the centre."""
+        r = np.full(np.shape(direction)[:-1], self.radius_mm)
         if self.cornea is None:
-            return np.asarray(np.full(np.shape(direction)[:-1], self.radius_mm))
+            return r
         local = self._mirror(direction) @ self.M
-        polar = np.arccos(np.clip(local[..., 0], -1, 1))
-        turn = np.arctan2(local[..., 2], local[..., 1]) / (2 * np.pi) % 1.0
-        table = _table(self.cornea, self.limbus_radius_mm, tuple(self.centre_mm.tolist()), self.radius_mm)
+        front = local[..., 0] > np.cos(_WIDEST)
+        local = local[front]
+        polar = np.arccos(np.clip(local[:, 0], -1, 1))
+        turn = np.arctan2(local[:, 2], local[:, 1]) / (2 * np.pi) % 1.0
         place = np.stack([polar / _WIDEST * (_POLAR - 1), turn * _TURNS])
-        bulge = ndimage.map_coordinates(table, place, order=1, mode="nearest")
-        return self.radius_mm + np.where(polar < _WIDEST, bulge, 0.0)
+        r[front] += ndimage.map_coordinates(self._bulge, place, order=1, mode="nearest")
+        return r
 
     def clearance(self, points: Floats) -> Floats:
         """Distance (n,) mm of points (n, 3) from the globe along the line from its centre; negative inside."""
@@ -89,8 +91,18 @@ class Globe(ArrayValue):
         away = points - self.centre
         distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-9)
         direction = away / distance[..., None]
-        least = self.radial(direction) + clearance_mm
+        least = self.radius_mm + np.broadcast_to(clearance_mm, distance.shape)
+        if self.cornea is not None:
+            near = distance < least + np.max(self._bulge)
+            least[near] += self.radial(direction[near]) - self.radius_mm
         return np.asarray(self.centre + direction * np.maximum(distance, least)[..., None])
+
+    @property
+    def _bulge(self) -> Floats:
+        """How far the cornea stands out of the sphere over polar angle and turn, mm."""
+        if self.cornea is None:
+            raise ValueError("a bare sphere has no cornea")
+        return _table(self.cornea, self.limbus_radius_mm, tuple(self.centre_mm.tolist()), self.radius_mm)
 
     def _mirror(self, vector: Floats) -> Floats:
         return vector * np.array([1.0, -1.0, 1.0]) if self.mirrored else np.asarray(vector)

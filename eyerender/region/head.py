@@ -140,7 +140,7 @@ def placed(head: HeadMesh, globe: Globe, texture: int = 0) -> RegionMesh:
     faces = head.faces[:, ::-1] if flipped else head.faces
     layout = RegionLayout(frozen(faces, np.int64), frozen(_map_uv(head, texture)), head.vertex_ends, head.face_ends)
     nothing = frozen(np.zeros((0, 3)))
-    return RegionMesh(frozen(vertices), frozen(head.normals * mirror), layout, nothing, nothing)
+    return RegionMesh(frozen(vertices), frozen(head.normals * mirror), layout, nothing, nothing, nothing, ())
 
 
 def head_map(spec: RegionSpec, head: HeadMesh) -> NDArray[np.float32]:

@@ -40,7 +40,9 @@ class RegionLayout(ArrayValue):
 class RegionMesh(ArrayValue):
     """A posed region: `vertices`, unit `normals` (n, 3) in the scene's frame (mm), and its layout.
 
-    `upper_margin`, `lower_margin` (k, 3): landmarks along the lids' inner edges from the temple to the nose.
+    `upper_margin`, `lower_margin` (k, 3): landmarks along the lids' inner edges from the temple to the nose. `border`
+    (k, 3) is the skin's outer end, closed; `strands` are the curves (n, k, 3) of all that stands before the skin. A
+    mesh of which none are known has none.
     """
 
     vertices: Floats
@@ -48,6 +50,8 @@ class RegionMesh(ArrayValue):
     layout: RegionLayout
     upper_margin: Floats
     lower_margin: Floats
+    border: Floats
+    strands: tuple[Floats, ...]
 
     def part(self, name: str) -> trimesh.Trimesh:
         """One part as a trimesh: skin, tears, lashes or brow."""
@@ -61,16 +65,19 @@ def region_mesh(spec: RegionSpec, globe: Globe) -> RegionMesh:
     """The region of a subject around a posed globe."""
     s = sheet(spec, globe)
     tears = meniscus(spec, globe, s)
-    lash, hair = lashes(spec, globe, s), brow(spec)
-    vertices = np.concatenate([_closed(s.vertices), _closed(tears), lash.tubes(), _brow_tubes(spec)])
-    normals = np.concatenate(
-        [_closed(s.normals), _closed(grid_normals(tears)), _round(lash, lash.tubes()), _brow_normals(spec)]
-    )
+    lash = lashes(spec, globe, s)
+    hair, hair_tubes, hair_normals = _brow(spec.model_copy(update={"blink": 0.0}))
+    lash_tubes = lash.tubes()
+    vertices = np.concatenate([_closed(s.vertices), _closed(tears), lash_tubes, hair_tubes])
+    normals = np.concatenate([_closed(s.normals), _closed(grid_normals(tears)), _round(lash, lash_tubes), hair_normals])
     upper, lower = _margins(s)
+    curves = [upper, lower, s.vertices[-1], lash.points, hair.points, np.concatenate([tears, tears[:, :1]], axis=1)]
     if globe.mirrored:
-        vertices, normals, upper, lower = (v * np.array([1.0, -1.0, 1.0]) for v in (vertices, normals, upper, lower))
+        mirror = np.array([1.0, -1.0, 1.0])
+        vertices, normals, curves = vertices * mirror, normals * mirror, [c * mirror for c in curves]
+    upper, lower, border, *strands = (frozen(c) for c in curves)
     layout = _layout(len(lash.points), len(hair.points), globe.mirrored)
-    return RegionMesh(frozen(vertices), frozen(normals), layout, frozen(upper), frozen(lower))
+    return RegionMesh(frozen(vertices), frozen(normals), layout, upper, lower, border, tuple(strands))
 
 
 def _closed(grid: Floats) -> Floats:
@@ -79,13 +86,11 @@ def _closed(grid: Floats) -> Floats:
 
 
 @lru_cache(maxsize=16)
-def _brow_tubes(spec: RegionSpec) -> Floats:
-    return frozen(brow(spec).tubes())
-
-
-@lru_cache(maxsize=16)
-def _brow_normals(spec: RegionSpec) -> Floats:
-    return frozen(_round(brow(spec), _brow_tubes(spec)))
+def _brow(spec: RegionSpec) -> tuple[Hairs, Floats, Floats]:
+    """The brow, its tubes and their normals; it does not blink."""
+    hairs = brow(spec)
+    tubes = frozen(hairs.tubes())
+    return hairs, tubes, frozen(_round(hairs, tubes))
 
 
 def _round(hairs: Hairs, tubes: Floats) -> Floats:

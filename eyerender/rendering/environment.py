@@ -5,13 +5,6 @@ without shadows. A map is infinitely far away; its irradiance is its cosine conv
 order 2 (Ramamoorthi and Hanrahan 2001, equations 4 to 12; on average within a few per cent of the integral),
 
     E(n) = sum_lm A_l L_lm Y_lm(n),    A = (pi, 2 pi / 3, pi / 4),    L_lm = integral of L Y_lm over all directions.
-
-A panel's irradiance is Lambert's formula for a polygon, cut at the horizon of the lit surface,
-
-    E(n) = L / 2 sum_k theta_k n . g_k,
-
-theta_k the angle under which its edge k is seen and g_k the unit normal of the plane of edge and eye point (Lambert
-1760; Arvo 1995, equation 2.9).
 """
 
 from __future__ import annotations
@@ -30,7 +23,7 @@ from ..rig.imaging import MapSpec
 from ..spec import file_digest
 from .exr import second_thread
 from .lidshade import LidShade
-from .values import PANEL_WIDTH, Panels
+from .panels import Panels
 
 _WIDTH, _HEIGHT = 1024, 512
 _FINE = 256
@@ -194,9 +187,6 @@ class Ambience:
         scene with an eye region."""
         self.lids = lids
         self._panels = Panels(panels)
-        self._count = dr.opaque(mi.UInt32, len(panels))
-        table = np.ascontiguousarray(panels, dtype=np.float32).reshape(-1)
-        self._table = mi.Float(table if table.size else np.zeros(PANEL_WIDTH, np.float32))
         self._texture, made = maps.of(spec)
         scale = 0.0 if spec is None else spec.scale_w_m2_sr * 1e-3
         M = np.eye(3) if spec is None else map_rotation(spec)
@@ -226,50 +216,7 @@ class Ambience:
         far = h[0] + h[1] * w.y + h[2] * w.z + h[3] * w.x
         far += h[4] * w.x * w.y + h[5] * w.y * w.z + h[6] * (3 * w.z * w.z - 1) + h[7] * w.x * w.z
         far += h[8] * (w.x * w.x - w.y * w.y)
-
-        def more(i: Any, *_: Any) -> Any:
-            return i < self._count
-
-        def body(i: Any, total: Any) -> Any:
-            row = [dr.gather(mi.Float, self._table, i * PANEL_WIDTH + k) for k in range(PANEL_WIDTH)]
-            centre, normal = mi.Vector3f(*row[0:3]), mi.Vector3f(*row[3:6])
-            right, up = mi.Vector3f(*row[6:9]), mi.Vector3f(*row[9:12])
-            right, up = right / dr.squared_norm(right), up / dr.squared_norm(up)
-            middle = centre - x
-            seen = polygon_irradiance(
-                [middle - right - up, middle + right - up, middle + right + up, middle - right + up], n
-            )
-            return i + 1, total + dr.select(dr.dot(middle, normal) < 0, row[12] * seen, 0)
-
-        state = (mi.UInt32(0), mi.Float(0) * n.x)
-        near = dr.while_loop(state, more, body, labels=("i", "total"), label="panel light")[1]
-        return self._even + dr.maximum(far, 0) + near
-
-
-def polygon_irradiance(corners: list[Any], n: Any) -> Any:
-    """Irradiance per radiance of a convex polygon, its corners given from the lit point, on a surface of normal n.
-
-    What lies below the horizon is cut off: the edges' parts above it and the arc of the horizon between them remain.
-    """
-    total = mi.Float(0)
-    leave, enter = mi.Vector3f(0), mi.Vector3f(0)
-    for a, b in zip(corners, [*corners[1:], corners[0]], strict=True):
-        ha, hb = dr.dot(n, a), dr.dot(n, b)
-        above_a, above_b = ha > 0, hb > 0
-        crossing = above_a != above_b
-        cut = a + dr.select(crossing, ha / dr.select(crossing, ha - hb, 1), 0) * (b - a)
-        leave = dr.select(above_a & ~above_b, cut, leave)
-        enter = dr.select(above_b & ~above_a, cut, enter)
-        total += dr.select(above_a | above_b, _arc(dr.select(above_a, a, cut), dr.select(above_b, b, cut), n), 0)
-    total += dr.select(dr.squared_norm(leave) > 0, _arc(leave, enter, n), 0)
-    return 0.5 * dr.abs(total)
-
-
-def _arc(a: Any, b: Any, n: Any) -> Any:
-    """The angle between two directions times n . unit(a x b)."""
-    c = dr.cross(a, b)
-    s = dr.norm(c)
-    return dr.atan2(s, dr.dot(a, b)) * dr.dot(n, c) / dr.maximum(s, 1e-20)
+        return self._even + dr.maximum(far, 0) + self._panels.irradiance(x, n)
 
 
 def _reduced(values: Floats) -> Floats:

@@ -1,12 +1,14 @@
 """The film: a window's pixels, their samples, and the mean radiance of each pixel.
 
-Before an eye region, which fills the picture, matte surfaces see one lamp a sample, and `shade_group` lets several
-samples of a pixel share one shadow ray. The groups of a pixel take the lamps in turn; a lamp that c of G groups look at
-counts G / c times, so that every lamp has its exact share in every pixel.
+Before an eye region, which fills the picture, `shade_group` lets several samples of a pixel share what they see of the
+skin and the rays from there to the lamps. The groups of a pixel take the lamps in turn; a lamp that c of G groups look
+at counts G / c times, so that every lamp has its exact share in every pixel. On the globe, which is shaded for every
+sample, the samples take the lamps in turn likewise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,28 +16,32 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import Floats
-from .integrator import shade_group
+from ..arrays import Bools, Floats
+from .groups import Group, shade_group
 from .sampling import Sampler, Samples, camera_ray
-from .values import Lights, Values
+from .values import Lamp, Lights, Values
 from .view import Textures
 
 Window = tuple[int, int, int, int]
 _LANES = 2**24  # samples in flight; more are rendered in several passes
 _LARGEST_GROUP = 4
 _PACKET = 16
-_LEAST_SHADOW_RAYS = 4  # a pixel
+_LEAST_GROUPS = 4  # a pixel
 _FEW_LAMPS = 2  # whose shadows are dark: they are sampled finely
 
 
 @dataclass(frozen=True, slots=True)
 class Exposed:
-    """What a window's pixels see of a bound frame: its Mitsuba scene, its numbers, its lamps and its textures."""
+    """What a window's pixels see of a bound frame: its Mitsuba scene, its numbers, its lamps and its textures.
+
+    `plain` says which tiles of a window show nothing but skin, and how large they are (px).
+    """
 
     scene: Any
     values: Values
     lights: Lights
     textures: Textures
+    plain: Callable[[Window], tuple[Bools, int]]
 
 
 def pixels_of(pixel: Any, window: Window) -> tuple[Any, Any]:
@@ -48,21 +54,19 @@ def pixels_of(pixel: Any, window: Window) -> tuple[Any, Any]:
     return u, v
 
 
-def group_size(spp: int, lamps: int) -> int:
-    """How many samples of a pixel share a shadow ray: few enough that every lamp is looked at in every pixel."""
+def group_size(spp: int) -> int:
+    """How many samples of a pixel are a group."""
     size = _LARGEST_GROUP
-    while size > 1 and (spp % size or spp // size < max(min(_LEAST_SHADOW_RAYS, spp // 2), lamps)):
+    while size > 1 and (spp % size or spp // size < min(_LEAST_GROUPS, spp // 2)):
         size //= 2
     return size
 
 
-def mean_radiance(
-    integrator: Any, shown: Exposed, window: Window, spp: int, seed: int, lamps: int
-) -> tuple[Floats, int]:
+def mean_radiance(integrator: Any, shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Floats, int]:
     """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
     width, height = window[2:]
     grouped = shown.values.structure.region and integrator.bounces == 0
-    size = group_size(spp, lamps) if grouped else 1
+    size = group_size(spp) if grouped else 1
     total, failed = np.zeros(width * height), 0
     each = max(1, min(spp // size, _LANES // (width * height * size)))
     for first in range(0, spp // size, each):
@@ -106,8 +110,8 @@ def _groups(
     """Sums over `count` groups of each pixel, one group a lane; sample j of group g is number g size + j."""
     pixels = window[2] * window[3]
     # Sixteen neighbouring lanes, which Embree traces together: a few groups of a few pixels, so that their rays to the
-    # camera stay close and those to the lamps go few ways.
-    wide = next(w for w in (4, 2, 1) if count % w == 0)
+    # camera stay close and those to the lamps go few ways: fewer groups where each looks at lamps of its own.
+    wide = next(w for w in ((2, 1) if len(shown.lights) > spp // size else (4, 2, 1)) if count % w == 0)
     tall = _PACKET // wide
     blocks = -(-pixels // tall)  # the last may reach beyond the window
     index = dr.arange(mi.UInt32, blocks * tall * count)
@@ -121,19 +125,10 @@ def _groups(
     u, v = pixels_of(block * dr.opaque(mi.UInt32, tall) + step, window)
     group = packet * across + (lane - step * across) + dr.opaque(mi.UInt32, first)
     samples = _samples(u, v, spp, seed)
-    groups = dr.opaque(mi.UInt32, spp // size)
-    # With fewer groups than lamps, chance says with which a pixel begins.
-    lamps = shown.lights.count
-    few = groups < lamps
-    start = dr.select(few, mi.UInt32(samples.pair(mi.UInt32(0), 1).x * mi.Float(lamps)), 0)
-    which = (group + start) % lamps
-    lamp = shown.lights[which]
-    share = dr.select(few, mi.Float(lamps), mi.Float(groups) / mi.Float((groups + lamps - 1 - which) // lamps))
-
-    samples_each = dr.opaque(mi.UInt32, size)
+    each = dr.opaque(mi.UInt32, size)
 
     def number(j: Any) -> Any:
-        return group * samples_each + j
+        return group * each + j
 
     def ray(j: Any) -> tuple[Any, Any, Any]:
         spot = samples.in_pixel(number(j))
@@ -141,19 +136,47 @@ def _groups(
         cosine = cosine * cosine
         return o, d, cosine * cosine
 
-    rest, direct, failures = shade_group(
+    lights = shown.lights
+    lamps, groups, all_samples = lights.count, dr.opaque(mi.UInt32, spp // size), dr.opaque(mi.UInt32, spp)
+    # With fewer samples than lamps, chance says with which a pixel begins.
+    start = mi.UInt32(samples.pair(mi.UInt32(0), 1).x * mi.Float(lamps))
+
+    def lamp(j: Any) -> tuple[Lamp, Any]:
+        which = dr.select(all_samples < lamps, number(j) + start, number(j)) % lamps
+        share = mi.Float(all_samples) / mi.Float((all_samples + lamps - 1 - which) // lamps)
+        return lights[which], dr.select(all_samples < lamps, mi.Float(lamps), share)
+
+    def shared(k: Any) -> tuple[Lamp, Any]:
+        which = group % lamps + k * groups
+        return lights[which], mi.Float(groups) / mi.Float(dr.maximum((groups + lamps - 1 - which) // lamps, 1))
+
+    several = groups < lamps
+    radiance, failures = shade_group(
         shown.values,
-        shown.lights,
+        lights,
         shown.textures,
         shown.scene,
-        ray,
-        lambda j: samples.pair(number(j), 0),
-        samples_each,
-        lamp,
-        lamps <= _FEW_LAMPS,
+        Group(
+            each,
+            ray,
+            lambda j: samples.pair(number(j), 0),
+            lamp,
+            dr.select(several, (groups + lamps - 1 - group) // groups, 1),
+            shared,
+            (lamps <= _FEW_LAMPS) & ~several,
+            _plain(shown, window, u, v),
+        ),
     )
-    lanes = rest + direct * share
-    failures = dr.select(block * dr.opaque(mi.UInt32, tall) + step < dr.opaque(mi.UInt32, pixels), failures, 0)
-    dr.eval(lanes, failures)
-    seen = dr.block_sum(lanes, wide).numpy().reshape(blocks, count // wide, tall).sum(axis=1, dtype=float)
+    inside = block * dr.opaque(mi.UInt32, tall) + step < dr.opaque(mi.UInt32, pixels)
+    failures = dr.select(inside, failures, 0)
+    dr.eval(radiance, failures)
+    seen = dr.block_sum(radiance, wide).numpy().reshape(blocks, count // wide, tall).sum(axis=1, dtype=float)
     return seen.reshape(-1)[:pixels], int(dr.sum(failures).numpy()[0])
+
+
+def _plain(shown: Exposed, window: Window, u: Any, v: Any) -> Any:
+    """Whether pixels of a window show nothing but skin."""
+    tiles, across = shown.plain(window)
+    x, y, size, rows, columns = (dr.opaque(mi.Int32, k) for k in (*window[:2], across, *tiles.shape))
+    row = dr.minimum((v - y) // size, rows - 1)  # lanes may lie beyond the window
+    return dr.gather(mi.UInt32, mi.UInt32(tiles.ravel().astype(np.uint32)), row * columns + (u - x) // size) > 0

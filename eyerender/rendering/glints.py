@@ -197,8 +197,9 @@ class GlintScene:
         return np.asarray((disc > 0) & (-b - np.sqrt(np.maximum(disc, 0)) > 1e-6))
 
 
-def glint_table(scene: GlintScene, images: Sequence[Image]) -> tuple[GlintTable, list[Spots]]:
-    """The glints of all lamps as they are seen, and the points that each is made of."""
+def glint_table(scene: GlintScene, images: Sequence[Image]) -> tuple[GlintTable, list[Spots], list[Bools]]:
+    """The glints of all lamps as they are seen, the points that each is made of, and for all points of each whether
+    nothing stands in their ways."""
     sources, entries, exits = (
         np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm")
     )
@@ -217,7 +218,7 @@ def glint_table(scene: GlintScene, images: Sequence[Image]) -> tuple[GlintTable,
     table = GlintTable(
         frozen(np.reshape(place, (-1, 2))), frozen(energies), frozen(share), frozen(energies > 0, np.bool_)
     )
-    return table, spots
+    return table, spots, clear
 
 
 @dataclass(frozen=True, slots=True)

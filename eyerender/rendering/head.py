@@ -33,6 +33,7 @@ class HeadScene(RegionScene):
     """
 
     parts = HEAD_PARTS
+    moving = 0  # it keeps still
 
     def __init__(self, spec: RegionSpec, globe: Globe) -> None:
         super().__init__(spec, globe)

@@ -75,8 +75,6 @@ class Structure:
             ("sclera.contrast", 1),
             ("limbus.albedo", 1),
             ("backdrop.x", 1),
-            ("region.mirror", 1),
-            ("region.sheet", 1),
             ("ambient.irradiance", 1),
         ]
         return tuple(rows)
@@ -176,45 +174,17 @@ class Lights:
     """The lamps in the eye frame, (n, 10) numbers in one buffer; kernels do not depend on their number."""
 
     def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
+        self._len = len(table)
         self.count = dr.opaque(mi.UInt32, len(table))
         self._buffer = mi.Float(np.ascontiguousarray(table, dtype=np.float32).reshape(-1))
+
+    def __len__(self) -> int:
+        return self._len
 
     def __getitem__(self, i: Any) -> Any:
         base = i * LIGHT_WIDTH
         row = [dr.gather(mi.Float, self._buffer, base + k) for k in range(LIGHT_WIDTH)]
         return Lamp(mi.Vector3f(*row[0:3]), mi.Vector3f(*row[3:6]), *row[6:10])
-
-
-PANEL_WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
-
-
-class Panels:
-    """Emitting rectangles of the scene's frame in one buffer."""
-
-    def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
-        self.count = dr.opaque(mi.UInt32, len(table))
-        data = np.ascontiguousarray(table, dtype=np.float32).reshape(-1)
-        self._buffer = mi.Float(data if data.size else np.zeros(PANEL_WIDTH, np.float32))
-
-    def radiance(self, o: Any, d: Any, active: Any) -> Any:
-        """Radiance (mW/mm^2/sr) that rays of the scene's frame meet; panels that overlap add up."""
-
-        def more(i: Any, *_: Any) -> Any:
-            return i < self.count
-
-        def body(i: Any, total: Any) -> Any:
-            row = [dr.gather(mi.Float, self._buffer, i * PANEL_WIDTH + k) for k in range(PANEL_WIDTH)]
-            centre, normal = mi.Vector3f(*row[0:3]), mi.Vector3f(*row[3:6])
-            right, up = mi.Vector3f(*row[6:9]), mi.Vector3f(*row[9:12])
-            facing = -dr.dot(d, normal)
-            t = dr.dot(o - centre, normal) / dr.select(dr.abs(facing) > 1e-6, facing, 1)
-            q = o + t * d - centre
-            met = active & (facing > 1e-6) & (t > 0)
-            met &= (dr.abs(dr.dot(q, right)) < 1) & (dr.abs(dr.dot(q, up)) < 1)
-            return i + 1, total + dr.select(met, row[12], 0)
-
-        state = (mi.UInt32(0), mi.Float(0) * d.x)
-        return dr.while_loop(state, more, body, labels=("i", "total"), label="panels")[1]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,12 +14,12 @@ import mitsuba as mi
 import numpy as np
 
 from ..region.texture import iris_texture, sclera_texture
-from .region import surface as region_surface
 from .surfaces import fresnel
 from .values import Values
 
 EPSILON_MM = 2e-3  # lengths below are one and the same point in single precision
 _NEAR_MM = 20.0
+_FAR = float(np.finfo(np.float32).max)
 _WET = 0.8  # gloss of the sclera
 
 
@@ -67,7 +67,7 @@ class Textures:
     iris: Any
     sclera: Any
     region: Any = None
-    panels: Any = None
+    ambience: Any = None
 
     @classmethod
     def of_seed(cls, seed: int) -> Textures:
@@ -90,23 +90,25 @@ def opacity(values: Values, rho: Any) -> Any:
 def look(values: Values, scene: Any, o: Any, d: Any, active: Any, region: Any = None) -> View:
     """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris.
 
-    `region` is the map of an eye region, whose normals and albedos then count.
+    `region` is the skin of an eye region, whose normals and albedos then count.
     """
     view, hit = meet(values, scene, o, d, active)
-    there = look_around(values, hit, o, d, view.other, region)
+    if region is not None:
+        there = look_at_skin(values, region, region.face(hit), hit.prim_uv, d, view.other)
+    else:
+        there = _look_around(values, hit, o, d, view.other)
     return replace(
         view,
         point=dr.select(view.other, there.point, view.point),
         normal=dr.select(view.other, there.normal, view.normal),
         interaction=there.interaction,
         albedo=there.albedo,
-        gloss=there.gloss,
+        gloss=dr.select(view.other, there.gloss, view.gloss),
     )
 
 
 def meet(values: Values, scene: Any, o: Any, d: Any, active: Any) -> tuple[View, Any]:
     """The view of the globe along camera rays, and what Embree or OptiX hits: nothing is said yet of its surface."""
-    hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True, active=active)
     # Single precision: start next to the eye.
     t0 = -dr.dot(o, d) - _NEAR_MM
     oe, de = values.point_to_eye(o + t0 * d), values.vector_to_eye(d)
@@ -123,7 +125,11 @@ def meet(values: Values, scene: Any, o: Any, d: Any, active: Any) -> tuple[View,
     on_sclera &= ~on_cornea
     t_eye = t0 + dr.select(on_cornea, tc, ts)
     amodal_cornea, amodal_sclera = on_cornea & (t_eye > EPSILON_MM), on_sclera & (t_eye > EPSILON_MM)
-    on_eye = (amodal_cornea | amodal_sclera) & ~(hit.is_valid() & (hit.t < t_eye)) & active
+    on_eye = amodal_cornea | amodal_sclera
+    ray = mi.Ray3f(mi.Point3f(o), d)
+    ray.maxt = dr.select(on_eye, t_eye, _FAR)  # what lies behind the eye does not matter
+    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    on_eye &= ~hit.is_valid() & active
     on_cornea &= on_eye
     on_sclera &= on_eye
     normal, mirrored, passed, inner, pupil = dr.if_stmt(
@@ -154,16 +160,23 @@ def meet(values: Values, scene: Any, o: Any, d: Any, active: Any) -> tuple[View,
     return view, hit
 
 
-def look_around(values: Values, hit: Any, o: Any, d: Any, other: Any, region: Any = None) -> View:
-    """The view of rays that meet something of the scene that is not the eye, where `other`."""
+def _look_around(values: Values, hit: Any, o: Any, d: Any, other: Any) -> View:
+    """The view of rays that meet something of the surround, where `other`."""
     flags = mi.RayFlags.Minimal | mi.RayFlags.UV
-    if region is not None:
-        flags = flags | mi.RayFlags.ShadingFrame
     interaction = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(o), d), flags, other)
-    facing, albedo, gloss = mi.Vector3f(interaction.n), mi.Float(0), mi.Float(_WET)
-    if region is not None:
-        skin = region_surface(region, values["region.mirror"], interaction, other)
-        facing, albedo, gloss = skin.normal, skin.albedo, dr.select(other, skin.gloss, _WET)
+    view = _matte(values, mi.Vector3f(interaction.p), mi.Vector3f(interaction.n), d, other)
+    return replace(view, interaction=interaction)
+
+
+def look_at_skin(values: Values, region: Any, face: Any, uv: Any, d: Any, other: Any) -> View:
+    """The view of rays that meet places on triangles of an eye region, where `other`."""
+    skin = region.surface(face, uv, other)
+    view = _matte(values, skin.point, skin.normal, d, other)
+    return replace(view, albedo=skin.albedo, gloss=skin.gloss)
+
+
+def _matte(values: Values, point: Any, facing: Any, d: Any, other: Any) -> View:
+    """The view of matte points of the scene; normals are turned to the viewer."""
     normal = values.vector_to_eye(facing)
     normal = dr.select(dr.dot(normal, values.vector_to_eye(d)) > 0, -normal, normal)
     no, nothing = mi.Bool(False), mi.Float(0)
@@ -171,19 +184,19 @@ def look_around(values: Values, hit: Any, o: Any, d: Any, other: Any, region: An
         cornea=no,
         sclera=no,
         other=other,
-        distance=hit.t,
-        point=values.point_to_eye(interaction.p),
+        distance=nothing,
+        point=values.point_to_eye(point),
         normal=dr.normalize(normal),
         opacity=mi.Float(1),
         mirrored=nothing,
         passed=nothing,
         inner=mi.Vector3f(0),
         pupil=no,
-        interaction=interaction,
+        interaction=None,
         amodal_cornea=no,
         amodal_sclera=no,
-        albedo=albedo,
-        gloss=gloss,
+        albedo=nothing,
+        gloss=mi.Float(_WET),
     )
 
 

@@ -1,0 +1,61 @@
+"""The parts of the eye that the pixels of a window show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import ArrayValue, frozen
+from .film import Exposed, Window, pixels_of
+from .sampling import camera_ray
+from .view import meet
+
+BACKGROUND, SCLERA, IRIS, PUPIL = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartLabels(ArrayValue):
+    """What each pixel's centre shows, seen through the cornea; arrays (height, width).
+
+    `part` and `amodal` hold 0 background or skin, 1 sclera, 2 iris, 3 pupil; `amodal` as if the eye stood alone.
+    `depth_mm` is the distance from the nodal point to the first surface, infinite where there is none. The visible
+    fractions are of the part of the amodal pupil and iris that lies in the window, NaN where none does.
+    """
+
+    part: NDArray[np.uint8]
+    amodal: NDArray[np.uint8]
+    depth_mm: NDArray[np.float32]
+
+    def visible_fraction(self, part: int) -> float:
+        """Share of the amodal pixels of a part that are visible."""
+        whole = int(np.count_nonzero(self.amodal == part))
+        both = int(np.count_nonzero((self.amodal == part) & (self.part == part)))
+        return both / whole if whole else float("nan")
+
+
+def part_labels(shown: Exposed, window: Window) -> PartLabels:
+    """The labels of a window."""
+    width, height = window[2:]
+    u, v = pixels_of(dr.arange(mi.UInt32, width * height), window)
+    o, d, _ = camera_ray(shown.values, mi.Float(u), mi.Float(v))
+    view, _ = meet(shown.values, shown.scene, o, d, True)
+    clear = view.amodal_cornea & (view.opacity < 0.5)
+    amodal = dr.select(
+        view.amodal_cornea | view.amodal_sclera,
+        dr.select(clear, dr.select(view.pupil, mi.UInt32(PUPIL), mi.UInt32(IRIS)), mi.UInt32(SCLERA)),
+        mi.UInt32(BACKGROUND),
+    )
+    eye = view.cornea | view.sclera
+    part = dr.select(eye, amodal, mi.UInt32(BACKGROUND))
+    depth = dr.select(eye | view.other, view.distance, dr.inf)
+    dr.eval(amodal, part, depth)
+    shape = (height, width)
+    return PartLabels(
+        frozen(part.numpy().reshape(shape), np.uint8),
+        frozen(amodal.numpy().reshape(shape), np.uint8),
+        frozen(depth.numpy().reshape(shape), np.float32),
+    )

@@ -1,0 +1,91 @@
+"""Where a picture shows nothing but skin: tiles of its window that no hair, no rim and no part of the globe reaches.
+
+A sheet of skin with a hole, the fissure, that ends at a border: a ray whose pixel lies within the border's outline and
+not within the hole's crosses the sheet, since it crosses it as often as the one winds about the pixel more than the
+other. Hairs and the line of tears stand before it; they, and both outlines, are marked with some pixels to spare.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..arrays import Bools, Floats
+from ..region.mesh import RegionMesh
+from ..rig.camera import Camera
+
+_TILE_PX = 8
+_STEP_PX = 4.0  # between marked points of a curve
+_SPARE_PX = 1.0
+_HAIR_MM = 0.1  # no hair and no part of a rim is thicker
+_NEAREST_MM = 3.0  # with hairs nearer to the camera nothing is plain
+
+
+def plain_tiles(
+    region: RegionMesh, camera: Camera, anchor_mm: Floats, window: tuple[int, int, int, int]
+) -> tuple[Bools, int]:
+    """Which tiles (rows, columns) of a window show nothing but skin, and the size of a tile in pixels.
+
+    None does where the region's border is not known, and where hairs come too near to the camera.
+    """
+    nothing = np.zeros((1, 1), dtype=bool), max(window[2:])
+    if len(region.border) == 0:
+        return nothing
+    hole = np.concatenate([region.upper_margin, region.lower_margin[-2:0:-1]])
+    closed = [np.concatenate([c, c[:1]])[None] for c in (hole, region.border)]
+    curves = [c for c in (*closed, *region.strands) if c.size]
+    depth = [float(np.min((c + anchor_mm - camera.nodal_point_mm) @ camera.R[2])) for c in curves]
+    if min(depth) < _NEAREST_MM:
+        return nothing
+    thick = _HAIR_MM * float(max(camera.K[0, 0], camera.K[1, 1])) / min(depth[2:], default=np.inf)
+    reach = _STEP_PX / 2 + _SPARE_PX + thick
+    tile = max(_TILE_PX, int(np.ceil(2 * reach)))
+    x0, y0, width, height = window
+    shape = (-(-height // tile), -(-width // tile))
+    corner = np.array([x0, y0]) - 0.5
+    marked = np.zeros(shape, dtype=bool)
+    outlines = []
+    for k, curve in enumerate(curves):
+        xy = (camera.project(curve + anchor_mm)[0] - corner) / tile
+        if k < 2:
+            outlines.append(_winding(xy[0], shape))
+        _mark(marked, _pieces(xy, shape), _STEP_PX / tile, reach / tile)
+    return (outlines[1] != 0) & (outlines[0] == 0) & ~marked, tile
+
+
+def _pieces(xy: Floats, shape: tuple[int, int]) -> Floats:
+    """The straight pieces (m, 2, 2) of polylines (n, k, 2) that come near the tiles."""
+    ends = np.stack([xy[:, :-1], xy[:, 1:]], axis=-2).reshape(-1, 2, 2)
+    limit = np.array(shape[::-1]) + 1.0
+    return ends[np.all((ends.max(axis=1) > -1) & (ends.min(axis=1) < limit), axis=1)]
+
+
+def _mark(marked: Bools, pieces: Floats, step: float, reach: float) -> None:
+    """Mark the tiles within `reach`, at most half a tile, of points of the pieces that are `step` tiles apart."""
+    rows, columns = marked.shape
+    start, way = pieces[:, 0], pieces[:, 1] - pieces[:, 0]
+    count = np.ceil(np.linalg.norm(way, axis=1) / step).astype(int) + 1
+    which = np.repeat(np.arange(len(count)), count)
+    share = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)) / np.maximum(count - 1, 1)[which]
+    xy = start[which] + share[:, None] * way[which]
+    for dx in (-reach, reach):
+        column = np.floor(xy[:, 0] + dx).astype(int)
+        for dy in (-reach, reach):
+            row = np.floor(xy[:, 1] + dy).astype(int)
+            there = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+            marked[row[there], column[there]] = True
+
+
+def _winding(xy: Floats, shape: tuple[int, int]) -> Floats:
+    """How often a closed polyline (k + 1, 2) winds about the middle of each tile (rows, columns)."""
+    rows, columns = shape
+    y = np.arange(rows) + 0.5
+    (ax, ay), (bx, by) = xy[:-1].T[..., None], xy[1:].T[..., None]
+    turn = ((ay <= y) & (by > y)).astype(int) - ((ay > y) & (by <= y))
+    edge, row = np.nonzero(turn)
+    share = (y[row] - ay[edge, 0]) / (by[edge, 0] - ay[edge, 0])
+    x = ax[edge, 0] + share * (bx[edge, 0] - ax[edge, 0])
+    # A crossing counts for all middles beyond it.
+    column = np.clip(np.ceil(x - 0.5).astype(int), 0, columns)
+    steps = np.zeros((rows, columns + 1), dtype=int)
+    np.add.at(steps, (row, column), turn[edge, row])
+    return np.cumsum(steps[:, :-1], axis=1)

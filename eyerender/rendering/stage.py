@@ -1,0 +1,110 @@
+"""What is kept from frame to frame, scenes, textures and maps, and a job's frame set up from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..arrays import frozen
+from ..errors import InputError
+from ..rig.imaging import AmbientSpec
+from .environment import Ambience, Maps
+from .film import Exposed, Window
+from .frame import (
+    RenderJob,
+    ambient_numbers,
+    camera_numbers,
+    eye_numbers,
+    kinds,
+    light_table,
+    look_numbers,
+    margin_waves,
+    panel_table,
+    pose_numbers,
+)
+from .head import place_scene
+from .lidshade import LidShade
+from .plain import plain_tiles
+from .region import RegionScene, globe_of
+from .surround import Obstacle, Surround
+from .values import Lights, Structure, Values
+from .view import Textures
+
+_REGIONS, _TEXTURES = 4, 8  # kept
+_NOTHING_PLAIN = frozen(np.zeros((1, 1)), np.bool_)
+
+
+class Stage:
+    """Scenes, textures and maps; `obstacles` stand in the scene's frame about eyes without a region."""
+
+    def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
+        self._surround = Surround(obstacles)
+        self._textures: dict[int, Textures] = {}
+        self._regions: dict[Any, RegionScene] = {}
+        self._maps = Maps()
+
+    def set(self, job: RenderJob) -> tuple[Exposed, Surround | RegionScene]:
+        """The frame of a job, and what stands around its eye: moved to its pose until the next is set."""
+        place = self._place(job)
+        region = place if isinstance(place, RegionScene) else None
+        structure = Structure(
+            kinds(job.eye),
+            bool(np.any(job.camera.distortion)),
+            place.obstructed,
+            region is not None,
+            job.ambient != AmbientSpec(),
+        )
+        anchor = job.anchor_mm
+        numbers = {
+            **eye_numbers(job.eye),
+            **look_numbers(job.look),
+            **pose_numbers(job.M, job.t, anchor),
+            **camera_numbers(job.camera, anchor),
+            **ambient_numbers(job.ambient),
+        }
+        values = Values(structure, structure.pack(numbers), margin_waves(job.eye))
+        lights = Lights(light_table(job.lights, job.M, job.t))
+        textures = self._textures_of(job)
+        if structure.ambient:
+            even = job.ambient.irradiance_w_m2 * 1e-3
+            lids = None
+            if region is not None and job.region is not None:
+                lids = LidShade(region.posed, job.region.lids.margin_mm)
+            ambience = Ambience(even, panel_table(job.ambient, anchor), job.ambient.map, self._maps, lids)
+            textures = replace(textures, ambience=ambience)
+
+        def plain(window: Window) -> Any:
+            if region is None:
+                return _NOTHING_PLAIN, max(window[2:])
+            return plain_tiles(region.posed, job.camera, anchor, window)
+
+        if region is not None:
+            textures = replace(textures, region=region.skin)
+        return Exposed(place.scene, values, lights, textures, plain), place
+
+    def _place(self, job: RenderJob) -> Surround | RegionScene:
+        if job.region is None:
+            self._surround.show(job.look)
+            return self._surround
+        if self._surround.obstructed:
+            raise InputError("obstacles and an eye region do not go together")
+        globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
+        key = RegionScene.key(job.region, globe)
+        if key not in self._regions:
+            if len(self._regions) >= _REGIONS:
+                self._regions.pop(next(iter(self._regions)))
+            self._regions[key] = place_scene(job.region, globe)
+        place = self._regions[key]
+        place.show(job.region, globe)
+        return place
+
+    def _textures_of(self, job: RenderJob) -> Textures:
+        seed = job.look.iris_seed
+        if seed not in self._textures:
+            if len(self._textures) >= _TEXTURES:
+                self._textures.pop(next(iter(self._textures)))
+            self._textures[seed] = Textures.of_seed(seed)
+        return self._textures[seed]
