@@ -20,10 +20,12 @@ Mask = NDArray[np.bool_]
 # the iris more, by a few hundredths of the step, which noise hides from any test but not from the centre.
 ORDERS = (1, 2, 4, 6, 8)
 OUTLIER = 5.0  # pixels beyond this many standard deviations do not count
-FIXED = SHAPE + 5  # parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, mean outer level
+# Parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, lean (two), mean outer level.
+FIXED = SHAPE + 7
 # Standard deviations of what is about 0 beforehand: the harmonics of the outer level, in steps (nothing else holds them
-# under a lid); its change over a semi-axis b, in steps (lamps beside the camera bring it about); the blur's kurtosis.
-HARMONIC_SD, SLOPE_SD, KURTOSIS_SD = 0.3, 0.15, 1.0
+# under a lid); its change over a semi-axis b, in steps (lamps beside the camera bring it about); the blur's kurtosis;
+# how the inner level leans, in steps: scattered light only, so that noise does not find a lean where there is none.
+HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
 KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond them the edge would not be monotonic
 
 
@@ -127,10 +129,11 @@ def _predict(model: RimModel, pixels: _Pixels) -> Array:
 
 
 def _jacobian(model: RimModel, place: Place) -> tuple[Array, Array]:
-    """Model levels (n,) and their derivatives (n, 9 + 1 + 2 K) by the parameters in the order of FIXED."""
+    """Model levels (n,) and their derivatives (n, FIXED + 2 K) by the parameters in the order of FIXED."""
     profile = Profile.of(place.distance, place.curvature, model.sigma_px, model.kurtosis)
     basis = harmonics(place.cos_t, place.sin_t, (model.outer.size - 1) // 2)
-    step = np.einsum("nk,k->n", basis, model.outer) - model.inner_dn
+    inner = model.inner(place)
+    step = np.einsum("nk,k->n", basis, model.outer) - inner
     by_distance = step * profile.edge_by_distance + model.slope * profile.ramp_by_distance
     out = np.empty((place.distance.size, FIXED - 1 + basis.shape[1]))
     out[:, :SHAPE] = by_distance[:, None] * distance_slopes(model.ellipse, place)
@@ -138,27 +141,29 @@ def _jacobian(model: RimModel, place: Place) -> tuple[Array, Array]:
     out[:, 6] = 1.0 - profile.edge
     out[:, 7] = profile.ramp
     out[:, 8] = step * profile.edge_by_kurtosis
-    out[:, 9:] = basis * profile.edge[:, None]
-    return model.inner_dn + step * profile.edge + model.slope * profile.ramp, out
+    out[:, 9] = out[:, 6] * place.cos_t
+    out[:, 10] = out[:, 6] * place.sin_t
+    out[:, 11:] = basis * profile.edge[:, None]
+    return inner + step * profile.edge + model.slope * profile.ramp, out
 
 
 def _prior(start: RimModel, noise_dn: float) -> Array:
-    """(3,) weights of the squares of slope, kurtosis and a harmonic beside those of a pixel's residual."""
+    """(4,) weights of the squares of slope, kurtosis, a lean and a harmonic beside those of a pixel's residual."""
     step = max(start.step_dn, noise_dn)
     slope = SLOPE_SD * step / float(start.ellipse.semi_axes_px[1])
-    return (noise_dn / np.array([slope, KURTOSIS_SD, HARMONIC_SD * step])) ** 2
+    return (noise_dn / np.array([slope, KURTOSIS_SD, LEAN_SD * step, HARMONIC_SD * step])) ** 2
 
 
 def _held(prior: Array, size: int) -> Array:
     """(size,) the prior's weight of every parameter."""
     out = np.zeros(size)
-    out[7], out[8], out[FIXED:] = prior
+    out[7], out[8], out[9:11], out[FIXED:] = prior
     return out
 
 
 def _values(model: RimModel) -> Array:
     """The parameters that a prior may hold, at their places; the others are 0."""
-    return np.concatenate([np.zeros(7), [model.slope, model.kurtosis, 0.0], model.outer[1:]])
+    return np.concatenate([np.zeros(7), [model.slope, model.kurtosis, *model.lean, 0.0], model.outer[1:]])
 
 
 def _moved(model: RimModel, step: Array) -> RimModel:
@@ -172,7 +177,8 @@ def _moved(model: RimModel, step: Array) -> RimModel:
     ellipse = Ellipse(model.ellipse.centre_px + step[:2], axes, angle)
     inner, slope = model.inner_dn + float(step[6]), model.slope + float(step[7])
     kurtosis = float(np.clip(model.kurtosis + step[8], *KURTOSIS_LIMITS))
-    return RimModel(ellipse, inner, model.outer + step[9:], max(sigma, 0.3), slope, kurtosis)
+    lean = (model.lean[0] + float(step[9]), model.lean[1] + float(step[10]))
+    return RimModel(ellipse, inner, model.outer + step[11:], max(sigma, 0.3), slope, kurtosis, lean)
 
 
 def _gauss_newton(pixels: _Pixels, model: RimModel, prior: Array, steps: int) -> tuple[RimModel, Array, Array, Place]:

@@ -1,13 +1,14 @@
 """The pixel model of a pupil's rim: two levels and the blurred convex edge between them.
 
-    I = inner (1 - E) + outer(t) E + slope (d Phi(d / s) + s phi(d / s))
+    I = inner(t) (1 - E) + outer(t) E + slope (d Phi(d / s) + s phi(d / s))
     E(d) = Phi(z) + (kappa s / 2) phi(z) - (g / 24) (z^3 - 3 z) phi(z),   z = d / s
 
 d: signed distance to the ellipse (positive outside), kappa: curvature of the rim at the nearest point, s: sigma of the
 blur, pixel included (s^2 = optics^2 + 1/12), Phi and phi: the normal distribution and density. The second term is
 the first order of the blur of a disc in s kappa; the third lets the blur have heavier tails than a normal distribution,
-g being its excess kurtosis (Edgeworth's series). outer(t) is a Fourier series in the ellipse's parameter t; the slope
-comes with a blurred ramp: the iris grows brighter or darker outwards, as lamps beside the camera make it.
+g being its excess kurtosis (Edgeworth's series). outer(t) is a Fourier series in the ellipse's parameter t, inner(t)
+one of the first order: iris light scattered into the pupil. The slope comes with a blurred ramp: the iris
+grows brighter or darker outwards, as lamps beside the camera make it.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 @dataclass(frozen=True, slots=True, eq=False)
 class RimModel:
     """ellipse; inner_dn; outer: (1 + 2 K,) Fourier coefficients (1, cos t, sin t, cos 2t, ...), DN; sigma_px; slope of
-    the outer level, DN per px; kurtosis of the blur beyond a Gaussian's 0."""
+    the outer level, DN per px; kurtosis of the blur beyond a Gaussian's 0; lean: the inner level's (cos t, sin t), DN.
+    """
 
     ellipse: Ellipse
     inner_dn: float
@@ -37,6 +39,7 @@ class RimModel:
     sigma_px: float
     slope: float = 0.0
     kurtosis: float = 0.0
+    lean: tuple[float, float] = (0.0, 0.0)
 
     @property
     def step_dn(self) -> float:
@@ -50,7 +53,12 @@ class RimModel:
         edge, ramp = profile.edge, profile.ramp
         basis = harmonics(place.cos_t, place.sin_t, (self.outer.size - 1) // 2)
         outer = np.einsum("nk,k->n", basis, self.outer)
-        return np.asarray((self.inner_dn + (outer - self.inner_dn) * edge + self.slope * ramp).reshape(x.shape))
+        inner = self.inner(place)
+        return np.asarray((inner + (outer - inner) * edge + self.slope * ramp).reshape(x.shape))
+
+    def inner(self, place: Place) -> Array:
+        """Inner level (n,) at places about the rim."""
+        return self.inner_dn + self.lean[0] * place.cos_t + self.lean[1] * place.sin_t
 
 
 @dataclass(frozen=True, slots=True, eq=False)

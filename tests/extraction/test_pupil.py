@@ -32,8 +32,11 @@ def _errors(ideal, condition: str, settings: ExtractionSettings, seeds: range = 
 
 
 # Allowed medians: those of the full bench (40 images a row). Of six images the median scatters by about a quarter, the
-# refined fit is a third below the bar or better, so a failure is a defect; at 16 DN it is a quarter below, which takes
-# twenty.
+# refined fit is a third below the bar or better, so a failure is a defect. In the rows of MORE it is a fifth below,
+# which takes more images.
+MORE = ("noise2-17px", "noise2-13px", "noise16")
+
+
 @pytest.mark.parametrize(
     ("condition", "median"),
     [
@@ -42,7 +45,7 @@ def _errors(ideal, condition: str, settings: ExtractionSettings, seeds: range = 
     ],
 )  # fmt: skip
 def test_refined_centre_error(ideal, condition, median):
-    seeds = range(20_000, 20_020) if condition == "noise16" else SEEDS
+    seeds = range(20_000, 20_024) if condition in MORE else SEEDS
     centre, _ = _errors(ideal, condition, REFINED, seeds)
     assert np.median(centre) <= median
 

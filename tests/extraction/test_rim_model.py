@@ -8,7 +8,7 @@ from scipy import integrate, ndimage, optimize, special
 
 from eyerender.extraction import extract
 from eyerender.extraction.covariance import to_axes
-from eyerender.extraction.refine import _jacobian, _moved
+from eyerender.extraction.refine import FIXED, _jacobian, _moved
 from eyerender.extraction.rimmodel import Place, Profile, RimModel
 from eyerender.geometry.ellipse import Ellipse
 
@@ -57,7 +57,9 @@ def test_distance_is_the_nearest_points():
 
 def test_jacobian_is_the_models_slope():
     outer = np.array([75.0, 6.0, -4.0, 3.0, 2.0])
-    model = RimModel(Ellipse([40.2, 38.7], [21.0, 15.0], 0.8), 20.0, outer, 1.3, slope=-1.2, kurtosis=0.7)
+    model = RimModel(
+        Ellipse([40.2, 38.7], [21.0, 15.0], 0.8), 20.0, outer, 1.3, slope=-1.2, kurtosis=0.7, lean=(0.4, -0.9)
+    )
     rng = np.random.default_rng(4)
     base = model.ellipse.points(300) + rng.normal(0.0, 1.0, (300, 2))
     place = Place.of(model.ellipse, base[:, 0], base[:, 1])
@@ -80,7 +82,7 @@ def test_covariance_of_the_axes_follows_the_shape_matrix():
     rng = np.random.default_rng(6)
     draws = rng.multivariate_normal(np.zeros(5), covariance, 4000)
     model = RimModel(ellipse, 0.0, np.array([1.0]), 1.0)
-    moved = [_moved(model, np.concatenate([d, np.zeros(5)])).ellipse for d in draws]
+    moved = [_moved(model, np.concatenate([d, np.zeros(FIXED - 5)])).ellipse for d in draws]
     sample = np.array([[*e.centre_px, *e.semi_axes_px, e.angle_rad] for e in moved])
     stated = np.sqrt(np.diag(to_axes(covariance, ellipse)))
     np.testing.assert_allclose(sample.std(axis=0), stated, rtol=0.05)
@@ -96,14 +98,16 @@ def test_refined_maximum_is_the_least_squares_one(ideal):
     x, y = xx.ravel()[near].astype(float), yy.ravel()[near].astype(float)
     data = drawing.image.ravel()[near].astype(float)
 
-    # What the extractor takes for likely beforehand, in units of the noise: the slope over b, the kurtosis.
-    likely = 4.0 / np.array([0.15 * 55.0 / e.semi_axes_px[1], 1.0])
+    # What the extractor takes for likely beforehand, in units of the noise: the outer level's first order, the slope
+    # over b, the kurtosis, the inner level's first order.
+    lean, first = [0.003 * 55.0] * 2, [0.15 * 55.0] * 2
+    likely = 4.0 / np.array([*first, 0.15 * 55.0 / e.semi_axes_px[1], 1.0, *lean])
 
     def residual(p):
-        level = RimModel(Ellipse(p[:2], p[2:4], p[4]), p[5], p[6:7], p[7], p[8], p[9]).level(x, y)
-        return np.concatenate([level - data, likely * p[8:]])
+        level = RimModel(Ellipse(p[:2], p[2:4], p[4]), p[5], p[6:9], p[9], p[10], p[11], p[12:]).level(x, y)
+        return np.concatenate([level - data, likely * p[[7, 8, 10, 11, 12, 13]]])
 
-    start = np.array([*e.centre_px, *e.semi_axes_px, e.angle_rad, 20.0, 75.0, 1.1, 0.0, 0.0])
+    start = np.array([*e.centre_px, *e.semi_axes_px, e.angle_rad, 20.0, 75.0, 0.0, 0.0, 1.1, 0.0, 0.0, 0.0, 0.0])
     best = optimize.least_squares(residual, start).x
     # The two use different borders of the band; they agree to a fraction of the noise's own 0.02 px.
     np.testing.assert_allclose(best[:4], start[:4], atol=0.012)
