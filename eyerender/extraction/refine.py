@@ -19,6 +19,8 @@ Mask = NDArray[np.bool_]
 # Fourier orders of the outer level that are tried. The first is always there: lamps beside the camera light one side of
 # the iris more, by a few hundredths of the step, which noise hides from any test but not from the centre.
 ORDERS = (1, 2, 4, 6, 8)
+# No pixel farther outside counts, px, however wide the blur: light falls off across the iris, faster than linearly.
+OUTWARD_PX = 8.0
 OUTLIER = 5.0  # pixels beyond this many standard deviations do not count
 # Parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, lean (two), mean outer level.
 FIXED = SHAPE + 7
@@ -100,14 +102,15 @@ def refine(linear: Image, start: RimModel, sectors: Mask, masked: Mask, noise_dn
 
 
 def _band(linear: Image, model: RimModel, masked: Mask) -> _Pixels:
-    """The pixels whose distance to the rim matters: 4 sigma and a pixel inside, 3 sigma and a pixel outside.
+    """The pixels whose distance to the rim matters: 4 sigma and a pixel inside, 3 sigma and a pixel outside,
+    where that is not beyond OUTWARD_PX.
 
     Farther out the outer level would be told better, but it changes with the distance: 2 px more make the error on a
     textured iris half as large again.
     """
     ellipse, sigma = model.ellipse, model.sigma_px
     a, b = ellipse.semi_axes_px
-    inward, outward = min(4.0 * sigma + 1.0, 0.8 * b), 3.0 * sigma + 1.0
+    inward, outward = min(4.0 * sigma + 1.0, 0.8 * b), min(3.0 * sigma + 1.0, OUTWARD_PX)
     reach = float(a) + outward + 2.0
     cx, cy = ellipse.centre_px
     x0, x1 = max(0, math.floor(cx - reach)), min(linear.shape[1], math.ceil(cx + reach) + 1)
