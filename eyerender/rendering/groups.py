@@ -111,11 +111,13 @@ def shade_group(values: Values, lights: Lights, textures: Textures, scene: Any, 
     def left(i: Any, *_: Any) -> Any:
         return settled & (i < group.count)
 
-    def weigh(i: Any, weight: Any) -> Any:
-        return i + 1, weight + group.ray(number(i))[2]
+    def weigh(i: Any, weight: Any, shared: Any) -> Any:
+        one = group.ray(number(i))[2]
+        return i + 1, weight + one, shared + one
 
-    _, weight = dr.while_loop((i, sheet.weight), left, weigh, labels=("i", "weight"), label="settled")
-    sheet = replace(sheet, weight=weight, shared=dr.select(settled, weight, sheet.shared))
+    state = (i, sheet.weight, sheet.shared)
+    _, weight, shared = dr.while_loop(state, left, weigh, labels=("i", "weight", "shared"), label="settled")
+    sheet = replace(sheet, weight=weight, shared=shared)
 
     for kept in (sheet, before):
 

@@ -165,6 +165,23 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin(renderer, monkeypatch, pla
     assert np.all(quick >= slow)
 
 
+@pytest.mark.parametrize("lamps", [1, 2])
+def test_plain_tiles_leave_no_seam_where_fine_shadows_begin(renderer, monkeypatch, lamps):
+    """With few lamps the samples of a group about the lids have rays of their own; one group may have both kinds."""
+    from eyerender.capture import render_job
+
+    data = scene(region={"seed": 100}).spec.to_mapping()
+    lamp = data["rig"]["lights"][0]
+    data["rig"]["lights"] = [{**lamp, "position_mm": [600, 40.0 * k, -60]} for k in range(lamps)]
+    s = Scene.of(SceneSpec.from_mapping(data))
+    job = replace(render_job(s, observe(s), 0), window=(0, 0, 640, 320))
+    quick = renderer.radiance(job)
+    monkeypatch.setattr("eyerender.rendering.stage.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000))
+    slow = renderer.radiance(job)
+    # Some pixels lack a sample without plain tiles, as above.
+    assert np.count_nonzero(np.abs(quick - slow) > 0.01 * np.median(slow)) < 1e-4 * slow.size
+
+
 def test_reasons_are_told_apart():
     yes, no = np.array([True, True]), np.array([False, False])
     energy = np.array([1.0, 1.0])
