@@ -112,11 +112,11 @@ def shade_group(values: Values, lights: Lights, textures: Textures, scene: Any, 
         return settled & (i < group.count)
 
     def weigh(i: Any, weight: Any, shared: Any) -> Any:
-        one = group.ray(number(i))[2]
-        return i + 1, weight + one, shared + one
+        rest = group.ray(number(i))[2]
+        return i + 1, weight + rest, shared + rest
 
-    state = (i, sheet.weight, sheet.shared)
-    _, weight, shared = dr.while_loop(state, left, weigh, labels=("i", "weight", "shared"), label="settled")
+    weights = (i, sheet.weight, sheet.shared)
+    _, weight, shared = dr.while_loop(weights, left, weigh, labels=("i", "weight", "shared"), label="settled")
     sheet = replace(sheet, weight=weight, shared=shared)
 
     for kept in (sheet, before):
