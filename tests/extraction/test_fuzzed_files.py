@@ -154,7 +154,7 @@ def _fuzz(ideal, tmp_path, capfd, count: int, first: int) -> None:
         right += iou(_pupil(record), truth) > 0.9
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     assert grown < 1_500_000  # kB: 8192^2 pixels of four channels, decoded and converted
-    assert answered > 0.1 * count
+    assert answered > 0.05 * count  # enough to judge by
     # A file that decodes is an image; where damage moves its rows, its pupil truly lies elsewhere.
     assert right >= 0.95 * answered
 
