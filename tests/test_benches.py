@@ -62,8 +62,8 @@ def test_the_report_holds_rows_machine_and_versions(bench, tmp_path):
 
 def test_memory_is_that_of_this_process(bench):
     before = bench.resident_mib()
-    block = np.ones(8_000_000)  # 61 MiB
-    assert 50 < bench.resident_mib() - before < 80
+    block = np.ones(64_000_000)  # 488 MiB: more than what earlier tests may have left to the allocator
+    assert 400 < bench.resident_mib() - before < 520
     del block
 
 
