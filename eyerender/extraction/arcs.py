@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse, fit_ellipse_direct, from_cv2, signed_distance
+from ..geometry.ellipse import Ellipse, EllipseFit, fit_ellipse_direct, from_cv2, signed_distance
 from .coarse import Candidate
 from .edges import EdgePoints
 from .settings import ExtractionSettings
@@ -21,6 +21,8 @@ SECTORS = 48  # of the outline, for support
 PIECES = 16  # arcs are cut at these sectors, so that a lid's margin parts from the rim it joins
 SAMPLES = 240
 POINTS_PER_PIECE = 3
+FINALISTS = 24  # of the random ellipses, counted with all points
+ALL_AGREE = 0.85  # of the highest support: the root mean square distance is then 0.39 of the tolerance at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +164,25 @@ def rims_without_stretch(
 def _consensus(
     edges: EdgePoints, candidate: Candidate, settings: ExtractionSettings, tolerance: float
 ) -> Ellipse | None:
-    """The ellipse, of those through all points and through random triples of arc pieces, that most outline supports."""
+    """The ellipse, of those through all points and through random triples of arc pieces, that most outline supports.
+
+    Where all points are about as close to theirs as their noise makes them, no other is looked for.
+    """
+    points = edges.points_px
+    whole = _sane(fit_ellipse_direct(points[None]), candidate, settings)
+    if whole.shape[0] and _support(points, edges.normals, whole, tolerance)[0] > ALL_AGREE * _most(points, whole)[0]:
+        return _ellipse(whole[0])
+    fits = np.concatenate([whole, _sane(_random_fits(edges, candidate), candidate, settings)])
+    if fits.shape[0] == 0:
+        return None
+    # Every third point tells which are worth counting all.
+    rough = _support(points[::3], edges.normals[::3], fits, tolerance)
+    fits = fits[np.argsort(-rough, kind="stable")[:FINALISTS]]
+    return _ellipse(fits[int(np.argmax(_support(points, edges.normals, fits, tolerance)))])
+
+
+def _random_fits(edges: EdgePoints, candidate: Candidate) -> EllipseFit:
+    """Ellipses through points of random triples of arc pieces."""
     points = edges.points_px
     offset = points - candidate.ellipse.centre_px
     bearing = np.arctan2(offset[:, 1], offset[:, 0])
@@ -170,48 +190,54 @@ def _consensus(
     _, piece = np.unique(edges.arc * PIECES + sector, return_inverse=True)
     sizes = np.bincount(piece)
     usable = np.nonzero(sizes >= 4)[0]
-    fits = [fit_ellipse_direct(points[None])]
-    if usable.size >= 3:
-        rng = np.random.default_rng(0)  # the same image gives the same answer
-        order = np.argsort(piece, kind="stable")
-        first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-        chance = sizes[usable] / sizes[usable].sum()
-        keys = rng.random((SAMPLES, usable.size)) ** (1.0 / chance)[None, :]  # weighted draw without replacement
-        chosen = usable[np.argsort(-keys, axis=1)[:, :3]]
-        at = rng.random((SAMPLES, 3, POINTS_PER_PIECE)) * sizes[chosen][..., None]
-        index = order[first[chosen][..., None] + at.astype(np.intp)].reshape(SAMPLES, -1)
-        fits.append(fit_ellipse_direct(points[index]))
-    centre = np.concatenate([fit.centre_px for fit in fits])
-    axes = np.concatenate([fit.semi_axes_px for fit in fits])
-    angle = np.concatenate([fit.angle_rad for fit in fits])
+    if usable.size < 3:
+        return fit_ellipse_direct(np.zeros((0, 5, 2)))
+    rng = np.random.default_rng(0)  # the same image gives the same answer
+    order = np.argsort(piece, kind="stable")
+    first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    chance = sizes[usable] / sizes[usable].sum()
+    keys = rng.random((SAMPLES, usable.size)) ** (1.0 / chance)[None, :]  # weighted draw without replacement
+    chosen = usable[np.argsort(-keys, axis=1)[:, :3]]
+    at = rng.random((SAMPLES, 3, POINTS_PER_PIECE)) * sizes[chosen][..., None]
+    index = order[first[chosen][..., None] + at.astype(np.intp)].reshape(SAMPLES, -1)
+    return fit_ellipse_direct(points[index])
+
+
+def _sane(fit: EllipseFit, candidate: Candidate, settings: ExtractionSettings) -> Array:
+    """(m, 5) centre, semi-axes and angle of those fits whose size and shape may be the candidate's."""
+    a, b = fit.semi_axes_px[:, 0], fit.semi_axes_px[:, 1]
     a0, b0 = candidate.ellipse.semi_axes_px
     with np.errstate(invalid="ignore"):
-        sane = (axes[:, 0] < 2.2 * a0) & (axes[:, 1] > 0.4 * b0) & (axes[:, 1] > settings.aspect_min * axes[:, 0])
-        sane &= (axes[:, 0] <= settings.radius_max_px) & (axes[:, 1] >= 0.8 * settings.radius_min_px)
-    centre, axes, angle = centre[sane], axes[sane], angle[sane]
-    if angle.size == 0:
-        return None
-    support = _support(points, edges.normals, centre, axes, angle, tolerance)
-    best = int(np.argmax(support))
-    return Ellipse(centre[best], axes[best], float(angle[best]))
+        sane = (a < 2.2 * a0) & (b > 0.4 * b0) & (b > settings.aspect_min * a)
+        sane &= (a <= settings.radius_max_px) & (b >= 0.8 * settings.radius_min_px)
+    return np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[sane]
 
 
-def _support(points: Array, normals: Array, centre: Array, axes: Array, angle: Array, tolerance: float) -> Array:
-    """Score of every ellipse: the points close by with an agreeing normal, weighted by closeness, per length."""
-    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    a, b = axes[:, :1], axes[:, 1:]
-    dx, dy = points[None, :, 0] - centre[:, :1], points[None, :, 1] - centre[:, 1:]
+def _ellipse(row: Array) -> Ellipse:
+    return Ellipse(row[:2], row[2:4], float(row[4]))
+
+
+def _support(points: Array, normals: Array, fits: Array, tolerance: float) -> Array:
+    """(m,) score of every ellipse (m, 5): the points close by with an agreeing normal, weighted by closeness, per
+    length."""
+    cos, sin = np.cos(fits[:, 4:]), np.sin(fits[:, 4:])
+    a, b = fits[:, 2:3], fits[:, 3:4]
+    dx, dy = points[:, 0] - fits[:, :1], points[:, 1] - fits[:, 1:2]
     p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
     radius = np.sqrt(p * p + q * q)
     nx, ny = p / a, q / b
     slope = np.sqrt(nx * nx + ny * ny)
     distance = (radius - 1.0) * radius / slope
-    agree = ((nx * cos - ny * sin) * normals[None, :, 0] + (nx * sin + ny * cos) * normals[None, :, 1]) > 0.9 * slope
-    closeness = np.maximum(1.0 - (distance / tolerance) ** 2, 0.0) * agree
-    perimeter = np.pi * (a + b)[:, 0]
+    agree = (nx * cos - ny * sin) * normals[:, 0] + (nx * sin + ny * cos) * normals[:, 1] > 0.9 * slope
+    closeness = np.maximum(1.0 - (distance / tolerance) ** 2, 0.0)
     # Per length of outline, so that a large loose ellipse does not win by points of other edges; total as well.
-    score: Array = closeness.sum(axis=1) / np.sqrt(perimeter)
+    score: Array = np.einsum("mn,mn->m", closeness, agree) / np.sqrt(np.pi * (a + b)[:, 0])
     return score
+
+
+def _most(points: Array, fits: Array) -> Array:
+    """(m,) what `_support` would be if all points were on every ellipse."""
+    return np.asarray(points.shape[0] / np.sqrt(np.pi * fits[:, 2:4].sum(axis=1)))
 
 
 def _polished(
@@ -224,11 +250,10 @@ def _polished(
     ellipse, inliers = start, np.zeros(edges.points_px.shape[0], dtype=bool)
     points = edges.points_px
     for turn in range(5):
-        shift = 0.5 * edges.sigma_px**2 * curvature_at(ellipse, points)
-        shift = np.minimum(shift, 0.15 * float(ellipse.semi_axes_px[1]))
-        points = edges.points_px + shift[:, None] * _normals(ellipse, edges.points_px)
-        distance = signed_distance(ellipse, points)
-        agree = np.sum(_normals(ellipse, points) * edges.normals, axis=1) > 0.9
+        distance, normals, curvature = _relative(ellipse, edges.points_px)
+        shift = np.minimum(0.5 * edges.sigma_px**2 * curvature, 0.15 * float(ellipse.semi_axes_px[1]))
+        points, distance = edges.points_px + shift[:, None] * normals, distance + shift
+        agree = np.einsum("nk,nk->n", normals, edges.normals) > 0.9
         reach = 2.0 * tolerance if turn == 0 and not free else tolerance
         chosen = (np.abs(distance) < reach) & agree
         if turn >= 1 and chosen.sum() >= 8:
@@ -302,9 +327,15 @@ def _parameter(ellipse: Ellipse, points: Array) -> tuple[Array, Array]:
     return p / radius, q / radius
 
 
-def _normals(ellipse: Ellipse, points: Array) -> Array:
-    cos_t, sin_t = _parameter(ellipse, points)
+def _relative(ellipse: Ellipse, points: Array) -> tuple[Array, Array, Array]:
+    """(signed distance (n,), outward normal (n, 2), the outline's curvature (n,)) about points near an ellipse."""
+    a, b = ellipse.semi_axes_px.tolist()
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-    p, q = cos_t / ellipse.semi_axes_px[0], sin_t / ellipse.semi_axes_px[1]
-    out = np.stack([p * cos - q * sin, p * sin + q * cos], axis=-1)
-    return np.asarray(out / np.hypot(out[:, :1], out[:, 1:]))
+    dx, dy = points[:, 0] - ellipse.centre_px[0], points[:, 1] - ellipse.centre_px[1]
+    p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
+    radius = np.maximum(np.sqrt(p * p + q * q), 1e-12)
+    u, v = p / a, q / b
+    slope = np.maximum(np.sqrt(u * u + v * v), 1e-12)
+    normals = np.stack([u * cos - v * sin, u * sin + v * cos], axis=-1) / slope[:, None]
+    # With (cos t, sin t) = (p, q) / radius: a b / (a^2 sin^2 t + b^2 cos^2 t)^1.5, and slope is its root over a b.
+    return (radius - 1.0) * radius / slope, normals, (radius / slope) ** 3 / (a * b) ** 2

@@ -50,9 +50,7 @@ def find_candidates(
         small = as_image(cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel))
     noise = noise_dn / (1.5 * factor) + 0.1  # after averaging factor^2 pixels and a 3 x 3 Gaussian
     blobs = _sweep(small, factor, settings)
-    if not blobs:
-        return []
-    return _ranked(small, noise, factor, blobs)[:most]
+    return _ranked(small, noise, factor, blobs, most) if blobs.size else []
 
 
 def _reduced(linear: Image, factor: int, removal: int) -> Image:
@@ -83,46 +81,46 @@ def _levels(small: Image) -> Array:
     return np.asarray(levels[keep], dtype=np.float64)
 
 
-def _sweep(small: Image, factor: int, settings: ExtractionSettings) -> list[tuple[Ellipse, float]]:
-    """Blobs of every threshold that could be a pupil: (ellipse in reduced pixels, share of the ellipse filled)."""
+def _sweep(small: Image, factor: int, settings: ExtractionSettings) -> Array:
+    """(n, 6) blobs of every threshold that could be a pupil: their ellipse (centre x, y, semi-axes a, b, angle) in
+    reduced pixels, and the share of it that they fill."""
     height, width = small.shape
     least = max(0.5 * settings.radius_min_px, settings.radius_min_px - 2.0 * factor) / factor
     most = 1.3 * settings.radius_max_px / factor
-    blobs: list[tuple[Ellipse, float]] = []
-    for level in _levels(small):
-        mask = (small <= level).view(np.uint8)
-        contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-        # A contour's length in pixels is at least half its ellipse's perimeter; holes have a parent.
-        parents = hierarchy[0, :, 3].tolist() if contours else []
-        for contour, parent in zip(contours, parents, strict=True):
-            if parent >= 0 or not 3.0 * least < contour.shape[0] < 15.0 * most:
+    # A contour's length in pixels is at least half its ellipse's perimeter.
+    shortest, longest = 3.0 * least, 15.0 * most
+    blobs: list[tuple[float, ...]] = []
+    for level in _levels(small).tolist():
+        contours, hierarchy = cv2.findContours(cv2.compare(small, level, cv2.CMP_LE), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        for i, contour in enumerate(contours):
+            if not shortest < len(contour) < longest or hierarchy[0, i, 3] >= 0:  # holes have a parent
                 continue
             x, y, w, h = cv2.boundingRect(contour)
             # A backdrop touches two sides or more, a lid one along its width.
             sides = (x == 0) + (y == 0) + (x + w == width) + (y + h == height)
             if (
                 sides >= 2
-                or (sides == 1 and _on_border(contour, width, height) > 0.15)
                 or min(w, h) < 1.2 * least
                 or max(w, h) > 2.2 * most
+                or (sides == 1 and _on_border(contour, width, height) > 0.15)
             ):
                 continue
             blob = _blob_ellipse(cv2.moments(contour), least, most, settings)
             if blob is not None:
                 blobs.append(blob)
-    return blobs
+    return np.array(blobs, dtype=np.float64).reshape(-1, 6)
 
 
 def _on_border(contour: NDArray[np.int32], width: int, height: int) -> float:
     """Share of a contour that runs along the frame: more than a little is a lid or backdrop, not a pupil cut off."""
     x, y = contour[:, 0, 0], contour[:, 0, 1]
-    return float(np.mean((x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)))
+    return np.count_nonzero((x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)) / len(contour)
 
 
 def _blob_ellipse(
     m: dict[str, float], least: float, most: float, settings: ExtractionSettings
-) -> tuple[Ellipse, float] | None:
-    """The ellipse with a filled contour's second moments, if the contour fills it."""
+) -> tuple[float, ...] | None:
+    """The ellipse with a filled contour's second moments, and its filled share, if the contour fills it."""
     area = m["m00"]
     if area < math.pi * least**2 * 0.5:
         return None
@@ -137,40 +135,38 @@ def _blob_ellipse(
     a, b = a + 0.5, b + 0.5
     if b / a < 0.7 * settings.aspect_min or filled < 0.8 or a * b < least**2 or a * b > most**2:
         return None
-    angle = 0.5 * math.atan2(2.0 * c12, c11 - c22)
-    return Ellipse(np.array([m["m10"] / area, m["m01"] / area]), np.array([a, b]), angle), filled
+    return m["m10"] / area, m["m01"] / area, a, b, 0.5 * math.atan2(2.0 * c12, c11 - c22), filled
 
 
-def _ranked(small: Image, noise: float, factor: int, blobs: list[tuple[Ellipse, float]]) -> list[Candidate]:
-    centre = np.array([blob[0].centre_px for blob in blobs])
-    axes = np.array([blob[0].semi_axes_px for blob in blobs])
-    angle = np.array([blob[0].angle_rad for blob in blobs])
-    filled = np.array([blob[1] for blob in blobs])
+def _ranked(small: Image, noise: float, factor: int, blobs: Array, most: int) -> list[Candidate]:
+    centre, axes, angle, filled = blobs[:, :2], blobs[:, 2:4], blobs[:, 4], blobs[:, 5]
     near_in = _sample(small, centre, axes * 0.65, angle)
     deep_in = _sample(small, centre, axes * 0.4, angle)
     near_out = _sample(small, centre, axes * 1.15 + 1.5, angle)
     step = near_out - near_in
-    inside = np.median(np.concatenate([near_in, deep_in], axis=1), axis=1)
-    typical = np.median(step, axis=1)
+    within = np.concatenate([near_in, deep_in], axis=1)
+    inside, typical, rim_level = (np.median(part, axis=1) for part in (within, step, near_in))
     enclosed = np.mean(step > np.maximum(0.35 * typical, 2.0 * noise)[:, None], axis=1)
-    rim_level = np.median(near_in, axis=1)
-    spread = np.std(np.concatenate([near_in, deep_in], axis=1), axis=1)
+    spread = np.std(within, axis=1)
     uniform = 1.0 / (1.0 + (spread / np.maximum(typical, 1e-6)) ** 2)
     strength = np.maximum(typical, 0.0) / (np.maximum(typical, 0.0) + 8.0 * noise + 4.0)
     score = enclosed**2 * strength * uniform * np.minimum(filled, 1.0) ** 2
+    eligible = (typical >= max(2.5 * noise, 0.5)) & (enclosed >= 0.3)
     order = np.argsort(-score, kind="stable")
+    best = blobs[order[eligible[order]]]
+    index = order[eligible[order]].tolist()
     kept: list[int] = []
-    for i in order:
-        if typical[i] < max(2.5 * noise, 0.5) or enclosed[i] < 0.3:
-            continue
-        if all(not _same(centre[i], axes[i], centre[j], axes[j]) for j in kept):
-            kept.append(int(i))
+    places: list[list[float]] = []
+    for i, place in zip(index, best.tolist(), strict=True):
+        if not any(_same(place, other) for other in places):
+            kept.append(i)
+            places.append(place)
         if len(kept) >= 12:
             break
     final = {i: float(score[i]) for i in kept}
-    for i in kept:
-        for j in kept:
-            inner = axes[j].prod() < 0.6 * axes[i].prod() and np.hypot(*(centre[i] - centre[j])) < 0.6 * axes[i, 1]
+    for i, (x, y, a, b, *_) in zip(kept, places, strict=True):
+        for j, (other_x, other_y, other_a, other_b, *_) in zip(kept, places, strict=True):
+            inner = other_a * other_b < 0.6 * a * b and math.hypot(x - other_x, y - other_y) < 0.6 * b
             darker = rim_level[i] - rim_level[j] > max(0.1 * typical[i], 2.0 * noise)
             # The iris holds the pupil: whatever holds a darker enclosed blob is not the pupil.
             if inner and darker and enclosed[j] > 0.55 and typical[j] > 0.12 * typical[i]:
@@ -178,25 +174,25 @@ def _ranked(small: Image, noise: float, factor: int, blobs: list[tuple[Ellipse, 
     kept.sort(key=lambda i: -final[i])
     return [
         Candidate(
-            Ellipse((centre[i] + 0.5) * factor - 0.5, axes[i] * factor, angle[i]),
+            Ellipse((centre[i] + 0.5) * factor - 0.5, axes[i] * factor, float(angle[i])),
             float(inside[i]), float(typical[i]), float(enclosed[i]), final[i],
         )
-        for i in kept
+        for i in kept[:most]
     ]  # fmt: skip
 
 
-def _sample(small: Image, centre: Array, axes: Array, angle: Array) -> Array:
+def _sample(small: Image, centre: Array, axes: Array, angle: Array) -> Image:
     """(n, ANGLES) levels at the nearest pixels of n ellipses; beyond the frame its border is repeated."""
-    points = points_on_ellipse(centre, axes, angle, ANGLES)
-    column = np.clip(np.rint(points[..., 0]).astype(np.intp), 0, small.shape[1] - 1)
-    row = np.clip(np.rint(points[..., 1]).astype(np.intp), 0, small.shape[0] - 1)
-    return small[row, column].astype(np.float64)
+    points = np.rint(points_on_ellipse(centre, axes, angle, ANGLES)).astype(np.intp)
+    column = np.minimum(np.maximum(points[..., 0], 0), small.shape[1] - 1)
+    row = np.minimum(np.maximum(points[..., 1], 0), small.shape[0] - 1)
+    return small[row, column]
 
 
-def _same(centre_1: Array, axes_1: Array, centre_2: Array, axes_2: Array) -> bool:
-    near = float(np.hypot(*(centre_1 - centre_2))) < 0.35 * float(min(axes_1[1], axes_2[1]))
-    ratio = float(axes_1.prod() / axes_2.prod())
-    return near and 0.6 < ratio < 1.65
+def _same(first: list[float], second: list[float]) -> bool:
+    """Whether two blobs (as of `_sweep`) are one place at two thresholds."""
+    near = math.hypot(first[0] - second[0], first[1] - second[1]) < 0.35 * min(first[3], second[3])
+    return near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +225,8 @@ def inspect_interior(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: 
     inside = crop[radius2 < max(end, 0.5) ** 2]
     spread = 0.0
     if inside.size >= 8:
-        low, high = np.percentile(inside, (25.0, 75.0))
+        quarters = (inside.size // 4, inside.size - 1 - inside.size // 4)
+        low, high = np.partition(inside, quarters)[list(quarters)]
         spread = math.sqrt(max((0.7413 * float(high - low)) ** 2 - noise_dn**2, 0.0))
     if end < 0.6 or core.size < 5 or rim.size < 5:
         return Interior(0.0, math.inf, spread)
