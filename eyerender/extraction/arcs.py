@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..geometry.ellipse import Ellipse, EllipseFit, fit_ellipse_direct, from_cv2, signed_distance
 from .coarse import Candidate
 from .edges import EdgePoints
+from .orderstatistics import median
 from .settings import ExtractionSettings
 
 Array = NDArray[np.float64]
@@ -210,7 +211,7 @@ def _sane(fit: EllipseFit, candidate: Candidate, settings: ExtractionSettings) -
     with np.errstate(invalid="ignore"):
         sane = (a < 2.2 * a0) & (b > 0.4 * b0) & (b > settings.aspect_min * a)
         sane &= (a <= settings.radius_max_px) & (b >= 0.8 * settings.radius_min_px)
-    return np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[sane]
+    return np.asarray(np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[sane])
 
 
 def _ellipse(row: Array) -> Ellipse:
@@ -257,7 +258,7 @@ def _polished(
         reach = 2.0 * tolerance if turn == 0 and not free else tolerance
         chosen = (np.abs(distance) < reach) & agree
         if turn >= 1 and chosen.sum() >= 8:
-            spread = 1.4826 * float(np.median(np.abs(distance[chosen] - np.median(distance[chosen]))))
+            spread = 1.4826 * median(np.abs(distance[chosen] - median(distance[chosen])))
             chosen &= np.abs(distance) < max(3.5 * spread, 0.1)
         if chosen.sum() < 8:
             return f"only {int(chosen.sum())} edge points agree on one ellipse"

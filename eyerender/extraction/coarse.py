@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.ellipse import Ellipse, points_on_ellipse
+from .orderstatistics import median, quantile
 from .preprocess import Image, Prepared, as_image
 from .settings import ExtractionSettings
 
@@ -91,7 +93,8 @@ def _sweep(small: Image, factor: int, settings: ExtractionSettings) -> Array:
     shortest, longest = 3.0 * least, 15.0 * most
     blobs: list[tuple[float, ...]] = []
     for level in _levels(small).tolist():
-        contours, hierarchy = cv2.findContours(cv2.compare(small, level, cv2.CMP_LE), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        mask = cv2.compare(small, level, cv2.CMP_LE)
+        contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
         for i, contour in enumerate(contours):
             if not shortest < len(contour) < longest or hierarchy[0, i, 3] >= 0:  # holes have a parent
                 continue
@@ -111,7 +114,7 @@ def _sweep(small: Image, factor: int, settings: ExtractionSettings) -> Array:
     return np.array(blobs, dtype=np.float64).reshape(-1, 6)
 
 
-def _on_border(contour: NDArray[np.int32], width: int, height: int) -> float:
+def _on_border(contour: NDArray[Any], width: int, height: int) -> float:
     """Share of a contour that runs along the frame: more than a little is a lid or backdrop, not a pupil cut off."""
     x, y = contour[:, 0, 0], contour[:, 0, 1]
     return np.count_nonzero((x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)) / len(contour)
@@ -186,7 +189,7 @@ def _sample(small: Image, centre: Array, axes: Array, angle: Array) -> Image:
     points = np.rint(points_on_ellipse(centre, axes, angle, ANGLES)).astype(np.intp)
     column = np.minimum(np.maximum(points[..., 0], 0), small.shape[1] - 1)
     row = np.minimum(np.maximum(points[..., 1], 0), small.shape[0] - 1)
-    return small[row, column]
+    return np.asarray(small[row, column])
 
 
 def _same(first: list[float], second: list[float]) -> bool:
@@ -225,13 +228,12 @@ def inspect_interior(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: 
     inside = crop[radius2 < max(end, 0.5) ** 2]
     spread = 0.0
     if inside.size >= 8:
-        quarters = (inside.size // 4, inside.size - 1 - inside.size // 4)
-        low, high = np.partition(inside, quarters)[list(quarters)]
-        spread = math.sqrt(max((0.7413 * float(high - low)) ** 2 - noise_dn**2, 0.0))
+        between = quantile(inside, 0.75) - quantile(inside, 0.25)
+        spread = math.sqrt(max((0.7413 * between) ** 2 - noise_dn**2, 0.0))
     if end < 0.6 or core.size < 5 or rim.size < 5:
         return Interior(0.0, math.inf, spread)
     error = 1.2533 * noise_dn * math.sqrt(1.0 / core.size + 1.0 / rim.size)
-    return Interior(float(np.median(rim) - np.median(core)), error, spread)
+    return Interior(median(rim) - median(core), error, spread)
 
 
 def find_inside(prepared: Prepared, ellipse: Ellipse, settings: ExtractionSettings) -> list[Candidate]:

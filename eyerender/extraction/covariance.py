@@ -18,22 +18,25 @@ Array = NDArray[np.float64]
 
 SECTORS = 48
 SHAPE = 5
+_TURN = 2.0 * np.pi * np.arange(32) / 32
+_COS, _SIN = np.cos(_TURN), np.sin(_TURN)
 SELECTION = 1.6  # edge points are selected by their residual, which understates the scatter (development images)
 
 
-def gram(jacobian: Array) -> Array:
-    """J^T J of (n, p), in blocks of rows: a BLAS would start its threads for the whole, at several times the cost."""
-    rows = max(1, 200_000 // jacobian.shape[1] ** 2)
-    out = np.zeros((jacobian.shape[1], jacobian.shape[1]))
-    for start in range(0, jacobian.shape[0], rows):
-        block = jacobian[start : start + rows]
-        out += block.T @ block
+def gram(slopes: Array) -> Array:
+    """S S^T of (p, n), in blocks of columns: a BLAS would start its threads for the whole, at several times the
+    cost."""
+    columns = max(1, 200_000 // slopes.shape[0] ** 2)
+    out = np.zeros((slopes.shape[0], slopes.shape[0]))
+    for start in range(0, slopes.shape[1], columns):
+        block = slopes[:, start : start + columns]
+        out += block @ block.T
     return out
 
 
-def project(jacobian: Array, residual: Array) -> Array:
-    """J^T r, without BLAS for the same reason."""
-    out: Array = np.einsum("np,n->p", jacobian, residual)
+def project(slopes: Array, residual: Array) -> Array:
+    """S r of (p, n), without BLAS for the same reason."""
+    out: Array = np.einsum("pn,n->p", slopes, residual)
     return out
 
 
@@ -44,28 +47,28 @@ def sector_of(place: Place) -> NDArray[np.intp]:
 
 
 def distance_slopes(ellipse: Ellipse, place: Place) -> Array:
-    """(n, 5) derivatives of the signed distance by cx, cy and the shape matrix (aa, bb, ab) in the ellipse's axes."""
+    """(5, n) derivatives of the signed distance by cx, cy and the shape matrix (aa, bb, ab) in the ellipse's axes."""
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-    return -np.stack(
-        [
-            place.nx * cos - place.ny * sin,
-            place.nx * sin + place.ny * cos,
-            place.nx * place.cos_t,
-            place.ny * place.sin_t,
-            place.nx * place.sin_t + place.ny * place.cos_t,
-        ],
-        axis=-1,
-    )
+    out = np.empty((SHAPE, place.nx.size))
+    np.subtract(place.ny * sin, place.nx * cos, out=out[0])
+    np.multiply(place.nx, -sin, out=out[1])
+    out[1] -= place.ny * cos
+    np.multiply(place.nx, -place.cos_t, out=out[2])
+    np.multiply(place.ny, -place.sin_t, out=out[3])
+    np.multiply(place.nx, -place.sin_t, out=out[4])
+    out[4] -= place.ny * place.cos_t
+    return out
 
 
 def sector_excess(plain: Array, inverse: Array, scores: Array, bins: NDArray[np.intp]) -> float:
     """How much more the parameters scatter than independent residuals would make them: trace(plain^-1 S) / 5, S the sum
-    over sectors of the outer square of inverse (5, p) times the sector's summed scores. scores (n, p), bins (n,).
+    over sectors of the outer square of inverse (5, p) times the sector's summed scores. scores (p, n), bins (n,).
 
     Source: the cluster-robust ("sandwich") covariance, Liang and Zeger (1986), reduced to one factor.
     """
-    sums = np.stack([np.bincount(bins, weights=column, minlength=SECTORS) for column in scores.T])
-    summed = inverse @ sums
+    order = np.argsort(bins.astype(np.uint8), kind="stable")  # a radix sort
+    first = np.flatnonzero(np.diff(bins[order], prepend=-1))
+    summed = inverse @ np.add.reduceat(scores[:, order], first, axis=1)
     return float(np.trace(np.linalg.solve(plain, summed @ summed.T))) / SHAPE
 
 
@@ -82,19 +85,21 @@ def edge_covariance(ellipse: Ellipse, points: Array, residual_px: float) -> Arra
     # A third of the sectors, so that one is longer than the noise's reach; n / (n - 5) for the parameters fitted.
     coarse = sector_of(place) // 3
     groups = max(np.unique(coarse).size, SHAPE + 1)
-    excess = sector_excess(plain, inverse, slopes * place.distance[:, None], coarse)
+    excess = sector_excess(plain, inverse, slopes * place.distance, coarse)
     excess *= groups / (groups - SHAPE)
     return to_axes(plain * max(excess, 1.0) * SELECTION, ellipse)
 
 
 def rim_deviation(ellipse: Ellipse, covariance: Array) -> float:
     """Root mean square, over the outline, of the rim's standard deviation along its normal, px."""
-    points = ellipse.points(32)
-    slopes = distance_slopes(ellipse, Place.of(ellipse, points[:, 0], points[:, 1]))
-    a, b = ellipse.semi_axes_px
+    a, b = ellipse.semi_axes_px.tolist()
+    nx, ny = b * _COS, a * _SIN
+    height = np.sqrt(nx * nx + ny * ny)
+    none = np.zeros_like(height)
+    slopes = distance_slopes(ellipse, Place(none, _COS, _SIN, nx / height, ny / height, none))
     # By the angle instead of the shape matrix's off-diagonal term: d ab = (a - b) d angle.
-    slopes[:, 4] *= float(a - b)
-    return math.sqrt(float(np.mean(np.einsum("ni,ij,nj->n", slopes, covariance, slopes))))
+    slopes[4] *= a - b
+    return math.sqrt(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1])
 
 
 def to_axes(covariance: Array, ellipse: Ellipse) -> Array:

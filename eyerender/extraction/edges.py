@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..geometry.ellipse import Ellipse
 from .coarse import Candidate
+from .orderstatistics import median, quantile
 from .preprocess import Image, as_image
 
 Array = NDArray[np.float64]
@@ -81,7 +82,7 @@ def find_edges(
     lean = np.where(level, np.abs(normals[:, 0]), np.abs(normals[:, 1]))
     spread = sigma * 1.1
     if keep.sum() >= 8:
-        spread = float(np.sqrt(np.median(lean[keep] ** 2 / -bend[keep])))
+        spread = math.sqrt(median(lean[keep] ** 2 / -bend[keep]))
     return EdgePoints(
         points[keep] + np.array([x0, y0]),
         normals[keep],
@@ -146,7 +147,7 @@ def _outward(shape: tuple[int, ...], ellipse: Ellipse, x0: int, y0: int) -> tupl
 
 def _typical(strength: Image) -> float:
     """The strong edges' level: an upper percentile, because a ridge has more flank than crest."""
-    return float(np.percentile(strength, 90.0)) if strength.size else 0.0
+    return quantile(strength, 0.9) if strength.size else 0.0
 
 
 def _nearest(image: Image, points: Array) -> Image:

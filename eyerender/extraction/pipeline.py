@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 
 from ..geometry.ellipse import signed_distance
 from .arcs import curvature_at
-from .covariance import SECTORS, edge_covariance, rim_deviation, sector_of
+from .covariance import rim_deviation
 from .fittedspots import SpotFit, spot_light
 from .glints import Spots, detect_spots, judge_spots, widest
+from .orderstatistics import median
 from .preprocess import DN, Image, Prepared, invert, prepare
 from .refine import PixelFit, refine
 from .result import Extraction, PupilResult
-from .rimmodel import Place, RimModel
-from .search import Found, edge_model, search
+from .rimmodel import RimModel
+from .search import Found, search
 from .secondlook import SURE, second_look
 from .settings import ExtractionSettings
 from .spotfit import fit_spots
@@ -63,52 +64,45 @@ def _explained(prepared: Prepared, work: Prepared, found: Found, settings: Extra
     """The pupil whose rim was found, with the glints about it."""
     size = (int(prepared.linear.shape[0]), int(prepared.linear.shape[1]))
     noise = prepared.noise_dn / DN
-    model = edge_model(found)
+    model = found.model
     refined = settings.method == "refined"
-    pupil = None if refined else pupil_of(found, work, model, None, settings)  # no glint moves a fast one
+    pupil = None if refined else pupil_of(found, None, settings)  # no glint moves a fast one
     if pupil is not None and pupil.status == "missing":
         return Extraction(pupil, (), (), noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     pixel_fit: PixelFit | None = None
     if refined:
         masked = _spot_mask(prepared, spots)
-        pixel_fit = _refined(work.linear, model, found, masked, work.noise_dn)
+        pixel_fit = _refined(work.linear, model, found, masked)
         model = model if pixel_fit is None else pixel_fit.model
     spots, fit = _fit_spots(prepared, work, spots, model)
     if refined and not work.inverted:
-        again = _second_pass(prepared, model, found, spots, fit, masked)
+        again = _second_pass(prepared, pixel_fit, found, spots, fit, masked)
         pixel_fit, model = (pixel_fit, model) if again is None else (again, again.model)
-    pupil = pupil or pupil_of(found, work, model, pixel_fit, settings)
+    pupil = pupil or pupil_of(found, pixel_fit, settings)
     if pupil.status == "missing":
         return Extraction(pupil, (), (), noise, size)
     accepted, rejected = judge_spots(spots, fit, prepared, abs(model.step_dn), model.sigma_px, settings)
     return Extraction(pupil, accepted, rejected, noise, size)
 
 
-def _seen(found: Found) -> NDArray[np.bool_]:
-    """Sectors of the outline with an edge point in them, and gaps of up to two sectors between such."""
-    place = Place.of(found.rim.ellipse, *found.edges.points_px[found.rim.inliers].T)
-    hit = np.bincount(sector_of(place), minlength=SECTORS) > 0
-    grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
-    return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
-
-
 def _refined(
-    linear: Image, start: RimModel, found: Found, masked: NDArray[np.bool_], noise_dn: float
+    linear: Image, start: RimModel, found: Found, masked: NDArray[np.bool_], counted: NDArray[np.bool_] | None = None
 ) -> PixelFit | None:
     """The pixel model's fit, if there is one that goes with the edges."""
-    fit = refine(linear, start, _seen(found), masked, noise_dn)
+    fit = refine(linear, start, found.sectors, masked, found.image.noise_dn, counted)
     return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None
 
 
 def _second_pass(
-    prepared: Prepared, model: RimModel, found: Found, spots: Spots, fit: SpotFit, masked: NDArray[np.bool_]
+    prepared: Prepared, first: PixelFit | None, found: Found, spots: Spots, fit: SpotFit, masked: NDArray[np.bool_]
 ) -> PixelFit | None:
     """The pixel model fitted again with the glints' own light taken away; None where that frees hardly any pixels.
 
     A glint's fit tells its flanks far better than the circle of the first pass; only where its light is more than three
     times the noise is it left out.
     """
+    model, counted = (found.model, None) if first is None else (first.model, first.sectors)
     told = fit.converged & (fit.residual_dn < 3.0 * prepared.noise_dn)
     reach = float(model.ellipse.semi_axes_px[0]) + 10.0
     offset = np.hypot(*(fit.xy_px - model.ellipse.centre_px).T)
@@ -127,7 +121,7 @@ def _second_pass(
         linear[rows, columns] -= light.astype(np.float32)
         clear[rows, columns] |= light > 3.0 * prepared.noise_dn
     freed = np.count_nonzero(masked & ~clear)
-    return None if freed < 20 else _refined(linear, model, found, clear, prepared.noise_dn)
+    return None if freed < 20 else _refined(linear, model, found, clear, counted)
 
 
 def _window(xy: Array, radius: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
@@ -143,16 +137,16 @@ def _agrees(fit: PixelFit, found: Found) -> bool:
 
     It may move by what noise and texture move it, no more; and where glints leave it too few pixels, it is of no use.
     """
-    rim = found.rim
-    by_edges = rim_deviation(rim.ellipse, edge_covariance(rim.ellipse, rim.points_px, rim.residual_px))
+    by_edges = rim_deviation(found.rim.ellipse, found.covariance)
     # Both are estimates from a few dozen sectors, which scatter by a fifth and more.
     if rim_deviation(fit.model.ellipse, fit.covariance) > 2.0 * by_edges:
         return False
-    points = found.edges.points_px[found.rim.inliers]
+    rim = found.rim
+    points = found.edges.points_px[rim.inliers]
     ellipse = fit.model.ellipse
     shift = 0.5 * found.edges.sigma_px**2 * curvature_at(ellipse, points)
-    distance = float(np.median(np.abs(signed_distance(ellipse, points) + shift)))
-    return distance < max(2.5 * found.rim.residual_px, 0.3)
+    distance = median(np.abs(signed_distance(ellipse, points) + shift))
+    return distance < max(2.5 * rim.residual_px, 0.3)
 
 
 def _spot_mask(prepared: Prepared, spots: Spots, which: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .orderstatistics import median, quantile
 
 Image = NDArray[np.float32]
 
@@ -93,7 +94,7 @@ def _from_integers(array: NDArray[np.generic], bit_depth: int | None, gamma: flo
     table = (DN * (np.arange(full + 1) / full) ** gamma).astype(np.float32)
     linear = table[array.astype(np.intp, copy=False)]
     # The decoded step at the image's own middle level.
-    middle = max(int(np.median(array[::4, ::4].astype(np.float64))), 1)
+    middle = max(int(median(array[::4, ::4].ravel())), 1)
     return linear, DN, float(table[middle] - table[middle - 1])
 
 
@@ -104,7 +105,7 @@ def _from_float(array: NDArray[np.generic], gamma: float) -> Image | str:
     if gamma != 1.0:
         values = np.maximum(values, 0.0) ** gamma
     step = max(1, int(np.sqrt(values.size / 40_000)))
-    scale = float(np.percentile(values[::step, ::step], 99.5))
+    scale = quantile(values[::step, ::step].ravel(), 0.995)
     if scale <= 0.0:
         scale = float(values.max())
     if scale <= 0.0:
@@ -131,7 +132,7 @@ def estimate_noise(linear: Image) -> float:
     if moving.size < 0.05 * difference.size:
         return 0.0
     source = difference if moving.size > 0.6 * difference.size else moving
-    return float(0.7413 * np.median(source))
+    return 0.7413 * median(source)
 
 
 def invert(prepared: Prepared) -> Prepared:
@@ -141,6 +142,6 @@ def invert(prepared: Prepared) -> Prepared:
     smoothed image, so that a bright pupil's own level stays apart from them.
     """
     smooth = cv2.medianBlur(prepared.linear, 5)
-    ceiling = float(np.percentile(smooth[::2, ::2], 99.9)) + 3.0 * prepared.noise_dn
+    ceiling = quantile(smooth[::2, ::2].ravel(), 0.999) + 3.0 * prepared.noise_dn
     negative = np.maximum(np.subtract(np.float32(ceiling), prepared.linear), np.float32(0.0))
     return Prepared(negative, float("inf"), prepared.noise_dn, inverted=True)

@@ -48,13 +48,14 @@ class RimModel:
 
     def level(self, x: Array, y: Array) -> Array:
         """Expected grey level at pixels (x, y) of any shape."""
-        place = Place.of(self.ellipse, x.ravel(), y.ravel())
+        return self.level_at(Place.of(self.ellipse, x.ravel(), y.ravel())).reshape(x.shape)
+
+    def level_at(self, place: Place) -> Array:
+        """Expected grey level (n,) at places about this rim."""
         profile = Profile.of(place.distance, place.curvature, self.sigma_px, self.kurtosis)
-        edge, ramp = profile.edge, profile.ramp
-        basis = harmonics(place.cos_t, place.sin_t, (self.outer.size - 1) // 2)
-        outer = np.einsum("nk,k->n", basis, self.outer)
+        outer = self.outer @ harmonics(place.cos_t, place.sin_t, (self.outer.size - 1) // 2)
         inner = self.inner(place)
-        return np.asarray((inner + (outer - inner) * edge + self.slope * ramp).reshape(x.shape))
+        return np.asarray(inner + (outer - inner) * profile.edge + self.slope * profile.ramp)
 
     def inner(self, place: Place) -> Array:
         """Inner level (n,) at places about the rim."""
@@ -73,8 +74,13 @@ class Place:
     ny: Array
     curvature: Array
 
+    def taken(self, which: NDArray[np.bool_]) -> Place:
+        """The chosen points'."""
+        parts = (self.distance, self.cos_t, self.sin_t, self.nx, self.ny, self.curvature)
+        return Place(*(part[which] for part in parts))
+
     @staticmethod
-    def of(ellipse: Ellipse, x: Array, y: Array) -> Place:
+    def of(ellipse: Ellipse, x: Array, y: Array, steps: int = 3) -> Place:
         """By Newton's iteration on the nearest point's parameter, from the point's own direction.
 
         f(t) = (a^2 - b^2) cos t sin t - a p sin t + b q cos t = 0; three steps reach 1e-6 px within b / 2 of the rim.
@@ -90,11 +96,11 @@ class Place:
         eccentric = a * a - b * b
         if eccentric > 1e-9 * a * a:
             ap, bq = a * p, b * q
-            for _ in range(3):
+            for _ in range(steps):
                 value = eccentric * c * s - ap * s + bq * c
                 slope = eccentric * (c * c - s * s) - ap * c - bq * s
                 # Far inside (beyond the evolute) the slope changes sign; there no pixel counts.
-                turn = np.clip(value / np.minimum(slope, -1e-9), -0.3, 0.3)
+                turn = np.minimum(np.maximum(value / np.minimum(slope, -1e-9), -0.3), 0.3)
                 c, s = c + turn * s, s - turn * c
                 length = np.sqrt(c * c + s * s)
                 c, s = c / length, s / length
@@ -141,11 +147,12 @@ class Profile:
 
 
 def harmonics(cos_t: Array, sin_t: Array, order: int) -> Array:
-    """(n, 1 + 2 K): 1, cos t, sin t, ..., cos K t, sin K t."""
-    out = np.empty((cos_t.size, 1 + 2 * order))
-    out[:, 0] = 1.0
-    c, s = cos_t, sin_t
-    for k in range(order):
-        out[:, 1 + 2 * k], out[:, 2 + 2 * k] = c, s
-        c, s = c * cos_t - s * sin_t, s * cos_t + c * sin_t
+    """(1 + 2 K, n): 1, cos t, sin t, ..., cos K t, sin K t."""
+    out = np.empty((1 + 2 * order, cos_t.size))
+    out[0] = 1.0
+    if order:
+        out[1], out[2] = cos_t, sin_t
+    for k in range(3, 1 + 2 * order, 2):
+        np.subtract(out[k - 2] * cos_t, out[k - 1] * sin_t, out=out[k])
+        np.add(out[k - 1] * cos_t, out[k - 2] * sin_t, out=out[k + 1])
     return out

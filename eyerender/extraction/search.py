@@ -4,26 +4,65 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .arcs import RimFit, fit_rim
-from .coarse import Candidate, find_candidates, find_inside, inspect_interior
+from .coarse import Candidate, Interior, find_candidates, find_inside, inspect_interior
+from .covariance import SECTORS, edge_covariance, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .preprocess import Prepared
 from .result import PupilResult
-from .rimmodel import RimModel
+from .rimmodel import Place, RimModel
 from .settings import ExtractionSettings
 
+Array = NDArray[np.float64]
 
-@dataclass(frozen=True, slots=True, eq=False)
+
+@dataclass(frozen=True, eq=False)
 class Found:
-    """A candidate, the edge points about it, the rim through them, and how much of it is seen and how clearly."""
+    """A candidate in an image, the edge points about it, the rim through them, and how much of it is seen and how
+    clearly; what follows from these is worked out once, when asked for."""
 
+    image: Prepared
     candidate: Candidate
     edges: EdgePoints
     rim: RimFit
     quality: float
+
+    @cached_property
+    def model(self) -> RimModel:
+        """The pixel model's parameters as far as the edges tell them."""
+        candidate = self.candidate
+        sigma = math.sqrt(max(self.edges.sigma_px**2 - self.edges.filter_px**2, 0.25))
+        outer = np.array([candidate.inside_dn + candidate.step_dn])
+        return RimModel(self.rim.ellipse, candidate.inside_dn, outer, sigma)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(5, 5) of the rim's centre, semi-axes and angle, by the edges' scatter."""
+        return edge_covariance(self.rim.ellipse, self.rim.points_px, self.rim.residual_px)
+
+    @cached_property
+    def interior(self) -> Interior:
+        """What lies inside the rim."""
+        return inspect_interior(self.image.linear, self.rim.ellipse, self.model.sigma_px, self.image.noise_dn)
+
+    @cached_property
+    def sectors(self) -> NDArray[np.bool_]:
+        """(SECTORS,) parts of the outline with an edge point in them, and gaps of up to two parts between such."""
+        hit = np.bincount(sector_of(Place.of(self.rim.ellipse, *self.edges.points_px[self.rim.inliers].T)),
+                          minlength=SECTORS) > 0  # fmt: skip
+        grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
+        return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
+
+    @property
+    def has_core(self) -> bool:
+        """Whether the middle is darker than the outer part, as an iris' is."""
+        inside = self.interior
+        return not inside.darker_dn < max(4.0 * inside.error_dn, 0.15 * self.candidate.step_dn)
 
 
 def search(work: Prepared, settings: ExtractionSettings) -> Found | PupilResult:
@@ -71,7 +110,7 @@ def _holds(outer: Found, inner: Found) -> bool:
 def _without_core(work: Prepared, found: Found, settings: ExtractionSettings) -> Found | PupilResult:
     """The same rim if its inside is even; what lies inside it if there is a darker core, as an iris has."""
     for _ in range(2):
-        if not has_core(work, found):
+        if not found.has_core:
             return found
         inner, _ = _first_good(work, find_inside(work, found.rim.ellipse, settings), settings)
         if inner is None or inner.rim.ellipse.area_px2 > 0.8 * found.rim.ellipse.area_px2:
@@ -79,12 +118,6 @@ def _without_core(work: Prepared, found: Found, settings: ExtractionSettings) ->
             return PupilResult.missing("edges", reason)
         found = inner
     return found
-
-
-def has_core(work: Prepared, found: Found) -> bool:
-    """Whether a rim's middle is darker than its outer part, as an iris' is."""
-    inside = inspect_interior(work.linear, found.rim.ellipse, edge_model(found).sigma_px, work.noise_dn)
-    return not inside.darker_dn < max(4.0 * inside.error_dn, 0.15 * found.candidate.step_dn)
 
 
 def rim_about(work: Prepared, candidate: Candidate, settings: ExtractionSettings) -> Found | str:
@@ -100,12 +133,4 @@ def rim_about(work: Prepared, candidate: Candidate, settings: ExtractionSettings
     rim = fit_rim(edges, candidate, settings, expected)
     if isinstance(rim, str):
         return rim
-    return Found(candidate, edges, rim, rim.support * min(1.0, 4.0 * candidate.score))
-
-
-def edge_model(found: Found) -> RimModel:
-    """The pixel model's parameters as far as the edges tell them."""
-    candidate = found.candidate
-    sigma = math.sqrt(max(found.edges.sigma_px**2 - found.edges.filter_px**2, 0.25))
-    outer = np.array([candidate.inside_dn + candidate.step_dn])
-    return RimModel(found.rim.ellipse, candidate.inside_dn, outer, sigma)
+    return Found(work, candidate, edges, rim, rim.support * min(1.0, 4.0 * candidate.score))

@@ -11,7 +11,7 @@ from .arcs import RimFit, rims_without_stretch
 from .coarse import find_candidates
 from .edges import edge_noise_px
 from .preprocess import Prepared
-from .search import Found, edge_model, has_core, rim_about
+from .search import Found, rim_about
 from .settings import ExtractionSettings
 from .verdict import pupil_of
 
@@ -37,13 +37,13 @@ def second_look(work: Prepared, refused: Found, settings: ExtractionSettings) ->
     for found in _rims(work, settings):
         if found.rim.support < LEAST_SUPPORT or found.rim.gap > LARGEST_GAP or _holds(found.rim, refused.rim):
             continue
-        pupil = pupil_of(found, work, edge_model(found), None, choice)
+        pupil = pupil_of(found, None, choice)
         good = pupil.goodness
         if good is None or good.spread > MOST_SPREAD:
             continue
         if good.rim_sd_px > UNCERTAIN * float(found.rim.ellipse.semi_axes_px[1]):
             continue
-        if pupil.confidence > most and not has_core(work, found):
+        if pupil.confidence > most and not found.has_core:
             best, most = found, pupil.confidence
     return best
 

@@ -5,28 +5,29 @@ from __future__ import annotations
 from ..arrays import frozen
 from .coarse import inspect_interior
 from .confidence import confidence
-from .covariance import edge_covariance, rim_deviation
-from .preprocess import DN, Prepared
+from .covariance import rim_deviation
+from .preprocess import DN
 from .refine import PixelFit
 from .result import Goodness, PupilResult
-from .rimmodel import RimModel
 from .search import Found
 from .settings import ExtractionSettings
 
 
-def pupil_of(
-    found: Found, work: Prepared, model: RimModel, fit: PixelFit | None, settings: ExtractionSettings
-) -> PupilResult:
-    """The pupil of a rim and its pixel model, `fit` where that was fitted; missing where it is too unlikely right."""
-    rim, ellipse = found.rim, model.ellipse
-    covariance = edge_covariance(ellipse, rim.points_px, rim.residual_px) if fit is None else fit.covariance
-    inside = inspect_interior(work.linear, ellipse, model.sigma_px, work.noise_dn)
+def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -> PupilResult:
+    """The pupil of a rim, by its edges or by the pixel model's fit; missing where it is too unlikely right."""
+    rim, image = found.rim, found.image
+    if fit is None:
+        model, covariance, inside = found.model, found.covariance, found.interior
+    else:
+        model, covariance = fit.model, fit.covariance
+        inside = inspect_interior(image.linear, model.ellipse, model.sigma_px, image.noise_dn)
+    ellipse = model.ellipse
     goodness = Goodness(
         support=rim.support,
         gap=rim.gap,
         explained=rim.support if fit is None else float(fit.sectors.mean()),
         contrast=model.step_dn / DN,
-        contrast_to_noise=model.step_dn / work.noise_dn,
+        contrast_to_noise=model.step_dn / image.noise_dn,
         residual_px=rim.residual_px,
         reduced_chi2=0.0 if fit is None else fit.reduced_chi2,
         blur_px=model.sigma_px,

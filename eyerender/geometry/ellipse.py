@@ -44,18 +44,22 @@ class Ellipse:
         angle = float(self.angle_rad)
         if centre.shape != (2,) or axes.shape != (2,):
             raise InputError("an ellipse needs a centre (x, y) and two semi-axes")
-        if not (np.isfinite(centre).all() and np.isfinite(axes).all() and math.isfinite(angle)):
+        # Plain floats from here: an image makes many ellipses, and arrays of two are slow.
+        a, b = axes.tolist()
+        if not all(map(math.isfinite, (*centre.tolist(), a, b, angle))):
             raise InputError("an ellipse's numbers must be finite")
-        if axes.min() <= 0.0:
+        if min(a, b) <= 0.0:
             raise InputError("an ellipse's semi-axes must be > 0")
-        if axes[1] > axes[0]:
+        if b > a:
             axes = axes[::-1].copy()
             angle += 0.5 * math.pi
+        angle %= math.pi
         centre.setflags(write=False)
         axes.setflags(write=False)
         object.__setattr__(self, "centre_px", centre)
         object.__setattr__(self, "semi_axes_px", axes)
-        object.__setattr__(self, "angle_rad", float(wrap_angle(angle)))
+        # As in `wrap_angle`: the remainder of a tiny negative angle is rounded up to pi itself.
+        object.__setattr__(self, "angle_rad", 0.0 if angle >= math.pi else angle)
 
     def _key(self) -> tuple[float, ...]:
         return (*self.centre_px.tolist(), *self.semi_axes_px.tolist(), self.angle_rad)
