@@ -12,14 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.ellipse import Ellipse
-from .rimmodel import Place
+from .rimmodel import Place, sector_of
 
 Array = NDArray[np.float64]
 
-SECTORS = 48
 SHAPE = 5
-_TURN = 2.0 * np.pi * np.arange(32) / 32
-_COS, _SIN = np.cos(_TURN), np.sin(_TURN)
 SELECTION = 1.6  # edge points are selected by their residual, which understates the scatter (development images)
 
 
@@ -38,12 +35,6 @@ def project(slopes: Array, residual: Array) -> Array:
     """S r of (p, n), without BLAS for the same reason."""
     out: Array = np.einsum("pn,n->p", slopes, residual)
     return out
-
-
-def sector_of(place: Place) -> NDArray[np.intp]:
-    """(n,) which of the SECTORS equal steps of the ellipse's parameter each point belongs to."""
-    share = np.arctan2(place.sin_t, place.cos_t) / (2.0 * np.pi) + 0.5
-    return (share * SECTORS).astype(np.intp) % SECTORS
 
 
 def distance_slopes(ellipse: Ellipse, place: Place) -> Array:
@@ -92,11 +83,8 @@ def edge_covariance(ellipse: Ellipse, points: Array, residual_px: float) -> Arra
 
 def rim_deviation(ellipse: Ellipse, covariance: Array) -> float:
     """Root mean square, over the outline, of the rim's standard deviation along its normal, px."""
+    slopes = distance_slopes(ellipse, Place.middles(ellipse, 32))
     a, b = ellipse.semi_axes_px.tolist()
-    nx, ny = b * _COS, a * _SIN
-    height = np.sqrt(nx * nx + ny * ny)
-    none = np.zeros_like(height)
-    slopes = distance_slopes(ellipse, Place(none, _COS, _SIN, nx / height, ny / height, none))
     # By the angle instead of the shape matrix's off-diagonal term: d ab = (a - b) d angle.
     slopes[4] *= a - b
     return math.sqrt(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1])

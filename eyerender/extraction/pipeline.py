@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from ..geometry.ellipse import signed_distance
 from .arcs import curvature_at
 from .covariance import rim_deviation
-from .fittedspots import SpotFit, spot_light
+from .fittedspots import SpotFit, joined
 from .glints import Spots, detect_spots, judge_spots, widest
 from .orderstatistics import median
-from .preprocess import DN, Image, Prepared, invert, prepare
+from .preprocess import DN, Prepared, invert, prepare
 from .refine import PixelFit, refine
 from .result import Extraction, PupilResult
 from .rimmodel import RimModel
@@ -21,7 +21,9 @@ from .search import Found, search
 from .secondlook import SURE, second_look
 from .settings import ExtractionSettings
 from .spotfit import fit_spots
+from .spotmask import covered, told, without_light
 from .spotmend import give_edges, split_blends
+from .spotpixels import window_radius
 from .verdict import pupil_of
 
 Array = NDArray[np.float64]
@@ -70,16 +72,16 @@ def _explained(prepared: Prepared, work: Prepared, found: Found, settings: Extra
     if pupil is not None and pupil.status == "missing":
         return Extraction(pupil, (), (), noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
-    pixel_fit: PixelFit | None = None
-    if refined:
-        masked = _spot_mask(prepared, spots)
-        pixel_fit = _refined(work.linear, model, found, masked)
-        model = model if pixel_fit is None else pixel_fit.model
     spots, fit = _fit_spots(prepared, work, spots, model)
-    if refined and not work.inverted:
-        again = _second_pass(prepared, pixel_fit, found, spots, fit, masked)
-        pixel_fit, model = (pixel_fit, model) if again is None else (again, again.model)
-    pupil = pupil or pupil_of(found, pixel_fit, settings)
+    if pupil is None:
+        pixel_fit = _refined(prepared, found, spots, fit)
+        on_rim = None if pixel_fit is None else _on_rim(spots, fit, pixel_fit.model)
+        if pixel_fit is not None and on_rim is not None:
+            # A glint and the rim below it were each fitted with a rough idea of the other.
+            fit = _fitted_again(prepared, work, spots, fit, on_rim, pixel_fit.model)
+            pixel_fit = _refined(prepared, found, spots, fit, pixel_fit) or pixel_fit
+        model = model if pixel_fit is None else pixel_fit.model
+        pupil = pupil_of(found, pixel_fit, settings)
     if pupil.status == "missing":
         return Extraction(pupil, (), (), noise, size)
     accepted, rejected = judge_spots(spots, fit, prepared, abs(model.step_dn), model.sigma_px, settings)
@@ -87,49 +89,38 @@ def _explained(prepared: Prepared, work: Prepared, found: Found, settings: Extra
 
 
 def _refined(
-    linear: Image, start: RimModel, found: Found, masked: NDArray[np.bool_], counted: NDArray[np.bool_] | None = None
+    prepared: Prepared, found: Found, spots: Spots, fit: SpotFit, before: PixelFit | None = None
 ) -> PixelFit | None:
-    """The pixel model's fit, if there is one that goes with the edges."""
-    fit = refine(linear, start, found.sectors, masked, found.image.noise_dn, counted)
-    return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None
+    """The pixel model's fit to the image without the spots, if there is one that goes with the edges."""
+    work = found.image
+    if work.inverted:
+        linear, masked = work.linear, covered(prepared, spots)
+    else:
+        known = told(prepared, fit)
+        linear, bright = without_light(prepared, fit, known, found.rim.ellipse)
+        masked = bright | covered(prepared, spots, ~known)
+    found_fit = refine(linear, found.model, found.sectors, masked, work.noise_dn, before)
+    return found_fit if isinstance(found_fit, PixelFit) and _agrees(found_fit, found) else None
 
 
-def _second_pass(
-    prepared: Prepared, first: PixelFit | None, found: Found, spots: Spots, fit: SpotFit, masked: NDArray[np.bool_]
-) -> PixelFit | None:
-    """The pixel model fitted again with the glints' own light taken away; None where that frees hardly any pixels.
-
-    A glint's fit tells its flanks far better than the circle of the first pass; only where its light is more than three
-    times the noise is it left out.
-    """
-    model, counted = (found.model, None) if first is None else (first.model, first.sectors)
-    told = fit.converged & (fit.residual_dn < 3.0 * prepared.noise_dn)
-    reach = float(model.ellipse.semi_axes_px[0]) + 10.0
-    offset = np.hypot(*(fit.xy_px - model.ellipse.centre_px).T)
-    near = told & (offset < reach + 8.0 * fit.sigma_px.max(axis=1, initial=0.0))
-    if not near.any():
-        return None
-    clear = _spot_mask(prepared, spots, ~told)
-    linear = prepared.linear.copy()
-    for i in np.nonzero(near)[0]:
-        sigma = float(fit.sigma_px[i].max())
-        ratio = max(5.0 * float(fit.amplitude_dn[i]) / prepared.noise_dn, math.e)
-        radius = sigma * math.sqrt(2.0 * math.log(ratio)) + 1.0
-        rows, columns = _window(fit.xy_px[i], radius, linear.shape)
-        light = spot_light(fit.one(int(i)), np.arange(columns.start, columns.stop)[None, :].astype(np.float64),
-                           np.arange(rows.start, rows.stop)[:, None].astype(np.float64))  # fmt: skip
-        linear[rows, columns] -= light.astype(np.float32)
-        clear[rows, columns] |= light > 3.0 * prepared.noise_dn
-    freed = np.count_nonzero(masked & ~clear)
-    return None if freed < 20 else _refined(linear, model, found, clear, counted)
+def _on_rim(spots: Spots, fit: SpotFit, model: RimModel) -> NDArray[np.bool_] | None:
+    """(n,) the spots whose window reaches the rim, or None."""
+    apart = np.abs(signed_distance(model.ellipse, spots.xy_px))
+    on_rim = fit.converged & (apart < window_radius(spots.width_px) + 3.0 * model.sigma_px)
+    return np.asarray(on_rim) if on_rim.any() else None
 
 
-def _window(xy: Array, radius: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of an image within `radius` of a point, along each axis."""
-    x, y = xy
-    columns = slice(max(0, math.floor(x - radius)), min(shape[1], math.ceil(x + radius) + 1))
-    rows = slice(max(0, math.floor(y - radius)), min(shape[0], math.ceil(y + radius) + 1))
-    return slice(rows.start, max(rows.stop, rows.start)), slice(columns.start, max(columns.stop, columns.start))
+def _fitted_again(
+    prepared: Prepared, work: Prepared, spots: Spots, fit: SpotFit, on_rim: NDArray[np.bool_], model: RimModel
+) -> SpotFit:
+    """The spots on the rim fitted before the refined rim, where that explains them as well."""
+    linear, _ = without_light(prepared, fit, fit.converged & ~on_rim, model.ellipse)
+    starts = (spots.xy_px[on_rim], spots.width_px[on_rim], spots.height_dn[on_rim])
+    again = fit_spots(linear, _background(work, model), *starts, *_limits(prepared, model))
+    good = again.converged & (again.residual_dn < 1.05 * fit.residual_dn[on_rim])
+    index = np.arange(fit.converged.size)
+    index[np.nonzero(on_rim)[0][good]] = fit.converged.size + np.nonzero(good)[0]
+    return joined([fit, again]).taken(index)
 
 
 def _agrees(fit: PixelFit, found: Found) -> bool:
@@ -139,44 +130,32 @@ def _agrees(fit: PixelFit, found: Found) -> bool:
     """
     by_edges = rim_deviation(found.rim.ellipse, found.covariance)
     # Both are estimates from a few dozen sectors, which scatter by a fifth and more.
-    if rim_deviation(fit.model.ellipse, fit.covariance) > 2.0 * by_edges:
+    if rim_deviation(fit.ellipse, fit.covariance) > 2.0 * by_edges:
         return False
     rim = found.rim
     points = found.edges.points_px[rim.inliers]
-    ellipse = fit.model.ellipse
+    ellipse = fit.ellipse
     shift = 0.5 * found.edges.sigma_px**2 * curvature_at(ellipse, points)
     distance = median(np.abs(signed_distance(ellipse, points) + shift))
     return distance < max(2.5 * rim.residual_px, 0.3)
 
 
-def _spot_mask(prepared: Prepared, spots: Spots, which: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-    """Pixels to which a spot, or one of `which` of them, adds more than a fifth of the noise, and what is no spot, and
-    those that the sensor clipped."""
-    own = slice(None) if which is None else which
-    parts = zip((spots.xy_px[own], spots.width_px[own], spots.height_dn[own]), spots.clutter, strict=True)
-    xy, width, height = (np.concatenate(part) for part in parts)
-    mask = prepared.linear >= prepared.clip_dn
-    for (x, y), sigma, peak in zip(xy, width, height, strict=True):
-        ratio = max(5.0 * peak / prepared.noise_dn, math.e)
-        radius = 1.2 * sigma * math.sqrt(2.0 * math.log(ratio)) + 1.0
-        rows, columns = _window(np.array([x, y]), radius, mask.shape)
-        dx, dy = np.arange(columns.start, columns.stop) - x, np.arange(rows.start, rows.stop) - y
-        mask[rows, columns] |= dx[None, :] ** 2 + dy[:, None] ** 2 < radius**2
-    return mask
-
-
 def _fit_spots(prepared: Prepared, work: Prepared, spots: Spots, model: RimModel) -> tuple[Spots, SpotFit]:
     """The spots fitted before the rim as the model has it; blends count as the spots they split into."""
-    step = abs(model.step_dn)
-
-    def known(x: Array, y: Array) -> Array:
-        level = model.level(x, y)
-        return -level if work.inverted else level  # up to a constant, which the fit has anyway
-
+    known, limits = _background(work, model), _limits(prepared, model)
     starts = (spots.xy_px, spots.width_px, spots.height_dn)
-    limits = (prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * step))
     broad = widest(model.sigma_px)
     fit = fit_spots(prepared.linear, known, *starts, *limits)
     fit = give_edges(prepared.linear, known, starts, fit, model.sigma_px, broad, limits)
     starts, fit = split_blends(prepared.linear, known, starts, fit, broad, limits)
     return Spots(*starts, spots.patches_px, spots.clutter), fit
+
+
+def _background(work: Prepared, model: RimModel) -> Callable[[Array, Array], Array]:
+    """Level without spots at pixels (x, y), up to a constant, which their fit has anyway."""
+    return (lambda x, y: -model.level(x, y)) if work.inverted else model.level
+
+
+def _limits(prepared: Prepared, model: RimModel) -> tuple[float, float, float]:
+    """Noise, clip level and background slope of `fit_spots`."""
+    return prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * abs(model.step_dn))

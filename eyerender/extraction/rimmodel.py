@@ -1,20 +1,21 @@
 """The pixel model of a pupil's rim: two levels and the blurred convex edge between them.
 
-    I = inner(t) (1 - E) + outer(t) E + slope (d Phi(d / s) + s phi(d / s))
+    I = inner(u) (1 - E) + outer(u) E + slope (d Phi(d / s) + s phi(d / s))
     E(d) = Phi(z) + (kappa s / 2) phi(z) - (g / 24) (z^3 - 3 z) phi(z),   z = d / s
 
 d: signed distance to the ellipse (positive outside), kappa: curvature of the rim at the nearest point, s: sigma of the
 blur, pixel included (s^2 = optics^2 + 1/12), Phi and phi: the normal distribution and density. The second term is
 the first order of the blur of a disc in s kappa; the third lets the blur have heavier tails than a normal distribution,
-g being its excess kurtosis (Edgeworth's series). outer(t) is a Fourier series in the ellipse's parameter t, inner(t)
-one of the first order: iris light scattered into the pupil. The slope comes with a blurred ramp: the iris
-grows brighter or darker outwards, as lamps beside the camera make it.
+g being its excess kurtosis (Edgeworth's series). outer is a Fourier series in u = t + angle, the ellipse's parameter t
+counted from the image's x axis, so that it does not turn with the axes of a nearly round ellipse; inner one of the
+first order: iris light scattered into the pupil. The slope comes with a blurred ramp: the iris grows brighter or darker
+outwards, as lamps beside the camera make it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +25,15 @@ from ..geometry.ellipse import Ellipse
 
 Array = NDArray[np.float64]
 
+SECTORS = 48  # equal steps of the ellipse's parameter u
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimModel:
-    """ellipse; inner_dn; outer: (1 + 2 K,) Fourier coefficients (1, cos t, sin t, cos 2t, ...), DN; sigma_px; slope of
-    the outer level, DN per px; kurtosis of the blur beyond a Gaussian's 0; lean: the inner level's (cos t, sin t), DN.
+    """ellipse; inner_dn; outer: (1 + 2 K,) Fourier coefficients (1, cos u, sin u, cos 2u, ...), DN; sigma_px; slope of
+    the outer level, DN per px; kurtosis of the blur beyond a Gaussian's 0; lean: the inner level's (cos u, sin u), DN;
+    displaced: (SECTORS,) how far the margin's sectors lie inside the ellipse, px.
     """
 
     ellipse: Ellipse
@@ -40,6 +43,7 @@ class RimModel:
     slope: float = 0.0
     kurtosis: float = 0.0
     lean: tuple[float, float] = (0.0, 0.0)
+    displaced: Array | None = None
 
     @property
     def step_dn(self) -> float:
@@ -48,24 +52,29 @@ class RimModel:
 
     def level(self, x: Array, y: Array) -> Array:
         """Expected grey level at pixels (x, y) of any shape."""
-        return self.level_at(Place.of(self.ellipse, x.ravel(), y.ravel())).reshape(x.shape)
+        place = Place.of(self.ellipse, x.ravel(), y.ravel())
+        if self.displaced is not None:
+            place = replace(place, distance=place.distance + _between(self.displaced, place))
+        return self.level_and_slope(place)[0].reshape(x.shape)
 
-    def level_at(self, place: Place) -> Array:
-        """Expected grey level (n,) at places about this rim."""
+    def level_and_slope(self, place: Place) -> tuple[Array, Array]:
+        """Expected grey level (n,) at places about this rim, were it even; and its slope by the distance, DN per px."""
         profile = Profile.of(place.distance, place.curvature, self.sigma_px, self.kurtosis)
-        outer = self.outer @ harmonics(place.cos_t, place.sin_t, (self.outer.size - 1) // 2)
         inner = self.inner(place)
-        return np.asarray(inner + (outer - inner) * profile.edge + self.slope * profile.ramp)
+        step = self.outer @ harmonics(place.cos_u, place.sin_u, (self.outer.size - 1) // 2) - inner
+        level = inner + step * profile.edge + self.slope * profile.ramp
+        return level, step * profile.edge_by_distance + self.slope * profile.ramp_by_distance
 
     def inner(self, place: Place) -> Array:
         """Inner level (n,) at places about the rim."""
-        return self.inner_dn + self.lean[0] * place.cos_t + self.lean[1] * place.sin_t
+        return self.inner_dn + self.lean[0] * place.cos_u + self.lean[1] * place.sin_u
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
     """Where points lie relative to an ellipse: signed distance, nearest point's parameter (cos t, sin t), outward
-    normal there in the ellipse's own axes (nx, ny), curvature. All (n,)."""
+    normal there in the ellipse's own axes (nx, ny), curvature, and the parameter counted from the image's x axis
+    (cos u, sin u). All (n,)."""
 
     distance: Array
     cos_t: Array
@@ -73,11 +82,28 @@ class Place:
     nx: Array
     ny: Array
     curvature: Array
+    cos_u: Array
+    sin_u: Array
 
-    def taken(self, which: NDArray[np.bool_]) -> Place:
+    def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Place:
         """The chosen points'."""
-        parts = (self.distance, self.cos_t, self.sin_t, self.nx, self.ny, self.curvature)
+        parts = (self.distance, self.cos_t, self.sin_t, self.nx, self.ny, self.curvature, self.cos_u, self.sin_u)
         return Place(*(part[which] for part in parts))
+
+    @staticmethod
+    def middles(ellipse: Ellipse, count: int = SECTORS) -> Place:
+        """On the ellipse, in the middle of every one of `count` sectors."""
+        t = 2.0 * np.pi * ((np.arange(count) + 0.5) / count - 0.5) - ellipse.angle_rad
+        return Place.on(ellipse, np.cos(t), np.sin(t))
+
+    @staticmethod
+    def on(ellipse: Ellipse, cos_t: Array, sin_t: Array) -> Place:
+        """On the ellipse."""
+        a, b = ellipse.semi_axes_px.tolist()
+        nx, ny = b * cos_t, a * sin_t
+        height = np.sqrt(nx * nx + ny * ny)
+        turned = _turned(cos_t, sin_t, ellipse.angle_rad)
+        return Place(np.zeros_like(height), cos_t, sin_t, nx / height, ny / height, a * b / height**3, *turned)
 
     @staticmethod
     def of(ellipse: Ellipse, x: Array, y: Array, steps: int = 3) -> Place:
@@ -108,7 +134,8 @@ class Place:
         height = np.sqrt(nx * nx + ny * ny)
         nx, ny = nx / height, ny / height
         distance = (p - a * c) * nx + (q - b * s) * ny
-        return Place(distance, c, s, nx, ny, a * b / height**3)
+        turned = _turned(c, s, ellipse.angle_rad)
+        return Place(distance, c, s, nx, ny, a * b / height**3, *turned)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,13 +173,34 @@ class Profile:
         )
 
 
-def harmonics(cos_t: Array, sin_t: Array, order: int) -> Array:
-    """(1 + 2 K, n): 1, cos t, sin t, ..., cos K t, sin K t."""
-    out = np.empty((1 + 2 * order, cos_t.size))
+def sector_of(place: Place) -> NDArray[np.intp]:
+    """(n,) which of the SECTORS equal steps of the ellipse's parameter u each point belongs to."""
+    share = np.arctan2(place.sin_u, place.cos_u) / (2.0 * np.pi) + 0.5
+    return (share * SECTORS).astype(np.intp) % SECTORS
+
+
+def _turned(cos_t: Array, sin_t: Array, angle: float) -> tuple[Array, Array]:
+    """Cosine and sine of t + angle."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    return cos_t * cos - sin_t * sin, sin_t * cos + cos_t * sin
+
+
+def _between(values: Array, place: Place) -> Array:
+    """(n,) values of the SECTORS at places, linear between the sectors' middles."""
+    share = np.arctan2(place.sin_u, place.cos_u) / (2.0 * np.pi) + 0.5
+    at = share * SECTORS - 0.5
+    low = np.floor(at).astype(np.intp)
+    first, second = values[low % SECTORS], values[(low + 1) % SECTORS]
+    return np.asarray(first + (at - low) * (second - first))
+
+
+def harmonics(cos_u: Array, sin_u: Array, order: int) -> Array:
+    """(1 + 2 K, n): 1, cos u, sin u, ..., cos K u, sin K u."""
+    out = np.empty((1 + 2 * order, cos_u.size))
     out[0] = 1.0
     if order:
-        out[1], out[2] = cos_t, sin_t
+        out[1], out[2] = cos_u, sin_u
     for k in range(3, 1 + 2 * order, 2):
-        np.subtract(out[k - 2] * cos_t, out[k - 1] * sin_t, out=out[k])
-        np.add(out[k - 1] * cos_t, out[k - 2] * sin_t, out=out[k + 1])
+        np.subtract(out[k - 2] * cos_u, out[k - 1] * sin_u, out=out[k])
+        np.add(out[k - 1] * cos_u, out[k - 2] * sin_u, out=out[k + 1])
     return out

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from .arcs import RimFit, fit_rim
 from .coarse import Candidate, Interior, find_candidates, find_inside, inspect_interior
-from .covariance import SECTORS, edge_covariance, sector_of
+from .covariance import edge_covariance
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .preprocess import Prepared
 from .result import PupilResult
-from .rimmodel import Place, RimModel
+from .rimmodel import SECTORS, Place, RimModel, sector_of
 from .settings import ExtractionSettings
 
 Array = NDArray[np.float64]

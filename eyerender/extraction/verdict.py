@@ -17,11 +17,10 @@ def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -
     """The pupil of a rim, by its edges or by the pixel model's fit; missing where it is too unlikely right."""
     rim, image = found.rim, found.image
     if fit is None:
-        model, covariance, inside = found.model, found.covariance, found.interior
+        model, ellipse, covariance, inside = found.model, rim.ellipse, found.covariance, found.interior
     else:
-        model, covariance = fit.model, fit.covariance
-        inside = inspect_interior(image.linear, model.ellipse, model.sigma_px, image.noise_dn)
-    ellipse = model.ellipse
+        model, ellipse, covariance = fit.model, fit.ellipse, fit.covariance
+        inside = inspect_interior(image.linear, ellipse, model.sigma_px, image.noise_dn)
     goodness = Goodness(
         support=rim.support,
         gap=rim.gap,

@@ -91,6 +91,14 @@ class Ellipse:
         """(count, 2) boundary points at equal steps of the parameter t."""
         return points_on_ellipse(self.centre_px, self.semi_axes_px, self.angle_rad, count)
 
+    def points_at(self, cos_t: Array, sin_t: Array) -> Array:
+        """(n, 2) boundary points at parameters given by their cosines and sines (n,)."""
+        a, b = self.semi_axes_px
+        cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        along, across = a * cos_t, b * sin_t
+        offset = np.stack([along * cos - across * sin, along * sin + across * cos], axis=-1)
+        return np.asarray(self.centre_px + offset)
+
     def shifted(self, offset_px: ArrayLike) -> Ellipse:
         """The same ellipse moved by (dx, dy)."""
         return Ellipse(self.centre_px + np.asarray(offset_px, dtype=np.float64), self.semi_axes_px, self.angle_rad)

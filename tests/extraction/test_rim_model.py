@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scipy import integrate, ndimage, optimize, special
 
 from eyerender.extraction import extract
 from eyerender.extraction.covariance import to_axes
-from eyerender.extraction.refine import FIXED, _jacobian, _moved
 from eyerender.extraction.rimmodel import Place, Profile, RimModel
-from eyerender.geometry.ellipse import Ellipse
+from eyerender.extraction.rimsystem import FIXED, jacobian, moved
+from eyerender.geometry.ellipse import Ellipse, fit_ellipse_direct
 
 
 def test_blurred_edge_of_a_disc():
@@ -55,24 +56,26 @@ def test_distance_is_the_nearest_points():
     np.testing.assert_array_equal(place.distance < 0.0, inside)
 
 
-def test_jacobian_is_the_models_slope():
+@pytest.mark.parametrize("b", [15.0, 20.98])
+def test_jacobian_is_the_models_slope(b):
+    """Of a nearly round ellipse too, whose axes turn far with a small change of its shape."""
     outer = np.array([75.0, 6.0, -4.0, 3.0, 2.0])
     model = RimModel(
-        Ellipse([40.2, 38.7], [21.0, 15.0], 0.8), 20.0, outer, 1.3, slope=-1.2, kurtosis=0.7, lean=(0.4, -0.9)
+        Ellipse([40.2, 38.7], [21.0, b], 0.8), 20.0, outer, 1.3, slope=-1.2, kurtosis=0.7, lean=(0.4, -0.9)
     )
     rng = np.random.default_rng(4)
     base = model.ellipse.points(300) + rng.normal(0.0, 1.0, (300, 2))
     place = Place.of(model.ellipse, base[:, 0], base[:, 1])
-    _, jacobian = _jacobian(model, place)
-    for k in range(jacobian.shape[0]):
-        step = np.zeros(jacobian.shape[0])
+    _, slopes, _ = jacobian(model, place)
+    for k in range(slopes.shape[0]):
+        step = np.zeros(slopes.shape[0])
         step[k] = 1e-5
-        up, down = _moved(model, step), _moved(model, -step)
+        up, down = moved(model, step), moved(model, -step)
         slope = (up.level(base[:, 0], base[:, 1]) - down.level(base[:, 0], base[:, 1])) / 2e-5
-        # The shape's columns leave out how the outer level turns and the curvature changes with the rim: small terms.
-        tolerance = 2.5 if k < 5 else 1e-5
-        assert np.abs(jacobian[k] - slope).max() < tolerance
-        assert np.corrcoef(jacobian[k], slope)[0, 1] > 0.98
+        # The shape's columns leave out how a pixel's place along the rim changes with it: small terms.
+        tolerance = 1.2 if k < 5 else 1e-5
+        assert np.abs(slopes[k] - slope).max() < tolerance
+        assert np.corrcoef(slopes[k], slope)[0, 1] > 0.99
 
 
 def test_covariance_of_the_axes_follows_the_shape_matrix():
@@ -82,8 +85,8 @@ def test_covariance_of_the_axes_follows_the_shape_matrix():
     rng = np.random.default_rng(6)
     draws = rng.multivariate_normal(np.zeros(5), covariance, 4000)
     model = RimModel(ellipse, 0.0, np.array([1.0]), 1.0)
-    moved = [_moved(model, np.concatenate([d, np.zeros(FIXED - 5)])).ellipse for d in draws]
-    sample = np.array([[*e.centre_px, *e.semi_axes_px, e.angle_rad] for e in moved])
+    ellipses = [moved(model, np.concatenate([d, np.zeros(FIXED - 5)])).ellipse for d in draws]
+    sample = np.array([[*e.centre_px, *e.semi_axes_px, e.angle_rad] for e in ellipses])
     stated = np.sqrt(np.diag(to_axes(covariance, ellipse)))
     np.testing.assert_allclose(sample.std(axis=0), stated, rtol=0.05)
 
@@ -145,3 +148,40 @@ def test_second_pass_on_a_textured_iris_with_glints(ideal):
         # What texture of that strength may leave in the 95th percentile; a pass gone wrong is off by far more.
         assert np.hypot(*(found.ellipse.centre_px - drawing.label["pupil"]["centre_px"])) < 0.08
     assert refined >= 4
+
+
+def test_uneven_margin_leaves_no_bias():
+    """Margins that deviate from an ellipse by 1 % of its radius (rms), in the third to eighth harmonic.
+
+    What is asked for is the ellipse that fits the whole margin best; the pixel model's finds it to the noise, and says
+    so. Taken for an even one, such a margin costs 0.1 px and more.
+    """
+    fine, width, height = 8, 112, 104
+    t = np.linspace(0.0, 2.0 * np.pi, 3600, endpoint=False)
+    distances, errors = [], []
+    for seed in range(8):
+        rng = np.random.default_rng([seed, 11])
+        ellipse = Ellipse(np.array([55.0, 51.0]) + rng.uniform(-1.0, 1.0, 2), [34.0, 30.0], rng.uniform(0.0, 3.0))
+        phase, size = rng.uniform(0.0, 2.0 * np.pi, 6), rng.uniform(0.5, 1.0, 6)
+        size *= 0.32 * np.sqrt(2.0) / np.hypot.reduce(size)
+        place = Place.on(ellipse, np.cos(t), np.sin(t))
+        out = sum(a * np.cos(k * t + p) for k, (a, p) in enumerate(zip(size, phase, strict=True), start=3))
+        cos, sin = np.cos(ellipse.angle_rad), np.sin(ellipse.angle_rad)
+        normals = np.stack([place.nx * cos - place.ny * sin, place.nx * sin + place.ny * cos], axis=-1)
+        margin = ellipse.points_at(place.cos_t, place.sin_t) + out[:, None] * normals
+        best = fit_ellipse_direct(margin)
+        mask = np.zeros((height * fine, width * fine), np.uint8)
+        corners = np.rint(((margin + 0.5) * fine - 0.5) * 16.0).astype(np.int32)
+        cv2.fillPoly(mask, [corners], 1, shift=4)
+        blurred = ndimage.gaussian_filter(mask.astype(np.float32), 0.9 * fine).reshape(height, fine, width, fine)
+        image = 75.0 - 55.0 * blurred.mean(axis=(1, 3)) + rng.normal(0.0, 1.0, (height, width))
+        found = extract(np.rint(image * 200.0).astype(np.uint16)).pupil
+        assert found.goodness.refined
+        error = found.ellipse.centre_px - best.centre_px
+        errors.append(np.hypot(*error))
+        distances.append(error @ np.linalg.solve(found.covariance[:2, :2], error))
+    assert np.median(errors) < 0.012
+    assert max(errors) < 0.04
+    # Chi-squared of two degrees of freedom: its median is 1.4, and one of eight is above 14 in 1 %.
+    assert np.median(distances) < 4.0
+    assert max(distances) < 14.0

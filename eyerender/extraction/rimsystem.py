@@ -1,0 +1,222 @@
+"""The least-squares system of the rim's pixel model: slopes, normal equations, Gauss-Newton steps.
+
+A margin is not quite an ellipse: every sector of it may be displaced, by amounts whose standard deviation is given. To
+first order a sector's displacement is one more linear parameter of that sector's pixels alone, so that a step of the
+others eliminates them all (Schur's complement).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.ellipse import Ellipse
+from .covariance import SHAPE, distance_slopes, gram, project
+from .rimmodel import Place, Profile, RimModel, harmonics
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# Parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, lean (two), mean outer level.
+FIXED = SHAPE + 7
+# Standard deviations of what is about 0 beforehand: the harmonics of the outer level, in steps (nothing else holds them
+# under a lid); its change over a semi-axis b, in steps (lamps beside the camera bring it about); the blur's kurtosis;
+# how the inner level leans, in steps: scattered light only, so that noise does not find a lean where there is none.
+HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
+KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond them the edge would not be monotonic
+NEAR = 2  # steps to the nearest point: the band is within a few tenths of b, and the rim's own pixels far nearer
+STILL_PX = 1e-3  # a step smaller than that is the last one of a fit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pixels:
+    """n pixels in the order of their sectors, of which k have some: x, y, level (n,); index (n,): which of the k each
+    is in; first (k,): where each begins; sector (k,): which of all it is."""
+
+    x: Array
+    y: Array
+    level: Array
+    index: Index
+    first: Index
+    sector: Index
+
+    @staticmethod
+    def of(x: Array, y: Array, level: Array, sector: Index) -> Pixels:
+        """sector (n,): of every pixel, in order."""
+        new = np.diff(sector, prepend=-1) > 0
+        first = np.flatnonzero(new)
+        return Pixels(x, y, level, np.cumsum(new) - 1, first, sector[first])
+
+    def sums(self, values: Array) -> Array:
+        """(..., k) sums of values (..., n) over every sector's pixels."""
+        return np.asarray(np.add.reduceat(values, self.first, axis=-1), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """Weights, beside those of a pixel's residual, of the squares of slope, kurtosis, a lean, a harmonic (4,); and the
+    standard deviation of a sector's displacement with the weight of its square (infinite where there is to be none)."""
+
+    weights: Array
+    uneven_px: float
+    displacement: float
+
+    @staticmethod
+    def of(start: RimModel, noise_dn: float, uneven_px: float) -> Prior:
+        """For a model that starts from there."""
+        displacement = (noise_dn / uneven_px) ** 2 if uneven_px > 0.0 else math.inf
+        step = max(start.step_dn, noise_dn)
+        slope = SLOPE_SD * step / float(start.ellipse.semi_axes_px[1])
+        weights = (noise_dn / np.array([slope, KURTOSIS_SD, LEAN_SD * step, HARMONIC_SD * step])) ** 2
+        return Prior(weights, uneven_px, displacement)
+
+    def of_all(self, size: int) -> Array:
+        """(size,) every parameter's, displacements apart."""
+        out = np.zeros(size)
+        out[7], out[8], out[9:11], out[FIXED:] = self.weights
+        return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """residual (n,); jacobian (p, n); slope (n,), the level's derivative by the distance."""
+
+    residual: Array
+    jacobian: Array
+    slope: Array
+
+    @staticmethod
+    def of(pixels: Pixels, model: RimModel, place: Place, displaced: Array) -> Rows:
+        """displaced (k,): how far every sector lies inside the ellipse, px."""
+        at = replace(place, distance=place.distance + displaced[pixels.index]) if displaced.any() else place
+        level, jacobian_, slope = jacobian(model, at)
+        return Rows(pixels.level - level, jacobian_, slope)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Normal:
+    """Sums over the pixels, the sectors' displacements eliminated: matrix (p, p), vector (p,); cost. Of every sector:
+    across (p, k) and along (k,), its displacement's products with the slopes and with the residual, priors included;
+    inverse (k,), of its product with itself and the prior."""
+
+    matrix: Array
+    vector: Array
+    cost: float
+    across: Array
+    along: Array
+    inverse: Array
+
+    def displaced_by(self, step: Array) -> Array:
+        """(k,) how the displacements change with a step of the parameters."""
+        return np.asarray((self.along - step @ self.across) * self.inverse)
+
+    @staticmethod
+    def of(pixels: Pixels, rows: Rows, displaced: Array, prior: Prior) -> Normal:
+        residual, slopes = rows.residual, rows.jacobian
+        matrix, vector, cost = gram(slopes), project(slopes, residual), float(np.sum(residual * residual))
+        if math.isinf(prior.displacement):
+            none = np.zeros(displaced.size)
+            return Normal(matrix, vector, cost, np.zeros((vector.size, none.size)), none, none)
+        along = pixels.sums(rows.slope * residual) - prior.displacement * displaced
+        across = pixels.sums(slopes * rows.slope)
+        inverse = 1.0 / (pixels.sums(rows.slope * rows.slope) + prior.displacement)
+        taken = across * inverse
+        cost += prior.displacement * float(displaced @ displaced)
+        return Normal(matrix - taken @ across.T, vector - taken @ along, cost, across, along, inverse)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """model; displaced (k,) px; rows and place (n,), of which all but the residual lack the share of a last tiny
+    step."""
+
+    model: RimModel
+    displaced: Array
+    rows: Rows
+    place: Place
+
+
+def jacobian(model: RimModel, place: Place) -> tuple[Array, Array, Array]:
+    """Model levels (n,), their derivatives (FIXED + 2 K, n) by the parameters in the order of FIXED, and by the
+    distance (n,)."""
+    profile = Profile.of(place.distance, place.curvature, model.sigma_px, model.kurtosis)
+    basis = harmonics(place.cos_u, place.sin_u, (model.outer.size - 1) // 2)
+    inner = model.inner(place)
+    step = model.outer @ basis - inner
+    out = np.empty((FIXED - 1 + basis.shape[0], place.distance.size))
+    by_distance = step * profile.edge_by_distance + model.slope * profile.ramp_by_distance
+    np.multiply(distance_slopes(model.ellipse, place), by_distance, out=out[:SHAPE])
+    out[5] = step * profile.edge_by_sigma + model.slope * profile.ramp_by_sigma
+    out[6] = 1.0 - profile.edge
+    out[7] = profile.ramp
+    out[8] = step * profile.edge_by_kurtosis
+    np.multiply(out[6], place.cos_u, out=out[9])
+    np.multiply(out[6], place.sin_u, out=out[10])
+    np.multiply(basis, profile.edge, out=out[11:])
+    return inner + step * profile.edge + model.slope * profile.ramp, out, by_distance
+
+
+def _values(model: RimModel) -> Array:
+    """The parameters that a prior may hold, at their places; the others are 0."""
+    return np.concatenate([np.zeros(7), [model.slope, model.kurtosis, *model.lean, 0.0], model.outer[1:]])
+
+
+def moved(model: RimModel, step: Array) -> RimModel:
+    """The model after a step of the parameters; the shape matrix's eigenvectors give the new axes."""
+    x, y, aa, bb, ab, sigma, inner, slope, kurtosis, lean_x, lean_y = step[:11].tolist()
+    cx, cy = model.ellipse.centre_px.tolist()
+    a, b = model.ellipse.semi_axes_px.tolist()
+    a, b = a + aa, b + bb
+    mean, apart = 0.5 * (a + b), math.hypot(0.5 * (a - b), ab)
+    angle = model.ellipse.angle_rad + 0.5 * math.atan2(2.0 * ab, a - b)
+    axes = np.array([max(mean + apart, 0.5), max(mean - apart, 0.5)])
+    ellipse = Ellipse(np.array([cx + x, cy + y]), axes, angle)
+    blur = min(max(model.sigma_px + sigma, 0.5 * model.sigma_px, 0.3), max(2.0 * model.sigma_px, 0.3))
+    tails = min(max(model.kurtosis + kurtosis, KURTOSIS_LIMITS[0]), KURTOSIS_LIMITS[1])
+    lean = (model.lean[0] + lean_x, model.lean[1] + lean_y)
+    return RimModel(ellipse, model.inner_dn + inner, model.outer + step[11:], blur, model.slope + slope, tails, lean)
+
+
+def gauss_newton(pixels: Pixels, model: RimModel, displaced: Array, place: Place, prior: Prior, steps: int) -> Solution:
+    """The model after at most `steps` steps with Levenberg's damping; cost = sum r^2 + what the priors add.
+
+    displaced (k,): where the sectors are to begin with.
+    """
+    rows = Rows.of(pixels, model, place, displaced)
+    held = prior.of_all(rows.jacobian.shape[0])
+    diagonal = np.arange(held.size)
+    normal = Normal.of(pixels, rows, displaced, prior)
+    cost = normal.cost + float(held @ _values(model) ** 2)
+    damping = 1e-4
+    for _ in range(steps):
+        matrix, vector = normal.matrix.copy(), normal.vector - held * _values(model)
+        matrix[diagonal, diagonal] += held
+        scale = np.sqrt(np.maximum(matrix[diagonal, diagonal], 1e-12))
+        matrix /= scale[:, None] * scale
+        matrix[diagonal, diagonal] += damping
+        step = np.linalg.solve(matrix, vector / scale) / scale
+        largest = float(np.abs(step[:SHAPE]).max())
+        if largest > 3.0:
+            step *= 3.0 / largest
+        further = normal.displaced_by(step)
+        trial, trial_displaced = moved(model, step), displaced + further
+        if largest < STILL_PX and abs(float(step[SHAPE])) < 10.0 * STILL_PX and damping < 1e-3:
+            # So small a step does what the slopes say, and another would be smaller by a factor of several.
+            left = rows.residual - project(rows.jacobian.T, step) - rows.slope * further[pixels.index]
+            return Solution(trial, trial_displaced, replace(rows, residual=left), place)
+        trial_place = Place.of(trial.ellipse, pixels.x, pixels.y, steps=NEAR)
+        trial_rows = Rows.of(pixels, trial, trial_place, trial_displaced)
+        trial_normal = Normal.of(pixels, trial_rows, trial_displaced, prior)
+        trial_cost = trial_normal.cost + float(held @ _values(trial) ** 2)
+        if trial_cost <= cost:
+            model, displaced, place, rows, normal = trial, trial_displaced, trial_place, trial_rows, trial_normal
+            gained, cost = cost - trial_cost, trial_cost
+            damping *= 0.1
+            if gained < 1e-7 * cost:
+                break
+        else:
+            damping = min(max(damping * 30.0, 1e-3), 1e6)
+    return Solution(model, displaced, rows, place)
