@@ -13,7 +13,7 @@ from .covariance import rim_deviation
 from .fittedspots import SpotFit, joined
 from .glints import Spots, detect_spots, judge_spots, widest
 from .orderstatistics import median
-from .preprocess import DN, Prepared, invert, prepare
+from .preprocess import DN, Image, Prepared, invert, prepare
 from .refine import PixelFit, refine
 from .result import Extraction, PupilResult
 from .rimmodel import RimModel
@@ -27,6 +27,8 @@ from .spotpixels import window_radius
 from .verdict import pupil_of
 
 Array = NDArray[np.float64]
+
+SAME_LIGHT = 0.5  # noises: a change of the spots' light by less does not move the rim
 
 
 def extract(
@@ -74,12 +76,7 @@ def _explained(prepared: Prepared, work: Prepared, found: Found, settings: Extra
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     spots, fit = _fit_spots(prepared, work, spots, model)
     if pupil is None:
-        pixel_fit = _refined(prepared, found, spots, fit)
-        on_rim = None if pixel_fit is None else _on_rim(spots, fit, pixel_fit.model)
-        if pixel_fit is not None and on_rim is not None:
-            # A glint and the rim below it were each fitted with a rough idea of the other.
-            fit = _fitted_again(prepared, work, spots, fit, on_rim, pixel_fit.model)
-            pixel_fit = _refined(prepared, found, spots, fit, pixel_fit) or pixel_fit
+        pixel_fit, fit = _refined(prepared, found, spots, fit)
         model = model if pixel_fit is None else pixel_fit.model
         pupil = pupil_of(found, pixel_fit, settings)
     if pupil.status == "missing":
@@ -88,19 +85,33 @@ def _explained(prepared: Prepared, work: Prepared, found: Found, settings: Extra
     return Extraction(pupil, accepted, rejected, noise, size)
 
 
-def _refined(
-    prepared: Prepared, found: Found, spots: Spots, fit: SpotFit, before: PixelFit | None = None
-) -> PixelFit | None:
-    """The pixel model's fit to the image without the spots, if there is one that goes with the edges."""
-    work = found.image
-    if work.inverted:
-        linear, masked = work.linear, covered(prepared, spots)
-    else:
-        known = told(prepared, fit)
-        linear, bright = without_light(prepared, fit, known, found.rim.ellipse)
-        masked = bright | covered(prepared, spots, ~known)
-    found_fit = refine(linear, found.model, found.sectors, masked, work.noise_dn, before)
-    return found_fit if isinstance(found_fit, PixelFit) and _agrees(found_fit, found) else None
+def _refined(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[PixelFit | None, SpotFit]:
+    """The pixel model's fit to the image without the spots, if there is one that goes with the edges; and the spots."""
+    cleared = _cleared(prepared, found, spots, fit)
+    first = _rim_fit(found, cleared)
+    on_rim = None if first is None else _on_rim(spots, fit, first.model)
+    if first is None or on_rim is None:
+        return first, fit
+    # A spot and the rim below it were each fitted with a rough idea of the other.
+    fit = _fitted_again(prepared, found.image, spots, fit, on_rim, first.model)
+    again = _cleared(prepared, found, spots, fit)
+    if float(np.abs(again[0] - cleared[0]).max()) < SAME_LIGHT * prepared.noise_dn:
+        return first, fit
+    return _rim_fit(found, again, first) or first, fit
+
+
+def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[Image, NDArray[np.bool_]]:
+    """The image less the light of spots that their fits tell, and the pixels where spots are still in the way."""
+    if found.image.inverted:
+        return found.image.linear, covered(prepared, spots)
+    known = told(prepared, fit)
+    linear, bright = without_light(prepared, fit, known, found.rim.ellipse)
+    return linear, bright | covered(prepared, spots, ~known)
+
+
+def _rim_fit(found: Found, cleared: tuple[Image, NDArray[np.bool_]], before: PixelFit | None = None) -> PixelFit | None:
+    fit = refine(cleared[0], found.model, found.sectors, cleared[1], found.image.noise_dn, before)
+    return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None
 
 
 def _on_rim(spots: Spots, fit: SpotFit, model: RimModel) -> NDArray[np.bool_] | None:
