@@ -114,7 +114,7 @@ def _add_row(table: Rows, name: str, tally: Tally, rig: str, row: str, *, barred
         condition = None  # that bar is for semi-axes of 28 px and more
     median, p95 = CENTRE[condition] if barred and condition is not None else (None, None)
     if not tally.iou:
-        table.add(f"{name}: found", 0.0, "1", least=1.0 if barred else None)
+        table.add(f"{name}: found", 0.0, "1", least=1.0 if barred and condition is not None else None)
         return
     table.add(f"{name}: centre error, median", float(np.median(tally.centre)), "px", most=median)
     table.add(f"{name}: centre error, 95th percentile", float(np.percentile(tally.centre, 95)), "px", most=p95)

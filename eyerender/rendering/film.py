@@ -69,10 +69,11 @@ def mean_radiance(integrator: Any, shown: Exposed, window: Window, spp: int, see
     size = group_size(spp) if grouped else 1
     total, failed = np.zeros(width * height), 0
     each = max(1, min(spp // size, _LANES // (width * height * size)))
+    plain = shown.plain(window) if grouped else None
     for first in range(0, spp // size, each):
         count = min(each, spp // size - first)
-        if grouped:
-            seen, failures = _groups(shown, window, spp, seed, first, count, size)
+        if plain is not None:
+            seen, failures = _groups(shown, window, plain, spp, seed, first, count, size)
         else:
             seen, failures = _singles(integrator, shown, window, spp, seed, first, count)
         total += seen
@@ -105,7 +106,7 @@ def _singles(
 
 
 def _groups(
-    shown: Exposed, window: Window, spp: int, seed: int, first: int, count: int, size: int
+    shown: Exposed, window: Window, plain: tuple[Bools, int], spp: int, seed: int, first: int, count: int, size: int
 ) -> tuple[Floats, int]:
     """Sums over `count` groups of each pixel, one group a lane; sample j of group g is number g size + j."""
     pixels = window[2] * window[3]
@@ -164,7 +165,7 @@ def _groups(
             dr.select(several, (groups + lamps - 1 - group) // groups, 1),
             shared,
             (lamps <= _FEW_LAMPS) & ~several,
-            _plain(shown, window, u, v),
+            _plain(plain, window, u, v),
         ),
     )
     inside = block * dr.opaque(mi.UInt32, tall) + step < dr.opaque(mi.UInt32, pixels)
@@ -174,9 +175,9 @@ def _groups(
     return seen.reshape(-1)[:pixels], int(dr.sum(failures).numpy()[0])
 
 
-def _plain(shown: Exposed, window: Window, u: Any, v: Any) -> Any:
+def _plain(plain: tuple[Bools, int], window: Window, u: Any, v: Any) -> Any:
     """Whether pixels of a window show nothing but skin."""
-    tiles, across = shown.plain(window)
+    tiles, across = plain
     x, y, size, rows, columns = (dr.opaque(mi.Int32, k) for k in (*window[:2], across, *tiles.shape))
     row = dr.minimum((v - y) // size, rows - 1)  # lanes may lie beyond the window
     return dr.gather(mi.UInt32, mi.UInt32(tiles.ravel().astype(np.uint32)), row * columns + (u - x) // size) > 0
