@@ -22,18 +22,19 @@ NARROWEST_PX = 0.9
 EXPLAINED = 2.0  # misfits below this many noises object to nothing
 
 
-def about(xy: Array, reach: Array, shape: tuple[int, ...]) -> tuple[Index, Index, Array, Mask]:
-    """(column, row, squared distance, whether it is in the image and within reach), each (n, k), of pixels about n
-    peak pixels xy (n, 2), reach (n,) px; places beyond the image have their nearest pixel's column and row."""
-    half = math.floor(float(reach.max(initial=0.0)))
-    dy, dx = (part.ravel() for part in np.mgrid[-half : half + 1, -half : half + 1])
-    away2 = dx * dx + dy * dy
-    order = np.nonzero(away2 <= float(reach.max(initial=0.0)) ** 2)[0]
-    dx, dy, away2 = dx[order], dy[order], away2[order]
+def about(xy: Array, reach: Array, shape: tuple[int, ...]) -> tuple[Index, NDArray[np.float32], Mask]:
+    """(flat index (n, k), offset (2, k), whether it is in the image and within reach (n, k)) of pixels about n peak
+    pixels xy (n, 2), reach (n,) px; places beyond the image have their nearest pixel's index."""
+    most = float(reach.max(initial=0.0))
+    half = math.floor(most)
+    step = np.arange(-half, half + 1)
+    away2 = (step * step)[:, None] + (step * step)
+    chosen = np.flatnonzero(away2 <= most**2)
+    dy, dx = step[chosen // step.size], step[chosen % step.size]
     x, y = xy[:, :1].astype(np.intp) + dx, xy[:, 1:].astype(np.intp) + dy
     column, row = np.minimum(np.maximum(x, 0), shape[1] - 1), np.minimum(np.maximum(y, 0), shape[0] - 1)
-    within = (column == x) & (row == y) & (away2 <= (reach**2)[:, None])
-    return column, row, np.broadcast_to(away2.astype(np.float64), column.shape), within
+    within = (column == x) & (row == y) & (away2.ravel()[chosen] <= (reach**2)[:, None])
+    return row * shape[1] + column, np.stack([dx, dy]).astype(np.float32), within
 
 
 def bell_shaped(
@@ -50,38 +51,52 @@ def bell_shaped(
     the pixels' scatter, and stands as high as it was detected. Spots that the sensor clipped are not judged.
     xy (n, 2) peak pixels, width (n,) sigma, height (n,) DN.
     """
-    index = np.arange(width.size) if which is None else np.nonzero(which)[0]
+    index = np.arange(width.size) if which is None else np.flatnonzero(which)
+    out = np.ones(index.size, dtype=bool)
     sigma, tall = np.maximum(width[index], NARROWEST_PX), height[index]  # a narrower one is mostly its pixel
     reach = 2.2 * sigma + 1.0
-    column, row, away2, use = about(xy[index], reach, linear.shape)
-    patch = linear[row, column]
+    at, offset, use = about(xy[index], reach, linear.shape)
+    patch = np.take(linear, at)
     clipped = patch >= clip_dn
-    judged = (use & clipped).sum(axis=1) <= MOST_CLIPPED  # what is left of others are the flanks, which tell no height
-    use &= ~clipped
-    dx, dy = column - xy[index, :1], row - xy[index, 1:]
-    apart = np.hypot(*np.moveaxis(xy[index, None] - xy[None], -1, 0))
-    for i, k in zip(*np.nonzero((apart < 2.0 * reach[:, None]) & (apart > 0.0)), strict=True):
-        gx, gy = xy[index[i]] - xy[k]
-        use[i] &= (dx[i] + gx) ** 2 + (dy[i] + gy) ** 2 >= away2[i]
-    count = use.sum(axis=1)
+    judged = np.ones(index.size, dtype=bool)
+    if clipped.any():
+        # What is left of others are the flanks, which tell no height.
+        judged = np.count_nonzero(use & clipped, axis=1) <= MOST_CLIPPED
+        use &= ~clipped
+    _nearest(use, offset, xy[index], xy, reach)
+    count = np.count_nonzero(use, axis=1)
     judged &= count >= 12
-    out = np.ones(index.size, dtype=bool)
     if not judged.any():
         return out
-    dx, dy, use, patch = dx[judged], dy[judged], use[judged].astype(np.float64), patch[judged]
-    sigma, tall, count = sigma[judged], tall[judged], count[judged]
-    u, v = dx / sigma[:, None], dy / sigma[:, None]
+    if not judged.all():
+        use, patch, sigma, tall, count = use[judged], patch[judged], sigma[judged], tall[judged], count[judged]
+    weight = use.astype(np.float32)
+    u, v = (part * (1.0 / sigma).astype(np.float32)[:, None] for part in offset)
     r2 = u * u + v * v
-    g = np.exp(-0.5 * r2)
-    terms = np.stack([g, g * u, g * v, g * r2, np.ones_like(u), u, v], axis=1) * use[:, None, :]
-    level = patch.astype(np.float64)
-    level = (level - ((level * use).sum(axis=1) / count)[:, None]) * use
+    g = np.exp(np.float32(-0.5) * r2) * weight
+    terms = np.empty((g.shape[0], 7, g.shape[1]), np.float32)
+    terms[:, 0], terms[:, 1], terms[:, 2], terms[:, 3] = g, g * u, g * v, g * r2
+    terms[:, 4], terms[:, 5], terms[:, 6] = weight, u * weight, v * weight
+    level = patch * weight
+    level -= (level.sum(axis=1) / count).astype(np.float32)[:, None] * weight
     # The ridge keeps patches whose other half is another spot's from being singular.
-    matrix = terms @ terms.transpose(0, 2, 1) + 1e-6 * np.eye(7)
-    found = np.linalg.solve(matrix, terms @ level[:, :, None])
-    misfit = np.sqrt((((found.transpose(0, 2, 1) @ terms)[:, 0] - level) ** 2).sum(axis=1) / count)
-    scatter = np.sqrt((level**2).sum(axis=1) / count)
+    matrix = (terms @ terms.transpose(0, 2, 1)).astype(np.float64) + 1e-6 * np.eye(7)
+    found = np.linalg.solve(matrix, (terms @ level[:, :, None]).astype(np.float64))
+    rest = (found.transpose(0, 2, 1).astype(np.float32) @ terms)[:, 0] - level
+    misfit, scatter = (np.sqrt(np.einsum("nk,nk->n", part, part) / count) for part in (rest, level))
     good = (misfit < MISFIT_OF_HEIGHT * np.minimum(tall, DN)) & (misfit < MISFIT_OF_SCATTER * scatter)
     good &= found[:, 0, 0] > LEAST_PEAK * tall
     out[judged] = good | (misfit <= EXPLAINED * noise_dn)
     return out
+
+
+def _nearest(use: Mask, offset: NDArray[np.float32], own: Array, xy: Array, reach: Array) -> None:
+    """Leaves in `use` (m, k) the pixels that are no nearer to any of the spots xy than to the own one."""
+    gx, gy = (xy[None] - own[:, None]).transpose(2, 0, 1)
+    apart2 = gx * gx + gy * gy
+    near, other = np.nonzero((apart2 < (4.0 * reach**2)[:, None]) & (apart2 > 0.0))
+    if near.size:
+        toward = np.stack([gx[near, other], gy[near, other]], axis=-1).astype(np.float32)
+        nearer = toward @ offset <= 0.5 * apart2[near, other].astype(np.float32)[:, None]
+        first = np.flatnonzero(np.diff(near, prepend=-1))
+        use[near[first]] &= np.logical_and.reduceat(nearer, first, axis=0)

@@ -21,6 +21,7 @@ from .secondlook import SURE, second_look
 from .settings import ExtractionSettings
 from .spotfit import fit_spots
 from .spotmend import give_edges, split_blends
+from .spotmodel import Limits
 from .verdict import pupil_of
 
 Array = NDArray[np.float64]
@@ -180,9 +181,9 @@ def _fit_spots(prepared: Prepared, work: Prepared, spots: Spots, model: RimModel
         return -level if work.inverted else level  # up to a constant, which the fit has anyway
 
     starts = (spots.xy_px, spots.width_px, spots.height_dn)
-    limits = (prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * step))
+    limits = Limits(prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * step))
     broad = widest(model.sigma_px)
-    fit = fit_spots(prepared.linear, known, *starts, *limits)
-    fit = give_edges(prepared.linear, known, starts, fit, model.sigma_px, broad, limits)
+    fitted = fit_spots(prepared.linear, known, *starts, limits)
+    fit = give_edges(fitted, model.sigma_px, broad, limits)
     starts, fit = split_blends(prepared.linear, known, starts, fit, broad, limits)
     return Spots(*starts, spots.patches_px, spots.clutter), fit
