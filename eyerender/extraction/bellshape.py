@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,21 +21,33 @@ LEAST_PEAK = 0.75
 MOST_CLIPPED = 1
 NARROWEST_PX = 0.9
 EXPLAINED = 2.0  # misfits below this many noises object to nothing
+LONGEST = 2.5  # deviations of the bright patch along and across; of glints, and two that run into one, at most 2.0
 
 
 def about(xy: Array, reach: Array, shape: tuple[int, ...]) -> tuple[Index, NDArray[np.float32], Mask]:
     """(flat index (n, k), offset (2, k), whether it is in the image and within reach (n, k)) of pixels about n peak
     pixels xy (n, 2), reach (n,) px; places beyond the image have their nearest pixel's index."""
-    most = float(reach.max(initial=0.0))
-    half = math.floor(most)
-    step = np.arange(-half, half + 1)
-    away2 = (step * step)[:, None] + (step * step)
-    chosen = np.flatnonzero(away2 <= most**2)
-    dy, dx = step[chosen // step.size], step[chosen % step.size]
-    x, y = xy[:, :1].astype(np.intp) + dx, xy[:, 1:].astype(np.intp) + dy
-    column, row = np.minimum(np.maximum(x, 0), shape[1] - 1), np.minimum(np.maximum(y, 0), shape[0] - 1)
-    within = (column == x) & (row == y) & (away2.ravel()[chosen] <= (reach**2)[:, None])
-    return row * shape[1] + column, np.stack([dx, dy]).astype(np.float32), within
+    dx, dy, away2, offset = _disc(math.ceil(float(reach.max(initial=0.0))))
+    x, y = xy.astype(np.intp).T[:, :, None]
+    within = away2 <= (reach**2)[:, None]
+    half, (width, height) = int(dx.max()), (shape[1], shape[0])
+    if x.min(initial=half) < half or y.min(initial=half) < half or (x.max(initial=0) + half >= width) or (
+        y.max(initial=0) + half >= height
+    ):
+        column, row = np.minimum(np.maximum(x + dx, 0), width - 1), np.minimum(np.maximum(y + dy, 0), height - 1)
+        within &= (column == x + dx) & (row == y + dy)
+        return row * width + column, offset, within
+    return y * width + x + (dy * width + dx), offset, within
+
+
+@lru_cache(maxsize=32)
+def _disc(radius: int) -> tuple[Index, Index, Index, NDArray[np.float32]]:
+    """dx, dy, squared distance (k,) of the pixels within a radius, and (2, k) dx and dy."""
+    step = np.arange(-radius, radius + 1)
+    away2 = (step * step)[:, None] + step * step
+    row, column = np.nonzero(away2 <= radius**2)
+    dx, dy = step[column], step[row]
+    return dx, dy, away2[row, column], np.stack([dx, dy]).astype(np.float32)
 
 
 def bell_shaped(
@@ -86,8 +99,22 @@ def bell_shaped(
     misfit, scatter = (np.sqrt(np.einsum("nk,nk->n", part, part) / count) for part in (rest, level))
     good = (misfit < MISFIT_OF_HEIGHT * np.minimum(tall, DN)) & (misfit < MISFIT_OF_SCATTER * scatter)
     good &= found[:, 0, 0] > LEAST_PEAK * tall
-    out[judged] = good | (misfit <= EXPLAINED * noise_dn)
+    good |= misfit <= EXPLAINED * noise_dn
+    out[judged] = good & (_elongation(np.where(use, patch, -np.inf), tall, offset) <= LONGEST)
     return out
+
+
+def _elongation(patch: NDArray[np.float32], tall: Array, offset: NDArray[np.float32]) -> Array:
+    """(m,) deviation along over that across, of what stands above a third of the height in patches (m, k)."""
+    weight = np.maximum(patch - (patch.max(axis=1) - 0.65 * tall).astype(np.float32)[:, None], np.float32(0.0))
+    dx, dy = offset
+    terms = np.stack([np.ones_like(dx), dx, dy, dx * dx, dx * dy, dy * dy], axis=1)
+    total, x, y, xx, xy, yy = (weight @ terms).astype(np.float64).T
+    x, y = x / total, y / total
+    xx, xy, yy = xx / total - x * x, xy / total - x * y, yy / total - y * y
+    mean = 0.5 * (xx + yy) + 1.0 / 12.0  # with a pixel's own
+    gap = np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+    return np.asarray(np.sqrt((mean + gap) / np.maximum(mean - gap, 1e-3)))
 
 
 def _nearest(use: Mask, offset: NDArray[np.float32], own: Array, xy: Array, reach: Array) -> None:

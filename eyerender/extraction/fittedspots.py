@@ -18,8 +18,9 @@ _ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
 class SpotFit:
     """A batch of fitted spots. xy_px (n, 2), covariance (n, 2, 2), amplitude_dn (n,), sigma_px (n, 2) along x and y,
     background_dn (n,) at the spot, residual_dn (n,) root mean square over the window, moments_px2 (n, 2, 2): second
-    moments of what stands above a third of the spot's height in the window, the background and the other spots taken
-    away, clipped (n,) number of pixels at the clip level, converged (n,).
+    moments of the bright patch, those of the Gaussian where it explains the pixels and else of what stands above a
+    third of the height, background and other spots taken away, clipped (n,) number of pixels at the clip level,
+    converged (n,).
     """
 
     xy_px: Array

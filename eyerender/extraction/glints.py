@@ -23,7 +23,11 @@ SMOOTH_PX = 0.7
 MAX_SIGMA_PX = 8.0
 RING_SHARE = 0.4  # of a glint's height above its darkest surroundings, that it has above its brightest
 MOST_PEAKS = 80  # maxima looked at, brightest first
+# A glint's bright patch is no longer than that many times its width, and the product of that ratio and the fit's is no
+# larger; the true ones' of the development images are below 1.99 and 2.2.
+LONG, LONG_TWICE = 2.0, 2.4
 
+_PIXEL = 1.0 / 12.0  # variance of a pixel: keeps a spot of one row of pixels from being a line
 _COS, _SIN = np.cos(np.arange(12) * (np.pi / 6.0)), np.sin(np.arange(12) * (np.pi / 6.0))
 # Places on a ring: three circles, each turned against the one before.
 _RING_STEPS = np.repeat((0.1, 0.5, 0.9), 24)
@@ -203,8 +207,7 @@ def judge_spots(
     """(accepted, rejected), brightest first."""
     accepted: list[GlintResult] = []
     rejected: list[GlintResult] = []
-    # A pixel's own 1/12 keeps a spot of one row of pixels from being a line.
-    axes = np.sqrt(np.linalg.eigvalsh(fit.moments_px2) + 1.0 / 12.0)
+    axes = np.sqrt(np.linalg.eigvalsh(fit.moments_px2) + _PIXEL)
     spread = np.sqrt(fit.sigma_px.prod(axis=1))
     for i in np.argsort(-fit.amplitude_dn, kind="stable").tolist():
         reason = _objection(spots, fit, i, axes[i], prepared, step_dn, blur_px)
@@ -221,10 +224,10 @@ def judge_spots(
     reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
     surplus = [replace(glint, status="rejected", reason=reason) for glint in accepted[settings.max_glints :]]
     strip = "a strip or a broad patch, as reflections off the sclera and wet lid margins are"
+    places = np.array([glint.xy_px for glint in accepted]).reshape(-1, 2)
+    far = (((spots.patches_px[:, None] - places) ** 2).sum(axis=-1) > 4.0**2).all(axis=1)
     patches = [
-        GlintResult("rejected", strip, frozen(xy), None, 0.0, 0.0, saturated=False)
-        for xy in spots.patches_px
-        if all(glint.xy_px is None or math.dist(xy, glint.xy_px) > 4.0 for glint in accepted)
+        GlintResult("rejected", strip, frozen(xy), None, 0.0, 0.0, saturated=False) for xy in spots.patches_px[far]
     ]
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
 
@@ -242,9 +245,10 @@ def _objection(
     if wide < 0.5 * optics_sigma(blur_px):
         return f"sharper than the optics (sigma {wide:.1f} px): a bad pixel"
     short, long = axes.tolist()
+    ratio, fitted = long / short, math.sqrt((wide**2 + _PIXEL) / (float(fit.sigma_px[i].min()) ** 2 + _PIXEL))
     wide = max(wide, long)
-    if long > 2.0 * short:
-        return f"elongated {long / short:.1f} : 1, as reflections off the sclera and wet lid margins are"
+    if ratio > LONG or ratio * fitted > LONG_TWICE:
+        return f"elongated {max(ratio, fitted):.1f} : 1, as reflections off the sclera and wet lid margins are"
     if wide > widest(blur_px):
         return f"too wide for a glint: sigma {wide:.1f} px"
     if height < max(5.0 * prepared.noise_dn, 0.4 * step_dn):

@@ -23,11 +23,12 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Turns of several steps each; after PATIENCE turns a spot that still moves by WANDERING_PX is given up. The second
-# numbers are for twins, which overlap, and so must push each other apart, and for spots that the fit explains to
-# within ROUGH noises.
-TURNS, PATIENCE, WANDERING_PX = (1, 2, 4), (1, 2), 0.3
-ROUGH = 3.0
+# numbers are for spots that the fit explains to within ROUGH noises or that share of their height, or soon may.
+TURNS, PATIENCE, WANDERING_PX = (1, 4), (1, 2), 0.3
+ROUGH, ROUGH_SHARE = 3.0, 0.05
+FEW_CLIPPED = 2  # pixels: a spot with more has a flat top
 SMOOTH_PX = 0.7  # of the image in which widths are guessed
+UNEXPLAINED = 2.0  # misfit in noises: below, a spot's pixels are as its Gaussian says
 NEARLY_STILL_PX = 0.02  # a pair that takes turns at that is settled
 
 
@@ -60,29 +61,31 @@ def fit_spots(
     pixels = cut(linear, known, start_px, width_px, limits.clip_dn)
     apart, radius = _distance(start_px), window_radius(width_px)
     touching = apart < 1.35 * (radius[:, None] + radius)
-    twin = (apart < 1.6 * (width_px[:, None] + width_px)).any(axis=1)
     theta = _start(pixels, start_px, width_px, height_dn, touching)
-    others = Others.of(pixels, theta, touching, noise)
+    others = Others.of(pixels, theta, touching, noise) if touching.any() else None
     rest = pixels.data - pixels.known
     light = np.zeros(rest.size)
     if others is not None:
         light = others.light(theta, rest.size)
     theta[:, 5] = _ring_level(pixels, rest - light)
+    found = descend(pixels, theta, rest - light, others, limits)
+    if others is None and bool(found.settled.all()):
+        return FittedSpots(report(pixels, found, rest, limits), pixels, found.theta, rest)
     begun, n = theta[:, :2].copy(), width_px.size
-    gone, settled, used = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), np.zeros(n)
-    gram = np.zeros((n, PARAMETERS + 1, PARAMETERS + 1))
-    live = np.arange(n)
-    for turn in range(TURNS[2]):
-        part, rows = pixels.taken(live), pixels.rows(live)
-        among = others if live.size == n else Others.of(part, theta[live], touching[np.ix_(live, live)], noise)
-        found = descend(part, theta[live], (rest - light)[rows], among, limits)
+    gone, settled = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+    gram, used, live = found.gram.copy(), np.array(found.used), np.arange(n)
+    for turn in range(TURNS[1]):
+        if turn > 0:
+            part, rows = pixels.taken(live), pixels.rows(live)
+            among = Others.of(part, theta[live], touching[np.ix_(live, live)], noise)
+            found = descend(part, theta[live], (rest - light)[rows], among, limits)
         theta[live], gram[live], used[live] = found.theta, found.gram, found.used
-        moved, done = np.zeros(n), np.ones(n, dtype=bool)
-        moved[live], done[live] = found.moved, found.settled
+        moved, done, falling = np.zeros(n), np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
+        moved[live], done[live], falling[live] = found.moved, found.settled, found.falling
         settled[live] = found.settled | (found.moved < NEARLY_STILL_PX)
-        smooth = gram[:, -1, -1] < ROUGH**2 * np.maximum(used, 1.0)
-        turns = np.where(smooth, TURNS[2], np.where(twin, TURNS[1], TURNS[0]))
-        patience = np.where(smooth | twin, PATIENCE[1], PATIENCE[0])
+        misfit = noise * np.sqrt(gram[:, -1, -1] / np.maximum(used, 1.0))
+        hopeful = falling | (misfit < np.maximum(ROUGH * noise, ROUGH_SHARE * np.exp(theta[:, 2])))
+        turns, patience = np.where(hopeful, TURNS[1], TURNS[0]), np.where(hopeful, PATIENCE[1], PATIENCE[0])
         gone |= lost(theta, begun) | (~done & (moved > WANDERING_PX) & (turn + 1 >= patience))
         if others is not None:
             before, light = light, others.light(theta, rest.size, ~gone)
@@ -90,7 +93,7 @@ def fit_spots(
         live = np.flatnonzero(~gone & ~done & (turn + 1 < turns))
         if live.size == 0:
             break
-    ended = Descent(theta, gram, used, settled & ~gone, np.zeros(n))
+    ended = Descent(theta, gram, used, settled & ~gone, moved, falling)
     return FittedSpots(report(pixels, ended, rest - light, limits), pixels, theta, rest - light)
 
 
@@ -98,7 +101,7 @@ def no_fit() -> FittedSpots:
     """Of no spots."""
     none, nobody = np.zeros(0), np.zeros(0, dtype=np.intp)
     pixels = SpotPixels(
-        np.zeros((0, 2)), none, np.zeros(1, dtype=np.intp), nobody, none, none, none, none, none, none > 0.0
+        np.zeros((0, 2)), none, np.zeros(1, dtype=np.intp), nobody, none, np.zeros((3, 0)), none, none, none > 0.0, False
     )
     return FittedSpots(no_spots(), pixels, np.zeros((0, PARAMETERS)), none)
 
@@ -117,7 +120,7 @@ def _start(pixels: SpotPixels, start: Array, width: Array, height: Array, touchi
     theta[:, :2] = start
     theta[:, 2] = np.log(1.3 * np.maximum(height, 1.0))
     theta[:, 3] = np.log(width)
-    if pixels.clip.any():
+    if pixels.clipped:
         own = pixels.spot
         at = pixels.centre[own] + np.stack([pixels.dx, pixels.dy], axis=-1)
         away2 = ((at - start[own]) ** 2).sum(axis=1)
@@ -127,7 +130,7 @@ def _start(pixels: SpotPixels, start: Array, width: Array, height: Array, touchi
             top[part] &= ((at[part] - start[k]) ** 2).sum(axis=1) >= away2[part]
         area = pixels.total(top)
         # A flat top's centre is its mean, its pixel of first maximum is anywhere.
-        flat = area > 2.0
+        flat = area > FEW_CLIPPED
         share = top / np.maximum(area, 1.0)[own]
         mean = pixels.centre + np.stack([pixels.total(share * pixels.dx), pixels.total(share * pixels.dy)], axis=-1)
         theta[flat, :2] = mean[flat]
@@ -163,28 +166,39 @@ def report(
     level = theta[:, 5] + (theta[:, 6:8] * at).sum(axis=1)
     if blur_px is not None:
         level += theta[:, 8] * ndtr((at[:, 0] * np.cos(theta[:, 9]) + at[:, 1] * np.sin(theta[:, 9]) - theta[:, 10]) / blur_px)
+    misfit, sigma = np.sqrt(data_cost / np.maximum(ended.used, 1.0)) * noise, np.exp(theta[:, 3:5])
     return SpotFit(
         theta[:, :2].copy(),
         np.asarray(inverse[:, :2, :2] * scale[:, None, None], dtype=np.float64),
         np.exp(theta[:, 2]),
-        np.exp(theta[:, 3:5]),
+        sigma,
         level + pixels.middle_dn,
-        np.sqrt(data_cost / np.maximum(ended.used, 1.0)) * noise,
-        _moments(pixels, rest - level[pixels.spot]),
+        misfit,
+        _moments(pixels, rest, level, misfit > UNEXPLAINED * noise, sigma),
         pixels.total(pixels.clip).astype(np.intp),
         ended.settled & np.isfinite(theta).all(axis=1) & (ended.used >= 12),
     )
 
 
-def _moments(pixels: SpotPixels, patch: Array) -> Array:
-    """(n, 2, 2) second moments of what stands above a third of the height in a patch (P,); 0 where nothing does."""
+def _moments(pixels: SpotPixels, rest: Array, level: Array, which: Mask, sigma: Array) -> Array:
+    """(n, 2, 2) second moments of what stands above a third of the height, background `level` (n,) taken away; of the
+    spots that are not asked for, their fits'."""
+    out = np.zeros((level.size, 2, 2))
+    out[:, 0, 0], out[:, 1, 1] = (sigma * sigma).T
+    index = np.flatnonzero(which)
+    if index.size == 0:
+        return out
+    if index.size < level.size:
+        rest, level, pixels = rest[pixels.rows(index)], level[index], pixels.taken(index)
+    patch = rest - level[pixels.spot]
     weight = np.maximum(patch - 0.35 * pixels.most(patch)[pixels.spot], 0.0)
     dx, dy = pixels.dx, pixels.dy
     total = np.maximum(pixels.total(weight), 1e-12)
     wx, wy = weight * dx, weight * dy
     x, y = pixels.total(wx) / total, pixels.total(wy) / total
     xx, xy, yy = (pixels.total(value) / total for value in (wx * dx, wx * dy, wy * dy))
-    out = np.empty((total.size, 2, 2))
-    out[:, 0, 0], out[:, 1, 1] = xx - x * x, yy - y * y
-    out[:, 0, 1] = out[:, 1, 0] = xy - x * y
+    own = np.empty((total.size, 2, 2))
+    own[:, 0, 0], own[:, 1, 1] = xx - x * x, yy - y * y
+    own[:, 0, 1] = own[:, 1, 0] = xy - x * y
+    out[index] = own
     return out

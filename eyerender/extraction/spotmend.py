@@ -15,7 +15,7 @@ from scipy.special import ndtr
 
 from .fittedspots import SpotFit, joined
 from .preprocess import DN, Image
-from .spotfit import FittedSpots, fit_spots, report
+from .spotfit import UNEXPLAINED, FittedSpots, fit_spots, report
 from .spotmodel import STEPS, Limits, descend, slopes
 from .spotpixels import Grid, window_radius
 
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Background = Callable[[Array, Array], Array]
 Starts = tuple[Array, Array, Array]
 
-UNEXPLAINED, UNLIKE_BELL = 2.0, 0.002
+UNLIKE_BELL = 0.002
 # What an edge beside a glint leaves of the glint's height, and a second glint: more is no glint's.
 BESIDE_EDGE, BESIDE_TWIN = 0.1, 0.17
 LEAST_SHARE = 0.5  # of the squared residual, taken by an edge: the fit beside it must take as much

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,9 @@ PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; and of an
 LOST_PX = 12.0  # no glint's fit is as wide as that, or as far from where it began
 ROUND_SD = 0.3  # standard deviation of ln sx - ln sy: glints are nearly round
 STEPS = 8
-SMALL_GAIN = 5e-3  # of a step, in the squared misfit per pixel that counts: the last one needed
+# What the last step needed gains, in squared noises: it is that step's square in standard deviations. The second number
+# is for spots in the light of others, of which their gain does not tell.
+SMALL_GAIN = (5e-2, 5e-3)
 SAME_LIGHT = 0.01  # change of the others' light, in noises, that asks for no further step
 
 _FREE = np.inf
@@ -48,13 +49,15 @@ class Limits:
 @dataclass(frozen=True, slots=True, eq=False)
 class Descent:
     """Where a descent ended: theta (n, K); gram (n, K + 1, K + 1), as `_gram` has it, priors included; used (n,)
-    pixels that count; settled (n,); moved (n,) px, in the last half of the steps."""
+    pixels that count; settled (n,); moved (n,) px and falling (n,), whether the squared misfit has halved, in the last
+    half of the steps."""
 
     theta: Array
     gram: Array
     used: Array
     settled: Mask
     moved: Array
+    falling: Mask
 
 
 def lost(theta: Array, start: Array) -> Mask:
@@ -68,17 +71,15 @@ def slopes(pixels: SpotPixels, grid: Grid, theta: Array, rest: Array, blur_px: f
     """(K + 1, P): the model's derivatives at every pixel and, last, the residual.
 
     rest (P,): image less all that is not fitted. blur_px: of the edges, where the spots have such."""
-    at, sigma = theta[:, :2] - pixels.centre, np.exp(theta[:, 3:5])
-    across, along = grid.profiles(at, sigma, np.exp(theta[:, 2]))
-    count = theta.shape[1]
-    out = np.empty((count + 1, rest.size))
+    across, along = grid.profiles(theta[:, :2] - pixels.centre, np.exp(theta[:, 3:5]), np.exp(theta[:, 2]))
+    out = np.empty((theta.shape[1] + 1, rest.size))
     np.multiply(across[0], along[1], out=out[0])
     np.multiply(across[1:], along[1], out=out[2:4])
     np.multiply(across[1], along[::2], out=out[1:5:3])
-    out[5], out[6], out[7] = 1.0, pixels.dx, pixels.dy
-    own = np.take(theta[:, 5:].T, pixels.spot, axis=1)
+    out[5:8] = pixels.plane
+    own = theta[:, 5:].T.take(pixels.spot, axis=1)
     np.subtract(rest, out[2], out=out[-1])
-    out[-1] -= own[0] + own[1] * pixels.dx + own[2] * pixels.dy
+    out[-1] -= np.einsum("kp,kp->p", own[:3], pixels.plane)
     if blur_px is not None:
         cos, sin = np.cos(own[4]), np.sin(own[4])
         t = (pixels.dx * cos + pixels.dy * sin - own[5]) / blur_px
@@ -104,30 +105,30 @@ def prior(limits: Limits, edge: bool) -> Array:
 def _gram(pixels: SpotPixels, rows: Array, theta: Array, noise: float, penalty: Array) -> tuple[Array, Array]:
     """(n, K + 1, K + 1): products of `slopes`, summed over every spot's pixels, in units of the noise, with the priors;
     and the number of pixels that count (n,): not the clipped ones where the model is brighter."""
-    used: Array = pixels.count.astype(np.float64)
-    if pixels.clip.any():
+    used = pixels.count
+    if pixels.clipped:
         idle = pixels.clip & (rows[-1] <= 0.0)
-        rows[:, idle] = 0.0
-        used -= pixels.total(idle)
+        rows *= ~idle
+        used = used - pixels.total(idle)
     k = theta.shape[1]
     out = np.empty((theta.shape[0], k + 1, k + 1))
-    for product, (begin, end) in zip(out, pairwise(pixels.first.tolist()), strict=True):
-        part = rows[:, begin:end]
+    for product, part in zip(out, pixels.parts(rows), strict=True):
         np.matmul(part, part.T, out=product)
     out *= 1.0 / noise**2
     pull = theta @ penalty
     out[:, :k, :k] += penalty
     out[:, :k, k] -= pull
-    out[:, k, k] += np.einsum("nk,nk->n", pull, theta)
+    pull *= theta
+    out[:, k, k] += pull.sum(axis=1)
     return out, used
 
 
 def _dimmed(pixels: SpotPixels, rows: Array, gram: Array, light: Array, noise: float) -> None:
     """Takes more light (P,) of others from the residual, in the products (changed in place)."""
     k = gram.shape[1] - 1
-    for product, (begin, end) in zip(gram, pairwise(pixels.first.tolist()), strict=True):
-        part = light[begin:end]
-        taken = rows[:, begin:end] @ part
+    for product, row, part in zip(gram, pixels.parts(rows), pixels.parts(light), strict=True):
+        part = part * row[5]  # none in pixels that do not count
+        taken = row @ part
         product[:, k] -= taken * (1.0 / noise**2)
         product[k, k] += (part @ part - taken[k]) * (1.0 / noise**2)
 
@@ -147,12 +148,13 @@ def descend(
     blur_px: of the edges, where the spots have such.
     """
     noise, penalty, k = limits.noise_dn, prior(limits, blur_px is not None), theta.shape[1]
-    theta, start, middle = theta.copy(), theta[:, :2], theta[:, :2]
+    theta, start, middle, cost = theta.copy(), theta[:, :2], theta[:, :2], np.full(theta.shape[0], np.inf)
     grid = Grid.of(pixels.radius, pixels.spot, pixels.dx, pixels.dy)
     rows = slopes(pixels, grid, theta, rest, blur_px)
     gram, used = _gram(pixels, rows, theta, noise, penalty)
     damping, over = np.full(theta.shape[0], 1e-2), np.zeros(theta.shape[0], dtype=bool)
     held = np.zeros(0) if others is None else others.light(theta, rest.size)
+    enough = SMALL_GAIN[0] if others is None else SMALL_GAIN[1]
     least, most, stride = _LEAST[:k], _MOST[:k], _STRIDE[:k]
     for turn in range(steps):
         matrix = gram[:, :k, :k].copy()
@@ -160,12 +162,14 @@ def descend(
         diagonal *= 1.0 + damping[:, None]
         diagonal += 1e-9
         step = np.linalg.solve(matrix, gram[:, :k, k:])[..., 0]
-        gain = np.einsum("nk,nk->n", step, gram[:, :k, k])
+        gain = (step * gram[:, :k, k]).sum(axis=1)
         step = np.minimum(np.maximum(step, -stride), stride)
         trial = np.minimum(np.maximum(theta + step, least), most)
-        over = (gain < SMALL_GAIN * np.maximum(gram[:, k, k] / np.maximum(used, 1.0), 1.0)) | (damping > 1e5) | lost(theta, start)
+        over = gain < enough * np.maximum(gram[:, k, k] / np.maximum(used, 1.0), 1.0)
+        if turn >= STEPS // 2:
+            over |= (damping > 1e5) | lost(theta, start)
         if over.all():
-            theta = np.where(((damping < 1e5) & (np.abs(step) < 1.0).all(axis=1))[:, None], trial, theta)
+            theta = np.where((np.abs(step) < 1.0).all(axis=1)[:, None], trial, theta)
             break
         rows = slopes(pixels, grid, trial, rest, blur_px)
         new, new_used = _gram(pixels, rows, trial, noise, penalty)
@@ -185,6 +189,6 @@ def descend(
             held, rest = held + change, rest - change
             _dimmed(pixels, rows, gram, change, noise)
         if turn + 1 == steps // 2:
-            middle = theta[:, :2].copy()
+            middle, cost = theta[:, :2].copy(), gram[:, k, k].copy()
     moved = np.abs(theta[:, :2] - middle).max(axis=1)
-    return Descent(theta, gram, used, over, moved)
+    return Descent(theta, gram, used, over, moved, gram[:, k, k] < 0.5 * cost)

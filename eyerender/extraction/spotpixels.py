@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +31,8 @@ class SpotPixels:
     """Windows of n spots: P pixels, one spot's after the other's.
 
     centre (n, 2): a window's middle pixel, px. radius (n,) px. first (n + 1,): where each spot's pixels begin, and the
-    end. spot (P,): whose pixel each is. middle_dn (n,): B in the middle. dx, dy (P,): from the middle. data, known
-    (P,): image and B. clip (P,): whether the sensor clipped the pixel.
+    end. spot (P,): whose pixel each is. middle_dn (n,): B in the middle. plane (3, P): 1, and the place from the middle.
+    data, known (P,): image and B. clip (P,): whether the sensor clipped the pixel; clipped: whether it did any.
     """
 
     centre: Array
@@ -39,30 +40,48 @@ class SpotPixels:
     first: Index
     spot: Index
     middle_dn: Array
-    dx: Array
-    dy: Array
+    plane: Array
     data: Array
     known: Array
     clip: Mask
+    clipped: bool
 
     @property
-    def count(self) -> Index:
+    def count(self) -> Array:
         """(n,) of every spot's pixels."""
-        return np.diff(self.first)
+        return np.asarray(self.first[1:] - self.first[:-1], dtype=np.float64)
+
+    @property
+    def dx(self) -> Array:
+        """(P,) from the window's middle."""
+        return self.plane[1]
+
+    @property
+    def dy(self) -> Array:
+        """(P,) from the window's middle."""
+        return self.plane[2]
+
+    def parts(self, values: Array) -> list[Array]:
+        """Every spot's own of values (..., P)."""
+        ends = self.first.tolist()
+        return [values[..., begin:end] for begin, end in pairwise(ends)]
 
     def rows(self, spots: Index) -> Index:
         """Which of the pixels are those spots', in the spots' order."""
-        return _ranges(self.first[spots], self.count[spots])
+        return _ranges(self.first[spots], self.first[spots + 1] - self.first[spots])
 
     def taken(self, spots: Index) -> SpotPixels:
         """The chosen spots'."""
         if spots.size == self.radius.size and bool((spots == np.arange(spots.size)).all()):
             return self
-        count = self.count[spots]
-        rows = _ranges(self.first[spots], count)
+        count = self.first[spots + 1] - self.first[spots]
+        rows, clip = _ranges(self.first[spots], count), self.clip
+        if self.clipped:
+            clip = clip[rows]
         return SpotPixels(
-            self.centre[spots], self.radius[spots], _starts(count), np.repeat(np.arange(spots.size), count),
-            self.middle_dn[spots], self.dx[rows], self.dy[rows], self.data[rows], self.known[rows], self.clip[rows],
+            self.centre[spots], self.radius[spots], _starts(count), np.arange(spots.size).repeat(count),
+            self.middle_dn[spots], self.plane[:, rows], self.data[rows], self.known[rows], clip[: rows.size],
+            self.clipped and bool(clip.any()),
         )  # fmt: skip
 
     def total(self, values: NDArray[np.generic]) -> Array:
@@ -114,9 +133,10 @@ def cut(
     at_x, at_y = centre[spot, 0] + dx, centre[spot, 1] + dy
     data = np.take(linear, (at_y * columns + at_x).astype(np.intp)).astype(np.float64)
     level = known(np.concatenate([at_x, centre[:, 0]]), np.concatenate([at_y, centre[:, 1]]))
-    first = _starts(np.bincount(spot, minlength=width.size))
+    first, clip = _starts(np.bincount(spot, minlength=width.size)), data >= clip_dn
+    plane = np.stack([np.ones_like(dx), dx, dy])
     return SpotPixels(
-        centre, radius, first, spot, level[data.size :], dx, dy, data, level[: data.size], data >= clip_dn
+        centre, radius, first, spot, level[data.size :], plane, data, level[: data.size], clip, bool(clip.any())
     )
 
 
@@ -125,13 +145,14 @@ class Grid:
     """Where the columns and rows of n windows begin and end, so that a spot's profile is worked out once for each.
 
     edges (2 E,): from the windows' middles, the columns' of one window after the other's, then the rows'. owner (2 E,):
-    whose, the rows' owners counted on from n. column, row (P,): the edge before each pixel.
+    whose, the rows' owners counted on from n. column, row (P,): the edge before each pixel. split: E.
     """
 
     edges: Array
     owner: Index
     column: Index
     row: Index
+    split: int
 
     @staticmethod
     def of(radius: Array, spot: Index, dx: Array, dy: Array) -> Grid:
@@ -141,7 +162,8 @@ class Grid:
         middle = np.cumsum(size) - size + np.tile(half, 2)
         owner = np.repeat(np.arange(2 * n), size)
         edges = np.asarray(np.arange(owner.size) - middle[owner] - 0.5, dtype=np.float64)
-        return Grid(edges, owner, middle[spot] + dx.astype(np.intp), middle[n + spot] + dy.astype(np.intp))
+        column, row = middle[spot] + dx.astype(np.intp), middle[n + spot] + dy.astype(np.intp)
+        return Grid(edges, owner, column, row, owner.size // 2)
 
     def profiles(self, at: Array, sigma: Array, amplitude: Array) -> tuple[Array, Array]:
         """((3, P), (3, P)): the spots' profiles across the pixels' columns, times the amplitude, and along their rows.
@@ -150,10 +172,10 @@ class Grid:
         the windows' middles, sigma (n, 2), amplitude (n,).
         """
         owner = self.owner
-        scale = np.concatenate([amplitude, np.ones_like(amplitude)])[owner[:-1]]
         parts = profile(self.edges, at.T.ravel()[owner], sigma.T.ravel()[owner])
-        parts *= scale
-        return np.take(parts, self.column, axis=1), np.take(parts, self.row, axis=1)
+        # Along the rows the profiles stay as they are.
+        across = parts[:, : self.split] * amplitude[owner[: self.split]]
+        return across.take(self.column, axis=1), parts.take(self.row, axis=1)
 
 
 def profile(edges: Array, centre: Array | float, sigma: Array) -> Array:
@@ -199,8 +221,8 @@ class Others:
         to, by = to[shines], by[shines]
         if to.size == 0:
             return None
-        count = pixels.count[to]
-        rows, pair = _ranges(pixels.first[to], count), np.repeat(np.arange(to.size), count)
+        count = pixels.first[to + 1] - pixels.first[to]
+        rows, pair = _ranges(pixels.first[to], count), np.arange(to.size).repeat(count)
         grid = Grid.of(pixels.radius[to], pair, pixels.dx[rows], pixels.dy[rows])
         return Others(by, rows, pair, grid, pixels.centre[to])
 
