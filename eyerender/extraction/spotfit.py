@@ -16,16 +16,15 @@ from scipy.special import ndtr
 
 from .fittedspots import SpotFit, no_spots
 from .preprocess import Image
-from .spotmodel import PARAMETERS, SAME_LIGHT, Descent, Limits, descend, lost, prior
+from .spotmodel import PARAMETERS, SAME_LIGHT, Descent, Limits, descend, hopeful, lost, prior
 from .spotpixels import Others, SpotPixels, cut, window_radius
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Turns of several steps each; after PATIENCE turns a spot that still moves by WANDERING_PX is given up. The second
-# numbers are for spots that the fit explains to within ROUGH noises or that share of their height, or soon may.
+# numbers are for hopeful spots, and those whose misfit still falls.
 TURNS, PATIENCE, WANDERING_PX = (1, 4), (1, 2), 0.3
-ROUGH, ROUGH_SHARE = 3.0, 0.05
 FEW_CLIPPED = 2  # pixels: a spot with more has a flat top
 SMOOTH_PX = 0.7  # of the image in which widths are guessed
 UNEXPLAINED = 2.0  # misfit in noises: below, a spot's pixels are as its Gaussian says
@@ -83,9 +82,8 @@ def fit_spots(
         moved, done, falling = np.zeros(n), np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
         moved[live], done[live], falling[live] = found.moved, found.settled, found.falling
         settled[live] = found.settled | (found.moved < NEARLY_STILL_PX)
-        misfit = noise * np.sqrt(gram[:, -1, -1] / np.maximum(used, 1.0))
-        hopeful = falling | (misfit < np.maximum(ROUGH * noise, ROUGH_SHARE * np.exp(theta[:, 2])))
-        turns, patience = np.where(hopeful, TURNS[1], TURNS[0]), np.where(hopeful, PATIENCE[1], PATIENCE[0])
+        likely = falling | hopeful(theta, gram, used, noise)
+        turns, patience = np.where(likely, TURNS[1], TURNS[0]), np.where(likely, PATIENCE[1], PATIENCE[0])
         gone |= lost(theta, begun) | (~done & (moved > WANDERING_PX) & (turn + 1 >= patience))
         if others is not None:
             before, light = light, others.light(theta, rest.size, ~gone)
@@ -125,7 +123,9 @@ def _start(pixels: SpotPixels, start: Array, width: Array, height: Array, touchi
         at = pixels.centre[own] + np.stack([pixels.dx, pixels.dy], axis=-1)
         away2 = ((at - start[own]) ** 2).sum(axis=1)
         top = pixels.clip & (away2 < (3.0 + 2.5 * width[own]) ** 2)
-        for i, k in zip(*np.nonzero(touching), strict=True):  # no other's
+        width_sum = 4.0 + 2.5 * width[:, None] + 1.5 * width
+        near = touching & (((start[:, None] - start) ** 2).sum(axis=-1) < width_sum**2)
+        for i, k in zip(*np.nonzero(near), strict=True):  # no other's
             part = slice(pixels.first[i], pixels.first[i + 1])
             top[part] &= ((at[part] - start[k]) ** 2).sum(axis=1) >= away2[part]
         area = pixels.total(top)

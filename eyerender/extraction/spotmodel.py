@@ -27,6 +27,8 @@ STEPS = 8
 # What the last step needed gains, in squared noises: it is that step's square in standard deviations. The second number
 # is for spots in the light of others, of which their gain does not tell.
 SMALL_GAIN = (5e-2, 5e-3)
+ROUGH, ROUGH_SHARE = 3.0, 0.05
+STALLED = 0.97  # of the squared misfit, left by a step: no further one for a spot without hope
 SAME_LIGHT = 0.01  # change of the others' light, in noises, that asks for no further step
 
 _FREE = np.inf
@@ -65,6 +67,12 @@ def lost(theta: Array, start: Array) -> Mask:
     wide = theta[:, 3:5].max(axis=1) > math.log(LOST_PX)
     away = theta[:, :2] - start
     return np.asarray(wide | ((away * away).sum(axis=1) > LOST_PX**2))
+
+
+def hopeful(theta: Array, gram: Array, used: Array, noise: float) -> Mask:
+    """(n,) which spots the fit explains to within ROUGH noises or that share of their height."""
+    misfit = noise * np.sqrt(gram[:, -1, -1] / np.maximum(used, 1.0))
+    return np.asarray(misfit < np.maximum(ROUGH * noise, ROUGH_SHARE * np.exp(theta[:, 2])))
 
 
 def slopes(pixels: SpotPixels, grid: Grid, theta: Array, rest: Array, blur_px: float | None = None) -> Array:
@@ -154,6 +162,7 @@ def descend(
     gram, used = _gram(pixels, rows, theta, noise, penalty)
     damping, over = np.full(theta.shape[0], 1e-2), np.zeros(theta.shape[0], dtype=bool)
     held = np.zeros(0) if others is None else others.light(theta, rest.size)
+    stalled = over.copy()
     enough = SMALL_GAIN[0] if others is None else SMALL_GAIN[1]
     least, most, stride = _LEAST[:k], _MOST[:k], _STRIDE[:k]
     for turn in range(steps):
@@ -168,12 +177,14 @@ def descend(
         over = gain < enough * np.maximum(gram[:, k, k] / np.maximum(used, 1.0), 1.0)
         if turn >= STEPS // 2:
             over |= (damping > 1e5) | lost(theta, start)
-        if over.all():
+            stalled &= ~hopeful(theta, gram, used, noise)
+        if (over | stalled if turn >= STEPS // 2 else over).all():
             theta = np.where((np.abs(step) < 1.0).all(axis=1)[:, None], trial, theta)
             break
         rows = slopes(pixels, grid, trial, rest, blur_px)
         new, new_used = _gram(pixels, rows, trial, noise, penalty)
         better = new[:, k, k] <= gram[:, k, k] * (1.0 + 1e-12)
+        stalled = better & (new[:, k, k] > STALLED * gram[:, k, k])
         if better.all():
             theta, gram, used = trial, new, new_used
             damping = np.maximum(0.1 * damping, 1e-7)
