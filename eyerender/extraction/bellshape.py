@@ -74,10 +74,10 @@ def bell_shaped(
     judged = np.ones(index.size, dtype=bool)
     if clipped.any():
         # What is left of others are the flanks, which tell no height.
-        judged = np.count_nonzero(use & clipped, axis=1) <= MOST_CLIPPED
+        judged = (use & clipped).sum(axis=1) <= MOST_CLIPPED
         use &= ~clipped
     _nearest(use, offset, xy[index], xy, reach)
-    count = np.count_nonzero(use, axis=1)
+    count = use.sum(axis=1)
     judged &= count >= 12
     if not judged.any():
         return out

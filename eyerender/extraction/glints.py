@@ -61,7 +61,7 @@ def detect_spots(
     crop = linear[y0:y1, x0:x1]
     if crop.shape[0] < 6 or crop.shape[1] < 6:
         return _no_spots()
-    smooth = as_image(cv2.GaussianBlur(crop, (0, 0), SMOOTH_PX))
+    smooth = as_image(cv2.GaussianBlur(crop, (5, 5), SMOOTH_PX))
     size = 2 * math.ceil(3.0 * max(blur_px, 1.0) + 3.0) + 1
     opened = _opening(smooth, size)
     # A top-hat of noise alone is near 3 sigma of the smoothed noise everywhere.
@@ -111,14 +111,14 @@ def _above_ring(smooth: Image, xy: Array, width: Array) -> Array:
     x, y = radius * _RING_COS, radius * _RING_SIN
     at_x, at_y = xy[:, :1] + x, xy[:, 1:] + y
     free = (at_x > -0.5) & (at_y > -0.5) & (at_x < smooth.shape[1] - 0.5) & (at_y < smooth.shape[0] - 0.5)
-    ring = np.count_nonzero(free, axis=1)
+    ring = free.sum(axis=1)
     apart2 = ((xy[:, None] - xy) ** 2).sum(axis=-1)
     to, by = np.nonzero((apart2 < (outer[:, None] + disc) ** 2) & (apart2 > 0.0))
     if to.size:
         clear = (at_x[to] - xy[by, :1]) ** 2 + (at_y[to] - xy[by, 1:]) ** 2 > (disc[by] ** 2)[:, None]
         first = np.flatnonzero(np.diff(to, prepend=-1))
         free[to[first]] &= np.logical_and.reduceat(clear, first, axis=0)
-    count = np.count_nonzero(free, axis=1)
+    count = free.sum(axis=1)
     level = np.sort(np.where(free, _sampled(smooth, xy, x, y), np.float32(np.inf)), axis=1)
     told = np.flatnonzero(count > 0.25 * ring)
     out = np.full(width.size, np.inf)
@@ -145,7 +145,7 @@ def _compact(smooth: Image, xy: Array, width: Array, height: Array) -> NDArray[n
     reach = (2.5 * width + 1.5)[:, None]
     top = np.take(smooth, (xy[:, 1] * smooth.shape[1] + xy[:, 0]).astype(np.intp))
     fallen = top[:, None] - _sampled(smooth, xy, reach * _COS, reach * _SIN) > 0.33 * height[:, None]
-    return np.asarray(np.count_nonzero(fallen, axis=1) >= 9)
+    return np.asarray(fallen.sum(axis=1) >= 9)
 
 
 def _parted(smooth: Image, xy: Array, size: int, dip: float) -> list[int]:
@@ -195,7 +195,7 @@ def _widths(smooth: Image, opened: Image, xy: Array, height: Array, size: int) -
     column, row = np.minimum(np.maximum(column, 0), smooth.shape[1] - 1), np.minimum(np.maximum(row, 0), smooth.shape[0] - 1)
     flat = (row * smooth.shape[1])[:, :, None] + column[:, None, :]
     high = np.take(smooth, flat) - np.take(opened, flat) > (0.5 * height).astype(np.float32)[:, None, None]
-    area = np.count_nonzero((high & inside).reshape(height.size, -1), axis=1)
+    area = (high & inside).reshape(height.size, -1).sum(axis=1)
     out = np.sqrt(np.maximum(area, 1) / (2.0 * math.pi * math.log(2.0)))
     sharp: Array = np.sqrt(np.maximum(out**2 - SMOOTH_PX**2, 0.3))
     return np.clip(sharp, 0.5, MAX_SIGMA_PX)
@@ -207,17 +207,17 @@ def judge_spots(
     """(accepted, rejected), brightest first."""
     accepted: list[GlintResult] = []
     rejected: list[GlintResult] = []
-    axes = np.sqrt(np.linalg.eigvalsh(fit.moments_px2) + _PIXEL)
-    spread = np.sqrt(fit.sigma_px.prod(axis=1))
+    looks = _Look.of_all(spots, fit)
     for i in np.argsort(-fit.amplitude_dn, kind="stable").tolist():
-        reason = _objection(spots, fit, i, axes[i], prepared, step_dn, blur_px)
+        look = looks[i]
+        reason = _objection(look, fit, i, prepared, step_dn, blur_px)
         result = GlintResult(
             status="ok" if reason is None else "rejected",
             reason=reason,
-            xy_px=frozen(fit.xy_px[i]) if fit.converged[i] else frozen(spots.xy_px[i]),
-            covariance=frozen(fit.covariance[i]) if fit.converged[i] else None,
-            amplitude=float(fit.amplitude_dn[i] / DN),
-            sigma_px=float(spread[i]),
+            xy_px=frozen(fit.xy_px[i]) if look.converged else frozen(spots.xy_px[i]),
+            covariance=frozen(fit.covariance[i]) if look.converged else None,
+            amplitude=look.height / DN,
+            sigma_px=math.sqrt(look.wide * look.narrow),
             saturated=bool(fit.clipped[i] > 0),
         )
         (accepted if reason is None else rejected).append(result)
@@ -232,30 +232,51 @@ def judge_spots(
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
 
 
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """A fitted spot's looks: sigma across and along, height and residual in DN, distance from the bright pixel, and the
+    deviations of its bright patch across and along."""
+
+    converged: bool
+    narrow: float
+    wide: float
+    height: float
+    residual: float
+    moved: float
+    short: float
+    long: float
+
+    @staticmethod
+    def of_all(spots: Spots, fit: SpotFit) -> list[_Look]:
+        gap = fit.xy_px - spots.xy_px
+        columns = (
+            fit.converged, fit.sigma_px.min(axis=1), fit.sigma_px.max(axis=1), fit.amplitude_dn, fit.residual_dn,
+            np.sqrt((gap * gap).sum(axis=1)), *np.sqrt(np.linalg.eigvalsh(fit.moments_px2) + _PIXEL).T,
+        )  # fmt: skip
+        return [_Look(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+
+
 def _objection(
-    spots: Spots, fit: SpotFit, i: int, axes: Array, prepared: Prepared, step_dn: float, blur_px: float
+    look: _Look, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float
 ) -> str | None:
-    """Why spot i is no glint, or None. axes (2,): deviations of its bright patch across and along."""
-    if not fit.converged[i]:
+    """Why spot i is no glint, or None."""
+    if not look.converged:
         return "the spot's fit did not converge"
-    wide, height = float(fit.sigma_px[i].max()), float(fit.amplitude_dn[i])
-    moved = math.dist(fit.xy_px[i].tolist(), spots.xy_px[i].tolist())
-    if moved > max(2.5, 2.0 * wide):
-        return f"no spot: the fit moved {moved:.1f} px from the bright pixel"
-    if wide < 0.5 * optics_sigma(blur_px):
-        return f"sharper than the optics (sigma {wide:.1f} px): a bad pixel"
-    short, long = axes.tolist()
-    ratio, fitted = long / short, math.sqrt((wide**2 + _PIXEL) / (float(fit.sigma_px[i].min()) ** 2 + _PIXEL))
-    wide = max(wide, long)
+    if look.moved > max(2.5, 2.0 * look.wide):
+        return f"no spot: the fit moved {look.moved:.1f} px from the bright pixel"
+    if look.wide < 0.5 * optics_sigma(blur_px):
+        return f"sharper than the optics (sigma {look.wide:.1f} px): a bad pixel"
+    ratio, fitted = look.long / look.short, math.sqrt((look.wide**2 + _PIXEL) / (look.narrow**2 + _PIXEL))
     if ratio > LONG or ratio * fitted > LONG_TWICE:
         return f"elongated {max(ratio, fitted):.1f} : 1, as reflections off the sclera and wet lid margins are"
+    wide = max(look.wide, look.long)
     if wide > widest(blur_px):
         return f"too wide for a glint: sigma {wide:.1f} px"
-    if height < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
+    if look.height < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
         return "too faint for a glint"
     if wide > 2.5 and not _outshines(fit, i, prepared):
         return "no brighter than what lies beside it, as a corner of sclera between lid and iris is"
-    if fit.residual_dn[i] > max(0.3 * min(height, DN), 3.0 * prepared.noise_dn):
+    if look.residual > max(0.3 * min(look.height, DN), 3.0 * prepared.noise_dn):
         return "no spot: the bright patch is not bell-shaped"
     return None
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from .fittedspots import SpotFit, joined
 from .preprocess import DN, Image
@@ -34,6 +33,7 @@ MOST_NEAR = 4  # spots about one that is split: more are skin or lashes
 MOST = 12  # spots that are mended: where there are more, they are no glints
 
 _DIRECTION = np.arange(12) * (np.pi / 12.0)
+_TURN = np.stack([np.cos(_DIRECTION), np.sin(_DIRECTION)], axis=1)
 _OFFSET = np.linspace(-0.8, 0.8, 9)
 
 
@@ -49,7 +49,7 @@ def give_edges(fitted: FittedSpots, blur_px: float, widest_px: float, limits: Li
         wide = fit.sigma_px[index].max(axis=1)
         gap = fit.xy_px[index, None] - fit.xy_px
         near = (gap * gap).sum(axis=-1) < ((5.0 * wide + 3.0) ** 2)[:, None]
-        index = index[(np.count_nonzero(near, axis=1) == 1) & (wide <= LONGEST * widest_px)]
+        index = index[(near.sum(axis=1) == 1) & (wide <= LONGEST * widest_px)]
     if index.size == 0:
         return fit
     pixels, rest = fitted.pixels.taken(index), fitted.rest[fitted.pixels.rows(index)]
@@ -82,26 +82,26 @@ def _best_edge(fitted: FittedSpots, blur_px: float) -> tuple[Array, Array]:
     grid = Grid.of(pixels.radius, pixels.spot, pixels.dx, pixels.dy)
     rows = slopes(pixels, grid, fitted.theta, fitted.rest)
     share, edge = np.zeros(n), np.zeros((n, 3))
-    for i in range(n):
-        own = slice(int(pixels.first[i]), int(pixels.first[i + 1]))
-        seen = ~pixels.clip[own]
-        if np.count_nonzero(seen) < 20:
+    for i, (part, clip) in enumerate(zip(pixels.parts(rows), pixels.parts(pixels.clip), strict=True)):
+        if clip.any():
+            part = part[:, ~clip]
+        if part.shape[1] < 20:
             continue
-        part, dx, dy = rows[:, own][:, seen], pixels.dx[own][seen], pixels.dy[own][seen]
-        along = np.multiply.outer(np.cos(_DIRECTION), dx) + np.multiply.outer(np.sin(_DIRECTION), dy)
+        basis, rest = part[:-1].astype(np.float32), part[-1].astype(np.float32)
+        basis /= np.sqrt((basis * basis).sum(axis=1) + np.float32(1e-12))[:, None]
         offset = _OFFSET * float(pixels.radius[i])
-        edges = ndtr((along[:, None] - offset[:, None]) * (1.0 / blur_px)).reshape(-1, dx.size)
-        basis = part[:-1] / np.sqrt((part[:-1] ** 2).sum(axis=1) + 1e-12)[:, None]
-        square = basis @ basis.T + 1e-9 * np.eye(basis.shape[0])
-        values = np.concatenate([edges, part[-1:]])
-        cross = values @ basis.T
-        free = cross @ np.linalg.inv(square)
-        left = np.einsum("ep,ep->e", values, values) - np.einsum("ek,ek->e", free, cross)
-        joint = edges @ part[-1] - free[:-1] @ cross[-1]
-        taken = joint**2 / (np.maximum(left[:-1], 0.0) + 1e-6)
-        best = int(taken.argmax())
-        share[i] = taken[best] / max(float(left[-1]), 1e-12)
-        edge[i] = joint[best] / (max(float(left[best]), 0.0) + 1e-6), _DIRECTION[best // 9], offset[best % 9]
+        along = _TURN @ part[6:8]
+        # A logistic function is within 0.01 of Phi.
+        edges = np.exp((offset[:, None] - along[:, None]).astype(np.float32) * np.float32(1.702 / blur_px))
+        values = np.concatenate([(1.0 / (1.0 + edges)).reshape(-1, rest.size), rest[None]])
+        cross = (values @ basis.T).astype(np.float64)
+        free = cross @ np.linalg.inv((basis @ basis.T).astype(np.float64) + 1e-6 * np.eye(basis.shape[0]))
+        left = (values * values).sum(axis=1).astype(np.float64) - (free * cross).sum(axis=1)
+        joint = (values[:-1] @ rest).astype(np.float64) - free[:-1] @ cross[-1]
+        size = np.maximum(left[:-1], 0.0) + 1e-3
+        best = int((joint**2 / size).argmax())
+        share[i] = joint[best] ** 2 / size[best] / max(float(left[-1]), 1e-12)
+        edge[i] = joint[best] / size[best], _DIRECTION[best // 9], offset[best % 9]
     return share, edge
 
 
