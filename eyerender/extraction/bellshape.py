@@ -31,8 +31,11 @@ def about(xy: Array, reach: Array, shape: tuple[int, ...]) -> tuple[Index, NDArr
     x, y = xy.astype(np.intp).T[:, :, None]
     within = away2 <= (reach**2)[:, None]
     half, (width, height) = int(dx.max()), (shape[1], shape[0])
-    if x.min(initial=half) < half or y.min(initial=half) < half or (x.max(initial=0) + half >= width) or (
-        y.max(initial=0) + half >= height
+    if (
+        x.min(initial=half) < half
+        or y.min(initial=half) < half
+        or (x.max(initial=0) + half >= width)
+        or (y.max(initial=0) + half >= height)
     ):
         column, row = np.minimum(np.maximum(x + dx, 0), width - 1), np.minimum(np.maximum(y + dy, 0), height - 1)
         within &= (column == x + dx) & (row == y + dy)

@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 SMOOTH_PX = 0.7
 MAX_SIGMA_PX = 8.0
+LEAST_OF_BLOCK = 0.5  # of a sharp peak's height, the mean of the 2 x 2 pixels about it
 RING_SHARE = 0.4  # of a glint's height above its darkest surroundings, that it has above its brightest
 MOST_PEAKS = 80  # maxima looked at, brightest first
 # A glint's bright patch is no longer than that many times its width, and the product of that ratio and the fit's is no
@@ -63,18 +64,18 @@ def detect_spots(
         return _no_spots()
     smooth = as_image(cv2.GaussianBlur(crop, (5, 5), SMOOTH_PX))
     size = 2 * math.ceil(3.0 * max(blur_px, 1.0) + 3.0) + 1
-    opened = _opening(smooth, size)
     # A top-hat of noise alone is near 3 sigma of the smoothed noise everywhere.
     noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * SMOOTH_PX)
     threshold = max(9.0 * noise, 0.6 * step_dn)
-    least = np.maximum(cv2.dilate(smooth, np.ones((3, 3), np.uint8)), opened + np.float32(threshold))
-    flat = np.flatnonzero(smooth >= least)
+    blocks = (smooth.shape[1] // 2, smooth.shape[0] // 2)
+    half = as_image(cv2.resize(smooth, blocks, interpolation=cv2.INTER_AREA))
+    opened = _opening(half, size)
+    flat, stands = _maxima(smooth, half, opened, threshold)
     if flat.size == 0:
         return _no_spots()
-    height = np.take(smooth, flat) - np.take(opened, flat)
-    order = np.argsort(-height, kind="stable")[:MOST_PEAKS]
+    order = np.argsort(-stands, kind="stable")[:MOST_PEAKS]
     row, column = np.divmod(flat[order], smooth.shape[1])
-    xy, height = np.stack([column, row], axis=-1).astype(np.float64), height[order].astype(np.float64)
+    xy, height = np.stack([column, row], axis=-1).astype(np.float64), stands[order].astype(np.float64)
     width = _widths(smooth, opened, xy, height, size)
     spot = _compact(smooth, xy, width, height) & (width < widest(blur_px))
     patches = xy[~spot & (height > 1.5 * threshold)][: settings.max_glints]
@@ -176,25 +177,42 @@ def _no_spots() -> Spots:
     return Spots(*none, np.zeros((0, 2)), none)
 
 
-def _opening(smooth: Image, size: int) -> Image:
-    """A square opening of `size` px, of blocks of 2 x 2 pixels (the image has even sides): the level about spots, for
-    which every second pixel does."""
-    height, width = smooth.shape
-    half = cv2.resize(smooth, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+def _opening(half: Image, size: int) -> Image:
+    """A square opening of `size` px of an image at half resolution: the level about spots, for which blocks of 2 x 2
+    pixels do."""
     side = 2 * (size // 4) + 1
-    opened = cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
-    return as_image(cv2.resize(opened, (width, height), interpolation=cv2.INTER_NEAREST))
+    return as_image(cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)))
+
+
+def _maxima(
+    smooth: Image, half: Image, opened: Image, threshold: float
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """(flat indices (n,) of the pixels that no neighbour surpasses and that stand more than the threshold above the
+    opened level; how far they do (n,))."""
+    blocks = np.flatnonzero(half - opened > LEAST_OF_BLOCK * threshold)
+    width, columns = smooth.shape[1], half.shape[1]
+    row, column = np.divmod(blocks, columns)
+    first = 2 * (row * width + column)
+    level = np.take(opened, blocks)
+    flat, height = np.empty((4, blocks.size), dtype=np.intp), np.empty((4, blocks.size), np.float32)
+    top = cv2.dilate(smooth, np.ones((3, 3), np.uint8))
+    for i, shift in enumerate((0, 1, width, width + 1)):
+        np.add(first, shift, out=flat[i])
+        height[i] = np.take(smooth, flat[i])
+    high = (height - level > threshold) & (height >= np.take(top, flat))
+    return flat[high], (height - level)[high]
 
 
 def _widths(smooth: Image, opened: Image, xy: Array, height: Array, size: int) -> Array:
     """sigma = sqrt(area above half height / (2 pi ln 2)), counted in a window of the opening's size."""
-    step = np.arange(-(size // 2), size // 2 + 1)
-    x, y = xy.astype(np.intp).T
-    column, row = x[:, None] + step, y[:, None] + step
-    inside = ((column >= 0) & (column < smooth.shape[1]))[:, None, :] & ((row >= 0) & (row < smooth.shape[0]))[:, :, None]
-    column, row = np.minimum(np.maximum(column, 0), smooth.shape[1] - 1), np.minimum(np.maximum(row, 0), smooth.shape[0] - 1)
+    step, (rows, columns) = np.arange(-(size // 2), size // 2 + 1), smooth.shape
+    x, y = xy.astype(np.intp).T[:, :, None] + step
+    column, row = np.minimum(np.maximum(x, 0), columns - 1), np.minimum(np.maximum(y, 0), rows - 1)
+    inside = (column == x)[:, None, :] & (row == y)[:, :, None]
     flat = (row * smooth.shape[1])[:, :, None] + column[:, None, :]
-    high = np.take(smooth, flat) - np.take(opened, flat) > (0.5 * height).astype(np.float32)[:, None, None]
+    flat_half = ((row >> 1) * opened.shape[1])[:, :, None] + (column >> 1)[:, None, :]
+    hat = np.take(smooth, flat) - np.take(opened, flat_half)
+    high = hat > (0.5 * height).astype(np.float32)[:, None, None]
     area = (high & inside).reshape(height.size, -1).sum(axis=1)
     out = np.sqrt(np.maximum(area, 1) / (2.0 * math.pi * math.log(2.0)))
     sharp: Array = np.sqrt(np.maximum(out**2 - SMOOTH_PX**2, 0.3))
@@ -256,9 +274,7 @@ class _Look:
         return [_Look(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 
 
-def _objection(
-    look: _Look, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float
-) -> str | None:
+def _objection(look: _Look, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float) -> str | None:
     """Why spot i is no glint, or None."""
     if not look.converged:
         return "the spot's fit did not converge"

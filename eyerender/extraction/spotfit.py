@@ -97,10 +97,8 @@ def fit_spots(
 
 def no_fit() -> FittedSpots:
     """Of no spots."""
-    none, nobody = np.zeros(0), np.zeros(0, dtype=np.intp)
-    pixels = SpotPixels(
-        np.zeros((0, 2)), none, np.zeros(1, dtype=np.intp), nobody, none, np.zeros((3, 0)), none, none, none > 0.0, False
-    )
+    none, index, pairs = np.zeros(0), np.zeros(1, dtype=np.intp), np.zeros((0, 2))
+    pixels = SpotPixels(pairs, none, index, index[:0], none, np.zeros((3, 0)), none, none, none > 0.0, False)
     return FittedSpots(no_spots(), pixels, np.zeros((0, PARAMETERS)), none)
 
 
@@ -151,9 +149,7 @@ def _ring_level(pixels: SpotPixels, rest: Array) -> Array:
     return pixels.total(rest * ring) / np.maximum(pixels.total(ring), 1.0)
 
 
-def report(
-    pixels: SpotPixels, ended: Descent, rest: Array, limits: Limits, blur_px: float | None = None
-) -> SpotFit:
+def report(pixels: SpotPixels, ended: Descent, rest: Array, limits: Limits, blur_px: float | None = None) -> SpotFit:
     """The fit that a descent ended at. rest (P,): image less B and the others' light. blur_px: of the edges."""
     theta, noise = ended.theta, limits.noise_dn
     k = theta.shape[1]
@@ -165,7 +161,8 @@ def report(
     at = theta[:, :2] - pixels.centre
     level = theta[:, 5] + (theta[:, 6:8] * at).sum(axis=1)
     if blur_px is not None:
-        level += theta[:, 8] * ndtr((at[:, 0] * np.cos(theta[:, 9]) + at[:, 1] * np.sin(theta[:, 9]) - theta[:, 10]) / blur_px)
+        height, turn, offset = theta[:, 8:].T
+        level += height * ndtr((at[:, 0] * np.cos(turn) + at[:, 1] * np.sin(turn) - offset) / blur_px)
     misfit, sigma = np.sqrt(data_cost / np.maximum(ended.used, 1.0)) * noise, np.exp(theta[:, 3:5])
     return SpotFit(
         theta[:, :2].copy(),

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from .preprocess import Image
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.intp]
+_T = TypeVar("_T", bound=np.generic)
 
 _ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)
 LARGEST_PX = 20  # radius of a window at most
@@ -31,7 +33,7 @@ class SpotPixels:
     """Windows of n spots: P pixels, one spot's after the other's.
 
     centre (n, 2): a window's middle pixel, px. radius (n,) px. first (n + 1,): where each spot's pixels begin, and the
-    end. spot (P,): whose pixel each is. middle_dn (n,): B in the middle. plane (3, P): 1, and the place from the middle.
+    end. spot (P,): whose pixel each is. middle_dn (n,): B in the middle. plane (3, P): 1 and the place from there.
     data, known (P,): image and B. clip (P,): whether the sensor clipped the pixel; clipped: whether it did any.
     """
 
@@ -54,14 +56,14 @@ class SpotPixels:
     @property
     def dx(self) -> Array:
         """(P,) from the window's middle."""
-        return self.plane[1]
+        return np.asarray(self.plane[1], dtype=np.float64)
 
     @property
     def dy(self) -> Array:
         """(P,) from the window's middle."""
-        return self.plane[2]
+        return np.asarray(self.plane[2], dtype=np.float64)
 
-    def parts(self, values: Array) -> list[Array]:
+    def parts(self, values: NDArray[_T]) -> list[NDArray[_T]]:
         """Every spot's own of values (..., P)."""
         ends = self.first.tolist()
         return [values[..., begin:end] for begin, end in pairwise(ends)]
