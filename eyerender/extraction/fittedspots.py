@@ -17,8 +17,10 @@ _ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
 @dataclass(frozen=True, slots=True, eq=False)
 class SpotFit:
     """A batch of fitted spots. xy_px (n, 2), covariance (n, 2, 2), amplitude_dn (n,), sigma_px (n, 2) along x and y,
-    background_dn (n,) at the spot, residual_dn (n,) root mean square over the window, clipped (n,) number of pixels
-    at the clip level, converged (n,).
+    background_dn (n,) at the spot, residual_dn (n,) root mean square over the window, moments_px2 (n, 2, 2): second
+    moments of the bright patch, those of the Gaussian where it explains the pixels and else of what stands above a
+    third of the height, background and other spots taken away, clipped (n,) number of pixels at the clip level,
+    converged (n,).
     """
 
     xy_px: Array
@@ -27,6 +29,7 @@ class SpotFit:
     sigma_px: Array
     background_dn: Array
     residual_dn: Array
+    moments_px2: Array
     clipped: NDArray[np.intp]
     converged: NDArray[np.bool_]
 
@@ -38,12 +41,12 @@ class SpotFit:
         """A batch of spot i alone."""
         return self.taken(np.array([i]))
 
-    def replaced(self, i: int, other: SpotFit) -> SpotFit:
-        """Spot i replaced by the only one of `other`."""
+    def replaced(self, index: NDArray[np.intp], other: SpotFit) -> SpotFit:
+        """The chosen spots replaced by those of `other`."""
         parts = []
         for one in fields(self):
             values = getattr(self, one.name).copy()
-            values[i] = getattr(other, one.name)[0]
+            values[index] = getattr(other, one.name)
             parts.append(values)
         return SpotFit(*parts)
 
@@ -57,20 +60,19 @@ def no_spots() -> SpotFit:
     """An empty batch."""
     return SpotFit(
         np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2)), np.zeros(0), np.zeros(0),
-        np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool),
+        np.zeros((0, 2, 2)), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool),
     )  # fmt: skip
 
 
 def spot_light(fit: SpotFit, x: Array, y: Array) -> Array:
     """The light of the first spot of a batch at pixels (x, y)."""
-    gx = profile(x, float(fit.xy_px[0, 0]), float(fit.sigma_px[0, 0]))[0]
-    gy = profile(y, float(fit.xy_px[0, 1]), float(fit.sigma_px[0, 1]))[0]
+    gx = profile(x, float(fit.xy_px[0, 0]), float(fit.sigma_px[0, 0]))
+    gy = profile(y, float(fit.xy_px[0, 1]), float(fit.sigma_px[0, 1]))
     return np.asarray(fit.amplitude_dn[0] * gx * gy)
 
 
-def profile(x: Array, centre: Array | float, sigma: Array | float) -> tuple[Array, Array, Array]:
-    """Mean over the pixel of exp(-(x - c)^2 / (2 s^2)), and its derivatives by c and by ln s."""
-    low, high = (x - 0.5 - centre) / sigma, (x + 0.5 - centre) / sigma
-    tail_low, tail_high = np.exp(-0.5 * low * low), np.exp(-0.5 * high * high)
-    value = sigma * _ROOT_HALF_PI * (erf(high / math.sqrt(2.0)) - erf(low / math.sqrt(2.0)))
-    return value, tail_low - tail_high, value - sigma * (high * tail_high - low * tail_low)
+def profile(x: Array, centre: float, sigma: float) -> Array:
+    """Mean over the pixel of exp(-(x - c)^2 / (2 s^2))."""
+    scale = math.sqrt(0.5) / sigma
+    low = (x - 0.5 - centre) * scale
+    return np.asarray(sigma * _ROOT_HALF_PI * (erf(low + scale) - erf(low)))

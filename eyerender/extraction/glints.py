@@ -11,19 +11,29 @@ from numpy.typing import NDArray
 
 from ..arrays import frozen
 from ..geometry.ellipse import Ellipse
-from .bellshape import about, bell_shaped
+from .bellshape import bell_shaped
 from .fittedspots import SpotFit
 from .preprocess import DN, Image, Prepared, as_image
 from .result import GlintResult
 from .settings import ExtractionSettings
-from .spotmend import patch_moments
 
 Array = NDArray[np.float64]
 
 SMOOTH_PX = 0.7
 MAX_SIGMA_PX = 8.0
+LEAST_OF_BLOCK = 0.5  # of a sharp peak's height, the mean of the 2 x 2 pixels about it
 RING_SHARE = 0.4  # of a glint's height above its darkest surroundings, that it has above its brightest
 MOST_PEAKS = 80  # maxima looked at, brightest first
+# A glint's bright patch is no longer than that many times its width, and the product of that ratio and the fit's is no
+# larger; the true ones' of the development images are below 1.99 and 2.2.
+LONG, LONG_TWICE = 2.0, 2.4
+
+_PIXEL = 1.0 / 12.0  # variance of a pixel: keeps a spot of one row of pixels from being a line
+_COS, _SIN = np.cos(np.arange(12) * (np.pi / 6.0)), np.sin(np.arange(12) * (np.pi / 6.0))
+# Places on a ring: three circles, each turned against the one before.
+_RING_STEPS = np.repeat((0.1, 0.5, 0.9), 24)
+_RING_ANGLE = (np.arange(72) % 24 + np.repeat((0.0, 1.0 / 3.0, 2.0 / 3.0), 24)) * (np.pi / 12.0)
+_RING_COS, _RING_SIN = np.cos(_RING_ANGLE), np.sin(_RING_ANGLE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,40 +58,35 @@ def detect_spots(
     cx, cy = ellipse.centre_px
     x0, x1 = max(0, math.floor(cx - reach)), min(linear.shape[1], math.ceil(cx + reach) + 1)
     y0, y1 = max(0, math.floor(cy - reach)), min(linear.shape[0], math.ceil(cy + reach) + 1)
+    x1, y1 = x1 - (x1 - x0) % 2, y1 - (y1 - y0) % 2  # whole blocks of the opening
     crop = linear[y0:y1, x0:x1]
-    if crop.shape[0] < 5 or crop.shape[1] < 5:
+    if crop.shape[0] < 6 or crop.shape[1] < 6:
         return _no_spots()
-    smooth = as_image(cv2.GaussianBlur(crop, (0, 0), SMOOTH_PX))
+    smooth = as_image(cv2.GaussianBlur(crop, (5, 5), SMOOTH_PX))
     size = 2 * math.ceil(3.0 * max(blur_px, 1.0) + 3.0) + 1
-    opened = _opening(smooth, size)
-    hat = smooth - opened
     # A top-hat of noise alone is near 3 sigma of the smoothed noise everywhere.
     noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * SMOOTH_PX)
     threshold = max(9.0 * noise, 0.6 * step_dn)
-    peak = (hat > threshold) & (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8)))
-    row, column = np.nonzero(peak)
-    if row.size == 0:
+    blocks = (smooth.shape[1] // 2, smooth.shape[0] // 2)
+    half = as_image(cv2.resize(smooth, blocks, interpolation=cv2.INTER_AREA))
+    opened = _opening(half, size)
+    flat, stands = _maxima(smooth, half, opened, threshold)
+    if flat.size == 0:
         return _no_spots()
-    height = hat[row, column].astype(np.float64)
-    order = np.argsort(-height, kind="stable")[:MOST_PEAKS]
-    xy, height = np.stack([column[order], row[order]], axis=-1).astype(np.float64), height[order]
-    width = _widths(hat, xy, height, size)
+    order = np.argsort(-stands, kind="stable")[:MOST_PEAKS]
+    row, column = np.divmod(flat[order], smooth.shape[1])
+    xy, height = np.stack([column, row], axis=-1).astype(np.float64), stands[order].astype(np.float64)
+    width = _widths(smooth, opened, xy, height, size)
     spot = _compact(smooth, xy, width, height) & (width < widest(blur_px))
     patches = xy[~spot & (height > 1.5 * threshold)][: settings.max_glints]
     xy, width, height = xy[spot], width[spot], height[spot]
-    keep: list[int] = []
-    close = np.hypot(*np.moveaxis(xy[:, None] - xy[None], -1, 0)) <= size  # far apart they are two anyway
-    for i in range(height.size):  # flat tops of clipped spots give several maxima, and so does noise on wide ones
-        if all(_parted(smooth, xy[i], xy[j], 4.0 * noise) for j in keep if close[i, j]):
-            keep.append(i)
-        if len(keep) >= settings.max_glints + 8:
-            break
+    keep = _parted(smooth, xy, size, 4.0 * noise)[: settings.max_glints + 8]
     xy, width, height = xy[keep], width[keep], height[keep]
     alone = _above_ring(smooth, xy, width) > RING_SHARE * height
     bell = alone.copy()
-    bell[alone] = bell_shaped(crop, xy, width, height, prepared.noise_dn, prepared.clip_dn, alone)
-    patches = np.concatenate([patches, xy[~bell]])[: settings.max_glints]
     corner = np.array([x0, y0])
+    bell[alone] = bell_shaped(linear, xy + corner, width, height, prepared.noise_dn, prepared.clip_dn, alone)
+    patches = np.concatenate([patches, xy[~bell]])[: settings.max_glints]
     clutter = alone & ~bell
     return Spots(
         xy[bell] + corner, width[bell], height[bell], patches + corner,
@@ -89,32 +94,37 @@ def detect_spots(
     )  # fmt: skip
 
 
+def _sampled(smooth: Image, xy: Array, x: Array, y: Array) -> NDArray[np.float32]:
+    """(n, k) levels of the pixels nearest to the offsets (x, y), (n, k) each, from the peaks xy (n, 2)."""
+    height, width = smooth.shape
+    column = np.rint(np.minimum(np.maximum(xy[:, :1] + x, 0.0), width - 1.0)).astype(np.intp)
+    row = np.rint(np.minimum(np.maximum(xy[:, 1:] + y, 0.0), height - 1.0)).astype(np.intp)
+    return np.asarray(np.take(smooth, row * width + column), dtype=np.float32)
+
+
 def _above_ring(smooth: Image, xy: Array, width: Array) -> Array:
     """(n,) how far each peak stands above the brightest tenth of a ring about it, the other spots left out.
 
     Skin, lashes and the gaps between them have many peaks, and beside each others as bright.
     """
-    spots, disc = np.zeros(smooth.shape, np.uint8), 2.5 * width + 1.0
-    for (x, y), radius in zip(xy.astype(int).tolist(), disc.tolist(), strict=True):
-        n = math.floor(radius)
-        step = np.arange(-n, n + 1)
-        inside = step[None, :] ** 2 + step[:, None] ** 2 <= radius**2
-        y0, x0 = max(0, y - n), max(0, x - n)
-        part = spots[y0 : y + n + 1, x0 : x + n + 1]
-        part += inside[y0 - y + n :, x0 - x + n :][: part.shape[0], : part.shape[1]]
-    reach = 3.5 * width + 2.0
-    column, row, away2, within = about(xy, reach, smooth.shape)
-    ring = within & (away2 > ((2.2 * width + 1.0) ** 2)[:, None]) & (away2 < (reach**2)[:, None])
-    free = ring & (spots[row, column] <= (away2 <= (disc**2)[:, None]))  # no spot's but its own
-    level = np.sort(np.where(free, smooth[row, column], np.float32(np.inf)), axis=1)
+    inner, outer, disc = 2.2 * width + 1.0, 3.5 * width + 2.0, 2.5 * width + 1.0
+    radius = inner[:, None] + (outer - inner)[:, None] * _RING_STEPS
+    x, y = radius * _RING_COS, radius * _RING_SIN
+    at_x, at_y = xy[:, :1] + x, xy[:, 1:] + y
+    free = (at_x > -0.5) & (at_y > -0.5) & (at_x < smooth.shape[1] - 0.5) & (at_y < smooth.shape[0] - 0.5)
+    ring = free.sum(axis=1)
+    apart2 = ((xy[:, None] - xy) ** 2).sum(axis=-1)
+    to, by = np.nonzero((apart2 < (outer[:, None] + disc) ** 2) & (apart2 > 0.0))
+    if to.size:
+        clear = (at_x[to] - xy[by, :1]) ** 2 + (at_y[to] - xy[by, 1:]) ** 2 > (disc[by] ** 2)[:, None]
+        first = np.flatnonzero(np.diff(to, prepend=-1))
+        free[to[first]] &= np.logical_and.reduceat(clear, first, axis=0)
     count = free.sum(axis=1)
-    told = np.nonzero(count > 0.25 * ring.sum(axis=1))[0]
-    at = 0.9 * (count[told] - 1)
-    low = np.floor(at).astype(np.intp)
-    lower, upper = level[told, low].astype(np.float64), level[told, np.ceil(at).astype(np.intp)].astype(np.float64)
+    level = np.sort(np.where(free, _sampled(smooth, xy, x, y), np.float32(np.inf)), axis=1)
+    told = np.flatnonzero(count > 0.25 * ring)
     out = np.full(width.size, np.inf)
-    peak = smooth[xy[told, 1].astype(np.intp), xy[told, 0].astype(np.intp)]
-    out[told] = peak - (lower + (at - low) * (upper - lower))
+    brightest = level[told, np.rint(0.9 * (count[told] - 1)).astype(np.intp)]
+    out[told] = smooth[xy[told, 1].astype(np.intp), xy[told, 0].astype(np.intp)] - brightest
     return out
 
 
@@ -133,21 +143,33 @@ def _compact(smooth: Image, xy: Array, width: Array, height: Array) -> NDArray[n
 
     Strips of sclera and corners between lid and iris do not; a glint beside another one, or on an edge, does.
     """
-    angle = np.arange(12) * (np.pi / 6.0)
     reach = (2.5 * width + 1.5)[:, None]
-    x = np.clip(np.rint(xy[:, :1] + reach * np.cos(angle)).astype(np.intp), 0, smooth.shape[1] - 1)
-    y = np.clip(np.rint(xy[:, 1:] + reach * np.sin(angle)).astype(np.intp), 0, smooth.shape[0] - 1)
-    top = smooth[xy[:, 1].astype(np.intp), xy[:, 0].astype(np.intp)]
-    fallen = top[:, None] - smooth[y, x] > 0.33 * height[:, None]
+    top = np.take(smooth, (xy[:, 1] * smooth.shape[1] + xy[:, 0]).astype(np.intp))
+    fallen = top[:, None] - _sampled(smooth, xy, reach * _COS, reach * _SIN) > 0.33 * height[:, None]
     return np.asarray(fallen.sum(axis=1) >= 9)
 
 
-def _parted(smooth: Image, first: Array, second: Array, dip: float) -> bool:
-    """Whether the level between two maxima falls `dip` below the lower one."""
-    t = np.linspace(0.0, 1.0, max(3, round(2.0 * math.dist(first, second))))[:, None]
-    x, y = np.rint(first + t * (second - first)).astype(np.intp).T
-    between = smooth[y, x]
-    return float(between.min()) < float(min(between[0], between[-1])) - dip
+def _parted(smooth: Image, xy: Array, size: int, dip: float) -> list[int]:
+    """The maxima, of those xy (n, 2) in their order, between which and all before them the level falls `dip` below the
+    lower one; farther apart than `size` they are two anyway.
+
+    Flat tops of clipped spots give several maxima, and so does noise on wide ones.
+    """
+    gap = xy[:, None] - xy
+    one, other = np.nonzero(np.tril((gap**2).sum(axis=-1) <= size**2, -1))
+    rival: dict[int, list[int]] = {}
+    if one.size:
+        t = np.linspace(0.0, 1.0, 2 * size)
+        way = xy[other] - xy[one]
+        between = _sampled(smooth, xy[one], way[:, :1] * t, way[:, 1:] * t)
+        same = between.min(axis=1) >= np.minimum(between[:, 0], between[:, -1]) - dip
+        for i, k in zip(one[same].tolist(), other[same].tolist(), strict=True):
+            rival.setdefault(i, []).append(k)
+    kept: dict[int, None] = {}
+    for i in range(xy.shape[0]):
+        if not any(k in kept for k in rival.get(i, ())):
+            kept[i] = None
+    return list(kept)
 
 
 def _no_spots() -> Spots:
@@ -155,19 +177,44 @@ def _no_spots() -> Spots:
     return Spots(*none, np.zeros((0, 2)), none)
 
 
-def _opening(smooth: Image, size: int) -> Image:
-    """A square opening, because OpenCV runs it as two passes along rows and columns."""
-    return as_image(cv2.morphologyEx(smooth, cv2.MORPH_OPEN, np.ones((size, size), np.uint8)))
+def _opening(half: Image, size: int) -> Image:
+    """A square opening of `size` px of an image at half resolution: the level about spots, for which blocks of 2 x 2
+    pixels do."""
+    side = 2 * (size // 4) + 1
+    return as_image(cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)))
 
 
-def _widths(hat: Image, xy: Array, height: Array, size: int) -> Array:
+def _maxima(
+    smooth: Image, half: Image, opened: Image, threshold: float
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """(flat indices (n,) of the pixels that no neighbour surpasses and that stand more than the threshold above the
+    opened level; how far they do (n,))."""
+    blocks = np.flatnonzero(half - opened > LEAST_OF_BLOCK * threshold)
+    width, columns = smooth.shape[1], half.shape[1]
+    row, column = np.divmod(blocks, columns)
+    first = 2 * (row * width + column)
+    level = np.take(opened, blocks)
+    flat, height = np.empty((4, blocks.size), dtype=np.intp), np.empty((4, blocks.size), np.float32)
+    top = cv2.dilate(smooth, np.ones((3, 3), np.uint8))
+    for i, shift in enumerate((0, 1, width, width + 1)):
+        np.add(first, shift, out=flat[i])
+        height[i] = np.take(smooth, flat[i])
+    high = (height - level > threshold) & (height >= np.take(top, flat))
+    return flat[high], (height - level)[high]
+
+
+def _widths(smooth: Image, opened: Image, xy: Array, height: Array, size: int) -> Array:
     """sigma = sqrt(area above half height / (2 pi ln 2)), counted in a window of the opening's size."""
-    half = size // 2
-    out = np.empty(height.size)
-    for i, (x, y) in enumerate(xy.astype(int).tolist()):
-        window = hat[max(0, y - half) : y + half + 1, max(0, x - half) : x + half + 1]
-        area = np.count_nonzero(window > 0.5 * float(height[i]))
-        out[i] = math.sqrt(max(int(area), 1) / (2.0 * math.pi * math.log(2.0)))
+    step, (rows, columns) = np.arange(-(size // 2), size // 2 + 1), smooth.shape
+    x, y = xy.astype(np.intp).T[:, :, None] + step
+    column, row = np.minimum(np.maximum(x, 0), columns - 1), np.minimum(np.maximum(y, 0), rows - 1)
+    inside = (column == x)[:, None, :] & (row == y)[:, :, None]
+    flat = (row * smooth.shape[1])[:, :, None] + column[:, None, :]
+    flat_half = ((row >> 1) * opened.shape[1])[:, :, None] + (column >> 1)[:, None, :]
+    hat = np.take(smooth, flat) - np.take(opened, flat_half)
+    high = hat > (0.5 * height).astype(np.float32)[:, None, None]
+    area = (high & inside).reshape(height.size, -1).sum(axis=1)
+    out = np.sqrt(np.maximum(area, 1) / (2.0 * math.pi * math.log(2.0)))
     sharp: Array = np.sqrt(np.maximum(out**2 - SMOOTH_PX**2, 0.3))
     return np.clip(sharp, 0.5, MAX_SIGMA_PX)
 
@@ -178,54 +225,74 @@ def judge_spots(
     """(accepted, rejected), brightest first."""
     accepted: list[GlintResult] = []
     rejected: list[GlintResult] = []
-    for i in np.argsort(-fit.amplitude_dn, kind="stable"):
-        reason = _objection(spots, fit, int(i), prepared, step_dn, blur_px)
-        spread = np.sqrt(fit.sigma_px[i].prod())
+    looks = _Look.of_all(spots, fit)
+    for i in np.argsort(-fit.amplitude_dn, kind="stable").tolist():
+        look = looks[i]
+        reason = _objection(look, fit, i, prepared, step_dn, blur_px)
         result = GlintResult(
             status="ok" if reason is None else "rejected",
             reason=reason,
-            xy_px=frozen(fit.xy_px[i]) if fit.converged[i] else frozen(spots.xy_px[i]),
-            covariance=frozen(fit.covariance[i]) if fit.converged[i] else None,
-            amplitude=float(fit.amplitude_dn[i] / DN),
-            sigma_px=float(spread),
+            xy_px=frozen(fit.xy_px[i]) if look.converged else frozen(spots.xy_px[i]),
+            covariance=frozen(fit.covariance[i]) if look.converged else None,
+            amplitude=look.height / DN,
+            sigma_px=math.sqrt(look.wide * look.narrow),
             saturated=bool(fit.clipped[i] > 0),
         )
         (accepted if reason is None else rejected).append(result)
     reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
     surplus = [replace(glint, status="rejected", reason=reason) for glint in accepted[settings.max_glints :]]
     strip = "a strip or a broad patch, as reflections off the sclera and wet lid margins are"
+    places = np.array([glint.xy_px for glint in accepted]).reshape(-1, 2)
+    far = (((spots.patches_px[:, None] - places) ** 2).sum(axis=-1) > 4.0**2).all(axis=1)
     patches = [
-        GlintResult("rejected", strip, frozen(xy), None, 0.0, 0.0, saturated=False)
-        for xy in spots.patches_px
-        if all(glint.xy_px is None or math.dist(xy, glint.xy_px) > 4.0 for glint in accepted)
+        GlintResult("rejected", strip, frozen(xy), None, 0.0, 0.0, saturated=False) for xy in spots.patches_px[far]
     ]
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
 
 
-def _objection(spots: Spots, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float) -> str | None:
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """A fitted spot's looks: sigma across and along, height and residual in DN, distance from the bright pixel, and the
+    deviations of its bright patch across and along."""
+
+    converged: bool
+    narrow: float
+    wide: float
+    height: float
+    residual: float
+    moved: float
+    short: float
+    long: float
+
+    @staticmethod
+    def of_all(spots: Spots, fit: SpotFit) -> list[_Look]:
+        gap = fit.xy_px - spots.xy_px
+        columns = (
+            fit.converged, fit.sigma_px.min(axis=1), fit.sigma_px.max(axis=1), fit.amplitude_dn, fit.residual_dn,
+            np.sqrt((gap * gap).sum(axis=1)), *np.sqrt(np.linalg.eigvalsh(fit.moments_px2) + _PIXEL).T,
+        )  # fmt: skip
+        return [_Look(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+
+
+def _objection(look: _Look, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float) -> str | None:
     """Why spot i is no glint, or None."""
-    if not fit.converged[i]:
+    if not look.converged:
         return "the spot's fit did not converge"
-    wide = float(fit.sigma_px[i].max())
-    moved = float(np.hypot(*(fit.xy_px[i] - spots.xy_px[i])))
-    if moved > max(2.5, 2.0 * wide):
-        return f"no spot: the fit moved {moved:.1f} px from the bright pixel"
-    if wide < 0.5 * optics_sigma(blur_px):
-        return f"sharper than the optics (sigma {wide:.1f} px): a bad pixel"
-    moments = patch_moments(prepared.linear, fit, i)
-    if moments is not None:
-        # A pixel's own 1/12 keeps a spot of one row of pixels from being a line.
-        short, long = np.sqrt(np.linalg.eigvalsh(moments) + 1.0 / 12.0).tolist()
-        wide = max(wide, long)
-        if long > 2.0 * short:
-            return f"elongated {long / short:.1f} : 1, as reflections off the sclera and wet lid margins are"
+    if look.moved > max(2.5, 2.0 * look.wide):
+        return f"no spot: the fit moved {look.moved:.1f} px from the bright pixel"
+    if look.wide < 0.5 * optics_sigma(blur_px):
+        return f"sharper than the optics (sigma {look.wide:.1f} px): a bad pixel"
+    ratio, fitted = look.long / look.short, math.sqrt((look.wide**2 + _PIXEL) / (look.narrow**2 + _PIXEL))
+    if ratio > LONG or ratio * fitted > LONG_TWICE:
+        return f"elongated {max(ratio, fitted):.1f} : 1, as reflections off the sclera and wet lid margins are"
+    wide = max(look.wide, look.long)
     if wide > widest(blur_px):
         return f"too wide for a glint: sigma {wide:.1f} px"
-    if fit.amplitude_dn[i] < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
+    if look.height < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
         return "too faint for a glint"
     if wide > 2.5 and not _outshines(fit, i, prepared):
         return "no brighter than what lies beside it, as a corner of sclera between lid and iris is"
-    if fit.residual_dn[i] > max(0.3 * min(fit.amplitude_dn[i], DN), 3.0 * prepared.noise_dn):
+    if look.residual > max(0.3 * min(look.height, DN), 3.0 * prepared.noise_dn):
         return "no spot: the bright patch is not bell-shaped"
     return None
 
@@ -241,11 +308,13 @@ def _outshines(fit: SpotFit, i: int, prepared: Prepared) -> bool:
     linear = prepared.linear
     x0, x1 = max(0, math.floor(x - reach)), min(linear.shape[1], math.ceil(x + reach) + 1)
     y0, y1 = max(0, math.floor(y - reach)), min(linear.shape[0], math.ceil(y + reach) + 1)
-    columns, rows = np.arange(x0, x1)[None, :], np.arange(y0, y1)[:, None]
-    ring = np.hypot(columns - x, rows - y) > 2.2 * wide
-    for k in range(fit.amplitude_dn.size):
-        if k != i and fit.converged[k]:
-            ring &= np.hypot(columns - fit.xy_px[k, 0], rows - fit.xy_px[k, 1]) > 3.0 * float(fit.sigma_px[k].max())
+    columns, rows = np.arange(x0, x1), np.arange(y0, y1)[:, None]
+    ring = (columns - x) ** 2 + (rows - y) ** 2 > (2.2 * wide) ** 2
+    disc = 3.0 * fit.sigma_px.max(axis=1)
+    apart2 = ((fit.xy_px - fit.xy_px[i]) ** 2).sum(axis=1)
+    near = fit.converged & (apart2 < (1.5 * reach + disc + 1.0) ** 2) & (np.arange(disc.size) != i)
+    for k in np.flatnonzero(near):
+        ring &= (columns - fit.xy_px[k, 0]) ** 2 + (rows - fit.xy_px[k, 1]) ** 2 > disc[k] ** 2
     beside = linear[y0:y1, x0:x1][ring]
     if beside.size < 8:
         return True

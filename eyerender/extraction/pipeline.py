@@ -23,6 +23,7 @@ from .settings import ExtractionSettings
 from .spotfit import fit_spots
 from .spotmask import covered, told, without_light
 from .spotmend import give_edges, split_blends
+from .spotmodel import Limits
 from .spotpixels import window_radius
 from .verdict import pupil_of
 
@@ -127,7 +128,7 @@ def _fitted_again(
     """The spots on the rim fitted before the refined rim, where that explains them as well."""
     linear, _ = without_light(prepared, fit, fit.converged & ~on_rim, model.ellipse)
     starts = (spots.xy_px[on_rim], spots.width_px[on_rim], spots.height_dn[on_rim])
-    again = fit_spots(linear, _background(work, model), *starts, *_limits(prepared, model))
+    again = fit_spots(linear, _background(work, model), *starts, _limits(prepared, model)).fit
     good = again.converged & (again.residual_dn < 1.05 * fit.residual_dn[on_rim])
     index = np.arange(fit.converged.size)
     index[np.nonzero(on_rim)[0][good]] = fit.converged.size + np.nonzero(good)[0]
@@ -156,8 +157,8 @@ def _fit_spots(prepared: Prepared, work: Prepared, spots: Spots, model: RimModel
     known, limits = _background(work, model), _limits(prepared, model)
     starts = (spots.xy_px, spots.width_px, spots.height_dn)
     broad = widest(model.sigma_px)
-    fit = fit_spots(prepared.linear, known, *starts, *limits)
-    fit = give_edges(prepared.linear, known, starts, fit, model.sigma_px, broad, limits)
+    fitted = fit_spots(prepared.linear, known, *starts, limits)
+    fit = give_edges(fitted, model.sigma_px, broad, limits)
     starts, fit = split_blends(prepared.linear, known, starts, fit, broad, limits)
     return Spots(*starts, spots.patches_px, spots.clutter), fit
 
@@ -167,6 +168,5 @@ def _background(work: Prepared, model: RimModel) -> Callable[[Array, Array], Arr
     return (lambda x, y: -model.level(x, y)) if work.inverted else model.level
 
 
-def _limits(prepared: Prepared, model: RimModel) -> tuple[float, float, float]:
-    """Noise, clip level and background slope of `fit_spots`."""
-    return prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * abs(model.step_dn))
+def _limits(prepared: Prepared, model: RimModel) -> Limits:
+    return Limits(prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * abs(model.step_dn)))

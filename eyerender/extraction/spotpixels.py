@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +17,9 @@ from .preprocess import Image
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.intp]
+_T = TypeVar("_T", bound=np.generic)
 
-_ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
+_ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)
 LARGEST_PX = 20  # radius of a window at most
 
 
@@ -29,53 +32,84 @@ def window_radius(width: Array) -> Array:
 class SpotPixels:
     """Windows of n spots: P pixels, one spot's after the other's.
 
-    centre (n, 2): a window's middle pixel, px. radius (n,) px. count (n,): of its pixels. middle_dn (n,): B there.
-    dx, dy (P,): from the middle. data, known (P,): image and B. clip (P,): whether the sensor clipped the pixel.
+    centre (n, 2): a window's middle pixel, px. radius (n,) px. first (n + 1,): where each spot's pixels begin, and the
+    end. spot (P,): whose pixel each is. middle_dn (n,): B in the middle. plane (3, P): 1 and the place from there.
+    data, known (P,): image and B. clip (P,): whether the sensor clipped the pixel; clipped: whether it did any.
     """
 
     centre: Array
     radius: Array
-    count: Index
+    first: Index
+    spot: Index
     middle_dn: Array
-    dx: Array
-    dy: Array
+    plane: Array
     data: Array
     known: Array
     clip: Mask
+    clipped: bool
 
     @property
-    def spot(self) -> Index:
-        """(P,) whose pixel each is."""
-        return np.repeat(np.arange(self.count.size), self.count)
+    def count(self) -> Array:
+        """(n,) of every spot's pixels."""
+        return np.asarray(self.first[1:] - self.first[:-1], dtype=np.float64)
 
     @property
-    def first(self) -> Index:
-        """(n + 1,) where each spot's pixels begin, and the end."""
-        return np.concatenate([[0], np.cumsum(self.count)])
+    def dx(self) -> Array:
+        """(P,) from the window's middle."""
+        return np.asarray(self.plane[1], dtype=np.float64)
+
+    @property
+    def dy(self) -> Array:
+        """(P,) from the window's middle."""
+        return np.asarray(self.plane[2], dtype=np.float64)
+
+    def parts(self, values: NDArray[_T]) -> list[NDArray[_T]]:
+        """Every spot's own of values (..., P)."""
+        ends = self.first.tolist()
+        return [values[..., begin:end] for begin, end in pairwise(ends)]
 
     def rows(self, spots: Index) -> Index:
         """Which of the pixels are those spots', in the spots' order."""
-        return _ranges(self.first[spots], self.count[spots])
+        return _ranges(self.first[spots], self.first[spots + 1] - self.first[spots])
 
     def taken(self, spots: Index) -> SpotPixels:
         """The chosen spots'."""
-        if spots.size == self.count.size and bool((spots == np.arange(spots.size)).all()):
+        if spots.size == self.radius.size and bool((spots == np.arange(spots.size)).all()):
             return self
-        rows = self.rows(spots)
+        count = self.first[spots + 1] - self.first[spots]
+        rows, clip = _ranges(self.first[spots], count), self.clip
+        if self.clipped:
+            clip = clip[rows]
         return SpotPixels(
-            self.centre[spots], self.radius[spots], self.count[spots], self.middle_dn[spots],
-            self.dx[rows], self.dy[rows], self.data[rows], self.known[rows], self.clip[rows],
+            self.centre[spots], self.radius[spots], _starts(count), np.arange(spots.size).repeat(count),
+            self.middle_dn[spots], self.plane[:, rows], self.data[rows], self.known[rows], clip[: rows.size],
+            self.clipped and bool(clip.any()),
         )  # fmt: skip
 
     def total(self, values: NDArray[np.generic]) -> Array:
         """(n,) sum of a value (P,) over every spot's pixels."""
-        return np.asarray(np.bincount(self.spot, weights=values, minlength=self.count.size), dtype=np.float64)
+        return np.asarray(np.bincount(self.spot, weights=values, minlength=self.radius.size), dtype=np.float64)
+
+    def most(self, values: Array) -> Array:
+        """(n,) largest value (P,), none below 0, in every spot's pixels."""
+        out = np.zeros(self.radius.size)
+        some = self.first[:-1] < self.first[1:]
+        if values.size:
+            out[some] = np.maximum.reduceat(values, self.first[:-1][some])
+        return np.maximum(out, 0.0)
+
+
+def _starts(count: Index) -> Index:
+    """0, count[0], count[0] + count[1], ..., their sum."""
+    out = np.zeros(count.size + 1, dtype=np.intp)
+    np.cumsum(count, out=out[1:])
+    return out
 
 
 def _ranges(first: Index, count: Index) -> Index:
     """first[0], first[0] + 1, ... (count[0] of them), first[1], ..."""
-    start = np.concatenate([[0], np.cumsum(count)[:-1]]) if count.size else count
-    return np.asarray(np.arange(int(count.sum())) + np.repeat(first - start, count), dtype=np.intp)
+    start = _starts(count)
+    return np.asarray(np.arange(start[-1]) + np.repeat(first - start[:-1], count), dtype=np.intp)
 
 
 def cut(
@@ -85,77 +119,118 @@ def cut(
 
     start (n, 2), width (n,): where the spots are and their sigma. known: B at pixels (x, y).
     """
-    height, columns = linear.shape
+    rows, columns = linear.shape
     centre, radius = np.rint(start), np.minimum(window_radius(width), LARGEST_PX)
     half = math.ceil(float(radius.max()) + 0.5)
     step = np.arange(-half, half + 1.0)
-    x, y = centre[:, :1] + step, centre[:, 1:] + step
-    away2 = ((x - start[:, :1]) ** 2)[:, None, :] + ((y - start[:, 1:]) ** 2)[:, :, None]
-    inside = away2 <= (radius**2)[:, None, None]
-    inside &= ((x >= 0) & (x < columns))[:, None, :] & ((y >= 0) & (y < height))[:, :, None]
+    off = (centre - start)[:, :, None] + step
+    off *= off
+    inside = off[:, 1, :, None] + off[:, 0, None, :] <= (radius**2)[:, None, None]
+    low, high = centre.min(axis=0) - half, centre.max(axis=0) + half
+    if min(low) < 0.0 or high[0] >= columns or high[1] >= rows:
+        x, y = centre[:, :1] + step, centre[:, 1:] + step
+        inside &= ((x >= 0) & (x < columns))[:, None, :] & ((y >= 0) & (y < rows))[:, :, None]
     spot, row, column = np.nonzero(inside)
     dx, dy = step[column], step[row]
     at_x, at_y = centre[spot, 0] + dx, centre[spot, 1] + dy
-    data = linear[at_y.astype(np.intp), at_x.astype(np.intp)].astype(np.float64)
+    data = np.take(linear, (at_y * columns + at_x).astype(np.intp)).astype(np.float64)
     level = known(np.concatenate([at_x, centre[:, 0]]), np.concatenate([at_y, centre[:, 1]]))
-    count = np.bincount(spot, minlength=width.size)
-    return SpotPixels(centre, radius, count, level[data.size :], dx, dy, data, level[: data.size], data >= clip_dn)
+    first, clip = _starts(np.bincount(spot, minlength=width.size)), data >= clip_dn
+    plane = np.stack([np.ones_like(dx), dx, dy])
+    return SpotPixels(
+        centre, radius, first, spot, level[data.size :], plane, data, level[: data.size], clip, bool(clip.any())
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
     """Where the columns and rows of n windows begin and end, so that a spot's profile is worked out once for each.
 
-    edges (E,): from the windows' middles, one window's after the other's. owner (E,): whose. column, row (P,): the edge
-    before each pixel.
+    edges (2 E,): from the windows' middles, the columns' of one window after the other's, then the rows'. owner (2 E,):
+    whose, the rows' owners counted on from n. column, row (P,): the edge before each pixel. split: E.
     """
 
     edges: Array
     owner: Index
     column: Index
     row: Index
+    split: int
 
     @staticmethod
-    def of(pixels: SpotPixels) -> Grid:
-        half = np.ceil(pixels.radius + 0.5).astype(np.intp)
-        size = 2 * half + 2
-        first = np.cumsum(size) - size
-        owner = np.repeat(np.arange(size.size), size)
-        edges = np.asarray(np.arange(owner.size) - np.repeat(first + half, size) - 0.5, dtype=np.float64)
-        middle = np.repeat(first + half, pixels.count)
-        return Grid(edges, owner, middle + pixels.dx.astype(np.intp), middle + pixels.dy.astype(np.intp))
+    def of(radius: Array, spot: Index, dx: Array, dy: Array) -> Grid:
+        """The windows' radius (n,); and of every pixel (P,) whose it is and its offset from the window's middle."""
+        n, half = radius.size, np.ceil(radius + 0.5).astype(np.intp)
+        size = np.tile(2 * half + 2, 2)
+        middle = np.cumsum(size) - size + np.tile(half, 2)
+        owner = np.repeat(np.arange(2 * n), size)
+        edges = np.asarray(np.arange(owner.size) - middle[owner] - 0.5, dtype=np.float64)
+        column, row = middle[spot] + dx.astype(np.intp), middle[n + spot] + dy.astype(np.intp)
+        return Grid(edges, owner, column, row, owner.size // 2)
+
+    def profiles(self, at: Array, sigma: Array, amplitude: Array) -> tuple[Array, Array]:
+        """((3, P), (3, P)): the spots' profiles across the pixels' columns, times the amplitude, and along their rows.
+
+        Of each the derivative by its centre, the value, the derivative by ln sigma. at (n, 2): the spots' centres from
+        the windows' middles, sigma (n, 2), amplitude (n,).
+        """
+        owner = self.owner
+        parts = profile(self.edges, at.T.ravel()[owner], sigma.T.ravel()[owner])
+        # Along the rows the profiles stay as they are.
+        across = parts[:, : self.split] * amplitude[owner[: self.split]]
+        return across.take(self.column, axis=1), parts.take(self.row, axis=1)
 
 
-def profile(edges: Array, centre: Array | float, sigma: Array | float) -> tuple[Array, Array, Array]:
-    """Mean of exp(-(x - c)^2 / (2 s^2)) between every edge and the next, 1 px on, and its derivatives by c and ln s.
+def profile(edges: Array, centre: Array | float, sigma: Array) -> Array:
+    """(3, E - 1): of the mean of exp(-(x - c)^2 / (2 s^2)) between every edge and the next, 1 px on, the derivative by
+    c, the value, the derivative by ln s.
 
-    (E - 1,) each. Where an edge is the last of a window, the next is another's and the value without meaning.
+    Where an edge is the last of a window, the next is another's and the value without meaning.
     """
     u = (edges - centre) / sigma
     tail = np.exp(-0.5 * u * u)
-    scale = sigma[:-1] if isinstance(sigma, np.ndarray) else sigma
-    value = scale * _ROOT_HALF_PI * np.diff(erf(u * math.sqrt(0.5)))
-    return value, -np.diff(tail), value - scale * np.diff(u * tail)
+    sums = erf(u * _ROOT_HALF)
+    scale = sigma[:-1]
+    out = np.empty((3, edges.size - 1))
+    np.subtract(tail[:-1], tail[1:], out=out[0])
+    np.subtract(sums[1:], sums[:-1], out=out[1])
+    out[1] *= scale * _ROOT_HALF_PI
+    tail *= u
+    np.subtract(tail[:-1], tail[1:], out=out[2])
+    out[2] *= scale
+    out[2] += out[1]
+    return out
 
 
-def light_between(pixels: SpotPixels, theta: Array, pairs: Mask, noise_dn: float) -> Array:
-    """(P,) the light of other spots in every spot's pixels.
+@dataclass(frozen=True, slots=True, eq=False)
+class Others:
+    """Pairs of spots of which one's light reaches into the other's window: `by` (m,) shines; rows (Q,): the pixels
+    into which, pair after pair, pair (Q,) whose each is; grid: of the pairs' windows, centre (m, 2) their middles."""
 
-    theta (n, 5 or more): x, y, ln A, ln sx, ln sy. pairs (n, n): whether the second may shine into the first's window;
-    where its light is far below the noise there, it is not worked out.
-    """
-    out = np.zeros(pixels.data.size)
-    to, by = np.nonzero(pairs)
-    gap = np.hypot(*(pixels.centre[to] - theta[by, :2]).T) - pixels.radius[to] - 1.0
-    wide2 = np.exp(2.0 * theta[by, 3:5].max(axis=1)) + 1.0 / 12.0
-    shines = theta[by, 2] - 0.5 * np.maximum(gap, 0.0) ** 2 / wide2 > math.log(1e-4 * noise_dn)
-    to, by = to[shines], by[shines]
-    if to.size == 0:
-        return out
-    part = pixels.taken(to)
-    grid = Grid.of(part)
-    at = (theta[by, :2] - part.centre)[grid.owner]
-    gx = profile(grid.edges, at[:, 0], np.exp(theta[by, 3])[grid.owner])[0]
-    gy = profile(grid.edges, at[:, 1], np.exp(theta[by, 4])[grid.owner])[0]
-    light = np.exp(theta[by, 2])[part.spot] * gx[grid.column] * gy[grid.row]
-    return np.asarray(np.bincount(pixels.rows(to), weights=light, minlength=out.size), dtype=np.float64)
+    by: Index
+    rows: Index
+    pair: Index
+    grid: Grid
+    centre: Array
+
+    @staticmethod
+    def of(pixels: SpotPixels, theta: Array, pairs: Mask, noise_dn: float) -> Others | None:
+        """theta (n, 5 or more): x, y, ln A, ln sx, ln sy. pairs (n, n): whether the second may shine into the first's
+        window. None where no light is more than far below the noise there."""
+        to, by = np.nonzero(pairs)
+        gap = np.hypot(*(pixels.centre[to] - theta[by, :2]).T) - pixels.radius[to] - 2.0
+        wide2 = np.exp(2.0 * theta[by, 3:5].max(axis=1)) * 1.5 + 0.1  # room for what the fit may make of it
+        shines = theta[by, 2] - 0.5 * np.maximum(gap, 0.0) ** 2 / wide2 > math.log(1e-3 * noise_dn)
+        to, by = to[shines], by[shines]
+        if to.size == 0:
+            return None
+        count = pixels.first[to + 1] - pixels.first[to]
+        rows, pair = _ranges(pixels.first[to], count), np.arange(to.size).repeat(count)
+        grid = Grid.of(pixels.radius[to], pair, pixels.dx[rows], pixels.dy[rows])
+        return Others(by, rows, pair, grid, pixels.centre[to])
+
+    def light(self, theta: Array, pixels: int, shining: Mask | None = None) -> Array:
+        """(pixels,) the light of other spots, all or those `shining` (n,), in every spot's pixels."""
+        own = theta[self.by]
+        amplitude = np.exp(own[:, 2]) if shining is None else np.exp(own[:, 2]) * shining[self.by]
+        across, along = self.grid.profiles(own[:, :2] - self.centre, np.exp(own[:, 3:5]), amplitude)
+        return np.asarray(np.bincount(self.rows, weights=across[1] * along[1], minlength=pixels), dtype=np.float64)

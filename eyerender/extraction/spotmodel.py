@@ -1,0 +1,205 @@
+"""The model of a bright spot in its window, and steps of Levenberg-Marquardt on many spots side by side.
+
+Model in pixel (x, y): B(x, y) + b0 + bx (x - xc) + by (y - yc) + A Gx(x) Gy(y), with Gx the mean over the pixel of
+exp(-(x - x0)^2 / (2 sx^2)). B is the image expected without spots (pupil, iris, the blurred edge between them). Beside
+an edge of its own a spot has h Phi(((x - xc) cos p + (y - yc) sin p - o) / blur) as well. A pixel at the clip level
+only says that the intensity is at least its own; it counts only where the model is below.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from .spotpixels import Grid, Others, SpotPixels
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; and of an edge h, p, o
+LOST_PX = 12.0  # no glint's fit is as wide as that, or as far from where it began
+ROUND_SD = 0.3  # standard deviation of ln sx - ln sy: glints are nearly round
+STEPS = 8
+# What the last step needed gains, in squared noises: it is that step's square in standard deviations. The second number
+# is for spots in the light of others, of which their gain does not tell.
+SMALL_GAIN = (5e-2, 5e-3)
+ROUGH, ROUGH_SHARE = 3.0, 0.05
+STALLED = 0.97  # of the squared misfit, left by a step: no further one for a spot without hope
+SAME_LIGHT = 0.01  # change of the others' light, in noises, that asks for no further step
+
+_FREE = np.inf
+_LEAST = np.array([-_FREE, -_FREE, -5.0, math.log(0.2), math.log(0.2), *[-_FREE] * 6])
+_MOST = np.array([_FREE, _FREE, 15.0, math.log(30.0), math.log(30.0), *[_FREE] * 6])
+_STRIDE = np.array([1.5, 1.5, 0.7, 0.7, 0.7, _FREE, _FREE, _FREE, _FREE, 0.5, 1.5])  # largest step
+_DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Limits:
+    """noise_dn, clip_dn; slope_dn: how steep the background may be beyond B, DN per px (standard deviation of its
+    prior)."""
+
+    noise_dn: float
+    clip_dn: float
+    slope_dn: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Descent:
+    """Where a descent ended: theta (n, K); gram (n, K + 1, K + 1), as `_gram` has it, priors included; used (n,)
+    pixels that count; settled (n,); moved (n,) px and falling (n,), whether the squared misfit has halved, in the last
+    half of the steps."""
+
+    theta: Array
+    gram: Array
+    used: Array
+    settled: Mask
+    moved: Array
+    falling: Mask
+
+
+def lost(theta: Array, start: Array) -> Mask:
+    """(n,) which spots have grown or moved beyond what a glint's fit could."""
+    wide = theta[:, 3:5].max(axis=1) > math.log(LOST_PX)
+    away = theta[:, :2] - start
+    return np.asarray(wide | ((away * away).sum(axis=1) > LOST_PX**2))
+
+
+def hopeful(theta: Array, gram: Array, used: Array, noise: float) -> Mask:
+    """(n,) which spots the fit explains to within ROUGH noises or that share of their height."""
+    misfit = noise * np.sqrt(gram[:, -1, -1] / np.maximum(used, 1.0))
+    return np.asarray(misfit < np.maximum(ROUGH * noise, ROUGH_SHARE * np.exp(theta[:, 2])))
+
+
+def slopes(pixels: SpotPixels, grid: Grid, theta: Array, rest: Array, blur_px: float | None = None) -> Array:
+    """(K + 1, P): the model's derivatives at every pixel and, last, the residual.
+
+    rest (P,): image less all that is not fitted. blur_px: of the edges, where the spots have such."""
+    across, along = grid.profiles(theta[:, :2] - pixels.centre, np.exp(theta[:, 3:5]), np.exp(theta[:, 2]))
+    out = np.empty((theta.shape[1] + 1, rest.size))
+    np.multiply(across[0], along[1], out=out[0])
+    np.multiply(across[1:], along[1], out=out[2:4])
+    np.multiply(across[1], along[::2], out=out[1:5:3])
+    out[5:8] = pixels.plane
+    own = theta[:, 5:].T.take(pixels.spot, axis=1)
+    np.subtract(rest, out[2], out=out[-1])
+    out[-1] -= np.einsum("kp,kp->p", own[:3], pixels.plane)
+    if blur_px is not None:
+        cos, sin = np.cos(own[4]), np.sin(own[4])
+        t = (pixels.dx * cos + pixels.dy * sin - own[5]) / blur_px
+        bell = own[3] * (_DENSITY / blur_px) * np.exp(-0.5 * t * t)
+        out[8] = ndtr(t)
+        np.multiply(bell, pixels.dy * cos - pixels.dx * sin, out=out[9])
+        np.negative(bell, out=out[10])
+        out[-1] -= own[3] * out[8]
+    return out
+
+
+def prior(limits: Limits, edge: bool) -> Array:
+    """(K, K) normal matrix of the priors, about 0: a nearly round spot, a background that is flat to within its slope,
+    an edge of no more than full scale within reach."""
+    out = np.zeros((WITH_EDGE, WITH_EDGE))
+    out[3, 3] = out[4, 4] = 1.0 / ROUND_SD**2
+    out[3, 4] = out[4, 3] = -1.0 / ROUND_SD**2
+    out[6, 6] = out[7, 7] = 1.0 / limits.slope_dn**2
+    out[8, 8], out[10, 10] = 1e-5, 1e-2
+    return out if edge else out[:PARAMETERS, :PARAMETERS]
+
+
+def _gram(pixels: SpotPixels, rows: Array, theta: Array, noise: float, penalty: Array) -> tuple[Array, Array]:
+    """(n, K + 1, K + 1): products of `slopes`, summed over every spot's pixels, in units of the noise, with the priors;
+    and the number of pixels that count (n,): not the clipped ones where the model is brighter."""
+    used = pixels.count
+    if pixels.clipped:
+        idle = pixels.clip & (rows[-1] <= 0.0)
+        rows *= ~idle
+        used = used - pixels.total(idle)
+    k = theta.shape[1]
+    out = np.empty((theta.shape[0], k + 1, k + 1))
+    for product, part in zip(out, pixels.parts(rows), strict=True):
+        np.matmul(part, part.T, out=product)
+    out *= 1.0 / noise**2
+    pull = theta @ penalty
+    out[:, :k, :k] += penalty
+    out[:, :k, k] -= pull
+    pull *= theta
+    out[:, k, k] += pull.sum(axis=1)
+    return out, used
+
+
+def _dimmed(pixels: SpotPixels, rows: Array, gram: Array, light: Array, noise: float) -> None:
+    """Takes more light (P,) of others from the residual, in the products (changed in place)."""
+    k = gram.shape[1] - 1
+    for product, row, part in zip(gram, pixels.parts(rows), pixels.parts(light), strict=True):
+        part = part * row[5]  # none in pixels that do not count
+        taken = row @ part
+        product[:, k] -= taken * (1.0 / noise**2)
+        product[k, k] += (part @ part - taken[k]) * (1.0 / noise**2)
+
+
+def descend(
+    pixels: SpotPixels,
+    theta: Array,
+    rest: Array,
+    others: Others | None,
+    limits: Limits,
+    blur_px: float | None = None,
+    steps: int = STEPS,
+) -> Descent:
+    """At most so many steps on every spot, its window's light of the others following theirs.
+
+    theta (n, K): the start. rest (P,): image less B and less the others' light at the start. others: among these spots.
+    blur_px: of the edges, where the spots have such.
+    """
+    noise, penalty, k = limits.noise_dn, prior(limits, blur_px is not None), theta.shape[1]
+    theta, start, middle, cost = theta.copy(), theta[:, :2], theta[:, :2], np.full(theta.shape[0], np.inf)
+    grid = Grid.of(pixels.radius, pixels.spot, pixels.dx, pixels.dy)
+    rows = slopes(pixels, grid, theta, rest, blur_px)
+    gram, used = _gram(pixels, rows, theta, noise, penalty)
+    damping, over = np.full(theta.shape[0], 1e-2), np.zeros(theta.shape[0], dtype=bool)
+    held = np.zeros(0) if others is None else others.light(theta, rest.size)
+    stalled = over.copy()
+    enough = SMALL_GAIN[0] if others is None else SMALL_GAIN[1]
+    least, most, stride = _LEAST[:k], _MOST[:k], _STRIDE[:k]
+    for turn in range(steps):
+        matrix = gram[:, :k, :k].copy()
+        diagonal = matrix.reshape(-1, k * k)[:, :: k + 1]
+        diagonal *= 1.0 + damping[:, None]
+        diagonal += 1e-9
+        step = np.linalg.solve(matrix, gram[:, :k, k:])[..., 0]
+        gain = (step * gram[:, :k, k]).sum(axis=1)
+        step = np.minimum(np.maximum(step, -stride), stride)
+        trial = np.minimum(np.maximum(theta + step, least), most)
+        over = gain < enough * np.maximum(gram[:, k, k] / np.maximum(used, 1.0), 1.0)
+        if turn >= STEPS // 2:
+            over |= (damping > 1e5) | lost(theta, start)
+            stalled &= ~hopeful(theta, gram, used, noise)
+        if (over | stalled if turn >= STEPS // 2 else over).all():
+            theta = np.where((np.abs(step) < 1.0).all(axis=1)[:, None], trial, theta)
+            break
+        rows = slopes(pixels, grid, trial, rest, blur_px)
+        new, new_used = _gram(pixels, rows, trial, noise, penalty)
+        better = new[:, k, k] <= gram[:, k, k] * (1.0 + 1e-12)
+        stalled = better & (new[:, k, k] > STALLED * gram[:, k, k])
+        if better.all():
+            theta, gram, used = trial, new, new_used
+            damping = np.maximum(0.1 * damping, 1e-7)
+        else:
+            np.copyto(theta, trial, where=better[:, None])
+            np.copyto(gram, new, where=better[:, None, None])
+            np.copyto(used, new_used, where=better)
+            damping = np.where(better, np.maximum(0.1 * damping, 1e-7), 8.0 * damping)
+        if others is not None and turn % 2 == 1:
+            change = others.light(theta, rest.size) - held
+            if not better.all():
+                change *= better[pixels.spot]
+            held, rest = held + change, rest - change
+            _dimmed(pixels, rows, gram, change, noise)
+        if turn + 1 == steps // 2:
+            middle, cost = theta[:, :2].copy(), gram[:, k, k].copy()
+    moved = np.abs(theta[:, :2] - middle).max(axis=1)
+    return Descent(theta, gram, used, over, moved, gram[:, k, k] < 0.5 * cost)
