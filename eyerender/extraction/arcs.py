@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -22,6 +23,7 @@ SECTORS = 48  # of the outline, for support
 PIECES = 16  # arcs are cut at these sectors, so that a lid's margin parts from the rim it joins
 SAMPLES = 240
 POINTS_PER_PIECE = 3
+CUT_POINTS = 40  # of what is left of a rim without a stretch
 FINALISTS = 24  # of the random ellipses, counted with all points
 ALL_AGREE = 0.85  # of the highest support: the root mean square distance is then 0.39 of the tolerance at most
 
@@ -81,67 +83,69 @@ def _without_lid(cuts: _Cuts, rim: RimFit, noise_px: float, within_px: float = n
     then fits 1.4 times better, and within `within_px`, and the edges left out lie inside the new ellipse.
     """
     good = cuts.residual_px < min(rim.residual_px / 1.4, within_px)
-    return cuts.best(good & (cuts.hidden_px < -np.maximum(2.0 * cuts.residual_px, noise_px)))
+    return cuts.best(good, lambda residual: max(2.0 * residual, noise_px))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cuts:
-    """Ellipses through a rim's points without a stretch, (m,) each but centre and axes (m, 2): the stretch's width as a
-    share of the outline, the rest's root mean square distance, and the median signed distance of the points left out
-    (negative inside)."""
+    """Ellipses (m, 5: centre, semi-axes, angle) through a rim's points without a stretch: the stretch's width as
+    a share of the outline, the rest's root mean square distance, and its first point and number of points, all (m,);
+    points (n, 2) of the whole rim, in turn."""
 
-    centre_px: Array
-    semi_axes_px: Array
-    angle_rad: Array
+    fits: Array
     width: Array
     residual_px: Array
-    hidden_px: Array
+    first: NDArray[np.intp]
+    count: NDArray[np.intp]
+    points: Array
 
-    def best(self, which: Mask) -> Ellipse | None:
-        """Of `which`, the one that the rest fits best."""
-        if not which.any():
-            return None
-        i = int(np.argmin(np.where(which, self.residual_px, np.inf)))
-        return Ellipse(self.centre_px[i], self.semi_axes_px[i], float(self.angle_rad[i]))
+    def best(self, which: Mask, depth_px: Callable[[float], float]) -> Ellipse | None:
+        """Of `which`, the one that the rest fits best of those whose stretch lies inside: the median of its points by
+        more than depth_px of the rest's residual."""
+        for i in np.nonzero(which)[0][np.argsort(self.residual_px[which], kind="stable")]:
+            hidden = (self.first[i] + np.arange(self.count[i])) % self.points.shape[0]
+            ellipse = _ellipse(self.fits[i])
+            if median(signed_distance(ellipse, self.points[hidden])) < -depth_px(float(self.residual_px[i])):
+                return ellipse
+        return None
 
 
 def _cuts(edges: EdgePoints, rim: RimFit, least: int, shares: tuple[float, ...], largest: float) -> _Cuts:
     """Every stretch of these widths left out of a rim in turn, if `least` points are left and the ellipse stays alike:
-    its longer axis below `largest` times the rim's."""
+    its longer axis below `largest` times the rim's. The rest is told by CUT_POINTS of its points."""
     points = edges.points_px[rim.inliers]
     cos_t, sin_t = _parameter(rim.ellipse, points)
-    order = np.argsort(np.arctan2(sin_t, cos_t), kind="stable")
-    points = points[order]
-    turn = (np.arctan2(sin_t, cos_t)[order] / (2.0 * np.pi) + 0.5) % 1.0
-    starts, widths = (part.reshape(-1, 1) for part in np.meshgrid(np.arange(24) / 24.0, np.array(shares)))
-    outside = ((turn[None, :] - starts) % 1.0) >= widths
-    left = outside.sum(axis=1)
-    enough = (left >= least) & (left < points.shape[0] - 3)
-    outside, left, widths = outside[enough], left[enough], widths[enough]
+    turn = np.arctan2(sin_t, cos_t) / (2.0 * np.pi) + 0.5
+    order = np.argsort(turn, kind="stable")
+    points, turn = points[order], turn[order]
+    n = turn.size
+    starts, widths = (part.ravel() for part in np.meshgrid(np.arange(24) / 24.0, np.array(shares)))
+    first = np.searchsorted(turn, starts)
+    count = np.searchsorted(turn, (starts + widths) % 1.0) - first
+    count = np.where(starts + widths > 1.0, count + n, count)
+    left = n - count
+    enough = (left >= least) & (left < n - 3)
+    first, count, left, widths = first[enough], count[enough], left[enough], widths[enough]
     if left.size == 0:
-        return _Cuts(np.zeros((0, 2)), np.zeros((0, 2)), *np.zeros((4, 0)))
-    ranks = np.argsort(~outside, axis=1, kind="stable")  # the points kept, in order, come first
-    take = (np.arange(40)[None, :] * left[:, None] / 40.0).astype(np.intp)
-    fits = fit_ellipse_direct(points[np.take_along_axis(ranks, take, axis=1)])
+        return _Cuts(np.zeros((0, 5)), np.zeros(0), np.zeros(0), first, count, points)
+    # The points kept follow on the stretch.
+    share = np.arange(CUT_POINTS) / CUT_POINTS
+    taken = points[(first[:, None] + count[:, None] + (share * left[:, None]).astype(np.intp)) % n]
+    fit = fit_ellipse_direct(taken)
     a, b = rim.ellipse.semi_axes_px
     with np.errstate(invalid="ignore"):
-        alike = fits.ok & (fits.semi_axes_px[:, 0] <= largest * a) & (fits.semi_axes_px[:, 1] >= 0.7 * b)
-    outside, left = outside[alike], left[alike]
-    placed = (fits.centre_px[alike], fits.semi_axes_px[alike], fits.angle_rad[alike])
-    distance = _distances(points, *placed)
-    residual = np.sqrt(np.einsum("mn,mn,mn->m", distance, distance, outside) / left)
-    # The median of the points left out: in every row they come first when the others are moved to the end.
-    hidden = np.sort(np.where(outside, np.inf, distance), axis=1)
-    low, high = (points.shape[0] - left - 1) // 2, (points.shape[0] - left) // 2
-    row = np.arange(left.size)
-    return _Cuts(*placed, widths[alike, 0], residual, 0.5 * (hidden[row, low] + hidden[row, high]))
+        alike = fit.ok & (fit.semi_axes_px[:, 0] <= largest * a) & (fit.semi_axes_px[:, 1] >= 0.7 * b)
+    fits = np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[alike]
+    distance = _distances(taken[alike], fits)
+    residual = np.sqrt(np.einsum("mn,mn->m", distance, distance) / CUT_POINTS)
+    return _Cuts(fits, widths[alike], residual, first[alike], count[alike], points)
 
 
-def _distances(points: Array, centre: Array, axes: Array, angle: Array) -> Array:
-    """(m, n) signed distances, as `signed_distance`, of points (n, 2) to ellipses: centre, axes (m, 2), angle (m,)."""
-    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    a, b = axes[:, :1], axes[:, 1:]
-    dx, dy = points[None, :, 0] - centre[:, :1], points[None, :, 1] - centre[:, 1:]
+def _distances(points: Array, fits: Array) -> Array:
+    """(m, n) signed distances, as `signed_distance`, of points (m, n, 2) to an ellipse (m, 5) each."""
+    cos, sin = np.cos(fits[:, 4:]), np.sin(fits[:, 4:])
+    a, b = fits[:, 2:3], fits[:, 3:4]
+    dx, dy = points[..., 0] - fits[:, :1], points[..., 1] - fits[:, 1:2]
     p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
     radius = np.sqrt(p * p + q * q)
     return np.asarray((radius - 1.0) * radius / np.maximum(np.sqrt((p / a) ** 2 + (q / b) ** 2), 1e-12))
@@ -155,8 +159,7 @@ def rims_without_stretch(
     What is left out must lie inside, as a lid's margin does that crosses the pupil.
     """
     cuts = _cuts(edges, rim, 8, (0.2, 0.3, 0.42, 0.52), 2.0)
-    inside = cuts.hidden_px < -2.0 * cuts.residual_px
-    best = (cuts.best(inside & (cuts.width == width)) for width in np.unique(cuts.width))
+    best = (cuts.best(cuts.width == width, lambda residual: 2.0 * residual) for width in np.unique(cuts.width))
     tolerance = max(0.35, 3.5 * expected_noise_px)
     rims = (_polished(edges, one, settings, tolerance, free=True) for one in best if one is not None)
     return [one for one in rims if isinstance(one, RimFit)]

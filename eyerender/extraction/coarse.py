@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 LEVELS = 20
 ANGLES = 48
+DARKER = 0.6  # of the thresholds; pupils show at a third of them, and brighter ones are for where none of these does
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +52,13 @@ def find_candidates(
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
         small = as_image(cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel))
     noise = noise_dn / (1.5 * factor) + 0.1  # after averaging factor^2 pixels and a 3 x 3 Gaussian
-    blobs = _sweep(small, factor, settings)
+    levels = _levels(small)
+    dark = round(DARKER * levels.size)
+    blobs = _sweep(small, levels[:dark], factor, settings)
+    found = _ranked(small, noise, factor, blobs, most) if blobs.size else []
+    if found:
+        return found
+    blobs = np.concatenate([blobs, _sweep(small, levels[dark:], factor, settings)])
     return _ranked(small, noise, factor, blobs, most) if blobs.size else []
 
 
@@ -83,7 +90,7 @@ def _levels(small: Image) -> Array:
     return np.asarray(levels[keep], dtype=np.float64)
 
 
-def _sweep(small: Image, factor: int, settings: ExtractionSettings) -> Array:
+def _sweep(small: Image, levels: Array, factor: int, settings: ExtractionSettings) -> Array:
     """(n, 6) blobs of every threshold that could be a pupil: their ellipse (centre x, y, semi-axes a, b, angle) in
     reduced pixels, and the share of it that they fill."""
     height, width = small.shape
@@ -92,7 +99,7 @@ def _sweep(small: Image, factor: int, settings: ExtractionSettings) -> Array:
     # A contour's length in pixels is at least half its ellipse's perimeter.
     shortest, longest = 3.0 * least, 15.0 * most
     blobs: list[tuple[float, ...]] = []
-    for level in _levels(small).tolist():
+    for level in levels.tolist():
         mask = cv2.compare(small, level, cv2.CMP_LE)
         contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
         for i, contour in enumerate(contours):
