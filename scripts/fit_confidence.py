@@ -97,9 +97,9 @@ def main() -> None:
     options = parser.parse_args()
     if not 0 < options.count <= 10_000:
         raise SystemExit("error: --count: must be between 1 and 10,000 (the seeds for development)")
-    # Before the first fit there is no table; extraction then still needs one to report a number.
+    # The table of other features would not fit; extraction needs one to report a number.
     for method in METHODS:
-        TABLE.setdefault(method, ((0.0,) * 14, (1.0,) * 14, (0.0,) * 43, (0.0, 1.0, 0.0)))
+        TABLE[method] = ((0.0,) * 15, (1.0,) * 15, (0.0,) * 46, (0.0, 1.0, 0.0))
     seeds = [*range(options.count), *(EYELESS - i for i in range(options.count // 10))]
     with Pool(options.processes) as pool:
         observed = pool.map(observe, seeds, chunksize=20)

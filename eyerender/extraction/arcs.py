@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from ..geometry.ellipse import Ellipse, EllipseFit, fit_ellipse_direct, from_cv2
 from .coarse import Candidate
 from .edges import EdgePoints
 from .orderstatistics import median
+from .rimcuts import Cuts
 from .settings import ExtractionSettings
 
 Array = NDArray[np.float64]
@@ -23,7 +24,6 @@ SECTORS = 48  # of the outline, for support
 PIECES = 16  # arcs are cut at these sectors, so that a lid's margin parts from the rim it joins
 SAMPLES = 240
 POINTS_PER_PIECE = 3
-CUT_POINTS = 40  # of what is left of a rim without a stretch
 FINALISTS = 24  # of the random ellipses, counted with all points
 ALL_AGREE = 0.85  # of the highest support: the root mean square distance is then 0.39 of the tolerance at most
 
@@ -65,90 +65,24 @@ def fit_rim(
     if isinstance(rim, str) or rim.residual_px < 1.3 * expected_noise_px:
         return rim
     # Parts of an uneven margin fit an ellipse better than the whole, but not as well as the edges' noise allows.
-    cuts = _cuts(edges, rim, 12, (0.12, 0.2, 0.3, 0.42), 1.6)
+    cuts = Cuts.of(edges.points_px[rim.inliers], rim.ellipse, 12, (0.12, 0.2, 0.3, 0.42), 1.6)
     freed, allowed = _without_lid(cuts, rim, expected_noise_px, 0.7 * expected_noise_px), expected_noise_px
-    if freed is None and rim.residual_px >= 1.3 * expected_px:
+    if not freed and rim.residual_px >= 1.3 * expected_px:
         freed, allowed = _without_lid(cuts, rim, expected_px), expected_px
-    if freed is None:
-        return rim
-    again = _polished(edges, freed, settings, max(0.35, 3.5 * allowed), free=True)
-    return rim if isinstance(again, str) or again.residual_px > 0.8 * rim.residual_px else again
+    again = (_polished(edges, one, settings, max(0.35, 3.5 * allowed), free=True) for one in freed)
+    better = [one for one in again if isinstance(one, RimFit) and one.residual_px <= 0.8 * rim.residual_px]
+    return min(better, key=lambda one: one.residual_px, default=rim)
 
 
-def _without_lid(cuts: _Cuts, rim: RimFit, noise_px: float, within_px: float = np.inf) -> Ellipse | None:
-    """The ellipse without the stretch of rim that is a lid's margin, if there is one.
+def _without_lid(cuts: Cuts, rim: RimFit, noise_px: float, within_px: float = np.inf) -> list[Ellipse]:
+    """The ellipses without a stretch of rim that may be a lid's margin.
 
     A margin that crosses the pupil gives edges inside the true rim, and an ellipse drawn through both fits neither.
-    Of the `cuts`, which leave every eighth to nearly a half of the outline out in turn, the best is taken when the rest
-    then fits 1.4 times better, and within `within_px`, and the edges left out lie inside the new ellipse.
+    Of the `cuts`, which leave every eighth to nearly a half of the outline out in turn, the best two are those where
+    the rest fits 1.4 times better, and within `within_px`, and the edges left out lie inside the new ellipse.
     """
     good = cuts.residual_px < min(rim.residual_px / 1.4, within_px)
-    return cuts.best(good, lambda residual: max(2.0 * residual, noise_px))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Cuts:
-    """Ellipses (m, 5: centre, semi-axes, angle) through a rim's points without a stretch: the stretch's width as
-    a share of the outline, the rest's root mean square distance, and its first point and number of points, all (m,);
-    points (n, 2) of the whole rim, in turn."""
-
-    fits: Array
-    width: Array
-    residual_px: Array
-    first: NDArray[np.intp]
-    count: NDArray[np.intp]
-    points: Array
-
-    def best(self, which: Mask, depth_px: Callable[[float], float]) -> Ellipse | None:
-        """Of `which`, the one that the rest fits best of those whose stretch lies inside: the median of its points by
-        more than depth_px of the rest's residual."""
-        for i in np.nonzero(which)[0][np.argsort(self.residual_px[which], kind="stable")]:
-            hidden = (self.first[i] + np.arange(self.count[i])) % self.points.shape[0]
-            ellipse = _ellipse(self.fits[i])
-            if median(signed_distance(ellipse, self.points[hidden])) < -depth_px(float(self.residual_px[i])):
-                return ellipse
-        return None
-
-
-def _cuts(edges: EdgePoints, rim: RimFit, least: int, shares: tuple[float, ...], largest: float) -> _Cuts:
-    """Every stretch of these widths left out of a rim in turn, if `least` points are left and the ellipse stays alike:
-    its longer axis below `largest` times the rim's. The rest is told by CUT_POINTS of its points."""
-    points = edges.points_px[rim.inliers]
-    cos_t, sin_t = _parameter(rim.ellipse, points)
-    turn = np.arctan2(sin_t, cos_t) / (2.0 * np.pi) + 0.5
-    order = np.argsort(turn, kind="stable")
-    points, turn = points[order], turn[order]
-    n = turn.size
-    starts, widths = (part.ravel() for part in np.meshgrid(np.arange(24) / 24.0, np.array(shares)))
-    first = np.searchsorted(turn, starts)
-    count = np.searchsorted(turn, (starts + widths) % 1.0) - first
-    count = np.where(starts + widths > 1.0, count + n, count)
-    left = n - count
-    enough = (left >= least) & (left < n - 3)
-    first, count, left, widths = first[enough], count[enough], left[enough], widths[enough]
-    if left.size == 0:
-        return _Cuts(np.zeros((0, 5)), np.zeros(0), np.zeros(0), first, count, points)
-    # The points kept follow on the stretch.
-    share = np.arange(CUT_POINTS) / CUT_POINTS
-    taken = points[(first[:, None] + count[:, None] + (share * left[:, None]).astype(np.intp)) % n]
-    fit = fit_ellipse_direct(taken)
-    a, b = rim.ellipse.semi_axes_px
-    with np.errstate(invalid="ignore"):
-        alike = fit.ok & (fit.semi_axes_px[:, 0] <= largest * a) & (fit.semi_axes_px[:, 1] >= 0.7 * b)
-    fits = np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[alike]
-    distance = _distances(taken[alike], fits)
-    residual = np.sqrt(np.einsum("mn,mn->m", distance, distance) / CUT_POINTS)
-    return _Cuts(fits, widths[alike], residual, first[alike], count[alike], points)
-
-
-def _distances(points: Array, fits: Array) -> Array:
-    """(m, n) signed distances, as `signed_distance`, of points (m, n, 2) to an ellipse (m, 5) each."""
-    cos, sin = np.cos(fits[:, 4:]), np.sin(fits[:, 4:])
-    a, b = fits[:, 2:3], fits[:, 3:4]
-    dx, dy = points[..., 0] - fits[:, :1], points[..., 1] - fits[:, 1:2]
-    p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
-    radius = np.sqrt(p * p + q * q)
-    return np.asarray((radius - 1.0) * radius / np.maximum(np.sqrt((p / a) ** 2 + (q / b) ** 2), 1e-12))
+    return list(islice(cuts.inside(good, lambda residual: max(2.0 * residual, noise_px)), 2))
 
 
 def rims_without_stretch(
@@ -158,10 +92,10 @@ def rims_without_stretch(
 
     What is left out must lie inside, as a lid's margin does that crosses the pupil.
     """
-    cuts = _cuts(edges, rim, 8, (0.2, 0.3, 0.42, 0.52), 2.0)
-    best = (cuts.best(cuts.width == width, lambda residual: 2.0 * residual) for width in np.unique(cuts.width))
+    cuts = Cuts.of(edges.points_px[rim.inliers], rim.ellipse, 8, (0.2, 0.3, 0.42, 0.52), 2.0)
+    of_width = (cuts.inside(cuts.width == width, lambda residual: 2.0 * residual) for width in np.unique(cuts.width))
     tolerance = max(0.35, 3.5 * expected_noise_px)
-    rims = (_polished(edges, one, settings, tolerance, free=True) for one in best if one is not None)
+    rims = (_polished(edges, one, settings, tolerance, free=True) for some in of_width for one in islice(some, 1))
     return [one for one in rims if isinstance(one, RimFit)]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.ellipse import Ellipse
-from .rimmodel import Place, sector_of
+from .rimmodel import SECTORS, Place, sector_of
 
 Array = NDArray[np.float64]
 
@@ -51,15 +51,13 @@ def distance_slopes(ellipse: Ellipse, place: Place) -> Array:
     return out
 
 
-def sector_excess(plain: Array, inverse: Array, scores: Array, bins: NDArray[np.intp]) -> float:
+def sector_excess(plain: Array, inverse: Array, sums: Array) -> float:
     """How much more the parameters scatter than independent residuals would make them: trace(plain^-1 S) / 5, S the sum
-    over sectors of the outer square of inverse (5, p) times the sector's summed scores. scores (p, n), bins (n,).
+    over k sectors of the outer square of inverse (5, p) times the sector's summed scores, `sums` (p, k).
 
     Source: the cluster-robust ("sandwich") covariance, Liang and Zeger (1986), reduced to one factor.
     """
-    order = np.argsort(bins.astype(np.uint8), kind="stable")  # a radix sort
-    first = np.flatnonzero(np.diff(bins[order], prepend=-1))
-    summed = inverse @ np.add.reduceat(scores[:, order], first, axis=1)
+    summed = inverse @ sums
     return float(np.trace(np.linalg.solve(plain, summed @ summed.T))) / SHAPE
 
 
@@ -75,8 +73,10 @@ def edge_covariance(ellipse: Ellipse, points: Array, residual_px: float) -> Arra
     plain = inverse * max(residual_px, 1e-4) ** 2
     # A third of the sectors, so that one is longer than the noise's reach; n / (n - 5) for the parameters fitted.
     coarse = sector_of(place) // 3
-    groups = max(np.unique(coarse).size, SHAPE + 1)
-    excess = sector_excess(plain, inverse, slopes * place.distance, coarse)
+    scores = slopes * place.distance
+    sums = np.array([np.bincount(coarse, weights=row, minlength=SECTORS // 3) for row in scores], dtype=np.float64)
+    groups = max(int(np.count_nonzero(np.bincount(coarse))), SHAPE + 1)
+    excess = sector_excess(plain, inverse, sums)
     excess *= groups / (groups - SHAPE)
     return to_axes(plain * max(excess, 1.0) * SELECTION, ellipse)
 

@@ -175,10 +175,10 @@ def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen
         errors = np.full(SECTORS, prior.uneven_px**2)
         errors[pixels.sector] = variance * normal.inverse
         own = (by_displaced * errors) @ by_displaced.T
-        slopes = slopes - rows.slope * (normal.across * normal.inverse)[:, pixels.index]
     plain = variance * influence @ matrix @ influence.T
     # Texture leaves residuals that agree within a sector; their excess over white noise scales the covariance.
-    excess = sector_excess(plain, influence, slopes * residual, pixels.sector[pixels.index])
+    sums = pixels.sums(slopes * residual) - normal.across * (normal.inverse * pixels.sums(rows.slope * residual))
+    excess = sector_excess(plain, influence, sums)
     covariance = plain * (excess if excess > 1.25 else 1.0) + own
     return PixelFit(
         model,

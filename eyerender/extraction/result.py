@@ -27,7 +27,8 @@ class Goodness:
     reduced_chi2: of the pixel model, 1 when noise alone explains the residual; 0 where it was not fitted.
     blur_px: sigma of the edge's blur. unevenness: how much darker the pupil's middle is than its outer part, as a share
     of the step. spread: scatter of its grey levels beyond the noise, likewise. rim_sd_px: standard deviation of the
-    rim's position, averaged along it, from the covariance. refined: whether the ellipse is the pixel model's.
+    rim's position, averaged along it, from the covariance. uneven_px: standard deviation of the margin's displacement
+    from the ellipse, 0 where it was not fitted. refined: whether the ellipse is the pixel model's.
     """
 
     support: float
@@ -41,6 +42,7 @@ class Goodness:
     unevenness: float
     spread: float
     rim_sd_px: float
+    uneven_px: float
     refined: bool
 
 

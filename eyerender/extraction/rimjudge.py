@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 OUTLIER = 5.0  # pixels beyond this many standard deviations do not count
+LINEAR = 0.1  # of the blur: so small a displacement is
 FARTHEST = 3.5  # a sector's displacement, in what margins and the noise make likely
 
 
@@ -43,7 +44,7 @@ def judge(
     """
     bins = sector_of(place)
     whole = displaced
-    for _ in range(2):  # a displacement of more than the blur is not linear in the levels
+    for _ in range(2):  # a displacement of about the blur is not linear in the levels
         expected, slope = model.level_and_slope(replace(place, distance=place.distance + whole[bins]))
         residual = level - expected
         counted = slope * use
@@ -51,6 +52,8 @@ def judge(
         further = np.bincount(bins, weights=counted * residual, minlength=SECTORS) / np.maximum(weight, 1e-9)
         further = np.where(weight > 1e-9, np.minimum(np.maximum(further, -model.sigma_px), model.sigma_px), 0.0)
         whole = whole + further
+        if float(np.abs(further).max()) < LINEAR * model.sigma_px:
+            break
     residual = residual - slope * further[bins]
     told = weight > 0.1 * float(weight.max(initial=0.0))
     by_noise = noise_dn**2 / np.maximum(weight, 1e-9)

@@ -33,6 +33,7 @@ def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -
         unevenness=inside.darker_dn / model.step_dn,
         spread=inside.spread_dn / model.step_dn,
         rim_sd_px=rim_deviation(ellipse, covariance),
+        uneven_px=0.0 if fit is None else fit.uneven_px,
         refined=fit is not None,
     )
     sure = confidence(ellipse, goodness, settings.method)

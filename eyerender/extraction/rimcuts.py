@@ -1,0 +1,93 @@
+"""A rim's points without a stretch of them, each stretch in turn: which of what is left fits an ellipse best."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.ellipse import Ellipse, fit_ellipse_direct, iou, signed_distance
+from .orderstatistics import median
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+STARTS = 24  # of the stretches, around the outline
+CUT_POINTS = 40  # of what is left
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cuts:
+    """Ellipses (m, 5: centre, semi-axes, angle) through a rim's points without a stretch: the stretch's width as a
+    share of the outline, the rest's root mean square distance, and its first point and number of points, all (m,);
+    points (n, 2) of the whole rim, in turn."""
+
+    fits: Array
+    width: Array
+    residual_px: Array
+    first: NDArray[np.intp]
+    count: NDArray[np.intp]
+    points: Array
+
+    @staticmethod
+    def of(points: Array, ellipse: Ellipse, least: int, shares: tuple[float, ...], largest: float) -> Cuts:
+        """Every stretch of these widths left out of a rim's points (n, 2) in turn, if `least` points are left and the
+        ellipse stays alike: its longer axis below `largest` times the rim's. CUT_POINTS of its points tell the rest."""
+        turn = _turn(points, ellipse)
+        order = np.argsort(turn, kind="stable")
+        points, turn = points[order], turn[order]
+        n = turn.size
+        starts, widths = (part.ravel() for part in np.meshgrid(np.arange(STARTS) / STARTS, np.array(shares)))
+        first = np.searchsorted(turn, starts)
+        count = np.searchsorted(turn, (starts + widths) % 1.0) - first
+        count = np.where(starts + widths > 1.0, count + n, count)
+        left = n - count
+        enough = (left >= least) & (left < n - 3)
+        first, count, left, widths = first[enough], count[enough], left[enough], widths[enough]
+        if left.size == 0:
+            return Cuts(np.zeros((0, 5)), np.zeros(0), np.zeros(0), first, count, points)
+        # The points kept follow on the stretch.
+        share = np.arange(CUT_POINTS) / CUT_POINTS
+        taken = points[(first[:, None] + count[:, None] + (share * left[:, None]).astype(np.intp)) % n]
+        fit = fit_ellipse_direct(taken)
+        a, b = ellipse.semi_axes_px
+        with np.errstate(invalid="ignore"):
+            alike = fit.ok & (fit.semi_axes_px[:, 0] <= largest * a) & (fit.semi_axes_px[:, 1] >= 0.7 * b)
+        fits = np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[alike]
+        distance = _distances(taken[alike], fits)
+        residual = np.sqrt(np.einsum("mn,mn->m", distance, distance) / CUT_POINTS)
+        return Cuts(fits, widths[alike], residual, first[alike], count[alike], points)
+
+    def inside(self, which: Mask, depth_px: Callable[[float], float]) -> Iterator[Ellipse]:
+        """Of `which`, different ones whose stretch lies inside, the median of its points by more than depth_px of the
+        rest's residual; those first that the rest fits best."""
+        given: list[Ellipse] = []
+        for i in np.nonzero(which)[0][np.argsort(self.residual_px[which], kind="stable")]:
+            hidden = (self.first[i] + np.arange(self.count[i])) % self.points.shape[0]
+            ellipse = Ellipse(self.fits[i, :2], self.fits[i, 2:4], float(self.fits[i, 4]))
+            if median(signed_distance(ellipse, self.points[hidden])) < -depth_px(float(self.residual_px[i])) and all(
+                iou(ellipse, other) < 0.9 for other in given
+            ):
+                given.append(ellipse)
+                yield ellipse
+
+
+def _turn(points: Array, ellipse: Ellipse) -> Array:
+    """(n,) where along the outline points lie, 0..1 by the ellipse's parameter."""
+    dx, dy = (points - ellipse.centre_px).T
+    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+    a, b = ellipse.semi_axes_px
+    return np.asarray(np.arctan2((dy * cos - dx * sin) / b, (dx * cos + dy * sin) / a) / (2.0 * np.pi) + 0.5)
+
+
+def _distances(points: Array, fits: Array) -> Array:
+    """(m, n) signed distances, as `signed_distance`, of points (m, n, 2) to an ellipse (m, 5) each."""
+    cos, sin = np.cos(fits[:, 4:]), np.sin(fits[:, 4:])
+    a, b = fits[:, 2:3], fits[:, 3:4]
+    dx, dy = points[..., 0] - fits[:, :1], points[..., 1] - fits[:, 1:2]
+    p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
+    radius = np.sqrt(p * p + q * q)
+    return np.asarray((radius - 1.0) * radius / np.maximum(np.sqrt((p / a) ** 2 + (q / b) ** 2), 1e-12))
