@@ -49,15 +49,18 @@ def find_edges(
     sigma = filter_px
     gx, gy = _gradient(crop, sigma)
     magnitude = as_image(cv2.magnitude(gx, gy))
-    u, v, radius = _outward(crop.shape, ellipse, x0, y0)
     half_band = max(band, 4.0 / b)
-    # The two coarse gates first: the rest works on the few pixels they leave.
+    # The coarse gates first: the rest works on the few pixels they leave.
     floor = 3.5 * noise_dn / (2.0 * math.sqrt(2.0 * math.pi) * sigma**2)
-    gate = (np.abs(radius - 1.0) < half_band) & (magnitude > floor) & (gx * u + gy * v > 0.7 * magnitude)
-    gate[[0, -1], :] = False
-    gate[:, [0, -1]] = False
-    row, column = np.nonzero(gate)
+    strong = magnitude > floor
+    strong[[0, -1], :] = False
+    strong[:, [0, -1]] = False
+    at = np.flatnonzero(strong)
+    row, column = at // crop.shape[1], at % crop.shape[1]
     dx, dy, here = gx[row, column], gy[row, column], magnitude[row, column]
+    u, v, radius = _outward(ellipse, column + (x0 - ellipse.centre_px[0]), row + (y0 - ellipse.centre_px[1]))
+    gate = np.flatnonzero((np.abs(radius - 1.0) < half_band) & (dx * u + dy * v > 0.7 * here))
+    row, column, dx, dy, here = row[gate], column[gate], dx[gate], dy[gate], here[gate]
     level = np.abs(dx) >= np.abs(dy)
     step_x, step_y = level.astype(np.intp), (~level).astype(np.intp)
     before = magnitude[row - step_y, column - step_x]
@@ -131,18 +134,15 @@ def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
     )
 
 
-def _outward(shape: tuple[int, ...], ellipse: Ellipse, x0: int, y0: int) -> tuple[Image, Image, Image]:
-    """Unit outward normal of the concentric ellipses, and the radius in units of the semi-axes, at every pixel."""
-    a, b = ellipse.semi_axes_px
+def _outward(ellipse: Ellipse, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Unit outward normal of the concentric ellipses, and the radius in units of the semi-axes, at pixels (n,) from the
+    centre."""
+    a, b = ellipse.semi_axes_px.tolist()
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-    x = (np.arange(shape[1]) + x0 - ellipse.centre_px[0]).astype(np.float32)[None, :]
-    y = (np.arange(shape[0]) + y0 - ellipse.centre_px[1]).astype(np.float32)[:, None]
-    p = x * np.float32(cos / a) + y * np.float32(sin / a)
-    q = y * np.float32(cos / b) - x * np.float32(sin / b)
-    radius = as_image(cv2.magnitude(p, q))
-    u, v = p * np.float32(cos / a) - q * np.float32(sin / b), p * np.float32(sin / a) + q * np.float32(cos / b)
-    length = np.maximum(as_image(cv2.magnitude(u, v)), np.float32(1e-12))
-    return u / length, v / length, radius
+    p, q = (x * cos + y * sin) / a, (y * cos - x * sin) / b
+    u, v = p * (cos / a) - q * (sin / b), p * (sin / a) + q * (cos / b)
+    length = np.maximum(np.sqrt(u * u + v * v), 1e-12)
+    return u / length, v / length, np.sqrt(p * p + q * q)
 
 
 def _typical(strength: Image) -> float:
