@@ -1,20 +1,17 @@
-"""Bright spots near the pupil: detection, and the reasons why a reflection is no glint of the cornea."""
+"""Bright spots near the pupil: their detection."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import frozen
 from ..geometry.ellipse import Ellipse
 from .bellshape import bell_shaped
-from .fittedspots import SpotFit
-from .preprocess import DN, Image, Prepared, as_image
-from .result import GlintResult
+from .preprocess import Image, Prepared, as_image
 from .settings import ExtractionSettings
 
 Array = NDArray[np.float64]
@@ -24,11 +21,7 @@ MAX_SIGMA_PX = 8.0
 LEAST_OF_BLOCK = 0.5  # of a sharp peak's height, the mean of the 2 x 2 pixels about it
 RING_SHARE = 0.4  # of a glint's height above its darkest surroundings, that it has above its brightest
 MOST_PEAKS = 80  # maxima looked at, brightest first
-# A glint's bright patch is no longer than that many times its width, and the product of that ratio and the fit's is no
-# larger; the true ones' of the development images are below 1.99 and 2.2.
-LONG, LONG_TWICE = 2.0, 2.4
 
-_PIXEL = 1.0 / 12.0  # variance of a pixel: keeps a spot of one row of pixels from being a line
 _COS, _SIN = np.cos(np.arange(12) * (np.pi / 6.0)), np.sin(np.arange(12) * (np.pi / 6.0))
 # Places on a ring: three circles, each turned against the one before.
 _RING_STEPS = np.repeat((0.1, 0.5, 0.9), 24)
@@ -217,106 +210,3 @@ def _widths(smooth: Image, opened: Image, xy: Array, height: Array, size: int) -
     out = np.sqrt(np.maximum(area, 1) / (2.0 * math.pi * math.log(2.0)))
     sharp: Array = np.sqrt(np.maximum(out**2 - SMOOTH_PX**2, 0.3))
     return np.clip(sharp, 0.5, MAX_SIGMA_PX)
-
-
-def judge_spots(
-    spots: Spots, fit: SpotFit, prepared: Prepared, step_dn: float, blur_px: float, settings: ExtractionSettings
-) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
-    """(accepted, rejected), brightest first."""
-    accepted: list[GlintResult] = []
-    rejected: list[GlintResult] = []
-    looks = _Look.of_all(spots, fit)
-    for i in np.argsort(-fit.amplitude_dn, kind="stable").tolist():
-        look = looks[i]
-        reason = _objection(look, fit, i, prepared, step_dn, blur_px)
-        result = GlintResult(
-            status="ok" if reason is None else "rejected",
-            reason=reason,
-            xy_px=frozen(fit.xy_px[i]) if look.converged else frozen(spots.xy_px[i]),
-            covariance=frozen(fit.covariance[i]) if look.converged else None,
-            amplitude=look.height / DN,
-            sigma_px=math.sqrt(look.wide * look.narrow),
-            saturated=bool(fit.clipped[i] > 0),
-        )
-        (accepted if reason is None else rejected).append(result)
-    reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
-    surplus = [replace(glint, status="rejected", reason=reason) for glint in accepted[settings.max_glints :]]
-    strip = "a strip or a broad patch, as reflections off the sclera and wet lid margins are"
-    places = np.array([glint.xy_px for glint in accepted]).reshape(-1, 2)
-    far = (((spots.patches_px[:, None] - places) ** 2).sum(axis=-1) > 4.0**2).all(axis=1)
-    patches = [
-        GlintResult("rejected", strip, frozen(xy), None, 0.0, 0.0, saturated=False) for xy in spots.patches_px[far]
-    ]
-    return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
-
-
-@dataclass(frozen=True, slots=True)
-class _Look:
-    """A fitted spot's looks: sigma across and along, height and residual in DN, distance from the bright pixel, and the
-    deviations of its bright patch across and along."""
-
-    converged: bool
-    narrow: float
-    wide: float
-    height: float
-    residual: float
-    moved: float
-    short: float
-    long: float
-
-    @staticmethod
-    def of_all(spots: Spots, fit: SpotFit) -> list[_Look]:
-        gap = fit.xy_px - spots.xy_px
-        columns = (
-            fit.converged, fit.sigma_px.min(axis=1), fit.sigma_px.max(axis=1), fit.amplitude_dn, fit.residual_dn,
-            np.sqrt((gap * gap).sum(axis=1)), *np.sqrt(np.linalg.eigvalsh(fit.moments_px2) + _PIXEL).T,
-        )  # fmt: skip
-        return [_Look(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
-
-
-def _objection(look: _Look, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float) -> str | None:
-    """Why spot i is no glint, or None."""
-    if not look.converged:
-        return "the spot's fit did not converge"
-    if look.moved > max(2.5, 2.0 * look.wide):
-        return f"no spot: the fit moved {look.moved:.1f} px from the bright pixel"
-    if look.wide < 0.5 * optics_sigma(blur_px):
-        return f"sharper than the optics (sigma {look.wide:.1f} px): a bad pixel"
-    ratio, fitted = look.long / look.short, math.sqrt((look.wide**2 + _PIXEL) / (look.narrow**2 + _PIXEL))
-    if ratio > LONG or ratio * fitted > LONG_TWICE:
-        return f"elongated {max(ratio, fitted):.1f} : 1, as reflections off the sclera and wet lid margins are"
-    wide = max(look.wide, look.long)
-    if wide > widest(blur_px):
-        return f"too wide for a glint: sigma {wide:.1f} px"
-    if look.height < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
-        return "too faint for a glint"
-    if wide > 2.5 and not _outshines(fit, i, prepared):
-        return "no brighter than what lies beside it, as a corner of sclera between lid and iris is"
-    if look.residual > max(0.3 * min(look.height, DN), 3.0 * prepared.noise_dn):
-        return "no spot: the bright patch is not bell-shaped"
-    return None
-
-
-def _outshines(fit: SpotFit, i: int, prepared: Prepared) -> bool:
-    """Whether a spot's peak stands above the brightest surroundings, other spots apart, by half its own height.
-
-    Asked of wide spots only: a narrow one has no time to be anything else.
-    """
-    x, y = fit.xy_px[i]
-    wide = float(fit.sigma_px[i].max())
-    reach = 3.5 * wide + 1.0
-    linear = prepared.linear
-    x0, x1 = max(0, math.floor(x - reach)), min(linear.shape[1], math.ceil(x + reach) + 1)
-    y0, y1 = max(0, math.floor(y - reach)), min(linear.shape[0], math.ceil(y + reach) + 1)
-    columns, rows = np.arange(x0, x1), np.arange(y0, y1)[:, None]
-    ring = (columns - x) ** 2 + (rows - y) ** 2 > (2.2 * wide) ** 2
-    disc = 3.0 * fit.sigma_px.max(axis=1)
-    apart2 = ((fit.xy_px - fit.xy_px[i]) ** 2).sum(axis=1)
-    near = fit.converged & (apart2 < (1.5 * reach + disc + 1.0) ** 2) & (np.arange(disc.size) != i)
-    for k in np.flatnonzero(near):
-        ring &= (columns - fit.xy_px[k, 0]) ** 2 + (rows - fit.xy_px[k, 1]) ** 2 > disc[k] ** 2
-    beside = linear[y0:y1, x0:x1][ring]
-    if beside.size < 8:
-        return True
-    height = min(float(fit.amplitude_dn[i]), DN)
-    return float(fit.background_dn[i]) + height - float(np.percentile(beside, 97.0)) > 0.5 * height

@@ -11,7 +11,8 @@ from ..geometry.ellipse import signed_distance
 from .arcs import curvature_at
 from .covariance import rim_deviation
 from .fittedspots import SpotFit, joined
-from .glints import Spots, detect_spots, judge_spots, widest
+from .glintjudge import judge_spots
+from .glints import Spots, detect_spots, widest
 from .orderstatistics import median
 from .preprocess import DN, Image, Prepared, invert, prepare
 from .refine import PixelFit, refine
@@ -111,7 +112,10 @@ def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tu
 
 
 def _rim_fit(found: Found, cleared: tuple[Image, NDArray[np.bool_]], before: PixelFit | None = None) -> PixelFit | None:
-    fit = refine(cleared[0], found.model, found.sectors, cleared[1], found.image.noise_dn, before)
+    try:
+        fit = refine(cleared[0], found.model, found.sectors, cleared[1], found.image.noise_dn, before)
+    except np.linalg.LinAlgError:  # the pixels do not tell the parameters apart
+        return None
     return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None
 
 

@@ -55,10 +55,11 @@ def judge(
         if float(np.abs(further).max()) < LINEAR * model.sigma_px:
             break
     residual = residual - slope * further[bins]
-    told = weight > 0.1 * float(weight.max(initial=0.0))
+    told = seen & (weight > 0.1 * float(weight.max(initial=0.0)))
     by_noise = noise_dn**2 / np.maximum(weight, 1e-9)
-    typical = 1.4826 * median(np.abs(whole[told & seen]))
-    uneven2 = max(typical**2 - 1.3 * median(by_noise[told & seen]), 0.0)
+    uneven2 = 0.0
+    if told.any():
+        uneven2 = max((1.4826 * median(np.abs(whole[told]))) ** 2 - 1.3 * median(by_noise[told]), 0.0)
     scale = max(1.4826 * median(np.abs(residual[use & seen[bins]])), noise_dn, 1e-3)
     new_use = np.abs(residual) < OUTLIER * scale
     total = np.maximum(np.bincount(bins, minlength=SECTORS), 1)

@@ -1,0 +1,125 @@
+"""Which fitted spots are glints, and the reasons why a reflection is no glint of the cornea."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..arrays import frozen
+from .fittedspots import SpotFit
+from .glints import Spots, optics_sigma, widest
+from .orderstatistics import quantile
+from .preprocess import DN, Prepared
+from .result import GlintResult
+from .settings import ExtractionSettings
+
+# A glint's bright patch is no longer than that many times its width, and the product of that ratio and the fit's is no
+# larger; the true ones' of the development images are below 1.99 and 2.2.
+LONG, LONG_TWICE = 2.0, 2.4
+
+_PIXEL = 1.0 / 12.0  # variance of a pixel: keeps a spot of one row of pixels from being a line
+
+
+def judge_spots(
+    spots: Spots, fit: SpotFit, prepared: Prepared, step_dn: float, blur_px: float, settings: ExtractionSettings
+) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
+    """(accepted, rejected), brightest first."""
+    accepted: list[GlintResult] = []
+    rejected: list[GlintResult] = []
+    looks = _Look.of_all(spots, fit)
+    for i in np.argsort(-fit.amplitude_dn, kind="stable").tolist():
+        look = looks[i]
+        reason = _objection(look, fit, i, prepared, step_dn, blur_px)
+        result = GlintResult(
+            status="ok" if reason is None else "rejected",
+            reason=reason,
+            xy_px=frozen(fit.xy_px[i]) if look.converged else frozen(spots.xy_px[i]),
+            covariance=frozen(fit.covariance[i]) if look.converged else None,
+            amplitude=look.height / DN,
+            sigma_px=math.sqrt(look.wide * look.narrow),
+            saturated=bool(fit.clipped[i] > 0),
+        )
+        (accepted if reason is None else rejected).append(result)
+    reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
+    surplus = [replace(glint, status="rejected", reason=reason) for glint in accepted[settings.max_glints :]]
+    strip = "a strip or a broad patch, as reflections off the sclera and wet lid margins are"
+    places = np.array([glint.xy_px for glint in accepted]).reshape(-1, 2)
+    far = (((spots.patches_px[:, None] - places) ** 2).sum(axis=-1) > 4.0**2).all(axis=1)
+    patches = [
+        GlintResult("rejected", strip, frozen(xy), None, 0.0, 0.0, saturated=False) for xy in spots.patches_px[far]
+    ]
+    return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """A fitted spot's looks: sigma across and along, height and residual in DN, distance from the bright pixel, and the
+    deviations of its bright patch across and along."""
+
+    converged: bool
+    narrow: float
+    wide: float
+    height: float
+    residual: float
+    moved: float
+    short: float
+    long: float
+
+    @staticmethod
+    def of_all(spots: Spots, fit: SpotFit) -> list[_Look]:
+        gap = fit.xy_px - spots.xy_px
+        columns = (
+            fit.converged, fit.sigma_px.min(axis=1), fit.sigma_px.max(axis=1), fit.amplitude_dn, fit.residual_dn,
+            np.sqrt((gap * gap).sum(axis=1)), *np.sqrt(np.linalg.eigvalsh(fit.moments_px2) + _PIXEL).T,
+        )  # fmt: skip
+        return [_Look(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+
+
+def _objection(look: _Look, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float) -> str | None:
+    """Why spot i is no glint, or None."""
+    if not look.converged:
+        return "the spot's fit did not converge"
+    if look.moved > max(2.5, 2.0 * look.wide):
+        return f"no spot: the fit moved {look.moved:.1f} px from the bright pixel"
+    if look.wide < 0.5 * optics_sigma(blur_px):
+        return f"sharper than the optics (sigma {look.wide:.1f} px): a bad pixel"
+    ratio, fitted = look.long / look.short, math.sqrt((look.wide**2 + _PIXEL) / (look.narrow**2 + _PIXEL))
+    if ratio > LONG or ratio * fitted > LONG_TWICE:
+        return f"elongated {max(ratio, fitted):.1f} : 1, as reflections off the sclera and wet lid margins are"
+    wide = max(look.wide, look.long)
+    if wide > widest(blur_px):
+        return f"too wide for a glint: sigma {wide:.1f} px"
+    if look.height < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
+        return "too faint for a glint"
+    if wide > 2.5 and not _outshines(fit, i, prepared):
+        return "no brighter than what lies beside it, as a corner of sclera between lid and iris is"
+    if look.residual > max(0.3 * min(look.height, DN), 3.0 * prepared.noise_dn):
+        return "no spot: the bright patch is not bell-shaped"
+    return None
+
+
+def _outshines(fit: SpotFit, i: int, prepared: Prepared) -> bool:
+    """Whether a spot's peak stands above the brightest surroundings, other spots apart, by half its own height.
+
+    Asked of wide spots only: a narrow one has no time to be anything else.
+    """
+    x, y = fit.xy_px[i]
+    wide = float(fit.sigma_px[i].max())
+    reach = 3.5 * wide + 1.0
+    linear = prepared.linear
+    x0, x1 = max(0, math.floor(x - reach)), min(linear.shape[1], math.ceil(x + reach) + 1)
+    y0, y1 = max(0, math.floor(y - reach)), min(linear.shape[0], math.ceil(y + reach) + 1)
+    columns, rows = np.arange(x0, x1), np.arange(y0, y1)[:, None]
+    ring = (columns - x) ** 2 + (rows - y) ** 2 > (2.2 * wide) ** 2
+    disc = 3.0 * fit.sigma_px.max(axis=1)
+    apart2 = ((fit.xy_px - fit.xy_px[i]) ** 2).sum(axis=1)
+    near = fit.converged & (apart2 < (1.5 * reach + disc + 1.0) ** 2) & (np.arange(disc.size) != i)
+    for k in np.flatnonzero(near):
+        ring &= (columns - fit.xy_px[k, 0]) ** 2 + (rows - fit.xy_px[k, 1]) ** 2 > disc[k] ** 2
+    beside = linear[y0:y1, x0:x1][ring]
+    if beside.size < 8:
+        return True
+    height = min(float(fit.amplitude_dn[i]), DN)
+    return float(fit.background_dn[i]) + height - quantile(beside, 0.97) > 0.5 * height
