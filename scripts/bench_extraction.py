@@ -193,7 +193,7 @@ def main() -> int:
     parser.add_argument("--only", choices=("ideal", "confidence", "rendered"), help="one part of the table")
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    count, many = (10, 200) if options.quick else (40, 2000)
+    count, many = (10, 200) if options.quick else (40, 4000)
     count = options.count or count
     table = Table()
     parts = ("ideal", "rendered", "confidence") if options.only is None else (options.only,)
