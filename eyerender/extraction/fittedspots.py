@@ -1,4 +1,4 @@
-"""What a fit of bright spots gives, as a batch; and the light of one."""
+"""What a fit of bright spots gives, as a batch; and the profile of one."""
 
 from __future__ import annotations
 
@@ -62,13 +62,6 @@ def no_spots() -> SpotFit:
         np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2)), np.zeros(0), np.zeros(0),
         np.zeros((0, 2, 2)), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool),
     )  # fmt: skip
-
-
-def spot_light(fit: SpotFit, x: Array, y: Array) -> Array:
-    """The light of the first spot of a batch at pixels (x, y)."""
-    gx = profile(x, float(fit.xy_px[0, 0]), float(fit.sigma_px[0, 0]))
-    gy = profile(y, float(fit.xy_px[0, 1]), float(fit.sigma_px[0, 1]))
-    return np.asarray(fit.amplitude_dn[0] * gx * gy)
 
 
 def profile(x: Array, centre: float, sigma: float) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -97,7 +98,7 @@ def _refined(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tu
     # A spot and the rim below it were each fitted with a rough idea of the other.
     fit = _fitted_again(prepared, found.image, spots, fit, on_rim, first.model)
     again = _cleared(prepared, found, spots, fit)
-    if float(np.abs(again[0] - cleared[0]).max()) < SAME_LIGHT * prepared.noise_dn:
+    if cv2.norm(again[0], cleared[0], cv2.NORM_INF) < SAME_LIGHT * prepared.noise_dn:
         return first, fit
     return _rim_fit(found, again, first) or first, fit
 

@@ -115,7 +115,8 @@ def _band(linear: Image, model: RimModel, masked: Mask) -> tuple[Array, Array, A
     # Inside the larger concentric ellipse and outside the smaller one: a cheap cover of the band.
     outer = (p / (a + outward)) ** 2 + (q / (b + outward)) ** 2 < 1.0
     inner = (p / max(a - inward, 0.5)) ** 2 + (q / max(b - inward, 0.5)) ** 2 > 1.0
-    row, column = np.nonzero(outer & inner & ~masked[y0:y1, x0:x1])
+    at = np.flatnonzero(outer & inner & ~masked[y0:y1, x0:x1])  # several times as fast as the mask's own indices
+    row, column = at // (x1 - x0), at % (x1 - x0)
     level = linear[row + y0, column + x0].astype(np.float64)
     return (column + x0).astype(np.float64), (row + y0).astype(np.float64), level
 

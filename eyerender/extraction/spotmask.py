@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.ellipse import Ellipse
-from .fittedspots import SpotFit, spot_light
+from .fittedspots import SpotFit, profile
 from .glints import Spots
 from .preprocess import Image, Prepared
 
@@ -52,8 +52,9 @@ def without_light(prepared: Prepared, fit: SpotFit, which: Mask, about: Ellipse)
         (x, y), sigma = fit.xy_px[i].tolist(), float(fit.sigma_px[i].max())
         radius = _reach(sigma, float(fit.amplitude_dn[i]), prepared.noise_dn) + 1.0
         rows, columns = _window(x, y, radius, linear.shape)
-        light = spot_light(fit.one(int(i)), np.arange(columns.start, columns.stop)[None, :].astype(np.float64),
-                           np.arange(rows.start, rows.stop)[:, None].astype(np.float64))  # fmt: skip
+        gx = profile(np.arange(columns.start, columns.stop), x, float(fit.sigma_px[i, 0]))
+        gy = profile(np.arange(rows.start, rows.stop), y, float(fit.sigma_px[i, 1]))
+        light = fit.amplitude_dn[i] * gx * gy[:, None]
         linear[rows, columns] -= light.astype(np.float32)
         bright[rows, columns] |= light > BRIGHT * prepared.noise_dn
     return linear, bright
