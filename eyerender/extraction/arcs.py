@@ -14,7 +14,7 @@ from ..geometry.ellipse import Ellipse, EllipseFit, fit_ellipse_direct, from_cv2
 from .coarse import Candidate
 from .edges import EdgePoints
 from .orderstatistics import median
-from .rimcuts import Cuts
+from .rimcuts import Cuts, turn_of
 from .settings import ExtractionSettings
 
 Array = NDArray[np.float64]
@@ -188,7 +188,7 @@ def _polished(
     ellipse, inliers = start, np.zeros(edges.points_px.shape[0], dtype=bool)
     points = edges.points_px
     for turn in range(5):
-        distance, normals, curvature = _relative(ellipse, edges.points_px)
+        distance, normals, curvature = relative_to(ellipse, edges.points_px)
         shift = np.minimum(0.5 * edges.sigma_px**2 * curvature, 0.15 * float(ellipse.semi_axes_px[1]))
         points, distance = edges.points_px + shift[:, None] * normals, distance + shift
         agree = np.einsum("nk,nk->n", normals, edges.normals) > 0.9
@@ -236,19 +236,10 @@ def ams_fit(points: Array) -> Ellipse | None:
     return Ellipse(unit.centre_px * scale + mean, unit.semi_axes_px * scale, unit.angle_rad)
 
 
-def curvature_at(ellipse: Ellipse, points: Array) -> Array:
-    """a b / (a^2 sin^2 t + b^2 cos^2 t)^1.5, 1/px: the outline's curvature at each point's parameter t."""
-    a, b = ellipse.semi_axes_px
-    cos_t, sin_t = _parameter(ellipse, points)
-    value: Array = a * b / (a * a * sin_t**2 + b * b * cos_t**2) ** 1.5
-    return value
-
-
 def outline_support(ellipse: Ellipse, points: Array) -> tuple[float, float]:
     """Shares of the SECTORS of the outline (equal steps of the parameter) that hold a point, and in the longest row of
     sectors that do not."""
-    cos_t, sin_t = _parameter(ellipse, points)
-    sector = ((np.arctan2(sin_t, cos_t) / (2.0 * np.pi) + 0.5) * SECTORS).astype(np.intp) % SECTORS
+    sector = (turn_of(points, ellipse) * SECTORS).astype(np.intp) % SECTORS
     held = np.unique(sector)
     if held.size == 0:
         return 0.0, 1.0
@@ -256,16 +247,7 @@ def outline_support(ellipse: Ellipse, points: Array) -> tuple[float, float]:
     return held.size / SECTORS, float(rows.max()) / SECTORS
 
 
-def _parameter(ellipse: Ellipse, points: Array) -> tuple[Array, Array]:
-    offset = points - ellipse.centre_px
-    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-    p = (offset[:, 0] * cos + offset[:, 1] * sin) / ellipse.semi_axes_px[0]
-    q = (offset[:, 1] * cos - offset[:, 0] * sin) / ellipse.semi_axes_px[1]
-    radius = np.maximum(np.hypot(p, q), 1e-12)
-    return p / radius, q / radius
-
-
-def _relative(ellipse: Ellipse, points: Array) -> tuple[Array, Array, Array]:
+def relative_to(ellipse: Ellipse, points: Array) -> tuple[Array, Array, Array]:
     """(signed distance (n,), outward normal (n, 2), the outline's curvature (n,)) about points near an ellipse."""
     a, b = ellipse.semi_axes_px.tolist()
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)

@@ -37,10 +37,6 @@ class SpotFit:
         """The chosen spots."""
         return SpotFit(*(getattr(self, one.name)[index] for one in fields(self)))
 
-    def one(self, i: int) -> SpotFit:
-        """A batch of spot i alone."""
-        return self.taken(np.array([i]))
-
     def replaced(self, index: NDArray[np.intp], other: SpotFit) -> SpotFit:
         """The chosen spots replaced by those of `other`."""
         parts = []

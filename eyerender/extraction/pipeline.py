@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.ellipse import signed_distance
-from .arcs import curvature_at
+from .arcs import relative_to
 from .covariance import rim_deviation
 from .fittedspots import SpotFit, joined
 from .glintjudge import judge_spots
@@ -59,15 +59,15 @@ def extract(
     found = search(work, settings)
     if isinstance(found, PupilResult):
         return Extraction(found, (), (), noise, size)
-    first = _explained(prepared, work, found, settings)
+    first = _explained(prepared, found, settings)
     if first.pupil.status == "ok" or work.inverted:
         return first
     other = second_look(work, found, settings)
-    again = None if other is None else _explained(prepared, work, other, settings)
+    again = None if other is None else _explained(prepared, other, settings)
     return again if again is not None and again.pupil.confidence >= SURE else first
 
 
-def _explained(prepared: Prepared, work: Prepared, found: Found, settings: ExtractionSettings) -> Extraction:
+def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -> Extraction:
     """The pupil whose rim was found, with the glints about it."""
     size = (int(prepared.linear.shape[0]), int(prepared.linear.shape[1]))
     noise = prepared.noise_dn / DN
@@ -77,7 +77,7 @@ def _explained(prepared: Prepared, work: Prepared, found: Found, settings: Extra
     if pupil is not None and pupil.status == "missing":
         return Extraction(pupil, (), (), noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
-    spots, fit = _fit_spots(prepared, work, spots, model)
+    spots, fit = _fit_spots(prepared, found, spots)
     if pupil is None:
         pixel_fit, fit = _refined(prepared, found, spots, fit)
         model = model if pixel_fit is None else pixel_fit.model
@@ -152,14 +152,15 @@ def _agrees(fit: PixelFit, found: Found) -> bool:
     rim = found.rim
     points = found.edges.points_px[rim.inliers]
     ellipse = fit.ellipse
-    shift = 0.5 * found.edges.sigma_px**2 * curvature_at(ellipse, points)
-    distance = median(np.abs(signed_distance(ellipse, points) + shift))
-    return distance < max(2.5 * rim.residual_px, 0.3)
+    distance, _, curvature = relative_to(ellipse, points)
+    off = median(np.abs(distance + 0.5 * found.edges.sigma_px**2 * curvature))
+    return off < max(2.5 * rim.residual_px, 0.3)
 
 
-def _fit_spots(prepared: Prepared, work: Prepared, spots: Spots, model: RimModel) -> tuple[Spots, SpotFit]:
-    """The spots fitted before the rim as the model has it; blends count as the spots they split into."""
-    known, limits = _background(work, model), _limits(prepared, model)
+def _fit_spots(prepared: Prepared, found: Found, spots: Spots) -> tuple[Spots, SpotFit]:
+    """The spots fitted before the rim as the edges have it; blends count as the spots they split into."""
+    model = found.model
+    known, limits = _background(found.image, model), _limits(prepared, model)
     starts = (spots.xy_px, spots.width_px, spots.height_dn)
     broad = widest(model.sigma_px)
     fitted = fit_spots(prepared.linear, known, *starts, limits)

@@ -36,7 +36,7 @@ class Cuts:
     def of(points: Array, ellipse: Ellipse, least: int, shares: tuple[float, ...], largest: float) -> Cuts:
         """Every stretch of these widths left out of a rim's points (n, 2) in turn, if `least` points are left and the
         ellipse stays alike: its longer axis below `largest` times the rim's. CUT_POINTS of its points tell the rest."""
-        turn = _turn(points, ellipse)
+        turn = turn_of(points, ellipse)
         order = np.argsort(turn, kind="stable")
         points, turn = points[order], turn[order]
         n = turn.size
@@ -75,7 +75,7 @@ class Cuts:
                 yield ellipse
 
 
-def _turn(points: Array, ellipse: Ellipse) -> Array:
+def turn_of(points: Array, ellipse: Ellipse) -> Array:
     """(n,) where along the outline points lie, 0..1 by the ellipse's parameter."""
     dx, dy = (points - ellipse.centre_px).T
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
