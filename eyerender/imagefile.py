@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from .errors import EyerenderError, InputError
+from .errors import InputError
+from .files import written
 
 # The largest window that can be rendered; this bounds what a hostile file can make us allocate.
 MAX_PIXELS = 8192 * 8192
@@ -23,16 +24,14 @@ MAX_PIXELS = 8192 * 8192
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "GIF", "WEBP", "JPEG2000")
 
 
-def write_png(path: str | Path, image: NDArray[Any]) -> None:
-    """Write (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour; complete or not at all."""
-    path = Path(path)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        encode_png(part, image)
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> None:
+    """Write (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour; complete or not at all.
+
+    Images are mostly written into a folder that is synced as a whole before it is published; `sync` makes a single one
+    durable.
+    """
+    with written(path, sync=sync) as file:
+        encode_png(file, image)
 
 
 def encode_png(target: Path | BinaryIO, image: NDArray[Any]) -> None:

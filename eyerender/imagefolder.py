@@ -11,13 +11,14 @@ import os
 import platform
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from .errors import EyerenderError, InputError
+from .files import write_json
 from .observation import Observations
 
 IMAGE_SCHEMA = "eyerender/image/1"
@@ -191,19 +192,6 @@ def write_dataset(folder: Path, lines: list[dict[str, Any]], *, spec: dict[str, 
         **more,
     }
     write_json(folder / DATASET, dataset)
-
-
-def write_json(path: str | Path, data: dict[str, Any]) -> None:
-    """Write JSON, complete or not at all."""
-    path = Path(path)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
 def versions() -> dict[str, str]:

@@ -17,6 +17,7 @@ PACKAGE = Path(eyerender.__file__).resolve().parent
 FLOORS = {
     "errors": 0,
     "arrays": 0,
+    "files": 0,
     "spec": 0,
     "geometry": 1,
     "optics": 2,
@@ -47,6 +48,7 @@ FLOORS = {
 ORDER = [
     "errors",
     "arrays",
+    "files",
     "spec",
     "observation",
     "imagefile",

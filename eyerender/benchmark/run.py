@@ -15,8 +15,9 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import EyerenderError, InputError
+from ..files import write_json
 from ..imagefile import read_image
-from ..imagefolder import refuse_non_empty, staged, versions, write_json
+from ..imagefolder import refuse_non_empty, staged, versions
 from ..report.benchmark import write_bench_report
 from .bound import Edge, edge_of
 from .folder import LabelledImage, load_labelled

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from ..errors import EyerenderError, InputError
+from ..errors import InputError
+from ..files import written
 from .app import app
 from .options import Result
 from .output import emit
@@ -75,12 +76,7 @@ def view(
         from ..scene import load_scene
 
         fig = scene_view(load_scene(name, eye=eye))
-    part = output.with_name(f".{output.name}.part")
-    try:
-        fig.savefig(part, format=output.suffix[1:].lower(), dpi=150)
-        part.replace(output)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise EyerenderError(f"{output}: cannot be written ({error.strerror or error})") from None
+    with written(output) as file:
+        fig.savefig(file, format=output.suffix[1:].lower(), dpi=150)
     print(output)
     return 0

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from ..imagefolder import write_json
+from ..files import write_json
 
 
 def say(text: str) -> None:

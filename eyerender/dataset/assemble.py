@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import EyerenderError
-from ..imagefolder import CONVENTIONS, DATASET, DATASET_SCHEMA, METADATA, write_json
+from ..files import write_json
+from ..imagefolder import CONVENTIONS, DATASET, DATASET_SCHEMA, METADATA
 from .card import data_card
 from .columns import type_first
 from .croissant import CROISSANT, croissant

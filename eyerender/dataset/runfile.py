@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..imagefolder import RUN, STAGE, write_json
+from ..files import write_json
+from ..imagefolder import RUN, STAGE
 from .lock import LOCK
 from .plan import Plan
 from .shard import run_versions

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from ..arrays import Floats, frozen
 from ..errors import InputError
-from ..imagefolder import write_json
+from ..files import write_json
 from ..observation import EYES, Observations
 from ..rig.rig import Rig
 from ..spec import Spec

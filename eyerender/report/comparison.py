@@ -11,7 +11,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..comparison import Comparison
-from ..errors import EyerenderError
+from ..files import write_text
 from ..imagefile import read_image
 from ..imagefolder import ImageEntry, versions
 from ..observation import EYES
@@ -48,13 +48,7 @@ def write_report(
         timings=timings,
         versions=versions(),
     )
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(page, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+    write_text(path, page)
 
 
 def feature_figure(comparison: Comparison) -> str:

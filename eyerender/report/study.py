@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from ..errors import EyerenderError
+from ..files import write_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,10 +64,4 @@ def write_page(path: Path, page: Page) -> None:
         loader=PackageLoader("eyerender.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     text = environment.get_template("study.html.j2").render(page=page)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+    write_text(path, text)

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..errors import EyerenderError
-from ..imagefolder import versions, write_json
+from ..files import write_json, write_text
+from ..imagefolder import versions
 
 SUMMARY_SCHEMA = "eyerender/study-summary/1"
 FINDINGS_SCHEMA = "eyerender/study-findings/1"
@@ -135,14 +135,3 @@ def table(kind: type, items: Sequence[Any]) -> str:
     for item in items:
         writer.writerow(["" if (v := getattr(item, name)) is None else v for name in names])
     return text.getvalue()
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, complete or not at all."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None

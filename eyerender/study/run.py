@@ -15,7 +15,8 @@ from typing import Any, Literal
 
 from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
-from ..imagefolder import refuse_non_empty, write_json
+from ..files import write_json, write_text
+from ..imagefolder import refuse_non_empty
 from ..report.study import write_page
 from ..scene import Scene
 from . import blignaut, guestrin, head_mounted, together
@@ -25,7 +26,7 @@ from .images import ImageSettings, StudyImages, make_images
 from .literature import MODELS, VARIANTS
 from .observing import Kind, Observing
 from .replicate import blignaut_part, facing, guestrin_part, scenes_of
-from .results import write_results, write_text
+from .results import write_results
 
 Progress = Callable[[int, int, str], None]
 STUDIES = ("guestrin2006", "blignaut2014", "observers", "conditions")

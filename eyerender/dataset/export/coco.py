@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...files import write_json
 from ...geometry.ellipse import Ellipse
 from ...imagefile import write_png
-from ...imagefolder import write_json
 from .item import Items
 
 # A category's id is the part's value in the mask, but for the glints.

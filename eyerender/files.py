@@ -1,0 +1,243 @@
+"""Files: durable, atomic writes; reads that trust nothing; JSON without surprises.
+
+A file is published by writing it under a temporary name beside its place, syncing it, renaming it and syncing the
+folder. After a power cut its place then holds the old content or the new one, never a part of either. Whatever is read
+may come from somebody else: it must be a regular file within a size limit.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from .errors import EyerenderError, InputError
+
+# Text files that people write: scenes, specs, eye files, calibrations.
+MAX_TEXT_BYTES = 16 * 2**20
+# A file that this package or a user's own scene names: an image, a map, a mesh.
+MAX_FILE_BYTES = 2**31
+PART = ".part"
+_PLAIN = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
+
+
+@contextmanager
+def written(path: str | Path, *, sync: bool = True) -> Iterator[BinaryIO]:
+    """A new file to write into; it takes its place when the block ends well, and leaves nothing when it does not.
+
+    Args:
+        path: the file to write; an old one is replaced.
+        sync: make it durable before the block's end: the file is synced before the rename, its folder after it.
+            Without it a power cut may leave an empty file, so use it only for what is synced later as a whole.
+
+    Raises:
+        EyerenderError: the disk is full or not writable.
+    """
+    path = Path(path)
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
+    made = False
+    try:
+        # Exclusive: a link or a file that somebody put there is not followed and not overwritten.
+        with open(part, "xb") as file:
+            made = True
+            yield file
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
+        os.replace(part, path)
+        made = False
+        if sync:
+            sync_folder(path.parent)
+    except OSError as error:
+        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+    finally:
+        if made:
+            with suppress(OSError):
+                part.unlink()
+
+
+def write_bytes(path: str | Path, data: bytes, *, sync: bool = True) -> None:
+    """Write a file, complete or not at all; raises as `written` does."""
+    with written(path, sync=sync) as file:
+        file.write(data)
+
+
+def write_text(path: str | Path, text: str, *, sync: bool = True) -> None:
+    """Write UTF-8 text, complete or not at all; raises as `written` does."""
+    write_bytes(path, text.encode(), sync=sync)
+
+
+def write_json(path: str | Path, data: Any, *, sync: bool = True) -> None:
+    """Write JSON, complete or not at all; raises as `written` does, and `ValueError` for NaN and infinity."""
+    write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n", sync=sync)
+
+
+def sync_file(path: str | Path) -> None:
+    """Make a file's content durable; raises `OSError`."""
+    _sync(path, os.O_RDONLY)
+
+
+def sync_folder(path: str | Path) -> None:
+    """Make the names in a folder durable; raises `OSError`. Does nothing where folders cannot be opened (Windows)."""
+    if hasattr(os, "O_DIRECTORY"):
+        _sync(path, os.O_RDONLY | os.O_DIRECTORY)
+
+
+def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> bytes:
+    """The content of a regular file.
+
+    Args:
+        path: the file.
+        limit: the largest size that is read, in bytes.
+        follow: whether the file may be a symbolic link.
+
+    Raises:
+        InputError: it is missing, not a regular file (a pipe, a device, a folder), too large, or may not be read.
+    """
+    source = str(path)
+    try:
+        # Opening a pipe for reading would wait for a writer.
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+        handle = os.open(path, flags | (0 if follow else getattr(os, "O_NOFOLLOW", 0)))
+    except OSError as error:
+        raise InputError(_why_unreadable(path, error), source=source) from None
+    except ValueError:
+        raise InputError("is no file name", source=source) from None
+    state = os.fstat(handle)
+    if not stat.S_ISREG(state.st_mode):
+        os.close(handle)
+        raise InputError(f"is {_kind(state.st_mode)}, not a file", source=source)
+    with open(handle, "rb") as file:
+        if state.st_size > limit:
+            raise InputError(f"is too large ({_size(state.st_size)}; at most {_size(limit)} is read)", source=source)
+        try:
+            data = file.read(limit + 1)
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror or error})", source=source) from None
+    if len(data) > limit:
+        raise InputError(f"is too large (at most {_size(limit)} is read)", source=source)
+    return data
+
+
+def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = True) -> str:
+    """The content of a UTF-8 text file; raises `InputError` as `read_bytes` does, and for other encodings."""
+    try:
+        return read_bytes(path, limit=limit, follow=follow).decode()
+    except UnicodeDecodeError:
+        raise InputError("cannot be read (not UTF-8 text)", source=str(path)) from None
+
+
+def parse_json(text: str | bytes, *, source: str = "", path: str = "") -> Any:
+    """A JSON value: finite numbers only, integers of at most 300 digits; raises `InputError`."""
+    try:
+        return json.loads(text, parse_constant=_refuse, parse_int=_integer, parse_float=_finite)
+    except RecursionError:
+        raise InputError("is not valid JSON: nested too deeply", source=source, path=path) from None
+    except UnicodeDecodeError:
+        raise InputError("is not valid JSON: not UTF-8 text", source=source, path=path) from None
+    except json.JSONDecodeError as error:
+        where = path or f"line {error.lineno}"
+        raise InputError(f"is not valid JSON: {error.msg}", source=source, path=where) from None
+    except ValueError as error:
+        raise InputError(f"is not valid JSON: {error}", source=source, path=path) from None
+
+
+def read_json(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = True) -> dict[str, Any]:
+    """A JSON file that holds an object; raises `InputError`."""
+    data = parse_json(read_bytes(path, limit=limit, follow=follow), source=str(path))
+    if not isinstance(data, dict):
+        raise InputError("must be a JSON object", source=str(path))
+    return data
+
+
+def inside(folder: Path, name: object, *, source: str = "", path: str = "") -> Path:
+    """The regular file `name` of a folder that somebody else may have made.
+
+    The name must be relative, of plain parts (no `..`, no control characters), and no part of it may be a link.
+
+    Raises:
+        InputError: the name leads out of the folder, or is no regular file there.
+    """
+    if not is_plain(name):
+        raise InputError(f"must be a path inside the folder, not {shown(name)}", source=source, path=path)
+    place = folder
+    parts = str(name).split("/")
+    for k, part in enumerate(parts):
+        place = place / part
+        try:
+            mode = place.lstat().st_mode
+        except OSError as error:
+            raise InputError(f"{shown(name)}: {_why_unreadable(place, error)}", source=source, path=path) from None
+        if not (stat.S_ISREG(mode) if k == len(parts) - 1 else stat.S_ISDIR(mode)):
+            raise InputError(f"{shown(name)}: is {_kind(mode)}", source=source, path=path)
+    return place
+
+
+def is_plain(name: object) -> bool:
+    """Whether a name is a relative path of plain parts, with `/` between them."""
+    return (
+        isinstance(name, str)
+        and len(name) <= 1024
+        and all(_PLAIN.fullmatch(part) and part not in (".", "..") for part in name.split("/"))
+    )
+
+
+def shown(value: object, limit: int = 80) -> str:
+    """A value from a file as it may stand in a message: one line of printable characters, not too long."""
+    text = repr(value) if not isinstance(value, int) or abs(value) < 10**limit else "a huge number"
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def _sync(path: str | Path, flags: int) -> None:
+    handle = os.open(path, flags)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _why_unreadable(path: str | Path, error: OSError) -> str:
+    if isinstance(error, FileNotFoundError):
+        return "no such file"
+    if os.path.islink(path):
+        return "is a symbolic link, not a file"
+    return f"cannot be read ({error.strerror or error})"
+
+
+def _kind(mode: int) -> str:
+    kinds = (
+        (stat.S_ISDIR, "a folder"),
+        (stat.S_ISREG, "a file"),
+        (stat.S_ISLNK, "a symbolic link"),
+        (stat.S_ISFIFO, "a pipe"),
+        (stat.S_ISSOCK, "a socket"),
+    )
+    return next((name for test, name in kinds if test(mode)), "a device")
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**20:.0f} MiB" if count >= 2**20 else f"{count} bytes"
+
+
+def _refuse(text: str) -> Any:
+    raise ValueError(f"{text} is no number")
+
+
+def _integer(text: str) -> int:
+    if len(text) > 300:
+        raise ValueError(f"an integer of {len(text)} digits")
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if value in (float("inf"), float("-inf")):
+        raise ValueError(f"the number {text[:40]} is too large")
+    return value

@@ -1,0 +1,146 @@
+"""Durable writes and reads that trust nothing."""
+
+from __future__ import annotations
+
+import os
+import socket
+
+import pytest
+
+from eyerender.errors import EyerenderError, InputError
+from eyerender.files import (
+    inside,
+    is_plain,
+    parse_json,
+    read_bytes,
+    read_json,
+    read_text,
+    shown,
+    write_json,
+    write_text,
+    written,
+)
+
+
+def test_a_file_is_replaced_only_when_the_block_ends_well(tmp_path):
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+
+    def fail_half_way():
+        with written(path) as file:
+            file.write(b"half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail_half_way()
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+    write_text(path, "new")
+    assert path.read_text() == "new"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_file_is_synced_before_its_rename_and_the_folder_after_it(tmp_path, monkeypatch):
+    done = []
+    fsync, replace = os.fsync, os.replace
+
+    def sync(handle):
+        done.append("folder" if os.path.isdir(f"/proc/self/fd/{handle}") else "file")
+        fsync(handle)
+
+    def rename(a, b):
+        done.append("rename")
+        replace(a, b)
+
+    monkeypatch.setattr(os, "fsync", sync)
+    monkeypatch.setattr(os, "replace", rename)
+    write_json(tmp_path / "a.json", {"a": 1})
+    assert done == ["file", "rename", "folder"]
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
+    with pytest.raises(EyerenderError, match=r"a\.txt: cannot be written"):
+        write_text(tmp_path / "missing" / "a.txt", "")
+
+
+def test_only_regular_files_within_the_limit_are_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="is a pipe, not a file"):
+        read_bytes(tmp_path / "pipe")
+    with pytest.raises(InputError, match="is a folder, not a file"):
+        read_bytes(tmp_path)
+    with pytest.raises(InputError, match="is a device, not a file"):
+        read_bytes("/dev/zero")
+    with pytest.raises(InputError, match="no such file"):
+        read_bytes(tmp_path / "none")
+    with pytest.raises(InputError, match="is no file name"):
+        read_bytes("a\0b")
+    (tmp_path / "large").write_bytes(bytes(11))
+    with pytest.raises(InputError, match="too large"):
+        read_bytes(tmp_path / "large", limit=10)
+    assert read_bytes(tmp_path / "large", limit=11) == bytes(11)
+    (tmp_path / "link").symlink_to(tmp_path / "large")
+    assert read_bytes(tmp_path / "link") == bytes(11)
+    with pytest.raises(InputError, match="symbolic link"):
+        read_bytes(tmp_path / "link", follow=False)
+    (tmp_path / "latin").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match="not UTF-8 text"):
+        read_text(tmp_path / "latin")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["NaN", "Infinity", "1e400", "9" * 400, "[" * 100_000, "{", "", "\x00", "-" + "9" * 5000, b"\xff\xff\xff\xff"],
+    ids=lambda t: repr(t[:8]),
+)
+def test_json_of_strangers_ends_with_one_line(text):
+    with pytest.raises(InputError, match="is not valid JSON") as caught:
+        parse_json(text, source="f.json")
+    assert len(str(caught.value)) < 200
+    assert "\n" not in str(caught.value)
+
+
+def test_json_that_is_no_object_is_refused(tmp_path):
+    write_text(tmp_path / "a.json", "[1]")
+    with pytest.raises(InputError, match="must be a JSON object"):
+        read_json(tmp_path / "a.json")
+    write_json(tmp_path / "a.json", {"n": 10**20, "x": 0.5})
+    assert read_json(tmp_path / "a.json") == {"n": 10**20, "x": 0.5}
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "/a", "a/../b", "../a", "a//b", "a/", "a\nb", "a\0", "C:\\a", "a" * 2000, None, 3, ["a"]]
+)
+def test_names_that_may_lead_elsewhere_are_refused(tmp_path, name):
+    assert not is_plain(name)
+    with pytest.raises(InputError, match="must be a path inside the folder"):
+        inside(tmp_path, name)
+
+
+def test_a_file_inside_is_reached_through_no_link(tmp_path):
+    folder = tmp_path / "set"
+    (folder / "images").mkdir(parents=True)
+    (folder / "images" / "a b.png").write_bytes(b"x")
+    assert inside(folder, "images/a b.png") == folder / "images" / "a b.png"
+    (tmp_path / "secret").write_bytes(b"s")
+    (folder / "images" / "link.png").symlink_to(tmp_path / "secret")
+    (folder / "out").symlink_to(tmp_path)
+    os.mkfifo(folder / "images" / "pipe.png")
+    with socket.socket(socket.AF_UNIX) as s:
+        s.bind(str(folder / "s"))
+        for name, why in (
+            ("images/link.png", "is a symbolic link"),
+            ("out/secret", "is a symbolic link"),
+            ("images/pipe.png", "is a pipe"),
+            ("s", "is a socket"),
+            ("images", "is a folder"),
+            ("images/none.png", "no such file"),
+        ):
+            with pytest.raises(InputError, match=why):
+                inside(folder, name, source="metadata.jsonl", path="line 1.file_name")
+
+
+def test_values_of_strangers_are_shown_on_one_short_line():
+    assert shown("a\nb\x1b[31m") == r"'a\nb\x1b[31m'"
+    assert len(shown("x" * 10_000)) == 80
+    assert shown(10**5000) == "a huge number"
