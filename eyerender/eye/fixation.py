@@ -232,18 +232,37 @@ def _window_miss(eye: Eye, target_mm: Array, angles: Array) -> tuple[Array, Arra
 
 
 def entrance_window_centre(eye: Eye, viewpoint_mm: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """The centre of the entrance window seen from viewpoints (n, 3) of the eye frame, and where there is none.
+    """The centre of the entrance window seen from viewpoints (n, 3) of the eye frame (mm), and where there is none.
 
     c = mean(p_i) - t mean(u_i) with exit points p_i and directions u_i; t makes c come closest to the optic axis.
+    Where the mean ray runs along the optic axis every t does. The window then lies where it lies for a viewpoint
+    1e-4 rad off the axis on the same side; t changes with the square of that angle, by some 1e-9 mm.
     """
+    point, way, lost = _mean_ray(eye, viewpoint_mm)
+    length = _to_the_axis(point, way)
+    on_axis = np.hypot(way[:, 1], way[:, 2]) < _ON_AXIS_RAD
+    on_axis &= np.hypot(point[:, 1], point[:, 2]) < _ON_AXIS_MM
+    if on_axis.any():
+        side = np.where(np.any(viewpoint_mm[:, 1:], axis=-1, keepdims=True), viewpoint_mm[:, 1:], 1.0)
+        reach = 2.0 * _ON_AXIS_RAD * np.linalg.norm(viewpoint_mm, axis=-1, keepdims=True)
+        side = reach * side / np.linalg.norm(side, axis=-1, keepdims=True)
+        beside, heading, _ = _mean_ray(eye, np.concatenate([viewpoint_mm[:, :1], side], axis=-1))
+        length = np.where(on_axis, _to_the_axis(beside, heading), length)
+    return point - length[:, None] * way, lost
+
+
+def _mean_ray(eye: Eye, viewpoint_mm: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+    """Mean exit point and mean direction (n, 3) of the rays from the stop's margin, and where one does not exist."""
     margin = eye.stop.boundary(WINDOW_POINTS)
     found = apparent_points(eye.front, eye.front_indices, margin, viewpoint_mm[:, None, :])
-    point, way = np.mean(found.exit_points_mm, axis=1), np.mean(found.directions, axis=1)
-    square = np.sum(way[:, 1:] ** 2, axis=-1)
-    # Seen along the optic axis every length does; there the window lies where near-axial ones do.
+    lost = (found.status != RayStatus.OK).any(axis=1)
+    return np.mean(found.exit_points_mm, axis=1), np.mean(found.directions, axis=1), lost
+
+
+def _to_the_axis(point: Array, way: Array) -> Array:
+    """t for which point - t way comes closest to the x axis, (n,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        length = np.where(square > 1e-24, np.sum(way[:, 1:] * point[:, 1:], axis=-1) / square, 0.0)
-    return point - length[:, None] * way, (found.status != RayStatus.OK).any(axis=1)
+        return np.asarray(np.sum(way[:, 1:] * point[:, 1:], axis=-1) / np.sum(way[:, 1:] ** 2, axis=-1))
 
 
 def _status(target_mm: Array, azimuth: Array, elevation: Array, residual: Array) -> npt.NDArray[np.int8]:
@@ -272,5 +291,8 @@ def _split(vector: Array) -> Xyz:
 
 
 _SETTLED_MM = 1e-11
+_ON_AXIS_RAD = 5e-5
+_ON_AXIS_MM = 1e-3
+"""A mean ray this close to the optic axis, in direction and in place, runs along it."""
 _NUDGE_RAD = 1e-5
 _START_RAD = np.radians(85.0)

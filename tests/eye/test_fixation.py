@@ -44,6 +44,32 @@ def test_entrance_windows_agree_with_the_reference():
     assert np.abs(centre[0] - seen["center"]).max() < 3e-8
 
 
+@pytest.mark.parametrize("name", ["E1", "E2", "E3", "E4"])
+def test_the_entrance_window_seen_along_the_axis_is_the_limit_of_those_beside_it(name):
+    """On the axis the formula is 0/0; the window's place runs evenly with the angle, so it must not jump there."""
+    eye = load_eye(name).build()
+    angle = np.array([0.0, 1e-18, 1e-15, 1e-12, 1e-9, 1e-6, 2e-5, 4.9e-5, 5.1e-5, 1e-4])
+    for turn in (0.0, 0.7, 2.0, 4.0):
+        lateral = np.sin(angle)[:, None] * [np.cos(turn), np.sin(turn)]
+        viewpoints = 1000.0 * np.column_stack([np.cos(angle), lateral])
+        centre, lost = entrance_window_centre(eye, viewpoints)
+        assert not lost.any()
+        beside, _ = entrance_window_centre(eye, 1000.0 * np.array([[np.cos(1e-3), *(1e-3 * lateral[-1] / 1e-4)]]))
+        # The place changes with the square of the angle: by some 2e-7 mm at 1e-3 rad.
+        assert np.abs(centre[:, 0] - beside[0, 0]).max() < 5e-7
+        assert np.ptp(centre[:, 0]) < 1e-8
+        assert np.abs(centre[:, 1:]).max() < 1e-8
+
+
+def test_an_eye_on_the_axis_does_not_disturb_the_others_of_its_batch():
+    eyes = stack_eyes([load_eye("E2").build(), load_eye("E2").build(pupil_diameter_mm=3.0)])
+    both, _ = entrance_window_centre(eyes, np.array([[600.0, 0.0, 0.0], [600.0, 30.0, -9.0]]))
+    for k, diameter in enumerate((None, 3.0)):
+        eye = load_eye("E2").build() if diameter is None else load_eye("E2").build(pupil_diameter_mm=diameter)
+        alone, _ = entrance_window_centre(eye, np.array([[600.0, 0.0, 0.0], [600.0, 30.0, -9.0]])[k : k + 1])
+        assert np.abs(both[k] - alone[0]).max() < 1e-9
+
+
 def test_poses_by_entrance_window_agree_with_the_reference():
     data = json.loads((DATA / "fixation_E2.json").read_text())
     expected = np.array([f["pose_azi_ele"] for f in data["fixations"]])
