@@ -32,6 +32,12 @@ SETTLED_MM = 1e-12
 ROUNDING_RAD = 4e-16
 RESIDUAL_LIMIT_MM = 1e-9
 """A ray that misses its end by more is no solution."""
+FAR_MM = 1000.0
+"""By how much a ray misses an end farther than this from the last surface is measured at this distance.
+
+One rounding of the direction moves a ray by 1e-7 mm at 1e9 mm. What counts is the direction: a residual of 1e-9 mm
+is 1e-12 rad for every end that is farther, up to infinity.
+"""
 
 _FAST_STEPS = 8
 _GUARDED_STEPS = 60
@@ -44,7 +50,8 @@ class Connection:
 
     start : unit direction at the source; first : the point on the first crossing; last : the point on the last one;
     turning : the point where the ray was last reflected (the first one if it never was);
-    end : unit direction in the last medium; residual_mm : by how much the traced ray misses the target;
+    end : unit direction in the last medium; residual_mm : by how much the traced ray misses the target, for one
+    beyond `FAR_MM` of the last surface measured there;
     tube_mm2_sr : |det|; status.
     """
 
@@ -215,7 +222,7 @@ def _shoot(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xy
         along = dot(gap, way)
         miss = _moved(gap, way, -along)
         a1, a2 = _moved(moves[0], turns[0], along), _moved(moves[1], turns[1], along)
-        residual = np.sqrt(dot(miss, miss))
+        residual = np.sqrt(dot(miss, miss)) * nearness(along)
         determinant = _triple(way, a1, a2)
     mark(status, ~np.isfinite(residual), RayStatus.MISSED)
     # The target lies ahead in the last medium, or the ray would have to run backwards to it.
@@ -295,13 +302,18 @@ def _guarded(
 
 def _settled(shot: _Shot, slack: float) -> Mask:
     """Whether the miss is down to `slack` times what Newton can reach."""
-    reach = SETTLED_MM + ROUNDING_RAD * np.sqrt(np.abs(shot.determinant))
+    reach = SETTLED_MM + ROUNDING_RAD * np.sqrt(np.abs(shot.determinant)) * nearness(shot.along)
     return np.asarray(shot.residual_mm <= slack * reach)
 
 
 def _better(trial: _Shot, best: _Shot) -> Mask:
     ok, held = trial.status == RayStatus.OK, best.status == RayStatus.OK
     return np.asarray((ok & ~held) | ((ok == held) & (trial.residual_mm < best.residual_mm)))
+
+
+def nearness(along_mm: Array) -> Array:
+    """What a miss at the distance `along_mm` behind the last surface is multiplied by: FAR_MM / along_mm, at most 1."""
+    return np.asarray(FAR_MM / np.maximum(along_mm, FAR_MM))
 
 
 def taken(crossing: Crossing, frame: npt.NDArray[np.intp]) -> Crossing:

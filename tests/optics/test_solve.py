@@ -211,6 +211,52 @@ def test_reflection_is_stationary_and_obeys_the_law():
     assert np.allclose(np.cross(normal, to_source + to_place), 0.0, atol=1e-14)
 
 
+@pytest.mark.parametrize("name", ["E1", "E2", "E4", "E5"])
+def test_glints_are_as_sure_for_distant_lights_as_for_near_ones(name):
+    """The law of reflection, which knows nothing of a residual, holds to 1e-12 rad at every distance.
+
+    Farther away the mirror point goes to that of a light at infinity: the difference falls as 1 / distance.
+    """
+    eye = load_eye(name).build()
+    rng = np.random.default_rng(3)
+    angle, turn = np.radians(rng.uniform(0.0, 75.0, 60)), rng.uniform(0.0, 2.0 * np.pi, 60)
+    ways = np.column_stack([np.cos(angle), np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn)])
+    places = viewpoints(2)[16:48]
+    places = places[rng.integers(0, len(places), 60)]
+    points = {}
+    for distance in 10.0 ** np.arange(1, 13):
+        lights = distance * ways
+        found = mirror_points(eye.front[0], lights, places)
+        assert (found.status == RayStatus.OK).all()
+        assert found.residual_mm.max() < 1e-9
+        points[distance] = found.points_mm
+        normal = eye.front[0].normal(found.points_mm)
+        to_light = lights - found.points_mm
+        to_light /= np.linalg.norm(to_light, axis=-1, keepdims=True)
+        reflected = 2.0 * np.sum(normal * to_light, axis=-1, keepdims=True) * normal - to_light
+        assert np.linalg.norm(np.cross(reflected, found.directions), axis=-1).max() < 2e-12
+    for distance in 10.0 ** np.arange(3, 12):
+        assert np.abs(points[distance] - points[1e12]).max() < 100.0 / distance + 1e-11
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+def test_images_from_inside_the_eye_of_distant_lights_are_found(order):
+    eye = load_eye("E4").build()
+    found = purkinje_points(
+        (eye.front + eye.back)[:order],
+        (eye.front_indices + eye.back_indices)[:order],
+        (np.inf,) * order,
+        (False,) * order,
+        10.0 ** np.arange(3, 13)[:, None] * (np.array([12.0, 1.0, -2.0]) / np.sqrt(149.0)),
+        [500.0, 60.0, 20.0],
+    )
+    assert (found.status == RayStatus.OK).all()
+    assert found.residual_mm.max() < 1e-9
+    # The points of lights at 1e3 and 1e12 mm lie less than 0.1 mm apart, and the gap falls as 1 / distance.
+    gap = np.abs(found.exit_points_mm - found.exit_points_mm[-1]).max(axis=-1)
+    assert (gap < 100.0 / 10.0 ** np.arange(3, 13) + 1e-10).all()
+
+
 def test_the_apparent_point_of_a_plane_is_snells():
     """A plane window: sin inside = sin outside / n, the depth of the object known."""
     window = Quadric.plane((0.0, 0.0, 0.0))
