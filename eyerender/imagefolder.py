@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import EyerenderError, InputError
-from .files import write_json
+from .files import make_folder, sync_folder, sync_tree, write_json
 from .observation import Observations
 
 IMAGE_SCHEMA = "eyerender/image/1"
@@ -148,8 +148,8 @@ def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
 def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
     """A folder to write into, inside `path`, whose content takes its place only when the block ends well.
 
-    `dataset.json` moves last, so a folder that has one is complete, whatever happened. What an earlier, killed run left
-    staged is removed.
+    `dataset.json` moves last, so a folder that has one is complete, also after a power cut: everything is synced before
+    it moves. What an earlier, killed run left staged is removed.
 
     Raises:
         InputError: the place is taken.
@@ -158,18 +158,24 @@ def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
     final = Path(path)
     refuse_non_empty(final, overwrite)
     stage = final / f"{STAGE}{os.getpid()}"
-    created = not final.exists()
+    created = False
     try:
-        final.mkdir(parents=True, exist_ok=True)
+        created = make_folder(final)
         for leftover in final.glob(f"{STAGE}*"):
             shutil.rmtree(leftover, ignore_errors=True)
         stage.mkdir()
         yield stage
-        old = sorted((p for p in final.iterdir() if p != stage), key=lambda p: p.name != DATASET)
-        for entry in old:
+        sync_tree(stage)
+        if (final / DATASET).exists():
+            (final / DATASET).unlink()
+            sync_folder(final)
+        for entry in [p for p in final.iterdir() if p != stage]:
             shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
         for entry in sorted(stage.iterdir(), key=lambda p: p.name == DATASET):
+            if entry.name == DATASET:
+                sync_folder(final)
             os.rename(entry, final / entry.name)
+        sync_folder(final)
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
     finally:

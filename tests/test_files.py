@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 
@@ -11,11 +12,14 @@ from eyerender.errors import EyerenderError, InputError
 from eyerender.files import (
     inside,
     is_plain,
+    make_folder,
     parse_json,
     read_bytes,
     read_json,
     read_text,
     shown,
+    sync_folder,
+    sync_tree,
     write_json,
     write_text,
     written,
@@ -56,6 +60,53 @@ def test_a_file_is_synced_before_its_rename_and_the_folder_after_it(tmp_path, mo
     monkeypatch.setattr(os, "replace", rename)
     write_json(tmp_path / "a.json", {"a": 1})
     assert done == ["file", "rename", "folder"]
+
+
+def synced(monkeypatch):
+    """A list that gets the path of whatever is synced."""
+    paths, fsync = [], os.fsync
+
+    def sync(handle):
+        paths.append(os.readlink(f"/proc/self/fd/{handle}"))
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", sync)
+    return paths
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="asks the kernel for a handle's path")
+def test_a_tree_is_synced_with_its_folders(tmp_path, monkeypatch):
+    (tmp_path / "deep" / "deeper").mkdir(parents=True)
+    (tmp_path / "outside").write_text("x")
+    tree = tmp_path / "deep"
+    (tree / "a").write_text("x")
+    (tree / "deeper" / "b").write_text("x")
+    (tree / "link").symlink_to(tmp_path / "outside")
+    os.mkfifo(tree / "pipe")
+    paths = synced(monkeypatch)
+    sync_tree(tree)
+    assert sorted(paths[:2]) == [str(tree / "a"), str(tree / "deeper" / "b")]
+    assert sorted(paths[2:]) == [str(tree), str(tree / "deeper")]
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="asks the kernel for a handle's path")
+def test_new_folders_are_synced_in_those_above_them(tmp_path, monkeypatch):
+    paths = synced(monkeypatch)
+    assert make_folder(tmp_path / "a" / "b")
+    assert sorted(paths) == [str(tmp_path), str(tmp_path / "a")]
+    assert not make_folder(tmp_path / "a" / "b")
+
+
+def test_a_file_system_that_syncs_no_folders_is_no_error(tmp_path, monkeypatch):
+    def fsync(handle):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    number = errno.EINVAL
+    sync_folder(tmp_path)
+    number = errno.EIO
+    with pytest.raises(OSError, match=os.strerror(errno.EIO)):
+        sync_folder(tmp_path)
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -83,6 +84,30 @@ def test_staged_folder_appears_complete(tmp_path):
     assert sorted(p.name for p in out.iterdir()) == ["dataset.json", "images", "metadata.jsonl"]
     assert same_run(out, "d")
     assert not same_run(out, "e")
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="asks the kernel for a handle's path")
+def test_everything_is_synced_before_dataset_json_takes_its_place(tmp_path, monkeypatch):
+    done, fsync, rename = [], os.fsync, os.rename
+
+    def sync(handle):
+        done.append(("sync", Path(os.readlink(f"/proc/self/fd/{handle}")).name))
+        fsync(handle)
+
+    def move(a, b):
+        done.append(("rename", Path(b).name))
+        rename(a, b)
+
+    out = tmp_path / "out"
+    with staged(out) as folder:
+        (folder / "images").mkdir()
+        (folder / "images" / "a.png").write_bytes(b"x")
+        write_dataset(folder, [line()], spec={}, digest="d")
+        monkeypatch.setattr(os, "fsync", sync)
+        monkeypatch.setattr(os, "rename", move)
+    first = next(k for k, (what, _) in enumerate(done) if what == "rename")
+    assert {name for _, name in done[:first]} >= {"a.png", "images", "metadata.jsonl", "dataset.json"}
+    assert done[-3:] == [("sync", "out"), ("rename", "dataset.json"), ("sync", "out")]
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, OSError])
