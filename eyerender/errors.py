@@ -7,11 +7,20 @@ in the result. Any other exception is a defect of this package.
 
 from __future__ import annotations
 
+# A message may quote a file that somebody else made. Longer parts lose their middle.
+MAX_MESSAGE, MAX_SOURCE, MAX_PATH, MAX_REASON = 2000, 600, 200, 400
+
 
 class EyerenderError(Exception):
-    """Base of every error this package raises on purpose: the run failed (disk, worker, backend)."""
+    """Base of every error this package raises on purpose: the run failed (disk, worker, backend).
+
+    The message is one line of printable characters of a limited length, whatever it quotes.
+    """
 
     exit_code = 1
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(one_line(message, MAX_MESSAGE))
 
 
 class InputError(EyerenderError):
@@ -23,13 +32,25 @@ class InputError(EyerenderError):
     exit_code = 2
 
     def __init__(self, reason: str, *, source: str = "", path: str = "") -> None:
-        self.reason = reason
+        self.reason = one_line(reason, MAX_REASON)
         self.source = source
-        self.path = path
-        super().__init__(": ".join(part for part in (source, path, reason) if part))
+        self.path = one_line(path, MAX_PATH)
+        shown = one_line(source, MAX_SOURCE)
+        super().__init__(": ".join(part for part in (shown, self.path, self.reason) if part))
 
 
 class BackendError(EyerenderError):
     """No usable render backend; the message names the mend."""
 
     exit_code = 3
+
+
+def one_line(text: str, limit: int) -> str:
+    """A text as one line of printable characters, its middle left out where it is longer than `limit`.
+
+    Control characters (terminals obey some of them) become question marks.
+    """
+    if len(text) > limit:
+        tail = limit // 4
+        text = f"{text[: limit - tail - 5]} ... {text[len(text) - tail :]}"
+    return "".join(c if c.isprintable() else "?" for c in " ".join(text.splitlines()))

@@ -16,6 +16,7 @@ import stat
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -125,12 +126,13 @@ def sync_tree(path: str | Path) -> None:
             pass
 
 
-def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> bytes:
-    """The content of a regular file.
+@contextmanager
+def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> Iterator[BufferedReader]:
+    """A regular file, open for reading.
 
     Args:
         path: the file.
-        limit: the largest size that is read, in bytes.
+        limit: the largest size that is opened, in bytes.
         follow: whether the file may be a symbolic link.
 
     Raises:
@@ -152,6 +154,13 @@ def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = 
     with open(handle, "rb") as file:
         if state.st_size > limit:
             raise InputError(f"is too large ({_size(state.st_size)}; at most {_size(limit)} is read)", source=source)
+        yield file
+
+
+def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> bytes:
+    """The content of a regular file; raises `InputError` as `opened` does."""
+    source = str(path)
+    with opened(path, limit=limit, follow=follow) as file:
         try:
             data = file.read(limit + 1)
         except OSError as error:

@@ -20,13 +20,14 @@ from .eye.catalogue import load_eye
 from .eye.margin import PupilMarginSpec
 from .eye.model import Eye
 from .eye.spec import EyeSpec
+from .files import read_text
 from .observation import EYES, Index
 from .region.anatomy import RegionSpec
 from .region.look import LookSpec
 from .rig.imaging import AmbientSpec, LensSpec, MotionSpec
 from .rig.rig import Rig, RigSpec
 from .rig.sensor import SensorSpec
-from .spec import FileSpec, Positive, Spec, Vec2, Vec3, file_digest
+from .spec import MAX_YAML_BYTES, FileSpec, Positive, Spec, Vec2, Vec3, file_digest
 
 Count = Annotated[int, Field(ge=1, le=1000)]
 
@@ -358,8 +359,8 @@ def shipped_files() -> dict[str, Path]:
 def is_dataset(path: Path) -> bool:
     """Whether a YAML file says that it is no scene but the spec of a dataset (`kind: dataset`)."""
     try:
-        return "\nkind: dataset" in "\n" + path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+        return "\nkind: dataset" in "\n" + read_text(path, limit=MAX_YAML_BYTES)
+    except InputError:
         return False
 
 

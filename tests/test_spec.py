@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+import socket
 
 import pytest
 import yaml
 
+from eyerender.dataset.spec import DatasetSpec, find_dataset
 from eyerender.errors import InputError
+from eyerender.eye.catalogue import load_eye
 from eyerender.scene import SceneSpec, load_scene, shipped_scenes
+from eyerender.spec import file_digest, read_yaml
 
 
 def quickstart():
@@ -96,6 +101,22 @@ def test_bad_keys_are_refused_with_their_path(tmp_path, path, value, words):
         ("name: !!python/object/apply:os.system ['true']", "not valid YAML"),
         ("name: x", "format: missing"),
         ("format: 1\nname: 2001-01-01", "no number, text or list"),
+        ("format: 1\nseed: 2020-13-45", "line 2: not valid YAML: is no timestamp .month must be in 1..12"),
+        ("format: 1\nseed: " + "1" * 5000, "line 2: not valid YAML: a number of 5000 characters"),
+        ("format: 1\nseed: 1" + ":1" * 5000, "line 2: not valid YAML: a number of 10001 characters"),
+        ('format: 1\nseed: !!int "x"', "is no int"),
+        ("format: 1\nseed: !!timestamp x", "is no timestamp"),
+        ("format: 1\nseed: !!bool x", "is no bool"),
+        ("? [1, 2]\n: 3", "unhashable key"),
+        ("format: 1\nname: !!binary aGVsbG8=", "no number, text or list"),
+        ("format: 1\nname: !!set {a, b}", "no number, text or list"),
+        ("format: 1\nname: &a [*a]", "'a' holds itself"),
+        ("format: 1\nname: *a", "undefined alias"),
+        ("format: 1\nname: " + "[" * 5000, "nested too deeply"),
+        ("format: 1\nname: " + "{a: " * 5000, "nested too deeply"),
+        ("format: 1\nname: !<" + "x" * 10_000 + "> 1", "could not determine a constructor"),
+        ("format: 1\nname: \x1b[31m", "special characters are not allowed"),
+        ("# " + "x" * (2**21 + 1), "too large"),
     ],
 )
 def test_bad_files_are_refused(tmp_path, text, words):
@@ -104,6 +125,56 @@ def test_bad_files_are_refused(tmp_path, text, words):
     with pytest.raises(InputError, match=words) as caught:
         SceneSpec.load(file)
     assert "\n" not in str(caught.value)
+
+
+LEVELS = list(zip("abcdefghi", "bcdefghij", strict=True))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join([f'*{p}'] * 9)}]\n" for p, c in LEVELS),
+        "a: &a {x: 1}\n" + "".join(f"{c}: &{c} {{<<: [{', '.join([f'*{p}'] * 9)}]}}\n" for p, c in LEVELS),
+    ],
+    ids=["lists", "merged mappings"],
+)
+def test_aliases_count_as_what_they_stand_for(tmp_path, text):
+    """Ten lines that stand for 9^9 values are refused before anything of that size is built."""
+    file = tmp_path / "laughs.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match="holds more than 100000 values, aliases written out"):
+        read_yaml(file)
+    file.write_text("a: &a {x: [1, 2]}\nb: [*a, *a]\nc: {<<: *a, y: 3}\n", encoding="utf-8")
+    assert read_yaml(file) == {"a": {"x": [1, 2]}, "b": [{"x": [1, 2]}] * 2, "c": {"x": [1, 2], "y": 3}}
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "socket"])
+def test_only_regular_files_are_read(tmp_path, kind):
+    """A pipe without a writer would wait for ever, /dev/zero would never end."""
+    file = tmp_path / "odd.yaml"
+    if kind == "pipe":
+        os.mkfifo(file)
+    elif kind == "device":
+        file.symlink_to("/dev/zero")
+    elif kind == "folder":
+        file.mkdir()
+    else:
+        with socket.socket(socket.AF_UNIX) as server:
+            server.bind(str(file))
+    for read in (load_scene, load_eye, lambda path: DatasetSpec.load(find_dataset(path)), file_digest):
+        with pytest.raises(InputError):
+            read(file)
+
+
+def test_messages_quote_little_and_no_control_characters(tmp_path):
+    with pytest.raises(InputError) as caught:
+        SceneSpec.from_mapping({"format": 1, "name": "x", "k\x1b[31m\n" + "y" * 10_000: 1, "rig": "z" * 10_000})
+    assert len(str(caught.value)) < 800
+    assert str(caught.value).isprintable()
+    error = InputError("\x1b]0;title\x07 " + "r" * 10_000, source="s\n" + "s" * 10_000, path="p" * 10_000)
+    assert len(str(error)) < 1300
+    assert str(error).isprintable()
+    assert pickle.loads(pickle.dumps(error)).reason == error.reason
 
 
 def test_numbers_written_as_1e_3_are_numbers(tmp_path):

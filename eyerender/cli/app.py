@@ -12,7 +12,7 @@ from typing import Any
 
 from cyclopts import App, CycloptsError, Parameter
 
-from ..errors import EyerenderError, InputError
+from ..errors import MAX_MESSAGE, EyerenderError, InputError, one_line
 
 INTERRUPTED = 130
 _interrupted = threading.Event()
@@ -105,7 +105,7 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"error: {' '.join(message.splitlines())}", file=sys.stderr)
+    print(f"error: {one_line(message, MAX_MESSAGE)}", file=sys.stderr)
     return code
 
 

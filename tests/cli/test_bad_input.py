@@ -79,7 +79,7 @@ TABLE = [
     (["features", "target.yaml"], 2, "target"),
     (["features", "text.yaml"], 2, "text.yaml: line 2: not valid YAML"),
     (["features", "binary.yaml"], 2, "binary.yaml: "),
-    (["features", "."], 2, ".: cannot be read"),
+    (["features", "."], 2, ".: is a folder, not a file"),
     (["features", "quickstart", "--eye", "E9"], 2, "E9"),
     (["features", "quickstart", "--eye", "missing.yaml"], 2, "missing.yaml"),
     (["features", "quickstart", "--points", "3"], 2, "--points: must be >= 6"),
