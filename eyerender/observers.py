@@ -16,7 +16,7 @@ from .arrays import Floats, Ints, frozen
 from .capture import render_windows
 from .errors import InputError
 from .extraction import Extraction, ExtractionSettings, extract
-from .extraction.assignment import assign_lights, predict_glints
+from .extraction.glints.matching import assign_lights, predict_glints
 from .eye.spec import EyeSpec
 from .imagefile import read_image
 from .imagefolder import DATASET, ImageEntry, ImageFolder

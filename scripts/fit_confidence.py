@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from eyerender.extraction import ExtractionSettings, extract
-from eyerender.extraction.confidence import TABLE, design, features
+from eyerender.extraction.pupil.scoring import TABLE, design, features
 from eyerender.geometry.ellipse import Ellipse, iou
 
 Array = NDArray[np.float64]

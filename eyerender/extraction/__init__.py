@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .assignment import Assignment, assign_lights, identify, predict_glints
+from .glints.matching import Assignment, assign_lights, identify, predict_glints
 from .pipeline import extract
 from .result import Extraction, GlintResult, Goodness, PupilResult
 from .settings import FAST, REFINED, ExtractionSettings

@@ -9,25 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.ellipse import signed_distance
-from .arcs import relative_to
-from .covariance import rim_deviation
-from .fittedspots import SpotFit, joined
-from .glintjudge import judge_spots
-from .glints import Spots, detect_spots, widest
-from .orderstatistics import median
-from .preprocess import DN, Image, Prepared, invert, prepare
-from .refine import PixelFit, refine
+from .glints.classification import judge_spots
+from .glints.deblending import give_edges, split_blends
+from .glints.detection import Spots, detect_spots, widest
+from .glints.fits import SpotFit, joined
+from .glints.fitting import fit_spots
+from .glints.gaussian_model import Limits
+from .glints.subtraction import covered, told, without_light
+from .glints.windows import window_radius
+from .preprocessing import DN, Image, Prepared, invert, prepare
+from .pupil.consensus import relative_to
+from .pupil.covariance import rim_deviation
+from .pupil.edge_model import RimModel
+from .pupil.fallback import SURE, second_look
+from .pupil.refinement import PixelFit, refine
+from .pupil.scoring import pupil_of
+from .pupil.search import Found, search
 from .result import Extraction, PupilResult
-from .rimmodel import RimModel
-from .search import Found, search
-from .secondlook import SURE, second_look
 from .settings import ExtractionSettings
-from .spotfit import fit_spots
-from .spotmask import covered, told, without_light
-from .spotmend import give_edges, split_blends
-from .spotmodel import Limits
-from .spotpixels import window_radius
-from .verdict import pupil_of
+from .statistics import median
 
 Array = NDArray[np.float64]
 

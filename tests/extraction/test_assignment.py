@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eyerender.extraction.assignment import assign_lights, identify, mirror_in_sphere, predict_glints
+from eyerender.extraction.glints.matching import assign_lights, identify, mirror_in_sphere, predict_glints
 
 DATA = Path(__file__).parents[1] / "data"
 # The reference's world axes (X, Y, Z) are this package's (y, z, x).

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from eyerender.extraction import extract, fittedspots, spotfit, spotmend, spotmodel, spotpixels
+from eyerender.extraction import extract
+from eyerender.extraction.glints import deblending, fits, fitting, gaussian_model, windows
 
 SEEDS = range(20_000, 20_008)
 
@@ -89,7 +90,7 @@ def test_pupil_does_not_feel_a_glint_on_its_edge(ideal):
 @pytest.mark.parametrize("blur", [None, 1.3], ids=["alone", "beside an edge"])
 def test_spot_jacobian_is_the_models_slope(blur):
     rng = np.random.default_rng(0)
-    pixels = spotpixels.cut(
+    pixels = windows.cut(
         np.zeros((40, 40), np.float32),
         lambda x, y: np.zeros(x.shape),
         np.array([[20.2, 19.7], [11.8, 12.1]]),
@@ -97,17 +98,17 @@ def test_spot_jacobian_is_the_models_slope(blur):
         255.0,
     )
     assert pixels.count.tolist() == [np.count_nonzero(pixels.spot == i) for i in range(2)]
-    grid = spotpixels.Grid.of(pixels.radius, pixels.spot, pixels.dx, pixels.dy)
+    grid = windows.Grid.of(pixels.radius, pixels.spot, pixels.dx, pixels.dy)
     rest = np.zeros(pixels.data.size)
     theta = np.array([[20.2, 19.7, 4.0, 0.2, 0.4, 10.0, 0.3, -0.2], [11.6, 12.3, 5.0, 0.1, 0.3, 20.0, -0.1, 0.2]])
     if blur is not None:
         theta = np.concatenate([theta, [[40.0, 0.7, 1.2], [-25.0, 2.1, -0.4]]], axis=1)
     theta += rng.normal(0.0, 0.02, theta.shape)
-    slopes = spotmodel.slopes(pixels, grid, theta, rest, blur)
+    slopes = gaussian_model.slopes(pixels, grid, theta, rest, blur)
     for k in range(theta.shape[1]):
         step = np.zeros_like(theta)
         step[:, k] = 1e-5
-        less, more = (spotmodel.slopes(pixels, grid, theta + d, rest, blur)[-1] for d in (-step, step))
+        less, more = (gaussian_model.slopes(pixels, grid, theta + d, rest, blur)[-1] for d in (-step, step))
         slope = (less - more) / 2e-5  # the last row is the residual, -model
         np.testing.assert_allclose(slopes[k], slope, atol=1e-6 * max(1.0, np.abs(slope).max()))
 
@@ -115,21 +116,21 @@ def test_spot_jacobian_is_the_models_slope(blur):
 def test_spots_light_in_each_others_windows():
     """As the product of the two profiles, pixel by pixel, and none where it is not asked for."""
     start, width = np.array([[15.3, 14.8], [20.1, 17.4], [40.0, 30.0]]), np.array([1.2, 1.6, 1.0])
-    pixels = spotpixels.cut(np.zeros((60, 60), np.float32), lambda x, y: np.zeros(x.shape), start, width, 255.0)
+    pixels = windows.cut(np.zeros((60, 60), np.float32), lambda x, y: np.zeros(x.shape), start, width, 255.0)
     theta = np.zeros((3, 8))
     theta[:, :2], theta[:, 2], theta[:, 3:5] = start, np.log([90.0, 70.0, 50.0]), np.log(width)[:, None]
-    others = spotpixels.Others.of(pixels, theta, ~np.eye(3, dtype=bool), 1.0)
+    others = windows.Others.of(pixels, theta, ~np.eye(3, dtype=bool), 1.0)
     light = others.light(theta, pixels.data.size)
     x, y = (pixels.centre[pixels.spot] + np.stack([pixels.dx, pixels.dy], axis=-1)).T
     for i, j in ((0, 1), (1, 0)):
         own = pixels.spot == i
-        gx, gy = (fittedspots.profile(at[own], c, width[j]) for at, c in zip((x, y), start[j], strict=True))
+        gx, gy = (fits.profile(at[own], c, width[j]) for at, c in zip((x, y), start[j], strict=True))
         np.testing.assert_allclose(light[own], np.exp(theta[j, 2]) * gx * gy, atol=1e-9)
     assert light[pixels.spot != 2].max() > 1.0
     assert not light[pixels.spot == 2].any()
     shining = np.array([True, False, True])
     assert not others.light(theta, pixels.data.size, shining)[pixels.spot == 0].any()
-    assert spotpixels.Others.of(pixels, theta, np.zeros((3, 3), dtype=bool), 1.0) is None
+    assert windows.Others.of(pixels, theta, np.zeros((3, 3), dtype=bool), 1.0) is None
 
 
 def _drawn(theta: np.ndarray, noise: float, clip: float, shape: tuple[int, int] = (60, 60)) -> np.ndarray:
@@ -137,7 +138,7 @@ def _drawn(theta: np.ndarray, noise: float, clip: float, shape: tuple[int, int] 
     y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
     image = np.full(shape, 20.0) + np.random.default_rng(3).normal(0.0, noise, shape)
     for cx, cy, height, sx, sy in theta:
-        image += height * fittedspots.profile(x, cx, sx) * fittedspots.profile(y, cy, sy)
+        image += height * fits.profile(x, cx, sx) * fits.profile(y, cy, sy)
     return np.minimum(image, clip).astype(np.float32)
 
 
@@ -146,9 +147,9 @@ def test_neighbours_are_fitted_together(height, gap):
     """Spots in each other's light, clipped ones too, come out at their places, as certain as they say."""
     theta = np.array([[25.3, 27.8, height, 1.2, 1.25], [25.3 + gap, 28.4, 0.8 * height, 1.1, 1.2]])
     image = _drawn(theta, 1.0, 255.0)
-    limits = spotmodel.Limits(1.0, 254.0, 1.0)
+    limits = gaussian_model.Limits(1.0, 254.0, 1.0)
     start = np.rint(theta[:, :2])
-    fit = spotfit.fit_spots(
+    fit = fitting.fit_spots(
         image, lambda x, y: np.full(x.shape, 20.0), start, np.full(2, 1.3), np.minimum(theta[:, 2], 230.0), limits
     ).fit
     assert fit.converged.all()
@@ -166,11 +167,11 @@ def test_a_spot_beside_an_unexpected_edge(direction):
     y, x = np.mgrid[:60, :60].astype(float)
     away = (x - 30.2) * np.cos(direction) + (y - 29.7) * np.sin(direction) - 1.0
     image = (_drawn(theta, 1.0, 1e9) + 50.0 * ndtr(away / 1.2)).astype(np.float32)
-    limits = spotmodel.Limits(1.0, 1e9, 0.5)
-    fitted = spotfit.fit_spots(
+    limits = gaussian_model.Limits(1.0, 1e9, 0.5)
+    fitted = fitting.fit_spots(
         image, lambda x, y: np.full(x.shape, 20.0), np.array([[30.0, 30.0]]), np.array([1.4]), np.array([150.0]), limits
     )
-    fit = spotmend.give_edges(fitted, 1.2, 4.0, limits)
+    fit = deblending.give_edges(fitted, 1.2, 4.0, limits)
     before, after = (np.hypot(*(one.xy_px[0] - theta[0, :2])) for one in (fitted.fit, fit))
     assert after < 0.06 < before
     assert fit.residual_dn[0] < 1.5

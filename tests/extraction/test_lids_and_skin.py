@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from eyerender.extraction import FAST, REFINED, ExtractionSettings, extract
-from eyerender.extraction.arcs import RimFit, ams_fit, rims_without_stretch
-from eyerender.extraction.bellshape import bell_shaped
-from eyerender.extraction.edges import EdgePoints
-from eyerender.extraction.secondlook import SURE
+from eyerender.extraction.glints.prescreening import bell_shaped
+from eyerender.extraction.pupil.consensus import RimFit, ams_fit, rims_without_stretch
+from eyerender.extraction.pupil.edges import EdgePoints
+from eyerender.extraction.pupil.fallback import SURE
 from eyerender.geometry.ellipse import Ellipse, iou
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from eyerender.extraction.orderstatistics import median, quantile
+from eyerender.extraction.statistics import median, quantile
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint16])

@@ -8,9 +8,9 @@ import pytest
 from scipy import integrate, ndimage, optimize, special
 
 from eyerender.extraction import extract
-from eyerender.extraction.covariance import to_axes
-from eyerender.extraction.rimmodel import Place, Profile, RimModel
-from eyerender.extraction.rimsystem import FIXED, jacobian, moved
+from eyerender.extraction.pupil.covariance import to_axes
+from eyerender.extraction.pupil.edge_model import Place, Profile, RimModel
+from eyerender.extraction.pupil.least_squares import FIXED, jacobian, moved
 from eyerender.geometry.ellipse import Ellipse, fit_ellipse_direct
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from ..geometry.ellipse import Ellipse
+from ...geometry.ellipse import Ellipse
 
 Array = NDArray[np.float64]
 

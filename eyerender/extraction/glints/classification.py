@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import frozen
-from .fittedspots import SpotFit
-from .glints import Spots, optics_sigma, widest
-from .orderstatistics import quantile
-from .preprocess import DN, Prepared
-from .result import GlintResult
-from .settings import ExtractionSettings
+from ...arrays import frozen
+from ..preprocessing import DN, Prepared
+from ..result import GlintResult
+from ..settings import ExtractionSettings
+from ..statistics import quantile
+from .detection import Spots, optics_sigma, widest
+from .fits import SpotFit
 
 # A glint's bright patch is no longer than that many times its width, and the product of that ratio and the fit's is no
 # larger; the true ones' of the development images are below 1.99 and 2.2.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
-from ..errors import InputError
+from ...errors import InputError
 
 Array = NDArray[np.float64]
 

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse, EllipseFit, fit_ellipse_direct, from_cv2, signed_distance
-from .coarse import Candidate
+from ...geometry.ellipse import Ellipse, EllipseFit, fit_ellipse_direct, from_cv2, signed_distance
+from ..settings import ExtractionSettings
+from ..statistics import median
+from .candidates import Candidate
 from .edges import EdgePoints
-from .orderstatistics import median
-from .rimcuts import Cuts, turn_of
-from .settings import ExtractionSettings
+from .stretches import Cuts, turn_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse
-from .fittedspots import SpotFit, profile
-from .glints import Spots
-from .preprocess import Image, Prepared
+from ...geometry.ellipse import Ellipse
+from ..preprocessing import Image, Prepared
+from .detection import Spots
+from .fits import SpotFit, profile
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .arcs import UNEVEN
-from .orderstatistics import median
-from .rimmodel import SECTORS, Place, RimModel, sector_of
+from ..statistics import median
+from .consensus import UNEVEN
+from .edge_model import SECTORS, Place, RimModel, sector_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse
-from .bellshape import bell_shaped
-from .preprocess import Image, Prepared, as_image
-from .settings import ExtractionSettings
+from ...geometry.ellipse import Ellipse
+from ..preprocessing import Image, Prepared, as_image
+from ..settings import ExtractionSettings
+from .prescreening import bell_shaped
 
 Array = NDArray[np.float64]
 

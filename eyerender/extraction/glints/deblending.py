@@ -12,11 +12,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .fittedspots import SpotFit, joined
-from .preprocess import DN, Image
-from .spotfit import UNEXPLAINED, FittedSpots, fit_spots, report
-from .spotmodel import STEPS, Limits, descend, slopes
-from .spotpixels import Grid, window_radius
+from ..preprocessing import DN, Image
+from .fits import SpotFit, joined
+from .fitting import UNEXPLAINED, FittedSpots, fit_spots, report
+from .gaussian_model import STEPS, Limits, descend, slopes
+from .windows import Grid, window_radius
 
 Array = NDArray[np.float64]
 Background = Callable[[Array, Array], Array]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from .preprocess import Image
+from ..preprocessing import Image
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

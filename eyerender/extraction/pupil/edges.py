@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse
-from .coarse import Candidate
-from .orderstatistics import median, quantile
-from .preprocess import Image, as_image
+from ...geometry.ellipse import Ellipse
+from ..preprocessing import Image, as_image
+from ..statistics import median, quantile
+from .candidates import Candidate
 
 Array = NDArray[np.float64]
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse, fit_ellipse_direct
+from ...geometry.ellipse import Ellipse, fit_ellipse_direct
+from ..preprocessing import Image
 from .covariance import SHAPE, distance_slopes, sector_excess, to_axes
-from .preprocess import Image
-from .rimjudge import clear_of_lids, judge
-from .rimmodel import SECTORS, Place, RimModel, sector_of
-from .rimsystem import FIXED, NEAR, Normal, Pixels, Prior, Rows, Solution, gauss_newton
+from .edge_model import SECTORS, Place, RimModel, sector_of
+from .least_squares import FIXED, NEAR, Normal, Pixels, Prior, Rows, Solution, gauss_newton
+from .occlusion import clear_of_lids, judge
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

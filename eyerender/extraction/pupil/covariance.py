@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse
-from .rimmodel import SECTORS, Place, sector_of
+from ...geometry.ellipse import Ellipse
+from .edge_model import SECTORS, Place, sector_of
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from .spotpixels import Grid, Others, SpotPixels
+from .windows import Grid, Others, SpotPixels
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

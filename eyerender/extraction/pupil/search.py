@@ -9,14 +9,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .arcs import RimFit, fit_rim
-from .coarse import Candidate, Interior, find_candidates, find_inside, inspect_interior
+from ..preprocessing import Prepared
+from ..result import PupilResult
+from ..settings import ExtractionSettings
+from .candidates import Candidate, Interior, find_candidates, find_inside, inspect_interior
+from .consensus import RimFit, fit_rim
 from .covariance import edge_covariance
+from .edge_model import SECTORS, Place, RimModel, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
-from .preprocess import Prepared
-from .result import PupilResult
-from .rimmodel import SECTORS, Place, RimModel, sector_of
-from .settings import ExtractionSettings
 
 Array = NDArray[np.float64]
 

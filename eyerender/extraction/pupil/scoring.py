@@ -15,8 +15,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse
-from .result import Goodness
+from ...arrays import frozen
+from ...geometry.ellipse import Ellipse
+from ..preprocessing import DN
+from ..result import Goodness, PupilResult
+from ..settings import ExtractionSettings
+from .candidates import inspect_interior
+from .covariance import rim_deviation
+from .refinement import PixelFit
+from .search import Found
 
 Array = NDArray[np.float64]
 
@@ -69,6 +76,36 @@ def confidence(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "re
 def calibrated(logit: Array, bend: Array) -> Array:
     """c0 + c1 logit + c2 min(logit, 1): what the logits of cross-validation were worth, doubtful ones apart."""
     return np.asarray(bend[0] + bend[1] * logit + bend[2] * np.minimum(logit, 1.0))
+
+
+def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -> PupilResult:
+    """The pupil of a rim, by its edges or by the pixel model's fit; missing where it is too unlikely right."""
+    rim, image = found.rim, found.image
+    if fit is None:
+        model, ellipse, covariance, inside = found.model, rim.ellipse, found.covariance, found.interior
+    else:
+        model, ellipse, covariance = fit.model, fit.ellipse, fit.covariance
+        inside = inspect_interior(image.linear, ellipse, model.sigma_px, image.noise_dn)
+    goodness = Goodness(
+        support=rim.support,
+        gap=rim.gap,
+        explained=rim.support if fit is None else float(fit.sectors.mean()),
+        contrast=model.step_dn / DN,
+        contrast_to_noise=model.step_dn / image.noise_dn,
+        residual_px=rim.residual_px,
+        reduced_chi2=0.0 if fit is None else fit.reduced_chi2,
+        blur_px=model.sigma_px,
+        unevenness=inside.darker_dn / model.step_dn,
+        spread=inside.spread_dn / model.step_dn,
+        rim_sd_px=rim_deviation(ellipse, covariance),
+        uneven_px=0.0 if fit is None else fit.uneven_px,
+        refined=fit is not None,
+    )
+    sure = confidence(ellipse, goodness, settings.method)
+    if sure < settings.min_confidence:
+        return PupilResult.missing("fit", f"the ellipse found is the pupil with a probability of only {sure:.2f}")
+    contour = frozen(found.edges.points_px[rim.inliers])
+    return PupilResult("ok", None, None, ellipse, frozen(covariance), sure, goodness, contour)
 
 
 # Lower limits, upper limits, weights, calibration; printed by scripts/fit_confidence.py.

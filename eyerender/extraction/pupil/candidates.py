@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse, points_on_ellipse
-from .orderstatistics import median, quantile
-from .preprocess import Image, Prepared, as_image
-from .settings import ExtractionSettings
+from ...geometry.ellipse import Ellipse, points_on_ellipse
+from ..preprocessing import Image, Prepared, as_image
+from ..settings import ExtractionSettings
+from ..statistics import median, quantile
 
 Array = NDArray[np.float64]
 

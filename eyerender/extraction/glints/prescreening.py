@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from .preprocess import DN, Image
+from ..preprocessing import DN, Image
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse, fit_ellipse_direct, iou, signed_distance
-from .orderstatistics import median
+from ...geometry.ellipse import Ellipse, fit_ellipse_direct, iou, signed_distance
+from ..statistics import median
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

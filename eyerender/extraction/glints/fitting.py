@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from .fittedspots import SpotFit, no_spots
-from .preprocess import Image
-from .spotmodel import PARAMETERS, SAME_LIGHT, Descent, Limits, descend, hopeful, lost, prior
-from .spotpixels import Others, SpotPixels, cut, window_radius
+from ..preprocessing import Image
+from .fits import SpotFit, no_spots
+from .gaussian_model import PARAMETERS, SAME_LIGHT, Descent, Limits, descend, hopeful, lost, prior
+from .windows import Others, SpotPixels, cut, window_radius
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.ellipse import Ellipse
+from ...geometry.ellipse import Ellipse
 from .covariance import SHAPE, distance_slopes, gram, project
-from .rimmodel import Place, Profile, RimModel, harmonics
+from .edge_model import Place, Profile, RimModel, harmonics
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

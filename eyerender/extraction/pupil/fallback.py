@@ -6,14 +6,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ..geometry.ellipse import Ellipse, iou
-from .arcs import RimFit, rims_without_stretch
-from .coarse import find_candidates
+from ...geometry.ellipse import Ellipse, iou
+from ..preprocessing import Prepared
+from ..settings import ExtractionSettings
+from .candidates import find_candidates
+from .consensus import RimFit, rims_without_stretch
 from .edges import edge_noise_px
-from .preprocess import Prepared
+from .scoring import pupil_of
 from .search import Found, rim_about
-from .settings import ExtractionSettings
-from .verdict import pupil_of
 
 SURE = 0.8  # confidence asked of the best of many: the likeliest of several wrong ones looks better than any one does
 LEAST_SUPPORT = 0.4

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .orderstatistics import median, quantile
+from .statistics import median, quantile
 
 Image = NDArray[np.float32]
 
