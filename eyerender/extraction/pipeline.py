@@ -19,8 +19,8 @@ from .glints.subtraction import covered, told, without_light
 from .glints.windows import window_radius
 from .preprocessing import DN, Image, Prepared, invert, prepare
 from .pupil.consensus import relative_to
-from .pupil.covariance import rim_deviation
-from .pupil.edge_model import RimModel
+from .pupil.covariance import boundary_deviation
+from .pupil.edge_model import EdgeModel
 from .pupil.fallback import SURE, second_look
 from .pupil.refinement import PixelFit, refine
 from .pupil.scoring import pupil_of
@@ -31,7 +31,7 @@ from .statistics import median
 
 Array = NDArray[np.float64]
 
-SAME_LIGHT = 0.5  # noises: a change of the spots' light by less does not move the rim
+SAME_LIGHT = 0.5  # noises: a change of the spots' light by less does not move the boundary
 
 
 def extract(
@@ -68,7 +68,7 @@ def extract(
 
 
 def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -> Extraction:
-    """The pupil whose rim was found, with the glints about it."""
+    """The pupil whose boundary was found, with the glints about it."""
     size = (int(prepared.linear.shape[0]), int(prepared.linear.shape[1]))
     noise = prepared.noise_dn / DN
     model = found.model
@@ -91,16 +91,16 @@ def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -
 def _refined(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[PixelFit | None, SpotFit]:
     """The pixel model's fit to the image without the spots, if there is one that goes with the edges; and the spots."""
     cleared = _cleared(prepared, found, spots, fit)
-    first = _rim_fit(found, cleared)
-    on_rim = None if first is None else _on_rim(spots, fit, first.model)
-    if first is None or on_rim is None:
+    first = _boundary_fit(found, cleared)
+    on_boundary = None if first is None else _on_boundary(spots, fit, first.model)
+    if first is None or on_boundary is None:
         return first, fit
-    # A spot and the rim below it were each fitted with a rough idea of the other.
-    fit = _fitted_again(prepared, found.image, spots, fit, on_rim, first.model)
+    # A spot and the boundary below it were each fitted with a rough idea of the other.
+    fit = _fitted_again(prepared, found.image, spots, fit, on_boundary, first.model)
     again = _cleared(prepared, found, spots, fit)
     if cv2.norm(again[0], cleared[0], cv2.NORM_INF) < SAME_LIGHT * prepared.noise_dn:
         return first, fit
-    return _rim_fit(found, again, first) or first, fit
+    return _boundary_fit(found, again, first) or first, fit
 
 
 def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[Image, NDArray[np.bool_]]:
@@ -108,11 +108,13 @@ def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tu
     if found.image.inverted:
         return found.image.linear, covered(prepared, spots)
     known = told(prepared, fit)
-    linear, bright = without_light(prepared, fit, known, found.rim.ellipse)
+    linear, bright = without_light(prepared, fit, known, found.boundary.ellipse)
     return linear, bright | covered(prepared, spots, ~known)
 
 
-def _rim_fit(found: Found, cleared: tuple[Image, NDArray[np.bool_]], before: PixelFit | None = None) -> PixelFit | None:
+def _boundary_fit(
+    found: Found, cleared: tuple[Image, NDArray[np.bool_]], before: PixelFit | None = None
+) -> PixelFit | None:
     try:
         fit = refine(cleared[0], found.model, found.sectors, cleared[1], found.image.noise_dn, before)
     except np.linalg.LinAlgError:  # the pixels do not tell the parameters apart
@@ -120,45 +122,45 @@ def _rim_fit(found: Found, cleared: tuple[Image, NDArray[np.bool_]], before: Pix
     return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None
 
 
-def _on_rim(spots: Spots, fit: SpotFit, model: RimModel) -> NDArray[np.bool_] | None:
-    """(n,) the spots whose window reaches the rim, or None."""
+def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> NDArray[np.bool_] | None:
+    """(n,) the spots whose window reaches the boundary, or None."""
     apart = np.abs(signed_distance(model.ellipse, spots.xy_px))
-    on_rim = fit.converged & (apart < window_radius(spots.width_px) + 3.0 * model.sigma_px)
-    return np.asarray(on_rim) if on_rim.any() else None
+    on_boundary = fit.converged & (apart < window_radius(spots.width_px) + 3.0 * model.sigma_px)
+    return np.asarray(on_boundary) if on_boundary.any() else None
 
 
 def _fitted_again(
-    prepared: Prepared, work: Prepared, spots: Spots, fit: SpotFit, on_rim: NDArray[np.bool_], model: RimModel
+    prepared: Prepared, work: Prepared, spots: Spots, fit: SpotFit, on_boundary: NDArray[np.bool_], model: EdgeModel
 ) -> SpotFit:
-    """The spots on the rim fitted before the refined rim, where that explains them as well."""
-    linear, _ = without_light(prepared, fit, fit.converged & ~on_rim, model.ellipse)
-    starts = (spots.xy_px[on_rim], spots.width_px[on_rim], spots.height_dn[on_rim])
+    """The spots on the boundary fitted before the refined boundary, where that explains them as well."""
+    linear, _ = without_light(prepared, fit, fit.converged & ~on_boundary, model.ellipse)
+    starts = (spots.xy_px[on_boundary], spots.width_px[on_boundary], spots.height_dn[on_boundary])
     again = fit_spots(linear, _background(work, model), *starts, _limits(prepared, model)).fit
-    good = again.converged & (again.residual_dn < 1.05 * fit.residual_dn[on_rim])
+    good = again.converged & (again.residual_dn < 1.05 * fit.residual_dn[on_boundary])
     index = np.arange(fit.converged.size)
-    index[np.nonzero(on_rim)[0][good]] = fit.converged.size + np.nonzero(good)[0]
+    index[np.nonzero(on_boundary)[0][good]] = fit.converged.size + np.nonzero(good)[0]
     return joined([fit, again]).taken(index)
 
 
 def _agrees(fit: PixelFit, found: Found) -> bool:
-    """Whether the refined rim still passes along the edges, and is no less certain than they make it.
+    """Whether the refined boundary still passes along the edges, and is no less certain than they make it.
 
     It may move by what noise and texture move it, no more; and where glints leave it too few pixels, it is of no use.
     """
-    by_edges = rim_deviation(found.rim.ellipse, found.covariance)
+    by_edges = boundary_deviation(found.boundary.ellipse, found.covariance)
     # Both are estimates from a few dozen sectors, which scatter by a fifth and more.
-    if rim_deviation(fit.ellipse, fit.covariance) > 2.0 * by_edges:
+    if boundary_deviation(fit.ellipse, fit.covariance) > 2.0 * by_edges:
         return False
-    rim = found.rim
-    points = found.edges.points_px[rim.inliers]
+    boundary = found.boundary
+    points = found.edges.points_px[boundary.inliers]
     ellipse = fit.ellipse
     distance, _, curvature = relative_to(ellipse, points)
     off = median(np.abs(distance + 0.5 * found.edges.sigma_px**2 * curvature))
-    return off < max(2.5 * rim.residual_px, 0.3)
+    return off < max(2.5 * boundary.residual_px, 0.3)
 
 
 def _fit_spots(prepared: Prepared, found: Found, spots: Spots) -> tuple[Spots, SpotFit]:
-    """The spots fitted before the rim as the edges have it; blends count as the spots they split into."""
+    """The spots fitted before the boundary as the edges have it; blends count as the spots they split into."""
     model = found.model
     known, limits = _background(found.image, model), _limits(prepared, model)
     starts = (spots.xy_px, spots.width_px, spots.height_dn)
@@ -169,10 +171,10 @@ def _fit_spots(prepared: Prepared, found: Found, spots: Spots) -> tuple[Spots, S
     return Spots(*starts, spots.patches_px, spots.clutter), fit
 
 
-def _background(work: Prepared, model: RimModel) -> Callable[[Array, Array], Array]:
+def _background(work: Prepared, model: EdgeModel) -> Callable[[Array, Array], Array]:
     """Level without spots at pixels (x, y), up to a constant, which their fit has anyway."""
     return (lambda x, y: -model.level(x, y)) if work.inverted else model.level
 
 
-def _limits(prepared: Prepared, model: RimModel) -> Limits:
+def _limits(prepared: Prepared, model: EdgeModel) -> Limits:
     return Limits(prepared.noise_dn, prepared.clip_dn, max(0.5 * prepared.noise_dn, 0.02 * abs(model.step_dn)))

@@ -20,15 +20,20 @@ Stage = Literal["input", "coarse search", "edges", "fit", "refinement"]
 class Goodness:
     """How well the ellipse explains the image.
 
-    support: share of the outline with an edge on it, 0..1. gap: share of the longest stretch without.
-    explained: share of the outline whose pixels the refined model explains (the support where it was not fitted).
-    contrast: step from pupil to iris as a share of full scale. contrast_to_noise: that step over a pixel's noise.
-    residual_px: root mean square distance of the edge points.
-    reduced_chi2: of the pixel model, 1 when noise alone explains the residual; 0 where it was not fitted.
-    blur_px: sigma of the edge's blur. unevenness: how much darker the pupil's middle is than its outer part, as a share
-    of the step. spread: scatter of its grey levels beyond the noise, likewise. rim_sd_px: standard deviation of the
-    rim's position, averaged along it, from the covariance. uneven_px: standard deviation of the margin's displacement
-    from the ellipse, 0 where it was not fitted. refined: whether the ellipse is the pixel model's.
+    Attributes:
+        support: share of the outline that has an edge point, 0 to 1.
+        gap: share of the outline in the longest stretch without edge points.
+        explained: share of the outline whose pixels the refined model explains; `support` if it was not fitted.
+        contrast: step from pupil to iris as a share of full scale.
+        contrast_to_noise: the same step divided by the noise of a pixel.
+        residual_px: root mean square distance of the edge points from the ellipse.
+        reduced_chi2: of the pixel model. 1 means that noise alone explains the residual; 0 that it was not fitted.
+        blur_px: standard deviation of the edge's blur.
+        unevenness: how much darker the pupil's middle is than its outer part, as a share of the step.
+        spread: scatter of the grey levels inside the pupil beyond the noise, as a share of the step.
+        boundary_sd_px: standard deviation of the boundary's position, averaged along it, from the covariance.
+        uneven_px: standard deviation of the boundary's displacement from the ellipse; 0 if it was not fitted.
+        refined: whether the ellipse comes from the pixel model.
     """
 
     support: float
@@ -41,7 +46,7 @@ class Goodness:
     blur_px: float
     unevenness: float
     spread: float
-    rim_sd_px: float
+    boundary_sd_px: float
     uneven_px: float
     refined: bool
 

@@ -73,18 +73,18 @@ def test_elongated_reflection_is_rejected_with_the_reason(ideal):
 
 
 def test_pupil_does_not_feel_a_glint_on_its_edge(ideal):
-    """The same noise with and without a spot on the rim: the centre moves by less than the noise moves it."""
+    """The same noise with and without a spot on the boundary: the centre moves by less than the noise moves it."""
     plain = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[2])
     pupil = plain.label["pupil"]
-    rim = np.array(pupil["centre_px"]) + pupil["semi_axes_px"][0] * np.array(
+    boundary = np.array(pupil["centre_px"]) + pupil["semi_axes_px"][0] * np.array(
         [np.cos(pupil["angle_rad"]), np.sin(pupil["angle_rad"])]
     )
     image = plain.image.astype(np.float64)
-    ideal._add_glint(image, {"xy": rim, "sigma": 1.4}, 220.0)
+    ideal._add_glint(image, {"xy": boundary, "sigma": 1.4}, 220.0)
     spotted = extract(np.clip(np.rint(image), 0, 255).astype(np.uint8))
     moved = spotted.pupil.ellipse.centre_px - extract(plain.image).pupil.ellipse.centre_px
     assert np.hypot(*moved) < 0.015
-    assert np.hypot(*(spotted.glints[0].xy_px - rim)) < 0.05
+    assert np.hypot(*(spotted.glints[0].xy_px - boundary)) < 0.05
 
 
 @pytest.mark.parametrize("blur", [None, 1.3], ids=["alone", "beside an edge"])

@@ -1,4 +1,4 @@
-"""Eyes in lids: rims that a lid cuts, answers to refuse, and bright places of skin that are not worth a fit."""
+"""Eyes in lids: boundaries that a lid cuts, answers to refuse, and bright places of skin that are not worth a fit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from eyerender.extraction import FAST, REFINED, ExtractionSettings, extract
 from eyerender.extraction.glints.prescreening import bell_shaped
-from eyerender.extraction.pupil.consensus import RimFit, ams_fit, rims_without_stretch
+from eyerender.extraction.pupil.consensus import BoundaryFit, ams_fit, boundaries_without_stretch
 from eyerender.extraction.pupil.edges import EdgePoints
 from eyerender.extraction.pupil.fallback import SURE
 from eyerender.geometry.ellipse import Ellipse, iou
@@ -54,7 +54,7 @@ def test_an_outline_without_the_lids_margin(covered, seed):
     slope = np.stack([np.cos(turn) / truth.semi_axes_px[0], np.sin(turn) / truth.semi_axes_px[1]], axis=-1)
     normals = slope @ np.array([[cos, sin], [-sin, cos]])
     normals /= np.hypot(*normals.T)[:, None]
-    # The lid's margin: a chord from rim to rim in place of the arc above it.
+    # The lid's margin: a chord from boundary to boundary in place of the arc above it.
     height = np.quantile(points[:, 1], covered)
     hidden = points[:, 1] < height
     points[hidden, 1] = height
@@ -64,10 +64,10 @@ def test_an_outline_without_the_lids_margin(covered, seed):
     through_all = ams_fit(points)
     assert through_all is not None
     assert iou(through_all, truth) < 0.9
-    rim = RimFit(through_all, np.ones(120, dtype=bool), points, 1.0, 0.0, 1.0)
-    rims = rims_without_stretch(edges, rim, ExtractionSettings(), 0.1)
+    boundary = BoundaryFit(through_all, np.ones(120, dtype=bool), points, 1.0, 0.0, 1.0)
+    boundaries = boundaries_without_stretch(edges, boundary, ExtractionSettings(), 0.1)
     # The points are shifted outward by the curvature of a blurred edge, sigma^2 / (2 r) = 0.03 px: 0.5 % of the area.
-    assert max(iou(one.ellipse, truth) for one in rims) > 0.95
+    assert max(iou(one.ellipse, truth) for one in boundaries) > 0.95
 
 
 def _spots(rng: np.random.Generator, sigma: float, height: float, noise: float) -> tuple[np.ndarray, np.ndarray]:

@@ -33,7 +33,7 @@ _RING_COS, _RING_SIN = np.cos(_RING_ANGLE), np.sin(_RING_ANGLE)
 class Spots:
     """Detected spots: xy_px (n, 2) of the peak pixels, width_px (n,) sigma guessed from the area above half height,
     height_dn (n,) above the surroundings. patches_px (k, 2): peaks of bright places that are no spots. clutter: of the
-    spots that no bell explains, likewise xy, width and height; they are not fitted, and no rim is fitted there."""
+    spots that no bell explains, likewise xy, width and height; they are not fitted, and no boundary is fitted there."""
 
     xy_px: Array
     width_px: Array
@@ -127,7 +127,7 @@ def widest(blur_px: float) -> float:
 
 
 def optics_sigma(blur_px: float) -> float:
-    """The rim's blur without the pixel's own share of it, 1/12 px^2."""
+    """The boundary's blur without the pixel's own share of it, 1/12 px^2."""
     return math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0))
 
 

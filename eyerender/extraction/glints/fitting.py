@@ -144,7 +144,7 @@ def _start(pixels: SpotPixels, start: Array, width: Array, height: Array, touchi
 
 
 def _ring_level(pixels: SpotPixels, rest: Array) -> Array:
-    """(n,) mean along the windows' rims."""
+    """(n,) mean along the windows' edges."""
     ring = pixels.dx * pixels.dx + pixels.dy * pixels.dy > ((pixels.radius - 1.0) ** 2)[pixels.spot]
     return pixels.total(rest * ring) / np.maximum(pixels.total(ring), 1.0)
 

@@ -1,4 +1,4 @@
-"""What bright spots do to the pixels about the pupil's rim: their light taken away, and the pixels left out."""
+"""What bright spots do to the pixels about the pupil's boundary: their light taken away, and the pixels left out."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Array, most: int) ->
     near_out = _sample(small, centre, axes * 1.15 + 1.5, angle)
     step = near_out - near_in
     within = np.concatenate([near_in, deep_in], axis=1)
-    inside, typical, rim_level = (np.median(part, axis=1) for part in (within, step, near_in))
+    inside, typical, edge_level = (np.median(part, axis=1) for part in (within, step, near_in))
     enclosed = np.mean(step > np.maximum(0.35 * typical, 2.0 * noise)[:, None], axis=1)
     spread = np.std(within, axis=1)
     uniform = 1.0 / (1.0 + (spread / np.maximum(typical, 1e-6)) ** 2)
@@ -177,7 +177,7 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Array, most: int) ->
     for i, (x, y, a, b, *_) in zip(kept, places, strict=True):
         for j, (other_x, other_y, other_a, other_b, *_) in zip(kept, places, strict=True):
             inner = other_a * other_b < 0.6 * a * b and math.hypot(x - other_x, y - other_y) < 0.6 * b
-            darker = rim_level[i] - rim_level[j] > max(0.1 * typical[i], 2.0 * noise)
+            darker = edge_level[i] - edge_level[j] > max(0.1 * typical[i], 2.0 * noise)
             # The iris holds the pupil: whatever holds a darker enclosed blob is not the pupil.
             if inner and darker and enclosed[j] > 0.55 and typical[j] > 0.12 * typical[i]:
                 final[i] = min(final[i], 0.5 * final[j])
@@ -217,7 +217,7 @@ class Interior:
 
 
 def inspect_interior(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: float) -> Interior:
-    """Levels inside an ellipse, up to where the rim's blur begins.
+    """Levels inside an ellipse, up to where the boundary's blur begins.
 
     A pupil's interior is even; an iris taken for one has the pupil in its middle, and other things have structure.
     Medians and quartiles, because of glints.
@@ -231,16 +231,16 @@ def inspect_interior(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: 
     radius2 = ((dx * cos + dy * sin) / a) ** 2 + ((dy * cos - dx * sin) / b) ** 2
     crop = linear[y0:y1, x0:x1]
     end = min(0.85, 1.0 - 2.5 * blur_px / float(b))
-    core, rim = crop[radius2 < 0.35**2], crop[(radius2 > (end - 0.25) ** 2) & (radius2 < end**2)]
+    core, ring = crop[radius2 < 0.35**2], crop[(radius2 > (end - 0.25) ** 2) & (radius2 < end**2)]
     inside = crop[radius2 < max(end, 0.5) ** 2]
     spread = 0.0
     if inside.size >= 8:
         between = quantile(inside, 0.75) - quantile(inside, 0.25)
         spread = math.sqrt(max((0.7413 * between) ** 2 - noise_dn**2, 0.0))
-    if end < 0.6 or core.size < 5 or rim.size < 5:
+    if end < 0.6 or core.size < 5 or ring.size < 5:
         return Interior(0.0, math.inf, spread)
-    error = 1.2533 * noise_dn * math.sqrt(1.0 / core.size + 1.0 / rim.size)
-    return Interior(median(rim) - median(core), error, spread)
+    error = 1.2533 * noise_dn * math.sqrt(1.0 / core.size + 1.0 / ring.size)
+    return Interior(median(ring) - median(core), error, spread)
 
 
 def find_inside(prepared: Prepared, ellipse: Ellipse, settings: ExtractionSettings) -> list[Candidate]:

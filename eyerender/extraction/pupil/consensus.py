@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SECTORS = 48  # of the outline, for support
-PIECES = 16  # arcs are cut at these sectors, so that a lid's margin parts from the rim it joins
+PIECES = 16  # arcs are cut at these sectors, so that a lid's margin parts from the boundary it joins
 SAMPLES = 240
 POINTS_PER_PIECE = 3
 FINALISTS = 24  # of the random ellipses, counted with all points
@@ -29,7 +29,7 @@ ALL_AGREE = 0.85  # of the highest support: the root mean square distance is the
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RimFit:
+class BoundaryFit:
     """The ellipse through the edge points, corrected for curvature.
 
     inliers: (n,) which edge points it rests on. points_px: those points, corrected. support: share of the outline they
@@ -49,10 +49,10 @@ class RimFit:
 UNEVEN = 0.01
 
 
-def fit_rim(
+def fit_boundary(
     edges: EdgePoints, candidate: Candidate, settings: ExtractionSettings, expected_noise_px: float
-) -> RimFit | str:
-    """The rim of the pupil among `edges`, or the reason why there is none."""
+) -> BoundaryFit | str:
+    """The boundary of the pupil among `edges`, or the reason why there is none."""
     if edges.points_px.shape[0] < 8:
         return f"only {edges.points_px.shape[0]} edge points around the darkest blob"
     uneven = UNEVEN * float(np.sqrt(np.prod(candidate.ellipse.semi_axes_px)))
@@ -61,42 +61,42 @@ def fit_rim(
     start = _consensus(edges, candidate, settings, tolerance)
     if start is None:
         return "no ellipse passes through the edges around the darkest blob"
-    rim = _polished(edges, start, settings, tolerance)
-    if isinstance(rim, str) or rim.residual_px < 1.3 * expected_noise_px:
-        return rim
+    boundary = _polished(edges, start, settings, tolerance)
+    if isinstance(boundary, str) or boundary.residual_px < 1.3 * expected_noise_px:
+        return boundary
     # Parts of an uneven margin fit an ellipse better than the whole, but not as well as the edges' noise allows.
-    cuts = Cuts.of(edges.points_px[rim.inliers], rim.ellipse, 12, (0.12, 0.2, 0.3, 0.42), 1.6)
-    freed, allowed = _without_lid(cuts, rim, expected_noise_px, 0.7 * expected_noise_px), expected_noise_px
-    if not freed and rim.residual_px >= 1.3 * expected_px:
-        freed, allowed = _without_lid(cuts, rim, expected_px), expected_px
+    cuts = Cuts.of(edges.points_px[boundary.inliers], boundary.ellipse, 12, (0.12, 0.2, 0.3, 0.42), 1.6)
+    freed, allowed = _without_lid(cuts, boundary, expected_noise_px, 0.7 * expected_noise_px), expected_noise_px
+    if not freed and boundary.residual_px >= 1.3 * expected_px:
+        freed, allowed = _without_lid(cuts, boundary, expected_px), expected_px
     again = (_polished(edges, one, settings, max(0.35, 3.5 * allowed), free=True) for one in freed)
-    better = [one for one in again if isinstance(one, RimFit) and one.residual_px <= 0.8 * rim.residual_px]
-    return min(better, key=lambda one: one.residual_px, default=rim)
+    better = [one for one in again if isinstance(one, BoundaryFit) and one.residual_px <= 0.8 * boundary.residual_px]
+    return min(better, key=lambda one: one.residual_px, default=boundary)
 
 
-def _without_lid(cuts: Cuts, rim: RimFit, noise_px: float, within_px: float = np.inf) -> list[Ellipse]:
-    """The ellipses without a stretch of rim that may be a lid's margin.
+def _without_lid(cuts: Cuts, boundary: BoundaryFit, noise_px: float, within_px: float = np.inf) -> list[Ellipse]:
+    """Up to two ellipses fitted without a stretch of edge points that may be a lid margin.
 
-    A margin that crosses the pupil gives edges inside the true rim, and an ellipse drawn through both fits neither.
-    Of the `cuts`, which leave every eighth to nearly a half of the outline out in turn, the best two are those where
-    the rest fits 1.4 times better, and within `within_px`, and the edges left out lie inside the new ellipse.
+    A lid margin that crosses the pupil gives edge points inside the true boundary. An ellipse through both fits
+    neither. `cuts` leaves out each stretch of 12 to 42 % of the outline in turn. A fit qualifies if its residual is 1.4
+    times smaller than before and below `within_px`, and if the points left out lie inside the new ellipse.
     """
-    good = cuts.residual_px < min(rim.residual_px / 1.4, within_px)
+    good = cuts.residual_px < min(boundary.residual_px / 1.4, within_px)
     return list(islice(cuts.inside(good, lambda residual: max(2.0 * residual, noise_px)), 2))
 
 
-def rims_without_stretch(
-    edges: EdgePoints, rim: RimFit, settings: ExtractionSettings, expected_noise_px: float
-) -> list[RimFit]:
-    """Rims to look at when the one found is none: for every width of a stretch left out, the best that remains.
+def boundaries_without_stretch(
+    edges: EdgePoints, boundary: BoundaryFit, settings: ExtractionSettings, expected_noise_px: float
+) -> list[BoundaryFit]:
+    """Alternative boundaries after a rejection: the best fit for each width of the stretch that is left out.
 
-    What is left out must lie inside, as a lid's margin does that crosses the pupil.
+    The points left out must lie inside the new ellipse, as those of a lid margin that crosses the pupil do.
     """
-    cuts = Cuts.of(edges.points_px[rim.inliers], rim.ellipse, 8, (0.2, 0.3, 0.42, 0.52), 2.0)
+    cuts = Cuts.of(edges.points_px[boundary.inliers], boundary.ellipse, 8, (0.2, 0.3, 0.42, 0.52), 2.0)
     of_width = (cuts.inside(cuts.width == width, lambda residual: 2.0 * residual) for width in np.unique(cuts.width))
     tolerance = max(0.35, 3.5 * expected_noise_px)
-    rims = (_polished(edges, one, settings, tolerance, free=True) for some in of_width for one in islice(some, 1))
-    return [one for one in rims if isinstance(one, RimFit)]
+    boundaries = (_polished(edges, one, settings, tolerance, free=True) for some in of_width for one in islice(some, 1))
+    return [one for one in boundaries if isinstance(one, BoundaryFit)]
 
 
 def _consensus(
@@ -180,7 +180,7 @@ def _most(points: Array, fits: Array) -> Array:
 
 def _polished(
     edges: EdgePoints, start: Ellipse, settings: ExtractionSettings, tolerance: float, *, free: bool = False
-) -> RimFit | str:
+) -> BoundaryFit | str:
     """Re-select and refit with AMS until the selection settles; edge points are moved outward by the curvature shift.
 
     A blurred convex edge has its steepest place sigma^2 kappa / 2 inside the true one.
@@ -216,7 +216,7 @@ def _polished(
         return f"its semi-axes {a:.1f} x {b:.1f} px are outside the sizes looked for"
     if b < settings.aspect_min * a:
         return f"its axes' ratio {b / a:.2f} is below {settings.aspect_min:g}"
-    return RimFit(ellipse, inliers, points[inliers], support, gap, float(np.sqrt(np.mean(distance**2))))
+    return BoundaryFit(ellipse, inliers, points[inliers], support, gap, float(np.sqrt(np.mean(distance**2))))
 
 
 def ams_fit(points: Array) -> Ellipse | None:

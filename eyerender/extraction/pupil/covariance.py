@@ -1,4 +1,4 @@
-"""How uncertain an ellipse is: covariances that know of residuals which agree along the rim.
+"""How uncertain an ellipse is: covariances that know of residuals which agree along the boundary.
 
 Parameters are (cx, cy) and the change of the shape matrix in the ellipse's own axes (aa, bb, ab), well defined for a
 circle too; what is reported is (cx, cy, a, b, angle).
@@ -81,8 +81,8 @@ def edge_covariance(ellipse: Ellipse, points: Array, residual_px: float) -> Arra
     return to_axes(plain * max(excess, 1.0) * SELECTION, ellipse)
 
 
-def rim_deviation(ellipse: Ellipse, covariance: Array) -> float:
-    """Root mean square, over the outline, of the rim's standard deviation along its normal, px."""
+def boundary_deviation(ellipse: Ellipse, covariance: Array) -> float:
+    """Root mean square, over the outline, of the boundary's standard deviation along its normal, px."""
     slopes = distance_slopes(ellipse, Place.middles(ellipse, 32))
     a, b = ellipse.semi_axes_px.tolist()
     # By the angle instead of the shape matrix's off-diagonal term: d ab = (a - b) d angle.

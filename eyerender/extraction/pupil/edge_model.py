@@ -1,15 +1,17 @@
-"""The pixel model of a pupil's rim: two levels and the blurred convex edge between them.
+"""The pixel model of a pupil's boundary: two levels and the blurred convex edge between them.
 
     I = inner(u) (1 - E) + outer(u) E + slope (d Phi(d / s) + s phi(d / s))
     E(d) = Phi(z) + (kappa s / 2) phi(z) - (g / 24) (z^3 - 3 z) phi(z),   z = d / s
 
-d: signed distance to the ellipse (positive outside), kappa: curvature of the rim at the nearest point, s: sigma of the
-blur, pixel included (s^2 = optics^2 + 1/12), Phi and phi: the normal distribution and density. The second term is
-the first order of the blur of a disc in s kappa; the third lets the blur have heavier tails than a normal distribution,
-g being its excess kurtosis (Edgeworth's series). outer is a Fourier series in u = t + angle, the ellipse's parameter t
-counted from the image's x axis, so that it does not turn with the axes of a nearly round ellipse; inner one of the
-first order: iris light scattered into the pupil. The slope comes with a blurred ramp: the iris grows brighter or darker
-outwards, as lamps beside the camera make it.
+d is the signed distance to the ellipse (positive outside) and kappa the curvature of the boundary at the nearest point.
+s is the standard deviation of the blur and includes the pixel (s^2 = optics^2 + 1/12). Phi and phi are the normal
+distribution and its density. The second term of E is the first order in s kappa of a blurred disc. The third term gives
+the blur heavier tails than a normal distribution; g is its excess kurtosis (Edgeworth series).
+
+outer is a Fourier series in u = t + angle: the ellipse's parameter t counted from the image's x axis. It therefore does
+not turn when the axes of a nearly round ellipse do. inner is a series of first order, for iris light that is scattered
+into the pupil. The slope multiplies a blurred ramp: the iris may grow brighter or darker outwards, as it does when the
+lamps stand beside the camera.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RimModel:
+class EdgeModel:
     """ellipse; inner_dn; outer: (1 + 2 K,) Fourier coefficients (1, cos u, sin u, cos 2u, ...), DN; sigma_px; slope of
     the outer level, DN per px; kurtosis of the blur beyond a Gaussian's 0; lean: the inner level's (cos u, sin u), DN;
     displaced: (SECTORS,) how far the margin's sectors lie inside the ellipse, px.
@@ -58,7 +60,7 @@ class RimModel:
         return self.level_and_slope(place)[0].reshape(x.shape)
 
     def level_and_slope(self, place: Place) -> tuple[Array, Array]:
-        """Expected grey level (n,) at places about this rim, were it even; and its slope by the distance, DN per px."""
+        """Expected grey level (n,) near the boundary of an exact ellipse, and its derivative by distance, DN per px."""
         profile = Profile.of(place.distance, place.curvature, self.sigma_px, self.kurtosis)
         inner = self.inner(place)
         step = self.outer @ harmonics(place.cos_u, place.sin_u, (self.outer.size - 1) // 2) - inner
@@ -66,7 +68,7 @@ class RimModel:
         return level, step * profile.edge_by_distance + self.slope * profile.ramp_by_distance
 
     def inner(self, place: Place) -> Array:
-        """Inner level (n,) at places about the rim."""
+        """Inner level (n,) at places about the boundary."""
         return self.inner_dn + self.lean[0] * place.cos_u + self.lean[1] * place.sin_u
 
 
@@ -109,7 +111,7 @@ class Place:
     def of(ellipse: Ellipse, x: Array, y: Array, steps: int = 3) -> Place:
         """By Newton's iteration on the nearest point's parameter, from the point's own direction.
 
-        f(t) = (a^2 - b^2) cos t sin t - a p sin t + b q cos t = 0; three steps reach 1e-6 px within b / 2 of the rim.
+        f(t) = (a^2 - b^2) cos t sin t - a p sin t + b q cos t = 0. Three steps reach 1e-6 px up to b / 2 away.
         """
         a, b = (float(value) for value in ellipse.semi_axes_px)
         cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
@@ -140,7 +142,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profile:
-    """Across the rim, all (n,): `edge` E from 0 inside to 1 outside and `ramp` max(d, 0) blurred, with their
+    """Across the boundary, all (n,): `edge` E from 0 inside to 1 outside and `ramp` max(d, 0) blurred, with their
     derivatives by the distance d (px), by sigma (px) and by the kurtosis."""
 
     edge: Array
@@ -153,7 +155,7 @@ class Profile:
 
     @staticmethod
     def of(distance: Array, curvature: Array, sigma: float, kurtosis: float = 0.0) -> Profile:
-        """distance, curvature: (n,) px and 1/px of the nearest point of the rim. sigma: px."""
+        """distance, curvature: (n,) px and 1/px of the nearest point of the boundary. sigma: px."""
         z = distance / sigma
         z2 = z * z
         density = _DENSITY * np.exp(-0.5 * z2)

@@ -1,4 +1,4 @@
-"""Sub-pixel edge points on the rim of a candidate: gradients, ridges, polarity and darkness gates."""
+"""Sub-pixel edge points on the boundary of a candidate: gradients, ridges, polarity and darkness gates."""
 
 from __future__ import annotations
 

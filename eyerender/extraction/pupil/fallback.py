@@ -1,4 +1,4 @@
-"""Another look where the first answer was none: every candidate, with and without dark lines, and cut rims."""
+"""Fallback search after no pupil was accepted: every candidate, and boundaries with a stretch left out."""
 
 from __future__ import annotations
 
@@ -10,64 +10,73 @@ from ...geometry.ellipse import Ellipse, iou
 from ..preprocessing import Prepared
 from ..settings import ExtractionSettings
 from .candidates import find_candidates
-from .consensus import RimFit, rims_without_stretch
+from .consensus import BoundaryFit, boundaries_without_stretch
 from .edges import edge_noise_px
 from .scoring import pupil_of
-from .search import Found, rim_about
+from .search import Found, boundary_about
 
-SURE = 0.8  # confidence asked of the best of many: the likeliest of several wrong ones looks better than any one does
+# The best of several wrong candidates looks better than one wrong candidate does, so more confidence is asked of it.
+SURE = 0.8
 LEAST_SUPPORT = 0.4
-LARGEST_GAP = 0.56  # an arc of less than 160 deg leaves the opposite side to the noise
-MOST_SPREAD = 0.8  # of the levels inside, in steps: lids and lashes in what would be the pupil
-UNCERTAIN = 0.015  # standard deviation of the rim over b: an arc that fits a lid's margin as well is less certain
-CANDIDATES = 3  # each way
+LARGEST_GAP = 0.56  # with an arc of less than 160 deg, noise decides where the opposite side lies
+MOST_SPREAD = 0.8  # of the levels inside, in steps; more means lids and lashes inside
+UNCERTAIN = 0.015  # largest standard deviation of the boundary over b; an arc that also fits a lid margin exceeds it
+CANDIDATES = 3  # of each search
 
 
 def second_look(work: Prepared, refused: Found, settings: ExtractionSettings) -> Found | None:
-    """The likeliest rim of all candidates, by the edges alone; None where none is likely enough.
+    """The most likely boundary among all candidates, judged by its edges alone; None if none is likely enough.
 
-    A lid that crosses the pupil gives its blob a straight side, and an ellipse through all of its outline is refused;
-    a lid's shadow or lashes that touch it make it one blob with them. So the rims looked at are those of the candidates
-    of both searches, as they are and without the stretch of outline that lies inside the ellipse through the rest. What
-    holds the rim that was refused, or has a dark core, is an iris.
+    A lid that crosses the pupil gives the dark region a straight side, so an ellipse through its whole outline is
+    rejected. A lid shadow or lashes that touch the pupil merge with it into one region. The fallback therefore tries
+    the candidates of both searches (with and without dark lines), each with its whole outline and with the stretch left
+    out that lies inside the ellipse through the rest. A boundary that contains the rejected one, or that has a dark
+    core, is an iris.
     """
     choice = settings.model_copy(update={"method": "fast", "min_confidence": SURE})
     best: Found | None = None
     most = 0.0
-    for found in _rims(work, settings):
-        if found.rim.support < LEAST_SUPPORT or found.rim.gap > LARGEST_GAP or _holds(found.rim, refused.rim):
+    for found in _boundaries(work, settings):
+        if (
+            found.boundary.support < LEAST_SUPPORT
+            or found.boundary.gap > LARGEST_GAP
+            or _holds(found.boundary, refused.boundary)
+        ):
             continue
         pupil = pupil_of(found, None, choice)
         good = pupil.goodness
         if good is None or good.spread > MOST_SPREAD:
             continue
-        if good.rim_sd_px > UNCERTAIN * float(found.rim.ellipse.semi_axes_px[1]):
+        if good.boundary_sd_px > UNCERTAIN * float(found.boundary.ellipse.semi_axes_px[1]):
             continue
         if pupil.confidence > most and not found.has_core:
             best, most = found, pupil.confidence
     return best
 
 
-def _holds(outer: RimFit, inner: RimFit) -> bool:
-    """Whether a rim of less than half the area lies inside."""
+def _holds(outer: BoundaryFit, inner: BoundaryFit) -> bool:
+    """Whether `inner` lies inside `outer` and has less than half its area."""
     apart = math.dist(outer.ellipse.centre_px, inner.ellipse.centre_px)
     return 2.0 * inner.ellipse.area_px2 < outer.ellipse.area_px2 and apart < 0.7 * float(outer.ellipse.semi_axes_px[1])
 
 
-def _rims(work: Prepared, settings: ExtractionSettings) -> Iterator[Found]:
-    """Different rims of all candidates."""
+def _boundaries(work: Prepared, settings: ExtractionSettings) -> Iterator[Found]:
+    """The distinct boundaries of all candidates."""
     tried: list[Ellipse] = []
-    seen: list[RimFit] = []
+    seen: list[BoundaryFit] = []
     for without_lines in (False, True):
         for candidate in find_candidates(work, settings, CANDIDATES, without_lines=without_lines):
             if any(iou(candidate.ellipse, one) > 0.95 for one in tried):
                 continue
             tried.append(candidate.ellipse)
-            found = rim_about(work, candidate, settings)
+            found = boundary_about(work, candidate, settings)
             if isinstance(found, str):
                 continue
             expected = edge_noise_px(candidate.step_dn, work.noise_dn, found.edges.filter_px, found.edges.sigma_px)
-            for rim in (found.rim, *rims_without_stretch(found.edges, found.rim, settings, expected)):
-                if all(iou(rim.ellipse, one.ellipse) < 0.99 for one in seen):
-                    seen.append(rim)
-                    yield replace(found, rim=rim)
+            for boundary in (
+                found.boundary,
+                *boundaries_without_stretch(found.edges, found.boundary, settings, expected),
+            ):
+                if all(iou(boundary.ellipse, one.ellipse) < 0.99 for one in seen):
+                    seen.append(boundary)
+                    yield replace(found, boundary=boundary)

@@ -1,4 +1,4 @@
-"""The least-squares system of the rim's pixel model: slopes, normal equations, Gauss-Newton steps.
+"""The least-squares system of the boundary's pixel model: slopes, normal equations, Gauss-Newton steps.
 
 A margin is not quite an ellipse: every sector of it may be displaced, by amounts whose standard deviation is given. To
 first order a sector's displacement is one more linear parameter of that sector's pixels alone, so that a step of the
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...geometry.ellipse import Ellipse
 from .covariance import SHAPE, distance_slopes, gram, project
-from .edge_model import Place, Profile, RimModel, harmonics
+from .edge_model import EdgeModel, Place, Profile, harmonics
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -27,7 +27,7 @@ FIXED = SHAPE + 7
 # how the inner level leans, in steps: scattered light only, so that noise does not find a lean where there is none.
 HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
 KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond them the edge would not be monotonic
-NEAR = 2  # steps to the nearest point: the band is within a few tenths of b, and the rim's own pixels far nearer
+NEAR = 2  # steps to the nearest point: the band is within a few tenths of b, and the boundary's own pixels far nearer
 STILL_PX = 1e-3  # a step smaller than that is the last one of a fit
 
 
@@ -65,7 +65,7 @@ class Prior:
     displacement: float
 
     @staticmethod
-    def of(start: RimModel, noise_dn: float, uneven_px: float) -> Prior:
+    def of(start: EdgeModel, noise_dn: float, uneven_px: float) -> Prior:
         """For a model that starts from there."""
         displacement = (noise_dn / uneven_px) ** 2 if uneven_px > 0.0 else math.inf
         step = max(start.step_dn, noise_dn)
@@ -89,7 +89,7 @@ class Rows:
     slope: Array
 
     @staticmethod
-    def of(pixels: Pixels, model: RimModel, place: Place, displaced: Array) -> Rows:
+    def of(pixels: Pixels, model: EdgeModel, place: Place, displaced: Array) -> Rows:
         """displaced (k,): how far every sector lies inside the ellipse, px."""
         at = replace(place, distance=place.distance + displaced[pixels.index]) if displaced.any() else place
         level, jacobian_, slope = jacobian(model, at)
@@ -133,13 +133,13 @@ class Solution:
     """model; displaced (k,) px; rows and place (n,), of which all but the residual lack the share of a last tiny
     step."""
 
-    model: RimModel
+    model: EdgeModel
     displaced: Array
     rows: Rows
     place: Place
 
 
-def jacobian(model: RimModel, place: Place) -> tuple[Array, Array, Array]:
+def jacobian(model: EdgeModel, place: Place) -> tuple[Array, Array, Array]:
     """Model levels (n,), their derivatives (FIXED + 2 K, n) by the parameters in the order of FIXED, and by the
     distance (n,)."""
     profile = Profile.of(place.distance, place.curvature, model.sigma_px, model.kurtosis)
@@ -159,12 +159,12 @@ def jacobian(model: RimModel, place: Place) -> tuple[Array, Array, Array]:
     return inner + step * profile.edge + model.slope * profile.ramp, out, by_distance
 
 
-def _values(model: RimModel) -> Array:
+def _values(model: EdgeModel) -> Array:
     """The parameters that a prior may hold, at their places; the others are 0."""
     return np.concatenate([np.zeros(7), [model.slope, model.kurtosis, *model.lean, 0.0], model.outer[1:]])
 
 
-def moved(model: RimModel, step: Array) -> RimModel:
+def moved(model: EdgeModel, step: Array) -> EdgeModel:
     """The model after a step of the parameters; the shape matrix's eigenvectors give the new axes."""
     x, y, aa, bb, ab, sigma, inner, slope, kurtosis, lean_x, lean_y = step[:11].tolist()
     cx, cy = model.ellipse.centre_px.tolist()
@@ -177,10 +177,12 @@ def moved(model: RimModel, step: Array) -> RimModel:
     blur = min(max(model.sigma_px + sigma, 0.5 * model.sigma_px, 0.3), max(2.0 * model.sigma_px, 0.3))
     tails = min(max(model.kurtosis + kurtosis, KURTOSIS_LIMITS[0]), KURTOSIS_LIMITS[1])
     lean = (model.lean[0] + lean_x, model.lean[1] + lean_y)
-    return RimModel(ellipse, model.inner_dn + inner, model.outer + step[11:], blur, model.slope + slope, tails, lean)
+    return EdgeModel(ellipse, model.inner_dn + inner, model.outer + step[11:], blur, model.slope + slope, tails, lean)
 
 
-def gauss_newton(pixels: Pixels, model: RimModel, displaced: Array, place: Place, prior: Prior, steps: int) -> Solution:
+def gauss_newton(
+    pixels: Pixels, model: EdgeModel, displaced: Array, place: Place, prior: Prior, steps: int
+) -> Solution:
     """The model after at most `steps` steps with Levenberg's damping; cost = sum r^2 + what the priors add.
 
     displaced (k,): where the sectors are to begin with.

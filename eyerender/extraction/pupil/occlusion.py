@@ -1,4 +1,4 @@
-"""Which pixels and sectors of a rim its model explains, and how uneven the margin is."""
+"""Which pixels and sectors of a boundary its model explains, and how uneven the margin is."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..statistics import median
 from .consensus import UNEVEN
-from .edge_model import SECTORS, Place, RimModel, sector_of
+from .edge_model import SECTORS, EdgeModel, Place, sector_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -33,14 +33,21 @@ class Judged:
 
 
 def judge(
-    model: RimModel, displaced: Array, level: Array, place: Place, use: Mask, seen: Mask, sectors: Mask, noise_dn: float
+    model: EdgeModel,
+    displaced: Array,
+    level: Array,
+    place: Place,
+    use: Mask,
+    seen: Mask,
+    sectors: Mask,
+    noise_dn: float,
 ) -> Judged:
-    """What of the rim the model explains: pixels (n,) that did count, `use`, and sectors, `seen`, as displaced.
+    """What of the boundary the model explains: pixels (n,) that did count, `use`, and sectors, `seen`, as displaced.
 
     A margin is not quite an ellipse; by how much its sectors scatter about one, by their median, is uneven_px. A
     sector counts when it is displaced no more than margins are, its pixels' mean square there is at most a multiple of
-    the typical sector's, and few are outliers. Where the edges saw the rim the limits are generous: iris texture
-    is no lid. Elsewhere the pixels must show by themselves that the rim is there.
+    the typical sector's, and few are outliers. Where the edges saw the boundary the limits are generous: iris texture
+    is no lid. Elsewhere the pixels must show by themselves that the boundary is there.
     """
     bins = sector_of(place)
     whole = displaced
@@ -76,7 +83,7 @@ def judge(
     )
 
 
-def clear_of_lids(seen: Mask, model: RimModel) -> Mask:
+def clear_of_lids(seen: Mask, model: EdgeModel) -> Mask:
     """Leave out the neighbours of every gap of two sectors or more, as far as a lid's margin is blurred into them."""
     if seen.all():
         return seen

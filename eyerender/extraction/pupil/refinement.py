@@ -1,4 +1,4 @@
-"""Maximum-likelihood refinement: the pixel model of the rim fitted to the pixels around it."""
+"""Maximum-likelihood refinement: the pixel model of the boundary fitted to the pixels around it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...geometry.ellipse import Ellipse, fit_ellipse_direct
 from ..preprocessing import Image
 from .covariance import SHAPE, distance_slopes, sector_excess, to_axes
-from .edge_model import SECTORS, Place, RimModel, sector_of
+from .edge_model import SECTORS, EdgeModel, Place, sector_of
 from .least_squares import FIXED, NEAR, Normal, Pixels, Prior, Rows, Solution, gauss_newton
 from .occlusion import clear_of_lids, judge
 
@@ -32,7 +32,7 @@ class PixelFit:
     angle); reduced_chi2 against the image's noise; residual_dn; pixels used; sectors: (SECTORS,) which parts of the
     outline count; uneven_px: standard deviation of their displacements."""
 
-    model: RimModel
+    model: EdgeModel
     ellipse: Ellipse
     covariance: Array
     reduced_chi2: float
@@ -43,12 +43,12 @@ class PixelFit:
 
 
 def refine(
-    linear: Image, start: RimModel, sectors: Mask, masked: Mask, noise_dn: float, before: PixelFit | None = None
+    linear: Image, start: EdgeModel, sectors: Mask, masked: Mask, noise_dn: float, before: PixelFit | None = None
 ) -> PixelFit | str:
-    """The most likely rim, or why the refinement failed.
+    """The most likely boundary, or why the refinement failed.
 
     linear: image. start: from the edges. sectors: (SECTORS,) parts of the outline that the edges saw. masked: image of
-    pixels that glints touch or the sensor clipped. before: what another image of the same rim gave, to begin with.
+    pixels that glints touch or the sensor clipped. before: what another image of the same boundary gave, to begin with.
     The Fourier order of the outer level is the one of least BIC, by the drop of chi^2 that one linear step with its
     columns promises. Pixels and sectors that the model cannot explain (lids, lashes, reflections) are put aside, and
     the rest is fitted again; where the margin proves uneven, with displacements of its sectors.
@@ -65,7 +65,7 @@ def refine(
         bins = sector_of(place)
         chosen = np.nonzero(use & seen[bins])[0]
         if chosen.size < 60:
-            return "too few pixels on the rim are free of glints and lids"
+            return "too few pixels on the boundary are free of glints and lids"
         chosen = chosen[np.argsort(bins[chosen].astype(np.uint8), kind="stable")]  # a radix sort
         pixels = Pixels.of(x[chosen], y[chosen], level[chosen], bins[chosen])
         begun = displaced[pixels.sector]
@@ -90,13 +90,13 @@ def refine(
             break
         use, seen, displaced = judged.use, new_seen, judged.displaced
         if seen.sum() < 0.15 * SECTORS:
-            return "too little of the rim fits the pixel model"
+            return "too little of the boundary fits the pixel model"
     return _report(pixels, found, prior, noise_dn, new_seen)
 
 
-def _band(linear: Image, model: RimModel, masked: Mask) -> tuple[Array, Array, Array]:
-    """(x, y, level) of the pixels whose distance to the rim matters: 4 sigma and a pixel inside, 3 sigma and a pixel
-    outside, where that is not beyond OUTWARD_PX.
+def _band(linear: Image, model: EdgeModel, masked: Mask) -> tuple[Array, Array, Array]:
+    """(x, y, level) of the pixels near the boundary: up to 4 sigma + 1 px inside it and 3 sigma + 1 px outside it, but
+    not beyond OUTWARD_PX.
 
     Farther out the outer level would be told better, but it changes with the distance: 2 px more make the error on a
     textured iris half as large again.
@@ -149,7 +149,7 @@ def _best_order(pixels: Pixels, found: Solution, prior: Prior) -> int:
     return best
 
 
-def _sane(model: RimModel, start: RimModel) -> bool:
+def _sane(model: EdgeModel, start: EdgeModel) -> bool:
     b = start.ellipse.semi_axes_px[1]
     moved = float(np.hypot(*(model.ellipse.centre_px - start.ellipse.centre_px)))
     ratio = model.ellipse.semi_axes_px / start.ellipse.semi_axes_px

@@ -21,14 +21,14 @@ from ..preprocessing import DN
 from ..result import Goodness, PupilResult
 from ..settings import ExtractionSettings
 from .candidates import inspect_interior
-from .covariance import rim_deviation
+from .covariance import boundary_deviation
 from .refinement import PixelFit
 from .search import Found
 
 Array = NDArray[np.float64]
 
 FEATURES = (
-    "support", "gap", "explained", "ln contrast to noise", "ln contrast", "ln rim deviation / b", "ln residual / b",
+    "support", "gap", "explained", "ln contrast to noise", "ln contrast", "ln boundary sd / b", "ln residual / b",
     "ln b", "blur / b", "b / a", "unevenness", "spread", "ln chi2", "uneven / b", "refined",
 )  # fmt: skip
 
@@ -44,7 +44,7 @@ def features(ellipse: Ellipse, goodness: Goodness) -> Array:
             g.explained,
             math.log(max(g.contrast_to_noise, 1e-3)),
             math.log(max(g.contrast, 1e-3)),
-            math.log(g.rim_sd_px / b + 1e-5),
+            math.log(g.boundary_sd_px / b + 1e-5),
             math.log(g.residual_px / b + 1e-4),
             math.log(b),
             g.blur_px / b,
@@ -79,32 +79,32 @@ def calibrated(logit: Array, bend: Array) -> Array:
 
 
 def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -> PupilResult:
-    """The pupil of a rim, by its edges or by the pixel model's fit; missing where it is too unlikely right."""
-    rim, image = found.rim, found.image
+    """The pupil of a boundary, by its edges or by the pixel model's fit; missing where it is too unlikely right."""
+    boundary, image = found.boundary, found.image
     if fit is None:
-        model, ellipse, covariance, inside = found.model, rim.ellipse, found.covariance, found.interior
+        model, ellipse, covariance, inside = found.model, boundary.ellipse, found.covariance, found.interior
     else:
         model, ellipse, covariance = fit.model, fit.ellipse, fit.covariance
         inside = inspect_interior(image.linear, ellipse, model.sigma_px, image.noise_dn)
     goodness = Goodness(
-        support=rim.support,
-        gap=rim.gap,
-        explained=rim.support if fit is None else float(fit.sectors.mean()),
+        support=boundary.support,
+        gap=boundary.gap,
+        explained=boundary.support if fit is None else float(fit.sectors.mean()),
         contrast=model.step_dn / DN,
         contrast_to_noise=model.step_dn / image.noise_dn,
-        residual_px=rim.residual_px,
+        residual_px=boundary.residual_px,
         reduced_chi2=0.0 if fit is None else fit.reduced_chi2,
         blur_px=model.sigma_px,
         unevenness=inside.darker_dn / model.step_dn,
         spread=inside.spread_dn / model.step_dn,
-        rim_sd_px=rim_deviation(ellipse, covariance),
+        boundary_sd_px=boundary_deviation(ellipse, covariance),
         uneven_px=0.0 if fit is None else fit.uneven_px,
         refined=fit is not None,
     )
     sure = confidence(ellipse, goodness, settings.method)
     if sure < settings.min_confidence:
         return PupilResult.missing("fit", f"the ellipse found is the pupil with a probability of only {sure:.2f}")
-    contour = frozen(found.edges.points_px[rim.inliers])
+    contour = frozen(found.edges.points_px[boundary.inliers])
     return PupilResult("ok", None, None, ellipse, frozen(covariance), sure, goodness, contour)
 
 

@@ -1,4 +1,4 @@
-"""From candidates to the rim: which dark blob's outline is the pupil's, by what its edges show at full resolution."""
+"""Search for the pupil boundary: which candidate is the pupil, judged by its edges at full resolution."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ..preprocessing import Prepared
 from ..result import PupilResult
 from ..settings import ExtractionSettings
 from .candidates import Candidate, Interior, find_candidates, find_inside, inspect_interior
-from .consensus import RimFit, fit_rim
+from .consensus import BoundaryFit, fit_boundary
 from .covariance import edge_covariance
-from .edge_model import SECTORS, Place, RimModel, sector_of
+from .edge_model import SECTORS, EdgeModel, Place, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 
 Array = NDArray[np.float64]
@@ -23,37 +23,37 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A candidate in an image, the edge points about it, the rim through them, and how much of it is seen and how
+    """A candidate in an image, the edge points about it, the boundary through them, and how much of it is seen and how
     clearly; what follows from these is worked out once, when asked for."""
 
     image: Prepared
     candidate: Candidate
     edges: EdgePoints
-    rim: RimFit
+    boundary: BoundaryFit
     quality: float
 
     @cached_property
-    def model(self) -> RimModel:
+    def model(self) -> EdgeModel:
         """The pixel model's parameters as far as the edges tell them."""
         candidate = self.candidate
         sigma = math.sqrt(max(self.edges.sigma_px**2 - self.edges.filter_px**2, 0.25))
         outer = np.array([candidate.inside_dn + candidate.step_dn])
-        return RimModel(self.rim.ellipse, candidate.inside_dn, outer, sigma)
+        return EdgeModel(self.boundary.ellipse, candidate.inside_dn, outer, sigma)
 
     @cached_property
     def covariance(self) -> Array:
-        """(5, 5) of the rim's centre, semi-axes and angle, by the edges' scatter."""
-        return edge_covariance(self.rim.ellipse, self.rim.points_px, self.rim.residual_px)
+        """(5, 5) of the boundary's centre, semi-axes and angle, by the edges' scatter."""
+        return edge_covariance(self.boundary.ellipse, self.boundary.points_px, self.boundary.residual_px)
 
     @cached_property
     def interior(self) -> Interior:
-        """What lies inside the rim."""
-        return inspect_interior(self.image.linear, self.rim.ellipse, self.model.sigma_px, self.image.noise_dn)
+        """What lies inside the boundary."""
+        return inspect_interior(self.image.linear, self.boundary.ellipse, self.model.sigma_px, self.image.noise_dn)
 
     @cached_property
     def sectors(self) -> NDArray[np.bool_]:
         """(SECTORS,) parts of the outline with an edge point in them, and gaps of up to two parts between such."""
-        hit = np.bincount(sector_of(Place.of(self.rim.ellipse, *self.edges.points_px[self.rim.inliers].T)),
+        hit = np.bincount(sector_of(Place.of(self.boundary.ellipse, *self.edges.points_px[self.boundary.inliers].T)),
                           minlength=SECTORS) > 0  # fmt: skip
         grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
         return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
@@ -66,12 +66,12 @@ class Found:
 
 
 def search(work: Prepared, settings: ExtractionSettings) -> Found | PupilResult:
-    """The best candidate by what its rim shows at full resolution; where there is none, again without dark lines."""
+    """The best candidate, judged by its edges; if there is none, the search repeats without dark lines."""
     found = _searched(work, settings, without_lines=False)
     if isinstance(found, Found) or work.inverted:
         return found
     again = _searched(work, settings, without_lines=True)
-    return again if isinstance(again, Found) and again.rim.support > 0.5 else found
+    return again if isinstance(again, Found) and again.boundary.support > 0.5 else found
 
 
 def _searched(work: Prepared, settings: ExtractionSettings, *, without_lines: bool) -> Found | PupilResult:
@@ -85,42 +85,42 @@ def _searched(work: Prepared, settings: ExtractionSettings, *, without_lines: bo
 
 
 def _first_good(work: Prepared, candidates: list[Candidate], settings: ExtractionSettings) -> tuple[Found | None, str]:
-    """The first candidate with a well-seen rim, else the best-seen one; and the first one's objection."""
+    """The first candidate with a well-seen boundary, else the best-seen one; and the first one's objection."""
     poor: list[Found] = []
     reason = ""
     for candidate in candidates:
-        found = rim_about(work, candidate, settings)
+        found = boundary_about(work, candidate, settings)
         if isinstance(found, str):
             reason = reason or found
             continue
         # The ranking knows what lies inside what; a later candidate must only stand in for a failed one.
-        if found.rim.support > 0.45:
+        if found.boundary.support > 0.45:
             return next((earlier for earlier in poor if _holds(found, earlier)), found), reason
         poor.append(found)
     return max(poor, key=lambda one: one.quality, default=None), reason
 
 
 def _holds(outer: Found, inner: Found) -> bool:
-    """Whether a smaller rim found earlier, however little of it is seen, lies inside."""
-    ratio = inner.rim.ellipse.area_px2 / outer.rim.ellipse.area_px2
-    apart = math.dist(inner.rim.ellipse.centre_px, outer.rim.ellipse.centre_px)
-    return ratio < 0.7 and apart < 0.7 * float(outer.rim.ellipse.semi_axes_px[1])
+    """Whether a smaller boundary found earlier, however little of it is seen, lies inside."""
+    ratio = inner.boundary.ellipse.area_px2 / outer.boundary.ellipse.area_px2
+    apart = math.dist(inner.boundary.ellipse.centre_px, outer.boundary.ellipse.centre_px)
+    return ratio < 0.7 and apart < 0.7 * float(outer.boundary.ellipse.semi_axes_px[1])
 
 
 def _without_core(work: Prepared, found: Found, settings: ExtractionSettings) -> Found | PupilResult:
-    """The same rim if its inside is even; what lies inside it if there is a darker core, as an iris has."""
+    """The same boundary if its inside is even; what lies inside it if there is a darker core, as an iris has."""
     for _ in range(2):
         if not found.has_core:
             return found
-        inner, _ = _first_good(work, find_inside(work, found.rim.ellipse, settings), settings)
-        if inner is None or inner.rim.ellipse.area_px2 > 0.8 * found.rim.ellipse.area_px2:
-            reason = "the dark region has a darker core, as an iris has, but no rim was found in it"
+        inner, _ = _first_good(work, find_inside(work, found.boundary.ellipse, settings), settings)
+        if inner is None or inner.boundary.ellipse.area_px2 > 0.8 * found.boundary.ellipse.area_px2:
+            reason = "the dark region has a darker core, as an iris has, but no boundary was found in it"
             return PupilResult.missing("edges", reason)
         found = inner
     return found
 
 
-def rim_about(work: Prepared, candidate: Candidate, settings: ExtractionSettings) -> Found | str:
+def boundary_about(work: Prepared, candidate: Candidate, settings: ExtractionSettings) -> Found | str:
     bright = candidate.inside_dn + 4.0 * candidate.step_dn
     b = float(candidate.ellipse.semi_axes_px[1])
     sigma = filter_sigma(candidate.step_dn, work.noise_dn, b)
@@ -130,7 +130,7 @@ def rim_about(work: Prepared, candidate: Candidate, settings: ExtractionSettings
         sigma = min(blur, max(1.0, 0.2 * b))
         edges = find_edges(work.linear, candidate, work.noise_dn, bright, sigma, band=0.4)
     expected = edge_noise_px(candidate.step_dn, work.noise_dn, sigma, edges.sigma_px)
-    rim = fit_rim(edges, candidate, settings, expected)
-    if isinstance(rim, str):
-        return rim
-    return Found(work, candidate, edges, rim, rim.support * min(1.0, 4.0 * candidate.score))
+    boundary = fit_boundary(edges, candidate, settings, expected)
+    if isinstance(boundary, str):
+        return boundary
+    return Found(work, candidate, edges, boundary, boundary.support * min(1.0, 4.0 * candidate.score))

@@ -1,4 +1,4 @@
-"""A rim's points without a stretch of them, each stretch in turn: which of what is left fits an ellipse best."""
+"""Ellipses through the edge points without one stretch of the outline, for each stretch in turn."""
 
 from __future__ import annotations
 
@@ -15,15 +15,22 @@ from ..statistics import median
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-STARTS = 24  # of the stretches, around the outline
-CUT_POINTS = 40  # of what is left
+STARTS = 24  # positions around the outline at which a stretch begins
+CUT_POINTS = 40  # points that a fit uses of those that remain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cuts:
-    """Ellipses (m, 5: centre, semi-axes, angle) through a rim's points without a stretch: the stretch's width as a
-    share of the outline, the rest's root mean square distance, and its first point and number of points, all (m,);
-    points (n, 2) of the whole rim, in turn."""
+    """Ellipses through the edge points of a boundary, each without one stretch of them.
+
+    Attributes:
+        fits: (m, 5) centre, semi-axes and angle.
+        width: (m,) width of the stretch that was left out, as a share of the outline.
+        residual_px: (m,) root mean square distance of the points that were kept.
+        first: (m,) index of the first point that was left out.
+        count: (m,) how many points were left out.
+        points: (n, 2) all points, in the order of the outline.
+    """
 
     fits: Array
     width: Array
@@ -34,8 +41,15 @@ class Cuts:
 
     @staticmethod
     def of(points: Array, ellipse: Ellipse, least: int, shares: tuple[float, ...], largest: float) -> Cuts:
-        """Every stretch of these widths left out of a rim's points (n, 2) in turn, if `least` points are left and the
-        ellipse stays alike: its longer axis below `largest` times the rim's. CUT_POINTS of its points tell the rest."""
+        """Leave out each stretch of the given widths in turn.
+
+        Args:
+            points: (n, 2) edge points.
+            ellipse: the fit to all of them.
+            least: how many points must remain.
+            shares: widths of the stretches, as shares of the outline.
+            largest: how many times `ellipse`'s longer semi-axis the new one may have.
+        """
         turn = turn_of(points, ellipse)
         order = np.argsort(turn, kind="stable")
         points, turn = points[order], turn[order]

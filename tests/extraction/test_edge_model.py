@@ -1,4 +1,4 @@
-"""The rim's pixel model against a brute-force blurred disc and ellipse, and its derivatives against differences."""
+"""The pixel model of the boundary against blurred discs and ellipses by brute force; its derivatives."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy import integrate, ndimage, optimize, special
 
 from eyerender.extraction import extract
 from eyerender.extraction.pupil.covariance import to_axes
-from eyerender.extraction.pupil.edge_model import Place, Profile, RimModel
+from eyerender.extraction.pupil.edge_model import EdgeModel, Place, Profile
 from eyerender.extraction.pupil.least_squares import FIXED, jacobian, moved
 from eyerender.geometry.ellipse import Ellipse, fit_ellipse_direct
 
@@ -38,7 +38,7 @@ def test_level_of_a_blurred_ellipse():
     x, y = np.meshgrid(axis, axis)
     mask = (Place.of(ellipse, x.ravel(), y.ravel()).distance.reshape(x.shape) > 0.0).astype(float)
     blurred = ndimage.gaussian_filter(mask, sigma * fine).reshape(64, fine, 64, fine).mean(axis=(1, 3))
-    model = RimModel(ellipse, 20.0, np.array([75.0]), np.sqrt(sigma**2 + 1.0 / 12.0))
+    model = EdgeModel(ellipse, 20.0, np.array([75.0]), np.sqrt(sigma**2 + 1.0 / 12.0))
     columns, rows = np.meshgrid(np.arange(64.0), np.arange(64.0))
     # Second order in blur times curvature: (1.2 * 0.11)^2 / 8 of 55 DN, and the mask's jagged edge.
     assert np.abs(model.level(columns, rows) - (20.0 + 55.0 * blurred)).max() < 0.35
@@ -60,7 +60,7 @@ def test_distance_is_the_nearest_points():
 def test_jacobian_is_the_models_slope(b):
     """Of a nearly round ellipse too, whose axes turn far with a small change of its shape."""
     outer = np.array([75.0, 6.0, -4.0, 3.0, 2.0])
-    model = RimModel(
+    model = EdgeModel(
         Ellipse([40.2, 38.7], [21.0, b], 0.8), 20.0, outer, 1.3, slope=-1.2, kurtosis=0.7, lean=(0.4, -0.9)
     )
     rng = np.random.default_rng(4)
@@ -72,7 +72,7 @@ def test_jacobian_is_the_models_slope(b):
         step[k] = 1e-5
         up, down = moved(model, step), moved(model, -step)
         slope = (up.level(base[:, 0], base[:, 1]) - down.level(base[:, 0], base[:, 1])) / 2e-5
-        # The shape's columns leave out how a pixel's place along the rim changes with it: small terms.
+        # The shape's columns leave out how a pixel's place along the boundary changes with it: small terms.
         tolerance = 1.2 if k < 5 else 1e-5
         assert np.abs(slopes[k] - slope).max() < tolerance
         assert np.corrcoef(slopes[k], slope)[0, 1] > 0.99
@@ -84,7 +84,7 @@ def test_covariance_of_the_axes_follows_the_shape_matrix():
     covariance = np.diag([0.02, 0.03, 0.05, 0.04, 0.06]) ** 2
     rng = np.random.default_rng(6)
     draws = rng.multivariate_normal(np.zeros(5), covariance, 4000)
-    model = RimModel(ellipse, 0.0, np.array([1.0]), 1.0)
+    model = EdgeModel(ellipse, 0.0, np.array([1.0]), 1.0)
     ellipses = [moved(model, np.concatenate([d, np.zeros(FIXED - 5)])).ellipse for d in draws]
     sample = np.array([[*e.centre_px, *e.semi_axes_px, e.angle_rad] for e in ellipses])
     stated = np.sqrt(np.diag(to_axes(covariance, ellipse)))
@@ -107,7 +107,7 @@ def test_refined_maximum_is_the_least_squares_one(ideal):
     likely = 4.0 / np.array([*first, 0.15 * 55.0 / e.semi_axes_px[1], 1.0, *lean])
 
     def residual(p):
-        level = RimModel(Ellipse(p[:2], p[2:4], p[4]), p[5], p[6:9], p[9], p[10], p[11], p[12:]).level(x, y)
+        level = EdgeModel(Ellipse(p[:2], p[2:4], p[4]), p[5], p[6:9], p[9], p[10], p[11], p[12:]).level(x, y)
         return np.concatenate([level - data, likely * p[[7, 8, 10, 11, 12, 13]]])
 
     start = np.array([*e.centre_px, *e.semi_axes_px, e.angle_rad, 20.0, 75.0, 0.0, 0.0, 1.1, 0.0, 0.0, 0.0, 0.0])
