@@ -10,22 +10,25 @@ import json
 import os
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard, overload
 
 from .errors import EyerenderError, InputError
-from .files import make_folder, sync_folder, sync_tree, write_json
-from .observation import Observations
+from .files import inside, is_plain, make_folder, read_json, shown, sync_folder, sync_tree, write_json
+from .jsonlines import JsonLines
+from .observation import EYES, Observations, concatenate, count_heads
 
 IMAGE_SCHEMA = "eyerender/image/1"
 DATASET_SCHEMA = "eyerender/dataset/1"
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
 RUN = "run.json"  # of a folder that `generate` fills, from its start
 STAGE = ".partial-"
+_BATCH = 1024  # lines whose records are held at a time
+_MAX_PX = 2**31
 
 CONVENTIONS = {
     "world_frame": "mm; origin midway between the corneal apexes of the unrotated eyes at the reference head position; "
@@ -37,23 +40,49 @@ CONVENTIONS = {
 }
 
 
+# The keys of a line that name files of the folder.
+FILE_KEYS = ("file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name")
+
+
 @dataclass(frozen=True, slots=True)
 class ImageEntry:
-    """One image of a folder: its files, the window (x0, y0, width, height) it shows, its line of metadata."""
+    """One image of a folder: its files, the window (x0, y0, width, height) it shows, its line of metadata.
+
+    `number` counts the lines of metadata from 1, 0 where it is not known.
+    """
 
     folder: Path
     line: dict[str, Any]
+    number: int = 0
+
+    @property
+    def name(self) -> str:
+        """The image's file, relative to the folder; for messages."""
+        return str(self.line["file_name"])
 
     @property
     def path(self) -> Path:
-        """The image file."""
-        return self.folder / str(self.line["file_name"])
+        """The image file; raises `InputError` as `file` does."""
+        found = self.file("file_name")
+        if found is None:
+            raise InputError("missing", source=str(self.folder / METADATA), path=self._where("file_name"))
+        return found
 
     @property
     def mask_path(self) -> Path | None:
-        """The mask file, where there is one."""
-        name = self.line.get("mask_file_name")
-        return self.folder / name if name else None
+        """The mask file, where there is one; raises `InputError` as `file` does."""
+        return self.file("mask_file_name")
+
+    def file(self, key: str) -> Path | None:
+        """The file that one of `FILE_KEYS` names, None where the line names none.
+
+        Raises:
+            InputError: it leads out of the folder, is missing, or is no regular file (a link, a pipe, a folder).
+        """
+        name = self.line.get(key)
+        if name is None:
+            return None
+        return inside(self.folder, name, source=str(self.folder / METADATA), path=self._where(key))
 
     @property
     def window(self) -> tuple[int, int, int, int]:
@@ -61,73 +90,156 @@ class ImageEntry:
         w = self.line["window_px"]
         return w["x0"], w["y0"], w["width"], w["height"]
 
+    def truth(self) -> Observations:
+        """The analytic observer's records of this image; raises `InputError` naming line and key."""
+        try:
+            return Observations.from_records(self.line["records"])
+        except InputError as error:
+            source, path = str(self.folder / METADATA), self._where(error.path or "records")
+            raise InputError(error.reason, source=source, path=path) from None
+
+    def _where(self, key: str) -> str:
+        return f"line {self.number}.{key}" if self.number else key
+
+
+@dataclass(frozen=True, slots=True)
+class Entries(Sequence[ImageEntry]):
+    """The images of a folder. Each line of metadata is read and checked when its entry is asked for, and not kept.
+
+    Asking for entries one after the other by iterating is faster than by index. A slice is another such sequence.
+
+    Raises:
+        InputError: on access; the line is wrong (the message names line and key), or the file has changed.
+    """
+
+    folder: Path
+    lines: JsonLines
+    rows: range
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, at: int) -> ImageEntry: ...
+    @overload
+    def __getitem__(self, at: slice) -> Entries: ...
+    def __getitem__(self, at: int | slice) -> ImageEntry | Entries:
+        if isinstance(at, slice):
+            return Entries(self.folder, self.lines, self.rows[at])
+        row = self.rows[at]
+        return next(iter(Entries(self.folder, self.lines, range(row, row + 1))))
+
+    def __iter__(self) -> Iterator[ImageEntry]:
+        source = str(self.lines.path)
+        for row, line in zip(self.rows, self.lines.read(self.rows), strict=True):
+            _check_line(line, source, f"line {row + 1}")
+            yield ImageEntry(self.folder, line, row + 1)
+
 
 @dataclass(frozen=True, slots=True)
 class ImageFolder:
-    """A complete folder of images, read."""
+    """A complete folder of images. Its lines of metadata are read when `entries` are asked for, and never all held."""
 
     path: Path
     dataset: dict[str, Any]
-    entries: tuple[ImageEntry, ...]
+    entries: Entries
 
     @classmethod
     def load(cls, path: str | Path) -> ImageFolder:
-        """Read a folder; raises `InputError` naming the file and the line."""
+        """Open a folder: read dataset.json, find the lines of metadata.jsonl and check the first one.
+
+        Raises:
+            InputError: naming the file, and the line and key where there is one. A wrong line further on is found when
+                it is read.
+        """
         folder = Path(path)
         if not folder.is_dir():
             raise InputError("no such folder", source=str(path))
         if (folder / RUN).is_file() and not (folder / DATASET).is_file():
             raise InputError("holds a run that is not finished; start generate again on it", source=str(path))
-        if not (folder / METADATA).is_file():
+        if not (folder / METADATA).exists():
             raise InputError(f"holds no {METADATA}; not a folder of images that this package wrote", source=str(path))
-        dataset = _json_file(folder / DATASET)
+        dataset = read_json(folder / DATASET, follow=False)
         if dataset.get("schema") != DATASET_SCHEMA:
             raise InputError(
-                f"is {dataset.get('schema')!r}; this version reads {DATASET_SCHEMA!r}",
+                f"is {shown(dataset.get('schema'))}; this version reads {DATASET_SCHEMA!r}",
                 source=str(folder / DATASET),
                 path="schema",
             )
-        entries = []
-        source = str(folder / METADATA)
-        try:
-            text = (folder / METADATA).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError):
-            raise InputError("cannot be read", source=source) from None
-        for k, raw in enumerate(text.splitlines()):
-            try:
-                line = json.loads(raw)
-                window = line["window_px"]
-                if line["schema"] != IMAGE_SCHEMA or not isinstance(line["records"], list):
-                    raise ValueError
-                if not all(isinstance(window[key], int) for key in ("x0", "y0", "width", "height")):
-                    raise ValueError
-            except (ValueError, KeyError, TypeError):
-                raise InputError("is no image record", source=source, path=f"line {k + 1}") from None
-            name = line.get("file_name")
-            if not isinstance(name, str) or Path(name).is_absolute() or ".." in Path(name).parts:
-                raise InputError("must be a path inside the folder", source=source, path=f"line {k + 1}.file_name")
-            entries.append(ImageEntry(folder, line))
-        if not entries:
-            raise InputError("holds no images", source=source)
-        return cls(folder, dataset, tuple(entries))
+        lines = JsonLines.index(folder / METADATA)
+        if not len(lines):
+            raise InputError("holds no images", source=str(folder / METADATA))
+        entries = Entries(folder, lines, range(len(lines)))
+        _ = entries[0]
+        return cls(folder, dataset, entries)
 
     def truth(self) -> Observations:
-        """The analytic observer's records of every image, in order."""
-        records = [record for entry in self.entries for record in entry.line["records"]]
-        return Observations.from_records(records, source=str(self.path / METADATA))
+        """The analytic observer's records of every image, in order; raises `InputError` for a wrong record."""
+        parts = []
+        for start in range(0, len(self.entries), _BATCH):
+            batch = list(self.entries[start : start + _BATCH])
+            try:
+                parts.append(Observations.from_records([r for entry in batch for r in entry.line["records"]]))
+            except InputError:
+                for entry in batch:
+                    entry.truth()  # says which line is wrong
+                raise
+        found = concatenate(parts)
+        # Positions of the head are counted over all images.
+        return replace(found, index=replace(found.index, head=count_heads(found.index.head_mm)))
+
+
+def _check_line(line: dict[str, Any], source: str, where: str) -> None:
+    """Raise `InputError` for a line whose files, names or window cannot be used; what else it holds is not checked."""
+
+    def refuse(reason: str, key: str) -> None:
+        raise InputError(reason, source=source, path=f"{where}.{key}")
+
+    if line.get("schema") != IMAGE_SCHEMA:
+        refuse(f"is {shown(line.get('schema'))}, no image record of {IMAGE_SCHEMA!r}", "schema")
+    for key in FILE_KEYS:
+        name = line.get(key)
+        if not is_plain(name) and (name is not None or key == "file_name"):
+            refuse(f"must be a path inside the folder, not {shown(name)}", key)
+    window = line.get("window_px")
+    for key in ("x0", "y0", "width", "height"):
+        value = window.get(key) if isinstance(window, dict) else None
+        if not _is_whole(value) or abs(value) > _MAX_PX or (value < 1 and key in ("width", "height")):
+            refuse("must be a whole number of pixels", f"window_px.{key}")
+    depth = line.get("bit_depth")
+    if depth is not None and not (_is_whole(depth) and 1 <= depth <= 32):
+        refuse("must be 1 to 32", "bit_depth")
+    # These become parts of the names of exported files.
+    for key in ("sample", "subject"):
+        if key in line and not (_is_whole(line[key]) and 0 <= line[key] < 2**63):
+            refuse("must be a whole number >= 0", key)
+    if "split" in line and not (is_plain(line["split"]) and "/" not in line["split"] and len(line["split"]) <= 64):
+        refuse(f"must be a plain name, not {shown(line['split'])}", "split")
+    records = line.get("records")
+    if not isinstance(records, list):
+        refuse("must be a list", "records")
+    for k, record in enumerate(line["records"]):
+        if not isinstance(record, dict):
+            refuse("must be a record", f"records.{k}")
+        if record.get("eye") not in (None, *EYES):
+            refuse("must be 'right' or 'left'", f"records.{k}.eye")
+        camera = record.get("camera")
+        if camera is not None and not (_is_whole(camera) and 0 <= camera < 2**31):
+            refuse("must be a whole number >= 0", f"records.{k}.camera")
+
+
+def _is_whole(value: object) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def same_run(path: str | Path, digest: str) -> bool:
     """Whether a folder already holds the complete result of the same spec made by the same versions."""
     try:
-        found = json.loads((Path(path) / DATASET).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = read_json(Path(path) / DATASET)
+    except InputError:
         return False
     return bool(
-        isinstance(found, dict)
-        and found.get("schema") == DATASET_SCHEMA
-        and found.get("digest") == digest
-        and found.get("versions") == versions()
+        found.get("schema") == DATASET_SCHEMA and found.get("digest") == digest and found.get("versions") == versions()
     )
 
 
@@ -209,15 +321,3 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             out[name] = "unknown"
     return out
-
-
-def _json_file(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError("no such file", source=str(path)) from None
-    except (OSError, ValueError):
-        raise InputError("is not valid JSON", source=str(path)) from None
-    if not isinstance(data, dict):
-        raise InputError("must be a JSON object", source=str(path))
-    return data

@@ -195,9 +195,6 @@ class Observations(ArrayValue):
             if name is not None and name not in EYES:
                 raise InputError("must be 'right' or 'left'", source=source, path=f"records.{k}.eye")
         head = reader.array("head_mm", (3,))
-        # The record holds no count of head positions: equal positions are the same one, in order of appearance.
-        heads: dict[bytes, int] = {}
-        head_index = [heads.setdefault((np.round(h, 9) + 0.0).tobytes(), len(heads)) for h in head]
         points = [r["pupil"]["points_px"] or [] for r in rows if reader.has_pupil(r)]
         k_points = max((len(p) for p in points), default=0)
         m = max((len(r.get("glints") or []) for r in rows), default=0)
@@ -208,7 +205,7 @@ class Observations(ArrayValue):
                 reader.counts("frame"),
                 reader.counts("fixation"),
                 reader.counts("camera"),
-                frozen(head_index, np.int64),
+                count_heads(head),
                 frozen([EYES.index(e) if e else -1 for e in eye], np.int64),
                 reader.texts("eye_model"),
                 reader.array("target_mm", (3,)),
@@ -323,6 +320,15 @@ class _Reader:
             except (KeyError, TypeError, ValueError):
                 raise InputError("not a glint record", source=self.source, path=f"records.{k}.glints.{j}") from None
         return light, status, reason, inside, xy.tolist(), cov.tolist()
+
+
+def count_heads(head_mm: Floats) -> Ints:
+    """Counts of head positions (n, 3) from 0: equal positions are the same one, in order of appearance.
+
+    Records hold no such count.
+    """
+    heads: dict[bytes, int] = {}
+    return frozen([heads.setdefault((np.round(h, 9) + 0.0).tobytes(), len(heads)) for h in head_mm], np.int64)
 
 
 def concatenate(parts: Iterable[Observations]) -> Observations:

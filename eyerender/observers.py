@@ -172,7 +172,7 @@ def _scene_of_samples(folder: ImageFolder) -> Scene:
     first: Scene | None = None
     seen: set[str] = set()
     for entry in folder.entries:
-        source = str(entry.path)
+        source = str(folder.path / entry.name)
         try:
             text, eye = entry.line["parameters"]["scene_json"], entry.line["parameters"]["eye_json"]
             rig = json.loads(text)["rig"]

@@ -171,11 +171,11 @@ def test_a_full_disk_is_one_error_and_leaves_nothing(tmp_path):
     [
         ("metadata.jsonl", None, "holds no metadata.jsonl"),
         ("metadata.jsonl", "", "holds no images"),
-        ("metadata.jsonl", "{}\n", "line 1: is no image record"),
+        ("metadata.jsonl", "{}\n", "line 1.schema: is None, no image record"),
         (
             "metadata.jsonl",
             json.dumps({"schema": "eyerender/image/1", **line(), "file_name": "../x"}),
-            "inside the folder",
+            "line 1.file_name: must be a path inside the folder",
         ),
         ("dataset.json", None, "dataset.json: no such file"),
         ("dataset.json", "[", "is not valid JSON"),
@@ -191,3 +191,139 @@ def test_damaged_folders_are_refused(tmp_path, file, content, words):
         (out / file).write_text(content)
     with pytest.raises(InputError, match=words):
         ImageFolder.load(out)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder of three images; returns it and a function that changes the second line."""
+    out = tmp_path / "folder"
+    with staged(out) as stage:
+        for name in ("images", "masks"):
+            (stage / name).mkdir()
+            for k in range(3):
+                write_png(stage / name / f"{k}.png", np.full((6, 5), k, np.uint8))
+        lines = [line(str(k)) | {"mask_file_name": f"masks/{k}.png"} for k in range(3)]
+        write_dataset(stage, lines, spec={}, digest="d")
+
+    def change(**keys):
+        text = (out / "metadata.jsonl").read_text().splitlines()
+        text[1] = json.dumps(json.loads(text[1]) | keys)
+        (out / "metadata.jsonl").write_text("\n".join(text))
+        return ImageFolder.load(out)
+
+    return out, change
+
+
+def test_entries_are_a_lazy_sequence(folder):
+    entries = ImageFolder.load(folder[0]).entries
+    assert len(entries) == 3
+    names = [entry.name for entry in entries]
+    assert names == ["images/0.png", "images/1.png", "images/2.png"]
+    assert [entry.name for entry in entries[::-1]] == names[::-1]
+    assert entries[-1].name == entries[1:][1].name == names[2]
+    assert len(entries[1:]) == 2
+    assert [read_image(entry.mask_path)[0][0, 0] for entry in entries] == [0, 1, 2]
+    with pytest.raises(IndexError):
+        entries[3]
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"schema": "eyerender/image/9"}, "line 2.schema: is 'eyerender/image/9'"),
+        ({"window_px": [1, 2, 3, 4]}, "line 2.window_px.x0: must be a whole number"),
+        ({"window_px": {"x0": 0, "y0": 0, "width": True, "height": 3}}, "line 2.window_px.width"),
+        ({"window_px": {"x0": 0, "y0": 10**200, "width": 3, "height": 3}}, "line 2.window_px.y0"),
+        ({"records": {}}, "line 2.records: must be a list"),
+        ({"records": [1]}, "line 2.records.0: must be a record"),
+        ({"records": [{"eye": "../left"}]}, "line 2.records.0.eye: must be 'right' or 'left'"),
+        ({"records": [{"camera": "/x"}]}, "line 2.records.0.camera"),
+        ({"file_name": None}, "line 2.file_name: must be a path inside the folder, not None"),
+        ({"file_name": "/etc/passwd"}, "line 2.file_name: must be a path inside the folder"),
+        ({"mask_file_name": "/etc/passwd"}, "line 2.mask_file_name: must be a path inside the folder"),
+        ({"mask_file_name": "masks/../../x"}, "line 2.mask_file_name"),
+        ({"noiseless_file_name": "images/a\nb.png"}, r"line 2.noiseless_file_name: .*'images/a\\nb.png'"),
+        ({"amodal_mask_file_name": ["x"]}, "line 2.amodal_mask_file_name"),
+        ({"split": "../../x"}, "line 2.split: must be a plain name, not '../../x'"),
+        ({"split": "a/b"}, "line 2.split"),
+        ({"split": ""}, "line 2.split"),
+        ({"split": 3}, "line 2.split"),
+        ({"subject": "../1"}, "line 2.subject"),
+        ({"sample": 1.5}, "line 2.sample"),
+        ({"bit_depth": 10**9}, "line 2.bit_depth"),
+    ],
+)
+def test_a_wrong_line_is_named_when_it_is_read(folder, keys, words):
+    entries = folder[1](**keys).entries
+    assert entries[0].name == "images/0.png"
+    for read in (lambda: list(entries), lambda: entries[1]):
+        with pytest.raises(InputError, match=words) as caught:
+            read()
+        assert "\n" not in str(caught.value)
+    assert entries[2].name == "images/2.png"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[" * 100_000, "line 2: is not valid JSON: nested too deeply"),
+        ("x" * (4 * 2**20 + 1), "line 2: is too long"),
+        ('{"a": NaN}', "line 2: is not valid JSON"),
+        ('{"a": 1' + "0" * 5000 + "}", "line 2: is not valid JSON"),
+        ("[]", "line 2: must be a JSON object"),
+        ("", "line 2: must be a JSON object"),
+        ('"\udcff"', "line 2: is not valid JSON: not UTF-8"),
+    ],
+)
+def test_hostile_lines_are_one_error(folder, text, words):
+    out, _ = folder
+    lines = (out / "metadata.jsonl").read_text().splitlines()
+    (out / "metadata.jsonl").write_bytes("\n".join([lines[0], text, lines[2]]).encode(errors="surrogateescape"))
+    with pytest.raises(InputError, match=words):
+        list(ImageFolder.load(out).entries)
+
+
+@pytest.mark.parametrize("key", ["file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name"])
+@pytest.mark.parametrize("kind", ["link", "folder link", "pipe", "folder", "missing"])
+def test_only_regular_files_inside_the_folder_are_opened(folder, tmp_path, key, kind):
+    out, change = folder
+    secret = tmp_path / "secret"
+    secret.mkdir()
+    write_png(secret / "x.png", np.zeros((6, 5), np.uint8))
+    name = "images/x.png"
+    if kind == "link":
+        (out / name).symlink_to(secret / "x.png")
+    elif kind == "folder link":
+        (out / "linked").symlink_to(secret)
+        name = "linked/x.png"
+    elif kind == "pipe":
+        os.mkfifo(out / name)
+    elif kind == "folder":
+        (out / name).mkdir()
+    entry = change(**{key: name}).entries[1]
+    why = {"missing": "no such file", "folder link": "is a symbolic link", "link": "is a symbolic link"}
+    with pytest.raises(InputError, match=f"line 2.{key}: '{name}': {why.get(kind, f'is a {kind}')}"):
+        entry.file(key)
+
+
+@pytest.mark.parametrize("name", ["metadata.jsonl", "dataset.json"])
+@pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
+def test_the_folders_own_files_are_regular_ones(folder, tmp_path, name, kind):
+    out, _ = folder
+    (out / name).rename(tmp_path / "moved")
+    if kind == "link":
+        (out / name).symlink_to(tmp_path / "moved")
+    elif kind == "pipe":
+        os.mkfifo(out / name)
+    else:
+        (out / name).mkdir()
+    with pytest.raises(InputError, match=f"{name}: is a"):
+        ImageFolder.load(out)
+
+
+def test_a_folder_that_changes_while_it_is_read_is_refused(folder):
+    out, change = folder
+    entries = ImageFolder.load(out).entries
+    change(file_name="images/1.png", more=1)
+    with pytest.raises(InputError, match=r"metadata\.jsonl: has changed while it was read"):
+        entries[2]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.ellipse import Ellipse, signed_distance
 from ..imagefile import read_image
-from ..imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
+from ..imagefolder import DATASET, FILE_KEYS, METADATA, ImageEntry, ImageFolder
 from ..observation import OK, Observations
 from .labels import IRIS, PUPIL, moments_ellipse
 from .shard import checksum, finished, read_done
@@ -134,11 +134,11 @@ def _keys(node: Any, nulls: set[str], path: str = "") -> set[str]:
 
 def _image(entry: ImageEntry, quick: bool, tally: _Tally) -> Iterator[str]:
     line = entry.line
-    found = Observations.from_records(line["records"], source=f"{entry.path}")
+    found = Observations.from_records(line["records"], source=str(entry.folder / entry.name))
     yield from _record(found)
     if quick:
-        if not entry.path.is_file():
-            yield "missing"
+        for key in FILE_KEYS:
+            entry.file(key)  # says what is wrong with it
         return
     image, stored = read_image(entry.path)
     w, h = entry.window[2:]
@@ -152,8 +152,9 @@ def _image(entry: ImageEntry, quick: bool, tally: _Tally) -> Iterator[str]:
     if float(image.max()) > full:
         yield f"has values above {full:g}"
     tally.take(image, full)
-    if line.get("noiseless_file_name"):
-        quiet, _ = read_image(entry.folder / line["noiseless_file_name"])
+    quiet_path = entry.file("noiseless_file_name")
+    if quiet_path is not None:
+        quiet, _ = read_image(quiet_path)
         if quiet.shape != image.shape or float(quiet.max()) > full:
             yield "its noiseless image has another shape or values above its range"
     if entry.mask_path is None:

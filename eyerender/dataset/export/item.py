@@ -58,9 +58,9 @@ class Item:
     @cached_property
     def amodal(self) -> NDArray[np.uint8]:
         """The same as if nothing stood before the eye: the file, or the mask with both ellipses filled in."""
-        name = self.line.get("amodal_mask_file_name")
-        if name:
-            return read_image(self.entry.folder / name)[0].astype(np.uint8)
+        path = self.entry.file("amodal_mask_file_name")
+        if path is not None:
+            return read_image(path)[0].astype(np.uint8)
         out = self.mask.copy()
         v, u = np.mgrid[: out.shape[0], : out.shape[1]]
         for part, value in (("iris", IRIS), ("pupil", PUPIL)):

@@ -9,6 +9,7 @@ import json
 import tarfile
 from pathlib import Path
 
+from ...files import read_bytes
 from .item import Items
 
 SAMPLES = 1000
@@ -26,12 +27,13 @@ def write(items: Items, out: Path) -> None:
                     tars[split].close()
                 tars[split] = _open(out / f"{split}-{k // SAMPLES:06d}.tar")
             counts[split] = k + 1
-            _add(tars[split], f"{item.name}.png", item.entry.path.read_bytes())
+            _add(tars[split], f"{item.name}.png", read_bytes(item.entry.path, follow=False))
             if item.entry.mask_path is not None:
-                _add(tars[split], f"{item.name}.mask.png", item.entry.mask_path.read_bytes())
+                _add(tars[split], f"{item.name}.mask.png", read_bytes(item.entry.mask_path, follow=False))
             for ending, key in (("amodal", "amodal_mask_file_name"), ("noiseless", "noiseless_file_name")):
-                if item.line.get(key):
-                    _add(tars[split], f"{item.name}.{ending}.png", (item.entry.folder / item.line[key]).read_bytes())
+                path = item.entry.file(key)
+                if path is not None:
+                    _add(tars[split], f"{item.name}.{ending}.png", read_bytes(path, follow=False))
             _add(tars[split], f"{item.name}.json", json.dumps(item.line).encode())
     finally:
         for tar in tars.values():
