@@ -6,8 +6,9 @@ Frames are ordered by head position, then fixation, then camera; within a frame 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -20,15 +21,15 @@ from .eye.catalogue import load_eye
 from .eye.margin import PupilMarginSpec
 from .eye.model import Eye
 from .eye.spec import EyeSpec
-from .files import read_text
 from .observation import EYES, Index
 from .region.anatomy import RegionSpec
 from .region.look import LookSpec
 from .rig.imaging import AmbientSpec, LensSpec, MotionSpec
 from .rig.rig import Rig, RigSpec
 from .rig.sensor import SensorSpec
-from .spec import MAX_YAML_BYTES, FileSpec, Positive, Spec, Vec2, Vec3, file_digest
+from .spec import FileSpec, Positive, Spec, Vec2, Vec3, file_digest, read_yaml
 
+DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
 
 
@@ -87,6 +88,16 @@ class ImageSpec(Spec):
     spp: Annotated[int, Field(ge=1, le=65536)] = Field(default=16, description="samples per pixel")
 
 
+NOT_A_SCENE = (
+    "is the spec of a dataset, not a scene; 'eyerender generate SPEC DIR' makes its images, "
+    "'eyerender sample SPEC 0 -o DIR' writes one of its scenes"
+)
+NOT_A_DATASET = (
+    "is a scene, not a dataset; 'eyerender render SCENE -o DIR' makes its images; the spec of a dataset says "
+    "'kind: dataset' and holds a scene under 'scene'"
+)
+
+
 class SceneSpec(FileSpec):
     """A scene file."""
 
@@ -118,6 +129,17 @@ class SceneSpec(FileSpec):
                 if any(w > r for w, r in zip(self.image.window_px, camera.resolution_px, strict=True)):
                     raise ValueError(f"image.window_px: is larger than the sensor of rig.cameras.{i}")
         return self
+
+    @classmethod
+    def from_mapping(cls, data: object, *, source: str = "") -> Self:
+        """Validate a plain mapping; raises `InputError`, which says so where it is a file of another kind."""
+        if isinstance(data, Mapping) and data.get("kind") == DATASET_KIND:
+            raise InputError(NOT_A_SCENE, source=source)
+        if isinstance(data, Mapping) and "cornea" in data:
+            raise InputError(
+                "is an eye file, not a scene; give it with --eye, or as 'eye.model' of a scene", source=source
+            )
+        return super().from_mapping(data, source=source)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -344,7 +366,13 @@ def _built_eye(
 
 def shipped_scenes() -> dict[str, Path]:
     """Name -> file of the scenes that come with the package."""
-    return {name: path for name, path in shipped_files().items() if not is_dataset(path)}
+    return {name: path for name, path in shipped_files().items() if not is_shipped_dataset(path)}
+
+
+@cache
+def is_shipped_dataset(path: Path) -> bool:
+    """The same as `is_dataset` for a shipped file; it stays as it is, and parsing them all takes a while."""
+    return is_dataset(path)
 
 
 def shipped_files() -> dict[str, Path]:
@@ -359,9 +387,21 @@ def shipped_files() -> dict[str, Path]:
 def is_dataset(path: Path) -> bool:
     """Whether a YAML file says that it is no scene but the spec of a dataset (`kind: dataset`)."""
     try:
-        return "\nkind: dataset" in "\n" + read_text(path, limit=MAX_YAML_BYTES)
+        return read_yaml(path).get("kind") == DATASET_KIND
     except InputError:
         return False
+
+
+def refuse_folder(path: Path, wanted: str) -> None:
+    """Raise `InputError` where a folder was given instead of a file, and say which file of it may have been meant."""
+    if not path.is_dir():
+        return
+    hint = ""
+    if (path / "scene.yaml").is_file():
+        hint = f"; give {path / 'scene.yaml'}"
+    elif (path / "images").is_dir():
+        hint = f"; the images that were made are in {path / 'images'}"
+    raise InputError(f"is a folder; give {wanted}{hint}", source=str(path))
 
 
 def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = None, seed: int | None = None) -> Scene:
@@ -374,20 +414,21 @@ def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = N
         seed: replaces the seed.
 
     Raises:
-        InputError: one line that names the file and the key.
+        InputError: one line that names the file and the key, or the option whose value does not fit.
     """
     path = Path(scene)
     shipped = shipped_scenes()
-    if str(scene) in shipped and not path.is_file():
-        path = shipped[str(scene)]
-    elif path.suffix not in (".yaml", ".yml") and not path.exists():
-        raise InputError(f"no such scene file; shipped scenes: {', '.join(shipped)}", source=str(scene))
+    if not path.is_file():
+        if str(scene) in shipped:
+            path = shipped[str(scene)]
+        elif str(scene) in shipped_files():
+            raise InputError(NOT_A_SCENE, source=str(scene))
+        elif path.suffix not in (".yaml", ".yml") and not path.exists():
+            raise InputError(f"no such scene file; shipped scenes: {', '.join(shipped)}", source=str(scene))
+    refuse_folder(path, "a scene file, or the name of a shipped scene")
     spec = SceneSpec.load(path)
-    if spp is not None or seed is not None:
-        data = spec.to_mapping()
-        if spp is not None:
-            data["image"]["spp"] = spp
-        if seed is not None:
-            data["seed"] = seed
-        spec = SceneSpec.from_mapping(data, source=str(path))
+    if spp is not None:
+        spec = spec.replaced("--spp", {"image": {**spec.to_mapping()["image"], "spp": spp}})
+    if seed is not None:
+        spec = spec.replaced("--seed", {"seed": seed})
     return Scene.of(spec, base=path.parent, eye=eye, source=str(path))

@@ -57,6 +57,18 @@ class Spec(BaseModel):
         """The plain mapping that `from_mapping` reads back as an equal object."""
         return self.model_dump(mode="json", exclude_none=True)
 
+    def replaced(self, option: str, changes: Mapping[str, Any]) -> Self:
+        """A copy with other top-level values that a command-line option gave; a None removes a key.
+
+        Raises:
+            InputError: they do not fit. It names the option, because the file itself was read without a fault.
+        """
+        data = {key: value for key, value in {**self.to_mapping(), **changes}.items() if value is not None}
+        try:
+            return self.from_mapping(data)
+        except InputError as error:
+            raise InputError(error.reason, source=option) from None
+
     def digest(self) -> str:
         """SHA-256 of the canonical JSON: equal specs have equal digests on every machine."""
         text = json.dumps(self.to_mapping(), sort_keys=True, separators=(",", ":"), allow_nan=False)
@@ -213,7 +225,7 @@ def _first_problem(error: ValidationError) -> tuple[str, str]:
         return path, "missing"
     if kind in ("greater_than", "less_than", "greater_than_equal", "less_than_equal"):
         sign = {"greater_than": ">", "less_than": "<", "greater_than_equal": ">=", "less_than_equal": "<="}[kind]
-        return path, f"must be {sign} {next(iter(context.values())):g}"
+        return path, f"must be {sign} {next(iter(context.values())):g}, not {shown(first['input'])}"
     if kind in ("too_short", "too_long"):
         bound = context.get("min_length", context.get("max_length"))
         return path, f"needs at {'least' if kind == 'too_short' else 'most'} {bound} entries"

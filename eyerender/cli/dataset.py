@@ -55,7 +55,7 @@ def generate(
     dry_run
         Only tell how long it would take and how much disk.
     count
-        Replace the spec's number of samples.
+        Make the first COUNT samples of the spec's plan; more than it has plan a larger dataset.
     timeout
         Seconds without a sign of life after which a worker is ended and its shard tried again.
     """
@@ -123,7 +123,11 @@ def sample(
 
     plan = Plan.load(spec, eye=eye, seed=seed)
     if not 0 <= index < plan.spec.count:
-        raise InputError(f"must be 0 to {plan.spec.count - 1}, not {index}", source="I")
+        raise InputError(
+            f"must be 0 to {plan.spec.count - 1}, not {index}: {spec} has {plan.spec.count} samples; "
+            "give one of them, or raise 'count' in the spec",
+            source="I",
+        )
     found = realise(plan, index)
     if found.sample is None or found.scene is None:
         raise InputError(f"sample {index} is given up: {found.rejections[-1].reason}", source=plan.source)
@@ -160,11 +164,13 @@ def preview(
     from ..dataset.plan import Plan
     from ..dataset.sheet import FORMATS, write_sheet
     from ..dataset.spec import shipped_datasets
-    from ..scene import is_dataset, load_scene
+    from ..scene import is_dataset, load_scene, refuse_folder, shipped_files
 
     if output.suffix.lower() not in FORMATS:
         raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(output))
     what: Plan | Scene
+    if spec not in shipped_files():
+        refuse_folder(Path(spec), "a scene or the spec of a dataset: a file, or the name of a shipped one")
     if spec in shipped_datasets() or is_dataset(Path(spec)):
         what = Plan.load(spec, eye=eye, seed=seed)
     else:

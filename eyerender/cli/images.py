@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from .app import app
 from .observe import comparison_text
-from .options import Backend, Eye, Overwrite, Result, Seed, Threads
+from .options import Backend, Eye, Overwrite, Result, Seed, Threads, positive
 from .output import emit, progress
 
 
@@ -44,6 +44,7 @@ def render(
     from ..capture import render_folder
     from ..scene import load_scene
 
+    positive("--threads", threads)
     loaded = load_scene(scene, eye=eye, spp=spp, seed=seed)
     with progress("rendering") as steps:
         done = render_folder(
@@ -73,6 +74,7 @@ def quickstart(
     """
     from ..quickstart import run_quickstart
 
+    positive("--threads", threads)
     with progress("quickstart") as steps:
         result = run_quickstart(folder, eye=eye, backend=backend, threads=threads, overwrite=overwrite, progress=steps)
     data = result.to_mapping()

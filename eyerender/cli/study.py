@@ -62,6 +62,7 @@ def study(
 
     positive("--spp", spp)
     positive("--threads", threads)
+    positive("--workers", workers)
     names = MODELS if eyes is None else tuple(e.strip() for e in eyes.split(",") if e.strip())
     with progress(f"study {name}") as steps:
         summary = run_study(

@@ -26,8 +26,8 @@ def estimate(plan: Plan, options: Options) -> dict[str, Any]:
     spec = plan.spec
     workers, threads = worker_count(options, spec.shard_count)
     maker = Maker(plan, frames_of(plan), backend=options.backend, threads=threads)
-    firsts = sorted({int(s) for s in np.linspace(0, spec.subject_count - 1, _SUBJECTS)})
-    starts = [-(-s * spec.count // spec.subject_count) for s in firsts]
+    subjects = plan.subject_of(spec.count - 1)[0] + 1
+    starts = [plan.first_of(s) for s in sorted({int(s) for s in np.linspace(0, subjects - 1, _SUBJECTS)})]
     maker.make(starts[0])  # kernels are compiled once a worker
     first: list[float] = []
     again: list[float] = []
@@ -47,7 +47,7 @@ def estimate(plan: Plan, options: Options) -> dict[str, Any]:
             images.append(len(made.images))
     usual = float(np.median(again or first))
     extra = max(float(np.median(first)) - usual, 0.0) if again else 0.0
-    seconds = (spec.count * usual + spec.subject_count * extra) / min(workers, spec.shard_count)
+    seconds = (spec.count * usual + subjects * extra) / min(workers, spec.shard_count)
     return {
         "schema": "eyerender/estimate/1",
         "samples": spec.count,

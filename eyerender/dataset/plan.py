@@ -1,7 +1,7 @@
 """What sample i of a dataset is: a pure function of (spec, i).
 
-Sample i belongs to subject floor(i S / N), N samples and S subjects, so a subject's frames stand together and counts
-differ by one at most. Subjects are put in the order of a hash and cut at the splits' shares.
+Sample i belongs to subject floor(i S / N), N samples planned and S subjects, so a subject's frames stand together and
+counts differ by one at most. Subjects are put in the order of a hash and cut at the splits' shares.
 """
 
 from __future__ import annotations
@@ -82,15 +82,17 @@ class Plan:
     ) -> Plan:
         """From a file, or the bare name of a shipped dataset; raises `InputError` with one line.
 
-        `eye`, `seed` and `count` replace the spec's; with another eye model, parameters of the others fall away.
+        `eye` and `seed` replace the spec's; with another eye model, parameters of the others fall away. `count` asks
+        for the first samples of the plan, or for a larger plan (see `DatasetSpec.first`).
         """
         file = find_dataset(path)
         spec = DatasetSpec.load(file)
-        changes: dict[str, Any] = {k: v for k, v in (("seed", seed), ("count", count)) if v is not None}
+        if seed is not None:
+            spec = spec.replaced("--seed", {"seed": seed})
+        if count is not None:
+            spec = spec.first(count)
         if eye is not None:
-            changes |= _with_eye(spec, eye)
-        if changes:
-            spec = DatasetSpec.from_mapping(spec.to_mapping() | changes, source=str(file))
+            spec = spec.replaced("--eye", _with_eye(spec, eye))
         return cls.of(spec, base=file.parent, source=str(file))
 
     @classmethod
@@ -180,9 +182,12 @@ class Plan:
 
     def subject_of(self, sample: int) -> tuple[int, int]:
         """(subject, place in the subject's sequence) of a sample."""
-        n, s = self.spec.count, self.spec.subject_count
-        subject = sample * s // n
-        return subject, sample - -(-subject * n // s)
+        subject = sample * self.spec.subject_count // self.spec.planned_count
+        return subject, sample - self.first_of(subject)
+
+    def first_of(self, subject: int) -> int:
+        """The first sample of a subject."""
+        return -(-subject * self.spec.planned_count // self.spec.subject_count)
 
     def draw(self, sample: int, attempt: int = 0) -> Sample:
         """Sample `sample` at an attempt.

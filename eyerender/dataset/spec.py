@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from ..errors import InputError
-from ..scene import is_dataset, shipped_files
+from ..scene import DATASET_KIND, NOT_A_DATASET, is_shipped_dataset, refuse_folder, shipped_files
 from ..spec import FileSpec, Spec
 
 _SPLIT = re.compile(r"[a-z][a-z0-9]*")
@@ -36,6 +37,9 @@ class DatasetSpec(FileSpec):
     name: Annotated[str, Field(min_length=1, max_length=100)]
     description: str = ""
     count: Annotated[int, Field(ge=1, le=10**9)] = Field(description="samples")
+    planned: Annotated[int, Field(ge=1, le=10**9)] | None = Field(
+        default=None, description="samples of the whole plan, of which the first `count` are made; default: all"
+    )
     shard_size: Annotated[int, Field(ge=1, le=100_000)] = Field(default=64, description="samples in a shard")
     subjects: Annotated[int, Field(ge=1, le=10**9)] | None = Field(
         default=None, description="identities; each has a run of consecutive samples; default: one a sample"
@@ -58,7 +62,9 @@ class DatasetSpec(FileSpec):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.subjects is not None and self.subjects > self.count:
+        if self.planned is not None and self.planned < self.count:
+            raise ValueError("planned: must be >= count")
+        if self.subjects is not None and self.subjects > self.planned_count:
             raise ValueError("subjects: must be <= count")
         if not self.splits:
             raise ValueError("splits: needs at least one")
@@ -67,10 +73,29 @@ class DatasetSpec(FileSpec):
                 raise ValueError(f"splits.{name}: a name is lower-case letters and digits")
         return self
 
+    @classmethod
+    def from_mapping(cls, data: object, *, source: str = "") -> Self:
+        """Validate a plain mapping; raises `InputError`, which says so where it is a file of another kind."""
+        if isinstance(data, Mapping) and data.get("kind") != DATASET_KIND:
+            if "rig" in data:
+                raise InputError(NOT_A_DATASET, source=source)
+            raise InputError(f"is no dataset; write 'kind: {DATASET_KIND}'", source=source, path="kind")
+        return super().from_mapping(data, source=source)
+
+    @property
+    def planned_count(self) -> int:
+        """How many samples the whole plan has; subjects and splits are parts of it."""
+        return self.planned or self.count
+
     @property
     def subject_count(self) -> int:
-        """How many identities there are."""
-        return self.subjects or self.count
+        """How many identities the whole plan has."""
+        return self.subjects or self.planned_count
+
+    def first(self, count: int) -> Self:
+        """The spec of the first `count` samples of the same plan; of a larger plan where it has fewer than that."""
+        planned = self.planned_count if count < self.planned_count else None
+        return self.replaced("--count", {"count": count, "planned": planned})
 
     @property
     def shard_count(self) -> int:
@@ -84,16 +109,18 @@ class DatasetSpec(FileSpec):
 
 def shipped_datasets() -> dict[str, Path]:
     """Name -> file of the dataset specs that come with the package."""
-    return {name: path for name, path in shipped_files().items() if is_dataset(path)}
+    return {name: path for name, path in shipped_files().items() if is_shipped_dataset(path)}
 
 
 def find_dataset(spec: str | Path) -> Path:
     """The file of a dataset spec, by its path or by the bare name of a shipped one; raises `InputError`."""
     path, shipped = Path(spec), shipped_datasets()
-    if str(spec) in shipped and not path.is_file():
-        return shipped[str(spec)]
-    if path.suffix not in (".yaml", ".yml") and not path.exists():
-        raise InputError(f"no such dataset file; shipped: {', '.join(shipped)}", source=str(spec))
-    if path.is_file() and not is_dataset(path):
-        raise InputError("is no dataset; write 'kind: dataset'", source=str(spec), path="kind")
+    if not path.is_file():
+        if str(spec) in shipped:
+            return shipped[str(spec)]
+        if str(spec) in shipped_files():
+            raise InputError(NOT_A_DATASET, source=str(spec))
+        if path.suffix not in (".yaml", ".yml") and not path.exists():
+            raise InputError(f"no such dataset file; shipped: {', '.join(shipped)}", source=str(spec))
+    refuse_folder(path, "the spec of a dataset: a file, or the name of a shipped one")
     return path

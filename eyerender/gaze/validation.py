@@ -52,7 +52,12 @@ def leave_one_target_out(estimator: Estimator, observations: Observations, rig: 
     """
     targets = observations.index.target_mm
     if not np.isfinite(targets).all():
-        raise InputError("gaze errors need observations with targets")
+        raise InputError("there are no targets to compare the gaze with; use a scene with 'targets' instead of 'poses'")
+    if len(np.unique(observations.index.fixation)) < 2:
+        raise InputError(
+            "there is only one fixation, and a calibration needs several targets in one scene, "
+            "such as 'targets: {grid: [3, 3]}'"
+        )
     points = np.full((len(observations), 3), np.nan)
     reason = np.full(len(observations), None, dtype=object)
     for fixation in np.unique(observations.index.fixation):

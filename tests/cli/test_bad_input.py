@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -59,6 +60,11 @@ def place(tmp_path, monkeypatch):
     ):
         changed = {**dataset, "scene": {**dataset["scene"], key: value}}
         Path(name).write_text(yaml.safe_dump(changed), encoding="utf-8")
+    with open("json.yaml", "w", encoding="utf-8") as file:
+        json.dump({**dataset, "colour": 1}, file)
+    Path("made/images").mkdir(parents=True)
+    Path("sample").mkdir()
+    Path("sample/scene.yaml").write_text("format: 1", encoding="utf-8")
     Path("hollow").mkdir()
     Path("taken").mkdir()
     (Path("taken") / "thesis.txt").write_text("years of work")
@@ -79,7 +85,12 @@ TABLE = [
     (["features", "target.yaml"], 2, "target"),
     (["features", "text.yaml"], 2, "text.yaml: line 2: not valid YAML"),
     (["features", "binary.yaml"], 2, "binary.yaml: "),
-    (["features", "."], 2, ".: is a folder, not a file"),
+    (["features", "."], 2, ".: is a folder; give a scene file, or the name of a shipped scene"),
+    (["features", "sample"], 2, "sample: is a folder; give a scene file, or the name of a shipped scene; give sample/"),
+    (["features", "dataset_quick"], 2, "dataset_quick: is the spec of a dataset, not a scene; 'eyerender generate"),
+    (["features", "draw.yaml"], 2, "draw.yaml: is the spec of a dataset, not a scene; 'eyerender generate"),
+    (["features", "json.yaml"], 2, "json.yaml: is the spec of a dataset, not a scene; 'eyerender generate"),
+    (["features", "contour.yaml"], 2, "contour.yaml: is an eye file, not a scene; give it with --eye"),
     (["features", "quickstart", "--eye", "E9"], 2, "E9"),
     (["features", "quickstart", "--eye", "missing.yaml"], 2, "missing.yaml"),
     (["features", "quickstart", "--points", "3"], 2, "--points: must be >= 6"),
@@ -99,11 +110,15 @@ TABLE = [
     (["render", "quickstart", "-o", "out", "--eye", "contour.yaml"], 2, "stop.contour: the margin's radius must"),
     (["render", "quickstart", "-o", "taken"], 2, "taken: is not empty; give another folder or --overwrite"),
     (["render", "quickstart", "-o", "file"], 2, "file: exists and is not a folder"),
-    (["render", "quickstart", "-o", "out", "--spp", "0"], 2, "image.spp: must be >= 1"),
-    (["render", "quickstart", "-o", "out", "--seed", "-1"], 2, "seed: must be >= 0"),
+    (["render", "quickstart", "-o", "out", "--spp", "0"], 2, "error: --spp: must be >= 1, not 0"),
+    (["render", "quickstart", "-o", "out", "--spp", "-4"], 2, "error: --spp: must be >= 1, not -4"),
+    (["render", "quickstart", "-o", "out", "--seed", "-1"], 2, "error: --seed: must be >= 0, not -1"),
+    (["render", "dataset_quick", "-o", "out"], 2, "dataset_quick: is the spec of a dataset, not a scene"),
+    (["render", "made", "-o", "out"], 2, "made: is a folder; give a scene file, or the name of a shipped scene; the "),
     (["render", "quickstart", "-o", "out", "--backend", "opengl"], 2, "--backend"),
-    (["render", "quickstart", "-o", "out", "--threads", "0"], 2, "threads: must be >= 1"),
+    (["render", "quickstart", "-o", "out", "--threads", "0"], 2, "error: --threads: must be >= 1, not 0"),
     (["quickstart"], 2, "DIR"),
+    (["quickstart", "out", "--threads", "-2"], 2, "error: --threads: must be >= 1, not -2"),
     (["quickstart", "taken"], 2, "taken: is not empty; give another folder or --overwrite"),
     (["extract"], 2, "give at least one image"),
     (["extract", "missing.png"], 2, "missing.png: no such file"),
@@ -126,7 +141,11 @@ TABLE = [
     (["generate", "dataset_quick"], 2, "DIR: give the folder to write"),
     (["generate", "nonsense", "out"], 2, "nonsense: no such dataset file; shipped: dataset_quick"),
     (["generate", "missing.yaml", "out"], 2, "missing.yaml: no such file"),
-    (["generate", "key.yaml", "out"], 2, "key.yaml: kind: is no dataset; write 'kind: dataset'"),
+    (["generate", "key.yaml", "out"], 2, "key.yaml: is a scene, not a dataset; 'eyerender render SCENE -o DIR' makes"),
+    (["generate", "quickstart", "out"], 2, "quickstart: is a scene, not a dataset; 'eyerender render SCENE -o DIR'"),
+    (["generate", "contour.yaml", "out"], 2, "contour.yaml: kind: is no dataset; write 'kind: dataset'"),
+    (["generate", "json.yaml", "out"], 2, "json.yaml: colour: unknown key"),
+    (["generate", "made", "out"], 2, "made: is a folder; give the spec of a dataset: a file, or the name of a shipped"),
     (["generate", "draw.yaml", "out"], 2, "draw.yaml: scene.wavelength_nm.draw: must be one of"),
     (["generate", "template.yaml", "out"], 2, "template.yaml: sample 0 cannot be made"),
     (["generate", "behind.yaml", "out"], 2, "behind.yaml: sample 0 cannot be made"),
@@ -139,15 +158,21 @@ TABLE = [
     (["generate", "dataset_quick", "out", "--workers", "0"], 2, "--workers: must be >= 1"),
     (["generate", "dataset_quick", "out", "--threads", "-1"], 2, "--threads: must be >= 1"),
     (["generate", "dataset_quick", "out", "--timeout", "0"], 2, "--timeout: must be > 0"),
-    (["generate", "dataset_quick", "out", "--seed", "-1"], 2, "seed: must be >= 0"),
-    (["generate", "dataset_quick", "out", "--count", "0"], 2, "count: must be >= 1"),
+    (["generate", "dataset_quick", "out", "--seed", "-1"], 2, "error: --seed: must be >= 0, not -1"),
+    (["generate", "dataset_quick", "out", "--count", "0"], 2, "error: --count: must be >= 1, not 0"),
+    (["generate", "dataset_quick", "out", "--count", "-3"], 2, "error: --count: must be >= 1, not -3"),
+    (["generate", "dataset_quick", "out", "--count", "2000000000"], 2, "error: --count: must be <= 1e+09, not 2000000"),
     (["generate", "dataset_quick", "out", "--engine", "spark"], 2, "--engine"),
     (["sample", "dataset_quick"], 2, "I"),
     (["sample", "dataset_quick", "-1"], 2, "I: must be 0 to"),
-    (["sample", "dataset_quick", "99999999"], 2, "I: must be 0 to"),
+    (["sample", "dataset_quick", "960"], 2, "I: must be 0 to 959, not 960: dataset_quick has 960 samples; give one of"),
+    (["sample", "made", "0"], 2, "made: is a folder; give the spec of a dataset: a file, or the name of a shipped one"),
     (["sample", "dataset_quick", "0", "-o", "taken"], 2, "taken: is not empty"),
     (["preview", "dataset_quick"], 2, "--output"),
     (["preview", "dataset_quick", "-o", "sheet.txt"], 2, "sheet.txt: must end with one of .png"),
+    (["preview", "made", "-o", "sheet.png"], 2, "shipped one; the images that were made are in made/images"),
+    (["preview", "sample", "-o", "sheet.png"], 2, "the name of a shipped one; give sample/scene.yaml"),
+    (["preview", "json.yaml", "-o", "sheet.png"], 2, "json.yaml: colour: unknown key"),
     (["preview", "nonsense", "-o", "sheet.png"], 2, "nonsense: no such scene file"),
     (["preview", "dataset_quick", "-o", "sheet.png", "--eye", "E9"], 2, "E9: no such eye; the catalogue holds"),
     (["generate", "dataset_quick", "out", "--eye", "missing.yaml"], 2, "missing.yaml: no such file"),
@@ -169,6 +194,7 @@ TABLE = [
         2,
         "two are called 'own-fast'",
     ),
+    (["study", "observers", "-o", "out", "--workers", "0"], 2, "error: --workers: must be >= 1, not 0"),
     (["schema", "car"], 2, "car"),
     (["doctor", "extra"], 2, "extra"),
 ]

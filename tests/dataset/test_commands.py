@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,6 +35,24 @@ def test_a_sample_written_as_a_scene_has_the_datasets_features(tiny, spec, capsy
         expected = line["records"][0]
         assert record["pupil"] == expected["pupil"]
         assert record["glints"] == expected["glints"]
+
+
+def test_a_count_makes_the_same_bytes_as_the_whole_dataset(tiny, spec, capsys):
+    assert run(["generate", spec, "part", "--count", "2", "--workers", "1", "--threads", "1"]) == 0
+    assert "2 images in part: validation 2;" in capsys.readouterr().out
+    assert Path("part/metadata.jsonl").read_text() == "".join((tiny / "metadata.jsonl").open().readlines()[:2])
+    made = sorted(p.relative_to("part") for p in Path("part").rglob("*.png"))
+    assert len(made) == 4
+    for name in made:
+        assert ("part" / name).read_bytes() == (tiny / name).read_bytes()
+    # The rest is another run.
+    assert run(["generate", spec, "part"]) == 2
+    assert "spec.count: 2 -> 24" in capsys.readouterr().err
+
+
+def test_a_dataset_without_several_targets_says_what_gaze_needs(tiny, capsys):
+    assert run(["compare", str(tiny)]) == 0
+    assert "a calibration needs several targets in one scene, such as" in capsys.readouterr().out
 
 
 def test_a_dry_run_makes_nothing_and_tells_time_and_disk(tiny, spec, tmp_path, capsys):

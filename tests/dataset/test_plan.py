@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import yaml
-from dataset_specs import plan
+from dataset_specs import plan, write
 
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of, realise
@@ -28,6 +28,41 @@ def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
         made = Plan.load(name)
         assert spec.shard_count >= 8
         assert realise(made, spec.count - 1, frames_of(made)).sample is not None
+
+
+def test_a_smaller_count_makes_the_first_samples_of_the_same_plan(tmp_path):
+    # Subjects and splits are parts of the whole plan, so nothing of a sample may depend on how many are made.
+    for changes in ({}, {"subjects": None}):
+        file = write(tmp_path / "spec.yaml", **changes)
+        whole, part = Plan.load(file), Plan.load(file, count=5)
+        assert part.spec.count == 5
+        assert part.spec.shard_count == 2
+        assert part.spec.subject_count == whole.spec.subject_count
+        assert [part.draw(i).to_mapping() for i in range(5)] == [whole.draw(i).to_mapping() for i in range(5)]
+        with pytest.raises(InputError, match="there are samples 0 to 4"):
+            part.draw(5)
+        # A part of a part; the whole again is the plan itself.
+        part.spec.dump(tmp_path / "part.yaml")
+        assert Plan.load(tmp_path / "part.yaml", count=2).spec == whole.spec.first(2)
+        assert Plan.load(tmp_path / "part.yaml", count=24).digest == whole.digest
+    # Fewer samples than subjects are planned are made too.
+    assert Plan.load("dataset_quick", count=2).draw(1).to_mapping() == Plan.load("dataset_quick").draw(1).to_mapping()
+
+
+def test_a_larger_count_plans_a_larger_dataset(tmp_path):
+    larger = Plan.load(write(tmp_path / "spec.yaml"), count=48)
+    assert larger.spec.planned is None
+    assert [larger.subject_of(i)[0] for i in (0, 11, 12, 47)] == [0, 0, 1, 3]
+
+
+def test_a_plan_has_at_least_the_samples_and_the_subjects_that_are_asked_for():
+    for changes, words in (
+        ({"planned": 23}, "planned: must be >= count"),
+        ({"planned": 0}, "planned: must be >= 1"),
+        ({"planned": 30, "subjects": 31}, "subjects: must be <= count"),
+    ):
+        with pytest.raises(InputError, match=words):
+            plan(**changes)
 
 
 def test_another_eye_takes_the_place_of_the_specs_own(tmp_path, monkeypatch):
