@@ -65,7 +65,7 @@ def render_windows(
     A `renderer` made before is used again (see `make_renderer`), else one is made for `backend` and `threads`.
 
     Raises:
-        BackendError: there is nothing to render with; the message names the mend.
+        BackendError: no backend renders; the message says how to fix it.
     """
     check_windows(scene)
     if renderer is None:
@@ -153,8 +153,8 @@ def check_windows(scene: Scene) -> None:
 
 
 def make_renderer(backend: BackendName = "auto", threads: int | None = None) -> Renderer:
-    """A renderer on a backend that works; raises `BackendError` with the mend where there is none."""
-    from .rendering.backend import choose_backend
+    """A renderer on a backend that works; raises `BackendError`, which says how to fix it, if there is none."""
+    from .backends.choose import choose_backend
 
     chosen = choose_backend(backend, threads)
     # Only now: importing the renderer imports mitsuba, which must find its backend ready.
@@ -222,7 +222,7 @@ def render_folder(
 
 def noiseless(scene: Scene, image: WindowImage) -> NDArray[Any]:
     """A rendering of a scene exposed once more, without the sensor's noise: what `sensor.noise: false` gives."""
-    from .rendering.sensor import expose
+    from .rig.exposure import expose
 
     sensor = scene.spec.sensor.model_copy(update={"noise": False})
     return _stored(scene, expose(sensor, image.irradiance.astype(float), scene.spec.wavelength_nm, 0))

@@ -40,7 +40,7 @@ class InputError(EyerenderError):
 
 
 class BackendError(EyerenderError):
-    """No usable render backend; the message names the mend."""
+    """No backend renders; the message says how to fix it."""
 
     exit_code = 3
 

@@ -161,7 +161,7 @@ set_up_llvm() {
     elif [ -n "$(find "$venv/.llvm-failed" -mmin -60 2>/dev/null)" ]; then
         return 0
     fi
-    if "$venv/bin/python" -m eyerender.rendering.llvm_setup --quiet >"$venv/.llvm.$$"; then
+    if "$venv/bin/python" -m eyerender.backends.set_up --quiet >"$venv/.llvm.$$"; then
         mv -f "$venv/.llvm.$$" "$venv/.llvm"
         rm -f "$venv/.llvm-failed"
     else

@@ -28,7 +28,7 @@ sys.path.insert(0, str(ROOT / "tests" / "rendering"))
 
 import numpy as np  # noqa: E402
 
-from eyerender.rendering.backend import choose_backend  # noqa: E402
+from eyerender.backends.choose import choose_backend  # noqa: E402
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
 

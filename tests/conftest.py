@@ -10,8 +10,8 @@ from __future__ import annotations
 import os
 import signal
 
+from eyerender.backends.choose import choose_backend
 from eyerender.errors import BackendError
-from eyerender.rendering.backend import choose_backend
 
 # A shell that starts the suite in the background ignores Ctrl-C for it, and the processes that tests interrupt would
 # inherit that.

@@ -13,29 +13,29 @@ from .output import emit, say
 
 @app.command(name="doctor")
 def doctor(*, json: Result = None) -> int:
-    """Tell what can render here, and what would mend what cannot; exit code 0 only where rendering works."""
-    from ..rendering.backend import doctor_report
+    """Show which backends render here and how to fix the others; the exit code is 0 only where one renders."""
+    from ..backends.doctor import doctor_report
 
     report = doctor_report()
     lines = []
     for state in report.backends:
         lines.append(f"{state.name:<5} {'works' if state.ok else 'does not work'}: {state.detail}")
         if not state.ok:
-            lines.append(f"      mend: {state.mend}")
+            lines.append(f"      fix: {state.fix}")
     lines.append(
         f"rendering uses {report.chosen}" if report.chosen else "nothing renders here; analysis and extraction do"
     )
     lines += [f"python   {report.python}", f"platform {report.platform}", f"cpu      {report.cpu}"]
     lines += [f"{name} {version}" for name, version in report.packages]
     lines.append(f"cache    {report.cache}")
-    emit({"schema": "eyerender/doctor/1", **dataclasses.asdict(report)}, "\n".join(lines), json)
+    emit({"schema": "eyerender/doctor/2", **dataclasses.asdict(report)}, "\n".join(lines), json)
     return 0 if report.ok else 3
 
 
 @app.command(name="setup-llvm")
 def setup_llvm() -> int:
-    """Bring the libLLVM that rendering on the processor needs, where there is none that works; no root needed."""
-    from ..rendering.backend import setup_llvm as bring
+    """Fetch the libLLVM that rendering on the processor needs if none here works; needs no root."""
+    from ..backends.set_up import setup_llvm as bring
 
     found = bring(say=say)
     print(f"libLLVM {found.version} works: {found.path}")

@@ -38,7 +38,7 @@ KINDS = {
 # The rooms and modules that a sample's bytes come from.
 SHAPING = {
     "analytic", "arrays", "capture", "dataset", "eye", "geometry", "imagefile", "imagefolder", "observation", "optics",
-    "region", "rendering", "rig", "scene", "spec",
+    "backends", "region", "rendering", "rig", "scene", "spec",
 }  # fmt: skip
 
 
@@ -215,7 +215,7 @@ def source_digest() -> str:
 
 def cpu_family() -> str:
     """The processor's name, or its architecture."""
-    from ..rendering.probe import cpu_name
+    from ..backends.probe import cpu_name
 
     return cpu_name()
 

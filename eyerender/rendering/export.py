@@ -18,13 +18,13 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..eye.meshes import Patch, eye_meshes
 from ..eye.model import Eye
 from ..region.anatomy import RegionSpec
 from ..region.head import HEAD_PARTS, load_head, placed
 from ..region.mesh import region_mesh
 from ..rig.imaging import AmbientSpec
 from .frame import RenderJob
-from .meshes import Patch, eye_meshes
 from .region import globe_of
 
 _BACKDROP_HALF_MM = 500.0

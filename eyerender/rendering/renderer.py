@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Floats, frozen
-from . import imaging, psf, sensor
+from ..rig import defocus, exposure, psf
 from .film import Exposed, mean_radiance
 from .frame import RenderJob
 from .glints import GlintTable
@@ -26,7 +26,7 @@ from .stage import Stage
 from .surround import Obstacle, Surround
 
 if TYPE_CHECKING:
-    from .backend import Backend
+    from ..backends.choose import Backend
 
 __all__ = ["BACKGROUND", "IRIS", "PUPIL", "SCLERA", "PartLabels", "RenderJob", "RenderedWindow", "Renderer"]
 
@@ -84,10 +84,10 @@ class Renderer:
         else:
             shown, place = self.bind(job)
             picture, mirrored, failed = self._picture(job, shown, place, spp)
-        blurred = picture * imaging.vignette(job.lens, job.camera, job.window)
-        irradiance = frozen(blurred * sensor.radiance_to_irradiance(job.sensor), np.float32)
+        blurred = picture * defocus.vignette(job.lens, job.camera, job.window)
+        irradiance = frozen(blurred * exposure.radiance_to_irradiance(job.sensor), np.float32)
         # Of the irradiance as it is given away, so that exposing that again gives the same counts.
-        dn = sensor.expose(job.sensor, irradiance.astype(float), job.wavelength_nm, job.seed)
+        dn = exposure.expose(job.sensor, irradiance.astype(float), job.wavelength_nm, job.seed)
         margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
         return RenderedWindow(
             job.window,
@@ -107,7 +107,7 @@ class Renderer:
     ) -> tuple[Floats, Mirrored, int]:
         """Radiance of a window behind the lens, glints included; the glints; failed light paths."""
         depth = float(job.camera.R[2] @ (job.anchor_mm - job.camera.nodal_point_mm))
-        kernel = imaging.disc(imaging.confusion_px(job.lens, job.camera, job.sensor, depth))
+        kernel = defocus.disc(defocus.confusion_px(job.lens, job.camera, job.sensor, depth))
         x0, y0, width, height = job.window
         reach = kernel.shape[0] // 2
         sharp = replace(job, window=(x0 - reach, y0 - reach, width + 2 * reach, height + 2 * reach))
@@ -117,7 +117,7 @@ class Renderer:
         radiance, failed = mean_radiance(self._integrator, shown, padded, spp, job.seed)
         blurred = psf.blur(radiance, job.sensor.psf_sigma_px).copy()
         mirrored = add_glints(sharp, place, blurred)
-        return imaging.defocused(blurred, kernel), mirrored, failed
+        return defocus.defocused(blurred, kernel), mirrored, failed
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
         """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), before lens and glints."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats
-from . import psf
+from ..rig import psf
 from .frame import RenderJob
 from .glints import POINT, GlintScene, GlintTable, Image, Spots, glint_table, quadrature
 from .occlusion import glint_reason

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from eyerender.backends.choose import choose_backend
 from eyerender.errors import BackendError
-from eyerender.rendering.backend import choose_backend
 
 if TYPE_CHECKING:
     from eyerender.rendering.renderer import Renderer

@@ -7,7 +7,7 @@ import pytest
 
 from eyerender.analytic.observer import observe
 from eyerender.capture import make_renderer, render_windows
-from eyerender.rendering.imaging import confusion_px, defocused, disc, vignette
+from eyerender.rig.defocus import confusion_px, defocused, disc, vignette
 from eyerender.rig.imaging import LensSpec
 from eyerender.rig.sensor import SensorSpec
 from eyerender.scene import Scene, SceneSpec

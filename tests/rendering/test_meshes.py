@@ -10,8 +10,8 @@ import pytest
 import trimesh
 from render_rigs import eye_of, job_of, remote_rig
 
+from eyerender.eye.meshes import crossing, eye_meshes
 from eyerender.rendering.export import bake_meshes, export_scene
-from eyerender.rendering.meshes import crossing, eye_meshes
 
 EYES = ["E1", "E2", "E3", "E4", "E5", "E5-published"]
 

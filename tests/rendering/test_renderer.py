@@ -41,7 +41,7 @@ def test_a_seed_gives_the_same_bytes_with_any_threads_and_after_other_frames(ren
 
 def test_a_fresh_process_gives_the_same_bytes(renderer):
     code = (
-        "from eyerender.rendering.backend import choose_backend\n"
+        "from eyerender.backends.choose import choose_backend\n"
         "b = choose_backend('llvm', threads=2)\n"
         "import test_renderer as t\n"
         "from eyerender.rendering.renderer import Renderer\n"

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from ..arrays import Floats
-from ..rig.sensor import SensorSpec
+from .sensor import SensorSpec
 
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0

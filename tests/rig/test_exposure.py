@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage, special, stats
 
-from eyerender.rendering import psf
-from eyerender.rendering.sensor import electrons, expose, photon_counts, radiance_to_irradiance
+from eyerender.rig import psf
+from eyerender.rig.exposure import electrons, expose, photon_counts, radiance_to_irradiance
 from eyerender.rig.sensor import SensorSpec
 
 

@@ -1,4 +1,4 @@
-"""What a user types to get a backend that is missing: one line, for the machine it is read on."""
+"""How to get a missing backend: one line for this machine."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 import sys
 from pathlib import Path
 
-CUDA_MEND = "install NVIDIA's driver (with OptiX and CUDA 12 or newer), or use --backend llvm"
+CUDA_FIX = "install NVIDIA's driver (with OptiX and CUDA 12 or newer), or use --backend llvm"
 
 _BY_DISTRIBUTION = {
     "fedora": "sudo dnf install llvm-libs",
@@ -22,7 +22,7 @@ def has_archive() -> bool:
     return sys.platform == "linux" and all(shutil.which(tool) for tool in ("apt-get", "apt-cache", "dpkg-deb"))
 
 
-def llvm_mend() -> str:
+def llvm_fix() -> str:
     """The command that brings a libLLVM here; on Debian and Ubuntu that is this package's own."""
     return "run: eyerender setup-llvm" if has_archive() else llvm_command()
 

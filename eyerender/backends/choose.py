@@ -1,4 +1,4 @@
-"""Choosing what renders, the processor (llvm) or an NVIDIA GPU (cuda), and telling what stands in the way.
+"""The choice of what renders: the processor (llvm) or an NVIDIA GPU (cuda).
 
 Call `choose_backend` before anything imports mitsuba or drjit (see `llvm`); it sets Mitsuba's variant.
 """
@@ -8,30 +8,16 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
-import platform
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from ..errors import BackendError, InputError
-from .libraries import cache_folder, load_runtime
-from .llvm import ensure_llvm, examine
-from .llvm_setup import setup_llvm
-from .mend import CUDA_MEND, llvm_mend
+from .libraries import load_runtime
+from .llvm import ensure_llvm
 from .probe import Verdict, cpu_name, package_version, probe
-
-__all__ = [
-    "Backend",
-    "BackendChoice",
-    "BackendName",
-    "BackendState",
-    "DoctorReport",
-    "backend_states",
-    "choose_backend",
-    "doctor_report",
-    "setup_llvm",
-]
+from .remedies import CUDA_FIX
 
 BackendName = Literal["cuda", "llvm"]
 BackendChoice = Literal["auto", "cuda", "llvm"]
@@ -65,26 +51,12 @@ class Backend:
 
 @dataclass(frozen=True, slots=True)
 class BackendState:
-    """Whether a backend renders on this machine; `detail` says what was found, `mend` what would help (empty if ok)."""
+    """Whether a backend renders on this machine; `detail` says what was found, `fix` what would help."""
 
     name: BackendName
     ok: bool
     detail: str
-    mend: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class DoctorReport:
-    """State of an installation: `ok` where some backend renders, `chosen` the one that "auto" takes."""
-
-    ok: bool
-    chosen: BackendName | None
-    backends: tuple[BackendState, ...]
-    python: str
-    platform: str
-    cpu: str
-    packages: tuple[tuple[str, str], ...]
-    cache: str
+    fix: str = ""
 
 
 def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> Backend:
@@ -102,7 +74,7 @@ def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> 
     InputError
         No such backend, or `threads` below 1.
     BackendError
-        None renders, or mitsuba was imported earlier with a libLLVM that does not; the message names the mend.
+        None renders, or mitsuba was imported earlier with a libLLVM that does not; the message says how to fix it.
     """
     if name not in ("auto", "cuda", "llvm"):
         raise InputError(f"must be auto, cuda or llvm, not {name!r}", path="backend")
@@ -111,35 +83,14 @@ def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> 
     if package_version("mitsuba") == "none":
         raise BackendError("mitsuba is not installed; run: pip install mitsuba")
     if name != "llvm":
-        cuda = _cuda_state()
+        cuda = cuda_state()
         if cuda.ok:
             return _start("cuda", cuda.detail, threads)
         if name == "cuda":
-            raise BackendError(f"cuda does not render here: {cuda.detail}; {cuda.mend}")
+            raise BackendError(f"cuda does not render here: {cuda.detail}; {cuda.fix}")
     library = ensure_llvm()
     path = str(library.path) if library.path else None
     return _start("llvm", cpu_name(), threads, llvm=library.version, library=path)
-
-
-def backend_states() -> list[BackendState]:
-    """What each backend would do on this machine. Looks in other processes only, so this one stays as it is."""
-    return [_cuda_state(refresh=True), _llvm_state()]
-
-
-def doctor_report() -> DoctorReport:
-    """Everything a report of a defect should carry about the installation."""
-    states = tuple(backend_states())
-    packages = ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless", "scikit-image")
-    return DoctorReport(
-        ok=any(state.ok for state in states),
-        chosen=next((state.name for state in states if state.ok), None),
-        backends=states,
-        python=f"{platform.python_version()} ({sys.executable})",
-        platform=platform.platform(),
-        cpu=f"{cpu_name()}, {_cpu_count()} usable",
-        packages=tuple((package, package_version(package)) for package in packages),
-        cache=str(cache_folder() or "none (no home folder)"),
-    )
 
 
 def _start(
@@ -168,23 +119,15 @@ def _start(
     )
 
 
-def _llvm_state() -> BackendState:
-    refused: list[str] = []
-    for examined in examine(refresh=True):
-        if examined.verdict.ok:
-            return BackendState("llvm", True, f"{examined.verdict.detail}, {examined.path}")
-        refused.append(f"{examined.path}: {examined.verdict.detail}")
-    return BackendState("llvm", False, "; ".join(refused) or "no libLLVM on this machine", llvm_mend())
-
-
-def _cuda_state(*, refresh: bool = False) -> BackendState:
+def cuda_state(*, refresh: bool = False) -> BackendState:
+    """Whether an NVIDIA GPU renders here; `refresh` tries again where an earlier trial failed."""
     driver = _cuda_driver()
     if driver is None:
-        return BackendState("cuda", False, "no NVIDIA driver on this machine", CUDA_MEND)
+        return BackendState("cuda", False, "no NVIDIA driver on this machine", CUDA_FIX)
     verdict: Verdict = probe(VARIANTS["cuda"], context=driver)
     if refresh and not verdict.ok:
         verdict = probe(VARIANTS["cuda"], context=driver, refresh=True)
-    return BackendState("cuda", verdict.ok, verdict.detail, "" if verdict.ok else CUDA_MEND)
+    return BackendState("cuda", verdict.ok, verdict.detail, "" if verdict.ok else CUDA_FIX)
 
 
 def _cuda_driver() -> str | None:
@@ -200,7 +143,3 @@ def _cuda_driver() -> str | None:
     with contextlib.suppress(OSError):
         parts.append(Path("/proc/driver/nvidia/version").read_text(encoding="utf-8"))
     return "\n".join(parts)
-
-
-def _cpu_count() -> int:
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1

@@ -1,6 +1,6 @@
 """Whether a backend renders, found out in a process of its own, because a wrong libLLVM ends the process it is used in.
 
-`python -m eyerender.rendering.probe VARIANT [LIBRARY]` is that process; `run_probe` starts it, `probe` also remembers.
+`python -m eyerender.backends.probe VARIANT [LIBRARY]` is that process; `run_probe` starts it, `probe` also remembers.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def run_probe(variant: str, library: Path | None = None, timeout_s: float = TIME
         environment["PYTHONPATH"] = os.pathsep.join(os.path.abspath(p) for p in sys.path)
         if library is not None:
             environment["DRJIT_LIBLLVM_PATH"] = str(library)
-        command = [sys.executable, "-P", "-m", "eyerender.rendering.probe", variant]
+        command = [sys.executable, "-P", "-m", "eyerender.backends.probe", variant]
         command += [str(library)] if library is not None else []
         try:
             done = subprocess.run(

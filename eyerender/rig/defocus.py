@@ -15,9 +15,9 @@ import numpy as np
 from scipy import signal
 
 from ..arrays import Floats
-from ..rig.camera import Camera
-from ..rig.imaging import LensSpec
-from ..rig.sensor import SensorSpec
+from .camera import Camera
+from .imaging import LensSpec
+from .sensor import SensorSpec
 
 _FINE = 9
 

@@ -16,14 +16,14 @@ from pathlib import Path
 
 import pytest
 
+from eyerender.backends import apt as apt_module
+from eyerender.backends.apt import Apt
+from eyerender.backends.libraries import cache_folder, library_folders, llvm_store, load_library, load_runtime
+from eyerender.backends.llvm import ENVIRONMENT, VARIANT, candidates, find_llvm, version_of
+from eyerender.backends.probe import REFUSAL_AGE_S, Verdict, probe, run_probe
+from eyerender.backends.remedies import has_archive, llvm_command
+from eyerender.backends.set_up import setup_llvm
 from eyerender.errors import BackendError
-from eyerender.rendering import apt as apt_module
-from eyerender.rendering.apt import Apt
-from eyerender.rendering.libraries import cache_folder, library_folders, llvm_store, load_library, load_runtime
-from eyerender.rendering.llvm import ENVIRONMENT, VARIANT, candidates, find_llvm, version_of
-from eyerender.rendering.llvm_setup import setup_llvm
-from eyerender.rendering.mend import has_archive, llvm_command
-from eyerender.rendering.probe import REFUSAL_AGE_S, Verdict, probe, run_probe
 
 COMPILER = shutil.which("cc")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
@@ -215,7 +215,7 @@ def test_bad_library_that_the_user_names_is_passed_over(good: Path, tmp_path: Pa
     named = bad[0] if bad else tmp_path / "libLLVM-15.so"
     done = python(
         """
-        from eyerender.rendering.llvm import ensure_llvm
+        from eyerender.backends.llvm import ensure_llvm
         print(ensure_llvm().path)
         import mitsuba as mi, drjit as dr
         mi.set_variant("llvm_ad_mono")
@@ -233,10 +233,10 @@ def test_mitsuba_imported_before_with_a_good_library_works(good: Path) -> None:
     load_runtime()
     preload = f"""
         from pathlib import Path
-        from eyerender.rendering.libraries import *
+        from eyerender.backends.libraries import *
         load_runtime(); load_library(Path({str(good)!r}), library_folders(Path({str(good)!r})))
         import mitsuba
-        from eyerender.rendering.backend import choose_backend
+        from eyerender.backends.choose import choose_backend
         print(choose_backend("llvm").library)
         """
     done = python(preload, **{ENVIRONMENT: str(good)})
@@ -247,11 +247,11 @@ def test_mitsuba_imported_before_with_a_good_library_works(good: Path) -> None:
 def test_mitsuba_imported_before_without_a_library_is_a_clear_error(good: Path) -> None:
     done = python(
         """
-        from eyerender.rendering.libraries import load_runtime
+        from eyerender.backends.libraries import load_runtime
         load_runtime()
         import mitsuba
         from eyerender.errors import BackendError
-        from eyerender.rendering.backend import choose_backend
+        from eyerender.backends.choose import choose_backend
         try:
             choose_backend("llvm")
         except BackendError as error:
@@ -268,14 +268,14 @@ def test_mitsuba_imported_before_without_a_library_is_a_clear_error(good: Path) 
 
 def test_importing_the_room_loads_no_mitsuba() -> None:
     done = python(
-        "import sys, eyerender.rendering.backend, eyerender.rendering.llvm_setup\n"
+        "import sys, eyerender.backends.choose, eyerender.backends.set_up\n"
         "print([name for name in ('mitsuba', 'drjit', 'cv2') if name in sys.modules])"
     )
     assert done.stdout.strip() == "[]", done.stderr
 
 
 def test_without_an_archive_the_command_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("eyerender.rendering.llvm.candidates", lambda: iter(()))
+    monkeypatch.setattr("eyerender.backends.llvm.candidates", lambda: iter(()))
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BackendError, match="no libLLVM here renders") as caught:
         setup_llvm()
@@ -357,8 +357,8 @@ def test_archive_without_a_fitting_library_leaves_nothing(
     archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The made-up packages hold no LLVM: each is refused, in one line, and the store stays as empty as it was."""
-    monkeypatch.setattr("eyerender.rendering.llvm.candidates", lambda: iter(()))
-    monkeypatch.setattr("eyerender.rendering.llvm_setup.RUNTIME", {})
+    monkeypatch.setattr("eyerender.backends.llvm.candidates", lambda: iter(()))
+    monkeypatch.setattr("eyerender.backends.set_up.RUNTIME", {})
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     said: list[str] = []
     with pytest.raises(BackendError, match="libllvm99 does not render"):
@@ -370,7 +370,7 @@ def test_archive_without_a_fitting_library_leaves_nothing(
 @needs_archive
 def test_archive_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     point_apt_at(f"deb [trusted=yes] file:{tmp_path}/nowhere ./", tmp_path, monkeypatch)
-    monkeypatch.setattr("eyerender.rendering.llvm.candidates", lambda: iter(()))
+    monkeypatch.setattr("eyerender.backends.llvm.candidates", lambda: iter(()))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with pytest.raises(BackendError, match=r"it does not answer|nowhere") as caught:
         setup_llvm()

@@ -27,8 +27,8 @@ import numpy as np
 import trimesh
 
 from ..arrays import Floats, Ints
-from ..eye.model import Eye
 from ..geometry.surfaces import Surface
+from .model import Eye
 
 _LENS_RADIUS_MM = 4.5
 _WALL_MM = 1.0

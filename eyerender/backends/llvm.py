@@ -18,8 +18,8 @@ from pathlib import Path
 
 from ..errors import BackendError
 from .libraries import library_folders, load_library, load_runtime, stored_folders
-from .mend import llvm_mend
 from .probe import Verdict, probe
+from .remedies import llvm_fix
 
 VARIANT = "llvm_ad_mono"
 ENVIRONMENT = "DRJIT_LIBLLVM_PATH"
@@ -83,7 +83,7 @@ def ensure_llvm() -> LibLlvm:
     Raises
     ------
     BackendError
-        There is none, or drjit was imported before and has loaded another, or none; the message names the mend.
+        There is none, or drjit was imported before and has loaded another, or none; the message says how to fix it.
     """
     global _active
     if _active is None:
@@ -118,7 +118,7 @@ def _activate() -> LibLlvm:
         if before is not None:
             os.environ[ENVIRONMENT] = before
         raise BackendError(f"Dr.Jit does not load {examined.path}, though it did in a process of its own")
-    raise BackendError(f"no libLLVM here renders (the llvm backend needs one); {llvm_mend()}")
+    raise BackendError(f"no libLLVM here renders (the llvm backend needs one); {llvm_fix()}")
 
 
 def _loaded() -> LibLlvm:
@@ -141,9 +141,9 @@ def _loaded() -> LibLlvm:
 def _too_late() -> str:
     found = find_llvm()
     if found is None:
-        return llvm_mend()
+        return llvm_fix()
     return (
-        "import mitsuba after eyerender.rendering.backend.choose_backend() has run, "
+        "import mitsuba after eyerender.backends.choose.choose_backend() has run, "
         f"or set {ENVIRONMENT}={found.path} before Python starts"
     )
 

@@ -1,4 +1,4 @@
-"""Choosing a backend, and what is told where there is none."""
+"""The choice of a backend, and the messages where none renders."""
 
 from __future__ import annotations
 
@@ -11,16 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from eyerender.backends.choose import VARIANTS, Backend, BackendState, choose_backend
+from eyerender.backends.doctor import backend_states, doctor_report
+from eyerender.backends.llvm import find_llvm
 from eyerender.errors import BackendError, InputError
-from eyerender.rendering.backend import (
-    VARIANTS,
-    Backend,
-    BackendState,
-    backend_states,
-    choose_backend,
-    doctor_report,
-)
-from eyerender.rendering.llvm import find_llvm
 
 needs_llvm = pytest.mark.skipif(find_llvm() is None, reason="no libLLVM here renders")
 
@@ -78,7 +72,7 @@ def test_auto_takes_the_gpu_only_where_it_renders(cuda: BackendState) -> None:
         assert choose_backend().name == ("cuda" if cuda.ok else "llvm")
 
 
-def test_gpu_that_is_not_there_is_an_error_with_a_mend(cuda: BackendState) -> None:
+def test_gpu_that_is_not_there_is_an_error_with_a_fix(cuda: BackendState) -> None:
     if cuda.ok:
         pytest.skip("a GPU renders here")
     with pytest.raises(BackendError, match="--backend llvm") as caught:
@@ -92,7 +86,7 @@ def test_broken_driver_is_found_out_without_harm(tmp_path: Path) -> None:
     libm = next((name for name in ("libm.so.6", "libSystem.dylib") if _loads(name)), None)
     if libm is None:
         pytest.skip("no library to pass for a driver here")
-    code = "from eyerender.rendering.backend import backend_states; print(backend_states()[0].ok)"
+    code = "from eyerender.backends.doctor import backend_states; print(backend_states()[0].ok)"
     environment = {**os.environ, "DRJIT_LIBCUDA_PATH": libm, "XDG_CACHE_HOME": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "False", done.stderr
@@ -105,19 +99,19 @@ def test_wrong_arguments_are_input_errors(arguments: dict[str, object], path: st
     assert caught.value.path == path
 
 
-def test_state_without_a_library_names_the_mend(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("eyerender.rendering.llvm.candidates", lambda: iter(()))
+def test_state_without_a_library_names_the_fix(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("eyerender.backends.llvm.candidates", lambda: iter(()))
     llvm = backend_states()[1]
     assert llvm.name == "llvm"
     assert not llvm.ok
     assert llvm.detail == "no libLLVM on this machine"
-    assert llvm.mend
+    assert llvm.fix
 
 
 def test_process_without_a_library_ends_with_one_line_and_no_abort(tmp_path: Path) -> None:
     code = (
-        "import sys\nfrom eyerender.rendering import llvm\nllvm.candidates = lambda: iter(())\n"
-        "from eyerender.errors import BackendError\nfrom eyerender.rendering.backend import choose_backend\n"
+        "import sys\nfrom eyerender.backends import llvm\nllvm.candidates = lambda: iter(())\n"
+        "from eyerender.errors import BackendError\nfrom eyerender.backends.choose import choose_backend\n"
         "try:\n    choose_backend('llvm')\nexcept BackendError as error:\n    sys.exit(f'{error.exit_code}: {error}')\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -131,7 +125,7 @@ def test_doctor_reports_both_backends_and_is_plain_data() -> None:
     assert [state.name for state in report.backends] == ["cuda", "llvm"]
     assert report.ok == any(state.ok for state in report.backends)
     assert (report.chosen is None) != report.ok
-    assert all(state.ok or state.mend for state in report.backends)
+    assert all(state.ok or state.fix for state in report.backends)
     assert dict(report.packages)["mitsuba"] != "none"
     plain = dataclasses.asdict(report)
     assert plain["backends"][1]["name"] == "llvm"

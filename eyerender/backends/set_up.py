@@ -1,7 +1,7 @@
 """`setup_llvm`: bring a libLLVM to a machine that has none, from Debian's or Ubuntu's archive, without root.
 
 The packages are fetched with the machine's own apt settings but into folders of ours, and only unpacked, so nothing on
-the system changes. `python -m eyerender.rendering.llvm_setup [--quiet]` does it and prints the library's path.
+the system changes. `python -m eyerender.backends.set_up [--quiet]` does it and prints the library's path.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from ..errors import BackendError
 from .apt import Apt
 from .libraries import RUNTIME, llvm_store
 from .llvm import VARIANT, LibLlvm, find_llvm, version_of
-from .mend import has_archive, llvm_command
 from .probe import probe, run_probe
+from .remedies import has_archive, llvm_command
 
 Say = Callable[[str], None]
 
@@ -113,7 +113,7 @@ def _locked(file: Path, say: Say) -> Iterator[None]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of `python -m eyerender.rendering.llvm_setup`: the library's path on stdout, one line on stderr if none."""
+    """Entry of `python -m eyerender.backends.set_up`: the library's path on stdout, one line on stderr if none."""
     quiet = "--quiet" in arguments
 
     def say(line: str) -> None:

@@ -1,0 +1,62 @@
+"""The state of an installation: which backends render here, and how to fix those that do not."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from dataclasses import dataclass
+
+from .choose import BackendName, BackendState, cuda_state
+from .libraries import cache_folder
+from .llvm import examine
+from .probe import cpu_name, package_version
+from .remedies import llvm_fix
+
+
+@dataclass(frozen=True, slots=True)
+class DoctorReport:
+    """State of an installation: `ok` where some backend renders, `chosen` the one that "auto" takes."""
+
+    ok: bool
+    chosen: BackendName | None
+    backends: tuple[BackendState, ...]
+    python: str
+    platform: str
+    cpu: str
+    packages: tuple[tuple[str, str], ...]
+    cache: str
+
+
+def backend_states() -> list[BackendState]:
+    """Whether each backend renders on this machine. It is tried in other processes, so this one is not changed."""
+    return [cuda_state(refresh=True), _llvm_state()]
+
+
+def doctor_report() -> DoctorReport:
+    """What a bug report should say about the installation."""
+    states = tuple(backend_states())
+    packages = ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless", "scikit-image")
+    return DoctorReport(
+        ok=any(state.ok for state in states),
+        chosen=next((state.name for state in states if state.ok), None),
+        backends=states,
+        python=f"{platform.python_version()} ({sys.executable})",
+        platform=platform.platform(),
+        cpu=f"{cpu_name()}, {_cpu_count()} usable",
+        packages=tuple((package, package_version(package)) for package in packages),
+        cache=str(cache_folder() or "none (no home folder)"),
+    )
+
+
+def _llvm_state() -> BackendState:
+    refused: list[str] = []
+    for examined in examine(refresh=True):
+        if examined.verdict.ok:
+            return BackendState("llvm", True, f"{examined.verdict.detail}, {examined.path}")
+        refused.append(f"{examined.path}: {examined.verdict.detail}")
+    return BackendState("llvm", False, "; ".join(refused) or "no libLLVM on this machine", llvm_fix())
+
+
+def _cpu_count() -> int:
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
