@@ -209,6 +209,9 @@ def export_dataset(
     /,
     *,
     format: Literal["webdataset", "coco", "csv", "openeds", "ellseg", "teyed"],
+    bits: Literal[8, 16] = 8,
+    encoding: Literal["linear", "gamma"] | None = None,
+    gain: float | None = None,
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
@@ -222,12 +225,21 @@ def export_dataset(
         The folder to write.
     format
         The layout.
+    bits
+        Of the images: 8, or 16 in webdataset, coco and csv.
+    encoding
+        Linear, or with a gamma of 2.2 (default: gamma for 8 bits, linear for 16).
+    gain
+        The exposure gain of all images (default: measured on a sample of them; 1 for 16 bits, linear).
     """
     from ..dataset.export import export
 
+    options: dict[str, Any] = {"bits": bits, "encoding": encoding, "gain": gain}
     with progress("exporting") as steps:
-        done = export(folder, out, format, overwrite=overwrite, progress=steps)
-    emit(done, f"{done['images']} images as {format} in {out}", json)
+        done = export(folder, out, format, **options, overwrite=overwrite, progress=steps)
+    image = done["image"]
+    how = f"{bits} bits, {image['encoding']}, gain {image['gain']:g}"
+    emit(done, f"{done['images']} images as {format} in {out} ({how})", json)
     return 0
 
 

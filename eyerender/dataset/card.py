@@ -6,6 +6,7 @@ from typing import Any
 
 from ..imagefolder import CONVENTIONS
 from .plan import Plan
+from .reading import IMAGEFOLDER, WHOLE
 from .shard import run_versions
 
 _LABELS = """\
@@ -61,6 +62,10 @@ the folder as it is (the loader itself calls all images `train`), without `filte
 
 {_LABELS.format(mask=CONVENTIONS["mask"], more="".join(_MORE.get(kind, "") for kind in spec.labels.pictures))}
 
+## Reading the images
+PNG of `bit_depth` bits, 16 unless the spec says otherwise, linear: a pupil has counts of about 1 % of the full scale.
+{WHOLE}
+{IMAGEFOLDER}
 ## Conventions
 - World frame: {CONVENTIONS["world_frame"]}.
 - Pixels: {CONVENTIONS["pixels"]}.

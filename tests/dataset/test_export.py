@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import sys
@@ -46,8 +47,12 @@ def exported(tiny, tmp_path_factory):
     return made
 
 
-def eight_bit(tiny, line):
-    return np.round(read_image(tiny / line["file_name"])[0] * (255 / 65535)).astype(np.uint8)
+def eight_bit(tiny, line, folder):
+    """What export.json says an image of the export is."""
+    how = json.loads((folder / "export.json").read_text())["image"]
+    assert (how["bits"], how["encoding"], how["gamma"]) == (8, "gamma", 2.2)
+    share = np.asarray(Image.open(tiny / line["file_name"])) / 65535
+    return np.round(255 * np.minimum(1, how["gain"] * share) ** (1 / 2.2)).astype(np.uint8)
 
 
 def local(line, xy):
@@ -64,9 +69,13 @@ def test_webdataset_reads_it(tiny, exported, lines):
         assert len(samples) == count
         for sample in samples:
             line = json.loads(sample["json"])
-            assert line == lines[sample["__key__"]]
+            source = lines[sample["__key__"]]
+            own = {key: line[key] for key in ("bit_depth", "encoding", "gain", "source_bit_depth")}
+            assert line == {**source, **own}
+            assert (own["bit_depth"], own["encoding"], own["source_bit_depth"]) == (8, "gamma", 16)
             assert line["split"] == split
-            assert sample["png"] == (tiny / line["file_name"]).read_bytes()
+            picture = np.asarray(Image.open(io.BytesIO(sample["png"])))
+            np.testing.assert_array_equal(picture, eight_bit(tiny, source, folder))
             assert sample["mask.png"] == (tiny / line["mask_file_name"]).read_bytes()
         decoded = next(iter(wds.WebDataset(url, shardshuffle=False, empty_check=False).decode("pil")))
         assert decoded["json"]["split"] == split
@@ -84,7 +93,7 @@ def test_coco_masks_come_back(tiny, exported, lines):
             line = lines[Path(info["file_name"]).stem]
             assert line["split"] == split
             picture = np.asarray(Image.open(folder / split / info["file_name"]))
-            np.testing.assert_array_equal(picture, eight_bit(tiny, line))
+            np.testing.assert_array_equal(picture, eight_bit(tiny, line, folder))
             mask, _ = read_image(tiny / line["mask_file_name"])
             glints = 0
             for mark in data.loadAnns(data.getAnnIds(imgIds=[number])):
@@ -118,7 +127,12 @@ def test_csv_rows(tiny, exported, lines):
     assert len(rows) == 24
     for row in rows:
         line = lines[Path(row["file_name"]).stem]
-        np.testing.assert_array_equal(read_image(folder / row["file_name"])[0], read_image(tiny / line["file_name"])[0])
+        assert (row["bit_depth"], row["encoding"], row["source_bit_depth"]) == ("8", "gamma", "16")
+        picture, depth = read_image(folder / row["file_name"])
+        assert depth == 8
+        np.testing.assert_array_equal(picture, eight_bit(tiny, line, folder))
+        mask = (folder / row["mask_file_name"]).read_bytes()
+        assert mask == (tiny / line["mask_file_name"]).read_bytes()
         centre = local(line, line["labels"]["pupil"]["amodal"]["centre_px"])
         assert [float(row["pupil_amodal_x_px"]), float(row["pupil_amodal_y_px"])] == centre.tolist()
         assert float(row["camera_target_mm_z"]) == line["labels"]["space"]["camera"]["target_mm"][2]
@@ -160,7 +174,7 @@ def test_ellseg_reads_it(tiny, exported, lines):
             for k in range(count):
                 line = lines[Path(file["Info"][k].decode()).stem]
                 assert line["split"] == key["subset"].item()
-                np.testing.assert_array_equal(file["Images"][k, ...], eight_bit(tiny, line))
+                np.testing.assert_array_equal(file["Images"][k, ...], eight_bit(tiny, line, folder))
                 mask = read_image(tiny / line["mask_file_name"])[0]
                 np.testing.assert_array_equal(file["Masks"][k, ...], mask)
                 # Nothing stands before these eyes: the whole outlines differ in a few pixels of their edges.
@@ -193,7 +207,7 @@ def test_teyed_reads_it(tiny, exported, lines):
         for k, line in enumerate(frames):
             good, picture = stream.read()
             assert good
-            np.testing.assert_array_equal(picture[..., 0], eight_bit(tiny, line))
+            np.testing.assert_array_equal(picture[..., 0], eight_bit(tiny, line, folder))
             frame, angle, x, y, width, height = rows["pupil_eli"][k]
             assert frame == k + 1
             drawn = np.zeros(picture.shape[:2], np.uint8)

@@ -34,7 +34,7 @@ def write(items: Items, out: Path) -> None:
         (out / split).mkdir()
     for number, item in enumerate(items, start=1):
         mask, line = item.mask, item.line
-        write_png(out / item.split / f"{item.name}.png", item.image8)
+        write_png(out / item.split / f"{item.name}.png", item.encoded)
         h, w = mask.shape
         images[item.split].append(
             {"id": number, "file_name": f"{item.name}.png", "width": w, "height": h, "subject": line["subject"]}

@@ -44,7 +44,7 @@ def write(items: Items, out: Path) -> None:
                 file.create_dataset(f"Fits/{name}", (n, 5), dtype="f8")
         for item in items:
             file, k = archives[item.split], len(infos[item.split])
-            file["Images"][k], file["Masks"][k], file["Masks_noSkin"][k] = item.image8, item.mask, item.amodal
+            file["Images"][k], file["Masks"][k], file["Masks_noSkin"][k] = item.encoded, item.mask, item.amodal
             fits = {name: fit_of(item, name) for name in ("pupil", "iris")}
             for name, fit in fits.items():
                 file[f"Fits/{name}"][k] = fit

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import io
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import InputError
+from ...files import read_bytes, shown
 from ...geometry.ellipse import Ellipse, signed_distance
-from ...imagefile import read_image
-from ...imagefolder import ImageEntry, ImageFolder
+from ...imagefile import encode_png, read_image
+from ...imagefolder import METADATA, ImageEntry, ImageFolder
+from .encoding import Encoding
 
 IRIS, PUPIL = 2, 3
 
 
 @dataclass(frozen=True)
 class Item:
-    """An image of a dataset and its labels, moved into the window's pixels."""
+    """An image of a dataset and its labels, moved into the window's pixels; `encoding` is that of the export."""
 
     entry: ImageEntry
+    encoding: Encoding
 
     @property
     def line(self) -> dict[str, Any]:
@@ -38,16 +45,46 @@ class Item:
         """The split it is in."""
         return str(self.line["split"])
 
+    @property
+    def bit_depth(self) -> int:
+        """Of the counts in the dataset; raises `InputError` where it is not 1 to 16."""
+        depth = self.line.get("bit_depth")
+        if not isinstance(depth, int) or isinstance(depth, bool) or not 1 <= depth <= 16:
+            raise InputError(f"{shown(self.line['file_name'])}: bit_depth must be 1 to 16", source=self._source)
+        return depth
+
     @cached_property
     def image(self) -> NDArray[Any]:
-        """The sensor's counts, (h, w)."""
-        return read_image(self.entry.path)[0]
+        """The sensor's counts, (h, w) uint8 or uint16; raises `InputError`."""
+        return self._counts(self.entry.path)
 
     @property
-    def image8(self) -> NDArray[np.uint8]:
-        """The same in 8 bits, linear."""
-        full = 2.0 ** int(self.line["bit_depth"]) - 1
-        return np.asarray(np.round(self.image * (255 / full)), dtype=np.uint8)
+    def encoded(self) -> NDArray[Any]:
+        """The image as the export stores it, (h, w) uint8 or uint16."""
+        return self.encoding.apply(self.image, self.bit_depth)
+
+    def encode(self, path: Path) -> bytes:
+        """One of the sample's pictures of counts as the PNG file that the export stores; raises `InputError`."""
+        if self.encoding.keeps(self.bit_depth):
+            return read_bytes(path, follow=False)
+        buffer = io.BytesIO()
+        encode_png(buffer, self.encoding.apply(self._counts(path), self.bit_depth))
+        return buffer.getvalue()
+
+    def exported_line(self) -> dict[str, Any]:
+        """The line of metadata for the exported image."""
+        own = {"bit_depth": self.encoding.bits, "encoding": self.encoding.curve, "gain": self.encoding.gain}
+        return {**self.line, **own, "source_bit_depth": self.bit_depth}
+
+    @property
+    def _source(self) -> str:
+        return str(self.entry.folder / METADATA)
+
+    def _counts(self, path: Path) -> NDArray[Any]:
+        image = read_image(path)[0]
+        if image.dtype.kind != "u":
+            raise InputError("holds no integers", source=str(path))
+        return image
 
     @cached_property
     def mask(self) -> NDArray[np.uint8]:
@@ -104,11 +141,22 @@ class Items:
 
     folder: ImageFolder
     step: Callable[[int], None]
+    encoding: Encoding
 
     def __iter__(self) -> Iterator[Item]:
         for k, entry in enumerate(sorted(self.folder.entries, key=lambda entry: int(entry.line["sample"]))):
-            yield Item(entry)
+            yield Item(entry, self.encoding)
             self.step(k + 1)
+
+    @property
+    def images_by_split(self) -> dict[str, int]:
+        """The number of images of each split."""
+        return dict(sorted(Counter(str(entry.line["split"]) for entry in self.folder.entries).items()))
+
+    @property
+    def bit_depths(self) -> list[int]:
+        """The bit depths that images of the dataset have."""
+        return sorted({Item(entry, self.encoding).bit_depth for entry in self.folder.entries})
 
     @property
     def splits(self) -> list[str]:

@@ -25,6 +25,6 @@ def write(items: Items, out: Path) -> None:
             # Names of digits only: readers strip letters of '.png' off both ends of a name.
             name = f"{counts.get(item.split, 0):06d}"
             counts[item.split] = counts.get(item.split, 0) + 1
-            write_png(out / item.split / "images" / f"{name}.png", item.image8)
+            write_png(out / item.split / "images" / f"{name}.png", item.encoded)
             np.save(out / item.split / "labels" / f"{name}.npy", item.mask)
             table.write(f"{item.split}/images/{name}.png,{item.line['file_name']},{item.line['subject']}\n")

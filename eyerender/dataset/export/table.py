@@ -1,15 +1,19 @@
-"""CSV: labels.csv with one row an image, beside copies of the images and masks."""
+"""CSV: labels.csv with one row an image, beside the images and masks."""
 
 from __future__ import annotations
 
 import csv
-import shutil
 from pathlib import Path
 from typing import Any
 
+from ...files import read_bytes, write_bytes
 from ...geometry.ellipse import Ellipse
 from .item import Item, Items
 
+_COLUMNS = (
+    *("sample", "subject", "split", "sequence_index"),
+    *("bit_depth", "encoding", "gain", "source_bit_depth"),
+)
 _ELLIPSE = ("x_px", "y_px", "a_px", "b_px", "angle_rad")
 
 
@@ -21,9 +25,10 @@ def write(items: Items, out: Path) -> None:
     writer = None
     with open(out / "labels.csv", "w", newline="", encoding="utf-8") as file:
         for item in items:
-            shutil.copyfile(item.entry.path, out / "images" / item.entry.path.name)
+            write_bytes(out / "images" / f"{item.name}.png", item.encode(item.entry.path), sync=False)
             if item.entry.mask_path is not None:
-                shutil.copyfile(item.entry.mask_path, out / "masks" / item.entry.mask_path.name)
+                data = read_bytes(item.entry.mask_path, follow=False)
+                write_bytes(out / "masks" / f"{item.name}.png", data, sync=False)
             row = row_of(item, lights)
             if writer is None:
                 writer = csv.DictWriter(file, list(row))
@@ -33,13 +38,13 @@ def write(items: Items, out: Path) -> None:
 
 def row_of(item: Item, lights: int) -> dict[str, Any]:
     """The flat labels of an image."""
-    line = item.line
+    line = item.exported_line()
     record, labels = line["records"][0], line["labels"]
     x0, y0 = item.entry.window[:2]
     row: dict[str, Any] = {
         "file_name": f"images/{item.name}.png",
-        "mask_file_name": f"masks/{item.name}.png",
-        **{key: line[key] for key in ("sample", "subject", "split", "sequence_index", "bit_depth")},
+        "mask_file_name": f"masks/{item.name}.png" if line.get("mask_file_name") else None,
+        **{key: line[key] for key in _COLUMNS},
         "eye": record["eye"],
         "eye_model": record["eye_model"],
         "window_x0_px": x0,

@@ -47,7 +47,7 @@ def write(items: Items, out: Path) -> None:
     """A video and its annotations for each (subject, eye, camera); splits.csv says which split each is in."""
     groups: dict[str, list[Item]] = {}
     for entry in items.folder.entries:
-        item = Item(entry)
+        item = Item(entry, items.encoding)
         record = entry.line["records"][0]
         name = f"{items.name}_{entry.line['subject']:06d}_{record['eye']}_{record['camera']}.mp4"
         groups.setdefault(name, []).append(item)
@@ -74,7 +74,7 @@ def _video(name: str, group: list[Item], out: Path) -> None:
         PngVideo(notes / f"{name}iris_seg_2D.mp4", w, h) as irises,
     ):
         for item in group:
-            video.add(item.image8)
+            video.add(item.encoded)
             pupils.add(np.where(item.mask == 3, 255, 0).astype(np.uint8))
             irises.add(np.where(item.mask >= 2, 255, 0).astype(np.uint8))
             for kind, values in rows_of(item).items():

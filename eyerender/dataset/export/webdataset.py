@@ -16,7 +16,7 @@ SAMPLES = 1000
 
 
 def write(items: Items, out: Path) -> None:
-    """SPLIT-000000.tar and so on; the image's own PNG (16 bits stay 16 bits)."""
+    """SPLIT-000000.tar and so on; the line in NAME.json says how its image is encoded."""
     counts: dict[str, int] = {}
     tars: dict[str, tarfile.TarFile] = {}
     try:
@@ -27,14 +27,15 @@ def write(items: Items, out: Path) -> None:
                     tars[split].close()
                 tars[split] = _open(out / f"{split}-{k // SAMPLES:06d}.tar")
             counts[split] = k + 1
-            _add(tars[split], f"{item.name}.png", read_bytes(item.entry.path, follow=False))
-            if item.entry.mask_path is not None:
-                _add(tars[split], f"{item.name}.mask.png", read_bytes(item.entry.mask_path, follow=False))
-            for ending, key in (("amodal", "amodal_mask_file_name"), ("noiseless", "noiseless_file_name")):
+            _add(tars[split], f"{item.name}.png", item.encode(item.entry.path))
+            for ending, key in (("mask", "mask_file_name"), ("amodal", "amodal_mask_file_name")):
                 path = item.entry.file(key)
                 if path is not None:
                     _add(tars[split], f"{item.name}.{ending}.png", read_bytes(path, follow=False))
-            _add(tars[split], f"{item.name}.json", json.dumps(item.line).encode())
+            noiseless = item.entry.file("noiseless_file_name")
+            if noiseless is not None:
+                _add(tars[split], f"{item.name}.noiseless.png", item.encode(noiseless))
+            _add(tars[split], f"{item.name}.json", json.dumps(item.exported_line()).encode())
     finally:
         for tar in tars.values():
             tar.close()

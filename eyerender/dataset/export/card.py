@@ -1,0 +1,50 @@
+"""README.md of an export: what it is, how its images are encoded, how they are read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..reading import WEBDATASET, WHOLE
+from .encoding import LARGEST_GAIN, LEVEL, SAMPLED, SHARE, Encoding
+
+_GAINS = {
+    "measured": f"""\
+It was measured on {SAMPLED} images spread evenly over the dataset (all, where there are fewer): it takes {SHARE:.1%} of
+their pixels to at most {LEVEL:g} of the full scale, and lies within 1 to {LARGEST_GAIN:g}. Glints may be clipped.""",
+    "given": "It was given.",
+    "none": "The images' brightness is as in the dataset.",
+}
+
+
+def export_card(name: str, done: dict[str, Any], layout: str, encoding: Encoding) -> str:
+    """The text of README.md; `layout` describes the files."""
+    image = encoding.to_mapping()
+    splits = "\n".join(f"| {split} | {count} |" for split, count in done["images_by_split"].items())
+    depths = " or ".join(str(depth) for depth in done["source_bit_depths"])
+    read = ""
+    if encoding.bits == 16:
+        read = f"\n## Reading 16 bits\n{WHOLE}{WEBDATASET if done['format'] == 'webdataset' else ''}"
+    return f"""# {name}: {done["format"]}
+
+{done["images"]} synthetic near-infrared images of eyes with exact labels, exported from the dataset "{name}".
+The dataset's own README.md says how they were made and what the labels mean.
+
+| split | images |
+|---|---|
+{splits}
+
+## Files
+{layout.strip()}
+
+## Values of the images
+{encoding.bits} bits, encoding `{encoding.curve}`, one exposure gain of {encoding.gain:g} for all images.
+{_GAINS[encoding.gain_from]}
+Images of two exports have the same scale only if their gains are the same (`--gain`).
+
+    {image["formula"]}
+    {image["inverse"]}
+
+`s` is the linear share of the full scale that the sensor's counts in the dataset had: s = count / (2^bits - 1) with
+{depths} bits there. The inverse is exact to half a code, except where the image was clipped at {2**encoding.bits - 1}.
+`export.json` holds the same for programs.
+{read}"""

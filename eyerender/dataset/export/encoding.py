@@ -1,0 +1,103 @@
+"""How an export stores the sensor's counts: bits, curve, and one exposure gain for the whole export.
+
+With s = count / (2^source_bit_depth - 1), the share of the source's full scale, and F = 2^bits - 1:
+
+    linear:  code = round(F min(1, gain s))              s = code / F / gain
+    gamma:   code = round(F min(1, gain s)^(1 / 2.2))    s = (code / F)^2.2 / gain
+
+The inverse is exact to half a code, but for the code F, where the image was clipped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+
+GAMMA = 2.2
+# A measured gain takes this share of all pixels to at most this part of the full scale. What is left above is for
+# brighter subjects, and so that skin is not as white as a glint. It is at most so large, because the black level is
+# 1/256 of the full scale by default, and images without light must stay dark.
+SHARE, LEVEL = 0.995, 0.8
+LARGEST_GAIN = 32.0
+SAMPLED = 256  # images that a gain is measured on
+
+Curve = Literal["linear", "gamma"]
+
+
+@dataclass(frozen=True, slots=True)
+class Encoding:
+    """Bits (8 or 16), curve and gain of the images of an export; `gain_from` says where the gain comes from."""
+
+    bits: int
+    curve: Curve
+    gain: float
+    gain_from: str
+
+    def apply(self, image: NDArray[Any], bit_depth: int) -> NDArray[Any]:
+        """The stored codes, (h, w) uint8 or uint16, of an image's counts, (h, w) unsigned integers of `bit_depth`."""
+        table = _table(self.bits, self.curve, self.gain, 2**bit_depth - 1)
+        return np.asarray(table[np.minimum(image.astype(np.intp), len(table) - 1)])
+
+    def keeps(self, bit_depth: int) -> bool:
+        """Whether the codes are the counts themselves."""
+        return self.curve == "linear" and self.gain == 1 and self.bits == bit_depth
+
+    def to_mapping(self) -> dict[str, Any]:
+        """As export.json holds it."""
+        full = 2**self.bits - 1
+        gamma = self.curve == "gamma"
+        return {
+            "bits": self.bits,
+            "encoding": self.curve,
+            "gamma": GAMMA if gamma else 1.0,
+            "gain": self.gain,
+            "gain_from": self.gain_from,
+            "formula": f"code = round({full} * min(1, gain * s)" + (f" ** (1 / {GAMMA}))" if gamma else ")"),
+            "inverse": (f"s = (code / {full}) ** {GAMMA} / gain" if gamma else f"s = code / {full} / gain"),
+            "s": "count / (2 ** source_bit_depth - 1), the linear share of the source's full scale",
+        }
+
+    def __str__(self) -> str:
+        return f"{self.bits} bits, {self.curve}, gain {self.gain:g}"
+
+
+def measured_gain(images: Iterable[tuple[NDArray[Any], int]]) -> float:
+    """The gain that takes the quantile `SHARE` of all pixels to `LEVEL`: 1 to `LARGEST_GAIN`, to four digits.
+
+    Args:
+        images: counts (h, w) and their bit depths.
+    """
+    counts = np.zeros(65536, dtype=np.int64)
+    for image, bit_depth in images:
+        full = 2**bit_depth - 1
+        share = np.round(np.minimum(image.astype(np.intp), full) * (65535 / full)).astype(np.intp)
+        counts += np.bincount(share.ravel(), minlength=65536)
+    below = np.cumsum(counts)
+    level = int(np.searchsorted(below, SHARE * below[-1]))
+    return float(np.clip(float(f"{LEVEL * 65535 / max(level, 1):.4g}"), 1.0, LARGEST_GAIN))
+
+
+def check(bits: int, curve: str | None, gain: float | None) -> None:
+    """Raise `InputError` for what is no encoding."""
+    if bits not in (8, 16):
+        raise InputError(f"must be 8 or 16, not {bits!r}", source="--bits")
+    if curve not in (None, "linear", "gamma"):
+        raise InputError(f"must be linear or gamma, not {curve!r}", source="--encoding")
+    if gain is not None and not 1e-3 <= gain <= 1e5:
+        raise InputError(f"must be 0.001 to 100000, not {gain!r}", source="--gain")
+
+
+@lru_cache(maxsize=4)
+def _table(bits: int, curve: Curve, gain: float, full: int) -> NDArray[Any]:
+    """The code of each count."""
+    value = np.minimum(1.0, gain * (np.arange(full + 1) / full))
+    if curve == "gamma":
+        value = value ** (1 / GAMMA)
+    return np.asarray(np.round((2**bits - 1) * value), dtype=np.uint8 if bits == 8 else np.uint16)

@@ -1,0 +1,182 @@
+"""How exports store the images: bits, curve and one gain, so that common loaders show them as they are."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from eyerender.cli.app import run
+from eyerender.dataset.export import FORMATS, Encoding, export
+from eyerender.dataset.export.encoding import measured_gain
+from eyerender.errors import InputError
+from eyerender.imagefile import read_image
+from eyerender.imagefolder import ImageFolder
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("curve", ["linear", "gamma"])
+@pytest.mark.parametrize("depth", [8, 10, 16])
+def test_the_inverse_gives_the_counts_back(bits, curve, depth):
+    """As export.json writes both formulas, evaluated as they stand there."""
+    encoding = Encoding(bits, curve, 2.5, "given")
+    counts = np.arange(2**depth).reshape(-1, 16)
+    codes = encoding.apply(counts.astype(np.uint8 if depth == 8 else np.uint16), depth)
+    assert codes.dtype == (np.uint8 if bits == 8 else np.uint16)
+    said = encoding.to_mapping()
+    names = {"gain": said["gain"], "min": np.minimum, "round": np.round}
+    s = counts / (2**depth - 1)
+    np.testing.assert_array_equal(codes, eval(said["formula"].removeprefix("code = "), {**names, "s": s}))
+    full = 2**bits - 1
+    kept = codes < full
+
+    def back(code):
+        return eval(said["inverse"].removeprefix("s = "), {**names, "code": code})
+
+    assert np.all((back(np.maximum(codes - 0.5, 0)) <= s + 1e-12) & (s <= back(codes + 0.5) + 1e-12) | ~kept)
+    np.testing.assert_array_equal(kept, s < back(full - 0.5))  # only what is clipped is lost
+
+
+def test_sixteen_bits_linear_are_the_counts_themselves():
+    counts = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+    encoding = Encoding(16, "linear", 1.0, "none")
+    np.testing.assert_array_equal(encoding.apply(counts, 16), counts)
+    assert encoding.keeps(16)
+    assert not encoding.keeps(12)
+    assert encoding.apply(np.array([[4095]], np.uint16), 12).item() == 65535
+
+
+def test_the_gain_looks_at_most_pixels_and_not_at_the_brightest():
+    draws = np.random.default_rng(3)
+    dim = [draws.integers(300, 6000, (50, 50)).astype(np.uint16) for _ in range(20)]
+    glints = [image.copy() for image in dim]
+    for image in glints:
+        image[10:12, 10:13] = 65535  # 6 of 2500 pixels
+    for images in (dim, glints):
+        gain = measured_gain((image, 16) for image in images)
+        assert gain == pytest.approx(0.8 * 65535 / 6000, rel=0.02)
+    assert measured_gain((image // 64, 10) for image in dim) == pytest.approx(0.8 * 65535 / 6000, rel=0.02)
+    bright = [np.full((4, 4), 65535, np.uint16)]
+    assert measured_gain((image, 16) for image in bright) == 1.0
+    dark = [np.full((4, 4), 257, np.uint16)]
+    assert measured_gain((image, 16) for image in dark) == 32.0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"bits": 12}, "--bits: must be 8 or 16"),
+        ({"encoding": "log"}, "--encoding: must be linear or gamma"),
+        ({"gain": 0.0}, "--gain: must be 0.001 to 100000"),
+        ({"gain": float("nan")}, "--gain: must be 0.001 to 100000"),
+    ],
+)
+def test_what_is_no_encoding_is_refused(tmp_path, options, words):
+    with pytest.raises(InputError, match=re.escape(words)):
+        export(tmp_path, tmp_path / "out", "csv", **options)
+    assert not (tmp_path / "out").exists()
+
+
+def pupil_codes(image, mask):
+    """How many codes the darker half of a pupil has; the other may have glints and the edge."""
+    inside = np.sort(image[mask == 3])
+    return len(np.unique(inside[: len(inside) // 2]))
+
+
+@pytest.mark.render
+def test_common_loaders_show_the_images_as_they_are(tiny, tmp_path):
+    """The decoder "pil" of webdataset and `convert("L")`; linear copies without a gain have 3 codes in a pupil."""
+    import webdataset as wds
+
+    masks = {entry.path.stem: read_image(entry.mask_path)[0] for entry in ImageFolder.load(tiny).entries}
+    export(tiny, tmp_path / "tars", "webdataset")
+    export(tiny, tmp_path / "table", "csv")
+    export(tiny, tmp_path / "plain", "csv", encoding="linear", gain=1)
+    seen = 0
+    for split in ("train", "validation", "test"):
+        url = str(tmp_path / "tars" / f"{split}-000000.tar")
+        for sample in wds.WebDataset(url, shardshuffle=False, empty_check=False).decode("pil"):
+            name, mask = sample["__key__"], masks[sample["__key__"]]
+            grey = Image.open(tmp_path / "table" / "images" / f"{name}.png").convert("L")
+            picture = np.asarray(sample["png"])[..., 0]
+            np.testing.assert_array_equal(picture, np.asarray(grey))
+            assert 40 < picture.mean() < 215
+            assert np.mean(picture == 255) < 0.02
+            assert pupil_codes(picture, mask) >= 6
+            plain = np.asarray(Image.open(tmp_path / "plain" / "images" / f"{name}.png"))
+            assert pupil_codes(plain, mask) <= 3
+            seen += 1
+    assert seen == 24
+
+
+@pytest.mark.render
+def test_sixteen_bits_are_the_files_of_the_dataset(tiny, tmp_path):
+    done = export(tiny, tmp_path / "out", "csv", bits=16)
+    assert (done["image"]["encoding"], done["image"]["gain"]) == ("linear", 1.0)
+    for entry in ImageFolder.load(tiny).entries:
+        assert (tmp_path / "out" / "images" / entry.path.name).read_bytes() == entry.path.read_bytes()
+    done = export(tiny, tmp_path / "gamma", "coco", bits=16, encoding="gamma")
+    assert done["image"]["gain"] > 1
+    assert read_image(next((tmp_path / "gamma" / "train").iterdir()))[1] == 16
+    for format in ("openeds", "ellseg", "teyed"):
+        with pytest.raises(InputError, match=f"--bits: the layout {format} holds 8 bits; webdataset, coco, csv can"):
+            export(tiny, tmp_path / "none", format, bits=16)
+
+
+@pytest.mark.render
+def test_an_export_says_how_its_images_are_encoded(tiny, tmp_path, capsys):
+    """In export.json, in README.md and in what the command answers; the same every time."""
+    assert run(["export-dataset", str(tiny), str(tmp_path / "first"), "--format", "openeds"]) == 0
+    assert "8 bits, gamma, gain " in capsys.readouterr().out
+    argv = ["export-dataset", str(tiny), str(tmp_path / "again"), "--format", "openeds", "--json", "-"]
+    assert run(argv) == 0
+    said = json.loads(capsys.readouterr().out)
+    for folder in ("first", "again"):
+        assert json.loads((tmp_path / folder / "export.json").read_text()) == {
+            key: value for key, value in said.items() if key != "path"
+        }
+    assert said["schema"] == "eyerender/export/2"
+    assert said["image"]["gain_from"] == "measured"
+    assert said["images_by_split"] == {"test": 6, "train": 12, "validation": 6}
+    trees = [
+        {str(p.relative_to(tmp_path / folder)): p.read_bytes() for p in (tmp_path / folder).rglob("*") if p.is_file()}
+        for folder in ("first", "again")
+    ]
+    assert trees[0] == trees[1]
+    for format in FORMATS:
+        done = export(tiny, tmp_path / format, format, gain=1.5)
+        card = (tmp_path / format / "README.md").read_text()
+        for words in (done["image"]["formula"], done["image"]["inverse"], "gain of 1.5", "8 bits", "It was given."):
+            assert words in card
+
+
+def blocks(card):
+    """The Python code of a data card."""
+    return re.findall(r"```python\n(.*?)```", card.read_text(), flags=re.DOTALL)
+
+
+@pytest.mark.render
+def test_the_cards_code_reads_sixteen_bits(tiny, tmp_path):
+    """The dataset's own card and that of an export: the code that they show gives the counts."""
+    entry = ImageFolder.load(tiny).entries[0]
+    wanted = read_image(entry.path)[0]
+    assert 'convert("L")' in (tiny / "README.md").read_text()
+    names = {"path": entry.path, "gain": 2.0}
+    for code in blocks(tiny / "README.md"):
+        for line in code.splitlines():
+            exec(line, names)
+            if line.startswith("counts ="):
+                assert names["counts"].dtype == np.uint16
+                np.testing.assert_array_equal(names["counts"], wanted)
+    assert names["picture"].dtype == np.uint8
+    np.testing.assert_array_equal(names["picture"], Encoding(8, "gamma", 2.0, "given").apply(wanted, 16))
+    export(tiny, tmp_path / "out", "webdataset", bits=16)
+    names = {"path": entry.path, "tar": str(tmp_path / "out" / f"{entry.line['split']}-000000.tar")}
+    for code in blocks(tmp_path / "out" / "README.md"):
+        exec(code, names)
+    (sample,) = (s for s in names["samples"] if s["__key__"] == entry.path.stem)
+    np.testing.assert_array_equal(sample["png"], wanted)
+    np.testing.assert_array_equal(sample["mask.png"], read_image(entry.mask_path)[0])
