@@ -1,7 +1,7 @@
-"""The files that a dataset's scenes name, HDR maps and head meshes: which they are, and what they hold.
+"""The files that a dataset's spec names (HDR maps, head meshes, eye files): which they are, and what they hold.
 
 Their content shapes the images as the spec does, so its check sums are a part of what a run is, by the names that the
-spec gives them.
+spec gives them. `Plan.of` adds the eye files, which it reads itself.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ def sums_of_files(scene: Mapping[str, Any], base: Path) -> dict[str, str]:
     Raises:
         InputError: one is missing or cannot be read.
     """
-    return {name: _sum(base / name) for name in sorted(set(_names(scene, base)))}
+    return {name: sum_of_file(base / name) for name in sorted(set(_names(scene, base)))}
 
 
 def check_files(files: Mapping[str, str], base: Path) -> None:
     """Raise `InputError` where a file holds something else than its sum says; cheap while no file changes."""
     for name, wanted in files.items():
-        if _sum(base / name) != wanted:
+        if sum_of_file(base / name) != wanted:
             raise InputError("has changed since the run began", source=str(base / name))
 
 
@@ -58,7 +58,8 @@ def _texts(node: Any, *keys: str) -> Iterator[str]:
                 yield from _texts(entry)
 
 
-def _sum(path: Path) -> str:
+def sum_of_file(path: Path) -> str:
+    """SHA-256 of a file, kept while the file seems the same; raises `InputError`."""
     try:
         state = path.stat()
     except OSError:

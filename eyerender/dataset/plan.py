@@ -19,7 +19,7 @@ from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
 from ..scene import Scene, SceneSpec
 from .draws import is_draw, unit_number
-from .files import check_files, sums_of_files
+from .files import check_files, sum_of_file, sums_of_files
 from .spec import DatasetSpec, find_dataset
 from .template import Template, Turn, possible
 
@@ -65,7 +65,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Plan:
-    """A dataset spec with the eye files it names, and check sums of the other files that its scenes name.
+    """A dataset spec with the eyes it names, and check sums of the files that it names, eye files among them.
 
     `files`: SHA-256 by name, relative to the folder `base`, in which a run finds them wherever its workers are.
     """
@@ -97,11 +97,12 @@ class Plan:
 
     @classmethod
     def of(cls, spec: DatasetSpec, *, base: Path | None = None, source: str = "") -> Plan:
-        """Check the template, read the eye files it names and sum up its other files.
+        """Check the template, read the eyes it names and sum up its files.
 
         All are relative to `base`, by default the current folder. Raises `InputError` where one cannot be read.
         """
         eyes: dict[str, Mapping[str, Any]] = {}
+        sums: dict[str, str] = {}
         eye_part = spec.scene.get("eye", {})
         if is_draw(eye_part):
             raise InputError("give its values draws of their own, not the whole eye", source=source, path="scene.eye")
@@ -111,13 +112,17 @@ class Plan:
                 raise InputError(f"must be names of eyes, not {name!r}", source=source, path="scene.eye.model")
             file = str(base / name) if base is not None and name not in catalogue_names() else name
             try:
+                if name not in catalogue_names() and Path(file).is_file():
+                    # Before it is read, so that a change in between is found when the run checks its files.
+                    sums[name] = sum_of_file(Path(file))
                 eyes[name] = load_eye(file).to_mapping()
             except InputError as error:
                 if error.source == file and error.reason.startswith("no such"):
                     raise InputError(f"{name!r}: {error.reason}", source=source, path="scene.eye.model") from None
                 raise
         folder = (Path.cwd() if base is None else base).resolve()
-        plan = cls(spec, eyes, sums_of_files(spec.scene, folder), folder, source)
+        sums |= sums_of_files(spec.scene, folder)
+        plan = cls(spec, eyes, dict(sorted(sums.items())), folder, source)
         for name in spec.eye_parameters:
             if name not in eyes:
                 raise InputError("no sample looks with this eye", source=source, path=f"eye_parameters.{name}")
@@ -154,7 +159,7 @@ class Plan:
         return cls(DatasetSpec.from_mapping(data["spec"]), data["eyes"], data.get("files", {}), base)
 
     def check_files(self) -> None:
-        """Raise `InputError` where a file that the scenes name is no longer what it was when the plan was made."""
+        """Raise `InputError` where a file that the spec names is no longer what it was when the plan was made."""
         check_files(self.files, self.base)
 
     @cached_property

@@ -24,6 +24,7 @@ from eyerender.dataset.shard import write_shard
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.dataset.worker import Job
 from eyerender.errors import InputError
+from eyerender.eye.catalogue import load_eye
 from eyerender.imagefile import read_image
 
 HEAD = {"unit": "mm", "licence": "CC0-1.0", "forward": [1, 0, 0], "up": [0, 0, 1], "right_eye": [0, 0, 0]}
@@ -117,7 +118,7 @@ def test_the_files_content_is_a_part_of_the_plan(tmp_path):
         ("heads/bar.json", Path.unlink, "bar.json: no such file"),
         ("heads/bar.ply", Path.unlink, "bar.ply: no such file"),
         ("heads/bar.json", lambda path: path.write_text("{"), "bar.json: is not a readable manifest"),
-        ("rooms/day.npy", lambda path: (path.unlink(), path.mkdir()), "day.npy: cannot be read (Is a directory)"),
+        ("rooms/day.npy", lambda path: (path.unlink(), path.mkdir()), "day.npy: is a folder, not a file"),
         ("heads/bar.json", lambda path: (path.unlink(), path.mkdir()), "bar.json: is not a readable manifest"),
     ],
 )
@@ -290,6 +291,41 @@ def test_a_file_that_changes_while_a_run_is_at_work_ends_it(made, tmp_path):
     room.write_bytes(kept)
     make(folder, Plan.load(spec / "spec.yaml"))
     assert tree(folder) == tree(made / "out")
+
+
+def test_eye_files_are_files_of_the_run(tmp_path, monkeypatch):
+    load_eye("E2").model_copy(update={"name": "mine"}).dump(tmp_path / "mine.yaml")
+    spec = write(tmp_path / "spec.yaml", eye_parameters={}, **{"scene.eye.model": "mine.yaml"})
+    own = Plan.load(spec)
+    assert set(own.files) == {"mine.yaml"}
+    (tmp_path / "away").mkdir()
+    monkeypatch.chdir(tmp_path / "away")
+    own.check_files()
+    # Also the eye file that an option names, which is meant from where the command runs.
+    (by_option,) = Plan.load("dataset_quick", eye="../mine.yaml").files
+    assert by_option == str(tmp_path / "mine.yaml")
+    with (tmp_path / "mine.yaml").open("a") as file:
+        file.write("description: another\n")
+    with pytest.raises(InputError, match=r"mine\.yaml: has changed since the run began"):
+        own.check_files()
+    # Eyes of the catalogue belong to the package; its source counts as a version.
+    assert Plan.load("dataset_quick").files == {}
+
+
+@pytest.mark.render
+def test_an_eye_file_that_changes_while_a_run_is_at_work_ends_it(tmp_path, monkeypatch):
+    load_eye("E2").dump(tmp_path / "mine.yaml")
+    spec = write(tmp_path / "spec.yaml", eye_parameters={}, **{"scene.eye.model": "mine.yaml"})
+    plan = Plan.load(spec)
+    maker = Maker(plan, frames_of(plan), threads=1)
+
+    def sample(samples: int, images: int) -> None:
+        if samples == 2:
+            (tmp_path / "mine.yaml").unlink()
+
+    with pytest.raises(InputError, match=r"mine\.yaml: no such file"):
+        write_shard(maker, tmp_path, 0, sample)
+    assert not list(tmp_path.glob(".partial-*"))
 
 
 @pytest.mark.render
