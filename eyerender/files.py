@@ -8,6 +8,7 @@ may come from somebody else: it must be a regular file within a size limit.
 from __future__ import annotations
 
 import errno
+import glob
 import json
 import os
 import re
@@ -107,6 +108,23 @@ def make_folder(path: str | Path) -> bool:
     for place in missing:
         sync_folder(place.parent)
     return bool(missing)
+
+
+def remove_file(path: str | Path) -> None:
+    """Remove a file, durably, where there is one; raises `OSError`."""
+    path = Path(path)
+    try:
+        path.unlink()
+    except FileNotFoundError:
+        return
+    sync_folder(path.parent)
+
+
+def remove_parts(path: str | Path) -> None:
+    """Remove the temporary files that killed writers of a file left beside it; raises `OSError`."""
+    path = Path(path)
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*{PART}"):
+        part.unlink(missing_ok=True)
 
 
 def sync_tree(path: str | Path) -> None:

@@ -2,53 +2,65 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from ..errors import EyerenderError
-from ..files import write_json
+from ..errors import EyerenderError, InputError
+from ..files import MAX_FILE_BYTES, read_json, remove_parts, write_json, write_text, written
 from ..imagefolder import CONVENTIONS, DATASET, DATASET_SCHEMA, METADATA
 from .card import data_card
 from .columns import type_first
 from .croissant import CROISSANT, croissant
 from .plan import Plan
-from .shard import LINES, SHARDS, checksum, read_done, run_versions, shard_name
+from .shard import (
+    LINES,
+    SHARDS,
+    checksum,
+    compare_sums,
+    finished,
+    is_sums,
+    read_done,
+    run_versions,
+    shard_name,
+    sum_of,
+    verify,
+)
 
 FAILURES, CARD = "failures.jsonl", "README.md"
-_PART = ".part"
 
 
 def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
-    """Put the dataset together; the same shards give the same bytes. Returns its statistics."""
+    """Put the dataset together; the same shards give the same bytes. Returns its statistics.
+
+    The shards must have been verified.
+
+    Raises:
+        EyerenderError: no sample could be made, or the disk is full or not writable.
+        InputError: a shard's lines are not those that this version writes.
+    """
+    for name in (FAILURES, METADATA, CROISSANT, CARD, DATASET):
+        remove_parts(folder / name)
     statistics = Statistics()
     shards = range(plan.spec.shard_count)
-    with open(folder / (FAILURES + _PART), "w", encoding="utf-8") as failures:
+    with written(folder / FAILURES) as file:
         for shard in shards:
             done = read_done(folder, shard)
             statistics.take_shard(done)
             for rejection in done["rejections"]:
-                failures.write(json.dumps(rejection) + "\n")
-
-    def lines() -> Iterator[str]:
-        for shard in shards:
-            with open(folder / SHARDS / shard_name(shard) / LINES, encoding="utf-8") as file:
-                yield from file
-
-    with open(folder / (METADATA + _PART), "w", encoding="utf-8") as metadata:
-        metadata.writelines(type_first(lines, statistics.take_line))
-    found = statistics.to_mapping()
-    if found["images"] == 0:
-        raise EyerenderError(f"{folder}: no sample of this spec can be made; {FAILURES}{_PART} says why")
-    os.replace(folder / (METADATA + _PART), folder / METADATA)
-    os.replace(folder / (FAILURES + _PART), folder / FAILURES)
-    write_json(folder / CROISSANT, croissant(plan, checksum(folder / METADATA)))
-    card = folder / (CARD + _PART)
-    card.write_text(data_card(plan, found), encoding="utf-8")
-    os.replace(card, folder / CARD)
+                file.write((json.dumps(rejection) + "\n").encode())
+    with written(folder / METADATA) as file:
+        for line in _lines(folder, shards, statistics.take_line):
+            file.write(line)
+        found = statistics.to_mapping()
+        if found["images"] == 0:
+            raise EyerenderError(f"{folder}: no sample of this spec can be made; {FAILURES} says why")
+    sums = {name: sum_of(folder / name) for name in (METADATA, FAILURES)}
+    write_json(folder / CROISSANT, croissant(plan, sums[METADATA]["sha256"]))
+    write_text(folder / CARD, data_card(plan, found))
     dataset = {
         "schema": DATASET_SCHEMA,
         "kind": "dataset",
@@ -58,9 +70,84 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
         "backends": sorted(statistics.backends),
         "conventions": CONVENTIONS,
         "statistics": found,
+        "checksums": sums,
     }
     write_json(folder / DATASET, dataset)
     return found
+
+
+def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
+    """What is wrong with what a dataset's shards were put together into: dataset.json and the files that it sums up.
+
+    Where dataset.json holds no checksums, as older versions wrote it, metadata.jsonl is compared with the shards.
+
+    Args:
+        folder: the dataset.
+        digest: of the plan that it must be made by; any where it is None.
+        quick: compare sizes only.
+    """
+    try:
+        dataset = read_json(folder / DATASET, limit=MAX_FILE_BYTES, follow=False)
+    except InputError as error:
+        yield f"{DATASET}: {error.reason}"
+        return
+    if dataset.get("schema") != DATASET_SCHEMA or digest not in (None, dataset.get("digest")):
+        yield f"{DATASET}: is of another spec"
+        return
+    sums = dataset.get("checksums")
+    if sums is None and not quick:
+        yield from _differs_from_shards(folder)
+    elif sums is not None and not (is_sums(sums) and METADATA in sums):
+        yield f"{DATASET}: checksums: are not as this version writes them"
+    else:
+        yield from compare_sums(folder, sums or {}, quick=quick)
+
+
+def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
+    """What is wrong with the files of a finished dataset: what `damage` finds, and what `verify` finds in its shards.
+
+    Args:
+        folder: the dataset.
+        quick: compare sizes only.
+    """
+    problems = list(damage(folder, quick=quick))
+    yield from problems
+    if any(problem.startswith(f"{DATASET}: ") for problem in problems):
+        return
+    dataset = read_json(folder / DATASET, limit=MAX_FILE_BYTES, follow=False)
+    spec = dataset.get("spec")
+    count, size = (spec.get(key) if isinstance(spec, dict) else None for key in ("count", "shard_size"))
+    if not (isinstance(count, int) and isinstance(size, int) and count > 0 and size > 0):
+        yield f"{DATASET}: spec: has no count and shard_size"
+        return
+    for shard in range(-(-count // size)):
+        yield from verify(folder, shard, dataset.get("digest"), quick=quick)
+
+
+def _lines(folder: Path, shards: Iterable[int], take: Callable[[dict[str, Any]], None]) -> Iterator[bytes]:
+    """The lines of metadata.jsonl; `take` gets each, parsed."""
+
+    def lines() -> Iterator[str]:
+        for shard in shards:
+            with open(folder / SHARDS / shard_name(shard) / LINES, encoding="utf-8") as file:
+                yield from file
+
+    try:
+        for line in type_first(lines, take):
+            yield line.encode()
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(
+            f"the lines of a shard are not as this version writes them ({reason})", source=str(folder)
+        ) from None
+
+
+def _differs_from_shards(folder: Path) -> Iterator[str]:
+    digest = hashlib.sha256()
+    for line in _lines(folder, sorted(finished(folder)), lambda _line: None):
+        digest.update(line)
+    if checksum(folder / METADATA) != digest.hexdigest():
+        yield f"{METADATA}: differs from the shards"
 
 
 class Statistics:

@@ -21,6 +21,7 @@ from .worker import Job, work
 TRIES = 3
 HOPELESS = 3  # shards given up before any was made: the rest would fare alike
 RECYCLE_IMAGES = 2000
+NO_SHARD = -1  # the shard of a worker that ends without one
 
 
 class Events(Protocol):
@@ -83,14 +84,17 @@ class LocalPool:
                         self._give(worker, pending.popleft())
                 wait([w.pipe for w in self._workers] + [w.process.sentinel for w in self._workers], timeout=1.0)
                 for worker in list(self._workers):
+                    made = self._made
                     reason = self._listen(worker, events)
+                    if self._made > made:
+                        del tries[NO_SHARD]  # so workers do start: only deaths one after the other end a run
                     if reason is None:
                         if worker.shard is None and worker.images >= self.recycle_images:
                             self._end(worker)  # before what its libraries leak adds up
                         continue
                     shard = worker.shard
                     self._end(worker)
-                    key = -1 if shard is None else shard
+                    key = NO_SHARD if shard is None else shard
                     tries[key] += 1
                     if shard is None:
                         if tries[key] >= TRIES:

@@ -14,17 +14,26 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from ..errors import EyerenderError, InputError
+from ..files import make_folder, remove_file
 from ..imagefolder import DATASET
-from .assemble import assemble
+from .assemble import assemble, damage
 from .lock import LOCK, final_lock, run_lock
 from .plan import Plan
-from .pool import Events, LocalPool
+from .pool import NO_SHARD, Events, LocalPool
 from .realise import frames_of
-from .runfile import begin, refuse_taken
-from .shard import Staged, check_finished, commit, cpu_family, finished, read_done, remove_leftovers
+from .runfile import LOG, begin, refuse_taken
+from .shard import (
+    Staged,
+    commit,
+    cpu_family,
+    finished,
+    is_finished,
+    read_done,
+    remove_leftovers,
+    withdraw_damaged,
+)
 from .worker import Job
 
-LOG = "log.jsonl"
 MEMORY_A_WORKER = 0.8e9  # bytes, measured resident size with head-room
 
 Progress = Callable[[int, int, str], None]
@@ -73,18 +82,17 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
     if not options.overwrite:
         refuse_taken(folder)
     frames = frames_of(plan)
-    created = not folder.exists()
+    created = False
     try:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise EyerenderError(f"{path}: cannot be written ({error.strerror})") from None
+        created = make_folder(folder)
         with run_lock(folder, options.part, say):
             if options.overwrite and n == 1:
                 _clear(folder)
-            resumed = begin(folder, plan)
+            run = _Run(plan, folder, options, frames, progress, say)
+            with final_lock(folder, say):
+                resumed = begin(folder, plan, run.repaired)
             try:
-                return _Run(plan, folder, options, frames, progress, say).make(resumed)
+                return run.make(resumed)
             except InputError:
                 if not resumed and n == 1 and not finished(folder):
                     _clear(folder)  # nothing can come of it
@@ -134,17 +142,23 @@ class _Run:
     retries: int = 0
     total: int = 0
     seen: set[str] = field(default_factory=set)
+    verified: set[int] = field(default_factory=set)  # shards whose checksums this run has seen to be right
 
     def make(self, resumed: bool) -> dict[str, Any]:
         """Make this part's missing shards, and put the dataset together when none is missing."""
         spec, (k, n) = self.plan.spec, self.options.part
         mine = set(range(k - 1, spec.shard_count, n))
         done = finished(self.folder)
-        for shard in sorted(done & mine):
-            check_finished(self.folder, shard)
+        self._withdraw(done & mine)
+        done = finished(self.folder)
+        todo = sorted(mine - done)
         if resumed:
             remove_leftovers(self.folder, mine, done)
-        todo = sorted(mine - done)
+            problem = next(damage(self.folder, self.plan.digest), None)
+            if problem is not None and ((self.folder / DATASET).exists() or not todo):
+                self.repaired(f"the dataset is put together again: {problem}")
+        if todo:
+            remove_file(self.folder / DATASET)  # a folder that has one is complete
         self.total = sum(len(spec.shard_samples(s)) for s in todo)
         if todo:
             self._note_backends(done)
@@ -159,7 +173,17 @@ class _Run:
                     f"{len(lost)} of {len(todo)} shards could not be made; shard {shard}: {reason}; "
                     "the others are kept, start again to try these"
                 )
-        missing = set(range(spec.shard_count)) - finished(self.folder)
+        missing = self._missing()
+        statistics = None
+        if not missing:
+            with final_lock(self.folder, self.say):
+                # Those of other parts; this run has verified or made its own.
+                self._withdraw(set(range(spec.shard_count)) - self.verified)
+                missing = self._missing()
+                if not missing:
+                    statistics = assemble(self.plan, self.folder)
+                else:
+                    remove_file(self.folder / DATASET)
         summary: dict[str, Any] = {
             "schema": "eyerender/generate/1",
             "path": str(self.folder),
@@ -170,12 +194,25 @@ class _Run:
             "seconds": round(time.monotonic() - self.start, 3),
             "retries": self.retries,
         }
-        if not missing:
-            with final_lock(self.folder, self.say):
-                statistics = assemble(self.plan, self.folder)
+        if statistics is not None:
             self._log("end", **statistics)
             summary |= {"statistics": statistics}
         return summary
+
+    def repaired(self, what: str) -> None:
+        """Something was damaged and is made or written again."""
+        self.say(f"repairing: {what}")
+        self._log("repair", what=what)
+
+    def _missing(self) -> set[int]:
+        return set(range(self.plan.spec.shard_count)) - finished(self.folder)
+
+    def _withdraw(self, shards: set[int]) -> None:
+        """Verify finished shards, so that the damaged ones are made again."""
+        damaged = withdraw_damaged(self.folder, sorted(shards), self.plan.digest)
+        for shard, problem in damaged.items():
+            self.repaired(f"shard {shard} is made again: {problem}")
+        self.verified |= shards - damaged.keys()
 
     def _engine(self, shards: int) -> Engine:
         options = self.options
@@ -202,8 +239,9 @@ class _Run:
 
     def staged(self, staged: Staged, worker: str) -> None:
         """A shard is written."""
-        if staged.shard not in finished(self.folder):
+        if not is_finished(self.folder, staged.shard):
             commit(self.folder, staged)
+            self.verified.add(staged.shard)
         self.made[staged.shard] = len(self.plan.spec.shard_samples(staged.shard))
         self.rejected += staged.rejected
         self.given_up += staged.given_up
@@ -222,7 +260,7 @@ class _Run:
         """A shard's worker ended."""
         self.retries += 1
         self.made.pop(shard, None)
-        what = f"shard {shard}" if shard >= 0 else "a worker"
+        what = "a worker" if shard == NO_SHARD else f"shard {shard}"
         self.say(f"{what}: {reason} (try {tries})")
         self._log("retry", shard=shard, reason=reason, tries=tries)
 
@@ -237,7 +275,8 @@ class _Run:
 
     def _note_backends(self, done: set[int]) -> None:
         for shard in sorted(done):
-            self._mixed(read_done(self.folder, shard), old=True)
+            with suppress(InputError):  # another part's, which is damaged
+                self._mixed(read_done(self.folder, shard), old=True)
 
     def _mixed(self, made_by: dict[str, Any], *, old: bool = False) -> None:
         """Warn when shards of different backends or processors come together: their bytes may differ in rounding."""
@@ -256,14 +295,17 @@ class _Run:
             "seconds": round(time.monotonic() - self.start, 3),
             **data,
         }
-        with open(self.folder / LOG, "a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
+        with open(self.folder / LOG, "ab+") as file:
+            if file.tell():
+                file.seek(-1, os.SEEK_END)
+                if file.read(1) != b"\n":  # a power cut may have cut the last line short
+                    file.write(b"\n")
+            file.write(json.dumps(line).encode() + b"\n")
 
 
 def _clear(folder: Path) -> None:
     """Empty a folder but for the locks; dataset.json first, so that no half of a dataset looks whole."""
-    with suppress(FileNotFoundError):
-        (folder / DATASET).unlink()
+    remove_file(folder / DATASET)
     for path in folder.iterdir():
         if not path.name.startswith(LOCK):
             shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()

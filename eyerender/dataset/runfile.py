@@ -3,62 +3,129 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import write_json
-from ..imagefolder import RUN, STAGE
+from ..files import MAX_FILE_BYTES, PART, read_json, remove_parts, write_json
+from ..imagefolder import DATASET, METADATA, RUN, STAGE
+from .assemble import CARD, FAILURES
+from .croissant import CROISSANT
 from .lock import LOCK
 from .plan import Plan
-from .shard import run_versions
+from .shard import KINDS, SHARDS, finished, read_done, run_versions
 
 RUN_SCHEMA = "eyerender/run/1"
+LOG = "log.jsonl"
+_OWN = {RUN, LOG, SHARDS, *KINDS, METADATA, FAILURES, CARD, CROISSANT, DATASET}
+_ELSE = "give another folder or --overwrite"
 _SHOWN = 4
 
 
 def refuse_taken(folder: Path) -> None:
     """Raise `InputError` where a folder holds something else than a run, before anything is put into it."""
     try:
-        taken = folder.is_dir() and any(not p.name.startswith((LOCK, STAGE)) for p in folder.iterdir())
+        taken = folder.is_dir() and _is_taken(folder)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", source=str(folder)) from None
-    if taken and not (folder / RUN).is_file():
+    if taken:
         raise InputError("is not empty; give another folder or --overwrite", source=str(folder))
 
 
-def begin(folder: Path, plan: Plan) -> bool:
+def begin(folder: Path, plan: Plan, repaired: Callable[[str], None]) -> bool:
     """Claim a folder for a plan, or find that it was claimed for the same one before (True).
+
+    Where run.json is damaged or missing, the finished shards tell whose the folder is, for each names its plan. Where
+    nothing tells, and the folder holds only what a run writes, the run starts over. `repaired` is told of either. The
+    caller holds the folder's final lock, so that two parts of a run do not repair it at the same time.
 
     Raises:
         InputError: it holds something else, or a run of another spec or other versions.
+        OSError: the disk is full or not writable.
     """
     path = folder / RUN
     mine = {"schema": RUN_SCHEMA, "digest": plan.digest, **plan.to_mapping(), "versions": run_versions()}
-    if not path.is_file():
-        refuse_taken(folder)
+    found, reason = _read(path)
+    if found is not None:
+        _refuse_another(folder, found, mine, plan.files)
+        return True
+    refuse_taken(folder)
+    remove_parts(path)
+    shards = list(_readable(folder))
+    same = [done for done in shards if done["digest"] == plan.digest]
+    if shards and not same:
+        raise InputError(f"holds a run of another spec, whose {RUN} is damaged; {_ELSE}", source=str(folder))
+    if same:
+        # The other shards are of another plan; resuming finds that and makes them again.
+        _refuse_another(folder, {**mine, "versions": same[0]["versions"]}, mine, plan.files)
         write_json(path, mine)
-        return False
+        repaired(f"{RUN} is written again: {reason}")
+        return True
+    names = {p.name for p in folder.iterdir() if not p.name.startswith(LOCK)}
+    for name in names:
+        shutil.rmtree(folder / name) if (folder / name).is_dir() else (folder / name).unlink()
+    write_json(path, mine)
+    if names & _OWN:
+        repaired(f"the run starts over: {RUN}: {reason}, and no shard is finished")
+    return False
+
+
+def _read(path: Path) -> tuple[dict[str, Any] | None, str]:
+    """What run.json says, or None and why it says nothing; raises `InputError` where it is no run's of this version."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if found["schema"] != RUN_SCHEMA:
-            raise ValueError
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError("does not describe a run of this version", source=str(path)) from None
+        found = read_json(path, limit=MAX_FILE_BYTES, follow=False)
+    except InputError as error:
+        return None, error.reason
+    if found.get("schema") != RUN_SCHEMA:
+        raise InputError("does not describe a run of this version", source=str(path))
+    return found, ""
+
+
+def _refuse_another(folder: Path, found: Mapping[str, Any], mine: Mapping[str, Any], files: Mapping[str, str]) -> None:
+    """Raise `InputError` with the difference where a folder is of another spec or other versions."""
     # Python's own version shapes no byte; it may differ from machine to machine.
     skip = ("versions.python:", "digest:", "files.", "files:")
     changes = [c for c in differences(found, json.loads(json.dumps(mine))) if not c.startswith(skip)]
-    old = found.get("files", {})
-    changes = [f"{name}: other content" for name, content in plan.files.items() if old.get(name) != content] + changes
+    old = found.get("files")
+    old = old if isinstance(old, Mapping) else {}
+    changes = [f"{name}: other content" for name, content in files.items() if old.get(name) != content] + changes
     if changes:
         more = f"; and {len(changes) - _SHOWN} more" if len(changes) > _SHOWN else ""
         raise InputError(
-            f"holds a run of another spec or version; give another folder or --overwrite "
-            f"({'; '.join(changes[:_SHOWN])}{more})",
-            source=str(folder),
+            f"holds a run of another spec or version; {_ELSE} ({'; '.join(changes[:_SHOWN])}{more})", source=str(folder)
         )
-    return True
+
+
+def _readable(folder: Path) -> Iterator[dict[str, Any]]:
+    """The content of every done.json that can be read."""
+    for shard in sorted(finished(folder)):
+        with suppress(InputError):
+            yield read_done(folder, shard)
+
+
+def _is_taken(folder: Path) -> bool:
+    """Whether a folder holds anything that is not a run's, or nothing that tells that it is a run's."""
+    if _read(folder / RUN)[0] is not None or any(_readable(folder)):
+        return False
+    names = {p.name for p in folder.iterdir() if not _is_passing(p.name)}
+    if names - _OWN:
+        return True
+    for kind in {*KINDS, SHARDS} & names:
+        place = folder / kind
+        if place.is_symlink() or not all(p.name.isdigit() for p in place.iterdir()):
+            return True
+    if names <= {RUN}:
+        return False
+    # A run has a log and shards from its start, and puts the dataset together when all shards are finished.
+    return not names & {LOG, SHARDS} or (RUN not in names and bool(names & {METADATA, DATASET}))
+
+
+def _is_passing(name: str) -> bool:
+    """Whether a name is that of a lock, of a staged shard or of a file of ours that was not finished."""
+    return name.startswith((LOCK, STAGE)) or (name.endswith(PART) and any(name.startswith(f".{own}.") for own in _OWN))
 
 
 def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:

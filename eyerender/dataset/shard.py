@@ -2,7 +2,8 @@
 
     images/00003/*.png   masks/00003/*.png   shards/00003/lines.jsonl, done.json
 
-`shards/00003` is renamed last, so a shard that has one is complete; whatever else a killed run left is removed.
+`done.json` is put in place last, after everything else is in its place and synced. So a shard that has one is complete,
+also after a power cut, and its checksums tell whether it still is. Whatever else an ended run left is removed.
 """
 
 from __future__ import annotations
@@ -13,13 +14,14 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ..errors import EyerenderError, InputError
+from ..errors import InputError
+from ..files import MAX_FILE_BYTES, inside, make_folder, read_json, remove_file, sync_folder, sync_tree, write_json
 from ..imagefile import write_png
 from ..imagefolder import IMAGE_SCHEMA, STAGE
 from .maker import MadeImage, Maker
@@ -40,6 +42,37 @@ SHAPING = {
     "analytic", "arrays", "capture", "dataset", "eye", "geometry", "imagefile", "imagefolder", "observation", "optics",
     "backends", "region", "rendering", "rig", "scene", "spec",
 }  # fmt: skip
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _are(value: object, fits: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and all(map(fits, value))
+
+
+def is_sums(value: object) -> bool:
+    """Whether a value from a file maps names to sizes and SHA-256, as `compare_sums` takes them."""
+    return isinstance(value, Mapping) and all(
+        isinstance(entry, Mapping) and _is_count(entry.get("bytes")) and isinstance(entry.get("sha256"), str)
+        for entry in value.values()
+    )
+
+
+# What stands under each key of done.json.
+_DONE_KEYS: dict[str, Callable[[Any], bool]] = {
+    "shard": _is_count,
+    "samples": lambda v: _are(v, _is_count) and len(v) == 2,
+    "images": _is_count,
+    "digest": lambda v: isinstance(v, str),
+    "versions": lambda v: isinstance(v, Mapping),
+    "backend": lambda v: isinstance(v, Mapping) and all(isinstance(v.get(key), str) for key in ("name", "device")),
+    "cpu": lambda v: isinstance(v, str),
+    "rejections": lambda v: _are(v, lambda entry: isinstance(entry, Mapping)),
+    "given_up": lambda v: _are(v, _is_count),
+    "files": is_sums,
+}
 
 
 def shard_name(shard: int) -> str:
@@ -103,10 +136,8 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
             "seconds": round(seconds, 3),
             "files": _checksums(stage, shard, kinds),
         }
-        with open(stage / "shard" / DONE, "w", encoding="utf-8") as file_:
-            file_.write(json.dumps(done, indent=1, allow_nan=False) + "\n")
-            file_.flush()
-            os.fsync(file_.fileno())
+        write_json(stage / DONE, done, sync=False)
+        sync_tree(stage)
     except BaseException:
         shutil.rmtree(stage, ignore_errors=True)
         raise
@@ -122,21 +153,28 @@ def _write_image(stage: Path, shard: int, image: MadeImage) -> dict[str, str]:
 
 
 def commit(folder: Path, staged: Staged) -> None:
-    """Put a staged shard in place."""
+    """Put a staged shard in place, done.json last; raises `OSError`."""
     stage, name = Path(staged.stage), shard_name(staged.shard)
-    for kind in KINDS:
-        if (stage / kind).is_dir():
-            place = folder / kind / name
-            shutil.rmtree(place, ignore_errors=True)  # of a run killed between these renames
-            place.parent.mkdir(exist_ok=True)
-            os.rename(stage / kind, place)
-    (folder / SHARDS).mkdir(exist_ok=True)
-    os.rename(stage / "shard", folder / SHARDS / name)
+    moves = [(stage / kind, folder / kind / name) for kind in KINDS if (stage / kind).is_dir()]
+    moves.append((stage / "shard", folder / SHARDS / name))
+    for source, place in moves:
+        shutil.rmtree(place, ignore_errors=True)  # of a run that ended between these renames
+        make_folder(place.parent)
+        os.rename(source, place)
+    for _, place in moves:
+        sync_folder(place.parent)
+    os.rename(stage / DONE, folder / SHARDS / name / DONE)
+    sync_folder(folder / SHARDS / name)
     stage.rmdir()
 
 
+def is_finished(folder: Path, shard: int) -> bool:
+    """Whether a shard has a done.json."""
+    return (folder / SHARDS / shard_name(shard) / DONE).is_file()
+
+
 def finished(folder: Path) -> set[int]:
-    """The shards that are complete."""
+    """The shards that have a done.json."""
     place = folder / SHARDS
     if not place.is_dir():
         return set()
@@ -144,35 +182,83 @@ def finished(folder: Path) -> set[int]:
 
 
 def read_done(folder: Path, shard: int) -> dict[str, Any]:
-    """A finished shard's done.json; raises `InputError` for what is none."""
+    """A finished shard's done.json, every key of its type; raises `InputError` for what is none."""
     path = folder / SHARDS / shard_name(shard) / DONE
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise InputError("is not valid JSON", source=str(path)) from None
-    if not isinstance(data, dict) or data.get("schema") != SHARD_SCHEMA:
+    data = read_json(path, limit=MAX_FILE_BYTES, follow=False)
+    if data.get("schema") != SHARD_SCHEMA:
         raise InputError(f"must have the schema {SHARD_SCHEMA!r}", source=str(path))
+    for key, fits in _DONE_KEYS.items():
+        if not fits(data.get(key)):
+            raise InputError("is missing or not as this version writes it", source=str(path), path=key)
     return data
 
 
-def check_finished(folder: Path, shard: int) -> None:
-    """Raise where a finished shard's files are not all there with their sizes; it is never rendered again by itself."""
-    for name, entry in read_done(folder, shard)["files"].items():
-        path = folder / name
-        if not path.is_file() or path.stat().st_size != entry["bytes"]:
-            raise EyerenderError(
-                f"{path}: missing or cut short in a finished shard; remove "
-                f"{folder / SHARDS / shard_name(shard)} to have the shard made again"
-            )
+def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
+    """What is wrong with a finished shard: its done.json, and its files against their sizes and SHA-256.
+
+    Args:
+        folder: the dataset.
+        shard: a shard that is said to be finished.
+        digest: of the plan that the shard must be made by; any where it is None.
+        quick: compare sizes only.
+    """
+    name = shard_name(shard)
+    try:
+        done = read_done(folder, shard)
+    except InputError as error:
+        yield f"{SHARDS}/{name}/{DONE}: {error.path}{': ' if error.path else ''}{error.reason}"
+        return
+    if done["shard"] != shard or digest not in (None, done["digest"]):
+        yield f"{SHARDS}/{name}/{DONE}: is of another {'spec' if done['shard'] == shard else 'shard'}"
+        return
+    places = tuple(f"{kind}/{name}/" for kind in (*KINDS, SHARDS))
+    if f"{SHARDS}/{name}/{LINES}" not in done["files"] or not all(n.startswith(places) for n in done["files"]):
+        yield f"{SHARDS}/{name}/{DONE}: files: are not those of this shard"
+        return
+    yield from compare_sums(folder, done["files"], quick=quick)
+
+
+def compare_sums(folder: Path, sums: Mapping[str, Mapping[str, Any]], *, quick: bool = False) -> Iterator[str]:
+    """What is wrong with files of a folder, whose sizes and SHA-256 are given by name; `quick` compares sizes only."""
+    for name, entry in sums.items():
+        try:
+            path = inside(folder, name)
+            size = path.stat().st_size
+            if size != entry["bytes"]:
+                yield f"{name}: has {size} bytes, not {entry['bytes']}"
+            elif not quick and checksum(path) != entry["sha256"]:
+                yield f"{name}: its checksum differs"
+        except InputError as error:
+            yield error.reason
+        except OSError as error:
+            yield f"{name}: cannot be read ({error.strerror or error})"
+
+
+def withdraw_damaged(folder: Path, shards: Iterable[int], digest: str) -> dict[int, str]:
+    """Verify finished shards; those that are damaged or of another plan lose their done.json, so they are made again.
+
+    Returns:
+        The shards withdrawn, with the first thing that is wrong with each.
+
+    Raises:
+        OSError: a done.json cannot be removed.
+    """
+    damaged = {}
+    for shard in shards:
+        problem = next(verify(folder, shard, digest), None)
+        if problem is not None:
+            damaged[shard] = problem
+            remove_file(folder / SHARDS / shard_name(shard) / DONE)
+    return damaged
 
 
 def remove_leftovers(folder: Path, mine: set[int], done: set[int]) -> None:
-    """Remove what killed runs left of shards that this run is to make."""
+    """Remove what ended runs left of shards that this run is to make."""
     for stage in folder.glob(f"{STAGE}*"):
         number = stage.name.removeprefix(STAGE).split("-")[0]
         if number.isdigit() and int(number) in mine:
             shutil.rmtree(stage, ignore_errors=True)
-    for kind in KINDS:
+    for kind in (*KINDS, SHARDS):
         if (folder / kind).is_dir():
             for place in (folder / kind).iterdir():
                 if place.name.isdigit() and int(place.name) in mine - done:
@@ -183,6 +269,11 @@ def checksum(path: Path) -> str:
     """SHA-256 of a file."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sum_of(path: Path) -> dict[str, Any]:
+    """Size and SHA-256 of a file."""
+    return {"bytes": path.stat().st_size, "sha256": checksum(path)}
 
 
 def run_versions() -> dict[str, str]:
@@ -229,7 +320,7 @@ def _checksums(stage: Path, shard: int, kinds: tuple[str, ...]) -> dict[str, dic
     out = {}
     for kind in kinds:
         for path in sorted((stage / kind).iterdir()):
-            out[_place(kind, shard, path.name)] = {"bytes": path.stat().st_size, "sha256": checksum(path)}
+            out[_place(kind, shard, path.name)] = sum_of(path)
     path = stage / "shard" / LINES
-    out[_place(SHARDS, shard, LINES)] = {"bytes": path.stat().st_size, "sha256": checksum(path)}
+    out[_place(SHARDS, shard, LINES)] = sum_of(path)
     return out

@@ -110,13 +110,6 @@ def test_a_finished_shard_is_never_made_again(tiny, tmp_path):
     assert make(folder, plan())["shards_made"] == 0
 
 
-def test_a_damaged_finished_shard_is_told(tiny, tmp_path):
-    folder = shutil.copytree(tiny, tmp_path / "copy")
-    next((folder / "images" / "00001").iterdir()).unlink()
-    with pytest.raises(EyerenderError, match=r"finished shard; remove .*00001"):
-        make(folder, plan())
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -198,6 +191,31 @@ def test_a_shard_is_given_up_after_three_tries(tmp_path):
     assert lost == {1: "the worker was ended by SIGKILL"}
     assert sorted(listener.made) == [0, 2]
     assert len(listener.retries) == 3
+
+
+class Troubled(LocalPool):
+    """A pool of one worker, some of whose starts are deadly."""
+
+    def __init__(self, folder, deadly):
+        made = plan(shard_size=1)
+        super().__init__(Job.of(made, frames_of(made), folder, "auto", 1), 1, recycle_images=1)
+        self.deadly = deadly
+        self.starts = 0
+
+    def _start(self):
+        super()._start()
+        self.starts += 1
+        if self.starts in self.deadly:
+            self._workers[-1].process.kill()
+
+
+def test_only_deaths_one_after_the_other_end_a_run(tmp_path):
+    listener = Listener()
+    assert Troubled(tmp_path, (1, 2, 4, 5)).run([0, 1], listener) == {}
+    assert listener.made == [0, 1]
+    assert listener.retries == [(-1, "the worker was ended by SIGKILL")] * 4
+    with pytest.raises(EyerenderError, match="workers do not start: the worker was ended by SIGKILL"):
+        Troubled(tmp_path, (1, 2, 3)).run([0], listener)
 
 
 @pytest.mark.slow

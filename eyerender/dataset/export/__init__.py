@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...files import write_json, write_text
 from ...imagefolder import DATASET, ImageFolder, staged
+from ..assemble import verify_dataset
 from . import coco, ellseg, openeds, table, teyed, webdataset
 from .card import export_card
 from .encoding import SAMPLED, Curve, Encoding, check, measured_gain
@@ -62,7 +63,8 @@ def export(
         progress: called with images done, images in all and "".
 
     Raises:
-        InputError: no such layout or encoding, no generated dataset, or OUT is taken.
+        InputError: no such layout or encoding, no generated dataset, a file that its checksum does not fit, or OUT is
+            taken.
         EyerenderError: OUT cannot be written.
     """
     if format not in FORMATS:
@@ -73,6 +75,8 @@ def export(
     folder = ImageFolder.load(path)
     if folder.dataset.get("kind") != "dataset":
         raise InputError("is no generated dataset (no kind: dataset)", source=str(Path(path) / DATASET))
+    for problem in verify_dataset(folder.path):
+        raise InputError(f"{problem}; start generate again on the folder to repair it", source=str(path))
     total = len(folder.entries)
     with staged(out, overwrite=overwrite) as stage:
 

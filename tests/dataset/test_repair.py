@@ -1,0 +1,237 @@
+"""Damaged folders: resuming finds what is wrong and makes it again by itself; nothing damaged is exported."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+from dataset_specs import make, plan, tree
+
+from eyerender.cli.app import run
+from eyerender.dataset.assemble import damage, verify_dataset
+from eyerender.dataset.shard import verify
+from eyerender.errors import InputError
+
+pytestmark = pytest.mark.render
+
+
+def repairs(folder):
+    """What the log says of repairs."""
+    entries = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    return [entry["what"] for entry in entries if entry["event"] == "repair"]
+
+
+def first(folder, kind, shard):
+    return sorted((folder / kind / f"{shard:05d}").iterdir())[0]
+
+
+def change_digit(path):
+    """Change one digit of a text."""
+    text = path.read_text()
+    at = next(k for k in range(len(text) // 2, len(text)) if text[k] in "123")
+    path.write_text(text[:at] + str(int(text[at]) + 1) + text[at + 1 :])
+
+
+def flip_byte(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def edit_done(folder, number, **changes):
+    path = folder / "shards" / f"{number:05d}" / "done.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def test_damaged_shards_are_made_again(tiny, tmp_path):
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    first(folder, "images", 0).unlink()
+    flip_byte(first(folder, "masks", 1))
+    change_digit(folder / "shards" / "00002" / "lines.jsonl")
+    first(folder, "images", 3).write_bytes(b"")
+    edit_done(folder, 4, digest="0" * 64)
+    (folder / "shards" / "00005" / "done.json").write_bytes(b"")
+    shutil.copy(folder / "shards" / "00006" / "done.json", folder / "shards" / "00007" / "done.json")
+    with open(folder / "log.jsonl", "a") as file:
+        file.write('{"time": "20')  # cut short
+    done = make(folder, plan())
+    assert done["shards_made"] == 7
+    assert tree(folder) == tree(tiny)
+    lines = (folder / "log.jsonl").read_text().splitlines()
+    assert lines.count('{"time": "20') == 1
+    words = {
+        0: "no such file",
+        1: "its checksum differs",
+        2: "lines.jsonl: its checksum differs",
+        3: "has 0 bytes",
+        4: "is of another spec",
+        5: "is not valid JSON",
+        7: "is of another shard",
+    }
+    found = [json.loads(line)["what"] for line in lines if '"repair"' in line]
+    for what, (shard, word) in zip(found, words.items(), strict=True):
+        assert what.startswith(f"shard {shard} is made again: ")
+        assert word in what
+        assert f"repairing: {what}" in done["said"]
+    assert list(verify_dataset(folder)) == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param(None, id="missing"),
+        pytest.param(b"", id="empty"),
+        pytest.param(b"\0" * 100, id="zeros"),
+        pytest.param(b'{"schema": "eyerender/', id="cut-short"),
+    ],
+)
+@pytest.mark.parametrize("name", ["run.json", "dataset.json", "metadata.jsonl"])
+def test_damaged_files_of_the_dataset_are_written_again(tiny, tmp_path, name, content):
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    (folder / name).unlink()
+    if content is not None:
+        (folder / name).write_bytes(content)
+    done = make(folder, plan())
+    assert done["shards_made"] == 0
+    assert tree(folder) == tree(tiny)
+    assert len(repairs(folder)) == 1
+    assert name in repairs(folder)[0]
+    assert done["said"] == [f"repairing: {repairs(folder)[0]}"]
+
+
+@pytest.mark.parametrize("content", [None, ""])
+def test_a_damaged_run_file_lets_no_other_spec_in(tiny, tmp_path, content):
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    (folder / "run.json").unlink()
+    if content is not None:
+        (folder / "run.json").write_text(content)
+    before = tree(folder)
+    with pytest.raises(InputError, match="holds a run of another spec"):
+        make(folder, plan(seed=6))
+    assert tree(folder) == before
+    for shard in range(8):
+        edit_done(folder, shard, versions={"mitsuba": "0.1"})
+    with pytest.raises(InputError, match=r"versions.mitsuba: .0.1. -> "):
+        make(folder, plan())
+    assert tree(folder) == before
+
+
+def test_a_run_starts_over_where_nothing_tells_what_it_was(tmp_path):
+    (tmp_path / "run.json").write_bytes(b"")
+    (tmp_path / "log.jsonl").write_bytes(b"\0\0\0")
+    (tmp_path / "images" / "00007").mkdir(parents=True)
+    (tmp_path / "shards" / "00000").mkdir(parents=True)
+    (tmp_path / "shards" / "00000" / "done.json").write_bytes(b"")
+    done = make(tmp_path, plan(count=1, subjects=1, shard_size=1))
+    assert done["complete"]
+    assert len(done["said"]) == 1
+    assert done["said"][0].startswith("repairing: the run starts over: run.json: ")
+    assert [p.name for p in (tmp_path / "images").iterdir()] == ["00000"]
+    assert list(verify_dataset(tmp_path)) == []
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["run.json", "thesis.txt", "log.jsonl"],
+        ["run.json", "README.md"],
+        ["run.json", "log.jsonl", "images/holiday.png"],
+        ["images/00001/a.png", "metadata.jsonl", "dataset.json"],
+        ["images/00001/a.png"],
+        ["shards/00001/lines.jsonl", "metadata.jsonl"],
+    ],
+)
+def test_folders_that_may_be_someone_elses_are_left_alone(tmp_path, names):
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("")
+    before = tree(tmp_path)
+    with pytest.raises(InputError, match="is not empty; give another folder or --overwrite"):
+        make(tmp_path, plan())
+    assert tree(tmp_path) == before
+
+
+def test_a_run_file_of_something_else_is_refused(tmp_path):
+    (tmp_path / "run.json").write_text('{"schema": "other/1"}')
+    with pytest.raises(InputError, match="does not describe a run of this version"):
+        make(tmp_path, plan())
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"schema": "eyerender/shard/9"}, "must have the schema"),
+        ({"files": None}, "files: is missing"),
+        ({"files": {}}, "files: are not those of this shard"),
+        ({"files": {"../run.json": {"bytes": 1, "sha256": ""}}}, "files: are not those of this shard"),
+        ({"files": {"images/00001/a.png": {"bytes": "1", "sha256": ""}}}, "files: is missing or not as"),
+        ({"samples": [1]}, "samples: is missing"),
+        ({"backend": {"name": 1}}, "backend: is missing"),
+        ({"shard": 3}, "is of another shard"),
+        ({"digest": "0"}, "is of another spec"),
+    ],
+)
+def test_a_wrong_done_file_is_told(tiny, tmp_path, changes, words):
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    edit_done(folder, 1, **changes)
+    found = list(verify(folder, 1, plan().digest))
+    assert len(found) == 1
+    assert found[0].startswith("shards/00001/done.json: ")
+    assert words in found[0]
+
+
+def test_links_are_not_followed(tiny, tmp_path):
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    image = first(folder, "images", 1)
+    image.rename(tmp_path / "away.png")
+    image.symlink_to(tmp_path / "away.png")
+    assert "a symbolic link" in next(verify(folder, 1))
+
+
+def test_a_quick_check_compares_sizes(tiny, tmp_path):
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    flip_byte(first(folder, "images", 1))
+    change_digit(folder / "metadata.jsonl")
+    assert list(verify_dataset(folder, quick=True)) == []
+    assert len(list(verify_dataset(folder))) == 2
+
+
+@pytest.mark.parametrize("name", ["metadata.jsonl", "shards/00002/lines.jsonl", "masks", "shards/00002/done.json"])
+def test_nothing_damaged_is_exported(tiny, tmp_path, capsys, name):
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    if name == "masks":
+        flip_byte(first(folder, "masks", 2))
+    elif name.endswith("done.json"):
+        (folder / name).unlink()
+    else:
+        change_digit(folder / name)
+    assert run(["export-dataset", str(folder), str(tmp_path / "out"), "--format", "csv"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    assert name in err
+    assert "start generate again on the folder to repair it" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_folders_of_older_versions_have_their_metadata_compared_with_the_shards(tiny, tmp_path):
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    dataset = json.loads((folder / "dataset.json").read_text())
+    del dataset["checksums"]
+    (folder / "dataset.json").write_text(json.dumps(dataset))
+    assert list(verify_dataset(folder)) == []
+    change_digit(folder / "metadata.jsonl")
+    assert list(damage(folder)) == ["metadata.jsonl: differs from the shards"]
+
+
+def test_a_part_withdraws_what_is_damaged_in_another(tiny, tmp_path):
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    flip_byte(first(folder, "images", 1))
+    done = make(folder, plan(), part=(1, 2))
+    assert not done["complete"]
+    assert done["shards_missing"] == 1
+    assert done["said"][0].startswith("repairing: shard 1 is made again: images/00001/")
+    assert not (folder / "dataset.json").exists()
+    assert make(folder, plan(), part=(2, 2))["complete"]
+    assert tree(folder) == tree(tiny)
