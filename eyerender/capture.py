@@ -15,7 +15,7 @@ from .arrays import Floats
 from .errors import InputError
 from .eye.model import Eye
 from .eye.pose import Poses, rigid_motion
-from .imagefile import write_png
+from .imagefile import MAX_PIXELS, write_png
 from .imagefolder import refuse_non_empty, staged, write_dataset
 from .observation import EYES, Observations
 from .scene import Scene
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int, str], None]
 BackendName = Literal["auto", "cuda", "llvm"]
+# Of one image: a day's work of a fast processor.
+MAX_SAMPLES = 10**12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,6 +152,17 @@ def check_windows(scene: Scene) -> None:
     """Raise `InputError` for a scene whose eyes cannot be rendered."""
     if scene.spec.image.window_px is None and len(scene.spec.subject.eyes) > 1:
         raise InputError("missing; both eyes are rendered in a window each", path="image.window_px")
+    spp = scene.spec.image.spp
+    for i, camera in enumerate(scene.rig.cameras):
+        width, height = scene.spec.image.window_px or camera.resolution_px
+        if width * height > MAX_PIXELS:
+            what = "image.window_px" if scene.spec.image.window_px else f"rig.cameras.{i}.resolution_px"
+            raise InputError(f"{width} x {height} pixels are too many to render; at most {MAX_PIXELS}", path=what)
+        if width * height * spp > MAX_SAMPLES:
+            raise InputError(
+                f"{width} x {height} pixels with {spp} samples each are more than {MAX_SAMPLES:.0e} samples",
+                path="image.spp",
+            )
 
 
 def make_renderer(backend: BackendName = "auto", threads: int | None = None) -> Renderer:

@@ -100,10 +100,12 @@ class GlintFeatures(ArrayValue):
 
     def of_light(self, light: int) -> tuple[Floats, Bools]:
         """Place (n, 2) of one light's glint, and where it was found (n,)."""
+        n, m = self.light.shape
+        if m == 0:
+            return np.full((n, 2), np.nan), np.zeros(n, dtype=bool)
         here = (self.light == light) & self.ok
         found = here.any(axis=1)
-        at = here.argmax(axis=1)
-        xy = self.xy_px[np.arange(len(at)), at] if self.light.shape[1] else np.full((len(found), 2), np.nan)
+        xy = self.xy_px[np.arange(n), here.argmax(axis=1)]
         return np.where(found[:, None], xy, np.nan), found
 
 

@@ -31,6 +31,10 @@ from .spec import FileSpec, Positive, Spec, Vec2, Vec3, file_digest, read_yaml
 
 DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
+# An observation is one eye in one frame. Analysing this many takes about 1 GB of memory, their records some 2 GB.
+MAX_OBSERVATIONS = 200_000
+# Glints of all observations, which have a status and a reason each.
+MAX_GLINTS = 5_000_000
 
 
 class EyeChoiceSpec(Spec):
@@ -124,6 +128,7 @@ class SceneSpec(FileSpec):
             raise ValueError("give either targets or poses")
         if self.targets is not None and self.targets.world_mm is None and self.rig.screen is None:
             raise ValueError("targets on a screen need rig.screen")
+        self._check_size()
         if self.image.window_px is not None:
             for i, camera in enumerate(self.rig.cameras):
                 if any(w > r for w, r in zip(self.image.window_px, camera.resolution_px, strict=True)):
@@ -140,6 +145,27 @@ class SceneSpec(FileSpec):
                 "is an eye file, not a scene; give it with --eye, or as 'eye.model' of a scene", source=source
             )
         return super().from_mapping(data, source=source)
+
+    def _check_size(self) -> None:
+        targets = self.targets
+        if targets is None:
+            fixations = len(self.poses or ())
+        elif targets.grid is not None:
+            fixations = targets.grid[0] * targets.grid[1]
+        else:
+            fixations = len(targets.screen_mm or targets.world_mm or ())
+        heads, cameras, eyes = len(self.subject.head_positions_mm), len(self.rig.cameras), len(self.subject.eyes)
+        count = fixations * heads * cameras * eyes
+        if count > MAX_OBSERVATIONS:
+            raise ValueError(
+                f"{fixations} fixations, {heads} head positions, {cameras} cameras and {eyes} eyes make {count} "
+                f"observations; a scene may have {MAX_OBSERVATIONS}"
+            )
+        lights = self.rig.light_count
+        if count * lights > MAX_GLINTS:
+            raise ValueError(
+                f"{count} observations of {lights} lights make {count * lights} glints; a scene may have {MAX_GLINTS}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -310,6 +336,7 @@ class Scene:
                     if self.spec.image.window_px is None:
                         continue
                     (u, v), front = camera.project(self.eye_position_mm(side) + np.array(head))
+                    front = front and np.isfinite(u) and np.isfinite(v)  # beside the camera distortion can overflow
                     ww, wh = self.spec.image.window_px
                     x0 = int(np.floor((u if front else (w - 1) / 2) - (ww - 1) / 2 + 0.5))
                     y0 = int(np.floor((v if front else (h - 1) / 2) - (wh - 1) / 2 + 0.5))

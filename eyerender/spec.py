@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from .errors import InputError
 from .files import opened, read_text, shown
@@ -26,10 +26,22 @@ MAX_YAML_BYTES, MAX_YAML_NODES, MAX_YAML_DEPTH = 2 * 2**20, 100_000, 64
 # Python needs time with the square of an integer's digits.
 _LONGEST_NUMBER = 300
 
-Vec2 = tuple[float, float]
-Vec3 = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
+# Lengths are in mm, and a light at 1,000 km is infinitely far away for every purpose here. Fourth powers of numbers
+# within these limits still fit into single precision, which the renderer computes in.
+LARGEST, SMALLEST = 1e9, 1e-9
+
+
+def _not_tiny(value: float) -> float:
+    if value < SMALLEST:
+        raise ValueError(f"must be >= {SMALLEST:g}")
+    return value
+
+
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Vec2 = tuple[Number, Number]
+Vec3 = tuple[Number, Number, Number]
+Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
+NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 
 
 class Spec(BaseModel):

@@ -132,6 +132,15 @@ def test_concatenate_fills_up_to_the_widest():
     assert [len(r["glints"]) for r in both.records()] == [2, 2, 3, 3, 3, 2]
 
 
+def test_glint_of_light_where_no_image_has_a_glint():
+    some = observations()
+    rows = [{**record, "glints": []} for record in some.records()]
+    xy, found = Observations.from_records(rows).glints.of_light(0)
+    assert xy.shape == (4, 2)
+    assert np.isnan(xy).all()
+    assert not found.any()
+
+
 def test_glint_of_light():
     a = observations()
     xy, found = a.glints.of_light(0)

@@ -32,6 +32,8 @@ CHUNK_POINTS = 12000
 """Points refracted at once: fewer leave the time to the interpreter, more leave the cache (measured: 8,000 to
 20,000).
 """
+MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 20_000_000
+"""Boundary points of one pupil (ten a degree), and of all pupils together, which take 25 bytes each."""
 BEHIND_CAMERA = 100
 """Status beside those of `RayStatus`: the point lies behind the camera."""
 
@@ -116,6 +118,14 @@ def features(
     """
     if boundary_points < 6:
         raise InputError("must be >= 6", path="boundary_points")
+    if boundary_points > MAX_BOUNDARY_POINTS:
+        raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", path="boundary_points")
+    if len(np.atleast_1d(eye_index)) * boundary_points > MAX_POINTS:
+        raise InputError(
+            f"{len(np.atleast_1d(eye_index))} observations with {boundary_points} points each are more than "
+            f"{MAX_POINTS} points; ask for fewer",
+            path="boundary_points",
+        )
     if not set(purkinje) <= {1, 2, 3, 4} or len(set(purkinje)) != len(purkinje):
         raise InputError("must be different numbers from 1 to 4", path="purkinje")
     which = np.asarray(eye_index, dtype=np.intp)

@@ -23,6 +23,9 @@ from ..spec import Positive, Spec
 
 Unit = Literal["sample", "subject"]
 MARK = "draw"
+# Cauchy's coefficients of an eye's media are the largest numbers that may be drawn, seeds the largest integers.
+Drawn = Annotated[float, Field(ge=-1e20, le=1e20)]
+Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
 
 class _Draw(Spec):
@@ -30,8 +33,8 @@ class _Draw(Spec):
 
 
 class _RangeDraw(_Draw):
-    low: float
-    high: float
+    low: Drawn
+    high: Drawn
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -57,15 +60,15 @@ class IntegerDraw(_RangeDraw):
     """A whole number from low to high, both included."""
 
     draw: Literal["integer"]
-    low: int
-    high: int
+    low: Whole
+    high: Whole
 
 
 class NormalDraw(_RangeDraw):
     """A normal distribution cut off at `low` and `high` and scaled to 1 in between."""
 
     draw: Literal["truncated_normal"]
-    mean: float
+    mean: Drawn
     sd: Positive
 
 
@@ -74,7 +77,7 @@ class ChoiceDraw(_Draw):
 
     draw: Literal["choice"]
     values: Annotated[tuple[Any, ...], Field(min_length=1)]
-    weights: tuple[Annotated[float, Field(ge=0)], ...] | None = None
+    weights: tuple[Annotated[float, Field(ge=0, le=1e20)], ...] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -90,8 +93,8 @@ class GridDraw(_Draw):
     """Evenly spaced numbers or given values, gone through in order; several grids form their full product."""
 
     draw: Literal["grid"]
-    low: float | None = None
-    high: float | None = None
+    low: Drawn | None = None
+    high: Drawn | None = None
     steps: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     values: Annotated[tuple[Any, ...], Field(min_length=1)] | None = None
 
@@ -105,13 +108,17 @@ class GridDraw(_Draw):
         return self
 
     @property
-    def points(self) -> tuple[Any, ...]:
-        """The values in order."""
+    def size(self) -> int:
+        """How many values there are."""
+        return len(self.values) if self.values is not None else self.steps or 1
+
+    def point(self, k: int) -> Any:
+        """The k-th value."""
         if self.values is not None:
-            return self.values
+            return self.values[k]
         if self.low is None or self.high is None or self.steps is None or self.steps == 1:
-            return (self.low,)
-        return tuple(self.low + (self.high - self.low) * (k / (self.steps - 1)) for k in range(self.steps))
+            return self.low
+        return self.low + (self.high - self.low) * (k / (self.steps - 1))
 
 
 class SobolDraw(_RangeDraw):

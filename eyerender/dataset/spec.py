@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from ..errors import InputError
 from ..scene import DATASET_KIND, NOT_A_DATASET, is_shipped_dataset, refuse_folder, shipped_files
-from ..spec import FileSpec, Spec
+from ..spec import FileSpec, Positive, Spec
 
 _SPLIT = re.compile(r"[a-z][a-z0-9]*")
 
@@ -44,7 +44,7 @@ class DatasetSpec(FileSpec):
     subjects: Annotated[int, Field(ge=1, le=10**9)] | None = Field(
         default=None, description="identities; each has a run of consecutive samples; default: one a sample"
     )
-    splits: dict[str, Annotated[float, Field(gt=0)]] = Field(
+    splits: dict[str, Positive] = Field(
         default={"train": 1.0}, description="name -> share of the subjects; shares are scaled to 1"
     )
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0

@@ -35,6 +35,8 @@ PASSING = ("region.blink",)
 # An eye does not change from frame to frame, whatever the draw says.
 FIXED_IDENTITY = ("eye.model", "eye.margin", "eye_parameters")
 _BLOCK = 256
+# Each becomes a column of the run, and all Sobol draws together one sequence of as many dimensions.
+MAX_DRAWS = 1000
 _CHOSEN = re.compile(r"#\d+")
 
 
@@ -103,7 +105,7 @@ class Template:
             return draw.values[k], k
         if isinstance(draw, GridDraw):
             k = self._grid_index(path, unit, number)
-            return draw.points[k], k
+            return draw.point(k), k
         if isinstance(draw, SobolDraw) and attempt == 0:
             dimensions = [p for p, d in self.draws.items() if isinstance(d.draw, SobolDraw) and d.unit == unit]
             points = sobol_block(self.seed, unit, len(dimensions), number // _BLOCK)
@@ -117,7 +119,7 @@ class Template:
         """The place in one grid of the full product, of which the last grid (by name) turns fastest."""
         grids = [(p, d.draw) for p, d in self.draws.items() if isinstance(d.draw, GridDraw) and d.unit == unit]
         for name, grid in reversed(grids):
-            size = len(grid.points)
+            size = grid.size
             if name == path:
                 return number % size
             number //= size
@@ -136,10 +138,10 @@ def _label(draw: Draw, value: Any, k: int) -> Any:
     """How a drawn value is recorded, of one type for every sample: the value, or which it is of unlike ones."""
     if isinstance(draw, FixedDraw):
         every: tuple[Any, ...] = (draw.value,)
-    elif isinstance(draw, ChoiceDraw | SequenceDraw):
-        every = draw.values
-    elif isinstance(draw, GridDraw):
-        every = draw.points
+    elif isinstance(draw, GridDraw) and draw.values is None:
+        return float(value)
+    elif isinstance(draw, ChoiceDraw | SequenceDraw | GridDraw):
+        every = draw.values or ()
     else:
         return value
     if all(isinstance(v, str) for v in every) or all(isinstance(v, bool) for v in every):
@@ -173,6 +175,8 @@ def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, pr
         if isinstance(draw, SequenceDraw) and unit == "subject":
             raise InputError("a sequence runs over the frames of a subject", source=source, path=shown)
         draws[path] = PlacedDraw(draw, unit)
+        if len(draws) > MAX_DRAWS:
+            raise InputError(f"holds more than {MAX_DRAWS} draws", source=source, path=prefix)
         inner: tuple[Any, ...] = ()
         if isinstance(draw, FixedDraw):
             inner = (draw.value,)

@@ -19,6 +19,7 @@ from ..optics.media import CauchyMedium, ConstantMedium, Medium
 from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
 from .model import Eye, LineOfSight, RotationCentres, Sphere, Stop
 from .spec import (
+    LARGEST_INDEX,
     BiconicSpec,
     ConicSpec,
     EllipsoidSpec,
@@ -141,8 +142,10 @@ def medium_of(spec: MediumSpec) -> Medium:
 def index_at(spec: MediumSpec, wavelength_nm: float, path: str) -> float:
     """The index at a wavelength; raises `InputError` below 1."""
     index = medium_of(spec).index(wavelength_nm)
-    if not index >= 1.0:
-        raise InputError(f"the index at {wavelength_nm:g} nm is {index:.6g}; must be >= 1", path=path)
+    if not 1.0 <= index <= LARGEST_INDEX:
+        raise InputError(
+            f"the index at {wavelength_nm:g} nm is {index:.6g}; must be >= 1 and <= {LARGEST_INDEX:g}", path=path
+        )
     return index
 
 

@@ -13,10 +13,17 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import Discriminator, Field, Tag
 
 from ..geometry.transforms import TiltOrder
-from ..spec import FileSpec, Positive, Spec, Vec2, Vec3
+from ..spec import FileSpec, Number, Positive, Spec, Vec2, Vec3
 
 if TYPE_CHECKING:
     from .model import Eye
+
+# As many surfaces as the finest lens of shells has.
+MAX_SURFACES = 400
+# Germanium's, of all that is transparent somewhere in the infrared the highest, is 4.
+LARGEST_INDEX = 5.0
+# Cauchy's coefficients grow with the sixth power of nanometres.
+Coefficient = Annotated[float, Field(ge=-1e20, le=1e20)]
 
 Side = Literal["right", "left"]
 Facing = Literal["front", "back"]
@@ -26,15 +33,15 @@ class SphereSpec(Spec):
     """y^2 + z^2 + 2 R s + s^2 = 0 from the apex; R > 0 opens to -x (cornea), R < 0 to +x (lens back, retina)."""
 
     kind: Literal["sphere"]
-    radius_mm: float
+    radius_mm: Number
 
 
 class ConicSpec(Spec):
     """y^2 + z^2 + 2 R s + (1 + Q) s^2 = 0 from the apex, on the sheet that holds the apex."""
 
     kind: Literal["conic"]
-    radius_mm: float
-    conic_constant: float
+    radius_mm: Number
+    conic_constant: Number
 
 
 class BiconicSpec(Spec):
@@ -60,7 +67,7 @@ class QuadricSpec(Spec):
     """
 
     kind: Literal["quadric"]
-    coefficients: tuple[float, float, float, float, float, float, float, float, float, float]
+    coefficients: tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number, Number]
     side: Facing = "front"
 
 
@@ -93,8 +100,8 @@ ShapeSpec = Annotated[
 class MediumSpec(Spec):
     """A constant `index`, or `cauchy` = (c0, c1, c2, c3): n = c0 + c1/l^2 + c2/l^4 + c3/l^6, l in nm."""
 
-    index: float | None = Field(default=None, ge=1.0)
-    cauchy: tuple[float, float, float, float] | None = None
+    index: float | None = Field(default=None, ge=1.0, le=LARGEST_INDEX)
+    cauchy: tuple[Coefficient, Coefficient, Coefficient, Coefficient] | None = None
 
 
 class PlacedSpec(Spec):
@@ -118,7 +125,7 @@ class SurfaceLensSpec(Spec):
     """A lens of homogeneous media; the last medium is the vitreous."""
 
     kind: Literal["surfaces"]
-    surfaces: tuple[SurfaceSpec, ...] = Field(min_length=1)
+    surfaces: tuple[SurfaceSpec, ...] = Field(min_length=1, max_length=MAX_SURFACES)
 
 
 class GradientLensSpec(Spec):
@@ -165,8 +172,8 @@ class ContourSpec(Spec):
     (Wyatt 1995, "The form of the human pupil", Vision Res. 35, 2021-2036). The shorter list is continued by zeros.
     """
 
-    cosines: tuple[float, ...] = Field(default=(), max_length=32)
-    sines: tuple[float, ...] = Field(default=(), max_length=32)
+    cosines: tuple[Number, ...] = Field(default=(), max_length=32)
+    sines: tuple[Number, ...] = Field(default=(), max_length=32)
 
 
 class StopSpec(Spec):
@@ -181,7 +188,7 @@ class StopSpec(Spec):
     position_mm: Vec3
     tilt_deg: Vec3 = (0.0, 0.0, 0.0)
     ellipticity: float = Field(default=0.0, ge=0.0, lt=1.0)
-    axis_deg: float = 0.0
+    axis_deg: Number = 0.0
     shift_mm_per_mm: Vec2 = (0.0, 0.0)
     contour: ContourSpec | None = None
 
@@ -224,7 +231,9 @@ class EyeSpec(FileSpec):
 
     name: str
     description: str = ""
-    cornea: tuple[SurfaceSpec, ...] = Field(min_length=1, description="surfaces between air and the stop")
+    cornea: tuple[SurfaceSpec, ...] = Field(
+        min_length=1, max_length=MAX_SURFACES, description="surfaces between air and the stop"
+    )
     lens: LensSpec | None = None
     retina: PlacedSpec
     stop: StopSpec

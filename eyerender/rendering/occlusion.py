@@ -68,12 +68,14 @@ def visible_arcs_deg(part: NDArray[np.uint8], pupil: int, points_px: Floats, ori
 
 def lid_margins_px(region: RegionMesh, camera: Camera, anchor_mm: Floats) -> dict[str, list[list[float]]] | None:
     """Landmarks along the inner edges of both margins, canthus to canthus from temple to nose, full-sensor pixels; None
-    for a mesh of which none are known."""
+    for a mesh of which none are known, and where one of them lies behind the camera."""
     if len(region.upper_margin) == 0:
         return None
     out = {}
     for name, margin in (("upper", region.upper_margin), ("lower", region.lower_margin)):
         marks = margin[np.linspace(0, len(margin) - 1, _MARKS).round().astype(int)] + anchor_mm
-        xy, _ = camera.project(marks)
+        xy, front = camera.project(marks)
+        if not np.all(front):
+            return None
         out[name] = np.round(xy, 4).tolist()
     return out

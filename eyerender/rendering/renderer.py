@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Floats, frozen
+from ..errors import InputError
 from ..rig import defocus, exposure, psf
 from .film import Exposed, mean_radiance
 from .frame import RenderJob
@@ -74,6 +75,9 @@ class Renderer:
 
         `moments` are the same window at moments of the exposure: their mean is the picture, with the samples shared
         among them; labels, glints and margins are those of `job`, the middle of the exposure.
+
+        Raises:
+            InputError: numbers so extreme that the image is not finite.
         """
         spp = spp or self.spp
         if moments:
@@ -86,6 +90,8 @@ class Renderer:
             picture, mirrored, failed = self._picture(job, shown, place, spp)
         blurred = picture * defocus.vignette(job.lens, job.camera, job.window)
         irradiance = frozen(blurred * exposure.radiance_to_irradiance(job.sensor), np.float32)
+        if not np.all(np.isfinite(irradiance)):
+            raise InputError("numbers of the scene are too extreme: its image is not finite")
         # Of the irradiance as it is given away, so that exposing that again gives the same counts.
         dn = exposure.expose(job.sensor, irradiance.astype(float), job.wavelength_nm, job.seed)
         margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
 from ..arrays import ArrayValue, Bools, Floats, frozen
-from ..spec import Positive, Spec, Vec2, Vec3
+from ..spec import Number, Positive, Spec, Vec2, Vec3
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
-Distortion = tuple[float, float, float, float, float]
+Distortion = tuple[Number, Number, Number, Number, Number]
 Pixels = Annotated[int, Field(gt=0, le=65536)]
 
 # Columns: the camera's right, down and forward axes at rest, in the world (x to the screen, y to the left, z up).
@@ -54,9 +54,9 @@ class CameraSpec(Spec):
     resolution_px: tuple[Pixels, Pixels] = Field(description="sensor width and height")
     position_mm: Vec3 | None = Field(default=None, description="nodal point in the world")
     look_at_mm: Vec3 | None = Field(default=None, description="world point on the optical axis")
-    pan_deg: float | None = Field(default=None, description="to the subject's left of -x")
-    tilt_deg: float | None = Field(default=None, description="upwards from -x")
-    roll_deg: float = Field(default=0.0, description="the image's content turns counter-clockwise for positive roll")
+    pan_deg: Number | None = Field(default=None, description="to the subject's left of -x")
+    tilt_deg: Number | None = Field(default=None, description="upwards from -x")
+    roll_deg: Number = Field(default=0.0, description="the image's content turns counter-clockwise for positive roll")
     focal_length_px: Positive | None = None
     focal_length_mm: Positive | None = None
     sensor_mm: tuple[Positive, Positive] | None = Field(default=None, description="sensor width and height")

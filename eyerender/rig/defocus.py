@@ -15,15 +15,18 @@ import numpy as np
 from scipy import signal
 
 from ..arrays import Floats
+from ..errors import InputError
 from .camera import Camera
 from .imaging import LensSpec
 from .sensor import SensorSpec
 
 _FINE = 9
+# Nothing of an eye is left in a picture that is blurred over more, and the kernel grows with the square.
+MAX_CONFUSION_PX = 400
 
 
 def confusion_px(lens: LensSpec, camera: Camera, sensor: SensorSpec, depth_mm: float) -> float:
-    """Diameter (px) of the circle of confusion of a point at a depth along the axis."""
+    """Diameter (px) of the circle of confusion of a point at a depth along the axis; `InputError` beyond 400 px."""
     if lens.focus_mm is None:
         return 0.0
     pitch_mm = sensor.pixel_pitch_um * 1e-3
@@ -31,6 +34,11 @@ def confusion_px(lens: LensSpec, camera: Camera, sensor: SensorSpec, depth_mm: f
     if lens.focus_mm <= focal_mm or depth_mm <= focal_mm:
         return 0.0
     blur = focal_mm / sensor.f_number * abs(depth_mm - lens.focus_mm) / depth_mm * focal_mm / (lens.focus_mm - focal_mm)
+    if blur / pitch_mm > MAX_CONFUSION_PX:
+        raise InputError(
+            f"the picture would be blurred over {blur / pitch_mm:.3g} px; at most {MAX_CONFUSION_PX}",
+            path="lens.focus_mm",
+        )
     return float(blur / pitch_mm)
 
 

@@ -12,8 +12,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from ..arrays import ArrayValue, Floats, frozen
-from ..spec import NonNegative, Positive, Spec, Vec3
+from ..spec import NonNegative, Number, Positive, Spec, Vec3
 from .camera import Camera
+
+# Of a rig, those of rings counted one by one: each has a glint in every frame, with a status and a reason.
+MAX_LIGHTS = 1000
 
 
 class RingSpec(Spec):
@@ -21,8 +24,8 @@ class RingSpec(Spec):
 
     camera: Annotated[int, Field(ge=0)] = Field(default=0, description="which camera the ring surrounds")
     radius_mm: Positive = Field(description="radius of the circle")
-    count: Annotated[int, Field(ge=1, le=1000)]
-    phase_deg: float = Field(default=0.0, description="of the first LED, from the image's right towards its bottom")
+    count: Annotated[int, Field(ge=1, le=MAX_LIGHTS)]
+    phase_deg: Number = Field(default=0.0, description="of the first LED, from the image's right towards its bottom")
 
 
 class LightSpec(Spec):

@@ -10,15 +10,18 @@ from pydantic import Field, model_validator
 from ..arrays import ArrayValue
 from ..spec import Spec
 from .camera import Camera, CameraSpec
-from .light import Light, LightSpec
+from .light import MAX_LIGHTS, Light, LightSpec
 from .screen import Screen, ScreenSpec
+
+# Each has frames of its own for every target and head position.
+MAX_CAMERAS = 100
 
 
 class RigSpec(Spec):
     """What stands before the subject; it does not move with the head."""
 
-    cameras: Annotated[tuple[CameraSpec, ...], Field(min_length=1)]
-    lights: Annotated[tuple[LightSpec, ...], Field(min_length=1)]
+    cameras: Annotated[tuple[CameraSpec, ...], Field(min_length=1, max_length=MAX_CAMERAS)]
+    lights: Annotated[tuple[LightSpec, ...], Field(min_length=1, max_length=MAX_LIGHTS)]
     screen: ScreenSpec | None = None
 
     @model_validator(mode="after")
@@ -26,7 +29,14 @@ class RigSpec(Spec):
         for i, light in enumerate(self.lights):
             if light.ring is not None and light.ring.camera >= len(self.cameras):
                 raise ValueError(f"lights.{i}.ring.camera: there is no camera {light.ring.camera}")
+        if self.light_count > MAX_LIGHTS:
+            raise ValueError(f"lights: are {self.light_count} with those of the rings; at most {MAX_LIGHTS}")
         return self
+
+    @property
+    def light_count(self) -> int:
+        """How many lights there are, those of rings counted one by one."""
+        return sum(1 if light.ring is None else light.ring.count for light in self.lights)
 
     def build(self) -> Rig:
         """The numeric rig."""

@@ -7,6 +7,7 @@ import pytest
 
 from eyerender.analytic.observer import observe
 from eyerender.capture import make_renderer, render_windows
+from eyerender.errors import InputError
 from eyerender.rig.defocus import confusion_px, defocused, disc, vignette
 from eyerender.rig.imaging import LensSpec
 from eyerender.rig.sensor import SensorSpec
@@ -73,6 +74,18 @@ def test_the_circle_of_confusion_follows_similar_triangles():
     corner = vignette(LensSpec(vignetting=0.4), camera, (0, 0, 640, 480))
     assert corner[0, 0] == pytest.approx(0.6, abs=1e-9)
     assert corner[239:241, 319:321].min() > 0.9999
+
+
+def test_a_picture_of_nothing_but_blur_is_refused(renderer):
+    with pytest.raises(InputError, match=r"lens.focus_mm: the picture would be blurred over .* px; at most 400"):
+        shot(renderer, lens={"focus_mm": 26.0})
+
+
+def test_a_picture_that_is_not_finite_is_refused(renderer, tmp_path):
+    np.save(tmp_path / "sun.npy", np.full((8, 16), 1e38, np.float32))
+    ambient = {"map": {"file": str(tmp_path / "sun.npy"), "scale_w_m2_sr": 1e9}}
+    with pytest.raises(InputError, match="too extreme: its image is not finite"), np.errstate(all="ignore"):
+        shot(renderer, ambient=ambient)
 
 
 def test_defocus_keeps_energy_and_centroids(renderer):
