@@ -16,8 +16,9 @@ from .errors import InputError
 from .eye.model import Eye
 from .eye.pose import Poses, rigid_motion
 from .imagefile import MAX_PIXELS, write_png
-from .imagefolder import refuse_non_empty, staged, write_dataset
+from .imagefolder import write_dataset
 from .observation import EYES, Observations
+from .outfolder import refuse_non_empty, staged
 from .scene import Scene
 
 if TYPE_CHECKING:

@@ -1,24 +1,17 @@
-"""A folder of labelled images (docs/formats.md): metadata.jsonl, images/, masks/, dataset.json.
-
-A folder is staged and put in place when it is complete, so a run that is interrupted or runs out of disk
-leaves nothing that looks like a result.
-"""
+"""A folder of labelled images (docs/formats.md): metadata.jsonl, images/, masks/, dataset.json."""
 
 from __future__ import annotations
 
 import json
-import os
 import platform
-import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeGuard, overload
 
-from .errors import EyerenderError, InputError
-from .files import inside, is_plain, make_folder, read_json, shown, sync_folder, sync_tree, write_json
+from .errors import InputError
+from .files import inside, is_plain, read_json, shown, write_json
 from .jsonlines import JsonLines
 from .observation import EYES, Observations, concatenate, count_heads
 
@@ -241,59 +234,6 @@ def same_run(path: str | Path, digest: str) -> bool:
     return bool(
         found.get("schema") == DATASET_SCHEMA and found.get("digest") == digest and found.get("versions") == versions()
     )
-
-
-def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
-    """Raise `InputError` where an output folder holds something that is not to be replaced."""
-    folder = Path(path)
-    if folder.exists() and not folder.is_dir():
-        raise InputError("exists and is not a folder", source=str(path))
-    try:
-        busy = folder.is_dir() and any(not p.name.startswith(STAGE) for p in folder.iterdir())
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", source=str(path)) from None
-    if busy and not overwrite:
-        raise InputError("is not empty; give another folder or --overwrite", source=str(path))
-
-
-@contextmanager
-def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A folder to write into, inside `path`, whose content takes its place only when the block ends well.
-
-    `dataset.json` moves last, so a folder that has one is complete, also after a power cut: everything is synced before
-    it moves. What an earlier, killed run left staged is removed.
-
-    Raises:
-        InputError: the place is taken.
-        EyerenderError: the disk is full or not writable; nothing is left behind.
-    """
-    final = Path(path)
-    refuse_non_empty(final, overwrite)
-    stage = final / f"{STAGE}{os.getpid()}"
-    created = False
-    try:
-        created = make_folder(final)
-        for leftover in final.glob(f"{STAGE}*"):
-            shutil.rmtree(leftover, ignore_errors=True)
-        stage.mkdir()
-        yield stage
-        sync_tree(stage)
-        if (final / DATASET).exists():
-            (final / DATASET).unlink()
-            sync_folder(final)
-        for entry in [p for p in final.iterdir() if p != stage]:
-            shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
-        for entry in sorted(stage.iterdir(), key=lambda p: p.name == DATASET):
-            if entry.name == DATASET:
-                sync_folder(final)
-            os.rename(entry, final / entry.name)
-        sync_folder(final)
-    except OSError as error:
-        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
-        if created and final.is_dir() and not any(final.iterdir()):
-            final.rmdir()
 
 
 def write_dataset(folder: Path, lines: list[dict[str, Any]], *, spec: dict[str, Any], digest: str, **more: Any) -> None:

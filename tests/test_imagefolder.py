@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from eyerender.errors import EyerenderError, InputError
+from eyerender.errors import InputError
 from eyerender.imagefile import preview, read_image, write_png
-from eyerender.imagefolder import ImageFolder, refuse_non_empty, same_run, staged, write_dataset
+from eyerender.imagefolder import ImageFolder, same_run, write_dataset
+from eyerender.outfolder import staged
 
 
 def test_png_keeps_every_bit(tmp_path):
@@ -108,62 +107,6 @@ def test_everything_is_synced_before_dataset_json_takes_its_place(tmp_path, monk
     first = next(k for k, (what, _) in enumerate(done) if what == "rename")
     assert {name for _, name in done[:first]} >= {"a.png", "images", "metadata.jsonl", "dataset.json"}
     assert done[-3:] == [("sync", "out"), ("rename", "dataset.json"), ("sync", "out")]
-
-
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, OSError])
-def test_a_failed_run_leaves_nothing(tmp_path, error):
-    out = tmp_path / "out"
-    with pytest.raises((error, EyerenderError)), staged(out) as folder:  # noqa: PT012
-        (folder / "half").write_text("x")
-        raise error
-    assert not out.exists()
-
-
-def test_a_failed_overwrite_keeps_what_was_there(tmp_path):
-    (tmp_path / "keep").write_text("x")
-    with pytest.raises(RuntimeError), staged(tmp_path, overwrite=True) as folder:  # noqa: PT012
-        (folder / "half").write_text("x")
-        raise RuntimeError
-    assert [p.name for p in tmp_path.iterdir()] == ["keep"]
-
-
-def test_overwrite_replaces_all_of_it(tmp_path):
-    (tmp_path / "old").mkdir()
-    (tmp_path / "old" / "file").write_text("x")
-    with staged(tmp_path, overwrite=True) as folder:
-        write_dataset(folder, [line()], spec={}, digest="d")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["dataset.json", "metadata.jsonl"]
-
-
-def test_leftovers_of_a_killed_run_do_not_block_the_next(tmp_path):
-    (tmp_path / ".partial-99").mkdir()
-    refuse_non_empty(tmp_path, overwrite=False)
-    with staged(tmp_path) as folder:
-        write_dataset(folder, [line()], spec={}, digest="d")
-    assert not (tmp_path / ".partial-99").exists()
-
-
-def test_taken_places_are_refused(tmp_path):
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="is not empty; give another folder or --overwrite"):
-        refuse_non_empty(tmp_path, overwrite=False)
-    with pytest.raises(InputError, match="exists and is not a folder"):
-        refuse_non_empty(tmp_path / "file", overwrite=True)
-
-
-@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="mounting a tmpfs needs root")
-def test_a_full_disk_is_one_error_and_leaves_nothing(tmp_path):
-    small = tmp_path / "small"
-    small.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", small], capture_output=True)
-    if mounted.returncode != 0:
-        pytest.skip("this machine does not let a tmpfs be mounted")
-    try:
-        with pytest.raises(EyerenderError, match="No space left on device"), staged(small / "out") as folder:
-            write_png(folder / "a.png", np.random.default_rng(3).integers(0, 65536, (400, 400)).astype(np.uint16))
-        assert list(small.iterdir()) == []
-    finally:
-        subprocess.run(["umount", small], check=True)
 
 
 @pytest.mark.parametrize(

@@ -253,7 +253,7 @@ def _part(text: str | None) -> tuple[int, int]:
 
 
 def _write_sample(folder: Path, scene: Scene) -> None:
-    from ..imagefolder import refuse_non_empty
+    from ..outfolder import refuse_non_empty
 
     refuse_non_empty(folder, False)
     spec = scene.located()

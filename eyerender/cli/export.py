@@ -43,8 +43,8 @@ def export_scene(
     """
     from ..analytic.observer import observe
     from ..capture import check_windows, render_job
-    from ..imagefolder import staged
     from ..observation import EYES
+    from ..outfolder import MARKER, staged
     from ..rendering.export import export_scene as write_scene
     from ..scene import load_scene
 
@@ -62,7 +62,7 @@ def export_scene(
     with staged(folder, overwrite=overwrite) as stage:
         written = write_scene(render_job(loaded, observed, rows[0]), stage, spp=spp)
         name = written.name
-    files = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+    files = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file() and p.name != MARKER)
     data = {"schema": "eyerender/export-scene/1", "path": str(folder), "scene": name, "files": files}
     emit(data, f"{folder / name}\nrender it with any stock integrator: mitsuba -m scalar_rgb {folder / name}", json)
     return 0

@@ -16,8 +16,9 @@ from typing import Any, Literal, Protocol
 from ..errors import EyerenderError, InputError
 from ..files import make_folder, remove_file
 from ..imagefolder import DATASET
+from ..lock import LOCK, final_lock, run_lock
+from ..outfolder import clear, refuse_non_empty
 from .assemble import assemble, damage
-from .lock import LOCK, final_lock, run_lock
 from .plan import Plan
 from .pool import NO_SHARD, Events, LocalPool
 from .realise import frames_of
@@ -79,7 +80,9 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
         raise InputError("must be K/N with 1 <= K <= N", source="--shard")
     if folder.exists() and not folder.is_dir():
         raise InputError("exists and is not a folder", source=str(path))
-    if not options.overwrite:
+    if options.overwrite:
+        refuse_non_empty(folder, True)
+    else:
         refuse_taken(folder)
     frames = frames_of(plan)
     created = False
@@ -87,7 +90,7 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
         created = make_folder(folder)
         with run_lock(folder, options.part, say):
             if options.overwrite and n == 1:
-                _clear(folder)
+                clear(folder)
             run = _Run(plan, folder, options, frames, progress, say)
             with final_lock(folder, say):
                 resumed = begin(folder, plan, run.repaired)
@@ -95,7 +98,8 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
                 return run.make(resumed)
             except InputError:
                 if not resumed and n == 1 and not finished(folder):
-                    _clear(folder)  # nothing can come of it
+                    with suppress(InputError):
+                        clear(folder)  # nothing can come of it
                 raise
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
@@ -301,14 +305,6 @@ class _Run:
                 if file.read(1) != b"\n":  # a power cut may have cut the last line short
                     file.write(b"\n")
             file.write(json.dumps(line).encode() + b"\n")
-
-
-def _clear(folder: Path) -> None:
-    """Empty a folder but for the locks; dataset.json first, so that no half of a dataset looks whole."""
-    remove_file(folder / DATASET)
-    for path in folder.iterdir():
-        if not path.name.startswith(LOCK):
-            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
 def _clock(seconds: float) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -12,9 +11,10 @@ from typing import Any
 from ..errors import InputError
 from ..files import MAX_FILE_BYTES, PART, read_json, remove_parts, write_json
 from ..imagefolder import DATASET, METADATA, RUN, STAGE
+from ..lock import LOCK
+from ..outfolder import clear
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
-from .lock import LOCK
 from .plan import Plan
 from .shard import KINDS, SHARDS, finished, read_done, run_versions
 
@@ -65,8 +65,7 @@ def begin(folder: Path, plan: Plan, repaired: Callable[[str], None]) -> bool:
         repaired(f"{RUN} is written again: {reason}")
         return True
     names = {p.name for p in folder.iterdir() if not p.name.startswith(LOCK)}
-    for name in names:
-        shutil.rmtree(folder / name) if (folder / name).is_dir() else (folder / name).unlink()
+    clear(folder, known=True)
     write_json(path, mine)
     if names & _OWN:
         repaired(f"the run starts over: {RUN}: {reason}, and no shard is finished")

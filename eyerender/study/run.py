@@ -16,7 +16,8 @@ from typing import Any, Literal
 from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
 from ..files import write_json, write_text
-from ..imagefolder import refuse_non_empty
+from ..lock import writer_lock
+from ..outfolder import clear, refuse_non_empty
 from ..report.study import write_page
 from ..scene import Scene
 from . import blignaut, guestrin, head_mounted, together
@@ -213,7 +214,7 @@ def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterato
     """Mark a folder as this study's while it runs; one that fails before it wrote anything leaves nothing behind.
 
     Raises:
-        InputError: the folder holds something else.
+        InputError: the folder holds something else, or another writer is at work in it.
     """
     try:
         found = json.loads((folder / MARKER).read_text(encoding="utf-8"))
@@ -229,8 +230,11 @@ def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterato
         raise EyerenderError(f"{folder}: cannot be written ({error.strerror or error})") from None
     done = False
     try:
-        write_json(folder / MARKER, {"schema": RUN_SCHEMA, "settings": settings})
-        yield
+        with writer_lock(folder):
+            if not same and overwrite:
+                clear(folder)
+            write_json(folder / MARKER, {"schema": RUN_SCHEMA, "settings": settings})
+            yield
         done = True
     finally:
         if not done and not same:

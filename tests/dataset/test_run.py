@@ -15,13 +15,13 @@ from pathlib import Path
 import pytest
 from dataset_specs import command, make, plan, tree, write
 
-from eyerender.dataset.lock import run_lock
 from eyerender.dataset.pool import LocalPool
 from eyerender.dataset.realise import frames_of
 from eyerender.dataset.run import Options, worker_count
 from eyerender.dataset.shard import finished
 from eyerender.dataset.worker import Job
 from eyerender.errors import EyerenderError, InputError
+from eyerender.lock import run_lock
 
 pytestmark = pytest.mark.render
 
@@ -144,9 +144,17 @@ def test_overwrite_replaces_and_other_folders_are_left_alone(tmp_path):
     with pytest.raises(InputError, match="is not empty"):
         make(folder, small)
     assert [p.name for p in folder.iterdir()] == ["thesis.txt"]
-    make(folder, small, overwrite=True)
-    assert not (folder / "thesis.txt").exists()
-    assert (folder / "dataset.json").is_file()
+    with pytest.raises(InputError, match="was not made by this package, so it is not overwritten"):
+        make(folder, small, overwrite=True)
+    assert [p.name for p in folder.iterdir()] == ["thesis.txt"]
+    made = tmp_path / "made"
+    make(made, small)
+    other = plan(count=2, subjects=2, shard_size=2, seed=5)
+    make(made, other, overwrite=True)
+    assert json.loads((made / "run.json").read_text())["digest"] == other.digest
+    (made / "thesis.txt").write_text("years of work")
+    with pytest.raises(InputError, match=r"holds 'thesis\.txt', which this package did not make"):
+        make(made, small, overwrite=True)
 
 
 def test_two_runs_exclude_each_other(tmp_path):

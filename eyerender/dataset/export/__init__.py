@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files import write_json, write_text
-from ...imagefolder import DATASET, ImageFolder, staged
+from ...imagefolder import DATASET, ImageFolder
+from ...outfolder import staged
 from ..assemble import verify_dataset
 from . import coco, ellseg, openeds, table, teyed, webdataset
 from .card import export_card

@@ -1,4 +1,4 @@
-"""Who may write to a folder: one run, or several runs over disjoint parts of its shards.
+"""Who may write to a folder: one writer, or several runs over disjoint parts of its shards.
 
 Locks are the kernel's (flock), held by an open file: a process that dies in any way lets go of them.
 """
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ..errors import EyerenderError, InputError
+from .errors import EyerenderError, InputError
 
 try:
     import fcntl
@@ -21,6 +21,24 @@ except ImportError:  # Windows has none
 
 LOCK = ".eyerender-lock"
 _UNSUPPORTED = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
+
+
+@contextmanager
+def writer_lock(folder: Path, warn: Callable[[str], None] = lambda _text: None) -> Iterator[None]:
+    """Hold a whole folder while the block runs, and leave no file of the lock behind.
+
+    Raises:
+        InputError: another writer holds it.
+        EyerenderError: it cannot be written.
+    """
+    with contextlib.ExitStack() as stack:
+        _take(stack, folder / LOCK, shared=False, folder=folder, warn=warn)
+        try:
+            yield
+        finally:
+            # It is removed while it is held: `_take` does not accept a lock on a file that is gone.
+            with contextlib.suppress(OSError):
+                (folder / LOCK).unlink()
 
 
 @contextmanager
@@ -62,18 +80,30 @@ def _take(
     warn: Callable[[str], None],
     wait: bool = False,
 ) -> None:
-    try:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise EyerenderError(f"{folder}: cannot be written ({error.strerror})") from None
-    stack.callback(os.close, file)
-    if fcntl is None:
-        warn("this system has no file locks: do not start two runs on one folder")
-        return
-    try:
-        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
-    except OSError as error:
-        if error.errno in _UNSUPPORTED:
+    while True:
+        try:
+            file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        except OSError as error:
+            raise EyerenderError(f"{folder}: cannot be written ({error.strerror})") from None
+        try:
+            if fcntl is None:
+                warn("this system has no file locks: do not start two runs on one folder")
+            else:
+                fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
+        except OSError as error:
+            if error.errno not in _UNSUPPORTED:
+                os.close(file)
+                raise InputError("another run is at work in this folder", source=str(folder)) from None
             warn("this file system has no locks: do not start two runs on one folder")
+        if _is_at(file, path):
+            stack.callback(os.close, file)
             return
-        raise InputError("another run is at work in this folder", source=str(folder)) from None
+        os.close(file)  # its last holder removed it in the meantime
+
+
+def _is_at(file: int, path: Path) -> bool:
+    """Whether an open file is still the one of a name."""
+    try:
+        return os.path.samestat(os.fstat(file), os.lstat(path))
+    except OSError:
+        return False

@@ -1,0 +1,242 @@
+"""Folders that a command fills: who writes, what may be replaced, and how a result takes its place.
+
+A folder is staged and put in place when it is complete, so a run that is interrupted or runs out of disk leaves nothing
+that looks like a result.
+
+`--overwrite` replaces what this package made and nothing else. A folder shows that it was made here by dataset.json,
+run.json, study.json or results.json with our schema, or by the marker file, which lists what was written. Files that
+neither have a known name nor stand in that list are somebody else's; then nothing is replaced at all.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Iterator, Set
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from .errors import EyerenderError, InputError
+from .files import is_plain, make_folder, read_json, remove_file, shown, sync_folder, sync_tree, write_json
+from .imagefolder import DATASET, RUN, STAGE
+from .lock import LOCK, writer_lock
+
+FOLDER_SCHEMA = "eyerender/folder/1"
+MARKER = ".eyerender.json"
+# The files that say what a folder is, and how their schemas begin; a finished shard's done.json says so too.
+_SIGNS = {
+    MARKER: FOLDER_SCHEMA,
+    DATASET: "eyerender/dataset/",
+    RUN: "eyerender/run/",
+    "study.json": "eyerender/study/",
+    "results.json": "eyerender/bench-extractors/",
+}
+_SIGN_BYTES = 2**30
+_FOLDERS = re.compile(r"(images/)?((images|masks|amodal_masks|noiseless|shards)(/[0-9]+)?)|images")
+_FILES = re.compile(
+    r"(images/)?("  # a study's images are a dataset of their own
+    r"(dataset|run|croissant)\.json|(metadata|failures|log)\.jsonl|README\.md|report\.html|"
+    r"(images|masks|amodal_masks|noiseless)/([0-9]+/)?[^/]+\.(png|exr)|shards/[0-9]+/(lines\.jsonl|done\.json))"
+    r"|(study|summary|findings|results)\.json|(summary|findings|waterfall|results)\.csv|\.eyerender\.json"
+)
+# The names of files that are being written, with the name they will have.
+_PARTS = re.compile(r"(?P<folder>(?:.*/)?)(?:\.(?P<hidden>[^/]+)\.[0-9a-f]{8}|(?P<plain>[^/]+))\.part")
+_STAGES = re.compile(rf"{re.escape(STAGE)}([0-9]+|[0-9]+-[0-9a-f]+)")
+
+
+def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
+    """Raise `InputError` where an output folder holds something that is not to be replaced.
+
+    With `overwrite`, that is any folder which this package did not make, or in which there is anything else.
+    """
+    folder = Path(path)
+    if folder.exists() and not folder.is_dir():
+        raise InputError("exists and is not a folder", source=str(path))
+    try:
+        busy = folder.is_dir() and any(not p.name.startswith((STAGE, LOCK)) for p in folder.iterdir())
+        if not busy:
+            return
+        if not overwrite:
+            raise InputError("is not empty; give another folder or --overwrite", source=str(path))
+        known = _listed(folder)
+        if known is None:
+            raise InputError("was not made by this package, so it is not overwritten", source=str(path))
+        _refuse_others(folder, known)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", source=str(path)) from None
+
+
+def clear(folder: Path, *, known: bool = False) -> None:
+    """Remove what this package made in a folder, and what killed runs left; locks stay.
+
+    `known`: the caller knows that the folder is a run's, even if the files that should say so are damaged.
+
+    dataset.json goes first, so that no half of a dataset looks whole, and the marker last, so that a clearing that was
+    stopped can be done again. Nothing is removed where something else is found.
+
+    Raises:
+        InputError: as `refuse_non_empty` with `overwrite`.
+        OSError: something cannot be removed.
+    """
+    if known:
+        _refuse_others(folder, _listed(folder) or set())
+    else:
+        refuse_non_empty(folder, True)
+    listed = _listed(folder) or set()
+    _mark(folder, listed)
+    _empty(folder, listed)
+    (folder / MARKER).unlink()
+
+
+@contextmanager
+def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """A folder to write into, inside `path`, whose content takes its place only when the block ends well.
+
+    `dataset.json` moves last, so a folder that has one is complete, also after a power cut: everything is synced before
+    it moves. A folder without one gets the marker. What an earlier, killed run left staged is removed.
+
+    Raises:
+        InputError: the place is taken, or another writer is at work in it.
+        EyerenderError: the disk is full or not writable; nothing is left behind.
+    """
+    final = Path(path)
+    refuse_non_empty(final, overwrite)
+    stage = final / f"{STAGE}{os.getpid()}"
+    created = False
+    try:
+        created = make_folder(final)
+        with writer_lock(final):
+            try:
+                refuse_non_empty(final, overwrite)  # again, now that nobody else writes
+                _remove_stages(final)
+                stage.mkdir()
+                yield stage
+                _publish(stage, final)
+            finally:
+                shutil.rmtree(stage, ignore_errors=True)
+    except OSError as error:
+        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+    finally:
+        if created:
+            with suppress(OSError):
+                final.rmdir()  # only where it is empty
+
+
+def _publish(stage: Path, final: Path) -> None:
+    """Put a staged folder's content in the place of what its folder held."""
+    sync_tree(stage)
+    new = _names(stage)
+    old = _listed(final) or set()
+    # From here on the folder can be recognised at every instant.
+    _mark(final, old | new)
+    _empty(final, old, keep=stage.name)
+    for entry in sorted(stage.iterdir(), key=lambda p: p.name == DATASET):
+        if entry.name == DATASET:
+            sync_folder(final)
+        os.rename(entry, final / entry.name)
+    sync_folder(final)
+    if DATASET in new:
+        (final / MARKER).unlink()
+    else:
+        _mark(final, new)
+
+
+def _mark(folder: Path, names: Set[str]) -> None:
+    write_json(folder / MARKER, {"schema": FOLDER_SCHEMA, "files": sorted(names)})
+
+
+def _listed(folder: Path) -> set[str] | None:
+    """What a folder's marker lists; nothing where another file shows that it is ours, None where none does.
+
+    Names of folders end with a slash.
+    """
+    marked = _read_sign(folder / MARKER, FOLDER_SCHEMA)
+    if marked is not None:
+        names = marked.get("files")
+        good = names if isinstance(names, list) else []
+        return {n for n in good if isinstance(n, str) and is_plain(n.removesuffix("/"))}
+    signs = [(folder / name, schema) for name, schema in _SIGNS.items()]
+    signs += [(path, "eyerender/shard/") for path in (folder / "shards").glob("[0-9]*/done.json")]
+    return set() if any(_read_sign(path, schema) is not None for path, schema in signs) else None
+
+
+def _read_sign(path: Path, schema: str) -> dict[str, Any] | None:
+    try:
+        found = read_json(path, limit=_SIGN_BYTES, follow=False)
+    except InputError:
+        return None
+    return found if str(found.get("schema")).startswith(schema) else None
+
+
+def _made_here(folder: Path, listed: Set[str], *, strict: bool) -> Iterator[tuple[str, bool]]:
+    """Name and whether it is a folder of all that this package made; a folder comes after what it holds.
+
+    With `strict` anything else raises `InputError`, otherwise it is left out.
+    """
+
+    def ours(name: str, is_folder: bool) -> bool:
+        if is_folder:
+            return f"{name}/" in listed or _FOLDERS.fullmatch(name) is not None
+        part = _PARTS.fullmatch(name)
+        if part:
+            name = part["folder"] + (part["hidden"] or part["plain"])
+        return name in listed or _FILES.fullmatch(name) is not None
+
+    def walk(prefix: str) -> Iterator[tuple[str, bool]]:
+        with os.scandir(folder / prefix) as found:
+            entries = list(found)  # they may be removed on the way
+        for entry in entries:
+            name = prefix + entry.name
+            is_folder = entry.is_dir(follow_symlinks=False)
+            plain = is_folder or entry.is_file(follow_symlinks=False)
+            if entry.name.startswith(LOCK) and not is_folder and plain:
+                if prefix:
+                    yield name, False
+            elif is_folder and _STAGES.fullmatch(entry.name):
+                continue
+            elif plain and ours(name, is_folder):
+                if is_folder:
+                    yield from walk(f"{name}/")
+                yield name, is_folder
+            elif strict:
+                raise InputError(
+                    f"holds {shown(name)}, which this package did not make, so it is not overwritten",
+                    source=str(folder),
+                )
+
+    return walk("")
+
+
+def _refuse_others(folder: Path, listed: Set[str]) -> None:
+    for _ in _made_here(folder, listed, strict=True):
+        pass
+
+
+def _empty(folder: Path, listed: Set[str], keep: str = "") -> None:
+    """Remove what this package made but for the marker, and stages but for `keep`."""
+    remove_file(folder / DATASET)
+    for name, is_folder in _made_here(folder, listed, strict=False):
+        if is_folder:
+            _remove_stages(folder / name)
+            with suppress(OSError):
+                (folder / name).rmdir()  # something else may be in it by now
+        elif name != MARKER:
+            (folder / name).unlink(missing_ok=True)
+    _remove_stages(folder, keep)
+
+
+def _remove_stages(folder: Path, keep: str = "") -> None:
+    for place in list(folder.iterdir()):
+        if _STAGES.fullmatch(place.name) and place.name != keep and not place.is_symlink():
+            shutil.rmtree(place, ignore_errors=True)
+
+
+def _names(folder: Path) -> set[str]:
+    """All that is in a folder, relative to it; names of folders end with a slash."""
+    out = set()
+    for place, folders, files in os.walk(folder):
+        prefix = "" if Path(place) == folder else f"{Path(place).relative_to(folder).as_posix()}/"
+        out |= {f"{prefix}{name}/" for name in folders} | {prefix + name for name in files}
+    return out
