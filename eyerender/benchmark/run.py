@@ -18,7 +18,7 @@ from ..errors import EyerenderError, InputError
 from ..files import write_json
 from ..imagefile import read_image
 from ..imagefolder import versions
-from ..outfolder import MARKER, refuse_non_empty, staged
+from ..outfolder import refuse_non_empty, staged
 from ..report.benchmark import write_bench_report
 from .bound import Edge, edge_of
 from .folder import LabelledImage, load_labelled
@@ -251,7 +251,7 @@ def _refuse(output: str | Path, overwrite: bool) -> None:
 def _is_bench(output: Path) -> bool:
     """Whether a folder holds a bench's files and nothing else."""
     try:
-        return {p.name for p in output.iterdir()} - {MARKER} == {REPORT, RESULTS, TABLE}
+        return {p.name for p in output.iterdir()} == {REPORT, RESULTS, TABLE}
     except OSError:
         return False
 
