@@ -95,7 +95,8 @@ def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
     """A folder to write into, inside `path`, whose content takes its place only when the block ends well.
 
     `dataset.json` moves last, so a folder that has one is complete, also after a power cut: everything is synced before
-    it moves. A folder that nothing else shows to be ours gets the marker. What an earlier, killed run left staged is removed.
+    it moves. A folder that nothing else shows to be ours gets the marker. What an earlier, killed run left staged is
+    removed.
 
     Raises:
         InputError: the place is taken, or another writer is at work in it.
