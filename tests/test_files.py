@@ -141,7 +141,24 @@ def test_only_regular_files_within_the_limit_are_read(tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    ["NaN", "Infinity", "1e400", "9" * 400, "[" * 100_000, "{", "", "\x00", "-" + "9" * 5000, b"\xff\xff\xff\xff"],
+    [
+        "NaN",
+        "Infinity",
+        "1e400",
+        "9" * 400,
+        "[" * 100_000,
+        "{",
+        "",
+        "\x00",
+        "-" + "9" * 5000,
+        b"\xff\xff\xff\xff",
+        "[-1E+0400]",
+        "9" * 199 + ".5e200",
+        "9" * 290 + "e99",
+        "1" + "0" * 400 + ".0",
+        b"1e999",
+        "1e400".encode("utf-16"),
+    ],
     ids=lambda t: repr(t[:8]),
 )
 def test_json_of_strangers_ends_with_one_line(text):
@@ -149,6 +166,12 @@ def test_json_of_strangers_ends_with_one_line(text):
         parse_json(text, source="f.json")
     assert len(str(caught.value)) < 200
     assert "\n" not in str(caught.value)
+
+
+def test_numbers_that_a_float_holds_are_read():
+    assert parse_json("[1e308, -1E-999, 1.5e+2]") == [1e308, 0.0, 150.0]
+    assert parse_json(b"9" * 199 + b"e99") == float("9" * 199 + "e99")
+    assert parse_json("9" * 299) == 10**299 - 1
 
 
 def test_json_that_is_no_object_is_refused(tmp_path):
