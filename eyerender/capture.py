@@ -111,7 +111,7 @@ def render_job(scene: Scene, observations: Observations, row: int, eye: Eye | No
     index, windows = observations.index, scene.windows()
     side, camera, head = EYES[index.eye[row]], int(index.camera[row]), int(index.head[row])
     eye = scene.eye(side) if eye is None else eye
-    M, t = _motion(eye, observations, row)
+    M, t = eye_motion(eye, observations, row)
     apex = index.eye_position_mm[row] + index.head_mm[row]
     return RenderJob(
         eye=eye,
@@ -247,7 +247,7 @@ def _stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
     return dn.astype(np.uint8) if scene.spec.sensor.bit_depth == 8 else dn
 
 
-def _motion(eye: Eye, observations: Observations, row: int) -> tuple[Floats, Floats]:
+def eye_motion(eye: Eye, observations: Observations, row: int) -> tuple[Floats, Floats]:
     """The pose of one observation as a rigid motion of the eye frame: M (3, 3), t (3,)."""
     pose = observations.pose
     M, t = rigid_motion(

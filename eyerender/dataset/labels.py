@@ -7,13 +7,14 @@ visible pixels (of pupil, or of iris and pupil together): semi-axes 2 sqrt(eigen
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..analytic.features import fixations
 from ..arrays import Bools, Floats
-from ..capture import WindowImage
+from ..capture import WindowImage, eye_motion
 from ..eye.model import Eye
 from ..geometry.ellipse import fit_ellipse_direct
 from ..observation import EYES, Observations
@@ -25,27 +26,64 @@ _SAG_STEP_MM = 0.05
 IRIS, PUPIL = 2, 3
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class EyeInWindow:
+    """An eye as a window shows it: observation `row` of a scene, its `camera` and `window` (x0, y0, width, height).
+
+    The eye's frame lies in the world by x_world = M x + t.
+    """
+
+    row: int
+    camera: int
+    window: tuple[int, int, int, int]
+    eye: Eye
+    M: Floats
+    t: Floats
+
+    @classmethod
+    def of(cls, scene: Scene, observations: Observations, row: int) -> EyeInWindow:
+        """Observation `row` of a scene in its window."""
+        index = observations.index
+        camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
+        eye = scene.eye(EYES[side])
+        M, t = eye_motion(eye, observations, row)
+        apex = index.eye_position_mm[row] + index.head_mm[row]
+        return cls(row, camera, scene.windows()[camera, head, side], eye, M, t + apex)
+
+
 def image_labels(scene: Scene, observations: Observations, image: WindowImage) -> dict[str, Any]:
     """The labels of a window; the same keys for every image."""
-    row, camera = image.row, scene.rig.cameras[image.camera]
     part, window = image.mask, image.window
+    known = known_labels(scene, observations, image)
     return {
         "pupil": {
-            "amodal": _ellipse_of_record(observations, row),
+            **known["pupil"],
             "visible": moments_ellipse(part == PUPIL, window),
             "visible_fraction": image.labels["pupil_visible_fraction"],
             "visible_arcs_deg": image.labels["pupil_visible_arcs_deg"],
         },
         "iris": {
-            "amodal": iris_outline(scene, image, camera),
+            **known["iris"],
             "visible": moments_ellipse((part == PUPIL) | (part == IRIS), window),
             "visible_fraction": image.labels["iris_visible_fraction"],
         },
-        "glints": _glints(observations, image),
+        "glints": [known["glints"][k] | _seen_glint(image, k, known["glints"][k]) for k in range(len(known["glints"]))],
         "lid_margins_px": image.labels["lid_margins_px"],
-        "space": _space(scene, observations, image, camera),
-        "globe_radius_mm": float(image.eye.sclera.radius_mm),
-        "pose": {"rotation": image.M.tolist(), "translation_mm": image.t.tolist()},
+        **{key: known[key] for key in ("space", "globe_radius_mm", "pose", "camera", "lights_mm")},
+        "failed_paths": int(image.labels["failed_paths"]),
+    }
+
+
+def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | WindowImage) -> dict[str, Any]:
+    """The labels that follow from pose and parameters alone, without a picture: a part of `image_labels`."""
+    camera = scene.rig.cameras[view.camera]
+    return {
+        "pupil": {"amodal": _ellipse_of_record(observations, view.row)},
+        "iris": {"amodal": iris_outline(scene, view)},
+        "glints": _glints(scene, observations, view),
+        "space": _space(scene, observations, view, camera),
+        "globe_radius_mm": float(view.eye.sclera.radius_mm),
+        "pose": {"rotation": view.M.tolist(), "translation_mm": view.t.tolist()},
         "camera": {
             "K": camera.K.tolist(),
             "R": camera.R.tolist(),
@@ -54,7 +92,6 @@ def image_labels(scene: Scene, observations: Observations, image: WindowImage) -
             "resolution_px": list(camera.resolution_px),
         },
         "lights_mm": [light.position_mm.tolist() for light in scene.rig.lights],
-        "failed_paths": int(image.labels["failed_paths"]),
     }
 
 
@@ -78,22 +115,12 @@ def moments_ellipse(inside: Bools, window: tuple[int, int, int, int]) -> dict[st
     return out | {"centre_px": [x + window[0], y + window[1]], "semi_axes_px": axes, "angle_rad": angle}
 
 
-def iris_outline(scene: Scene, image: WindowImage, camera: Camera) -> dict[str, Any]:
-    """The apparent limbus: the circle of the front cornea at limbus radius - half the limbus' width, projected."""
-    surface, look = image.eye.front[0], scene.spec.look
-    rho = float(image.eye.limbus_radius_mm) - 0.5 * look.limbus_width_mm
-    angle = 2 * np.pi * np.arange(_OUTLINE_POINTS) / _OUTLINE_POINTS
-    y, z = rho * np.cos(angle), rho * np.sin(angle)
-    local = np.stack([np.broadcast_to(surface.sag(y, z), y.shape), y, z], axis=-1)
-    points = surface.origin_mm + local @ np.asarray(surface.rotation).T
-    eyepoint = image.M.T @ (camera.nodal_point_mm - image.t)
-    facing = np.sum(surface.normal(points) * (eyepoint - points), axis=-1) > 0
-    pixels, front = camera.project(points @ image.M.T + image.t)
+def iris_outline(scene: Scene, view: EyeInWindow | WindowImage) -> dict[str, Any]:
+    """The ellipse of the apparent limbus (`limbus_px`), with a status and a reason where there is none."""
     nothing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
-    if not front.all():
-        return {"status": "missing", "reason": "behind the camera", **nothing}
-    if not facing.all():
-        return {"status": "missing", "reason": "the cornea hides a part of its rim", **nothing}
+    pixels, reason = limbus_px(scene, view, _OUTLINE_POINTS)
+    if reason is not None:
+        return {"status": "missing", "reason": reason, **nothing}
     fit = fit_ellipse_direct(pixels)
     if not fit.ok:
         return {"status": "missing", "reason": "no ellipse fits the outline", **nothing}
@@ -104,6 +131,26 @@ def iris_outline(scene: Scene, image: WindowImage, camera: Camera) -> dict[str, 
         "semi_axes_px": fit.semi_axes_px.tolist(),
         "angle_rad": float(fit.angle_rad),
     }
+
+
+def limbus_px(scene: Scene, view: EyeInWindow | WindowImage, count: int) -> tuple[Floats, str | None]:
+    """The apparent limbus, (count, 2) full-sensor px: the circle of the front cornea at limbus radius - half the
+    limbus' width, projected. The second value says why it is not to be seen as a whole, None where it is."""
+    surface, camera = view.eye.front[0], scene.rig.cameras[view.camera]
+    rho = float(view.eye.limbus_radius_mm) - 0.5 * scene.spec.look.limbus_width_mm
+    angle = 2 * np.pi * np.arange(count) / count
+    y, z = rho * np.cos(angle), rho * np.sin(angle)
+    local = np.stack([np.broadcast_to(surface.sag(y, z), y.shape), y, z], axis=-1)
+    points = surface.origin_mm + local @ np.asarray(surface.rotation).T
+    eyepoint = view.M.T @ (camera.nodal_point_mm - view.t)
+    facing = np.sum(surface.normal(points) * (eyepoint - points), axis=-1) > 0
+    pixels, front = camera.project(points @ view.M.T + view.t)
+    reason = None
+    if not front.all():
+        reason = "behind the camera"
+    elif not facing.all():
+        reason = "the cornea hides a part of its rim"
+    return np.asarray(pixels), reason
 
 
 def cornea_centre(eye: Eye) -> Floats:
@@ -126,19 +173,17 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
     }
 
 
-def _glints(observations: Observations, image: WindowImage) -> list[dict[str, Any]]:
-    """Each lamp's glint: where ray optics puts its centre, and what of it the camera gets."""
-    glints, table, row = observations.glints, image.rendered.glints, image.row
-    x0, y0, w, h = image.window
-    hidden = image.labels["glints"]
+def _glints(scene: Scene, observations: Observations, view: EyeInWindow | WindowImage) -> list[dict[str, Any]]:
+    """Where ray optics puts the centre of each lamp's glint."""
+    glints, row = observations.glints, view.row
+    x0, y0, w, h = view.window
     out = []
-    for k in range(len(table.energy)):
+    for k in range(len(scene.rig.lights)):
         xy, _ = glints.of_light(k)
         found = bool(np.isfinite(xy[row]).all())
         at = (glints.light[row] == k) & (glints.status[row] != "")
         slot = int(at.argmax())
         inside = found and bool(x0 - 0.5 <= xy[row, 0] <= x0 + w - 0.5 and y0 - 0.5 <= xy[row, 1] <= y0 + h - 0.5)
-        lit = np.isfinite(table.xy_px[k]).all()
         out.append(
             {
                 "light": k,
@@ -146,20 +191,28 @@ def _glints(observations: Observations, image: WindowImage) -> list[dict[str, An
                 "reason": glints.reason[row, slot] or None,
                 "xy_px": xy[row].tolist() if found else None,
                 "in_window": inside,
-                "visible": bool(table.visible[k]) and inside,
-                "hidden_by": hidden[k]["reason"],
-                "visible_share": float(table.share[k]),
-                "spot_xy_px": table.xy_px[k].tolist() if lit else None,
             }
         )
     return out
 
 
-def _space(scene: Scene, observations: Observations, image: WindowImage, camera: Camera) -> dict[str, Any]:
+def _seen_glint(image: WindowImage, k: int, known: dict[str, Any]) -> dict[str, Any]:
+    """What of a lamp's glint the camera gets."""
+    table = image.rendered.glints
+    lit = np.isfinite(table.xy_px[k]).all()
+    return {
+        "visible": bool(table.visible[k]) and known["in_window"],
+        "hidden_by": image.labels["glints"][k]["reason"],
+        "visible_share": float(table.share[k]),
+        "spot_xy_px": table.xy_px[k].tolist() if lit else None,
+    }
+
+
+def _space(scene: Scene, observations: Observations, view: EyeInWindow | WindowImage, camera: Camera) -> dict[str, Any]:
     """Points (mm) and lines in the world and in the camera's frame."""
-    eye, M, t, row = image.eye, image.M, image.t, image.row
+    eye, M, t, row = view.eye, view.M, view.t, view.row
     index = observations.index
-    point, way = _line_of_sight(scene, observations, image)
+    point, way = _line_of_sight(scene, observations, view)
     points = {
         "rotation_centre_mm": eye.rotation.azimuth_centre_mm,
         "globe_centre_mm": eye.sclera.centre_mm,
@@ -180,12 +233,12 @@ def _space(scene: Scene, observations: Observations, image: WindowImage, camera:
     }
 
 
-def _line_of_sight(scene: Scene, observations: Observations, image: WindowImage) -> tuple[Floats, Floats]:
+def _line_of_sight(scene: Scene, observations: Observations, view: EyeInWindow | WindowImage) -> tuple[Floats, Floats]:
     """The line of sight of the unturned eye: the fixed chief ray, or the one that the entrance window gives."""
-    index, row = observations.index, image.row
+    index, row = observations.index, view.row
     if scene.spec.eye.line_of_sight == "entrance_window" and np.isfinite(index.target_mm[row]).all():
         place = index.eye_position_mm[[row]] + index.head_mm[[row]]
         eyes = [scene.eye(side) for side in EYES]
         found = fixations(eyes, index.eye[[row]], index.target_mm[[row]], place, "entrance_window")
         return np.asarray(found.line_of_sight_mm[0]), np.asarray(found.line_of_sight_direction[0])
-    return np.asarray(image.eye.chief_ray.point_mm), np.asarray(image.eye.chief_ray.direction)
+    return np.asarray(view.eye.chief_ray.point_mm), np.asarray(view.eye.chief_ray.direction)

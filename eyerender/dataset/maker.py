@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import BackendName, WindowImage, make_renderer, noiseless, render_windows
-from ..observation import EYES
 from ..scene import Scene
 from .labels import image_labels
+from .line import image_line
 from .plan import Plan
 from .realise import Realised, Rejection, realise
 
@@ -60,43 +59,12 @@ class Maker:
         return MadeSample(index, tuple(self._images(found)), found.rejections)
 
     def _images(self, found: Realised) -> Iterator[MadeImage]:
-        sample, scene, observations = found.sample, found.scene, found.observations
-        if sample is None or scene is None or observations is None:
+        scene, observations = found.scene, found.observations
+        if found.sample is None or scene is None or observations is None:
             return
-        records = list(observations.records())
-        turn = sample.turn
-        many = self.frames > 1
         for image in render_windows(scene, observations, renderer=self.renderer):
-            record = records[image.row]
-            frame = record["frame"]
-            # A frame's number is its own in the whole dataset.
-            record = {**record, "frame": turn.sample * self.frames + frame}
-            side = EYES[int(observations.index.eye[image.row])]
-            name = f"{turn.sample:08d}-{f'{frame:03d}-' if many else ''}{side}"
-            line = {
-                "sample": turn.sample,
-                "subject": turn.subject,
-                "split": sample.split,
-                "sequence_index": turn.sequence,
-                "window_px": dict(zip(("x0", "y0", "width", "height"), image.window, strict=True)),
-                "bit_depth": scene.spec.sensor.bit_depth,
-                "records": [record],
-                "labels": image_labels(scene, observations, image),
-                "parameters": {
-                    "eye_model": scene.eye_spec.name,
-                    "pupil_diameter_mm": scene.pupil_diameter_mm,
-                    "wavelength_nm": scene.spec.wavelength_nm,
-                    "spp": scene.spec.image.spp,
-                    "seed": scene.spec.seed,
-                    "camera": image.camera,
-                    "attempt": turn.attempt,
-                    "subject_attempt": turn.subject_attempt,
-                    "draws": sample.draws,
-                    # As text: what is nested in them may differ from sample to sample, the columns must not.
-                    "scene_json": json.dumps(sample.scene, sort_keys=True),
-                    "eye_json": json.dumps({k: v for k, v in sample.eye.items() if k != "sources"}, sort_keys=True),
-                },
-            }
+            labels = image_labels(scene, observations, image)
+            name, line = image_line(found, image.row, self.frames, image.window, labels)
             kinds = self.plan.spec.labels.pictures
             yield MadeImage(name, {kind: _PICTURES[kind](scene, image) for kind in kinds}, line)
 

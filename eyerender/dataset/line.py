@@ -1,0 +1,54 @@
+"""The line of metadata of one image of a sample, but for the names of its files; and its own name."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from ..observation import EYES
+from .realise import Realised
+
+
+def image_name(sample: int, frame: int, frames: int, side: str) -> str:
+    """An image's name without ending; `frame` counts within the sample, which has `frames` of them."""
+    return f"{sample:08d}-{f'{frame:03d}-' if frames > 1 else ''}{side}"
+
+
+def image_line(
+    found: Realised, row: int, frames: int, window: tuple[int, int, int, int], labels: dict[str, Any]
+) -> tuple[str, dict[str, Any]]:
+    """The name and the line of observation `row` of a sample that was made; `frames` is how many each sample has."""
+    sample, scene, observations = found.sample, found.scene, found.observations
+    assert sample is not None
+    assert scene is not None
+    assert observations is not None
+    turn = sample.turn
+    (record,) = observations.take([row]).records()
+    frame = record["frame"]
+    side = EYES[int(observations.index.eye[row])]
+    line = {
+        "sample": turn.sample,
+        "subject": turn.subject,
+        "split": sample.split,
+        "sequence_index": turn.sequence,
+        "window_px": dict(zip(("x0", "y0", "width", "height"), window, strict=True)),
+        "bit_depth": scene.spec.sensor.bit_depth,
+        # A frame's number is its own in the whole dataset.
+        "records": [{**record, "frame": turn.sample * frames + frame}],
+        "labels": labels,
+        "parameters": {
+            "eye_model": scene.eye_spec.name,
+            "pupil_diameter_mm": scene.pupil_diameter_mm,
+            "wavelength_nm": scene.spec.wavelength_nm,
+            "spp": scene.spec.image.spp,
+            "seed": scene.spec.seed,
+            "camera": int(observations.index.camera[row]),
+            "attempt": turn.attempt,
+            "subject_attempt": turn.subject_attempt,
+            "draws": sample.draws,
+            # As text: what is nested in them may differ from sample to sample, the columns must not.
+            "scene_json": json.dumps(sample.scene, sort_keys=True),
+            "eye_json": json.dumps({k: v for k, v in sample.eye.items() if k != "sources"}, sort_keys=True),
+        },
+    }
+    return image_name(turn.sample, frame, frames, side), line
