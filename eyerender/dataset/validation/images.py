@@ -1,0 +1,178 @@
+"""The pictures of one image: their sizes and values, and the masks against the outlines and the labels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import Bools, Floats
+from ...imagefile import read_image
+from ...imagefolder import ImageEntry
+from ...observation import OK
+from ..labels import IRIS, PUPIL, moments_ellipse
+from .outline import EXACT_PX, Outline
+
+SKIN, SCLERA = 0, 1
+Mask = NDArray[Any]
+Window = tuple[int, int, int, int]
+
+
+class Tally:
+    """Statistics of the pixels, of which only sums are kept."""
+
+    def __init__(self) -> None:
+        self.images = 0
+        self.level = self.saturated = 0.0
+
+    def take(self, image: NDArray[Any], full: float) -> None:
+        """One image, whose greatest value is `full`."""
+        self.images += 1
+        self.level += float(image.mean()) / full
+        self.saturated += float(np.mean(image >= full))
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Means over all images; nothing where there were none."""
+        if not self.images:
+            return {}
+        return {
+            "mean_level": round(self.level / self.images, 4),
+            "saturated_share": round(self.saturated / self.images, 6),
+        }
+
+
+def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> Iterator[str]:
+    """What is wrong with an image's files; `limbus_px` (k, 2) is the iris' outline where it was recomputed.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    line = entry.line
+    image, stored = read_image(entry.path)
+    w, h = entry.window[2:]
+    if image.shape != (h, w):
+        yield f"is {_size(image)} px, its window is {w} x {h}"
+        return
+    depth = int(line.get("bit_depth") or stored)
+    if depth > stored and not (stored == 16 and depth <= 16):
+        yield f"is stored with {stored} bits, its bit depth is {depth}"
+    full = float(2**depth - 1)
+    if float(image.max()) > full:
+        yield f"has values above {full:g}"
+    tally.take(image, full)
+    quiet_path, mask_path, whole_path = (
+        entry.file(f"{kind}_file_name") for kind in ("noiseless", "mask", "amodal_mask")
+    )
+    if quiet_path is not None:
+        quiet, _ = read_image(quiet_path)
+        if quiet.shape != image.shape or float(quiet.max()) > full:
+            yield "its noiseless image has another shape or values above its range"
+    if mask_path is None:
+        return
+    mask = read_image(mask_path)[0]
+    whole = None if whole_path is None else read_image(whole_path)[0]
+    for name, picture in (("mask", mask), ("amodal mask", whole)):
+        if picture is None:
+            continue
+        if picture.shape != image.shape:
+            yield f"its {name} is {_size(picture)} px"
+            return
+        if int(picture.max()) > PUPIL:
+            yield f"its {name} holds the value {int(picture.max())}"
+    yield from _visible(line, mask, entry.window)
+    yield from _outlines(line, mask, whole, limbus_px, entry.window)
+
+
+def _size(picture: NDArray[Any]) -> str:
+    return f"{picture.shape[1]} x {picture.shape[0]}"
+
+
+def _visible(line: dict[str, Any], mask: Mask, window: Window) -> Iterator[str]:
+    """The visible ellipses, which are those of the mask's own pixels."""
+    for name, inside in (("pupil", mask == PUPIL), ("iris", mask >= IRIS)):
+        own = line.get("labels", {}).get(name)
+        if isinstance(own, dict):
+            again = moments_ellipse(inside, window)
+            if any(again[key] != own["visible"][key] for key in again):
+                yield f"the visible ellipse of its {name} is not that of its mask"
+
+
+def _outlines(
+    line: dict[str, Any], mask: Mask, whole: Mask | None, limbus_px: Floats | None, window: Window
+) -> Iterator[str]:
+    """Masks against the apparent outlines of pupil and limbus.
+
+    Within them is what the part hides or what hides it. So a pixel that shows the eye at all must show the part exactly
+    where its centre lies within the outline, lids or no lids; skin within it is right unless the labels say that
+    nothing hides the part.
+    """
+    labels = line.get("labels", {})
+    pupil, iris = pupil_outline(line), iris_outline(line, limbus_px)
+    shares = [_share(labels, name) for name in ("pupil", "iris")]
+    # The iris' share does not count what hides before the pupil, so both must be whole.
+    bare = all(share is not None and share >= 1.0 for share in shares)
+    within = None if iris is None else iris.inside(window)
+    for picture, what, alone in ((mask, "mask", bare), (whole, "amodal mask", True)):
+        if picture is None:
+            continue
+        other = (picture == SKIN) if alone else np.zeros(picture.shape, dtype=bool)
+        if pupil is not None:
+            # Where the rim of the cornea has turned to sclera it hides the pupil behind it.
+            clear = picture == IRIS if within is None else (picture == IRIS) | ((picture == SCLERA) & within)
+            yield from _compare(f"{what} of its pupil", picture == PUPIL, clear | other, pupil, window)
+        if iris is not None:
+            yield from _compare(f"{what} of its iris", picture >= IRIS, (picture == SCLERA) | other, iris, window)
+    if whole is not None:
+        if np.any((mask != SKIN) & (mask != whole)):
+            yield "its mask shows what its amodal mask does not have there"
+        for name, part, share in zip(("pupil", "iris"), (PUPIL, IRIS), shares, strict=True):
+            there = np.count_nonzero(whole == part)
+            seen = np.count_nonzero((whole == part) & (mask == part))
+            if share is not None and (not there or abs(share - seen / there) > 1e-9):
+                yield f"the visible fraction of its {name} is not that of its masks"
+
+
+def _compare(name: str, shown: Bools, not_shown: Bools, outline: Outline, window: Window) -> Iterator[str]:
+    """Pixels that show a part beyond its outline, and pixels within it that show something else."""
+    area = outline.inside(window)
+    for wrong, words in ((shown & ~area, "leaves its outline"), (not_shown & area, "does not fill its outline")):
+        if wrong.any():
+            far = outline.beyond(wrong, window)
+            if len(far):
+                yield f"the {name} {words}: {len(far)} pixels, by up to {far.max():.2f} px"
+
+
+def pupil_outline(line: dict[str, Any]) -> Outline | None:
+    """The apparent outline of the pupil in a line's record; None where there is none, or not the whole of it."""
+    if len(line["records"]) != 1:
+        return None
+    pupil = line["records"][0]["pupil"]
+    if pupil["status"] != OK:
+        return None
+    points = np.array(pupil["points_px"] or [], dtype=float)
+    if len(points) >= 6 and np.isfinite(points).all():
+        return Outline.through(points)
+    return _ellipse(pupil)
+
+
+def iris_outline(line: dict[str, Any], limbus_px: Floats | None) -> Outline | None:
+    """The apparent limbus, recomputed or the ellipse of the labels; None where there is none."""
+    if limbus_px is not None:
+        return Outline(limbus_px, EXACT_PX)
+    own = line.get("labels", {}).get("iris")
+    if not isinstance(own, dict) or own["amodal"]["status"] != OK:
+        return None
+    return _ellipse(own["amodal"])
+
+
+def _ellipse(values: dict[str, Any]) -> Outline:
+    return Outline.ellipse(np.array(values["centre_px"]), np.array(values["semi_axes_px"]), values["angle_rad"])
+
+
+def _share(labels: dict[str, Any], name: str) -> float | None:
+    """The visible fraction of a part, as a dataset's labels or as a rendered folder's have it."""
+    own = labels.get(name)
+    value = own["visible_fraction"] if isinstance(own, dict) else labels.get(f"{name}_visible_fraction")
+    return None if value is None else float(value)

@@ -1,0 +1,168 @@
+"""Checks of every line of metadata: names, keys, records, labels that must agree with records, subjects and splits.
+
+A few bytes are kept of each line, never the line.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...files import shown
+from ...imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
+from ...observation import OK, Observations
+from .problems import WRONG, Problems
+from .truth import DatasetTruth, SceneTruth
+
+# Parts of the labels that every image of a dataset has, whatever it shows.
+_ALWAYS = (
+    ("labels", "pupil", "amodal"),
+    ("labels", "pupil", "visible"),
+    ("labels", "iris", "amodal"),
+    ("labels", "iris", "visible"),
+    ("labels", "space", "world"),
+    ("labels", "space", "camera"),
+    ("labels", "pose"),
+    ("labels", "camera"),
+    ("parameters", "draws"),
+)
+
+
+class Lines:
+    """Checks lines one after the other, and at the end what concerns several of them."""
+
+    def __init__(self, folder: ImageFolder, truth: DatasetTruth | SceneTruth | None) -> None:
+        self._folder = folder
+        self._truth = truth
+        count = len(folder.entries)
+        self._names = np.zeros(count, dtype=np.uint64)
+        self._subjects = np.full(count, -1, dtype=np.int64)
+        self._splits = np.zeros(count, dtype=np.uint64)
+        self._shape: tuple[set[str], set[str]] | None = None
+
+    def take(self, number: int, entry: ImageEntry) -> Iterator[str]:
+        """What is wrong with line `number`, counted from 0; raises one of `WRONG` for a line that cannot be read."""
+        line = entry.line
+        self._names[number] = _hash(line["file_name"])
+        if self._truth is not None:
+            for key, value in self._truth.whose(line).items():
+                if line.get(key) != value:
+                    yield f"{key} is {shown(line.get(key))}, not {value!r}"
+        if "subject" not in line:
+            return
+        self._subjects[number], self._splits[number] = line["subject"], _hash(line["split"])
+        nulls: set[str] = set()
+        keys = _keys(line, nulls)
+        self._shape = self._shape or (keys, nulls)
+        # What a null stands for in one of the two lines may be anything in the other.
+        known, empty = self._shape
+        if keys != known:
+            other = sorted(key for key in keys ^ known if not any(key.startswith(n) for n in nulls | empty))
+            if other:
+                yield f"has other keys than line 1 ({', '.join(key[1:] for key in other[:3])})"
+        for path in _ALWAYS:
+            node: Any = line
+            for key in path:
+                node = node.get(key) if isinstance(node, dict) else None
+            if not isinstance(node, dict) or (not node and path[-1] != "draws"):
+                yield f"{'.'.join(path)} is empty"
+        yield from _agree(line)
+
+    def finish(self, problems: Problems) -> None:
+        """What concerns several lines: their number, names that stand twice, subjects in two splits."""
+        entries = self._folder.entries
+        statistics = self._folder.dataset.get("statistics")
+        expected = statistics.get("images") if isinstance(statistics, dict) else None
+        if expected is not None and expected != len(entries):
+            problems.add(f"{METADATA}: has {len(entries)} lines, {DATASET} says {expected}")
+        order = np.argsort(self._names, kind="stable")
+        again = order[1:][self._names[order[1:]] == self._names[order[:-1]]]
+        for k in np.sort(again):
+            problems.add(f"{METADATA} line {k + 1}: its file name stands twice")
+        for k in self._moved():
+            problems.add(f"{METADATA} line {k + 1}: subject {self._subjects[k]} is in two splits")
+
+    def _moved(self) -> NDArray[np.int64]:
+        """The lines whose subject was in another split before."""
+        order = np.argsort(self._subjects, kind="stable")
+        subject, split = self._subjects[order], self._splits[order]
+        first = np.concatenate([[True], subject[1:] != subject[:-1]])
+        reference = split[np.maximum.accumulate(np.where(first, np.arange(len(order)), 0))]
+        return np.asarray(np.sort(order[(subject >= 0) & (split != reference)]))
+
+
+def check_records(batch: list[dict[str, Any]]) -> list[list[str]]:
+    """What is wrong with the records of each line of a batch."""
+    problems: list[list[str]] = [[] for _ in batch]
+    try:
+        rows = [k for k, line in enumerate(batch) for _ in line["records"]]
+        found = Observations.from_records([record for line in batch for record in line["records"]])
+    except (InputError, *WRONG):
+        # One of them is wrong; which one is seen alone.
+        if len(batch) > 1:
+            return [check_records([line])[0] for line in batch]
+        try:
+            Observations.from_records(batch[0]["records"])
+        except InputError as error:
+            return [[f"{error.path}: {error.reason}"]]
+        except WRONG as error:
+            return [[f"records cannot be read ({type(error).__name__}: {error})"]]
+        return problems
+    pupil = found.pupil
+    ok = pupil.status == OK
+    with np.errstate(invalid="ignore"):
+        a, b = pupil.semi_axes_px.T
+        ellipse = np.isfinite(pupil.centre_px).all(axis=1) & (a >= b) & (b > 0)
+        ellipse &= (pupil.angle_rad >= 0) & (pupil.angle_rad < np.pi)
+    for i in np.flatnonzero(ok & ~ellipse):
+        problems[rows[i]].append("its pupil is no ellipse in the record's convention")
+    for i in np.flatnonzero(~ok):
+        if not pupil.reason[i]:
+            problems[rows[i]].append(f"its pupil is {pupil.status[i]} without a reason")
+    placed = np.isfinite(found.glints.xy_px).all(axis=2)
+    for i in np.flatnonzero(((found.glints.status == OK) & ~placed).any(axis=1)):
+        problems[rows[i]].append("a glint has no place")
+    return problems
+
+
+def _agree(line: dict[str, Any]) -> Iterator[str]:
+    """Labels repeat numbers of the record; both were written from the same ones."""
+    (record,) = line["records"]
+    labels = line["labels"]
+    own, pupil = labels["pupil"]["amodal"], record["pupil"]
+    keys = ("status", "centre_px", "semi_axes_px", "angle_rad") if own["status"] == OK else ("status",)
+    if any(own[key] != pupil[key] for key in keys):
+        yield "the pupil of its labels is not that of its record"
+    places = {glint["light"]: glint["xy_px"] for glint in record["glints"] if glint["status"] == OK}
+    for glint in labels["glints"]:
+        if glint["xy_px"] != places.get(glint["light"]):
+            yield f"the glint of light {glint['light']} of its labels is not that of its record"
+
+
+def _keys(node: Any, nulls: set[str], path: str = "") -> set[str]:
+    """The key paths of a line; lists count as one entry; `nulls` gets the beginnings of what would be below a null."""
+    found: set[str] = set()
+    _collect(node, path, found, nulls)
+    return found
+
+
+def _collect(node: Any, path: str, found: set[str], nulls: set[str]) -> None:
+    found.add(path)
+    if isinstance(node, dict):
+        for key, value in node.items():
+            _collect(value, f"{path}.{key}", found, nulls)
+    elif isinstance(node, list):
+        if node and isinstance(node[0], dict):
+            for value in node:
+                _collect(value, f"{path}[]", found, nulls)
+    elif node is None:
+        nulls |= {f"{path}.", f"{path}["}
+
+
+def _hash(text: Any) -> np.uint64:
+    return np.uint64(int.from_bytes(hashlib.blake2b(str(text).encode(), digest_size=8).digest(), "big"))

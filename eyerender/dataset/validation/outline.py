@@ -1,0 +1,77 @@
+"""Outlines in full-sensor pixels: closed curves through a few boundary points, and the pixels inside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...arrays import Bools, Floats
+from ...geometry.ellipse import points_on_ellipse
+
+# A mask is traced in single precision, which moves an outline by less than a thousandth of a pixel (measured on all
+# shipped scenes); the polygon of `_POINTS` chords lies within r pi^2 / (2 n^2) of the curve, 0.02 px at r = 500 px.
+EXACT_PX = 0.05
+# Where only an ellipse is known: what a tilted or toric cornea, an uneven margin or a lens' distortion bend it by.
+ELLIPSE_PX = 1.5
+_POINTS = 360
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outline:
+    """A closed polygon `curve` (n, 2) px, and how far from it a pixel's centre may lie on either side."""
+
+    curve: Floats
+    tolerance_px: float
+
+    @classmethod
+    def through(cls, points_px: Floats) -> Outline:
+        """The closed curve through boundary points (k, 2) at even steps of a parameter, k >= 6.
+
+        Trigonometric interpolation: exact for a curve with fewer than k / 2 harmonics. The outline of a stop has few,
+        so those above k / 4 tell how far the interpolation may be off.
+        """
+        k = len(points_px)
+        harmonics = np.fft.fft(points_px[:, 0] + 1j * points_px[:, 1]) / k
+        order = np.fft.fftfreq(k, 1 / k)
+        error = float(np.abs(harmonics[np.abs(order) > k / 4]).sum())
+        t = np.arange(_POINTS) / _POINTS
+        # The highest harmonic of an even number of points stands for both its signs.
+        waves = np.exp(2j * np.pi * np.outer(t, order))
+        if k % 2 == 0:
+            waves[:, k // 2] = np.cos(np.pi * k * t)
+        curve = waves @ harmonics
+        return cls(np.stack([curve.real, curve.imag], axis=1), EXACT_PX + error)
+
+    @classmethod
+    def ellipse(cls, centre_px: Floats, semi_axes_px: Floats, angle_rad: float) -> Outline:
+        """The outline where nothing but the ellipse that fits it best is known."""
+        return cls(points_on_ellipse(centre_px, semi_axes_px, angle_rad, _POINTS), ELLIPSE_PX)
+
+    def inside(self, window: tuple[int, int, int, int]) -> Bools:
+        """Whether each pixel's centre of a window (x0, y0, width, height) lies inside, (height, width)."""
+        x0, y0, width, height = window
+        p = self.curve - np.array([x0, y0])
+        q = np.roll(p, -1, axis=0)
+        rows = np.arange(height)[:, None]
+        row, edge = np.nonzero((p[:, 1] <= rows) != (q[:, 1] <= rows))
+        share = (row - p[edge, 1]) / (q[edge, 1] - p[edge, 1])
+        x = p[edge, 0] + share * (q[edge, 0] - p[edge, 0])
+        crossings = np.zeros((height, width + 1), dtype=np.int64)
+        np.add.at(crossings, (row, np.clip(np.ceil(x), 0, width).astype(int)), 1)
+        return np.asarray(np.cumsum(crossings, axis=1)[:, :width] % 2 == 1)
+
+    def beyond(self, pixels: Bools, window: tuple[int, int, int, int]) -> Floats:
+        """How far from the outline those of a window's pixels are that lie farther from it than the tolerance, px."""
+        v, u = np.nonzero(pixels)
+        at = np.stack([u + window[0], v + window[1]], axis=1).astype(float)
+        p, way = self.curve, np.roll(self.curve, -1, axis=0) - self.curve
+        length2 = np.maximum(np.sum(way * way, axis=1), 1e-300)
+        out = []
+        for part in np.array_split(at, max(1, len(at) // 1024)):
+            away = part[:, None, :] - p
+            t = np.clip(np.sum(away * way, axis=2) / length2, 0, 1)
+            gap = away - t[..., None] * way
+            out.append(np.sqrt(np.sum(gap * gap, axis=2)).min(axis=1, initial=np.inf))
+        distance = np.concatenate(out)
+        return np.asarray(distance[distance > self.tolerance_px])

@@ -1,0 +1,89 @@
+"""What is wrong with a folder: counted, and the first of it kept in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from math import sin
+from typing import Any
+
+# A damaged folder of a million images has a million problems; the first ones say what happened.
+SHOWN = 50
+MAX_LENGTH = 400
+# What a value that is not what it should be makes the code that reads it raise.
+WRONG = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
+
+
+class Problems:
+    """Collects problems in constant memory."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.shown: list[str] = []
+
+    def add(self, text: str) -> None:
+        """One problem, in one line."""
+        self.count += 1
+        if len(self.shown) < SHOWN:
+            line = "".join(c if c.isprintable() else "?" for c in text)
+            self.shown.append(line if len(line) <= MAX_LENGTH else line[: MAX_LENGTH - 3] + "...")
+
+    def extend(self, texts: Iterable[str]) -> None:
+        """Several problems."""
+        for text in texts:
+            self.add(text)
+
+
+def differences(expected: Any, found: Any, tolerance: float, path: str = "") -> Iterator[str]:
+    """Where a JSON value differs from the expected one, as `path is FOUND, not EXPECTED`.
+
+    Numbers may differ by `tolerance` (1 + |expected|). What `found` has beyond the expected keys is not looked at. The
+    angle of an ellipse counts as far as it moves the ellipse's edge: a circle has none.
+    """
+    if isinstance(expected, dict):
+        if not isinstance(found, dict):
+            yield _differ(path, found, expected)
+            return
+        for key, value in expected.items():
+            where = f"{path}.{key}" if path else str(key)
+            if key not in found:
+                yield f"{where} is missing"
+            elif key == "angle_rad" and _same_angle(expected, found, tolerance):
+                continue
+            else:
+                yield from differences(value, found[key], tolerance, where)
+    elif isinstance(expected, list | tuple):
+        if not isinstance(found, list) or len(found) != len(expected):
+            yield _differ(path, found, expected)
+            return
+        for k, (a, b) in enumerate(zip(expected, found, strict=True)):
+            yield from differences(a, b, tolerance, f"{path}.{k}")
+    elif _is_number(expected) and _is_number(found):
+        if not abs(found - expected) <= tolerance * (1 + abs(expected)):
+            yield _differ(path, found, expected)
+    elif expected != found or isinstance(expected, bool) != isinstance(found, bool):
+        yield _differ(path, found, expected)
+
+
+def _same_angle(expected: dict[str, Any], found: dict[str, Any], tolerance: float) -> bool:
+    """Whether two ellipses of the same axes are the same for all their angles say."""
+    axes, a, b = expected.get("semi_axes_px"), expected.get("angle_rad"), found.get("angle_rad")
+    if axes is None or not (isinstance(a, float) and isinstance(b, int | float)):
+        return False
+    return bool((axes[0] - axes[1]) * abs(sin(b - a)) <= tolerance * (1 + axes[0]))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _differ(path: str, found: Any, expected: Any) -> str:
+    return f"{path} is {_short(found)}, not {_short(expected)}"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, dict):
+        return "an object" if value else "empty"
+    if isinstance(value, list | tuple):
+        return f"a list of {len(value)}"
+    text = "null" if value is None else f"{value:.10g}" if isinstance(value, float) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,143 @@
+"""The finished dataset against its shards: the checksums of files, and metadata.jsonl against the shards' lines."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...files import opened, parse_json, shown
+from ...imagefolder import METADATA
+from ...jsonlines import MAX_BYTES, MAX_LINE_BYTES
+from ..assemble import damage
+from ..shard import LINES, SHARDS, finished, shard_name, verify
+from .problems import SHOWN, Problems, differences
+
+_EXACT_INTEGER = 2**53
+Numbers = NDArray[np.int64]
+Hashes = NDArray[np.uint64]
+Step = Callable[[int, int, str], None]
+
+
+def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: Problems, step: Step) -> None:
+    """Every shard that dataset.json asks for: there, of its plan, its files with their sizes and, unless `quick`, their
+    checksums; and the files that were put together out of the shards."""
+    # Without checksums of its own, as older versions wrote it, metadata.jsonl is left to `compare_lines`.
+    problems.extend(damage(folder, quick=quick or dataset.get("checksums") is None))
+    there = sorted(finished(folder))
+    digest = dataset.get("digest")
+    for k, shard in enumerate(there):
+        problems.extend(verify(folder, shard, digest if isinstance(digest, str) else None, quick=quick))
+        step(k + 1, len(there), "shards")
+    spec = dataset.get("spec")
+    count, size = (spec.get(key) if isinstance(spec, dict) else None for key in ("count", "shard_size"))
+    if not (isinstance(count, int) and isinstance(size, int) and count > 0 and size > 0):
+        return  # the plan cannot be read either
+    asked = range(-(-count // size))
+    known = frozenset(there)
+    missing = len(asked) - sum(shard in asked for shard in there)
+    problems.extend(f"{SHARDS}/{shard_name(s)}: missing" for s in islice((s for s in asked if s not in known), SHOWN))
+    problems.count += max(missing - SHOWN, 0)
+    problems.extend(f"{SHARDS}/{shard_name(s)}: dataset.json asks for no such shard" for s in there if s not in asked)
+
+
+def compare_lines(folder: Path, problems: Problems) -> None:
+    """metadata.jsonl against the shards' lines, as values: the order of lines and of keys does not matter.
+
+    Lines whose text does not stand in both are read, and compared by their image's name; whole numbers are equal to
+    their floating-point form. It takes some ten bytes of memory a line.
+    """
+    mine = [folder / METADATA]
+    theirs = [folder / SHARDS / shard_name(shard) / LINES for shard in sorted(finished(folder))]
+    hashes = [np.array([_hash(raw) for _, raw in _lines(files)], dtype=np.uint64) for files in (mine, theirs)]
+    a = _Values.of(mine, np.flatnonzero(~np.isin(hashes[0], hashes[1])))
+    b = _Values.of(theirs, np.flatnonzero(~np.isin(hashes[1], hashes[0])))
+    _, at, to = np.intersect1d(a.names, b.names, return_indices=True)
+    changed = a.values[at] != b.values[to]
+    pairs = sorted(zip(a.numbers[at[changed]].tolist(), b.numbers[to[changed]].tolist(), strict=True))
+    lines = [_parsed(files, [pair[k] for pair in pairs[:SHOWN]]) for k, files in enumerate((mine, theirs))]
+    for number, other in pairs:
+        said = "differs from its shard's line"
+        if number in lines[0] and other in lines[1]:
+            first = next(differences(lines[1][other], lines[0][number], 0.0), "it has other keys")
+            said = f"{lines[0][number].get('file_name')} is not what its shard has: {first}"
+        problems.add(f"{METADATA} line {number + 1}: {said}")
+    for files, found, other, words in ((mine, a, b, "no shard has its line"), (theirs, b, a, f"not in {METADATA}")):
+        alone = np.sort(found.numbers[~np.isin(found.names, other.names)]).tolist()
+        known = _parsed(files, alone[:SHOWN])
+        where = METADATA if files is mine else f"{SHARDS}/*/{LINES}"
+        for number in alone:
+            name = shown(known[number].get("file_name")) if number in known else "it"
+            problems.add(f"{where} line {number + 1}: {name}: {words}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Values:
+    """Some lines of a few files: their numbers, and hashes of their images' names and of their values."""
+
+    numbers: Numbers
+    names: Hashes
+    values: Hashes
+
+    @classmethod
+    def of(cls, files: Sequence[Path], numbers: Numbers) -> _Values:
+        rows = []
+        for number, line in _objects(files, numbers):
+            name = line.get("file_name")
+            rows.append((number, _hash(str(name).encode()), _hash(json.dumps(_plain(line), sort_keys=True).encode())))
+        columns = list(zip(*rows, strict=True)) or [(), (), ()]
+        return cls(np.array(columns[0], np.int64), *(np.array(column, np.uint64) for column in columns[1:]))
+
+
+def _parsed(files: Sequence[Path], numbers: Sequence[int]) -> dict[int, dict[str, Any]]:
+    return dict(_objects(files, np.sort(np.array(numbers, dtype=np.int64))))
+
+
+def _objects(files: Sequence[Path], numbers: Numbers) -> Iterator[tuple[int, dict[str, Any]]]:
+    """The lines of some numbers, in order, that hold objects; what is no object is found elsewhere."""
+    if not len(numbers):
+        return
+    wanted = iter(numbers.tolist())
+    next_ = next(wanted)
+    for number, raw in _lines(files):
+        if number == next_:
+            with suppress(InputError):
+                value = parse_json(raw)
+                if isinstance(value, dict):
+                    yield number, value
+            next_ = next(wanted, -1)
+            if next_ < 0:
+                return
+
+
+def _lines(files: Sequence[Path]) -> Iterator[tuple[int, bytes]]:
+    """The lines of files one after the other, numbered from 0; a file that cannot be read has none."""
+    number = 0
+    for path in files:
+        with suppress(InputError, OSError), opened(path, limit=MAX_BYTES, follow=False) as file:
+            while raw := file.readline(MAX_LINE_BYTES):
+                yield number, raw.strip()
+                number += 1
+
+
+def _plain(node: Any) -> Any:
+    """A JSON value whose whole numbers are floating-point ones where these are exact."""
+    if isinstance(node, dict):
+        return {key: _plain(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_plain(value) for value in node]
+    whole = isinstance(node, int) and not isinstance(node, bool) and abs(node) < _EXACT_INTEGER
+    return float(node) if whole else node
+
+
+def _hash(data: bytes) -> int:
+    return int.from_bytes(hashlib.blake2b(data, digest_size=8).digest(), "big")

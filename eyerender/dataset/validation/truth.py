@@ -1,0 +1,216 @@
+"""What can be computed again: from the plan of a dataset, or from the scene of a rendered folder, to lines of metadata.
+
+A line but for what its pixels say: whose image it is, what was drawn, the names of its files, the analytic record, and
+the labels that follow from pose and parameters.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...analytic.observer import observe
+from ...arrays import Bools, Floats
+from ...errors import InputError
+from ...imagefolder import DATASET, ImageFolder, versions
+from ...observation import EYES, Observations
+from ...rendering.glints import GlintScene
+from ...scene import Scene, SceneSpec
+from ..labels import EyeInWindow, known_labels, limbus_px
+from ..line import image_line, image_name
+from ..plan import Plan
+from ..realise import Realised, frames_of, realise
+from ..shard import KINDS, shard_name
+from .problems import WRONG, Problems, differences
+
+# Rays are traced to 1e-9 mm, and another machine's mathematical functions change the last digits: 1e-8 px at the
+# sharpest of the shipped cameras. A number may differ by this times 1 + its size.
+TOLERANCE = 1e-7
+# The centre of a lamp's image, of which hidden points may be missing, is a mean of points that are traced as exactly.
+SPOT_PX = 1e-3
+_LIMBUS_POINTS = 360
+_SHOWN = 2
+
+
+class NoTruth(Exception):
+    """Nothing can be computed again, for a reason that is no fault of the folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class Again:
+    """An image computed again: what its line differs in, and its limbus (k, 2) px where the whole of it is seen."""
+
+    problems: tuple[str, ...]
+    limbus_px: Floats | None = None
+
+
+@dataclass
+class DatasetTruth:
+    """Lines of a generated dataset, from its plan; `frames` is how many each sample has."""
+
+    plan: Plan
+    frames: int
+    _last: Realised | None = field(default=None, init=False)
+
+    @classmethod
+    def of(cls, dataset: Mapping[str, Any], problems: Problems) -> DatasetTruth | None:
+        """From dataset.json; what is wrong with it is added to the problems."""
+        try:
+            plan = Plan.from_mapping(dataset, Path())
+            text = json.dumps({k: dataset[k] for k in plan.to_mapping()}, sort_keys=True, separators=(",", ":"))
+            if hashlib.sha256(text.encode()).hexdigest() != dataset["digest"]:
+                problems.add(f"{DATASET}: its digest is not that of its spec, eyes and files")
+            return cls(plan, frames_of(plan))
+        except InputError as error:
+            problems.add(f"{DATASET}: its plan cannot be used: {error}")
+        except WRONG as error:
+            problems.add(f"{DATASET}: holds no plan ({type(error).__name__}: {error})")
+        return None
+
+    def whose(self, line: dict[str, Any]) -> dict[str, Any]:
+        """Subject, split and file names that a line must have; raises one of `WRONG`, `InputError`."""
+        sample, record = line["sample"], line["records"][0]
+        subject, sequence = self.plan.subject_of(sample)
+        name = image_name(sample, record["frame"] - sample * self.frames, self.frames, record["eye"])
+        shard = shard_name(sample // self.plan.spec.shard_size)
+        files = {KINDS[kind]: f"{kind}/{shard}/{name}.png" for kind in self.plan.spec.labels.pictures}
+        return {**files, "subject": subject, "sequence_index": sequence, "split": self.plan.split_of(subject)}
+
+    def again(self, line: dict[str, Any]) -> Again:
+        """A line computed again; raises one of `WRONG` where it is no line of a dataset."""
+        number, record = line["sample"], line["records"][0]
+        if self._last is None or self._last.index != number:
+            self._last = realise(self.plan, number, self.frames)
+        found = self._last
+        scene, observations = found.scene, found.observations
+        if scene is None or observations is None:
+            return Again((f"sample {number} is given up by the plan",))
+        row = _row(observations, record["frame"] - number * self.frames, record["eye"])
+        if row is None:
+            return Again((f"sample {number} has no such image",))
+        view = EyeInWindow.of(scene, observations, row)
+        _, expected = image_line(found, row, self.frames, view.window, known_labels(scene, observations, view))
+        texts = ("scene_json", "eye_json")
+        problems = _differences(_open(expected, texts), _open(line, texts))
+        return Again((*problems, *_spots(scene, view, line)), _limbus(scene, view))
+
+
+@dataclass
+class SceneTruth:
+    """Lines of a folder that one scene was rendered into."""
+
+    scene: Scene
+    observations: Observations
+
+    @classmethod
+    def of(cls, dataset: Mapping[str, Any], problems: Problems) -> SceneTruth:
+        """From dataset.json; raises `NoTruth` where a file of the scene is not at hand, or the folder is no scene's."""
+        if not isinstance(dataset.get("spec"), dict):
+            raise NoTruth(f"{DATASET} has no scene")
+        try:
+            scene = Scene.of(SceneSpec.from_mapping(dataset["spec"], source=DATASET))
+            digest = scene.digest()
+            found = observe(scene)
+        except InputError as error:
+            raise NoTruth(str(error)) from None
+        if digest != dataset.get("digest"):
+            # An eye, a default or a file of the scene may have changed since; a present folder must agree.
+            here = dataset.get("versions")
+            if not isinstance(here, dict) or here.get("eyerender") != versions()["eyerender"]:
+                raise NoTruth("it was made by another version")
+            problems.add(f"{DATASET}: its digest is not that of its scene, its eye and its files")
+        return cls(scene, found)
+
+    def whose(self, line: dict[str, Any]) -> dict[str, Any]:
+        """File names that a line must have; raises one of `WRONG`."""
+        name = f"{line['records'][0]['frame']:06d}_{line['records'][0]['eye']}"
+        return {"file_name": f"images/{name}.png", "mask_file_name": f"masks/{name}.png"}
+
+    def again(self, line: dict[str, Any]) -> Again:
+        """A line computed again; raises one of `WRONG` where it is no line of a rendered folder."""
+        scene, found = self.scene, self.observations
+        record = line["records"][0]
+        row = _row(found, record["frame"], record["eye"])
+        if row is None:
+            return Again(("the scene has no such image",))
+        view = EyeInWindow.of(scene, found, row)
+        expected = {
+            "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
+            "bit_depth": scene.spec.sensor.bit_depth,
+            "records": list(found.take([row]).records()),
+            "parameters": {
+                "eye_model": scene.eye_spec.name,
+                "pupil_diameter_mm": scene.pupil_diameter_mm,
+                "wavelength_nm": scene.spec.wavelength_nm,
+                "spp": scene.spec.image.spp,
+                "seed": scene.spec.seed,
+                "camera": view.camera,
+            },
+        }
+        return Again(tuple(_differences(expected, line)), _limbus(scene, view))
+
+
+def truth_of(folder: ImageFolder, problems: Problems) -> DatasetTruth | SceneTruth | None:
+    """What a folder's lines can be compared with; None where dataset.json is damaged; raises `NoTruth`."""
+    if folder.dataset.get("kind") == "dataset":
+        return DatasetTruth.of(folder.dataset, problems)
+    return SceneTruth.of(folder.dataset, problems)
+
+
+def _row(observations: Observations, frame: int, eye: str) -> int | None:
+    index = observations.index
+    rows = np.flatnonzero((index.frame == frame) & (index.eye == EYES.index(eye)))
+    return int(rows[0]) if len(rows) else None
+
+
+def _open(line: dict[str, Any], texts: tuple[str, ...]) -> dict[str, Any]:
+    """A line with JSON that it holds as text as values."""
+    parameters = line["parameters"]
+    return {**line, "parameters": {**parameters, **{key: json.loads(parameters[key]) for key in texts}}}
+
+
+def _differences(expected: dict[str, Any], line: dict[str, Any]) -> list[str]:
+    """The first differences by part of the line, and how many more there are."""
+    found = list(differences(expected, line, TOLERANCE))
+    if len(found) > _SHOWN:
+        found = [*found[:_SHOWN], f"{len(found) - _SHOWN} more values differ"]
+    return [f"computed again: {text}" for text in found]
+
+
+def _limbus(scene: Scene, view: EyeInWindow) -> Floats | None:
+    points, reason = limbus_px(scene, view, _LIMBUS_POINTS)
+    return points if reason is None else None
+
+
+def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
+    """The spots of the glints: the mean of the lamp's image, or within it where a part of it is hidden."""
+    eye, camera = view.eye, scene.rig.cameras[view.camera]
+    mirror = GlintScene(
+        eye.front[0], float(eye.front_indices[0]), float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm),
+        float(eye.sclera.radius_mm), view.M, view.t, camera, _all_clear,
+    )  # fmt: skip
+    images = mirror.images(scene.rig.lights, scene.spec.sensor.psf_sigma_px)
+    for image, glint in zip(images, line["labels"]["glints"], strict=True):
+        spot, lit = glint["spot_xy_px"], image.energy > 0
+        if spot is None:
+            continue
+        if not lit.any():
+            yield f"the spot of light {glint['light']} is at {spot}, its cornea mirrors nothing to the camera"
+            continue
+        low, high = image.xy_px[lit].min(axis=0), image.xy_px[lit].max(axis=0)
+        if glint["visible_share"] >= 1.0:
+            low = high = np.average(image.xy_px[lit], axis=0, weights=image.energy[lit])
+        if not (np.all(spot >= low - SPOT_PX) and np.all(spot <= high + SPOT_PX)):
+            x, y = (float(v) for v in (low + high) / 2)
+            yield f"computed again: the spot of light {glint['light']} is at {spot}, not at [{x:.3f}, {y:.3f}]"
+
+
+def _all_clear(a: Floats, b: Floats) -> Bools:
+    del b
+    return np.ones(len(a), dtype=bool)

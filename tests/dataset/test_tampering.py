@@ -1,0 +1,386 @@
+"""Validation against people: each way to change a dataset is found, also where every checksum is signed again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from eyerender.capture import render_folder
+from eyerender.dataset.plan import Plan
+from eyerender.dataset.validate import SAMPLE, sampled, validate
+from eyerender.scene import Scene, SceneSpec
+
+pytestmark = pytest.mark.render
+
+SHARD, AGAIN = "is not what its shard has", "computed again"
+
+
+def lines_of(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def write_lines(path, lines):
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def sum_of(path):
+    return {"bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+
+
+def sign(folder):
+    """Write every checksum of a dataset anew, as somebody would who knows the format."""
+    for path in folder.glob("shards/*/done.json"):
+        done = json.loads(path.read_text())
+        done["files"] = {name: sum_of(folder / name) for name in done["files"]}
+        path.write_text(json.dumps(done))
+    path = folder / "dataset.json"
+    dataset = json.loads(path.read_text())
+    if "checksums" in dataset:
+        dataset["checksums"] = {name: sum_of(folder / name) for name in dataset["checksums"]}
+    path.write_text(json.dumps(dataset))
+
+
+def glint_of_label(line):
+    line["labels"]["glints"][0]["xy_px"][0] += 50
+
+
+def glint_of_record(line):
+    line["records"][0]["glints"][1]["xy_px"][1] -= 50
+
+
+def glint_of_both(line):
+    glint_of_record(line)
+    line["labels"]["glints"][1]["xy_px"] = line["records"][0]["glints"][1]["xy_px"]
+
+
+def spot(line):
+    line["labels"]["glints"][0]["spot_xy_px"][0] += 50
+
+
+def focal_length(line):
+    line["labels"]["camera"]["K"][0][0] *= 1.01
+
+
+def camera_turned(line):
+    line["labels"]["camera"]["R"][0] = [1.0, 0.0, 0.0]
+
+
+def camera_moved(line):
+    line["labels"]["camera"]["t_mm"][2] += 1
+
+
+def camera_of_scene(line):
+    scene = json.loads(line["parameters"]["scene_json"])
+    scene["rig"]["cameras"][0]["focal_length_px"] = 2410.0
+    line["parameters"]["scene_json"] = json.dumps(scene)
+
+
+def cornea_of_eye(line):
+    eye = json.loads(line["parameters"]["eye_json"])
+    eye["cornea"][0]["shape"]["radius_mm"] += 0.1
+    line["parameters"]["eye_json"] = json.dumps(eye)
+
+
+def draw(line):
+    line["parameters"]["draws"]["look.iris_albedo"] += 0.01
+
+
+def empty_space(line):
+    line["labels"]["space"] = {}
+
+
+def no_space(line):
+    line["labels"]["space"] = None
+
+
+def target(line):
+    line["labels"]["space"]["camera"]["target_mm"][0] += 5
+
+
+def pupil(line):
+    for place in (line["records"][0]["pupil"], line["labels"]["pupil"]["amodal"]):
+        place["semi_axes_px"][0] += 0.5
+
+
+def limbus(line):
+    line["labels"]["iris"]["amodal"]["centre_px"][0] += 1
+
+
+def pose(line):
+    line["records"][0]["pose"]["azimuth_deg"] += 0.5
+
+
+# What is done to which line, and what is said of it where every checksum is signed again.
+HARMS = {
+    0: (glint_of_label, "labels.glints.0.xy_px.0"),
+    1: (glint_of_record, "records.0.glints.1.xy_px.1"),
+    2: (glint_of_both, "records.0.glints.1.xy_px.1"),
+    3: (spot, "the spot of light 0"),
+    4: (focal_length, "labels.camera.K.0.0"),
+    5: (camera_turned, "labels.camera.R.0"),
+    6: (camera_moved, "labels.camera.t_mm.2"),
+    7: (camera_of_scene, "parameters.scene_json.rig.cameras.0.focal_length_px"),
+    8: (cornea_of_eye, "parameters.eye_json.cornea.0.shape.radius_mm"),
+    9: (draw, "parameters.draws.look.iris_albedo"),
+    10: (empty_space, "labels.space.world is missing"),
+    11: (no_space, "labels.space is null"),
+    12: (target, "labels.space.camera.target_mm.0"),
+    13: (pupil, "records.0.pupil.semi_axes_px.0"),
+    14: (limbus, "labels.iris.amodal.centre_px.0"),
+    15: (pose, "records.0.pose.azimuth_deg"),
+}
+
+
+@pytest.fixture
+def copy(tiny, tmp_path):
+    return shutil.copytree(tiny, tmp_path / "copy")
+
+
+def tamper(folder, change, *, metadata, shards):
+    """Give `change` the lines of metadata.jsonl, of all shards, or of both, by their samples; sign all anew."""
+    places = [folder / "metadata.jsonl"] if metadata else []
+    places += sorted(folder.glob("shards/*/lines.jsonl")) if shards else []
+    for path in places:
+        lines = lines_of(path)
+        change({line["sample"]: line for line in lines})
+        write_lines(path, lines)
+    sign(folder)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "shards"), [(True, False), (False, True), (True, True)], ids=["metadata", "shards", "both"]
+)
+def test_changed_values_are_found(copy, metadata, shards):
+    def change(lines):
+        for number in HARMS.keys() & lines.keys():
+            HARMS[number][0](lines[number])
+
+    tamper(copy, change, metadata=metadata, shards=shards)
+    found = validate(copy, quick=True)["problems"]
+    for number, (harm, words) in HARMS.items():
+        mine = [p for p in found if f"/{number:08d}-right.png" in p]
+        if metadata:
+            assert any(words in p and SHARD not in p for p in mine), (harm, mine)
+        # Where one of the two was left as it was they differ.
+        assert any(SHARD in p for p in mine) == (metadata != shards), (harm, mine)
+    assert not any(f"/{number:08d}" in p for number in range(16, 24) for p in found)
+
+
+@pytest.mark.parametrize("key", ["file_name", "mask_file_name"])
+@pytest.mark.parametrize("both", [False, True])
+def test_two_swapped_names_are_found(copy, key, both):
+    def change(lines):
+        if 4 in lines:
+            lines[4][key], lines[5][key] = lines[5][key], lines[4][key]
+
+    tamper(copy, change, metadata=True, shards=both)
+    found = validate(copy, quick=True)["problems"]
+    assert sum(f": {key} is '" in p for p in found if SHARD not in p and AGAIN not in p) == 2
+    assert any(SHARD in p for p in found) != both
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_a_subject_in_another_split_is_found(copy, both):
+    moved = {"train": "test", "test": "train"}
+
+    def change(lines):
+        for line in lines.values():
+            if line["subject"] == 1:
+                line["split"] = moved.get(line["split"], "train")
+
+    tamper(copy, change, metadata=True, shards=both)
+    found = validate(copy, quick=True)["problems"]
+    assert sum(": split is '" in p for p in found if SHARD not in p and AGAIN not in p) == 6
+    assert any(SHARD in p for p in found) != both
+
+
+def test_lost_and_new_lines_are_found(copy):
+    path = copy / "metadata.jsonl"
+    lines = lines_of(path)
+    extra = json.loads(json.dumps(lines[0]))
+    write_lines(path, [extra, *lines[1:7], *lines[8:], {**lines[3], "file_name": "images/00001/x.png"}])
+    found = validate(copy, quick=True)["problems"]
+    assert any("not in metadata.jsonl" in p and lines[7]["file_name"] in p for p in found)
+    assert any("no shard has its line" in p and "x.png" in p for p in found)
+
+
+def test_order_of_lines_and_keys_and_whole_numbers_do_not_matter(copy):
+    path = copy / "metadata.jsonl"
+    lines = [dict(reversed(line.items())) for line in reversed(lines_of(path))]
+    for line in lines:
+        line["parameters"]["spp"] = float(line["parameters"]["spp"])
+        line["labels"]["globe_radius_mm"] = int(line["labels"]["globe_radius_mm"])
+    write_lines(path, lines)
+    sign(copy)
+    report = validate(copy, quick=True)
+    assert report["ok"], report["problems"]
+
+
+def test_a_byte_of_unchanged_size_is_found_by_the_full_check_alone(copy):
+    path = sorted(copy.glob("images/*/*.png"))[5]
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert validate(copy, quick=True)["ok"]
+    name = str(path.relative_to(copy))
+    assert any(p == f"{name}: its checksum differs" for p in validate(copy)["problems"])
+
+
+def test_a_changed_spec_is_found(copy):
+    path = copy / "dataset.json"
+    dataset = json.loads(path.read_text())
+    dataset["spec"]["scene"]["rig"]["cameras"][0]["focal_length_px"] = 2500.0
+    path.write_text(json.dumps(dataset))
+    found = validate(copy, quick=True)["problems"]
+    assert "dataset.json: its digest is not that of its spec, eyes and files" in found
+    # With digests that agree every line still tells of another camera.
+    dataset["digest"] = Plan.from_mapping(dataset, copy).digest
+    path.write_text(json.dumps(dataset))
+    for place in copy.glob("shards/*/done.json"):
+        done = json.loads(place.read_text())
+        place.write_text(json.dumps(done | {"digest": dataset["digest"]}))
+    sign(copy)
+    report = validate(copy, quick=True)
+    assert report["problem_count"] >= 24
+    assert all("computed again" in p for p in report["problems"])
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda done: done.pop("files"),
+        lambda done: done.update(files=5),
+        lambda done: done.update(files={"images/00001/x.png": {}}),
+        lambda done: done.update(digest="0" * 64),
+        lambda done: done.update(schema=None),
+    ],
+)
+def test_a_damaged_done_is_a_problem(copy, harm):
+    path = copy / "shards" / "00001" / "done.json"
+    done = json.loads(path.read_text())
+    harm(done)
+    path.write_text(json.dumps(done))
+    report = validate(copy, quick=True)
+    assert any("00001" in p for p in report["problems"])
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", "\xff\xfe", "[" * 100_000])
+def test_what_is_no_done_is_a_problem(copy, text):
+    (copy / "shards" / "00001" / "done.json").write_bytes(text.encode("latin-1"))
+    assert any("shards/00001/done.json" in p for p in validate(copy, quick=True)["problems"])
+
+
+def test_a_missing_shard_is_a_problem(copy):
+    shutil.rmtree(copy / "shards" / "00002")
+    assert "shards/00002: missing" in validate(copy, quick=True)["problems"]
+
+
+@pytest.mark.parametrize("key", ["spec", "eyes", "digest", "statistics", "versions"])
+@pytest.mark.parametrize("value", [None, 5, [], {"a": 1}])
+def test_a_damaged_dataset_json_is_a_problem_and_no_traceback(copy, key, value):
+    path = copy / "dataset.json"
+    dataset = json.loads(path.read_text())
+    dataset[key] = value
+    path.write_text(json.dumps(dataset))
+    report = validate(copy, quick=True)
+    assert not report["ok"] or key in ("statistics", "versions")
+
+
+def test_every_kind_of_wrong_value_in_a_line_is_a_problem_and_no_traceback(copy):
+    """Every key of a line, one by one, gets a value of another kind."""
+    path = copy / "metadata.jsonl"
+    lines = lines_of(path)
+
+    def paths(node, at=()):
+        yield from ((at, node),) if at else ()
+        for key, value in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+            if not isinstance(key, int) or key == 0:
+                yield from paths(value, (*at, key))
+
+    every = [at for at, _ in paths(lines[3])]
+    rng = np.random.default_rng(1)
+    for start in range(0, len(every), 23):
+        changed = json.loads(json.dumps(lines))
+        chosen = every[start : start + 23]
+        for line, at in zip(changed[1:], chosen, strict=False):
+            node = line
+            for key in at[:-1]:
+                node = node[key]
+            node[at[-1]] = [None, "x", [], {}, -1, 10**30, True][rng.integers(7)]
+        write_lines(path, changed)
+        report = validate(copy, quick=True)
+        assert not report["ok"]
+        assert all("\n" not in p and len(p) <= 400 for p in report["problems"])
+
+
+def test_the_sample_is_spread_and_the_same_each_time():
+    assert sampled(SAMPLE, "a") == list(range(SAMPLE))
+    rows = sampled(1_000_000, "a")
+    assert rows == sampled(1_000_000, "a") != sampled(1_000_000, "b")
+    assert [row * SAMPLE // 1_000_000 for row in rows] == list(range(SAMPLE))
+
+
+def test_deep_computes_every_line_again(copy, monkeypatch):
+    def change(lines):
+        if 13 in lines:
+            focal_length(lines[13])
+
+    tamper(copy, change, metadata=True, shards=True)
+    monkeypatch.setattr("eyerender.dataset.validate.SAMPLE", 2)
+    assert validate(copy, quick=True)["recomputed"] == 2
+    report = validate(copy, quick=True, deep=True)
+    assert report["recomputed"] == 24
+    assert any("labels.camera.K.0.0" in p for p in report["problems"])
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory, tiny):
+    """A folder that one scene was rendered into."""
+    line = lines_of(tiny / "metadata.jsonl")[0]
+    data = json.loads(line["parameters"]["scene_json"])
+    data["eye"]["margin"] = {"seed": 3}
+    data["targets"] = {"grid": [3, 2]}
+    folder = tmp_path_factory.mktemp("rendered") / "out"
+    render_folder(Scene.of(SceneSpec.from_mapping(data)), folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [
+        (glint_of_record, "records.0.glints.1.xy_px.1"),
+        (pose, "records.0.pose.azimuth_deg"),
+        (lambda line: line["records"][0]["pupil"]["points_px"][0].reverse(), "records.0.pupil.points_px.0.0"),
+        (lambda line: line["window_px"].update(x0=3), "window_px.x0"),
+        (lambda line: line["parameters"].update(pupil_diameter_mm=3.0), "parameters.pupil_diameter_mm"),
+        (lambda line: line.update(file_name="images/000002_right.png"), "file_name is '"),
+    ],
+)
+def test_a_rendered_folder_is_computed_again(rendered, tmp_path, harm, words):
+    folder = shutil.copytree(rendered, tmp_path / "copy")
+    report = validate(folder)
+    assert report["ok"], report["problems"]
+    assert report["recomputed"] == 6
+    lines = lines_of(folder / "metadata.jsonl")
+    harm(lines[4])
+    write_lines(folder / "metadata.jsonl", lines)
+    assert any(words in p for p in validate(folder, quick=True)["problems"])
+
+
+def test_a_changed_scene_of_a_rendered_folder_is_found(rendered, tmp_path):
+    folder = shutil.copytree(rendered, tmp_path / "copy")
+    path = folder / "dataset.json"
+    dataset = json.loads(path.read_text())
+    dataset["spec"]["rig"]["cameras"][0]["focal_length_px"] = 2500.0
+    path.write_text(json.dumps(dataset))
+    found = validate(folder, quick=True)["problems"]
+    assert "dataset.json: its digest is not that of its scene, its eye and its files" in found
+    dataset["spec"]["eye"]["model"] = "gone.yaml"
+    path.write_text(json.dumps(dataset))
+    report = validate(folder, quick=True)
+    assert report["recomputed"] == 0
+    assert any("gone.yaml" in note for note in report["notes"])
