@@ -63,6 +63,7 @@ def glint_exits(eye: Eye, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[X
         ((False,) * corneal + eye.back_passing)[:depth],
         join(lights_mm),
         join(camera_mm)[:, None, :],
+        eye.lens_gradient if order == 4 else None,
     )
     status = found.status
     if order > 2:

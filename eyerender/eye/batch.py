@@ -10,16 +10,18 @@ import numpy.typing as npt
 
 from ..geometry.surfaces import Surface
 from ..geometry.transforms import Array, read_only
+from ..optics.gradient import GradientMedium
 from ..optics.interface import Number
 from .model import Eye, LineOfSight, RotationCentres, Sphere, Stop
 
-Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], str]
+Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str]
 S = TypeVar("S", bound=Surface)
 
 
 def structure_of(eye: Eye) -> Structure:
     """What must agree between eyes that are to be stacked: kinds and numbers of surfaces."""
-    return tuple(s.kind for s in eye.front), tuple(s.kind for s in eye.back), eye.back_passing, eye.retina.kind
+    front, back = (tuple(s.kind for s in surfaces) for surfaces in (eye.front, eye.back))
+    return front, back, eye.back_passing, eye.lens_gradient is not None, eye.retina.kind
 
 
 def stack_eyes(eyes: Sequence[Eye]) -> Eye:
@@ -34,6 +36,7 @@ def stack_eyes(eyes: Sequence[Eye]) -> Eye:
     def points(values: Sequence[Array]) -> Array:
         return read_only(np.stack(values))
 
+    gradients = [e.lens_gradient for e in eyes if e.lens_gradient is not None]
     waves = max(e.stop.contour.shape[-1] for e in eyes)
     return Eye(
         name=first.name,
@@ -60,6 +63,7 @@ def stack_eyes(eyes: Sequence[Eye]) -> Eye:
         chief_ray=LineOfSight(
             points([e.chief_ray.point_mm for e in eyes]), points([e.chief_ray.direction for e in eyes])
         ),
+        lens_gradient=GradientMedium.stack(gradients) if gradients else None,
     )
 
 
@@ -93,6 +97,7 @@ def take_eyes(eye: Eye, index: npt.NDArray[np.intp]) -> Eye:
         fovea_mm=eye.fovea_mm[index],
         incident_node_mm=eye.incident_node_mm[index],
         chief_ray=LineOfSight(ray.point_mm[index], ray.direction[index]),
+        lens_gradient=None if eye.lens_gradient is None else eye.lens_gradient.take(index),
     )
 
 

@@ -14,10 +14,12 @@ from ..geometry.surfaces import Surface
 from ..geometry.surfaces_biconic import Biconic
 from ..geometry.surfaces_quadric import Quadric
 from ..geometry.transforms import Array, flip_y, mirror_rotation, read_only, rotation_x, tilt_rotation
+from ..optics.gradient import GradientMedium
 from ..optics.interface import Number
 from ..optics.media import CauchyMedium, ConstantMedium, Medium
 from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
 from .model import Eye, LineOfSight, RotationCentres, Sphere, Stop
+from .shells import SHELLS, lens_shells, passing_shells
 from .spec import (
     LARGEST_INDEX,
     BiconicSpec,
@@ -63,6 +65,7 @@ def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> Eye:
     back_indices: tuple[Number, ...] = ()
     rims: tuple[Number, ...] = ()
     passing: tuple[bool, ...] = ()
+    gradient: GradientMedium | None = None
     if isinstance(spec.lens, SurfaceLensSpec):
         back = tuple(surface_of(s) for s in spec.lens.surfaces)
         back_indices = tuple(
@@ -70,9 +73,8 @@ def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> Eye:
         )
         rims, passing = (np.inf,) * len(back), (False,) * len(back)
     elif isinstance(spec.lens, GradientLensSpec):
-        back, back_indices, rims = gradient_shells(spec.lens, wavelength_nm)
-        count = spec.lens.shells
-        passing = tuple(k not in (0, 2 * count - 1) for k in range(2 * count))
+        back, back_indices, rims, gradient = gradient_lens(spec.lens, wavelength_nm)
+        passing = passing_shells(len(back))
     zero = read_only(np.zeros(3))
     return Eye(
         name=spec.name,
@@ -97,6 +99,7 @@ def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> Eye:
         fovea_mm=zero,
         incident_node_mm=zero,
         chief_ray=LineOfSight(zero, zero),
+        lens_gradient=gradient,
     )
 
 
@@ -185,44 +188,44 @@ def sclera_of(spec: EyeSpec, cornea: Surface) -> Sphere:
     return Sphere(read_only(cornea.to_eye(local)), radius)
 
 
-def gradient_shells(
-    lens: GradientLensSpec, wavelength_nm: float
-) -> tuple[tuple[Surface, ...], tuple[Number, ...], tuple[Number, ...]]:
-    """(surfaces, the index behind each, rims) of a gradient lens, outside in: front shells, then back shells."""
-    edge = index_at(lens.edge, wavelength_nm, "lens.edge")
-    core = index_at(lens.core, wavelength_nm, "lens.core")
-    vitreous = index_at(lens.vitreous, wavelength_nm, "lens.vitreous")
-    count = lens.shells
-    size = np.sqrt(1.0 - np.arange(count) / (lens.index_rate * count))
-    inside = edge + (core - edge) * (np.arange(count) + 0.5) / count
-    front_apex, back_apex = np.array(lens.front.position_mm), np.array(lens.back.position_mm)
-    centre = front_apex + lens.centre_fraction * (back_apex - front_apex)
-    equator = _equator_radius(lens)
-    fronts = tuple(surface_of(_scaled(lens.front, centre, float(p))) for p in size)
-    backs = tuple(surface_of(_scaled(lens.back, centre, float(p))) for p in size[::-1])
-    behind = [float(n) for n in inside] + [float(n) for n in inside[-2::-1]] + [vitreous]
-    rims = [float(equator * p) for p in size] + [float(equator * p) for p in size[::-1]]
-    return fronts + backs, tuple(behind), tuple(rims)
-
-
-def _scaled(placed: PlacedSpec, centre: Array, p: float) -> PlacedSpec:
-    """A lens surface scaled by p about the lens' centre: the radius and the apex' distance shrink, Q stays."""
-    position = centre + p * (np.array(placed.position_mm) - centre)
-    shape = placed.shape
-    scaled: SphereSpec | ConicSpec | BiconicSpec
-    if isinstance(shape, SphereSpec | ConicSpec):
-        scaled = shape.model_copy(update={"radius_mm": shape.radius_mm * p})
-    elif isinstance(shape, BiconicSpec):
-        scaled = shape.model_copy(update={"radii_mm": (shape.radii_mm[0] * p, shape.radii_mm[1] * p)})
-    else:
-        raise InputError("a gradient lens is made of spheres, conics or biconics", path="lens")
-    x, y, z = (float(v) for v in position)
-    return placed.model_copy(update={"shape": scaled, "position_mm": (x, y, z)})
-
-
-def _equator_radius(lens: GradientLensSpec) -> float:
-    """Where the outer front and back surfaces meet (mm from the axis); infinite if they do not."""
+def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Array]:
+    """(front, back, centre (3,)) of a gradient lens; raises `InputError` for what cannot be one."""
+    for name, shape in (("front", lens.front.shape), ("back", lens.back.shape)):
+        if not isinstance(shape, SphereSpec | ConicSpec | BiconicSpec):
+            raise InputError("a gradient lens is made of spheres, conics or biconics", path=f"lens.{name}.shape")
+        if lens.shells is None and isinstance(shape, BiconicSpec):
+            raise InputError("give a number: a gradient between biconics is traced as shells", path="lens.shells")
+    if lens.shells is None and lens.index_rate != 1:
+        raise InputError("must be 1 without 'shells'", path="lens.index_rate")
     front, back = surface_of(lens.front), surface_of(lens.back)
+    if lens.centre_mm is None:
+        centre = front.origin_mm + lens.centre_fraction * (back.origin_mm - front.origin_mm)
+    else:
+        centre = np.array(lens.centre_mm)
+        if not (front.implicit(centre) < 0.0 < back.implicit(centre)):
+            raise InputError("must lie between the lens' front and its back", path="lens.centre_mm")
+    return front, back, centre
+
+
+def gradient_lens(
+    lens: GradientLensSpec, wavelength_nm: float
+) -> tuple[tuple[Surface, ...], tuple[Number, ...], tuple[Number, ...], GradientMedium | None]:
+    """(surfaces outside in, the index behind each, rims, the medium between the two if they are no shells)."""
+    front, back, centre = gradient_geometry(lens)
+    edge, core, vitreous = (
+        index_at(medium, wavelength_nm, f"lens.{name}")
+        for name, medium in (("edge", lens.edge), ("core", lens.core), ("vitreous", lens.vitreous))
+    )
+    rim = _equator_radius(front, back)
+    if isinstance(front, Quadric) and isinstance(back, Quadric) and lens.shells is None:
+        medium = GradientMedium.between(front, back, centre, edge, core)
+        return (front, back), (edge, vitreous), (rim, rim), medium
+    count = SHELLS if lens.shells is None else lens.shells
+    return *lens_shells(front, back, centre, (edge, core, vitreous), rim, count, lens.index_rate), None
+
+
+def _equator_radius(front: Surface, back: Surface) -> float:
+    """Where the outer front and back surfaces meet (mm from the axis); infinite if they do not."""
     thickness = float(np.linalg.norm(front.origin_mm - back.origin_mm))
 
     def gap(r: float) -> float:
@@ -267,6 +270,7 @@ def mirrored_eye(eye: Eye) -> Eye:
         fovea_mm=read_only(flip_y(eye.fovea_mm)),
         incident_node_mm=read_only(flip_y(eye.incident_node_mm)),
         chief_ray=LineOfSight(read_only(flip_y(eye.chief_ray.point_mm)), read_only(flip_y(eye.chief_ray.direction))),
+        lens_gradient=None if eye.lens_gradient is None else eye.lens_gradient.mirrored(),
     )
 
 

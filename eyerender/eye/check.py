@@ -14,6 +14,7 @@ from .spec import (
     ConicSpec,
     EllipsoidSpec,
     EyeSpec,
+    GradientLensSpec,
     MediumSpec,
     PlacedSpec,
     QuadricSpec,
@@ -28,7 +29,7 @@ _FAR_MM = 60.0
 
 def check_eye(spec: EyeSpec, *, source: str = "") -> None:
     """Raise `InputError` with the path of the first key that cannot stand."""
-    from .build import stop_of, stop_reach_mm
+    from .build import gradient_geometry, stop_of, stop_reach_mm
 
     def refuse(path: str, reason: str) -> None:
         raise InputError(reason, source=source, path=path)
@@ -55,6 +56,11 @@ def check_eye(spec: EyeSpec, *, source: str = "") -> None:
     if any(abs(angle) >= 60.0 for angle in spec.fovea.field_deg):
         refuse("fovea.field_deg", "must be within 60 degrees of the optic axis")
     _check_order(spec, source, radius)
+    if isinstance(spec.lens, GradientLensSpec):
+        try:
+            gradient_geometry(spec.lens)
+        except InputError as error:
+            refuse(error.path, error.reason)
 
 
 def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:

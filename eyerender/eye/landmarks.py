@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import InputError
 from ..geometry.surfaces import components, join
 from ..geometry.transforms import Array, normalize, read_only
+from ..optics.gradient import GradientMedium
 from ..optics.shooting import connect
 from ..optics.trace import Crossing, RayStatus, Traced, outward_path, trace
 from .model import Eye, LineOfSight
@@ -23,12 +24,20 @@ NODE_DISTANCE_MM = 1500.0
 def path_to_retina(eye: Eye) -> tuple[Crossing, ...]:
     """All crossings from air to the retina; light ends there, so the last one does not bend it."""
     last = eye.back_indices[-1] if eye.back else eye.front_indices[-1]
-    lens = zip(eye.back, eye.back_indices, eye.back_rims_mm, eye.back_passing, strict=True)
+    lens = zip(eye.back, eye.back_indices, eye.back_rims_mm, eye.back_passing, _through(eye, 1), strict=True)
     return (
         *(Crossing(s, n) for s, n in zip(eye.front, eye.front_indices, strict=True)),
-        *(Crossing(s, n, rim_mm=rim, beyond_rim=None if passing else RayStatus.MISSED) for s, n, rim, passing in lens),
+        *(
+            Crossing(s, n, rim_mm=rim, beyond_rim=None if passing else RayStatus.MISSED, through=through)
+            for s, n, rim, passing, through in lens
+        ),
         Crossing(eye.retina, last),
     )
+
+
+def _through(eye: Eye, last: int) -> list[GradientMedium | None]:
+    """What lies before each surface of the lens on a way on which a gradient lens ends with its surface `last`."""
+    return [eye.lens_gradient if k == last else None for k in range(len(eye.back))]
 
 
 def nodal_rays(eye: Eye, objects_mm: Array, guess_mm: Array) -> tuple[Array, Array]:
@@ -79,12 +88,12 @@ def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
 
 
 def incident_node(eye: Eye) -> Array:
-    """The waist of a ring of nodal rays on the optic axis (3,).
+    """The waist of a ring of nodal rays (3,).
 
     16 nodal rays from (h, v) = 14.3 deg (sin f, cos f), objects 1500 mm from the apex; the node is the mean of the
-    points of closest approach of all pairs, on the axis. (Harris 2010, "Nodes and nodal points and lines in eyes and
-    other optical systems", Ophthalmic Physiol. Opt. 30, 24-42: an aspheric or tilted eye has no nodal point, but a
-    waist.)
+    points of closest approach of all pairs. It lies on the optic axis where the eye is centred about it, and off the
+    axis where surfaces are tilted or decentred. (Harris 2010, "Nodes and nodal points and lines in eyes and other
+    optical systems", Ophthalmic Physiol. Opt. 30, 24-42: an aspheric or tilted eye has no nodal point, but a waist.)
     """
     angle = 2.0 * np.pi * np.arange(NODE_RAYS) / NODE_RAYS
     ring = np.radians(NODE_RING_DEG) * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
@@ -97,7 +106,7 @@ def incident_node(eye: Eye) -> Array:
     square = 1.0 - cosine**2
     s, t = (cosine * along_j - along_i) / square, (along_j - cosine * along_i) / square
     middle = 0.5 * (objects[i] + s[:, None] * directions[i] + objects[j] + t[:, None] * directions[j])
-    return np.array([np.mean(middle[:, 0]), 0.0, 0.0])
+    return np.asarray(np.mean(middle, axis=0))
 
 
 def fovea_by_nodal_ray(eye: Eye, node_mm: Array, field_rad: Array, distance_mm: float) -> Array:
@@ -120,12 +129,15 @@ def chief_ray_in_air(eye: Eye, fovea_mm: Array) -> LineOfSight:
     centre = eye.stop.centre_mm
     if eye.back:
         path = [
-            Crossing(surface, n, inward=False, rim_mm=rim, beyond_rim=None if passing else RayStatus.MISSED)
-            for surface, n, rim, passing in zip(
+            Crossing(
+                surface, n, inward=False, rim_mm=rim, beyond_rim=None if passing else RayStatus.MISSED, through=through
+            )
+            for surface, n, rim, passing, through in zip(
                 reversed(eye.back),
                 reversed([eye.front_indices[-1], *eye.back_indices[:-1]]),
                 reversed(eye.back_rims_mm),
                 reversed(eye.back_passing),
+                reversed(_through(eye, 0)),
                 strict=True,
             )
         ]

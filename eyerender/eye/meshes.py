@@ -29,6 +29,7 @@ import trimesh
 from ..arrays import Floats, Ints
 from ..geometry.surfaces import Surface
 from .model import Eye
+from .shells import shelled
 
 _LENS_RADIUS_MM = 4.5
 _WALL_MM = 1.0
@@ -63,7 +64,8 @@ class EyeMeshes:
 
 
 def eye_meshes(eye: Eye, rings: int = 48, sectors: int = 128) -> EyeMeshes:
-    """All meshes of an eye, in the eye frame (mm)."""
+    """All meshes of an eye, in the eye frame (mm); a gradient lens is made of shells."""
+    eye = shelled(eye)
     angle = 2 * np.pi * np.arange(sectors) / sectors
     limbus = np.full(sectors, float(eye.limbus_radius_mm))
     indices = [1.0, *(float(n) for n in eye.front_indices)]
@@ -267,6 +269,7 @@ def _closed(*parts: tuple[Patch, int]) -> Any:
 
 def crossing(eye: Eye, meshes: EyeMeshes, tolerance_mm: float = 1e-6) -> Sequence[str]:
     """Names of refracting patches that poke through the next surface outside them; empty for a sound eye."""
+    eye = shelled(eye)
     order: list[tuple[str, Surface]] = [("cornea_front", eye.front[0])]
     if len(eye.front) > 1:
         order.append(("cornea_back", eye.front[-1]))

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ..arrays import ArrayValue
 from ..geometry.surfaces import Surface, Xyz, components, fit, shift, turn_back
 from ..geometry.transforms import Array, read_only
+from ..optics.gradient import GradientMedium
 from ..optics.interface import Number
 from .spec import EyeSpec, Side
 
@@ -137,7 +138,8 @@ class Eye(ArrayValue):
     """An eye in the eye frame, at one wavelength and with one pupil.
 
     front, front_indices : refracting surfaces between air and the stop, outside in; the index behind each.
-    back, back_indices : the lens' surfaces, likewise (a gradient lens: many shells); empty without a lens.
+    back, back_indices : the lens' surfaces, likewise; empty without a lens. A gradient lens has two, with the index of
+        its edge behind the front and `lens_gradient` between them, or many shells.
     back_rims_mm, back_passing : where each ends, and whether a ray that does not meet it passes on.
     fovea_mm, incident_node_mm (3,); chief_ray : the fixed ray in air that the fovea sees through the stop's centre.
     """
@@ -160,6 +162,7 @@ class Eye(ArrayValue):
     fovea_mm: Array
     incident_node_mm: Array
     chief_ray: LineOfSight
+    lens_gradient: GradientMedium | None = None
 
     @property
     def purkinje_orders(self) -> tuple[int, ...]:

@@ -129,13 +129,15 @@ class SurfaceLensSpec(Spec):
 
 
 class GradientLensSpec(Spec):
-    """A gradient-index lens as iso-indicial shells.
+    """A gradient-index lens.
 
-    The shell of relative size p in (0, 1] is the outer surface scaled by p about the lens' centre, which lies on the
-    line between the two apexes at `centre_fraction` of it, counted from the front; n(p) = n_core - (n_core - n_edge)
-    p^2. `shells` shells a half stand at evenly spaced n_k from edge to core; the medium inside shell k has the mid
-    index between n_k and n_(k+1). `index_rate` 2 reproduces software that steps the index twice as fast as the shells:
-    shell k stands where n has gone half as far as the index inside it says.
+    Its surfaces of one index are the outer surfaces scaled by p in (0, 1] about the lens' centre, which lies at
+    `centre_mm`, or on the line between the two apexes at `centre_fraction` of it, counted from the front;
+    n(p) = n_core - (n_core - n_edge) p^2. Rays are traced through the gradient itself, or through as many `shells` a
+    half as are given: shell k stands where n has gone k / shells of the way from edge to core, and the medium inside it
+    has the index half a step farther. `index_rate` 2 reproduces software that steps the index inside twice as fast as
+    the shells: shell k stands at k / (2 shells) of the way and has (k + 1) / shells inside; the lens' own surfaces lie
+    on the first shell.
     """
 
     kind: Literal["gradient"]
@@ -144,8 +146,9 @@ class GradientLensSpec(Spec):
     edge: MediumSpec
     core: MediumSpec
     vitreous: MediumSpec
-    shells: int = Field(default=21, ge=1, le=200)
+    shells: int | None = Field(default=None, ge=1, le=200)
     centre_fraction: float = Field(default=0.4, gt=0.0, lt=1.0)
+    centre_mm: Vec3 | None = None
     index_rate: Literal[1, 2] = 1
 
 

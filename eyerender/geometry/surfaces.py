@@ -106,6 +106,10 @@ class Surface(ABC):
         """The batch of surfaces at `index`; a single surface is returned as it is."""
 
     @abstractmethod
+    def scaled(self, centre_mm: Array, factor: float) -> Self:
+        """The surface with all distances from `centre_mm` (3,) multiplied by `factor` > 0."""
+
+    @abstractmethod
     def mirrored(self) -> Self:
         """The surface with y -> -y: that of the other eye."""
 

@@ -140,6 +140,10 @@ class Biconic(Surface):
             return self
         return type(self)(*(part[index] for part in self._key()))
 
+    def scaled(self, centre_mm: Array, factor: float) -> Self:
+        origin = centre_mm + factor * (self.origin_mm - centre_mm)
+        return type(self)(origin, self.rotation, factor * self.radii_mm, self.conic_constants)
+
     def mirrored(self) -> Self:
         # The sag is even in y, so only the placement is mirrored.
         return type(self)(flip_y(self.origin_mm), mirror_rotation(self.rotation), self.radii_mm, self.conic_constants)

@@ -199,6 +199,10 @@ class Quadric(Surface):
             return self
         return type(self)(*(part[index] for part in self._key()))
 
+    def scaled(self, centre_mm: Array, factor: float) -> Self:
+        origin = centre_mm + factor * (self.origin_mm - centre_mm)
+        return type(self)(origin, self.rotation, self.matrix, factor * self.vector, factor * factor * self.constant)
+
     def mirrored(self) -> Self:
         # In the mirrored local frame y changes sign too, so the local implicit function is mirrored with it.
         return type(self)(

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from ..arrays import ArrayValue
 from ..geometry.surfaces import Mask, Surface, components, join
 from ..geometry.transforms import Array, normalize
+from .gradient import GradientMedium
 from .interface import Number
 from .shooting import Corrected, correct, taken
 from .solve import apex_of
@@ -62,23 +63,26 @@ def purkinje_path(
     indices: Sequence[Number],
     rims_mm: Sequence[Number],
     passing: Sequence[bool],
+    gradient: GradientMedium | None = None,
     n_outside: float = 1.0,
 ) -> tuple[Crossing, ...]:
     """The crossings of a ray thrown back by the innermost of `surfaces`.
 
     surfaces : outside in, the last one reflects; indices : the index behind each; rims_mm : where each ends; passing :
-    whether a ray that does not meet a surface passes on (shells of a gradient lens).
+    whether a ray that does not meet a surface passes on (shells of a gradient lens); gradient : the medium before the
+    innermost surface where it is not of one index.
     """
 
     def crossing(k: int, n_after: Number, inward: bool) -> Crossing:
         edge = RayStatus.OUTSIDE_LIMBUS if k == 0 else RayStatus.MISSED
-        return Crossing(surfaces[k], n_after, inward, False, rims_mm[k], None if passing[k] else edge)
+        through = gradient if k == last - 1 and not inward else None
+        return Crossing(surfaces[k], n_after, inward, False, rims_mm[k], None if passing[k] else edge, through)
 
     last = len(surfaces) - 1
     before = [n_outside, *indices]
     return (
         *(crossing(k, indices[k], True) for k in range(last)),
-        Crossing(surfaces[last], 1.0, True, True, rims_mm[last], RayStatus.NO_MIRROR_POINT),
+        Crossing(surfaces[last], 1.0, True, True, rims_mm[last], RayStatus.NO_MIRROR_POINT, gradient),
         *(crossing(k, before[k], False) for k in reversed(range(last))),
     )
 
@@ -90,6 +94,7 @@ def purkinje_points(
     passing: Sequence[bool],
     source_mm: npt.ArrayLike,
     viewpoint_mm: npt.ArrayLike,
+    gradient: GradientMedium | None = None,
     n_outside: float = 1.0,
 ) -> PurkinjePoints:
     """Reflection at the innermost of `surfaces`, refraction at the others on the way in and out.
@@ -98,7 +103,7 @@ def purkinje_points(
     NO_MIRROR_POINT: the image, followed from the axis, ends before source and viewpoint are where they are, or lies
     beyond the rim of the reflecting surface.
     """
-    path = purkinje_path(surfaces, indices, rims_mm, passing, n_outside)
+    path = purkinje_path(surfaces, indices, rims_mm, passing, gradient, n_outside)
     viewpoint, source = np.broadcast_arrays(
         np.asarray(viewpoint_mm, dtype=np.float64), np.asarray(source_mm, dtype=np.float64)
     )

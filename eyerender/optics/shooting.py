@@ -164,11 +164,16 @@ def _shoot(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xy
     turning: Xyz | None = None
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for crossing in path:
-            lead = -dot(point, way)
-            near = _moved(point, way, lead)
-            hit = crossing.surface.hit(near, way, crossing.inward)
-            step = hit.distance + lead
-            met = hit.ok & (step > -BEHIND_MM)
+            if crossing.through is None:
+                lead = -dot(point, way)
+                near = _moved(point, way, lead)
+                hit = crossing.surface.hit(near, way, crossing.inward)
+                step = hit.distance + lead
+                met = hit.ok & (step > -BEHIND_MM)
+            else:
+                passage = crossing.through.cross(crossing.surface, crossing.inward, point, way, moves, turns)
+                hit, way, moves, turns = passage.hit, passage.way, passage.moves, passage.turns
+                step, met = hit.distance, hit.ok
             skip: Mask | None = None
             if crossing.beyond_rim is None:
                 skip = ~(met & inside_rim(crossing, hit.point))
@@ -326,6 +331,7 @@ def taken(crossing: Crossing, frame: npt.NDArray[np.intp]) -> Crossing:
         crossing.reflects,
         rim if np.ndim(rim) == 0 else np.asarray(rim)[frame],
         crossing.beyond_rim,
+        None if crossing.through is None else crossing.through.take(frame),
     )
 
 

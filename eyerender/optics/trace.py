@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ..arrays import ArrayValue
 from ..geometry.surfaces import Mask, Surface, Xyz, components, fit, join
 from ..geometry.transforms import Array
+from .gradient import GradientMedium
 from .interface import Number, dot, reflect, refract
 
 Status = npt.NDArray[np.int8]
@@ -54,6 +55,7 @@ class Crossing:
     rim_mm : the surface ends at this distance from its axis (infinite: it does not end).
     beyond_rim : the status of a ray that meets the surface outside its rim; None: such a ray passes on undisturbed, as
         does one that misses the surface (the inner shells of a gradient lens do not reach as far as the pupil).
+    through : the gradient medium before the crossing, where rays are bent on their way to it; None: they run straight.
     """
 
     surface: Surface
@@ -62,6 +64,7 @@ class Crossing:
     reflects: bool = False
     rim_mm: Number = np.inf
     beyond_rim: RayStatus | None = RayStatus.MISSED
+    through: GradientMedium | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,12 +104,18 @@ def trace(path: Sequence[Crossing], n_start: Number, origins_mm: npt.ArrayLike, 
     length = np.zeros(shape)
     index: Number = n_start if isinstance(n_start, float) else fit(np.asarray(n_start, dtype=np.float64), ndim)
     for crossing in path:
-        # A far origin loses digits in the quadratic; the foot of the perpendicular from the eye's origin does not.
-        lead = -dot(point, direction)
-        near = (point[0] + lead * direction[0], point[1] + lead * direction[1], point[2] + lead * direction[2])
-        hit = crossing.surface.hit(near, direction, crossing.inward)
-        step = hit.distance + lead
-        met = hit.ok & (step > -BEHIND_MM)
+        if crossing.through is None:
+            # A far origin loses digits in the quadratic; the foot of the perpendicular from the eye's origin does not.
+            lead = -dot(point, direction)
+            near = (point[0] + lead * direction[0], point[1] + lead * direction[1], point[2] + lead * direction[2])
+            hit = crossing.surface.hit(near, direction, crossing.inward)
+            step = hit.distance + lead
+            met = hit.ok & (step > -BEHIND_MM)
+        else:
+            passage = crossing.through.cross(crossing.surface, crossing.inward, point, direction)
+            hit, direction, met = passage.hit, passage.way, passage.hit.ok
+            step = hit.distance
+            length = length + passage.optical_path_mm
         within = met & inside_rim(crossing, hit.point)
         after, way, passes = cross(crossing, hit.gradient, direction, index)
         if crossing.beyond_rim is None:

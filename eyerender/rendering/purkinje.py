@@ -19,6 +19,7 @@ from ..arrays import Bools, Floats
 from ..errors import InputError
 from ..eye.model import Eye
 from ..geometry.surfaces import Surface
+from ..optics.gradient import GradientMedium
 from ..optics.interface import fresnel
 from ..optics.purkinje import purkinje_path, purkinje_points
 from ..optics.trace import Crossing, Traced, trace
@@ -34,13 +35,13 @@ def purkinje_images(
     """Images of the lamps by the given points of their discs."""
     camera, M, t = scene.camera, scene.M, scene.t
     images = []
-    surfaces, indices, rims, passing = stack(eye, order)
-    path = purkinje_path(surfaces, indices, rims, passing)
+    surfaces, indices, rims, passing, gradient = stack(eye, order)
+    path = purkinje_path(surfaces, indices, rims, passing, gradient)
     eyepoint = M.T @ (camera.nodal_point_mm - t)
     for lamp, node in zip(lights, nodes, strict=True):
         points = disc_points(lamp, node)
         sources = (points - t) @ M
-        found = purkinje_points(surfaces, indices, rims, passing, sources, eyepoint)
+        found = purkinje_points(surfaces, indices, rims, passing, sources, eyepoint, gradient)
         ok = np.asarray(found.status) == 0
         out = np.where(ok[:, None], -np.asarray(found.directions), np.array([-1.0, 0.0, 0.0]))
         traced = trace(path, 1.0, np.broadcast_to(eyepoint, out.shape), out)
@@ -108,8 +109,10 @@ def _through_pupil(eye: Eye, points: Floats, corneal: int) -> Bools:
     return inside
 
 
-def stack(eye: Eye, order: int) -> tuple[tuple[Surface, ...], tuple[float, ...], tuple[float, ...], tuple[bool, ...]]:
-    """Surfaces down to the mirror, the indices behind them, their rims, and which a ray may pass by.
+def stack(
+    eye: Eye, order: int
+) -> tuple[tuple[Surface, ...], tuple[float, ...], tuple[float, ...], tuple[bool, ...], GradientMedium | None]:
+    """Surfaces down to the mirror, indices behind, rims, which a ray may pass by, and the gradient before the mirror.
 
     Raises:
         InputError: the eye has no such image.
@@ -121,4 +124,5 @@ def stack(eye: Eye, order: int) -> tuple[tuple[Surface, ...], tuple[float, ...],
     rims = (float(eye.limbus_radius_mm), *(np.inf for _ in eye.front[1:]), *(float(r) for r in eye.back_rims_mm))
     indices = tuple(float(n) for n in (*eye.front_indices, *eye.back_indices))
     passing = ((False,) * corneal + eye.back_passing)[:depth]
-    return (eye.front + eye.back)[:depth], indices[:depth], rims[:depth], passing
+    gradient = eye.lens_gradient if order == 4 else None
+    return (eye.front + eye.back)[:depth], indices[:depth], rims[:depth], passing, gradient

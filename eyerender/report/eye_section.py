@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..eye.model import Eye
+from ..eye.shells import shelled
 from ..geometry.surfaces import Surface
 from .style import ANALYTIC, IMAGE, TARGET, figure
 
@@ -42,15 +43,15 @@ def _draw(ax: Any, eye: Eye, across: int) -> None:
         if k:  # the back of the cornea ends at the iris
             rim &= x >= _iris_x(eye, s, across)
         _curve(ax, surface, x, s, across, rim, _CORNEA, 1.8, "cornea" if k == 0 else None)
-    shells = len(eye.back) > 2
+    shells = shelled(eye)
     # A gradient lens has dozens of shells: a grid of their own, no larger than they are.
     back = float(eye.stop.centre_mm[0]) - 6.0
     lx, ls = np.meshgrid(np.linspace(back, back + 7.0, _LENS_GRID), np.linspace(-6.5, 6.5, _LENS_GRID))
-    for k, (surface, rim_mm) in enumerate(zip(eye.back, eye.back_rims_mm, strict=True)):
-        outer = k in (0, len(eye.back) - 1)
+    for k, (surface, rim_mm) in enumerate(zip(shells.back, shells.back_rims_mm, strict=True)):
+        outer = k in (0, len(shells.back) - 1) or len(shells.back) <= 2
         inside = _axis_distance(surface, lx, ls, across) <= min(float(np.asarray(rim_mm)), _LENS_MM)
         name = "lens" if k == 0 else None
-        _curve(ax, surface, lx, ls, across, inside, _LENS, 1.6 if outer or not shells else 0.35, name)
+        _curve(ax, surface, lx, ls, across, inside, _LENS, 1.6 if outer else 0.35, name)
     _curve(ax, eye.retina, x, s, across, x < -8.0, _RETINA, 1.6, "retina (optical)")
     outside = np.hypot(x - centre[0], s - centre[across]) - radius
     beside = (_axis_distance(eye.front[0], x, s, across) >= eye.limbus_radius_mm) | (x < -8.0)

@@ -270,7 +270,7 @@ def test_the_iris_hides_images_of_the_lens_from_the_pupil_on_that_just_lets_them
             ((eye.limbus_radius_mm,) * len(eye.front) + eye.back_rims_mm)[:depth],
             ((False,) * len(eye.front) + eye.back_passing)[:depth],
         ]
-        found = purkinje_points(*path, lamp, place)
+        found = purkinje_points(*path, lamp, place, eye.lens_gradient if order == 4 else None)
         assert found.status[0] == RayStatus.OK
         reach = []
         for start, target in ((place, found.exit_points_mm), (lamp, found.course_mm[-1])):

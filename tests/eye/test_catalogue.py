@@ -13,6 +13,8 @@ import yaml
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import FOLDER, catalogue_names, load_eye
 from eyerender.eye.model import EyeSpec
+from eyerender.eye.shells import shelled
+from eyerender.geometry.surfaces_quadric import centre_of
 from eyerender.optics.trace import RayStatus, trace
 
 NAMES = ("E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop")
@@ -80,37 +82,62 @@ def test_dispersion_and_constant_media():
         assert (np.asarray(blue.front_indices) >= np.asarray(red.front_indices)).all()
 
 
-def test_the_gradient_lens_follows_its_law():
+def test_the_shells_of_a_gradient_lens_follow_its_law():
     """n(p) = n_core - (n_core - n_edge) p^2 at the shells; inside each the mid index; p from the apexes' distances."""
-    eye, spec = load_eye("E5").build(), load_eye("E5").lens
-    core, edge = (np.polyval(m.cauchy[::-1], 850.0**-2.0) for m in (spec.core, spec.edge))
-    assert len(eye.back) == 42
-    centre = np.array([-3.6 - 0.4 * 3.5, -0.371 + 0.4 * 0.101, 0.04 + 0.4 * 0.05])
-    front, back = eye.back[:21], eye.back[21:][::-1]
-    nodes = []
-    for half, apex in ((front, [-3.6, -0.371, 0.04]), (back, [-7.1, -0.27, 0.09])):
-        whole = np.array(apex) - centre
-        size = [np.linalg.norm(s.origin_mm - centre) / np.linalg.norm(whole) for s in half]
-        for s, p in zip(half, size, strict=True):
-            assert np.allclose(s.origin_mm - centre, p * whole, atol=1e-14)
-        law = core - (core - edge) * np.array(size) ** 2
-        assert np.allclose(law, np.linspace(edge, core, 22)[:-1], atol=1e-14)
-        nodes.append(law)
-    middle = 0.5 * (np.append(nodes[0][1:], core) + nodes[0])
-    assert np.allclose(eye.back_indices[:21], middle, atol=1e-14)
-    assert np.allclose(eye.back_indices[21:41], middle[-2::-1], atol=1e-14)
-    # Scaled with the shell: the radius, not the conic constant. The apex radius is the half gradient over A_yy.
-    for s in front:
-        p = np.linalg.norm(s.origin_mm - centre) / np.linalg.norm(front[0].origin_mm - centre)
-        assert s.vector[0] == pytest.approx(14.304 * p, rel=1e-13)
-        assert s.matrix[0, 0] == pytest.approx(1.0 - 3.546, rel=1e-13)
-
-
-def test_more_shells_converge():
-    """The steps of the lens are fine enough: doubling them moves the fovea by a few microns at most."""
     spec = load_eye("E5")
-    fine = spec.model_copy(update={"lens": spec.lens.model_copy(update={"shells": 42})})
-    assert np.linalg.norm(fine.build().fovea_mm - spec.build().fovea_mm) < 5e-3
+    built = spec.model_copy(update={"lens": spec.lens.model_copy(update={"shells": 21})}).build()
+    core, edge = (np.polyval(m.cauchy[::-1], 850.0**-2.0) for m in (spec.lens.core, spec.lens.edge))
+    for eye in (built, shelled(spec.build())):
+        assert len(eye.back) == 42
+        centre = np.array([-3.6 - 0.4 * 3.5, -0.371 + 0.4 * 0.101, 0.04 + 0.4 * 0.05])
+        front, back = eye.back[:21], eye.back[21:][::-1]
+        nodes = []
+        for half, apex in ((front, [-3.6, -0.371, 0.04]), (back, [-7.1, -0.27, 0.09])):
+            whole = np.array(apex) - centre
+            size = [np.linalg.norm(s.origin_mm - centre) / np.linalg.norm(whole) for s in half]
+            for s, p in zip(half, size, strict=True):
+                assert np.allclose(s.origin_mm - centre, p * whole, atol=1e-14)
+            law = core - (core - edge) * np.array(size) ** 2
+            assert np.allclose(law, np.linspace(edge, core, 22)[:-1], atol=1e-14)
+            nodes.append(law)
+        middle = 0.5 * (np.append(nodes[0][1:], core) + nodes[0])
+        assert np.allclose(eye.back_indices[:21], middle, atol=1e-14)
+        assert np.allclose(eye.back_indices[21:41], middle[-2::-1], atol=1e-14)
+        # Scaled with the shell: the radius, not the conic constant. The apex radius is the half gradient over A_yy.
+        for s in front:
+            p = np.linalg.norm(s.origin_mm - centre) / np.linalg.norm(front[0].origin_mm - centre)
+            assert s.vector[0] == pytest.approx(14.304 * p, rel=1e-13)
+            assert s.matrix[0, 0] == pytest.approx(1.0 - 3.546, rel=1e-13)
+    # The gradient itself is not made of shells, and the eye is the same but for its lens.
+    eye = spec.build()
+    assert len(eye.back) == 2
+    assert eye.back_indices == pytest.approx((edge, built.back_indices[-1]), abs=1e-14)
+    assert float(eye.lens_gradient.core) == pytest.approx(core, abs=1e-14)
+    assert shelled(load_eye("E4").build()) == load_eye("E4").build()
+
+
+def test_the_published_lens_is_the_authors_software():
+    """44 surfaces (its two outer ones and 42 shells); the core's index does not square the age: 1.425654, not 1.421859.
+
+    Node and shells by a port of that software's surfaces as 4 x 4 matrices, which shares nothing with this package.
+    """
+    eye = load_eye("E5-published").build()
+    assert len(eye.back) == 44
+    edge, core = 1.363983982095, 1.425654450575
+    inside = edge + (core - edge) * np.arange(22) / 21.0
+    aqueous, vitreous = 1.3302435786, 1.3304719540
+    ladder = [*inside, *inside[-2::-1], vitreous]
+    assert eye.back_indices == pytest.approx(ladder, abs=1e-10)
+    assert eye.front_indices[-1] == pytest.approx(aqueous, abs=1e-10)
+    # Hyperboloids about K(p) = C + p (K(1) - C); the software turns each about its own centre.
+    for half, centre in ((eye.back[:22], [-3.6 + 14.304 / 2.546, -0.371, 0.036]),
+                         (eye.back[22:][::-1], [-7.1 - 6.884 / 2.3286, -0.27, 0.092])):  # fmt: skip
+        assert half[0] == half[1]
+        middle = np.array([-5.0, -0.3205, 0.064])
+        for k, surface in enumerate(half[1:]):
+            p = np.sqrt(1.0 - k / 42.0)
+            assert np.allclose(centre_of(surface), middle + p * (np.array(centre) - middle), atol=1e-9)
+    assert np.abs(eye.incident_node_mm - [-7.08250041, 0.12055175, -0.15770869]).max() < 1e-8
 
 
 def test_corneas_and_stops_stand_where_the_table_says():
@@ -149,6 +176,7 @@ def test_the_left_eye_is_the_mirror_image(name):
     assert np.allclose(other.points_mm, one.points_mm * mirror, atol=1e-11)
     for a, b in (
         (left.fovea_mm, right.fovea_mm),
+        (left.incident_node_mm, right.incident_node_mm),
         (left.stop.boundary(9), right.stop.boundary(9)),
         (left.chief_ray.direction, right.chief_ray.direction),
         (left.sclera.centre_mm, right.sclera.centre_mm),

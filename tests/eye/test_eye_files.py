@@ -59,6 +59,16 @@ BAD = [
     ("E5", "cornea.0.shape.radii_mm", [7.7, -7.7], "cornea.0.shape.radii_mm", "both"),
     ("E5", "cornea.0.placed_by", "centre", "cornea.0.placed_by", "apex"),
     ("E5", "lens.shells", 0, "lens.shells", "must be >= 1"),
+    ("E5", "lens.index_rate", 2, "lens.index_rate", "without 'shells'"),
+    ("E5", "lens.centre_mm", [-3.0, 0.0, 0.0], "lens.centre_mm", "between"),
+    ("E5", "lens.front.shape", {"kind": "plane"}, "lens.front.shape", "spheres, conics or biconics"),
+    (
+        "E5",
+        "lens.front.shape",
+        {"kind": "biconic", "radii_mm": [14.0, 14.5], "conic_constants": [-3.0, -3.5]},
+        "lens.shells",
+        "biconics",
+    ),
     ("E5", "lens.centre_fraction", 1.0, "lens.centre_fraction", "must be < 1"),
     ("E5-published", "cornea.0.shape.semi_axes_mm", [10.0, -9.0, 9.0], "cornea.0.shape.semi_axes_mm.1", "must be > 0"),
 ]

@@ -31,6 +31,7 @@ def images(eye, order, source, viewpoint, rim=np.inf):
         ((False,) * len(eye.front) + eye.back_passing)[:depth],
         source,
         viewpoint,
+        eye.lens_gradient if order == 4 else None,
     )
 
 
@@ -175,13 +176,10 @@ def test_every_rig_gets_an_answer_and_the_same_one_backwards(name, kind):
         assert ok.sum() > (count / 20 if order == 3 else count / 2)
         assert found.residual_mm[ok].max() < 1e-9
         apart = np.linalg.norm(found.points_mm - back.points_mm, axis=-1)[ok]
-        if (name, order) == ("E5", 4):
-            # The gradient lens has steps: a ray that grazes a shell has a twin on the step's other side.
-            assert np.mean(apart < 1e-9) > 0.95
-            assert apart.max() < 0.02
-        else:
-            assert apart.max() < 1e-9
-            assert np.abs(found.course_mm - back.course_mm[::-1])[:, ok].max() < 1e-9
+        # Through the gradient lens the steps of the way back are not those of the way there.
+        limit = 1e-6 if (name, order) == ("E5", 4) else 1e-9
+        assert apart.max() < limit
+        assert np.abs(found.course_mm - back.course_mm[::-1])[:, ok].max() < limit
         for values in (found.points_mm, found.exit_points_mm, found.directions, found.residual_mm):
             assert np.isnan(values[~ok]).all()
 

@@ -19,12 +19,12 @@ from eyerender.rendering.purkinje import stack, tube_mm2_sr
 def test_the_ray_tube_is_the_same_from_the_lamp(model, order):
     # Reciprocity: |d x / d omega| is the same both ways where both ends are in air.
     eye = eye_of(model)
-    surfaces, indices, rims, passing = stack(eye, order)
+    *lens, gradient = stack(eye, order)
     lamp, node = np.array([[560.0, 20.0, -120.0]]), np.array([[520.0, 0.0, -60.0]])
-    path = purkinje_path(surfaces, indices, rims, passing)
+    path = purkinje_path(*lens, gradient)
     ways = []
     for a, b in ((lamp, node), (node, lamp)):
-        found = purkinje_points(surfaces, indices, rims, passing, a, b[0])
+        found = purkinje_points(*lens, a, b[0], gradient)
         assert found.status[0] == 0
         ways.append(tube_mm2_sr(path, b[0], -found.directions, a)[0][0])
     assert ways[0] == pytest.approx(ways[1], rel=1e-6)
@@ -74,9 +74,9 @@ def test_place_in_the_picture(renderer, order):
     job = replace(job, window=rig.window(48, 48, np.round(xy)))
     image = renderer.render(job, spp=1).irradiance
     assert np.linalg.norm(centroid(image, job.window) - xy) < 1e-3
-    surfaces, indices, rims, passing = stack(eye, order)
+    *lens, gradient = stack(eye, order)
     node, source = (job.M.T @ (p - job.t) for p in (job.camera.nodal_point_mm, lamp.position_mm))
-    found = purkinje_points(surfaces, indices, rims, passing, source[None], node)
+    found = purkinje_points(*lens, source[None], node, gradient)
     truth = job.camera.project(found.exit_points_mm @ job.M.T + job.t)[0][0]
     assert np.linalg.norm(xy - truth) < 1e-6
 
