@@ -9,16 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from .arrays import ArrayValue, Bools, Floats, Ints, Objects, frozen
 from .errors import InputError
+from .files import shown
 
 SCHEMA = "eyerender/record/1"
 OK, MISSING = "ok", "missing"
 EYES = ("right", "left")
+
+# Boundary points of one pupil (ten a degree) and of all pupils of a batch, which take 25 bytes each.
+MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
+# Glints of all observations of a batch, which have a status and a reason each.
+MAX_GLINTS = 5_000_000
+# In a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
+_MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,22 +194,20 @@ class Observations(ArrayValue):
                 raise InputError("must be a record", source=source, path=f"records.{k}")
             if record.get("schema") != SCHEMA:
                 raise InputError(
-                    f"is {record.get('schema')!r}; this version reads {SCHEMA!r}",
+                    f"is {shown(record.get('schema'))}; this version reads {SCHEMA!r}",
                     source=source,
                     path=f"records.{k}.schema",
                 )
         reader = _Reader(rows, source)
-        n = len(rows)
         eye = reader.texts("eye")
         for k, name in enumerate(eye):
             if name is not None and name not in EYES:
                 raise InputError("must be 'right' or 'left'", source=source, path=f"records.{k}.eye")
         head = reader.array("head_mm", (3,))
-        points = [r["pupil"]["points_px"] or [] for r in rows if reader.has_pupil(r)]
-        k_points = max((len(p) for p in points), default=0)
-        m = max((len(r.get("glints") or []) for r in rows), default=0)
-        glints = [reader.glints(k, m) for k in range(n)]
-        pupil_status = reader.texts("pupil.status")
+        status, centre = reader.statuses("pupil.status"), reader.array("pupil.centre_px", (2,))
+        semi_axes = reader.array("pupil.semi_axes_px", (2,))
+        for row in np.flatnonzero((status == OK) & ~(np.isfinite(centre).all(axis=1) & (semi_axes > 0).all(axis=1))):
+            reader.refuse(row, "pupil", f"is {OK!r}, but has no centre or semi-axes")
         return cls(
             Index(
                 reader.counts("frame"),
@@ -221,24 +227,17 @@ class Observations(ArrayValue):
                 reader.array("pose.residual_mm", ()),
             ),
             PupilFeatures(
-                pupil_status,
+                status,
                 reader.texts("pupil.reason"),
-                frozen([bool(v) for v in reader.values("pupil.in_image")], bool),
-                reader.array("pupil.centre_px", (2,)),
-                reader.array("pupil.semi_axes_px", (2,)),
+                reader.flags("pupil.in_image"),
+                centre,
+                semi_axes,
                 reader.array("pupil.angle_rad", ()),
                 reader.array("pupil.anatomical_centre_px", (2,)),
-                reader.points("pupil.points_px", k_points),
+                reader.points("pupil.points_px"),
                 reader.array("pupil.covariance", (5, 5)),
             ),
-            GlintFeatures(
-                frozen(np.array([g[0] for g in glints], dtype=np.int64).reshape(n, m), np.int64),
-                frozen(np.array([g[1] for g in glints], dtype=object).reshape(n, m), object),
-                frozen(np.array([g[2] for g in glints], dtype=object).reshape(n, m), object),
-                frozen(np.array([g[3] for g in glints], dtype=bool).reshape(n, m), bool),
-                frozen(np.array([g[4] for g in glints], dtype=float).reshape(n, m, 2)),
-                frozen(np.array([g[5] for g in glints], dtype=float).reshape(n, m, 2, 2)),
-            ),
+            reader.glints(),
         )
 
 
@@ -260,68 +259,137 @@ class _Reader:
             out.append(value)
         return out
 
+    def refuse(self, k: Any, path: str, reason: str) -> NoReturn:
+        raise InputError(reason, source=self.source, path=f"records.{k}.{path}")
+
     def texts(self, path: str) -> Objects:
         out = np.empty(len(self.records), dtype=object)
-        out[:] = self.values(path)
+        for k, value in enumerate(self.values(path)):
+            if not (value is None or (isinstance(value, str) and len(value) <= _MAX_TEXT)):
+                self.refuse(k, path, f"must be null or a text of at most {_MAX_TEXT} characters")
+            out[k] = value
         return frozen(out, object)
+
+    def statuses(self, path: str) -> Objects:
+        out = self.texts(path)
+        for k, value in enumerate(out):
+            if not value:
+                self.refuse(k, path, f"must be {OK!r} or {MISSING!r}")
+        return out
+
+    def flags(self, path: str) -> Bools:
+        values = self.values(path)
+        for k, value in enumerate(values):
+            if not (value is None or isinstance(value, bool)):
+                self.refuse(k, path, "must be true, false or null")
+        return frozen([bool(v) for v in values], bool)
 
     def counts(self, path: str) -> Ints:
         values = self.values(path)
-        for k, v in enumerate(values):
-            if v is not None and (isinstance(v, bool) or not isinstance(v, int)):
-                raise InputError("must be a whole number or null", source=self.source, path=f"records.{k}.{path}")
+        for k, value in enumerate(values):
+            if not (value is None or _is_count(value)):
+                self.refuse(k, path, "must be a whole number or null")
         return frozen([-1 if v is None else v for v in values], np.int64)
 
     def array(self, path: str, shape: tuple[int, ...]) -> Floats:
         out = np.full((len(self.records), *shape), np.nan)
         for k, value in enumerate(self.values(path)):
-            if value is None:
-                continue
-            try:
-                out[k] = np.asarray(value, dtype=float)
-            except (TypeError, ValueError):
-                raise InputError(
-                    f"must be null or {'x'.join(map(str, shape)) or 'one'} number(s)",
-                    source=self.source,
-                    path=f"records.{k}.{path}",
-                ) from None
+            if value is not None:
+                found = _array(value)
+                if found is None or found.shape != shape:
+                    self.refuse(k, path, f"must be null or {'x'.join(map(str, shape)) or 'one'} number(s)")
+                out[k] = found
         return frozen(out)
 
-    def points(self, path: str, width: int) -> Floats:
-        out = np.full((len(self.records), width, 2), np.nan)
-        for k, value in enumerate(self.values(path)):
+    def points(self, path: str) -> Floats:
+        values = self.values(path)
+        for k, value in enumerate(values):
+            if not (value is None or (isinstance(value, list) and len(value) <= MAX_BOUNDARY_POINTS)):
+                self.refuse(k, path, f"must be null or a list of at most {MAX_BOUNDARY_POINTS} points")
+        width = max((len(value) for value in values if value), default=0)
+        _check_width(len(values), width, MAX_POINTS, "boundary points", self.source)
+        out = np.full((len(values), width, 2), np.nan)
+        for k, value in enumerate(values):
             if value:
-                try:
-                    out[k, : len(value)] = np.asarray(value, dtype=float)
-                except (TypeError, ValueError):
-                    raise InputError(
-                        "must be null or a list of points", source=self.source, path=f"records.{k}.{path}"
-                    ) from None
+                found = _array(value)
+                if found is None or found.shape != (len(value), 2):
+                    self.refuse(k, path, "must be null or a list of points")
+                out[k, : len(value)] = found
         return frozen(out)
 
-    @staticmethod
-    def has_pupil(record: dict[str, Any]) -> bool:
-        pupil = record.get("pupil")
-        return isinstance(pupil, dict) and isinstance(pupil.get("points_px"), list)
-
-    def glints(self, k: int, m: int) -> tuple[list[Any], ...]:
-        entries = self.records[k].get("glints")
-        if not isinstance(entries, list):
-            raise InputError("must be a list", source=self.source, path=f"records.{k}.glints")
-        light, status, reason = [-1] * m, [""] * m, [None] * m
-        inside = [False] * m
-        xy, cov = np.full((m, 2), np.nan), np.full((m, 2, 2), np.nan)
-        for j, g in enumerate(entries):
-            try:
-                light[j] = -1 if g["light"] is None else int(g["light"])
-                status[j], reason[j], inside[j] = g["status"], g["reason"], bool(g["in_image"])
+    def glints(self) -> GlintFeatures:
+        rows = self.values("glints")
+        for k, entries in enumerate(rows):
+            if not isinstance(entries, list) or len(entries) > _MAX_ENTRIES:
+                self.refuse(k, "glints", f"must be a list of at most {_MAX_ENTRIES}")
+        n, m = len(rows), max(map(len, rows), default=0)
+        _check_width(n, m, MAX_GLINTS, "glints", self.source)
+        light, status = np.full((n, m), -1, np.int64), np.full((n, m), "", object)
+        reason = np.full((n, m), None, object)
+        inside, xy, covariance = np.zeros((n, m), bool), np.full((n, m, 2), np.nan), np.full((n, m, 2, 2), np.nan)
+        for k, entries in enumerate(rows):
+            for j, g in enumerate(entries):
+                why = _glint_problem(g)
+                if why is not None:
+                    self.refuse(k, f"glints.{j}", f"is no glint record: {why}")
+                light[k, j] = -1 if g["light"] is None else g["light"]
+                status[k, j], reason[k, j], inside[k, j] = g["status"], g["reason"], bool(g["in_image"])
                 if g["xy_px"] is not None:
-                    xy[j] = g["xy_px"]
+                    xy[k, j] = g["xy_px"]
                 if g["covariance"] is not None:
-                    cov[j] = g["covariance"]
-            except (KeyError, TypeError, ValueError):
-                raise InputError("not a glint record", source=self.source, path=f"records.{k}.glints.{j}") from None
-        return light, status, reason, inside, xy.tolist(), cov.tolist()
+                    covariance[k, j] = g["covariance"]
+        return GlintFeatures(
+            frozen(light, np.int64),
+            frozen(status, object),
+            frozen(reason, object),
+            frozen(inside, bool),
+            frozen(xy),
+            frozen(covariance),
+        )
+
+
+def _glint_problem(g: Any) -> str | None:
+    """What is wrong with an entry of a record's glints; None where nothing is."""
+    if not isinstance(g, dict):
+        return "must be an object"
+    for key in ("light", "status", "reason", "in_image", "xy_px", "covariance"):
+        if key not in g:
+            return f"{key} is missing"
+    if not (g["light"] is None or _is_count(g["light"])):
+        return "light must be a whole number or null"
+    if not (isinstance(g["status"], str) and 0 < len(g["status"]) <= _MAX_TEXT):
+        return f"status must be {OK!r} or {MISSING!r}"
+    if not (g["reason"] is None or (isinstance(g["reason"], str) and len(g["reason"]) <= _MAX_TEXT)):
+        return "reason must be null or a text"
+    if not (g["in_image"] is None or isinstance(g["in_image"], bool)):
+        return "in_image must be true, false or null"
+    for key, shape in (("xy_px", (2,)), ("covariance", (2, 2))):
+        if g[key] is not None and ((found := _array(g[key])) is None or found.shape != shape):
+            return f"{key} must be null or {'x'.join(map(str, shape))} numbers"
+    if g["status"] == OK and g["xy_px"] is None:
+        return f"it is {OK!r}, but has no xy_px"
+    return None
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
+
+
+def _array(value: Any) -> Floats | None:
+    """Plain numbers, of a size that can be squared, as an array; None for anything else."""
+    try:
+        found = np.asarray(value)
+    except (ValueError, OverflowError):  # rows of unequal length
+        return None
+    if found.dtype.kind not in "iuf" or not (np.abs(found) <= _LARGEST).all():
+        return None
+    return found
+
+
+def _check_width(rows: int, width: int, limit: int, what: str, source: str = "") -> None:
+    """Rows are filled up to the widest: one wide record among many must not take all the memory."""
+    if rows * width > limit:
+        raise InputError(f"{rows} records of up to {width} {what} are more than {limit} {what}", source=source)
 
 
 def count_heads(head_mm: Floats) -> Ints:
@@ -345,6 +413,9 @@ def concatenate(parts: Iterable[Observations]) -> Observations:
         for f in fields(groups[0]):
             arrays = [getattr(g, f.name) for g in groups]
             width = max((a.shape[1] for a in arrays if a.ndim > 1), default=0)
+            limit, what = (MAX_GLINTS, "glints") if name == "glints" else (MAX_POINTS, "boundary points")
+            if f.name in ("points_px", "light"):
+                _check_width(sum(map(len, arrays)), width, limit, what)
             columns[f.name] = frozen(np.concatenate([_widened(a, width) for a in arrays]), arrays[0].dtype)
         return replace(groups[0], **columns)
 

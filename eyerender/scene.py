@@ -21,7 +21,7 @@ from .eye.catalogue import load_eye
 from .eye.margin import PupilMarginSpec
 from .eye.model import Eye
 from .eye.spec import EyeSpec
-from .observation import EYES, Index
+from .observation import EYES, MAX_GLINTS, Index
 from .region.anatomy import RegionSpec
 from .region.look import LookSpec
 from .rig.imaging import AmbientSpec, LensSpec, MotionSpec
@@ -33,8 +33,6 @@ DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
 # An observation is one eye in one frame. Analysing this many takes about 1 GB of memory, their records some 2 GB.
 MAX_OBSERVATIONS = 200_000
-# Glints of all observations, which have a status and a reason each.
-MAX_GLINTS = 5_000_000
 
 
 class EyeChoiceSpec(Spec):

@@ -132,6 +132,14 @@ def test_concatenate_fills_up_to_the_widest():
     assert [len(r["glints"]) for r in both.records()] == [2, 2, 3, 3, 3, 2]
 
 
+def test_one_wide_record_does_not_take_all_memory():
+    """Rows are filled up to the widest: 6,000 records of two glints, and one of 1,000, would be six million."""
+    record = next(observations().records())
+    wide = {**record, "glints": [record["glints"][0]] * 1000}
+    with pytest.raises(InputError, match="6001 records of up to 1000 glints are more than 5000000 glints"):
+        Observations.from_records([record] * 6000 + [wide])
+
+
 def test_glint_of_light_where_no_image_has_a_glint():
     some = observations()
     rows = [{**record, "glints": []} for record in some.records()]
@@ -157,7 +165,29 @@ def test_glint_of_light():
         (lambda r: r.update(eye="both"), "records.0.eye: must be 'right' or 'left'"),
         (lambda r: r["pupil"].update(centre_px=[1, 2, 3]), "records.0.pupil.centre_px: must be null or 2 number"),
         (lambda r: r.update(frame="x"), "records.0.frame: must be a whole number"),
+        (lambda r: r.update(frame=10**200), "records.0.frame: must be a whole number"),
+        (lambda r: r.update(frame=-1), "records.0.frame: must be a whole number"),
+        (lambda r: r.update(eye=["right"]), "records.0.eye: must be null or a text"),
+        (lambda r: r.update(eye_model="E" * 501), "records.0.eye_model: must be null or a text of at most 500"),
+        (lambda r: r.update(target_mm=[1, 2, "3"]), "records.0.target_mm: must be null or 3 number"),
+        (lambda r: r.update(target_mm=[1, 2, 1e200]), "records.0.target_mm: must be null or 3 number"),
+        (lambda r: r.update(target_mm=[1, 2, 10**200]), "records.0.target_mm: must be null or 3 number"),
+        (lambda r: r.update(target_mm=[1, 2, float("nan")]), "records.0.target_mm: must be null or 3 number"),
+        (lambda r: r.update(head_mm=[[1], [2, 3], 4]), "records.0.head_mm: must be null or 3 number"),
+        (lambda r: r["pose"].update(azimuth_deg=True), "records.0.pose.azimuth_deg: must be null or one number"),
+        (lambda r: r["pupil"].update(status=None), "records.0.pupil.status: must be 'ok' or 'missing'"),
+        (lambda r: r["pupil"].update(in_image="yes"), "records.0.pupil.in_image: must be true, false or null"),
+        (lambda r: r["pupil"].update(centre_px=None), "records.0.pupil: is 'ok', but has no centre"),
+        (lambda r: r["pupil"].update(semi_axes_px=[3, 0]), "records.0.pupil: is 'ok', but has no centre or semi-axes"),
+        (lambda r: r["pupil"].update(points_px=[[1, 2, 3]]), "records.0.pupil.points_px: must be null or a list"),
+        (lambda r: r["pupil"].update(points_px=[[1, 2]] * 3601), "records.0.pupil.points_px: must be null or a list"),
         (lambda r: r.update(glints=None), "records.0.glints: must be a list"),
+        (lambda r: r.update(glints=[{}] * 1001), "records.0.glints: must be a list of at most 1000"),
+        (lambda r: r["glints"][1].pop("light"), "records.0.glints.1: is no glint record: light is missing"),
+        (lambda r: r["glints"][1].update(light=2**70), "records.0.glints.1: is no glint record: light must be"),
+        (lambda r: r["glints"][1].update(status=["ok"]), "records.0.glints.1: is no glint record: status must be"),
+        (lambda r: r["glints"][1].update(xy_px=None), "records.0.glints.1: is no glint record: it is 'ok', but has no"),
+        (lambda r: r["glints"][1].update(xy_px=[1, "2"]), "records.0.glints.1: is no glint record: xy_px must be null"),
     ],
 )
 def test_bad_records_are_named(change, words):

@@ -22,6 +22,7 @@ from ..eye.model import Eye
 from ..eye.pose import Poses, rigid_motion
 from ..geometry.ellipse import fit_ellipse_direct
 from ..geometry.surfaces import Xyz
+from ..observation import MAX_BOUNDARY_POINTS, MAX_POINTS
 from ..optics.trace import RayStatus
 from ..rig.camera import Camera, distort
 from .rays import glint_exits, pupil_exits
@@ -32,8 +33,6 @@ CHUNK_POINTS = 12000
 """Points refracted at once: fewer leave the time to the interpreter, more leave the cache (measured: 8,000 to
 20,000).
 """
-MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 20_000_000
-"""Boundary points of one pupil (ten a degree), and of all pupils together, which take 25 bytes each."""
 BEHIND_CAMERA = 100
 """Status beside those of `RayStatus`: the point lies behind the camera."""
 

@@ -65,7 +65,9 @@ class Estimator(Protocol):
 
 
 def gaze_points(point_mm: Floats, reason: Objects) -> GazePoints:
-    """Gaze points whose status follows from the reason (None: ok)."""
+    """Gaze points whose status follows from the reason (None: ok); one that is not finite has none."""
+    reason = reason.copy()
+    reason[(reason == None) & ~np.isfinite(point_mm).all(axis=-1)] = "the estimate is not finite"  # noqa: E711
     ok = np.array([r is None for r in reason], dtype=bool)
     status = np.where(ok, OK, MISSING).astype(object)
     return GazePoints(frozen(np.where(ok[:, None], point_mm, np.nan)), frozen(status, object), frozen(reason, object))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +10,17 @@ import numpy as np
 
 from ..arrays import Floats, frozen
 from ..errors import InputError
+from ..files import parse_json, read_text
 from ..observation import Observations
-from ..rig.camera import Camera
-from ..rig.light import Light
-from ..rig.rig import Rig
+from ..rig.camera import CalibrationSpec, Camera
+from ..rig.light import MAX_LIGHTS, Light
+from ..rig.rig import MAX_CAMERAS, Rig
 from ..rig.screen import Screen
 from ..scene import load_scene
+from ..spec import LARGEST
+
+# Records of some 40,000 observations. All of them are held at once.
+MAX_RECORDS_BYTES = 128 * 2**20
 
 
 def load_observations(path: str | Path, scene: str | None = None) -> tuple[Observations, Rig]:
@@ -28,32 +33,7 @@ def load_observations(path: str | Path, scene: str | None = None) -> tuple[Obser
         InputError: naming the file and the key.
     """
     source = str(path)
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError("no such file", source=source) from None
-    except (OSError, UnicodeDecodeError):
-        raise InputError("cannot be read as text", source=source) from None
-    rig, records = None, []
-    try:
-        data = json.loads(text)
-    except ValueError:
-        data = None
-    if isinstance(data, dict) and "records" in data:
-        if not isinstance(data["records"], list):
-            raise InputError("must be a list", source=source, path="records")
-        records, rig = data["records"], data.get("rig")
-    elif isinstance(data, dict):
-        records = [data]
-    else:
-        for k, line in enumerate(text.splitlines()):
-            if line.strip():
-                try:
-                    records.append(json.loads(line))
-                except ValueError:
-                    raise InputError("is not valid JSON", source=source, path=f"line {k + 1}") from None
-        # A line of a folder's metadata holds the records of its image.
-        records = [r for line in records for r in (line["records"] if _is_image_line(line) else [line])]
+    records, rig = _read(read_text(path, limit=MAX_RECORDS_BYTES), source)
     if not records:
         raise InputError("holds no records", source=source)
     observations = Observations.from_records(records, source=source)
@@ -64,51 +44,84 @@ def load_observations(path: str | Path, scene: str | None = None) -> tuple[Obser
     return observations, rig_from_mapping(rig, source=source)
 
 
+def _read(text: str, source: str) -> tuple[list[Any], Any]:
+    """Records and rig (None: there is none) of the text of a file."""
+    lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
+    # One record a line: the first line is a whole object, and not the last.
+    if len(lines) > 1 and lines[0][1].rstrip().endswith("}"):
+        objects = [parse_json(line, source=source, path=f"line {k}") for k, line in lines]
+        # A line of a folder's metadata holds the records of its image.
+        return [r for o in objects for r in (o["records"] if _is_image_line(o) else [o])], None
+    if not lines:
+        return [], None
+    data = parse_json(text, source=source)
+    if not isinstance(data, dict):
+        raise InputError("must be a JSON object", source=source)
+    if "records" not in data:
+        return [data], None
+    if not isinstance(data["records"], list):
+        raise InputError("must be a list", source=source, path="records")
+    return data["records"], data.get("rig")
+
+
 def rig_from_mapping(data: Any, *, source: str = "") -> Rig:
     """The rig as `features --json` writes it; raises `InputError` naming the part that is wrong."""
 
     def array(value: Any, shape: tuple[int, ...], path: str) -> Floats:
         try:
-            out = np.array(value, dtype=float)
-        except (TypeError, ValueError):
+            out = np.asarray(value)
+        except (ValueError, OverflowError):  # rows of unequal length
             out = np.zeros(0)
-        if out.shape != shape or not np.isfinite(out).all():
+        if out.shape != shape or out.dtype.kind not in "iuf" or not (np.abs(out) <= LARGEST).all():
             raise InputError(f"must be {' x '.join(map(str, shape))} numbers", source=source, path=path)
         return frozen(out)
 
     if not isinstance(data, dict) or not isinstance(data.get("cameras"), list):
         raise InputError("must hold cameras", source=source, path="rig")
+    if len(data["cameras"]) > MAX_CAMERAS:
+        raise InputError(f"are more than {MAX_CAMERAS}", source=source, path="rig.cameras")
     cameras = []
     for k, c in enumerate(data["cameras"]):
         at = f"rig.cameras.{k}"
         if not isinstance(c, dict):
             raise InputError("must be a camera", source=source, path=at)
         size = array(c.get("resolution_px"), (2,), f"{at}.resolution_px")
-        cameras.append(
-            Camera.of(
-                array(c.get("K"), (3, 3), f"{at}.K"),
-                array(c.get("R"), (3, 3), f"{at}.R"),
-                array(c.get("t"), (3,), f"{at}.t"),
-                (int(size[0]), int(size[1])),
-                array(c.get("distortion", [0.0] * 5), (5,), f"{at}.distortion"),
-            )
-        )
+        if not ((size >= 1) & (size <= 65536) & (size == np.floor(size))).all():
+            raise InputError("must be whole numbers from 1 to 65536", source=source, path=f"{at}.resolution_px")
+        K, R, t = (array(c.get(key), (3, 3)[: 1 + (key != "t")], f"{at}.{key}") for key in ("K", "R", "t"))
+        distortion = array(c.get("distortion", [0.0] * 5), (5,), f"{at}.distortion")
+        # The same rules as those of a camera in a scene.
+        calibration = {"K": K.tolist(), "R": R.tolist(), "t_mm": t.tolist(), "distortion": distortion.tolist()}
+        try:
+            CalibrationSpec.from_mapping(calibration)
+        except InputError as error:
+            raise InputError(error.reason, source=source, path=at) from None
+        cameras.append(Camera.of(K, R, t, (int(size[0]), int(size[1])), distortion))
     places = data.get("lights_mm") or []
+    if not isinstance(places, list) or len(places) > MAX_LIGHTS:
+        raise InputError(f"must be a list of at most {MAX_LIGHTS} points", source=source, path="rig.lights_mm")
     lights = tuple(
         Light(array(p, (3,), f"rig.lights_mm.{k}"), frozen([1.0, 0.0, 0.0]), 0.0, 1.0, 0.0)
         for k, p in enumerate(places)
     )
-    s = data.get("screen")
-    screen = None
-    if isinstance(s, dict):
-        w, h = array(s.get("size_mm"), (2,), "rig.screen.size_mm")
-        screen = Screen(
-            array(s.get("centre_mm"), (3,), "rig.screen.centre_mm"),
-            array(s.get("right", [0, -1, 0]), (3,), "rig.screen.right"),
-            array(s.get("up", [0, 0, 1]), (3,), "rig.screen.up"),
-            (float(w), float(h)),
-        )
-    return Rig(tuple(cameras), lights, screen)
+    return Rig(tuple(cameras), lights, _screen(data.get("screen"), array, source))
+
+
+def _screen(data: Any, array: Callable[[Any, tuple[int, ...], str], Floats], source: str) -> Screen | None:
+    if data is None:
+        return None
+    if not isinstance(data, dict):
+        raise InputError("must be null or a screen", source=source, path="rig.screen")
+    w, h = array(data.get("size_mm"), (2,), "rig.screen.size_mm")
+    if not (w > 0 and h > 0):
+        raise InputError("must be > 0", source=source, path="rig.screen.size_mm")
+    right = array(data.get("right", [0, -1, 0]), (3,), "rig.screen.right")
+    up = array(data.get("up", [0, 0, 1]), (3,), "rig.screen.up")
+    axes = np.stack([right, up])
+    if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
+        raise InputError("right and up must be unit vectors at a right angle", source=source, path="rig.screen")
+    centre = array(data.get("centre_mm"), (3,), "rig.screen.centre_mm")
+    return Screen(centre, right, up, (float(w), float(h)))
 
 
 def _is_image_line(line: Any) -> bool:

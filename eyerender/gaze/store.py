@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from ..arrays import Floats, frozen
 from ..errors import InputError
-from ..files import write_json
+from ..files import read_json, shown, write_json
 from ..observation import EYES, Observations
 from ..rig.rig import Rig
-from ..spec import Spec
+from ..spec import Positive, Spec
 from .crossratio import CrossRatio
 from .estimate import Estimator, angular_error_deg, binocular_average
 from .guestrin import GuestrinEizenman
@@ -86,9 +86,12 @@ def fit_estimator(
         raise InputError("a calibration needs records with target_mm", source=source)
     used = observations.take(rows)
     try:
-        fitted = spec.build().fit(used, used.index.target_mm, rig)
+        with np.errstate(all="ignore"):
+            fitted = spec.build().fit(used, used.index.target_mm, rig)
     except InputError as error:
         raise InputError(error.reason, source=error.source or source, path=error.path) from None
+    except np.linalg.LinAlgError:
+        raise InputError("the records determine no calibration", source=source) from None
     gaze = predictions(fitted, used, rig)
     errors = [g["error_deg"] for g in gaze["gaze"] if g["error_deg"] is not None]
     return fitted, {
@@ -109,8 +112,9 @@ def predictions(estimator: Estimator, observations: Observations, rig: Rig) -> d
     Errors are angles at the eye's place, or at the mid-point of the eyes; null without a target or a place.
     """
     index = observations.index
-    gaze = estimator.predict(observations, rig)
-    at_eye = angular_error_deg(gaze.point_mm, index.target_mm, index.eye_position_mm + index.head_mm)
+    with np.errstate(all="ignore"):
+        gaze = estimator.predict(observations, rig)
+        at_eye = angular_error_deg(gaze.point_mm, index.target_mm, index.eye_position_mm + index.head_mm)
     single = [
         {
             "frame": int(index.frame[i]),
@@ -150,21 +154,85 @@ def save_estimator(path: str | Path, spec: EstimatorSpec, estimator: Estimator) 
 def load_estimator(path: str | Path) -> Estimator:
     """Read a calibration back; raises `InputError` naming the file and the key."""
     source = str(path)
+    data = read_json(path)
+    if data.get("schema") != CALIBRATION_SCHEMA:
+        found = shown(data.get("schema"))
+        raise InputError(f"is {found}; this version reads {CALIBRATION_SCHEMA!r}", source=source, path="schema")
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError("no such file", source=source) from None
-    except (OSError, ValueError):
-        raise InputError("is not valid JSON", source=source) from None
-    if not isinstance(data, dict) or data.get("schema") != CALIBRATION_SCHEMA:
-        found = data.get("schema") if isinstance(data, dict) else None
-        raise InputError(f"is {found!r}; this version reads {CALIBRATION_SCHEMA!r}", source=source, path="schema")
-    spec = EstimatorSpec.from_mapping(data.get("estimator"), source=source)
-    try:
-        eyes = {(EYES.index(k) if k in EYES else -1): v for k, v in data["eyes"].items()}
-        return _restored(spec, eyes)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError):
-        raise InputError("is no calibration of this estimator", source=source, path="eyes") from None
+        spec = EstimatorSpec.from_mapping(data.get("estimator"))
+        estimator = spec.build()
+    except InputError as error:
+        path_of = ".".join(part for part in ("estimator", error.path) if part)
+        raise InputError(error.reason, source=source, path=path_of) from None
+    eyes = data.get("eyes")
+    if not isinstance(eyes, dict) or not set(eyes) <= {*EYES, "unknown"}:
+        raise InputError("must hold a calibration for each eye", source=source, path="eyes")
+    found_eyes = {}
+    for name, state in eyes.items():
+        try:
+            found_eyes[EYES.index(name) if name in EYES else -1] = _checked(estimator, state)
+        except InputError as error:
+            path_of = ".".join(part for part in ("eyes", name, error.path) if part)
+            raise InputError(error.reason, source=source, path=path_of) from None
+    return _restored(estimator, found_eyes)
+
+
+class _RegressionState(Spec):
+    origin: tuple[float, float]
+    scale: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
+    a: tuple[float, ...]
+    b: tuple[float, ...]
+
+
+class _HomographyState(Spec):
+    homography: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+class _CrossRatioState(Spec):
+    alpha: tuple[float, float, float, float]
+
+
+_Six = tuple[float, float, float, float, float, float]
+
+
+class _CorrectionState(Spec):
+    coefficients: tuple[_Six, _Six]
+
+
+class _ParametersState(Spec):
+    cornea_radius_mm: Positive
+    pupil_distance_mm: Positive
+    index: Annotated[float, Field(ge=1, le=2)]
+    alpha_deg: Annotated[float, Field(ge=-90, le=90)]
+    beta_deg: Annotated[float, Field(ge=-90, le=90)]
+
+
+class _ModelState(Spec):
+    parameters: _ParametersState
+    start: _ParametersState
+    objective: str
+    cost: Annotated[float, Field(ge=0)]
+    evaluations: Annotated[int, Field(ge=0, lt=2**53)]
+    converged: bool
+    message: str
+    at_bound: Annotated[tuple[str, ...], Field(max_length=5)]
+
+
+def _checked(estimator: Estimator, state: object) -> Spec:
+    """One eye's part of a calibration's file; raises `InputError` with the key's path."""
+    if isinstance(estimator, PupilGlintRegression):
+        regression = _RegressionState.from_mapping(state)
+        for key, values, terms in zip("ab", (regression.a, regression.b), estimator.terms, strict=True):
+            if len(values) != len(terms):
+                raise InputError(f"must be {len(terms)} numbers, one for each term", path=key)
+        return regression
+    if isinstance(estimator, HomographyNormalisation):
+        return _HomographyState.from_mapping(state)
+    if isinstance(estimator, CrossRatio):
+        return _CrossRatioState.from_mapping(state)
+    if isinstance(estimator, GuestrinEizenman):
+        return _ModelState.from_mapping(state)
+    return _CorrectionState.from_mapping(state)
 
 
 def _state(estimator: Estimator) -> dict[str, Any]:
@@ -189,40 +257,28 @@ def _state(estimator: Estimator) -> dict[str, Any]:
     return {(EYES[e] if e >= 0 else "unknown"): v for e, v in found.items()}
 
 
-def _restored(spec: EstimatorSpec, eyes: dict[int, Any]) -> Estimator:
-    from dataclasses import replace
+def _restored(estimator: Estimator, eyes: dict[int, Any]) -> Estimator:
+    """An estimator with the calibrations that a file holds, by eye, as `_checked` gives them."""
 
-    estimator = spec.build()
-
-    def numbers(key: str, *shape: int) -> dict[int, Floats]:
-        return {e: frozen(np.array(v[key], dtype=float).reshape(shape)) for e, v in eyes.items()}
+    def arrays(key: str) -> dict[int, Floats]:
+        return {e: frozen(getattr(state, key)) for e, state in eyes.items()}
 
     if isinstance(estimator, PupilGlintRegression):
-        parts = {k: numbers(k, -1) for k in ("origin", "scale", "a", "b")}
-        return replace(estimator, fits={e: EyeFit(*(parts[k][e] for k in parts)) for e in eyes})
+        parts = [arrays(key) for key in ("origin", "scale", "a", "b")]
+        return replace(estimator, fits={e: EyeFit(*(part[e] for part in parts)) for e in eyes})
     if isinstance(estimator, HomographyNormalisation):
-        return replace(estimator, homographies=numbers("homography", 3, 3))
+        return replace(estimator, homographies=arrays("homography"))
     if isinstance(estimator, CrossRatio):
-        return replace(estimator, alphas=numbers("alpha", 4))
+        return replace(estimator, alphas=arrays("alpha"))
     if isinstance(estimator, GuestrinEizenman):
-        return replace(
-            estimator,
-            calibrations={
-                e: Calibration(
-                    EyeParameters(**v["parameters"]),
-                    EyeParameters(**v["start"]),
-                    v["cost"],
-                    v["objective"],
-                    v["evaluations"],
-                    v["converged"],
-                    v["message"],
-                    tuple(v["at_bound"]),
-                )
-                for e, v in eyes.items()
-            },
-        )
+        found = {}
+        for e, state in eyes.items():
+            values = state.to_mapping()
+            parameters, start = EyeParameters(**values.pop("parameters")), EyeParameters(**values.pop("start"))
+            found[e] = Calibration(parameters, start, **{**values, "at_bound": state.at_bound})
+        return replace(estimator, calibrations=found)
     if isinstance(estimator, Hennessey | ShihWuLiu) and estimator.recalibration != "none":
-        return replace(estimator, correction=Recalibration(estimator.recalibration, numbers("coefficients", 2, 6)))
+        return replace(estimator, correction=Recalibration(estimator.recalibration, arrays("coefficients")))
     return estimator
 
 

@@ -12,6 +12,7 @@ from eyerender.analytic.observer import observe
 from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.gaze.records import load_observations, rig_from_mapping
+from eyerender.gaze.regression import EyeFit, PupilGlintRegression
 from eyerender.gaze.store import (
     EstimatorSpec,
     fit_estimator,
@@ -149,7 +150,7 @@ BAD = [
     (["gaze", "fit", "badrig.json", "--estimator", "regression", "-o", "c.json"], "rig.cameras.0.K: must be 3 x 3"),
     (["gaze", "predict", "features.json", "-c", "none.json"], "none.json: no such file"),
     (["gaze", "predict", "features.json", "-c", "features.json"], "features.json: schema: is 'eyerender/features/1'"),
-    (["gaze", "predict", "features.json", "-c", "hollow.json"], "eyes: is no calibration"),
+    (["gaze", "predict", "features.json", "-c", "hollow.json"], "hollow.json: eyes.right.origin: missing"),
     (["gaze", "predict", "features.json"], "--calibration"),
 ]  # fmt: skip
 
@@ -174,6 +175,97 @@ def test_bad_input(guestrin, tmp_path, monkeypatch, capsys, argv, words):
     assert err.startswith("error: ")
     assert words in err
     assert not (tmp_path / "c.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("schema", [10**200] * 3, "schema: is [10000000000"),
+        ("estimator.name", "magic", "estimator.name: must be"),
+        ("estimator.function", "R13", "estimator: 'R13' is no function"),
+        ("eyes", [], "eyes: must hold a calibration for each eye"),
+        ("eyes.third", {}, "eyes: must hold a calibration for each eye"),
+        ("eyes.right", 3, "eyes.right: must be a mapping"),
+        ("eyes.right.a", [1.0], "eyes.right.a: must be 6 numbers, one for each term"),
+        ("eyes.right.a", [[1.0]] * 6, "eyes.right.a.0: must be a valid number"),
+        ("eyes.left.scale", [0.0, 1.0], "eyes.left.scale.0: must be > 0"),
+        ("eyes.left.origin", ["0", 1.0], "eyes.left.origin.0: must be a valid number"),
+        ("eyes.left.b", None, "eyes.left.b: must be a valid array"),
+    ],
+)
+def test_a_calibration_of_another_shape_is_refused(guestrin, tmp_path, path, value, words):
+    seen, rig = load_observations(guestrin)
+    spec = EstimatorSpec.from_mapping({"name": "regression"})
+    save_estimator(tmp_path / "c.json", spec, fit_estimator(spec, seen, rig)[0])
+    data = json.loads((tmp_path / "c.json").read_text())
+    *parents, last = path.split(".")
+    node = data
+    for key in parents:
+        node = node[key]
+    node[last] = value
+    (tmp_path / "c.json").write_text(json.dumps(data))
+    with pytest.raises(InputError) as caught:
+        load_estimator(tmp_path / "c.json")
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("cameras", [{}] * 101, "rig.cameras: are more than 100"),
+        ("cameras.0.K.0.0", 0.0, "rig.cameras.0: K must be upper triangular"),
+        ("cameras.0.K.0.0", 10**200, "rig.cameras.0.K: must be 3 x 3 numbers"),
+        ("cameras.0.R.0.0", 7.0, "rig.cameras.0: R must be a rotation matrix"),
+        ("cameras.0.R.0.0", "1", "rig.cameras.0.R: must be 3 x 3 numbers"),
+        ("cameras.0.t", [[1], [2, 3], 4], "rig.cameras.0.t: must be 3 numbers"),
+        ("cameras.0.resolution_px", [1e300, 1], "rig.cameras.0.resolution_px"),
+        ("cameras.0.resolution_px", [1.5, 1], "rig.cameras.0.resolution_px: must be whole numbers"),
+        ("lights_mm", 3, "rig.lights_mm: must be a list of at most 1000 points"),
+        ("lights_mm", [[0, 0, 0]] * 1001, "rig.lights_mm: must be a list of at most 1000 points"),
+        ("screen", "wide", "rig.screen: must be null or a screen"),
+        ("screen.size_mm", [0, 1], "rig.screen.size_mm: must be > 0"),
+        ("screen.up", [0, 0, 0], "rig.screen: right and up must be unit vectors"),
+    ],
+)
+def test_a_rig_that_cannot_be_is_refused(guestrin, path, value, words):
+    rig = json.loads(guestrin.read_text())["rig"]
+    *parents, last = path.split(".")
+    node = rig
+    for key in parents:
+        node = node[int(key) if key.isdigit() else key]
+    node[int(last) if last.isdigit() else last] = value
+    with pytest.raises(InputError) as caught:
+        rig_from_mapping(rig)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[" * 200_000, "nested too deeply"),
+        ('{"records": [], "rig": NaN}', "NaN is no number"),
+        ('{"frame": 1' + "0" * 5000 + "}", "an integer of 5001 digits"),
+        ('{"frame": 1e999}', "is too large"),
+        ("[]", "must be a JSON object"),
+        ("\x00", "is not valid JSON"),
+        ('{"a": 1}\n{"b": 2', "line 2: is not valid JSON"),
+    ],
+)
+def test_json_that_is_no_file_of_records(tmp_path, text, words):
+    path = tmp_path / "records.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        load_observations(path, "guestrin2006")
+    assert len(str(caught.value)) < 600
+
+
+def test_estimates_that_overflow_are_missing(guestrin):
+    """Coefficients of 1e300 give no number; that is a reason, not an infinity in the output."""
+    seen, rig = load_observations(guestrin)
+    fit = EyeFit(np.zeros(2), np.full(2, 1e-100), np.full(6, 1e300), np.full(6, -1e300))
+    gaze = predictions(PupilGlintRegression(fits={0: fit, 1: fit}), seen, rig)
+    assert {g["reason"] for g in gaze["gaze"]} == {"the estimate is not finite"}
+    json.dumps(gaze, allow_nan=False)
 
 
 def test_rig_without_screen_or_lights():
