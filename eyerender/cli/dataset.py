@@ -9,8 +9,8 @@ from cyclopts import Parameter
 
 from ..errors import EyerenderError, InputError
 from .app import app
-from .options import Backend, Eye, Overwrite, Result, Seed, Threads, positive
-from .output import emit, progress, say
+from .options import Backend, Eye, Overwrite, Result, Seed, Strict, Threads, positive
+from .output import Heed, emit, progress, say
 
 if TYPE_CHECKING:
     from ..scene import Scene
@@ -34,6 +34,7 @@ def generate(
     threads: Threads = None,
     timeout: float = 600.0,
     overwrite: Overwrite = False,
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Make a labelled dataset; started again on the same folder, it makes what is missing.
@@ -62,6 +63,7 @@ def generate(
     from ..dataset.plan import Plan
     from ..dataset.run import Options
     from ..dataset.run import generate as run
+    from ..plausibility import saturation_warnings
 
     plan = Plan.load(spec, eye=eye, seed=seed, count=count)
     positive("--workers", workers)
@@ -78,19 +80,24 @@ def generate(
         timeout_s=timeout,
         overwrite=overwrite,
     )
+    if folder is None and not dry_run:
+        raise InputError("give the folder to write", source="DIR")
+    if overwrite and shard is not None:
+        raise InputError("cannot be given with --shard: other parts may be at work in the folder", source="--overwrite")
+    heed = Heed(strict)
+    heed(plan.warnings())
     if dry_run:
         from ..dataset.estimate import estimate
 
         found = estimate(plan, options)
-        emit(found, _estimate_text(found), json)
+        emit(found, _estimate_text(found), json, heed)
         return 0
-    if folder is None:
-        raise InputError("give the folder to write", source="DIR")
-    if overwrite and shard is not None:
-        raise InputError("cannot be given with --shard: other parts may be at work in the folder", source="--overwrite")
+    assert folder is not None
     with progress("generating") as steps:
         done = run(plan, folder, options, progress=steps, say=say)
-    emit(done, _generate_text(done), json)
+    statistics = done.get("statistics", {})
+    heed(saturation_warnings(statistics.get("images_saturated", 0), statistics.get("images", 0), str(folder)))
+    emit(done, _generate_text(done), json, heed)
     return 0
 
 
@@ -103,6 +110,7 @@ def sample(
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     eye: Eye = None,
     seed: Seed = None,
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Show sample I of a dataset: whose it is, what was drawn, and the scene and eye that come of it.
@@ -131,12 +139,14 @@ def sample(
     found = realise(plan, index)
     if found.sample is None or found.scene is None:
         raise InputError(f"sample {index} is given up: {found.rejections[-1].reason}", source=plan.source)
+    heed = Heed(strict)
+    heed(warning.at(plan.source) for warning in found.scene.warnings())
     data = {"schema": "eyerender/sample/1", **found.sample.to_mapping()}
     data["rejections"] = [f"{r.of}, attempt {r.attempt}: {r.reason}" for r in found.rejections]
     if output is not None:
         _write_sample(output, found.scene)
     text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100).rstrip()
-    emit(data, text, json)
+    emit(data, text, json, heed)
     return 0
 
 
@@ -150,6 +160,7 @@ def preview(
     seed: Seed = None,
     backend: Backend = "auto",
     threads: Threads = None,
+    strict: Strict = False,
 ) -> int:
     """Render a contact sheet of 16 images of a scene or a dataset; for people, never to measure in.
 
@@ -175,8 +186,10 @@ def preview(
         what = Plan.load(spec, eye=eye, seed=seed)
     else:
         what = load_scene(spec, eye=eye, seed=seed)
+    heed = Heed(strict)
+    heed(what.warnings())
     with progress("rendering") as steps:
-        write_sheet(what, output, backend=backend, threads=threads, progress=steps)
+        write_sheet(what, output, backend=backend, threads=threads, progress=steps, warn=heed)
     print(output)
     return 0
 

@@ -14,7 +14,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
 from ..scene import Scene, SceneSpec
@@ -22,6 +22,8 @@ from .draws import is_draw, unit_number
 from .files import check_files, sum_of_file, sums_of_files
 from .spec import DatasetSpec, find_dataset
 from .template import Template, Turn, possible
+
+_LOOKED_AT = 16  # samples in which `Plan.warnings` looks for what was not meant
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,20 @@ class Plan:
     def from_mapping(cls, data: Mapping[str, Any], base: Path) -> Plan:
         """The plan that another process has, its files relative to `base`."""
         return cls(DatasetSpec.from_mapping(data["spec"]), data["eyes"], data.get("files", {}), base)
+
+    def warnings(self) -> list[InputWarning]:
+        """What of the scenes of some samples, spread over the dataset, was probably not meant; each thing once."""
+        found: dict[tuple[str, str], InputWarning] = {}
+        count = min(self.spec.count, _LOOKED_AT)
+        for sample in (k * self.spec.count // count for k in range(count)):
+            try:
+                warnings = self.draw(sample).build().warnings()
+            except InputError:
+                continue  # it is drawn again, or told when it is made
+            for w in warnings:
+                path, reason = f"scene.{w.path}", f"{w.reason} (sample {sample})"
+                found.setdefault((w.code, path), InputWarning(w.code, reason, self.source, path))
+        return list(found.values())
 
     def check_files(self) -> None:
         """Raise `InputError` where a file that the spec names is no longer what it was when the plan was made."""

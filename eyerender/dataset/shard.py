@@ -65,6 +65,7 @@ _DONE_KEYS: dict[str, Callable[[Any], bool]] = {
     "shard": _is_count,
     "samples": lambda v: _are(v, _is_count) and len(v) == 2,
     "images": _is_count,
+    "images_saturated": lambda v: v is None or _is_count(v),  # older versions did not count them
     "digest": lambda v: isinstance(v, str),
     "versions": lambda v: isinstance(v, Mapping),
     "backend": lambda v: isinstance(v, Mapping) and all(isinstance(v.get(key), str) for key in ("name", "device")),
@@ -108,7 +109,7 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
         for kind in kinds:
             (stage / kind).mkdir(parents=True)
         (stage / "shard").mkdir()
-        count, rejections, given_up = 0, [], []
+        count, saturated, rejections, given_up = 0, 0, [], []
         with open(stage / "shard" / LINES, "w", encoding="utf-8") as lines:
             for k, index in enumerate(samples):
                 made = maker.make(index)
@@ -119,6 +120,7 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
                     names = _write_image(stage, shard, image)
                     lines.write(json.dumps({"schema": IMAGE_SCHEMA, **names, **image.line}, allow_nan=False) + "\n")
                 count += len(made.images)
+                saturated += sum(image.saturated for image in made.images)
                 on_sample(k + 1, len(made.images))
         maker.plan.check_files()  # a shard is of one state of them
         seconds = time.monotonic() - start
@@ -127,6 +129,7 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
             "shard": shard,
             "samples": [samples.start, samples.stop],
             "images": count,
+            "images_saturated": saturated,
             "digest": maker.plan.digest,
             "versions": run_versions(),
             "backend": maker.backend,
