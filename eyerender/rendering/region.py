@@ -24,6 +24,7 @@ from ..region.head import file_states
 from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh
 from ..region.skin import skin_map
 from .surround import clear_between, rays_between
+from .values import aligned
 
 _F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, about the same (n 1.40 and 1.33)
 _ROUGH_SKIN, _ROUGH_WET = 0.19, 0.04
@@ -67,9 +68,8 @@ class RegionScene:
         self.scene = mi.load_dict(parts)
         self._params: Any = mi.traverse(self.scene)
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
-        look = texture(
-            mi.TensorXf16(self._look(spec).astype(np.float16)), use_accel=False, wrap_mode=dr.WrapMode.Repeat
-        )
+        pixels = aligned(self._look(spec).astype(np.float16))
+        look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         moving = next((s for s in self.scene.shapes() if s.id() == "shown_moving"), None)
         self.skin = Skin(look, layout, faces, moving, -1.0 if globe.mirrored else 1.0)
         self.skin.pose(posed)
@@ -151,7 +151,7 @@ class Skin:
         self._map = look
         corners = np.zeros((len(layout.faces), 4), np.uint32)  # of four, which are gathered together
         corners[:, :3] = layout.faces
-        self._corners = mi.UInt32(corners.ravel())
+        self._corners = mi.UInt32(aligned(corners.ravel()))
         self._records = np.zeros((len(layout.uv), 8), np.float32)
         self._records[:, 3], self._records[:, 7] = layout.uv.T
         self._buffer = mi.Float(0)
@@ -162,7 +162,7 @@ class Skin:
     def pose(self, posed: RegionMesh) -> None:
         """Bring the corners to a pose."""
         self._records[:, 0:3], self._records[:, 4:7] = posed.vertices, posed.normals
-        self._buffer = mi.Float(self._records.ravel().copy())
+        self._buffer = mi.Float(aligned(self._records.ravel()))
 
     def face(self, hit: Any) -> Any:
         """Which of the layout's triangles was hit."""

@@ -13,11 +13,25 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .surfaces import Surface
 
+_ALIGNMENT = 64  # bytes; the widest vector of a processor
 LIGHT_WIDTH = 10  # position 3, axis 3, radius, intensity, lobe exponent, inner radius
+
+
+def aligned(values: NDArray[Any]) -> NDArray[Any]:
+    """A copy that starts at a multiple of 64 bytes.
+
+    Dr.Jit shares NumPy's memory. It gathers several numbers at once only from memory that is aligned, so without this
+    the place of an allocation would decide which kernel a frame is compiled to.
+    """
+    memory = np.empty(values.nbytes + _ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % _ALIGNMENT
+    copy = memory[start : start + values.nbytes].view(values.dtype).reshape(values.shape)
+    copy[...] = values
+    return copy
 
 
 @dataclass(frozen=True, slots=True)
