@@ -6,10 +6,13 @@ import json
 import sys
 import textwrap
 import time
+import tracemalloc
 
 import pytest
 
 from eyerender.benchmark.folder import load_labelled
+from eyerender.benchmark.process import ExtractorProcess, Failed
+from eyerender.benchmark.protocol import Request
 from eyerender.benchmark.registry import Extractor, resolve
 from eyerender.benchmark.run import run_extractor
 
@@ -66,6 +69,19 @@ CASES = {
         "unusable answer: pupil.centre_px.0: must be a finite number",
     ),
     "flood": ("say(GREETING)\nwhile True: sys.stdout.write('x' * 100000)", "error", "bytes without an answer"),
+    "floods its errors": (
+        "os.write(2, b'e' * 50_000_000); say(GREETING)\nfor line in sys.stdin: os.write(2, b'e' * 1_000_000); "
+        "ok(json.loads(line))",
+        "none",
+        "blind",
+    ),
+    "speaks to the terminal": (
+        "say(GREETING)\nfor line in sys.stdin: say({'id': json.loads(line)['id'], 'error': '\\x1b]0;x\\x07' * 999})",
+        "error",
+        "?]0;x??]0;x?",
+    ),
+    "deep": ("say(GREETING)\nfor line in sys.stdin: print('[' * 100000, flush=True)", "error", "no JSON: '[[[["),
+    "huge": ("say(GREETING)\nfor line in sys.stdin: print('1' * 5000, flush=True)", "error", "no JSON: '1111"),
     "closes its output": ("say(GREETING); os.close(1); time.sleep(3600)", "error", "closed its output"),
     "binary": ("say(GREETING); os.write(1, bytes(range(255, 127, -1)) + b'\\n'); time.sleep(3600)", "error", "no JSON"),
 }  # fmt: skip
@@ -94,6 +110,29 @@ def test_a_failure_on_one_image_costs_that_image_only(program, images):
     run = run_extractor(program(body), images, timeout_s=5.0)  # what answers takes some milliseconds
     assert [s.outcome for s in run.scores] == ["none", "error", "none", "error", "error", "none"]
     assert run.scores[4].reason == "too many eyes"
+
+
+def test_one_that_reads_nothing_is_not_waited_for(program):
+    """A pipe holds some 64 KB; after that, writing would wait for a reader."""
+    extractor = program("say(GREETING); time.sleep(3600)")
+    with ExtractorProcess(extractor.argv, start_timeout_s=20.0, timeout_s=0.3) as process:
+        with pytest.raises(Failed, match="read no request within"):
+            process.ask(Request(0, "x" * 1_000_000, 8, {}))
+        assert not process.alive
+
+
+def test_a_flood_of_errors_leaves_only_its_end(program):
+    extractor = program("os.write(2, b'e' * 5_000_000 + b'\\nthe last word\\n'); say(GREETING); sys.stdin.readline()")
+    tracemalloc.start()
+    try:
+        with (
+            ExtractorProcess(extractor.argv, start_timeout_s=20.0, timeout_s=5.0) as process,
+            pytest.raises(Failed, match="ended with exit code 0: the last word"),
+        ):
+            process.ask(Request(0, "x.png", 8, {}))
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_after_three_failures_in_a_row_it_is_not_asked_again(program, images, tmp_path):
