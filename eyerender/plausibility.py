@@ -45,6 +45,8 @@ _LIMBUS_MM = np.array([[0, 0, 0], [-3, 6, 0], [-3, -6, 0], [-3, 0, 6], [-3, 0, -
 # A camera that is further than this from an eye's axis sees no cornea, wherever the eye turns.
 _FURTHEST_RAD = np.radians(140.0)
 
+# How far a target may lie off the screen's plane: screens are not flat to less.
+_OFF_PLANE_MM = 1.0
 # An image is called saturated where more than this share of its pixels is.
 SATURATED_SHARE = 0.2
 
@@ -131,6 +133,44 @@ def saturation_warnings(saturated: int, images: int, source: str) -> list[InputW
         "lower sensor.exposure_ms or the lights' intensity_mw_sr"
     )
     return [InputWarning("saturated", reason, source)]
+
+
+def target_warnings(targets_mm: Floats, screen: Screen | None, source: str) -> list[InputWarning]:
+    """Targets (n, 3) in the world that do not lie on the screen, on which estimators put every gaze point."""
+    if screen is None or not len(targets_mm):
+        return []
+    off = np.abs((targets_mm - screen.centre_mm) @ screen.normal)
+    count = int(np.count_nonzero(off > _OFF_PLANE_MM))
+    if not count:
+        return []
+    reason = (
+        f"{count} of {len(off)} targets lie off the plane of the rig's screen, by up to {off.max():.4g} mm; "
+        "gaze points are always on that plane"
+    )
+    return [InputWarning("off-screen-plane", reason, source, "target_mm")]
+
+
+def rig_warnings(rig: Rig, calibrated: Rig, source: str) -> list[InputWarning]:
+    """A rig that is not the one an estimator was calibrated on."""
+    path = next(_differences(rig.to_mapping(), calibrated.to_mapping(), "rig"), None)
+    if path is None:
+        return []
+    return [InputWarning("other-rig", "differs from the rig of the calibration; calibrate on this one", source, path)]
+
+
+def _differences(one: Any, other: Any, path: str) -> Iterator[str]:
+    """Where two values of the same kind differ by more than rounding does."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for key in one:
+            yield from _differences(one[key], other.get(key), f"{path}.{key}")
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        for k, (a, b) in enumerate(zip(one, other, strict=True)):
+            yield from _differences(a, b, f"{path}.{k}")
+    elif isinstance(one, int | float) and isinstance(other, int | float):
+        if not np.isclose(one, other, rtol=1e-6, atol=1e-6):
+            yield path
+    elif one != other:
+        yield path
 
 
 def _misplaced(

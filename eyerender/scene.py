@@ -383,28 +383,7 @@ class Scene:
 
     def rig_mapping(self) -> dict[str, Any]:
         """The rig as `features --json` writes it (docs/formats.md)."""
-        screen = self.rig.screen
-        return {
-            "cameras": [
-                {
-                    "K": c.K.tolist(),
-                    "R": c.R.tolist(),
-                    "t": c.t.tolist(),
-                    "distortion": c.distortion.tolist(),
-                    "resolution_px": list(c.resolution_px),
-                }
-                for c in self.rig.cameras
-            ],
-            "lights_mm": [light.position_mm.tolist() for light in self.rig.lights],
-            "screen": None
-            if screen is None
-            else {
-                "centre_mm": screen.centre_mm.tolist(),
-                "size_mm": list(screen.size_mm),
-                "right": screen.right.tolist(),
-                "up": screen.up.tolist(),
-            },
-        }
+        return self.rig.to_mapping()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
