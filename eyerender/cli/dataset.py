@@ -27,6 +27,7 @@ def generate(
     engine: Literal["local", "ray"] = "local",
     address: str | None = None,
     dry_run: bool = False,
+    measure: bool = False,
     eye: Eye = None,
     seed: Seed = None,
     count: int | None = None,
@@ -54,7 +55,9 @@ def generate(
     address
         The Ray cluster's address (default: one started on this machine).
     dry_run
-        Only tell how long it would take and how much disk.
+        Only tell how long it would take and how much disk, by the last rate of this spec on this machine.
+    measure
+        With --dry-run: make a few samples to measure the rate.
     count
         Make the first COUNT samples of the spec's plan; more than it has plan a larger dataset.
     timeout
@@ -80,6 +83,8 @@ def generate(
         timeout_s=timeout,
         overwrite=overwrite,
     )
+    if measure and not dry_run:
+        raise InputError("needs --dry-run", source="--measure")
     if folder is None and not dry_run:
         raise InputError("give the folder to write", source="DIR")
     if overwrite and shard is not None:
@@ -89,7 +94,7 @@ def generate(
     if dry_run:
         from ..dataset.estimate import estimate
 
-        found = estimate(plan, options)
+        found = estimate(plan, options, measure=measure)
         emit(found, _estimate_text(found), json, heed)
         return 0
     assert folder is not None
@@ -306,12 +311,29 @@ def _generate_text(done: dict[str, Any]) -> str:
 
 
 def _estimate_text(found: dict[str, Any]) -> str:
-    minutes, seconds = divmod(round(found["seconds"]), 60)
+    rate = found["rate"]
+    text = f"{found['images']} images in {found['shards']} shards, {found['workers']} workers"
+    if rate is None:
+        return f"{text}: time and disk unknown, no rate of this spec on this machine; --measure makes a few samples"
+    how = "measured" if rate["how"] == "measured" else "of a run"
     return (
-        f"{found['images']} images in {found['shards']} shards: about {minutes} min {seconds} s with "
-        f"{found['workers']} workers of {found['threads_per_worker']} threads on {found['backend']['name']}, "
-        f"{found['bytes'] / 1e6:.1f} MB"
+        f"{text} of {found['threads_per_worker']} threads on {rate['backend']}: about {_duration(found['seconds'])}, "
+        f"{_size(found['bytes'])} (rate {how} with {rate['samples']} samples, {rate['time']})"
     )
+
+
+def _duration(seconds: float) -> str:
+    """As people say it, in seconds up to days."""
+    if seconds < 3600:
+        minutes, rest = divmod(round(seconds), 60)
+        return f"{minutes} min {rest} s"
+    return f"{seconds / 3600:.1f} h" if seconds < 2 * 86400 else f"{seconds / 86400:.1f} days"
+
+
+def _size(count: int) -> str:
+    """As people say it, in MB up to TB."""
+    unit, name = next(u for u in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if count >= u[0] or u[0] == 1e6)
+    return f"{count / unit:.1f} {name}"
 
 
 def _validate_text(report: dict[str, Any]) -> str:

@@ -91,6 +91,7 @@ class Staged:
     rejected: int
     given_up: int
     seconds: float
+    bytes: int  # on disk in the end: metadata stands in the shard and in the whole
 
 
 def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int, int], None]) -> Staged:
@@ -124,6 +125,7 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
                 on_sample(k + 1, len(made.images))
         maker.plan.check_files()  # a shard is of one state of them
         seconds = time.monotonic() - start
+        files = _checksums(stage, shard, kinds)
         done = {
             "schema": SHARD_SCHEMA,
             "shard": shard,
@@ -137,14 +139,15 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
             "rejections": rejections,
             "given_up": given_up,
             "seconds": round(seconds, 3),
-            "files": _checksums(stage, shard, kinds),
+            "files": files,
         }
+        size = sum(entry["bytes"] for entry in files.values()) + files[_place(SHARDS, shard, LINES)]["bytes"]
         write_json(stage / DONE, done, sync=False)
         sync_tree(stage)
     except BaseException:
         shutil.rmtree(stage, ignore_errors=True)
         raise
-    return Staged(shard, str(stage), count, len(rejections), len(given_up), seconds)
+    return Staged(shard, str(stage), count, len(rejections), len(given_up), seconds, size)
 
 
 def _write_image(stage: Path, shard: int, image: MadeImage) -> dict[str, str]:

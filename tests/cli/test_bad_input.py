@@ -153,6 +153,7 @@ TABLE = [
     (["generate", "draw.yaml", "out"], 2, "draw.yaml: scene.wavelength_nm.draw: must be one of"),
     (["generate", "template.yaml", "out"], 2, "template.yaml: sample 0 cannot be made"),
     (["generate", "behind.yaml", "out"], 2, "behind.yaml: sample 0 cannot be made"),
+    (["generate", "dataset_quick", "out", "--measure"], 2, "--measure: needs --dry-run"),
     (["generate", "dataset_quick", "taken"], 2, "taken: is not empty; give another folder or --overwrite"),
     (["generate", "dataset_quick", "taken", "--overwrite"], 2, "taken: was not made by this package"),
     (["generate", "dataset_quick", "file"], 2, "file: exists and is not a folder"),
