@@ -197,10 +197,10 @@ class Ambience:
         self._even, self._scale, self._rows, self._harmonics = n[0], n[10], n[11], n[12:]
         self._axes = tuple(mi.Vector3f(*n[k : k + 3]) for k in (1, 4, 7))
 
-    def _in_map(self, v: Any) -> Any:
+    def _in_map(self, v: mi.Vector3f) -> mi.Vector3f:
         return mi.Vector3f(*(dr.dot(axis, v) for axis in self._axes))
 
-    def radiance(self, o: Any, d: Any, active: Any) -> Any:
+    def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Radiance (mW/mm^2/sr) that rays of the scene's frame meet, even light left out; panels that overlap add up
         and do not hide the map behind them."""
         w = self._in_map(d)
@@ -209,7 +209,7 @@ class Ambience:
         place = mi.Point2f(u, (1 + v * self._rows) / (self._rows + 2))
         return self._panels.radiance(o, d, active) + self._scale * self._texture.eval(place, active)[0]
 
-    def irradiance(self, x: Any, n: Any) -> Any:
+    def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) of a matte surface at points x with unit normals n of the scene's frame, unshadowed."""
         w = self._in_map(n)
         h = self._harmonics
