@@ -166,6 +166,10 @@ class SceneSpec(FileSpec):
                 f"{count} observations of {lights} lights make {count * lights} glints; a scene may have {MAX_GLINTS}"
             )
 
+    def with_spp(self, spp: int) -> Self:
+        """A copy with other samples per pixel; raises an `InputError` that names the option --spp."""
+        return self.replaced("--spp", {"image": {**self.to_mapping()["image"], "spp": spp}})
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames(ArrayValue):
@@ -472,7 +476,7 @@ def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = N
     refuse_folder(path, "a scene file, or the name of a shipped scene")
     spec = SceneSpec.load(path)
     if spp is not None:
-        spec = spec.replaced("--spp", {"image": {**spec.to_mapping()["image"], "spp": spp}})
+        spec = spec.with_spp(spp)
     if seed is not None:
         spec = spec.replaced("--seed", {"seed": seed})
     return Scene.of(spec, base=path.parent, eye=eye, source=str(path))

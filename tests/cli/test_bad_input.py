@@ -205,6 +205,7 @@ TABLE = [
         2,
         "two are called 'own-fast'",
     ),
+    (["study", "observers", "-o", "out", "--spp", "70000"], 2, "error: --spp: must be <= 65536, not 70000"),
     (["study", "observers", "-o", "out", "--workers", "0"], 2, "error: --workers: must be >= 1, not 0"),
     (["schema", "car"], 2, "car"),
     (["doctor", "extra"], 2, "extra"),
