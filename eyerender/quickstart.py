@@ -91,5 +91,6 @@ def compare_folder(folder: str | Path, *, function: str = "R3", progress: Progre
 def _compare(scene: Scene, images: ImageFolder, function: str, progress: Progress | None) -> Comparison:
     if function not in FUNCTIONS:
         raise InputError(f"{function!r} is no function of Table 2 (R1 to R12)", source="--function")
-    found = ImageObserver().observe_folder(images, scene, progress=progress)
-    return compare(images.truth(), found, scene.rig, PupilGlintRegression(function), f"regression {function}")
+    truth = images.truth()
+    found = ImageObserver().observe_entries(images.entries, truth.index, scene, progress=progress)
+    return compare(truth, found, scene.rig, PupilGlintRegression(function), f"regression {function}")
