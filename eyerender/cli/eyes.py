@@ -10,8 +10,8 @@ from cyclopts import Parameter
 from ..errors import InputError
 from ..files import written
 from .app import app
-from .options import Result, Strict
-from .output import Heed, emit
+from .options import Result
+from .output import emit
 
 _FORMATS = (".svg", ".pdf", ".png")
 
@@ -50,7 +50,6 @@ def view(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     eye: str | None = None,
-    strict: Strict = False,
 ) -> int:
     """Draw an eye's section, or a scene's rig with its rays, as SVG, PDF or PNG.
 
@@ -76,9 +75,7 @@ def view(
         from ..report.scene_view import scene_view
         from ..scene import load_scene
 
-        loaded = load_scene(name, eye=eye)
-        Heed(strict)(loaded.warnings())
-        fig = scene_view(loaded)
+        fig = scene_view(load_scene(name, eye=eye))
     with written(output) as file:
         fig.savefig(file, format=output.suffix[1:].lower(), dpi=150)
     print(output)

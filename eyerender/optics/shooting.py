@@ -268,7 +268,8 @@ def _rescue(
     best_way = _pick(direction, index)
     best = _shoot(few_path, few_start, few_source, best_way, few_target)
     done = np.zeros(frame.shape, dtype=bool)
-    for blend in (0.0, 0.5, -0.5, 1.0):
+    # Aimed at the target itself, all blends are the same.
+    for blend in (0.0,) if all(map(np.array_equal, few_aim, few_target)) else (0.0, 0.5, -0.5, 1.0):
         aimed = _moved(few_aim, _minus(few_target, few_aim), np.full(frame.shape, blend))
         way = _unit(_minus(aimed, few_source))
         trial = _shoot(few_path, few_start, few_source, way, few_target)

@@ -3,7 +3,9 @@
 The many are found by Newton on the optical length (`fermat`), from a paraxial start. Every path found is then traced,
 from the viewpoint through the surfaces; what the traced ray misses the other point by is the residual. A path that
 misses by more than rounding is searched again by shooting with ray differentials and guarded steps (`shooting`), which
-also serves surfaces that have no common graph and all paths with several reflections or shells.
+also serves surfaces that have no common graph. A refracted ray that is still not found is looked for from
+the object's side: seen at a grazing angle, Newton from a straight line's guess may miss a ray that exists. Whatever the
+surfaces, these are tried in turn.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from ..geometry.transforms import Array
 from .fermat import stationary_path
 from .interface import Number, dot
 from .shooting import RESIDUAL_LIMIT_MM, Connection, connect, nearness, taken
-from .trace import Crossing, RayStatus, Status, cross, inside_rim, mark
+from .trace import Crossing, RayStatus, Status, cross, inside_rim, mark, outward_path, trace
 
 SURE_MM = 1e-11
 """A path that its traced ray confirms to this is taken as found; rounding stays well below."""
@@ -116,7 +118,9 @@ def refracted_rays(
     ndim = max(target[0].ndim, viewpoint[0].ndim)
     frame = graphs_of(surfaces, ndim)
     if frame is None:
-        return _from_connection(connect(path, n_outside, viewpoint, target, target))
+        return _launched(
+            path, n_outside, viewpoint, target, _from_connection(connect(path, n_outside, viewpoint, target, target))
+        )
     graphs, origin, rotation = frame
     plain = not np.any(origin) and np.array_equal(rotation, np.broadcast_to(np.eye(3), rotation.shape))
     inner = target if plain else turn_back(rotation, shift(target, origin, -1.0))
@@ -124,7 +128,7 @@ def refracted_rays(
     ladder = [n_outside, *(_spread_index(n, ndim) for n in indices)]
     points = stationary_path(graphs, ladder, outer, inner, _paraxial_start(graphs, ladder, outer, inner)).points
     first = points[0] if plain else shift(turn(rotation, points[0]), origin, 1.0)
-    return _confirmed(path, n_outside, viewpoint, target, first, target)
+    return _launched(path, n_outside, viewpoint, target, _confirmed(path, n_outside, viewpoint, target, first, target))
 
 
 def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Number = np.inf) -> Rays:
@@ -194,6 +198,50 @@ def _confirmed(
     mark(status, ~inside_rim(path[0], first), path[0].beyond_rim or RayStatus.MISSED)
     rays = Rays(first, way, end, residual, status)
     return rays if found.all() else _searched(path, n_start, viewpoint, target, aim, rays, ~found)
+
+
+def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target: Xyz, rays: Rays) -> Rays:
+    """The refracted rays, with those that were not found searched from the object.
+
+    A cone of rays is launched from it; the one that leaves closest to the viewpoint's direction starts the search.
+    """
+    lost = (rays.status != RayStatus.OK) & (rays.status != RayStatus.OUTSIDE_LIMBUS)
+    if not lost.any():
+        return rays
+    shape = lost.shape or (1,)
+    rows = np.nonzero(lost.reshape(shape))
+    places, ends = (np.broadcast_to(join(point), (*shape, 3))[rows] for point in (viewpoint, target))
+    aims, found = np.zeros((*shape, 3)), np.zeros(shape, dtype=bool)
+    for start in range(0, len(ends), _LAUNCHED_AT_ONCE):
+        part = slice(start, start + _LAUNCHED_AT_ONCE)
+        few = [taken(crossing, rows[0][part]) for crossing in path]
+        indices = [crossing.n_after for crossing in few]
+        outward = outward_path([crossing.surface for crossing in few], indices, n_outside)
+        out = trace(outward, indices[-1], ends[part, None, :], _CONE)
+        gap = places[part, None, :] - out.points_mm[-1]
+        with np.errstate(all="ignore"):
+            cosine = np.sum(gap * out.directions[-1], axis=-1) / np.linalg.norm(gap, axis=-1)
+        best = _CONE[np.argmax(np.where(out.status == RayStatus.OK, cosine, -2.0), axis=1)]
+        shot = connect(
+            outward, indices[-1], components(ends[part]), components(places[part]), components(ends[part] + best)
+        )
+        index = tuple(axis[part] for axis in rows)
+        aims[index], found[index] = join(shot.last), shot.status == RayStatus.OK
+    if not found.any():
+        return rays
+    aim = components(aims.reshape(*lost.shape, 3))
+    return _searched(path, n_outside, viewpoint, target, aim, rays, found.reshape(lost.shape))
+
+
+def _cone(count: int, reach_rad: float) -> Array:
+    """Unit directions (count, 3) spread evenly about +x, up to `reach_rad` from it."""
+    step = np.arange(count) + 0.5
+    angle, turn = reach_rad * np.sqrt(step / count), np.pi * (1.0 + np.sqrt(5.0)) * step
+    return np.column_stack([np.cos(angle), np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn)])
+
+
+_CONE = _cone(64, 1.45)
+_LAUNCHED_AT_ONCE = 200
 
 
 def _searched(
