@@ -148,6 +148,24 @@ def correct(
     return Corrected(direction, shot.first, shot.last, shot.turning, shot.residual_mm, shot.determinant, shot.status)
 
 
+class RayTube(NamedTuple):
+    """The tube of rays around a traced ray, arrays (...) and components.
+
+    cross_section_mm2_sr : its cross section at the target per solid angle at the source, |w . (a1 x a2)|. Where source
+    and target lie in media of the same index it is the same in both directions. end : the ray's unit direction there.
+    """
+
+    cross_section_mm2_sr: Array
+    end: Xyz
+
+
+def ray_tube(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xyz, target: Xyz) -> RayTube:
+    """The tube of rays that leave `source` along unit directions, where they pass `target` (see the module)."""
+    shape = np.broadcast_shapes(*(p.shape for p in (*source, *direction, *target)))
+    shot = _shoot(path, n_start, _spread(source, shape), _spread(direction, shape), _spread(target, shape))
+    return RayTube(np.abs(shot.determinant), shot.end)
+
+
 def _shoot(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xyz, target: Xyz) -> _Shot:
     """Trace `direction` with its two differentials to the point of closest approach to `target`.
 

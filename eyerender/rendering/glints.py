@@ -1,14 +1,14 @@
-"""Glints: the mirror images of the lamps in the front cornea (first Purkinje images), exact in place and energy.
+"""Glints: the mirror images of the LEDs in the front cornea (first Purkinje images), exact in position and energy.
 
-The ray leaves a point of the lamp in direction d, is mirrored at the cornea (w = d + 2 c N) and must pass the camera's
-nodal point; Newton's method on d with ray differentials, in float64. With J = |w . (a x b)| = dA_perp / dOmega:
+The mirror point of each point of an LED comes from `optics.solve`, the ray tube J = dA_perp / dOmega from
+`optics.shooting`. With the Fresnel reflectance F and the LED's radiant intensity I in the direction d of the ray:
 
-    E = I(d) F / J                                          irradiance at the nodal point, per point of the lamp
+    E = I(d) F / J                                          irradiance at the nodal point, for each point of the LED
     e = E f_x f_y D / cos^3(theta)                          energy of the spot, in radiance times pixels
 
-theta is the angle to the optical axis, D the determinant of the lens distortion's Jacobian. A lamp of finite size is
-integrated by Gauss-Legendre nodes in r^2 and even angles, each with its own place and energy, so that near lamps, which
-image to several pixels, come out as the energy-weighted disc and not as the image of their centre.
+theta is the angle to the optical axis, D the determinant of the Jacobian of the lens distortion. An LED of finite size
+is integrated by Gauss-Legendre nodes in r^2 and even angles, each with its own position and energy. Near LEDs, whose
+images span several pixels, thus become an energy-weighted disc.
 """
 
 from __future__ import annotations
@@ -21,12 +21,16 @@ from functools import lru_cache
 import numpy as np
 
 from ..arrays import ArrayValue, Bools, Floats, frozen
-from ..geometry.surfaces import Surface
+from ..geometry.surfaces import Surface, components, join
+from ..geometry.transforms import normalize
+from ..optics.interface import fresnel
+from ..optics.shooting import ray_tube
+from ..optics.solve import mirrored_rays
+from ..optics.trace import Crossing, RayStatus
 from ..rig.camera import Camera
 from ..rig.light import Light
-from .frame import apex_of, ring_radius_mm
+from .frame import ring_radius_mm
 
-_STEPS = 40
 Visibility = Callable[[Floats, Floats], Bools]
 
 
@@ -60,69 +64,6 @@ class Image:
     energy: Floats
 
 
-def mirror_paths(
-    surface: Surface, sources: Floats, eyepoint: Floats, residual_mm: float = 1e-9
-) -> tuple[Floats, Floats, Floats, Floats, Bools]:
-    """Rays from points through the mirror of `surface` to one point, all in the eye frame.
-
-    Args:
-        sources: (n, 3) mm.
-        eyepoint: (3,) mm, the camera's nodal point.
-        residual_mm: by which a path may miss it.
-
-    Returns:
-        mirror points (n, 3), directions before and after (n, 3), J (n,) mm^2, and whether the path was found.
-    """
-    n = len(sources)
-    centre = apex_of(surface) - 7.8 * np.asarray(surface.rotation)[:, 0]
-    middle = _unit(sources - centre) + _unit(eyepoint - centre)
-    d = _unit(centre + 7.8 * _unit(middle) - sources)
-    found = np.zeros(n, dtype=bool)
-    y, w, J = np.zeros((n, 3)), np.zeros((n, 3)), np.ones(n)
-    for _ in range(_STEPS):
-        e = _basis(d)
-        hit = surface.hit(_xyz(sources), _xyz(d), True)
-        t = hit.distance[:, None]
-        y = sources + t * d
-        g = np.stack(np.broadcast_arrays(*hit.gradient), axis=-1)
-        size = np.sqrt(_dot(g, g))[:, None]
-        N = g / size
-        c = -_dot(N, d)[:, None]
-        w = d + 2 * c * N
-        hessian = surface.hessian_at(_xyz(y))
-        s = _dot(eyepoint - y, w)[:, None]
-        r = eyepoint - (y + s * w)
-        a = []
-        for k in range(2):
-            dy = t * (e[k] + d * (_dot(N, e[k])[:, None] / c))
-            h = np.stack(np.broadcast_arrays(*hessian.times(_xyz(dy))), axis=-1) / size
-            dN = h - N * _dot(N, h)[:, None]
-            dc = -(_dot(e[k], N) + _dot(d, dN))[:, None]
-            a.append(dy + s * (e[k] + 2 * (dc * N + c * dN)))
-        det = _dot(w, _cross(a[0], a[1]))
-        J = np.abs(det)
-        miss = np.sqrt(_dot(r, r))
-        found = hit.ok & (miss < residual_mm) & (s[:, 0] > 0) & (c[:, 0] > 0)
-        bad = ~np.isfinite(miss)
-        if np.all(found | bad):
-            break
-        with np.errstate(divide="ignore", invalid="ignore"):
-            du, dv = _dot(w, _cross(r, a[1])) / det, _dot(w, _cross(a[0], r)) / det
-            cut = np.minimum(1.0, 2.0 / (np.hypot(du, dv) * np.abs(hit.distance)))
-        step = (cut * du)[:, None] * e[0] + (cut * dv)[:, None] * e[1]
-        moved = d + np.where(np.isfinite(step), step, 0.0)
-        d = np.where((found | bad)[:, None], d, _unit(moved))
-    return y, d, w, J, found
-
-
-def reflectance(cosine: Floats, index: float) -> Floats:
-    """Unpolarised Fresnel reflectance from air on to `index` (Born & Wolf, section 1.5)."""
-    c2 = np.sqrt(1 - (1 - cosine**2) / index**2)
-    rs = (cosine - index * c2) / (cosine + index * c2)
-    rp = (index * cosine - c2) / (index * cosine + c2)
-    return np.asarray(0.5 * (rs**2 + rp**2))
-
-
 @dataclass(frozen=True, slots=True)
 class GlintScene:
     """What glints need: the front cornea and its rim, the pose (x_world = M x + t), camera, and what may stand between.
@@ -144,7 +85,7 @@ class GlintScene:
         """The image of each lamp, as finely as its size and the point-spread function ask for."""
         if all(lamp.radius_mm == 0 for lamp in lights):
             return self._trace(lights, [POINT] * len(lights))
-        rough = self._trace(lights, [quadrature(1, 4) if lamp.radius_mm > 0 else POINT for lamp in lights], 1e-2)
+        rough = self._trace(lights, [quadrature(1, 4) if lamp.radius_mm > 0 else POINT for lamp in lights])
         nodes = []
         for lamp, image in zip(lights, rough, strict=True):
             if lamp.radius_mm == 0:
@@ -157,7 +98,7 @@ class GlintScene:
             nodes.append(quadrature(radial, 4 * radial + 2))
         return self._trace(lights, nodes)
 
-    def _trace(self, lights: Sequence[Light], nodes: Sequence[Nodes], residual_mm: float = 1e-9) -> list[Image]:
+    def _trace(self, lights: Sequence[Light], nodes: Sequence[Nodes]) -> list[Image]:
         """Images of lamps by the given points of their discs; all lamps in one batch."""
         camera = self.camera
         points = np.concatenate([disc_points(lamp, n) for lamp, n in zip(lights, nodes, strict=True)])
@@ -169,10 +110,16 @@ class GlintScene:
         exponent = np.array([float(lamp.lobe_exponent) for lamp in lights])
         eyepoint = self.M.T @ (camera.nodal_point_mm - self.t)
         sources = (points - self.t) @ self.M
-        y, d, w, J, found = mirror_paths(self.surface, sources, eyepoint, residual_mm)
-        found &= self.surface.axis_distance(_xyz(y)) < self.limbus_radius_mm
-        y, d, w = (np.where(found[:, None], a, (1.0, 0.0, 0.0)) for a in (y, d, w))
-        F = reflectance(np.clip(-_dot(self.surface.normal(y), d), 0, 1), self.index)
+        lamp_xyz, node_xyz = components(sources), components(np.broadcast_to(eyepoint, sources.shape))
+        rays = mirrored_rays(self.surface, lamp_xyz, node_xyz, rim_mm=self.limbus_radius_mm)
+        found = np.asarray(rays.status == RayStatus.OK)
+        mirror = (Crossing(self.surface, 1.0, reflects=True),)
+        J = ray_tube(mirror, 1.0, node_xyz, rays.way, lamp_xyz).cross_section_mm2_sr
+        # The solver's ray runs from the camera to the lamp, the light the other way.
+        y, d, w = (
+            np.where(found[:, None], a, (1.0, 0.0, 0.0)) for a in (join(rays.exit), -join(rays.end), -join(rays.way))
+        )
+        F = fresnel(np.clip(-_dot(self.surface.normal(y), d), 0, 1), 1.0, self.index).unpolarized
         leaving = np.maximum(_dot(d, axes[which]), 0)
         power = exponent[which]
         lobe = np.where(power == 0, 1.0, np.where(leaving > 0, leaving ** np.where(power == 0, 1.0, power), 0.0))
@@ -190,7 +137,7 @@ class GlintScene:
 
     def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
         """Whether the way from points of the cornea is barred by the sclera's sphere (eye frame)."""
-        d = _unit(towards)
+        d = normalize(towards)
         o = y - self.sclera_centre_mm
         b = _dot(o, d)
         disc = b * b - (_dot(o, o) - self.sclera_radius_mm**2)
@@ -244,7 +191,9 @@ def quadrature(radial: int, angular: int) -> Nodes:
 
 def disc_points(light: Light, nodes: Nodes) -> Floats:
     """Points (k, 3) of a lamp's disc or ring in the world."""
-    e1, e2 = _basis(light.axis[None, :])
+    axis = light.axis
+    e1 = normalize(np.cross(axis, (1.0, 0.0, 0.0) if abs(axis[0]) < 0.6 else (0.0, 1.0, 0.0)))
+    e2 = np.cross(axis, e1)
     outer, inner = float(light.radius_mm), ring_radius_mm(light)
     r2 = _dot(nodes.point, nodes.point)
     # Even area on the disc stays even on the ring: r^2 runs from inner^2 to outer^2.
@@ -267,24 +216,3 @@ def distortion_determinant(camera: Camera, x: Floats, y: Floats) -> Floats:
 
 def _dot(a: Floats, b: Floats) -> Floats:
     return np.asarray(np.einsum("...i,...i->...", a, b))
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """The cross product of (n, 3) arrays; np.cross spends more time on axes than on numbers."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
-
-
-def _unit(v: Floats) -> Floats:
-    return np.asarray(v / np.sqrt(_dot(v, v))[..., None])
-
-
-def _basis(d: Floats) -> tuple[Floats, Floats]:
-    """Two unit vectors orthogonal to each unit vector (n, 3) and to each other."""
-    helper = np.where(np.abs(d[:, :1]) < 0.6, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
-    e1 = _unit(_cross(d, helper))
-    return e1, _cross(d, e1)
-
-
-def _xyz(v: Floats) -> tuple[Floats, Floats, Floats]:
-    return np.ascontiguousarray(v[:, 0]), np.ascontiguousarray(v[:, 1]), np.ascontiguousarray(v[:, 2])

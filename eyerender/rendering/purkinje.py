@@ -18,15 +18,14 @@ import numpy as np
 from ..arrays import Bools, Floats
 from ..errors import InputError
 from ..eye.model import Eye
-from ..geometry.surfaces import Surface
+from ..geometry.surfaces import Surface, components, join
 from ..optics.gradient import GradientMedium
 from ..optics.interface import fresnel
 from ..optics.purkinje import purkinje_path, purkinje_points
+from ..optics.shooting import ray_tube
 from ..optics.trace import Crossing, Traced, trace
 from ..rig.light import Light
 from .glints import GlintScene, Image, Nodes, disc_points, distortion_determinant
-
-_ANGLE = 2e-6  # of the finite differences: their error is of its square, the rounding's of 1e-16 over it
 
 
 def purkinje_images(
@@ -48,7 +47,8 @@ def purkinje_images(
         ok &= np.asarray(traced.status) == 0
         if order > 2:
             ok &= _through_pupil(eye, traced.points_mm, len(eye.front))
-        tube, towards = tube_mm2_sr(path, eyepoint, out, sources)
+        rays = ray_tube(path, 1.0, components(eyepoint), components(out), components(sources))
+        tube, towards = rays.cross_section_mm2_sr, join(rays.end)
         passed = transmittance(path, traced, indices[-1])
         leaving = np.maximum(np.einsum("ij,ij->i", -towards, np.broadcast_to(M.T @ lamp.axis, towards.shape)), 0)
         lobe = leaving ** float(lamp.lobe_exponent) if lamp.lobe_exponent else np.ones_like(leaving)
@@ -61,24 +61,6 @@ def purkinje_images(
         entry, leave = traced.points_mm[-1] @ M.T + t, traced.points_mm[1] @ M.T + t
         images.append(Image(points, entry, leave, camera.pixels_of(x, y), np.where(ok, energy, 0.0)))
     return images
-
-
-def tube_mm2_sr(path: Sequence[Crossing], start: Floats, d: Floats, end: Floats) -> tuple[Floats, Floats]:
-    """Cross section of the ray tube at `end` (n, 3) per solid angle at `start`, and the rays' directions there."""
-    helper = np.where(np.abs(d[:, :1]) < 0.6, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
-    e1 = np.cross(d, helper)
-    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
-    e2 = np.cross(d, e1)
-    ways = np.stack([d, *(d + sign * _ANGLE * e for e in (e1, e2) for sign in (1, -1))])
-    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-    traced = trace(path, 1.0, np.broadcast_to(start, ways.shape), ways)
-    p, w = traced.points_mm[-1], traced.directions[-1]
-    axis = w[0]
-    # Where each ray passes the plane through the end, across the middle ray.
-    s = np.einsum("kij,ij->ki", end - p, axis) / np.einsum("kij,ij->ki", w, axis)
-    q = p + s[..., None] * w
-    a, b = (q[1] - q[2]) / (2 * _ANGLE), (q[3] - q[4]) / (2 * _ANGLE)
-    return np.abs(np.einsum("ij,ij->i", axis, np.cross(a, b))), axis
 
 
 def transmittance(path: Sequence[Crossing], traced: Traced, behind: float) -> Floats:

@@ -10,8 +10,10 @@ from render_oracles import centroid
 from render_rigs import BLACK, RIGS, eye_of, head_rig, job_of, remote_rig
 
 from eyerender.errors import InputError
+from eyerender.geometry.surfaces import components
 from eyerender.optics.purkinje import purkinje_path, purkinje_points
-from eyerender.rendering.purkinje import stack, tube_mm2_sr
+from eyerender.optics.shooting import ray_tube
+from eyerender.rendering.purkinje import stack
 
 
 @pytest.mark.parametrize("model", ["E3", "E4", "E5"])
@@ -26,7 +28,8 @@ def test_the_ray_tube_is_the_same_from_the_lamp(model, order):
     for a, b in ((lamp, node), (node, lamp)):
         found = purkinje_points(*lens, a, b[0], gradient)
         assert found.status[0] == 0
-        ways.append(tube_mm2_sr(path, b[0], -found.directions, a)[0][0])
+        tube = ray_tube(path, 1.0, components(b), components(-found.directions), components(a))
+        ways.append(tube.cross_section_mm2_sr[0])
     assert ways[0] == pytest.approx(ways[1], rel=1e-6)
 
 
