@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,30 @@ _ALWAYS = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """The keys of an object, and the shapes of its values that are objects, or lists of objects of one shape."""
+
+    keys: frozenset[str]
+    objects: tuple[tuple[str, _Shape], ...]
+    lists: tuple[tuple[str, _Shape], ...]
+
+    @classmethod
+    def of(cls, node: dict[str, Any]) -> _Shape:
+        objects = [(k, cls.of(v)) for k, v in node.items() if isinstance(v, dict)]
+        lists = [(k, cls.of(v[0])) for k, v in node.items() if isinstance(v, list) and v and isinstance(v[0], dict)]
+        return cls(frozenset(node), tuple(objects), tuple(lists))
+
+    def fits(self, node: Any) -> bool:
+        """Whether a value is an object of this shape."""
+        return (
+            isinstance(node, dict)
+            and node.keys() == self.keys
+            and all(shape.fits(node[key]) for key, shape in self.objects)
+            and all(isinstance(node[key], list) and all(map(shape.fits, node[key])) for key, shape in self.lists)
+        )
+
+
 class Lines:
     """Checks lines one after the other, and at the end what concerns several of them."""
 
@@ -43,7 +68,8 @@ class Lines:
         self._names = np.zeros(count, dtype=np.uint64)
         self._subjects = np.full(count, -1, dtype=np.int64)
         self._splits = np.zeros(count, dtype=np.uint64)
-        self._shape: tuple[set[str], set[str]] | None = None
+        self._first: dict[str, Any] = {}
+        self._shape: _Shape | None = None
 
     def take(self, number: int, entry: ImageEntry) -> Iterator[str]:
         """What is wrong with line `number`, counted from 0; raises one of `WRONG` for a line that cannot be read."""
@@ -56,15 +82,10 @@ class Lines:
         if "subject" not in line:
             return
         self._subjects[number], self._splits[number] = line["subject"], _hash(line["split"])
-        nulls: set[str] = set()
-        keys = _keys(line, nulls)
-        self._shape = self._shape or (keys, nulls)
-        # What a null stands for in one of the two lines may be anything in the other.
-        known, empty = self._shape
-        if keys != known:
-            other = sorted(key for key in keys ^ known if not any(key.startswith(n) for n in nulls | empty))
-            if other:
-                yield f"has other keys than line 1 ({', '.join(key[1:] for key in other[:3])})"
+        if self._shape is None:
+            self._first, self._shape = line, _Shape.of(line)
+        if not self._shape.fits(line):
+            yield from _other_keys(line, self._first)
         for path in _ALWAYS:
             node: Any = line
             for key in path:
@@ -144,14 +165,20 @@ def _agree(line: dict[str, Any]) -> Iterator[str]:
             yield f"the glint of light {glint['light']} of its labels is not that of its record"
 
 
-def _keys(node: Any, nulls: set[str], path: str = "") -> set[str]:
-    """The key paths of a line; lists count as one entry; `nulls` gets the beginnings of what would be below a null."""
-    found: set[str] = set()
-    _collect(node, path, found, nulls)
-    return found
+def _other_keys(line: dict[str, Any], first: dict[str, Any]) -> Iterator[str]:
+    """The keys that one of two lines has and the other has not; below a null there may be anything."""
+    keys: set[str] = set()
+    known: set[str] = set()
+    nulls: set[str] = set()
+    _collect(line, "", keys, nulls)
+    _collect(first, "", known, nulls)
+    other = sorted(key for key in keys ^ known if not any(key.startswith(n) for n in nulls))
+    if other:
+        yield f"has other keys than line 1 ({', '.join(key[1:] for key in other[:3])})"
 
 
 def _collect(node: Any, path: str, found: set[str], nulls: set[str]) -> None:
+    """The key paths of a line; lists count as one entry; `nulls` gets the beginnings of what would be below a null."""
     found.add(path)
     if isinstance(node, dict):
         for key, value in node.items():

@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from .problems import SHOWN, Problems, differences
 
 _EXACT_INTEGER = 2**53
 Numbers = NDArray[np.int64]
-Hashes = NDArray[np.uint64]
 Step = Callable[[int, int, str], None]
 
 
@@ -58,48 +56,34 @@ def compare_lines(folder: Path, problems: Problems) -> None:
     """
     mine = [folder / METADATA]
     theirs = [folder / SHARDS / shard_name(shard) / LINES for shard in sorted(finished(folder))]
-    hashes = [np.array([_hash(raw) for _, raw in _lines(files)], dtype=np.uint64) for files in (mine, theirs)]
-    a = _Values.of(mine, np.flatnonzero(~np.isin(hashes[0], hashes[1])))
-    b = _Values.of(theirs, np.flatnonzero(~np.isin(hashes[1], hashes[0])))
-    _, at, to = np.intersect1d(a.names, b.names, return_indices=True)
-    changed = a.values[at] != b.values[to]
-    pairs = sorted(zip(a.numbers[at[changed]].tolist(), b.numbers[to[changed]].tolist(), strict=True))
-    lines = [_parsed(files, [pair[k] for pair in pairs[:SHOWN]]) for k, files in enumerate((mine, theirs))]
-    for number, other in pairs:
-        said = "differs from its shard's line"
-        if number in lines[0] and other in lines[1]:
-            first = next(differences(lines[1][other], lines[0][number], 0.0), "it has other keys")
-            said = f"{lines[0][number].get('file_name')} is not what its shard has: {first}"
-        problems.add(f"{METADATA} line {number + 1}: {said}")
-    for files, found, other, words in ((mine, a, b, "no shard has its line"), (theirs, b, a, f"not in {METADATA}")):
-        alone = np.sort(found.numbers[~np.isin(found.names, other.names)]).tolist()
-        known = _parsed(files, alone[:SHOWN])
+    hashes = [np.fromiter((_hash(raw) for _, raw in _lines(files)), dtype=np.uint64) for files in (mine, theirs)]
+    a = _values(mine, np.flatnonzero(~np.isin(hashes[0], hashes[1])))
+    b = _values(theirs, np.flatnonzero(~np.isin(hashes[1], hashes[0])))
+    _, at, to = np.intersect1d(a["name"], b["name"], return_indices=True)
+    changed = a["value"][at] != b["value"][to]
+    pairs = np.stack([a["number"][at[changed]], b["number"][to[changed]]], axis=1)
+    pairs = pairs[np.argsort(pairs[:, 0])]
+    first = [dict(_objects(files, np.sort(pairs[:SHOWN, k]))) for k, files in enumerate((mine, theirs))]
+    for number, other in pairs[:SHOWN].tolist():
+        line = first[0].get(number, {})
+        said = next(differences(first[1].get(other, {}), line, 0.0), "it has other keys")
+        problems.add(f"{METADATA} line {number + 1}: {line.get('file_name')} is not what its shard has: {said}")
+    problems.count += max(len(pairs) - SHOWN, 0)
+    for files, found, others, words in ((mine, a, b, "no shard has its line"), (theirs, b, a, f"not in {METADATA}")):
+        alone = np.sort(found["number"][~np.isin(found["name"], others["name"])])
         where = METADATA if files is mine else f"{SHARDS}/*/{LINES}"
-        for number in alone:
-            name = shown(known[number].get("file_name")) if number in known else "it"
-            problems.add(f"{where} line {number + 1}: {name}: {words}")
+        for number, line in _objects(files, alone[:SHOWN]):
+            problems.add(f"{where} line {number + 1}: {shown(line.get('file_name'))}: {words}")
+        problems.count += max(len(alone) - SHOWN, 0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Values:
+def _values(files: Sequence[Path], numbers: Numbers) -> NDArray[np.void]:
     """Some lines of a few files: their numbers, and hashes of their images' names and of their values."""
-
-    numbers: Numbers
-    names: Hashes
-    values: Hashes
-
-    @classmethod
-    def of(cls, files: Sequence[Path], numbers: Numbers) -> _Values:
-        rows = []
-        for number, line in _objects(files, numbers):
-            name = line.get("file_name")
-            rows.append((number, _hash(str(name).encode()), _hash(json.dumps(_plain(line), sort_keys=True).encode())))
-        columns = list(zip(*rows, strict=True)) or [(), (), ()]
-        return cls(np.array(columns[0], np.int64), *(np.array(column, np.uint64) for column in columns[1:]))
-
-
-def _parsed(files: Sequence[Path], numbers: Sequence[int]) -> dict[int, dict[str, Any]]:
-    return dict(_objects(files, np.sort(np.array(numbers, dtype=np.int64))))
+    rows = (
+        (number, _hash(str(line.get("file_name")).encode()), _hash(json.dumps(_plain(line), sort_keys=True).encode()))
+        for number, line in _objects(files, numbers)
+    )
+    return np.fromiter(rows, dtype=[("number", np.int64), ("name", np.uint64), ("value", np.uint64)])
 
 
 def _objects(files: Sequence[Path], numbers: Numbers) -> Iterator[tuple[int, dict[str, Any]]]:
