@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from .analytic.observer import observe
 from .arrays import Floats
-from .errors import InputError
+from .errors import InputError, Warn
 from .eye.model import Eye
 from .eye.pose import Poses, rigid_motion
 from .imagefile import MAX_PIXELS, write_png
 from .imagefolder import write_dataset
 from .observation import EYES, Observations
 from .outfolder import refuse_non_empty, staged
+from .plausibility import is_saturated, saturation_warnings
 from .scene import Scene
 
 if TYPE_CHECKING:
@@ -191,16 +192,22 @@ def render_folder(
     overwrite: bool = False,
     exr: bool = False,
     progress: Progress | None = None,
+    warn: Warn | None = None,
 ) -> dict[str, Any]:
     """Render a scene into a folder of labelled images (docs/formats.md); complete or not at all.
 
+    `warn` hears of saturated images before the folder is put in place; if it raises, nothing is written. What can be
+    said of the scene beforehand is in `Scene.warnings`.
+
     Returns:
-        What was written: schema eyerender/render/1, path, number of images.
+        What was written: schema eyerender/render/1, path, number of images, warnings of both kinds.
     """
+    warnings = scene.warnings()
     refuse_non_empty(path, overwrite)  # before the work, not after it
     truth = observe(scene)
     records = list(truth.records())
     lines: list[dict[str, Any]] = []
+    saturated = 0
     spec = scene.spec
     with staged(path, overwrite=overwrite) as folder:
         (folder / "images").mkdir()
@@ -229,9 +236,18 @@ def render_folder(
 
                 write_exr(folder / "images" / f"{image.name}.exr", image.irradiance)
             lines.append(line)
-        statistics = {"images": len(lines), "observations": len(truth)}
+            saturated += is_saturated(image.dn, spec.sensor)
+        found = saturation_warnings(saturated, len(lines), scene.source)
+        if warn is not None:
+            warn(found)
+        statistics = {"images": len(lines), "images_saturated": saturated, "observations": len(truth)}
         write_dataset(folder, lines, spec=spec.to_mapping(), digest=scene.digest(), statistics=statistics)
-    return {"schema": "eyerender/render/1", "path": str(path), "images": len(lines)}
+    return {
+        "schema": "eyerender/render/1",
+        "path": str(path),
+        "images": len(lines),
+        "warnings": [warning.to_mapping() for warning in (*warnings, *found)],
+    }
 
 
 def noiseless(scene: Scene, image: WindowImage) -> NDArray[Any]:

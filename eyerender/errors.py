@@ -7,6 +7,9 @@ in the result. Any other exception is a defect of this package.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+
 # A message may quote a file that somebody else made. Longer parts lose their middle.
 MAX_MESSAGE, MAX_SOURCE, MAX_PATH, MAX_REASON = 2000, 600, 200, 400
 
@@ -37,6 +40,38 @@ class InputError(EyerenderError):
         self.path = one_line(path, MAX_PATH)
         shown = one_line(source, MAX_SOURCE)
         super().__init__(": ".join(part for part in (shown, self.path, self.reason) if part))
+
+
+@dataclass(frozen=True, slots=True)
+class InputWarning:
+    """What the user gave can be used, but was probably not meant.
+
+    `code` is a word for programs, `source` and `path` are as of `InputError`.
+    """
+
+    code: str
+    reason: str
+    source: str = ""
+    path: str = ""
+
+    def __str__(self) -> str:
+        return str(self.error())
+
+    def error(self) -> InputError:
+        """The same as an error, for who wants none of it."""
+        return InputError(self.reason, source=self.source, path=self.path)
+
+    def at(self, source: str) -> InputWarning:
+        """The same in a source."""
+        return replace(self, source=source)
+
+    def to_mapping(self) -> dict[str, str]:
+        """As JSON has it."""
+        return asdict(self)
+
+
+# What hears of warnings while there is still time to stop: it may raise.
+Warn = Callable[[Iterable[InputWarning]], None]
 
 
 class BackendError(EyerenderError):

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from .errors import InputError
-from .files import written
+from .files import opened, written
 
 # The largest window that can be rendered; this bounds what a hostile file can make us allocate.
 MAX_PIXELS = 8192 * 8192
+# More than such an image takes in any of the formats; the file's descriptive data come on top.
+MAX_IMAGE_BYTES = 2**30
 # Pillow knows many more, some of which start other programs.
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "GIF", "WEBP", "JPEG2000")
 
@@ -48,23 +50,19 @@ def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
         (h, w) uint8 or uint16, or float32 for a float TIFF; bit depth (32 for float).
 
     Raises:
-        InputError: missing, unreadable, empty, too large, with real colour or transparency, or with several frames.
+        InputError: missing, no regular file, unreadable, empty, too large, with real colour or transparency, or with
+            several frames.
     """
     source = str(path)
     try:
-        if os.path.getsize(path) == 0:
-            raise InputError("is empty", source=source)
-        # What Pillow warns of, it either reads all the same or fails at with an error.
-        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as file:
-            return _decoded(file, source)
+        with opened(path, limit=MAX_IMAGE_BYTES) as data:
+            if os.fstat(data.fileno()).st_size == 0:
+                raise InputError("is empty", source=source)
+            # What Pillow warns of, it either reads all the same or fails at with an error.
+            with warnings.catch_warnings(action="ignore"), Image.open(data, formats=FORMATS) as file:
+                return _decoded(file, source)
     except InputError:
         raise
-    except FileNotFoundError:
-        raise InputError("no such file", source=source) from None
-    except IsADirectoryError:
-        raise InputError("is a folder, not an image", source=source) from None
-    except PermissionError:
-        raise InputError("may not be read", source=source) from None
     except MemoryError:
         raise InputError("needs more memory than there is", source=source) from None
     except Exception:
@@ -75,9 +73,9 @@ def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
 def _decoded(file: Image.Image, source: str) -> tuple[NDArray[Any], int]:
     if file.width * file.height > MAX_PIXELS:
         raise InputError(f"is too large ({file.width} x {file.height} pixels)", source=source)
-    frames = getattr(file, "n_frames", 1)
-    if frames > 1:
-        raise InputError(f"holds {frames} images; a file of one is read", source=source)
+    # Counting them would go through the whole file.
+    if getattr(file, "is_animated", False):
+        raise InputError("holds several images; a file of one is read", source=source)
     mode = file.mode
     if mode in ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr", "HSV", "LAB"):
         if file.has_transparency_data and np.asarray(file.convert("RGBA"))[..., 3].min() < 255:

@@ -28,6 +28,7 @@ Progress = Callable[[int, int, str], None]
 
 # How far the reflections of a real eye lie from those of a typical one that is placed by its pupil.
 _PLACE_MM = 1.5
+_BATCH = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +88,9 @@ class ImageObserver:
         self, entries: Sequence[ImageEntry], index: Index, scene: Scene, *, progress: Progress | None = None
     ) -> Observations:
         """Extract the features of some images of a scene; `index` has a row for each of their records."""
-        parts, row = [], 0
+        parts: list[Observations] = []
+        few: list[Observations] = []  # observations of one row take ten times the memory of joined ones
+        row = 0
         for k, entry in enumerate(entries):
             image, stored = read_image(entry.path)
             if image.shape != (entry.window[3], entry.window[2]):
@@ -96,11 +99,14 @@ class ImageObserver:
                 )
             rows = np.arange(row, row + len(entry.line["records"]))
             depth = int(entry.line.get("bit_depth") or stored)
-            parts.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene))
+            few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene))
+            if len(few) == _BATCH:
+                parts.append(concatenate(few))
+                few = []
             row = int(rows[-1]) + 1 if len(rows) else row
             if progress is not None:
                 progress(k + 1, len(entries), "")
-        return concatenate(parts)
+        return concatenate([*parts, *few])
 
     def observe_files(
         self, paths: Sequence[str | Path], *, scene: Scene | None = None, progress: Progress | None = None

@@ -9,10 +9,11 @@ from typing import Literal
 
 from .capture import render_folder
 from .comparison import Comparison, compare
-from .errors import InputError
+from .errors import InputError, Warn
 from .gaze.regression import FUNCTIONS, PupilGlintRegression
 from .imagefolder import ImageFolder, same_run
 from .observers import ImageObserver, scene_of
+from .plausibility import saturation_warnings
 from .report.comparison import Timing, write_report
 from .scene import Scene, load_scene
 
@@ -30,10 +31,13 @@ def run_quickstart(
     threads: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    warn: Warn | None = None,
 ) -> Comparison:
     """Do the main job in a folder and write `report.html` there.
 
-    Images of the same scene, seed and versions that the folder already holds are used again.
+    Images of the same scene, seed and versions that the folder already holds are used again. `warn` hears of what was
+    probably not meant, and may raise: of the scene before anything is done, of saturated images before they are put in
+    place (or used again).
 
     Raises:
         InputError: the folder holds something else and `overwrite` is not given.
@@ -41,6 +45,8 @@ def run_quickstart(
     """
     folder = Path(folder)
     loaded = load_scene(scene, eye=eye)
+    if warn is not None:
+        warn(loaded.warnings())
     count = len(loaded.frames())
 
     def step(offset: int, what: str) -> Progress:
@@ -60,10 +66,14 @@ def run_quickstart(
             threads=threads,
             overwrite=overwrite,
             progress=step(0, "rendering"),
+            warn=warn,
         )
         timings.append(Timing(f"observing and rendering {count} windows", time.monotonic() - start))
     start = time.monotonic()
     images = ImageFolder.load(folder)
+    if warn is not None:
+        saturated = images.dataset.get("statistics", {}).get("images_saturated", 0)
+        warn(saturation_warnings(saturated, len(images.entries), loaded.source))
     result = _compare(loaded, images, function, step(count, "extracting"))
     timings.append(Timing("extracting and calibrating", time.monotonic() - start))
     write_report(folder / REPORT, loaded, result, images.entries, timings)
@@ -81,5 +91,6 @@ def compare_folder(folder: str | Path, *, function: str = "R3", progress: Progre
 def _compare(scene: Scene, images: ImageFolder, function: str, progress: Progress | None) -> Comparison:
     if function not in FUNCTIONS:
         raise InputError(f"{function!r} is no function of Table 2 (R1 to R12)", source="--function")
-    found = ImageObserver().observe_folder(images, scene, progress=progress)
-    return compare(images.truth(), found, scene.rig, PupilGlintRegression(function), f"regression {function}")
+    truth = images.truth()
+    found = ImageObserver().observe_entries(images.entries, truth.index, scene, progress=progress)
+    return compare(truth, found, scene.rig, PupilGlintRegression(function), f"regression {function}")

@@ -16,12 +16,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from .arrays import ArrayValue, Floats, frozen
-from .errors import InputError
+from .errors import InputError, InputWarning
 from .eye.catalogue import load_eye
 from .eye.margin import PupilMarginSpec
 from .eye.model import Eye
 from .eye.spec import EyeSpec
 from .observation import EYES, MAX_GLINTS, Index
+from .plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
 from .region.anatomy import RegionSpec
 from .region.look import LookSpec
 from .rig.imaging import AmbientSpec, LensSpec, MotionSpec
@@ -165,6 +166,10 @@ class SceneSpec(FileSpec):
                 f"{count} observations of {lights} lights make {count * lights} glints; a scene may have {MAX_GLINTS}"
             )
 
+    def with_spp(self, spp: int) -> Self:
+        """A copy with other samples per pixel; raises an `InputError` that names the option --spp."""
+        return self.replaced("--spp", {"image": {**self.to_mapping()["image"], "spp": spp}})
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames(ArrayValue):
@@ -182,13 +187,17 @@ class Frames(ArrayValue):
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A scene ready to be observed: the spec, the eye's spec and the numeric rig; `base` is what files of its pictures
-    (an HDR map, a head mesh) are relative to, by default the current folder."""
+    """A scene ready to be observed: the spec, the eye's spec and the numeric rig.
+
+    `base` is what files of its pictures (an HDR map, a head mesh) are relative to, by default the current folder;
+    `source` is what messages call the scene's file.
+    """
 
     spec: SceneSpec
     eye_spec: EyeSpec
     rig: Rig
     base: Path | None = None
+    source: str = ""
 
     @classmethod
     def of(cls, spec: SceneSpec, *, base: Path | None = None, eye: str | None = None, source: str = "") -> Scene:
@@ -203,7 +212,7 @@ class Scene:
         if eye is not None:
             spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": eye})})
         eye_spec = load_eye(name)
-        scene = cls(spec, eye_spec, spec.rig.build(), base)
+        scene = cls(spec, eye_spec, spec.rig.build(), base, source)
         try:
             scene.eye("right")
             for file in scene.files if base is not None else ():
@@ -222,6 +231,41 @@ class Scene:
     def pupil_diameter_mm(self) -> float:
         """Diameter of the anatomical pupil: the scene's, or the eye's own."""
         return float(2 * self.eye("right").stop.semi_axes_mm[0])
+
+    def warnings(self) -> list[InputWarning]:
+        """What of the scene was probably not meant: a pupil of 0.4 mm, lengths in metres, a lamp in the head, ...
+
+        Nothing is traced or rendered for it. An empty list does not say that the scene is a good one.
+        """
+        spec, rig = self.spec, self.rig
+        positions = [np.array(head) for head in spec.subject.head_positions_mm]
+        at = [f" at head position {k}" if len(positions) > 1 else "" for k in range(len(positions))]
+        heads = {f"head{where}": head for where, head in zip(at, positions, strict=True)}
+        eyes = {
+            f"{side} eye{where}": self.eye_position_mm(side) + head
+            for where, head in zip(at, positions, strict=True)
+            for side in spec.subject.eyes
+        }
+        cameras = [
+            f"rig.cameras.{i}.{'position_mm' if camera.calibration is None else 'calibration'}"
+            for i, camera in enumerate(spec.rig.cameras)
+        ]
+        lights = [
+            f"rig.lights.{i}.{'position_mm' if light.ring is None else 'ring'}"
+            for i, light in enumerate(spec.rig.lights)
+            for _ in range(1 if light.ring is None else light.ring.count)
+        ]
+        views: dict[int, list[tuple[tuple[int, int, int, int], Floats]]] = {c: [] for c in range(len(rig.cameras))}
+        for (c, k, side), window in self.windows().items():
+            views[c].append((window, self.eye_position_mm(EYES[side]) + positions[k]))
+        pupil = "eye.pupil_diameter_mm" if spec.eye.pupil_diameter_mm is not None else "eye.model"
+        found = [
+            *pupil_warnings(self.pupil_diameter_mm, pupil),
+            *length_warnings(spec.to_mapping()),
+            *place_warnings(rig, eyes, heads, cameras, lights),
+            *view_warnings(rig, views, [f"rig.cameras.{i}" for i in range(len(rig.cameras))]),
+        ]
+        return [warning.at(self.source) for warning in found]
 
     def digest(self) -> str:
         """SHA-256 of everything the scene's images depend on, the eye file's content included."""
@@ -343,28 +387,7 @@ class Scene:
 
     def rig_mapping(self) -> dict[str, Any]:
         """The rig as `features --json` writes it (docs/formats.md)."""
-        screen = self.rig.screen
-        return {
-            "cameras": [
-                {
-                    "K": c.K.tolist(),
-                    "R": c.R.tolist(),
-                    "t": c.t.tolist(),
-                    "distortion": c.distortion.tolist(),
-                    "resolution_px": list(c.resolution_px),
-                }
-                for c in self.rig.cameras
-            ],
-            "lights_mm": [light.position_mm.tolist() for light in self.rig.lights],
-            "screen": None
-            if screen is None
-            else {
-                "centre_mm": screen.centre_mm.tolist(),
-                "size_mm": list(screen.size_mm),
-                "right": screen.right.tolist(),
-                "up": screen.up.tolist(),
-            },
-        }
+        return self.rig.to_mapping()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -453,7 +476,7 @@ def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = N
     refuse_folder(path, "a scene file, or the name of a shipped scene")
     spec = SceneSpec.load(path)
     if spp is not None:
-        spec = spec.replaced("--spp", {"image": {**spec.to_mapping()["image"], "spp": spp}})
+        spec = spec.with_spp(spp)
     if seed is not None:
         spec = spec.replaced("--seed", {"seed": seed})
     return Scene.of(spec, base=path.parent, eye=eye, source=str(path))

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Bench of dataset runs: rate, what is not rendering, scaling over workers, memory, disk, runs killed at random.
+"""Bench of dataset runs: rate, what is not rendering, syncing, scaling over workers, memory, disk, killed runs.
 
     bench_generate.py [--quick] [--json F] [--backend llvm|cuda]
 
@@ -18,7 +18,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +29,12 @@ single_threaded()
 
 import yaml  # noqa: E402
 
+from eyerender.dataset import shard  # noqa: E402
 from eyerender.dataset.maker import Maker  # noqa: E402
 from eyerender.dataset.plan import Plan  # noqa: E402
 from eyerender.dataset.pool import LocalPool  # noqa: E402
 from eyerender.dataset.realise import frames_of  # noqa: E402
-from eyerender.dataset.shard import Staged, write_shard  # noqa: E402
+from eyerender.dataset.shard import Staged, commit, write_shard  # noqa: E402
 from eyerender.dataset.spec import DatasetSpec, find_dataset  # noqa: E402
 from eyerender.dataset.worker import Job  # noqa: E402
 
@@ -114,7 +116,7 @@ class Bench:
         yield row("two workers against one", rates[2] / rates[1], "ratio", must=1.8, at_least=True)
 
     def apart(self) -> Iterable[Row]:
-        """What an image takes besides rendering, and bytes on disk."""
+        """What an image takes besides rendering, what syncing takes of a run, and bytes on disk."""
         count = 20 if self.small else 60
         made = plan(count, count)
         maker = Maker(made, 1, backend=self.backend, threads=1)  # type: ignore[arg-type]
@@ -131,14 +133,19 @@ class Bench:
                 inside[1] += time.thread_time() - cpu
 
         maker.renderer.render = timed  # type: ignore[method-assign]
-        with tempfile.TemporaryDirectory() as folder:
-            cpu = time.thread_time()
+        with tempfile.TemporaryDirectory() as folder, syncing_timed() as syncing:
+            start, cpu = time.perf_counter(), time.thread_time()
             staged = write_shard(maker, Path(folder), 0, lambda *_: None)
             apart = time.thread_time() - cpu - inside[1]
             size = sum(p.stat().st_size for p in Path(staged.stage).rglob("*") if p.is_file())
+            commit(Path(folder), staged)
+            whole = time.perf_counter() - start
         n = staged.images
         yield row("rendering, one thread", 1e3 * inside[0] / n, "ms/image")
         yield row("everything but rendering", 1e3 * apart / n, "ms/image", must=35.0)
+        yield row(f"a shard of {n} images, synced", whole, "s")
+        yield row("the same without syncing", whole - syncing[0], "s")
+        yield row("what syncing adds", 100 * syncing[0] / (whole - syncing[0]), "%", must=3.0)
         yield row("on disk, masks and labels included", size / n, "bytes")
 
     def memory(self) -> Iterable[Row]:
@@ -181,6 +188,30 @@ class Bench:
                 other = _tree(Path(place) / f"killed{k}")
                 differ += sum(whole.get(name) != other.get(name) for name in {*whole, *other})
         yield row(f"files that differ after {kills} kills", differ, "files", must=0)
+
+
+@contextmanager
+def syncing_timed() -> Iterator[list[float]]:
+    """A list whose one number grows by the seconds that shards wait for syncs while the block runs."""
+    spent, real = [0.0], {name: getattr(shard, name) for name in ("sync_tree", "sync_folder", "make_folder")}
+
+    def timed(sync: Callable[[Path], Any]) -> Callable[[Path], Any]:
+        def call(path: Path) -> Any:
+            start = time.perf_counter()
+            try:
+                return sync(path)
+            finally:
+                spent[0] += time.perf_counter() - start
+
+        return call
+
+    for name, sync in real.items():
+        setattr(shard, name, timed(sync))
+    try:
+        yield spent
+    finally:
+        for name, sync in real.items():
+            setattr(shard, name, sync)
 
 
 def _tree(folder: Path) -> dict[str, str]:

@@ -79,7 +79,7 @@ def number(value: Any, path: str, limit: float = 1e6) -> float:
     """A finite number within reason; raises `InputError` naming the path."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"must be a number, not {_shown(value)}", path=path)
-    if not math.isfinite(value) or abs(value) > limit:
+    if abs(value) > limit or not math.isfinite(value):  # in this order: an integer may be too large for a float
         raise InputError(f"must be a finite number within {limit:g}, not {_shown(value)}", path=path)
     return float(value)
 

@@ -6,23 +6,51 @@ import os
 import selectors
 import signal
 import subprocess
-import tempfile
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from types import TracebackType
 from typing import IO, Self
 
-from ..errors import InputError
+from ..errors import InputError, one_line
 from .protocol import Greeting, Reply, Request
 
 _LONGEST_LINE = 4_000_000
+_TAIL_BYTES = 4096
 # One core: seconds of different extractors are only comparable when none spreads over more.
 _ONE_CORE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 
 
 class Failed(Exception):
     """The extractor did not answer as it must; the message is the reason."""
+
+
+class _Tail:
+    """The end of what comes out of a pipe. A thread of its own reads it, so that the writer never waits; the rest is
+    dropped, so that a process may print without end."""
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        self._pipe = pipe
+        self._kept = b""
+        self._thread = threading.Thread(target=self._drain, daemon=True)
+        self._thread.start()
+
+    def _drain(self) -> None:
+        while chunk := os.read(self._pipe.fileno(), 65536):
+            self._kept = (self._kept + chunk)[-_TAIL_BYTES:]
+
+    def read(self) -> bytes:
+        """The last bytes so far; all of them where the writer has ended."""
+        self._thread.join(timeout=0.5)
+        return self._kept
+
+    def close(self) -> None:
+        """Close the pipe once its writers have ended."""
+        self._thread.join(timeout=0.5)
+        # A process that has left the group may still hold the pipe: its reader then goes on until that one ends.
+        if not self._thread.is_alive():
+            self._pipe.close()
 
 
 class ExtractorProcess:
@@ -35,7 +63,6 @@ class ExtractorProcess:
         self, argv: Sequence[str], *, start_timeout_s: float, timeout_s: float, env: Mapping[str, str] | None = None
     ) -> None:
         self._timeout_s = timeout_s
-        self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  (closed with the process)
         self._buffer = b""
         self._closed = False
         try:
@@ -43,14 +70,19 @@ class ExtractorProcess:
                 list(argv),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=self._stderr,
+                stderr=subprocess.PIPE,
                 # A group of its own, so that killing it takes along whatever it started.
                 start_new_session=True,
                 env={**os.environ, **_ONE_CORE, **(env or {})},
             )
         except OSError as error:
-            self._stderr.close()
             raise Failed(f"cannot be started: {error.strerror or error}") from None
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        assert self._process.stderr is not None
+        # It may stop reading at any time: writing must not wait longer than for an answer.
+        os.set_blocking(self._process.stdin.fileno(), False)
+        self._stderr = _Tail(self._process.stderr)
         try:
             self.greeting = Greeting.parse(self._line(start_timeout_s, "no greeting"))
         except InputError as error:
@@ -68,12 +100,7 @@ class ExtractorProcess:
     def ask(self, request: Request) -> tuple[Reply, float]:
         """The answer to one request, and the seconds the round trip took."""
         begin = time.monotonic()
-        try:
-            assert self._process.stdin is not None
-            self._process.stdin.write(request.to_line().encode())
-            self._process.stdin.flush()
-        except OSError:
-            raise self._died() from None
+        self._send(request.to_line().encode())
         line = self._line(self._timeout_s, "no answer")
         seconds = time.monotonic() - begin
         try:
@@ -105,6 +132,25 @@ class ExtractorProcess:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _send(self, data: bytes) -> None:
+        """Write to its input; raises `Failed` when it has ended or does not read."""
+        assert self._process.stdin is not None
+        pipe = self._process.stdin.fileno()
+        end = time.monotonic() + self._timeout_s
+        with selectors.DefaultSelector() as selector:
+            selector.register(pipe, selectors.EVENT_WRITE)
+            while data:
+                left = end - time.monotonic()
+                if left <= 0 or not selector.select(left):
+                    self.close()
+                    raise Failed(f"read no request within {self._timeout_s:g} s")
+                try:
+                    data = data[os.write(pipe, data) :]
+                except BlockingIOError:
+                    continue
+                except OSError:
+                    raise self._died() from None
 
     def _line(self, timeout_s: float, what: str) -> str:
         """The next line of its output; raises `Failed` when it takes longer, ends, or the line never does."""
@@ -144,8 +190,6 @@ class ExtractorProcess:
         return Failed(f"{how}: {last}" if last else how)
 
     def _last_words(self) -> str:
-        size = self._stderr.seek(0, os.SEEK_END)
-        self._stderr.seek(max(0, size - 4096))
         lines = [line.strip() for line in self._stderr.read().decode("utf-8", "replace").splitlines()]
         lines = [line for line in lines if line]
-        return "".join(c if c.isprintable() else "?" for c in lines[-1])[:160] if lines else ""
+        return one_line(lines[-1], 160) if lines else ""

@@ -18,7 +18,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import InputError
+from ..errors import InputError, one_line
+from ..files import shown
 from ..geometry.ellipse import Ellipse
 from .conventions import Conventions, number, pair
 
@@ -85,11 +86,9 @@ class Reply:
         """Raises `InputError` saying what is wrong with the line."""
         data = _object(line)
         if data.get("id") != request_id:
-            raise InputError(f"must be {request_id}, not {data.get('id')!r}", path="id")
+            raise InputError(f"must be {request_id}, not {shown(data.get('id'))}", path="id")
         if data.get("error") is not None:
-            return cls(
-                None, None, None, (), None, None, " ".join(str(data["error"]).split())[:200] or "no reason given"
-            )
+            return cls(None, None, None, (), None, None, _words(data["error"]) or "no reason given")
         record = data.get("record")
         if not isinstance(record, dict) or not isinstance(record.get("pupil"), dict):
             raise InputError("must hold the pupil", path="record")
@@ -98,11 +97,11 @@ class Reply:
         if pupil.get("status") == "ok":
             ellipse = _ellipse(pupil, conventions)
         elif pupil.get("status") != "missing":
-            raise InputError(f"must be 'ok' or 'missing', not {pupil.get('status')!r}", path="pupil.status")
+            raise InputError(f"must be 'ok' or 'missing', not {shown(pupil.get('status'))}", path="pupil.status")
         reason = pupil.get("reason")
         return cls(
             ellipse,
-            str(reason)[:200] if reason else None,
+            _words(reason) if reason else None,
             _optional(pupil.get("confidence"), "pupil.confidence"),
             _glints(record.get("glints"), conventions),
             _optional(data.get("cpu_s"), "cpu_s"),
@@ -142,6 +141,11 @@ def _glints(entries: Any, conventions: Conventions) -> tuple[tuple[tuple[float, 
     return tuple(out)
 
 
+def _words(value: Any) -> str:
+    """What an extractor says, as one line that may be shown."""
+    return one_line(" ".join(str(value).split()), 200)
+
+
 def _optional(value: Any, path: str) -> float | None:
     return None if value is None else number(value, path)
 
@@ -150,8 +154,7 @@ def _object(line: str) -> dict[str, Any]:
     try:
         data = json.loads(line)
     except (ValueError, RecursionError):
-        shown = line.strip()
-        raise InputError(f"printed what is no JSON: {shown[:60]!r}") from None
+        raise InputError(f"printed what is no JSON: {shown(line.strip())}") from None
     if not isinstance(data, dict):
         raise InputError("printed JSON that is no object")
     return data

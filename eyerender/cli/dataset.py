@@ -9,8 +9,8 @@ from cyclopts import Parameter
 
 from ..errors import EyerenderError, InputError
 from .app import app
-from .options import Backend, Eye, Overwrite, Result, Seed, Threads, positive
-from .output import emit, progress, say
+from .options import Backend, Eye, Overwrite, Result, Seed, Strict, Threads, positive
+from .output import Heed, emit, progress, say
 
 if TYPE_CHECKING:
     from ..scene import Scene
@@ -27,6 +27,7 @@ def generate(
     engine: Literal["local", "ray"] = "local",
     address: str | None = None,
     dry_run: bool = False,
+    measure: bool = False,
     eye: Eye = None,
     seed: Seed = None,
     count: int | None = None,
@@ -34,6 +35,7 @@ def generate(
     threads: Threads = None,
     timeout: float = 600.0,
     overwrite: Overwrite = False,
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Make a labelled dataset; started again on the same folder, it makes what is missing.
@@ -53,7 +55,9 @@ def generate(
     address
         The Ray cluster's address (default: one started on this machine).
     dry_run
-        Only tell how long it would take and how much disk.
+        Only tell how long it would take and how much disk, by the last rate of this spec on this machine.
+    measure
+        With --dry-run: make a few samples to measure the rate.
     count
         Make the first COUNT samples of the spec's plan; more than it has plan a larger dataset.
     timeout
@@ -62,6 +66,7 @@ def generate(
     from ..dataset.plan import Plan
     from ..dataset.run import Options
     from ..dataset.run import generate as run
+    from ..plausibility import saturation_warnings
 
     plan = Plan.load(spec, eye=eye, seed=seed, count=count)
     positive("--workers", workers)
@@ -78,19 +83,26 @@ def generate(
         timeout_s=timeout,
         overwrite=overwrite,
     )
-    if dry_run:
-        from ..dataset.estimate import estimate
-
-        found = estimate(plan, options)
-        emit(found, _estimate_text(found), json)
-        return 0
-    if folder is None:
+    if measure and not dry_run:
+        raise InputError("needs --dry-run", source="--measure")
+    if folder is None and not dry_run:
         raise InputError("give the folder to write", source="DIR")
     if overwrite and shard is not None:
         raise InputError("cannot be given with --shard: other parts may be at work in the folder", source="--overwrite")
+    heed = Heed(strict)
+    heed(plan.warnings())
+    if dry_run:
+        from ..dataset.estimate import estimate
+
+        found = estimate(plan, options, measure=measure)
+        emit(found, _estimate_text(found), json, heed)
+        return 0
+    assert folder is not None
     with progress("generating") as steps:
         done = run(plan, folder, options, progress=steps, say=say)
-    emit(done, _generate_text(done), json)
+    statistics = done.get("statistics", {})
+    heed(saturation_warnings(statistics.get("images_saturated", 0), statistics.get("images", 0), str(folder)))
+    emit(done, _generate_text(done), json, heed)
     return 0
 
 
@@ -103,6 +115,7 @@ def sample(
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     eye: Eye = None,
     seed: Seed = None,
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Show sample I of a dataset: whose it is, what was drawn, and the scene and eye that come of it.
@@ -131,12 +144,14 @@ def sample(
     found = realise(plan, index)
     if found.sample is None or found.scene is None:
         raise InputError(f"sample {index} is given up: {found.rejections[-1].reason}", source=plan.source)
+    heed = Heed(strict)
+    heed(warning.at(plan.source) for warning in found.scene.warnings())
     data = {"schema": "eyerender/sample/1", **found.sample.to_mapping()}
     data["rejections"] = [f"{r.of}, attempt {r.attempt}: {r.reason}" for r in found.rejections]
     if output is not None:
         _write_sample(output, found.scene)
     text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100).rstrip()
-    emit(data, text, json)
+    emit(data, text, json, heed)
     return 0
 
 
@@ -150,6 +165,7 @@ def preview(
     seed: Seed = None,
     backend: Backend = "auto",
     threads: Threads = None,
+    strict: Strict = False,
 ) -> int:
     """Render a contact sheet of 16 images of a scene or a dataset; for people, never to measure in.
 
@@ -175,8 +191,10 @@ def preview(
         what = Plan.load(spec, eye=eye, seed=seed)
     else:
         what = load_scene(spec, eye=eye, seed=seed)
+    heed = Heed(strict)
+    heed(what.warnings())
     with progress("rendering") as steps:
-        write_sheet(what, output, backend=backend, threads=threads, progress=steps)
+        write_sheet(what, output, backend=backend, threads=threads, progress=steps, warn=heed)
     print(output)
     return 0
 
@@ -293,12 +311,29 @@ def _generate_text(done: dict[str, Any]) -> str:
 
 
 def _estimate_text(found: dict[str, Any]) -> str:
-    minutes, seconds = divmod(round(found["seconds"]), 60)
+    rate = found["rate"]
+    text = f"{found['images']} images in {found['shards']} shards, {found['workers']} workers"
+    if rate is None:
+        return f"{text}: time and disk unknown, no rate of this spec on this machine; --measure makes a few samples"
+    how = "measured" if rate["how"] == "measured" else "of a run"
     return (
-        f"{found['images']} images in {found['shards']} shards: about {minutes} min {seconds} s with "
-        f"{found['workers']} workers of {found['threads_per_worker']} threads on {found['backend']['name']}, "
-        f"{found['bytes'] / 1e6:.1f} MB"
+        f"{text} of {found['threads_per_worker']} threads on {rate['backend']}: about {_duration(found['seconds'])}, "
+        f"{_size(found['bytes'])} (rate {how} with {rate['samples']} samples, {rate['time']})"
     )
+
+
+def _duration(seconds: float) -> str:
+    """As people say it, in seconds up to days."""
+    if seconds < 3600:
+        minutes, rest = divmod(round(seconds), 60)
+        return f"{minutes} min {rest} s"
+    return f"{seconds / 3600:.1f} h" if seconds < 2 * 86400 else f"{seconds / 86400:.1f} days"
+
+
+def _size(count: int) -> str:
+    """As people say it, in MB up to TB."""
+    unit, name = next(u for u in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if count >= u[0] or u[0] == 1e6)
+    return f"{count / unit:.1f} {name}"
 
 
 def _validate_text(report: dict[str, Any]) -> str:

@@ -9,8 +9,8 @@ from cyclopts import Parameter
 
 from ..errors import InputError
 from .app import app
-from .options import Eye, Overwrite, Result, positive
-from .output import emit
+from .options import Eye, Overwrite, Result, Strict, positive
+from .output import Heed, emit
 
 
 @app.command(name="export-scene")
@@ -24,6 +24,7 @@ def export_scene(
     side: str | None = None,
     spp: int = 64,
     overwrite: Overwrite = False,
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Write one frame as PLY meshes and a Mitsuba XML that the stock `mitsuba` command renders as it is.
@@ -49,7 +50,9 @@ def export_scene(
     from ..scene import load_scene
 
     positive("--spp", spp)
+    heed = Heed(strict)
     loaded = load_scene(scene, eye=eye)
+    heed(loaded.warnings())
     check_windows(loaded)
     observed = observe(loaded)
     if side is not None and side not in EYES:
@@ -64,5 +67,7 @@ def export_scene(
         name = written.name
     files = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file() and p.name != MARKER)
     data = {"schema": "eyerender/export-scene/1", "path": str(folder), "scene": name, "files": files}
-    emit(data, f"{folder / name}\nrender it with any stock integrator: mitsuba -m scalar_rgb {folder / name}", json)
+    emit(
+        data, f"{folder / name}\nrender it with any stock integrator: mitsuba -m scalar_rgb {folder / name}", json, heed
+    )
     return 0

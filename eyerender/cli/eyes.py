@@ -10,8 +10,8 @@ from cyclopts import Parameter
 from ..errors import InputError
 from ..files import written
 from .app import app
-from .options import Result
-from .output import emit
+from .options import Result, Strict
+from .output import Heed, emit
 
 _FORMATS = (".svg", ".pdf", ".png")
 
@@ -50,6 +50,7 @@ def view(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     eye: str | None = None,
+    strict: Strict = False,
 ) -> int:
     """Draw an eye's section, or a scene's rig with its rays, as SVG, PDF or PNG.
 
@@ -75,7 +76,9 @@ def view(
         from ..report.scene_view import scene_view
         from ..scene import load_scene
 
-        fig = scene_view(load_scene(name, eye=eye))
+        loaded = load_scene(name, eye=eye)
+        Heed(strict)(loaded.warnings())
+        fig = scene_view(loaded)
     with written(output) as file:
         fig.savefig(file, format=output.suffix[1:].lower(), dpi=150)
     print(output)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
 from ..errors import InputError
 from .app import app
-from .options import Result
-from .output import emit
+from .options import Result, Strict
+from .output import Heed, emit
+
+if TYPE_CHECKING:
+    from ..scene import Scene
 
 gaze = App(name="gaze", help="Estimate gaze from records of features, those of real images too.")
 app.command(gaze)
@@ -35,6 +38,7 @@ def fit(
     index: float | None = None,
     recalibration: Literal["angle", "screen", "none"] = "angle",
     fixations: str | None = None,
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Calibrate a gaze estimator on records of known targets, and write the calibration.
@@ -75,7 +79,8 @@ def fit(
 
     if (terms_x is None) != (terms_y is None):
         raise InputError("give both --terms-x and --terms-y", source="--terms-x")
-    observations, rig = load_observations(records, scene)
+    heed = Heed(strict)
+    observations, rig = load_observations(records, _scene(scene, heed))
     chosen = _chosen(fixations)
     spec = EstimatorSpec.from_mapping(
         {
@@ -89,14 +94,14 @@ def fit(
             "recalibration": recalibration,
         }
     )
-    fitted, summary = fit_estimator(spec, observations, rig, chosen, source=str(records))
-    save_estimator(output, spec, fitted)
+    fitted, summary = fit_estimator(spec, observations, rig, chosen, source=str(records), warn=heed)
+    save_estimator(output, spec, fitted, rig)
     summary = {**summary, "path": str(output)}
     mean = summary["calibration_error_deg"]["mean_deg"]
     text = f"{estimator}: calibrated on {summary['calibration_observations']} observations, written to {output}"
     if mean is not None:
         text += f"\nerror on them (not a test): mean {mean:.4f} deg over {summary['calibration_error_deg']['n']}"
-    emit(summary, text, json)
+    emit(summary, text, json, heed)
     return 0
 
 
@@ -107,6 +112,7 @@ def predict(
     *,
     calibration: Annotated[Path, Parameter(name=["--calibration", "-c"])],
     scene: str | None = None,
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Estimate gaze points with a calibration that `gaze fit` wrote; where targets are known, their errors too.
@@ -121,12 +127,27 @@ def predict(
         A scene file or the name of a shipped one, for its rig; default: the rig in the records' file.
     """
     from ..gaze.records import load_observations
-    from ..gaze.store import load_estimator, predictions
+    from ..gaze.store import load_calibration, predictions
+    from ..plausibility import rig_warnings
 
-    observations, rig = load_observations(records, scene)
-    data = predictions(load_estimator(calibration), observations, rig)
-    emit(data, _gaze_table(data), json)
+    heed = Heed(strict)
+    observations, rig = load_observations(records, _scene(scene, heed))
+    estimator, calibrated = load_calibration(calibration)
+    if calibrated is not None:
+        heed(rig_warnings(rig, calibrated, scene or str(records)))
+    data = predictions(estimator, observations, rig)
+    emit(data, _gaze_table(data), json, heed)
     return 0
+
+
+def _scene(name: str | None, heed: Heed) -> Scene | None:
+    if name is None:
+        return None
+    from ..scene import load_scene
+
+    scene = load_scene(name)
+    heed(scene.warnings())
+    return scene
 
 
 def _chosen(text: str | None) -> list[int] | None:

@@ -9,8 +9,8 @@ from cyclopts import Parameter
 
 from .app import app
 from .observe import comparison_text
-from .options import Backend, Eye, Overwrite, Result, Seed, Threads, positive
-from .output import emit, progress
+from .options import Backend, Eye, Overwrite, Result, Seed, Strict, Threads, positive
+from .output import Heed, emit, progress
 
 
 @app.command(name="render")
@@ -26,6 +26,7 @@ def render(
     threads: Threads = None,
     exr: bool = False,
     overwrite: Overwrite = False,
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Render a scene into a folder of labelled near-infrared images.
@@ -45,12 +46,14 @@ def render(
     from ..scene import load_scene
 
     positive("--threads", threads)
+    heed = Heed(strict)
     loaded = load_scene(scene, eye=eye, spp=spp, seed=seed)
+    heed(loaded.warnings())
     with progress("rendering") as steps:
         done = render_folder(
-            loaded, output, backend=backend, threads=threads, overwrite=overwrite, exr=exr, progress=steps
+            loaded, output, backend=backend, threads=threads, overwrite=overwrite, exr=exr, progress=steps, warn=heed
         )
-    emit(done, f"{done['images']} images in {output}", json)
+    emit(done, f"{done['images']} images in {output}", json, heed)
     return 0
 
 
@@ -63,6 +66,7 @@ def quickstart(
     backend: Backend = "auto",
     threads: Threads = None,
     overwrite: Overwrite = False,
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Do the main job: fixate, render, extract, calibrate, compare; and write a report to look at.
@@ -75,8 +79,11 @@ def quickstart(
     from ..quickstart import run_quickstart
 
     positive("--threads", threads)
+    heed = Heed(strict)
     with progress("quickstart") as steps:
-        result = run_quickstart(folder, eye=eye, backend=backend, threads=threads, overwrite=overwrite, progress=steps)
+        result = run_quickstart(
+            folder, eye=eye, backend=backend, threads=threads, overwrite=overwrite, progress=steps, warn=heed
+        )
     data = result.to_mapping()
-    emit(data, f"{comparison_text(data)}\nreport: {folder / 'report.html'}", json)
+    emit(data, f"{comparison_text(data)}\nreport: {folder / 'report.html'}", json, heed)
     return 0

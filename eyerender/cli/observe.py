@@ -11,8 +11,8 @@ from cyclopts import Parameter
 from ..errors import InputError
 from ..observation import EYES, Observations
 from .app import app
-from .options import Eye, Result
-from .output import emit, progress
+from .options import Eye, Result, Strict
+from .output import Heed, emit, progress
 
 
 @app.command(name="features")
@@ -23,6 +23,7 @@ def features(
     eye: Eye = None,
     points: int = 30,
     purkinje: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (),
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Compute the apparent pupil and the glints of a scene by ray optics; needs no renderer.
@@ -42,7 +43,9 @@ def features(
 
     if points < 6:
         raise InputError("must be >= 6", source="--points")
+    heed = Heed(strict)
     loaded = load_scene(scene, eye=eye)
+    heed(loaded.warnings())
     observed, seen = observe_in_detail(loaded, boundary_points=points, purkinje=purkinje or (1,))
     data: dict[str, Any] = {
         "schema": "eyerender/features/1",
@@ -52,7 +55,7 @@ def features(
     if purkinje:
         data["purkinje"] = purkinje_records(observed, seen, (1, *sorted(set(purkinje) - {1})))
         data["non_ellipticity_px"] = [float(v) if np.isfinite(v) else None for v in seen.ellipse_residual_px]
-    emit(data, _feature_table(observed), json)
+    emit(data, _feature_table(observed), json, heed)
     return 0
 
 
@@ -61,6 +64,7 @@ def extract(
     *images: Path,
     scene: str | None = None,
     gamma: float = 1.0,
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Recover the pupil ellipse and the glints from images; a pupil that is not found is a result, not an error.
@@ -81,12 +85,14 @@ def extract(
         raise InputError("give at least one image", source="extract")
     if not (np.isfinite(gamma) and 0.1 <= gamma <= 10):
         raise InputError("must be between 0.1 and 10", source="--gamma")
+    heed = Heed(strict)
     loaded = load_scene(scene) if scene is not None else None
+    heed(loaded.warnings() if loaded is not None else ())
     with progress("extracting") as steps:
         observed = ImageObserver(gamma=gamma).observe_files(images, scene=loaded, progress=steps)
     data = {"schema": "eyerender/features/1", "rig": None, "records": list(observed.records())}
     names = [str(path) for path in images]
-    emit(data, _feature_table(observed, names if len(names) == len(observed) else None), json)
+    emit(data, _feature_table(observed, names if len(names) == len(observed) else None), json, heed)
     return 0
 
 

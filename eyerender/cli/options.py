@@ -13,6 +13,7 @@ Seed = Annotated[int | None, Parameter(help="Replace the seed.")]
 Backend = Annotated[Literal["auto", "cuda", "llvm"], Parameter(help="Where to render.")]
 Threads = Annotated[int | None, Parameter(help="Processor threads in all (default: all there are).")]
 Overwrite = Annotated[bool, Parameter(help="Replace what the folder holds.")]
+Strict = Annotated[bool, Parameter(help="Treat warnings as errors: nothing is done, exit code 2.")]
 Result = Annotated[
     str | None,
     Parameter(name="--json", allow_leading_hyphen=True, help="Write the result as JSON to a file, or to stdout (-)."),

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
+from ..errors import InputWarning
 from ..files import write_json
 
 
@@ -17,8 +19,31 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def emit(data: dict[str, Any], text: str, target: str | None) -> None:
-    """The result: `text` on stdout; with a JSON target the data there instead ('-' is stdout) or beside it (a file)."""
+class Heed:
+    """The warnings of a command: one line each on stderr and a list in the JSON; with `strict` errors instead."""
+
+    def __init__(self, strict: bool) -> None:
+        self.strict = strict
+        self.found: list[InputWarning] = []
+
+    def __call__(self, warnings: Iterable[InputWarning]) -> None:
+        """Tell warnings, each once; raises the first as an `InputError` where the command is strict."""
+        new = [warning for warning in dict.fromkeys(warnings) if warning not in self.found]
+        if new and self.strict:
+            more = f"; {len(new) - 1} more" if len(new) > 1 else ""
+            raise replace(new[0], reason=f"{new[0].reason} (--strict{more})").error()
+        for warning in new:
+            say(f"warning: {warning}")
+        self.found += new
+
+
+def emit(data: dict[str, Any], text: str, target: str | None, heed: Heed | None = None) -> None:
+    """The result: `text` on stdout; with a JSON target the data there instead ('-' is stdout) or beside it (a file).
+
+    The data get a list `warnings` where the command heeds any.
+    """
+    if heed is not None:
+        data = {**data, "warnings": [warning.to_mapping() for warning in heed.found]}
     if target == "-":
         print(json.dumps(data, allow_nan=False))
         return

@@ -155,7 +155,7 @@ class Statistics:
 
     def __init__(self) -> None:
         self.backends: set[str] = set()
-        self.images = self.rejected = self.given_up = self.samples = self.bytes = 0
+        self.images = self.saturated = self.rejected = self.given_up = self.samples = self.bytes = 0
         self.splits: Counter[str] = Counter()
         self.subjects: dict[str, set[int]] = {}
         self.pupil_px: list[float] = []
@@ -167,6 +167,7 @@ class Statistics:
         backend = done["backend"]
         self.backends.add(f"{backend['name']} ({backend['device']}; {done['cpu']})")
         self.samples += done["samples"][1] - done["samples"][0]
+        self.saturated += done.get("images_saturated") or 0
         self.rejected += len(done["rejections"])
         self.given_up += len(done["given_up"])
         self.bytes += sum(entry["bytes"] for entry in done["files"].values())
@@ -189,6 +190,7 @@ class Statistics:
         return {
             "samples": self.samples,
             "images": self.images,
+            "images_saturated": self.saturated,
             "images_by_split": dict(sorted(self.splits.items())),
             "subjects_by_split": {k: len(v) for k, v in sorted(self.subjects.items())},
             "bytes_per_image": round(self.bytes / self.images) if self.images else 0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..imagefolder import CONVENTIONS
-from .plan import Plan
+from .plan import RANKED_SUBJECTS, Plan
 from .reading import IMAGEFOLDER, WHOLE
 from .shard import run_versions
 
@@ -39,6 +39,11 @@ def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
         f"| {name} | {statistics['subjects_by_split'][name]} | {statistics['images_by_split'][name]} |"
         for name in splits
     )
+    drawn = ""
+    if spec.subject_count > RANKED_SUBJECTS and len(spec.splits) > 1:
+        drawn = (
+            " The splits' sizes are those of a random draw of each subject, so near their shares and not exactly them."
+        )
     size = statistics["pupil_semi_axis_px"]
     pupils = "" if size is None else f" The pupil's long semi-axis is {size[0]:.1f} to {size[2]:.1f} px."
     return f"""# {spec.name}
@@ -46,7 +51,7 @@ def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
 {spec.description or "Rendered near-infrared images of eyes."}
 
 {statistics["images"]} synthetic near-infrared images of eyes, rendered through refracting corneas, with exact labels.
-No person was recorded. Subjects are drawn eyes; a subject is in one split only.{pupils}
+No person was recorded. Subjects are drawn eyes; a subject is in one split only.{drawn}{pupils}
 
 | split | subjects | images |
 |---|---|---|

@@ -1,23 +1,29 @@
 """The Ray engine: an actor a worker, on one machine or many; one a GPU where Ray has GPUs.
 
 The folder must be one that every machine sees under the same path. Ray restarts an actor that dies and has it
-make its shard again. The driver puts shards in place, as with the local engine.
+make its shard again. The engine puts shards in place, as the local engine does.
 """
 
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
+import signal
+import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import import_module
+from importlib.util import find_spec
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
 from ..errors import BackendError, EyerenderError, InputError
-from .pool import RECYCLE_IMAGES, TRIES, Events
+from .pool import RECYCLE_IMAGES, TRIES, Events, end_of, signals_held
 from .shard import Staged, cpu_family, write_shard
 from .worker import Job
 
@@ -62,15 +68,12 @@ class ShardActor:
         return os.getpid()
 
 
-@dataclass(slots=True)
-class _Held:
-    actor: Any
-    shard: int
-    since: float
-
-
 class RayEngine:
-    """Runs shards on the actors of a Ray cluster."""
+    """Runs shards on the actors of a Ray cluster.
+
+    A process of its own, the driver, talks to Ray, because Ray takes over its driver's signals: SIGTERM would end this
+    process with a stack trace. When this process ends in whatever way, the driver ends what Ray has started here.
+    """
 
     def __init__(self, job: Job, workers: int | None, *, address: str | None = None, timeout_s: float = 600.0) -> None:
         self.job = job
@@ -85,29 +88,145 @@ class RayEngine:
             InputError: Ray is not installed, or the cluster cannot be reached; or as the local engine.
             BackendError, EyerenderError: as the local engine.
         """
+        if find_spec("ray") is None:
+            raise InputError("needs Ray (the extra 'ray'); run: pip install ray", source="--engine")
+        driver = _Driver(self.job, self.workers, self.address, self.timeout_s)
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=drive, args=(theirs, driver, list(shards)), daemon=True)
+        with signals_held():
+            process.start()
+        theirs.close()
         try:
-            ray: Any = import_module("ray")
-        except ImportError:
-            raise InputError("needs Ray (the extra 'ray'); run: pip install ray", source="--engine") from None
-        variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
-        started = not ray.is_initialized()
-        if started:
-            try:
-                ray.init(
-                    address=self.address,
-                    runtime_env={"env_vars": variables},
-                    log_to_driver=False,
-                    logging_level=logging.ERROR,
-                    include_dashboard=False if self.address is None else None,
-                )
-            except (ConnectionError, ValueError, RuntimeError) as error:
-                reason = str(error).splitlines()[0]
-                raise InputError(f"the cluster cannot be reached ({reason})", source="--address") from None
-        try:
-            return self._run(ray, deque(shards), events)
+            while True:
+                try:
+                    kind, *message = ours.recv()
+                except (EOFError, OSError):
+                    wait([process.sentinel], timeout=10)
+                    raise EyerenderError(end_of(process.exitcode, "Ray's driver")) from None
+                if kind == "end":
+                    return dict(message[0])
+                if kind == "failed":
+                    raise message[0]
+                getattr(events, kind)(*message)
         finally:
-            if started:
-                ray.shutdown()
+            ours.close()  # tells the driver to end
+            wait([process.sentinel], timeout=10)
+            process.kill()
+            end_session(process.pid or 0)
+            process.join()
+
+
+def drive(pipe: Connection, driver: _Driver, shards: list[int]) -> None:
+    """The driver's life. Messages out: the names and arguments of events, ("failed", error) or ("end", shards lost).
+
+    When the pipe's other end closes, because the engine was interrupted or its process killed, the driver ends all that
+    Ray has started on this machine: the session of processes that it leads.
+    """
+    if hasattr(os, "setsid"):
+        os.setsid()  # out of reach of Ctrl-C, too
+    silence = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silence, 1)
+    os.dup2(silence, 2)
+    threading.Thread(target=_end_with, args=(pipe,), daemon=True).start()
+    try:
+        message: tuple[Any, ...] = ("end", driver.run(deque(shards), _Sender(pipe)))
+    except EyerenderError as error:
+        message = ("failed", error)
+    except Exception as error:
+        message = ("failed", EyerenderError(f"Ray: {type(error).__name__}: {' '.join(str(error).split())[:200]}"))
+    pipe.send(message)
+
+
+def _end_with(pipe: Connection) -> None:
+    with suppress(EOFError, OSError):
+        pipe.recv()
+    end_session(os.getpid())
+    os._exit(1)
+
+
+def end_session(session: int, patience_s: float = 3.0) -> None:
+    """End the other processes of a session: with SIGTERM first, after a while with SIGKILL.
+
+    Ray's agents carry no other mark: they lose their parents, change their titles and overwrite their environment.
+    Does nothing where there is no /proc; there a process of Ray's own watches over its driver.
+    """
+    start = time.monotonic()
+    asked: set[int] = set()
+    while found := set(_members(session)):
+        late = time.monotonic() - start > patience_s
+        for pid in found if late else found - asked:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL if late else signal.SIGTERM)
+        asked |= found
+        time.sleep(0.05)
+
+
+def _members(session: int) -> Iterator[int]:
+    """The living processes of a session but for this one."""
+    for place in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended
+            # After the name, which may hold anything: state, parent, group, session.
+            state, _, _, its = (place / "stat").read_text().rpartition(")")[2].split()[:4]
+            if int(its) == session and state not in ("Z", "X") and int(place.name) != os.getpid():
+                yield int(place.name)
+
+
+class _Sender:
+    """Events of an engine, sent to another process."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self.pipe = pipe
+
+    def ready(self, backend: dict[str, Any], worker: str) -> None:
+        self.pipe.send(("ready", backend, worker))
+
+    def sample(self, shard: int, samples: int, images: int) -> None:
+        self.pipe.send(("sample", shard, samples, images))
+
+    def staged(self, staged: Staged, worker: str) -> None:
+        self.pipe.send(("staged", staged, worker))
+
+    def retry(self, shard: int, reason: str, tries: int) -> None:
+        self.pipe.send(("retry", shard, reason, tries))
+
+
+@dataclass(slots=True)
+class _Held:
+    actor: Any
+    shard: int
+    since: float
+
+
+@dataclass
+class _Driver:
+    """What talks to Ray, in a process of its own."""
+
+    job: Job
+    workers: int | None
+    address: str | None
+    timeout_s: float
+
+    def run(self, pending: deque[int], events: Events) -> dict[int, str]:
+        """Make shards as the engine does; raises as it does."""
+        ray: Any = import_module("ray")
+        variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
+        try:
+            ray.init(
+                address=self.address,
+                runtime_env={"env_vars": variables},
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+                include_dashboard=False if self.address is None else None,
+            )
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"the cluster cannot be reached ({reason})", source="--address") from None
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray has set a handler
+        try:
+            return self._run(ray, pending, events)
+        finally:
+            ray.shutdown()
 
     def _run(self, ray: Any, pending: deque[int], events: Events) -> dict[int, str]:
         resources = ray.cluster_resources()

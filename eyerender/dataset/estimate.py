@@ -1,4 +1,4 @@
-"""What a run would take: a few samples made in memory, and what that says of all of them."""
+"""What a run would take: from the rate that was last measured, or from a few samples made in memory."""
 
 from __future__ import annotations
 
@@ -12,20 +12,57 @@ import numpy as np
 from ..imagefile import encode_png
 from .maker import Maker
 from .plan import Plan
-from .realise import frames_of
+from .rates import Rate, keep_rate, last_rate, now
+from .realise import frames_of, realise
 from .run import Options, worker_count
 
 _SUBJECTS = 3
 
 
-def estimate(plan: Plan, options: Options) -> dict[str, Any]:
-    """Time and disk of a run (schema eyerender/estimate/1), from two samples each of a few subjects.
+def estimate(plan: Plan, options: Options, *, measure: bool = False) -> dict[str, Any]:
+    """Time and disk of a run (schema eyerender/estimate/2): seconds = (samples t + subjects t_subject) / workers.
 
-    A subject's first sample also pays for its eye and its textures: seconds = samples t + subjects (t_first - t).
+    The rate is the last one of this spec on this machine, whatever the seed and the number of samples were; with
+    `measure` two samples each of a few subjects are made. `seconds` and `bytes` are None where no rate is known.
+
+    Raises:
+        InputError: the first sample cannot be made at all.
+        BackendError: with `measure`; there is nothing to render with.
     """
     spec = plan.spec
     workers, threads = worker_count(options, spec.shard_count)
-    maker = Maker(plan, frames_of(plan), backend=options.backend, threads=threads)
+    frames = frames_of(plan)
+    if measure:
+        rate: Rate | None = measured_rate(plan, Maker(plan, frames, backend=options.backend, threads=threads))
+    else:
+        rate = last_rate(plan, options.backend)
+    seconds = None
+    if rate is not None:
+        subjects = plan.subject_of(spec.count - 1)[0] + 1
+        seconds = (spec.count * rate.seconds + subjects * rate.subject_seconds) / min(workers, spec.shard_count)
+        images = rate.images
+    else:
+        first = realise(plan, 0, frames).observations
+        images = 0 if first is None else len(first)
+    return {
+        "schema": "eyerender/estimate/2",
+        "samples": spec.count,
+        "images": round(spec.count * images),
+        "shards": spec.shard_count,
+        "workers": workers,
+        "threads_per_worker": threads,
+        "seconds": None if seconds is None else round(seconds, 1),
+        "bytes": None if rate is None else round(spec.count * rate.bytes),
+        "rate": None if rate is None else rate.to_mapping(),
+    }
+
+
+def measured_rate(plan: Plan, maker: Maker) -> Rate:
+    """The rate of one worker, from two samples each of a few subjects; it is remembered.
+
+    A subject's first sample also pays for its eye and its textures.
+    """
+    spec = plan.spec
     subjects = plan.subject_of(spec.count - 1)[0] + 1
     starts = [plan.first_of(s) for s in sorted({int(s) for s in np.linspace(0, subjects - 1, _SUBJECTS)})]
     maker.make(starts[0])  # kernels are compiled once a worker
@@ -41,25 +78,24 @@ def estimate(plan: Plan, options: Options) -> dict[str, Any]:
             began = time.perf_counter()
             made = maker.make(sample)
             pictures = [picture for image in made.images for picture in image.pictures.values()]
-            size = sum(map(_bytes, pictures)) + sum(len(json.dumps(image.line)) for image in made.images)
+            # Metadata stands in the shards and in the whole.
+            size = sum(map(_bytes, pictures)) + 2 * sum(len(json.dumps(image.line)) for image in made.images)
             times.append(time.perf_counter() - began)
             sizes.append(size)
             images.append(len(made.images))
     usual = float(np.median(again or first))
-    extra = max(float(np.median(first)) - usual, 0.0) if again else 0.0
-    seconds = (spec.count * usual + subjects * extra) / min(workers, spec.shard_count)
-    return {
-        "schema": "eyerender/estimate/1",
-        "samples": spec.count,
-        "images": round(spec.count * float(np.mean(images))),
-        "shards": spec.shard_count,
-        "workers": workers,
-        "threads_per_worker": threads,
-        "seconds": round(seconds, 1),
-        # Metadata stands in the shards and in the whole.
-        "bytes": round(spec.count * float(np.mean(sizes))),
-        "backend": maker.backend,
-    }
+    rate = Rate(
+        how="measured",
+        time=now(),
+        backend=str(maker.backend["name"]),
+        samples=len(sizes),
+        seconds=usual,
+        subject_seconds=max(float(np.median(first)) - usual, 0.0) if again else 0.0,
+        images=float(np.mean(images)),
+        bytes=float(np.mean(sizes)),
+    )
+    keep_rate(plan, rate)
+    return rate
 
 
 def _bytes(image: Any) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import BackendName, WindowImage, make_renderer, noiseless, render_windows
+from ..plausibility import is_saturated
 from ..scene import Scene
 from .labels import image_labels
 from .line import image_line
@@ -22,12 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MadeImage:
-    """An image of a sample: its name without ending, its pictures by kind (`LabelsSpec.pictures`), and its line of
-    metadata (without files)."""
+    """An image of a sample: its name without ending, its pictures by kind (`LabelsSpec.pictures`), its line of metadata
+    (without files), and whether it is saturated (`is_saturated`)."""
 
     name: str
     pictures: dict[str, NDArray[Any]]
     line: dict[str, Any]
+    saturated: bool
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,8 @@ class Maker:
             labels = image_labels(scene, observations, image)
             name, line = image_line(found, image.row, self.frames, image.window, labels)
             kinds = self.plan.spec.labels.pictures
-            yield MadeImage(name, {kind: _PICTURES[kind](scene, image) for kind in kinds}, line)
+            pictures = {kind: _PICTURES[kind](scene, image) for kind in kinds}
+            yield MadeImage(name, pictures, line, is_saturated(image.dn, scene.spec.sensor))
 
 
 def _amodal(scene: Scene, image: WindowImage) -> NDArray[np.uint8]:

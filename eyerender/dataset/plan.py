@@ -1,7 +1,8 @@
 """What sample i of a dataset is: a pure function of (spec, i).
 
 Sample i belongs to subject floor(i S / N), N samples planned and S subjects, so a subject's frames stand together and
-counts differ by one at most. Subjects are put in the order of a hash and cut at the splits' shares.
+counts differ by one at most. A hash of the subject decides on its split (`Plan.split_of`). A plan takes no more memory
+for more samples.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, InputWarning
 from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
 from ..scene import Scene, SceneSpec
@@ -22,6 +26,10 @@ from .draws import is_draw, unit_number
 from .files import check_files, sum_of_file, sums_of_files
 from .spec import DatasetSpec, find_dataset
 from .template import Template, Turn, possible
+
+# Beyond this many subjects, splits are drawn without sorting them.
+RANKED_SUBJECTS = 1_000_000
+_LOOKED_AT = 16  # samples in which `Plan.warnings` looks for what was not meant
 
 
 @dataclass(frozen=True)
@@ -158,32 +166,64 @@ class Plan:
         """The plan that another process has, its files relative to `base`."""
         return cls(DatasetSpec.from_mapping(data["spec"]), data["eyes"], data.get("files", {}), base)
 
+    def warnings(self) -> list[InputWarning]:
+        """What of the scenes of some samples, spread over the dataset, was probably not meant; each thing once."""
+        found: dict[tuple[str, str], InputWarning] = {}
+        count = min(self.spec.count, _LOOKED_AT)
+        for sample in (k * self.spec.count // count for k in range(count)):
+            try:
+                warnings = self.draw(sample).build().warnings()
+            except InputError:
+                continue  # it is drawn again, or told when it is made
+            for w in warnings:
+                path, reason = f"scene.{w.path}", f"{w.reason} (sample {sample})"
+                found.setdefault((w.code, path), InputWarning(w.code, reason, self.source, path))
+        return list(found.values())
+
     def check_files(self) -> None:
         """Raise `InputError` where a file that the spec names is no longer what it was when the plan was made."""
         check_files(self.files, self.base)
 
     @cached_property
-    def _splits(self) -> dict[int, str] | None:
-        """Subject -> split; None where there is only one."""
-        spec = self.spec
-        names = sorted(spec.splits)  # the order of keys in a file means nothing
-        if len(names) == 1:
-            return None
-        n = spec.subject_count
-        order = sorted(range(n), key=lambda s: unit_number(spec.seed, "split", "subject", s, 0))
-        total = sum(spec.splits.values())
-        out, start, share = {}, 0, 0.0
-        for name in names:
-            share += spec.splits[name] / total
-            end = n if name == names[-1] else round(n * share)
-            out.update(dict.fromkeys(order[start:end], name))
+    def _ranked(self) -> NDArray[np.int32]:
+        """The place of each subject's split in the order of their names: subjects by rank of their number u."""
+        n = self.spec.subject_count
+        order = np.argsort(np.fromiter(map(self._split_number, range(n)), float, n), kind="stable")
+        out = np.zeros(n, dtype=np.int32)
+        start = 0
+        for k, share in enumerate(self._shares):
+            end = n if k == len(self._shares) - 1 else round(n * share)
+            out[order[start:end]] = k
             start = end
         return out
 
+    @cached_property
+    def _shares(self) -> tuple[float, ...]:
+        """The cumulative shares of the splits, in the order of their names: that of keys in a file means nothing."""
+        splits = self.spec.splits
+        total, share, out = sum(splits.values()), 0.0, []
+        for name in sorted(splits):
+            share += splits[name] / total
+            out.append(share)
+        return tuple(out)
+
+    def _split_number(self, subject: int) -> float:
+        return unit_number(self.spec.seed, "split", "subject", subject, 0)
+
     def split_of(self, subject: int) -> str:
-        """The split that a subject belongs to."""
-        found = self._splits
-        return next(iter(self.spec.splits)) if found is None else found[subject]
+        """The split that a subject belongs to.
+
+        A number u in (0, 1) of each subject decides. Up to `RANKED_SUBJECTS` of them they are put in the order of u and
+        cut at the cumulative shares, so counts are exact; more are not sorted, and u itself is compared with the
+        shares, so counts are those of a random draw.
+        """
+        names = sorted(self.spec.splits)
+        if len(names) == 1:
+            return names[0]
+        if self.spec.subject_count <= RANKED_SUBJECTS:
+            return names[int(self._ranked[subject])]
+        u = self._split_number(subject)
+        return next((name for name, share in zip(names, self._shares, strict=True) if u < share), names[-1])
 
     def subject_of(self, sample: int) -> tuple[int, int]:
         """(subject, place in the subject's sequence) of a sample."""

@@ -124,7 +124,7 @@ class LocalPool:
     def _start(self) -> None:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=work, args=(theirs, self.job), daemon=True)
-        with _environment(self.job.threads), _signals_held():
+        with _environment(self.job.threads), signals_held():
             process.start()
         theirs.close()
         self._workers.append(_Worker(process, ours, f"{process.pid}", time.monotonic()))
@@ -146,7 +146,7 @@ class LocalPool:
         except (EOFError, OSError):
             worker.process.join(5)
         if not worker.process.is_alive():
-            return _end_of(worker.process.exitcode)
+            return end_of(worker.process.exitcode)
         if time.monotonic() - worker.heard > self.timeout_s and (worker.shard is not None or not worker.is_ready):
             return f"no sign of life for {self.timeout_s:g} s"
         return None
@@ -185,13 +185,14 @@ class LocalPool:
             worker.process.join(10)
 
 
-def _end_of(code: int | None) -> str:
+def end_of(code: int | None, who: str = "the worker") -> str:
+    """How a process ended, in words."""
     if code is not None and code < 0:
         try:
-            return f"the worker was ended by {signal.Signals(-code).name}"
+            return f"{who} was ended by {signal.Signals(-code).name}"
         except ValueError:
-            return f"the worker was ended by signal {-code}"
-    return f"the worker ended with exit code {code}"
+            return f"{who} was ended by signal {-code}"
+    return f"{who} ended with exit code {code}"
 
 
 @contextmanager
@@ -211,7 +212,7 @@ def _environment(threads: int) -> Iterator[None]:
 
 
 @contextmanager
-def _signals_held() -> Iterator[None]:
+def signals_held() -> Iterator[None]:
     """A child inherits the mask: Ctrl-C must not hit it while it still imports."""
     if not hasattr(signal, "pthread_sigmask"):
         yield

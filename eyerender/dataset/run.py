@@ -21,6 +21,7 @@ from ..outfolder import clear, refuse_non_empty
 from .assemble import assemble, damage
 from .plan import Plan
 from .pool import NO_SHARD, Events, LocalPool
+from .rates import Rate, keep_rate, now
 from .realise import frames_of
 from .runfile import LOG, begin, refuse_taken
 from .shard import (
@@ -145,6 +146,12 @@ class _Run:
     given_up: int = 0
     retries: int = 0
     total: int = 0
+    samples: int = 0  # the sum of `made`
+    timed: int = 0  # samples of the shards that this run has finished
+    worker_seconds: float = 0.0  # and what they took
+    staged_images: int = 0
+    bytes: int = 0
+    backends: set[str] = field(default_factory=set)
     seen: set[str] = field(default_factory=set)
     verified: set[int] = field(default_factory=set)  # shards whose checksums this run has seen to be right
 
@@ -170,6 +177,7 @@ class _Run:
             try:
                 lost = self._engine(len(todo)).run(todo, self)
             finally:
+                self._keep_rate()
                 remove_leftovers(self.folder, mine, finished(self.folder))
             if lost:
                 shard, reason = next(iter(lost.items()))
@@ -228,16 +236,33 @@ class _Run:
             return RayEngine(job, options.workers, address=options.address, timeout_s=options.timeout_s)
         return LocalPool(job, min(workers, shards), timeout_s=options.timeout_s)
 
+    def _keep_rate(self) -> None:
+        """Remember how fast this machine was, for an estimate of the next run of this spec."""
+        if self.options.engine != "local" or not self.timed or len(self.backends) != 1:
+            return
+        rate = Rate(
+            how="run",
+            time=now(),
+            backend=next(iter(self.backends)),
+            samples=self.timed,
+            seconds=self.worker_seconds / self.timed,
+            subject_seconds=0.0,
+            images=self.staged_images / self.timed,
+            bytes=self.bytes / self.timed,
+        )
+        keep_rate(self.plan, rate)
+
     # What the engine reports.
 
     def ready(self, backend: dict[str, Any], worker: str) -> None:
         """A worker can render."""
         self._log("worker", worker=worker, backend=backend)
+        self.backends.add(backend["name"])
         self._mixed({"backend": backend, "cpu": cpu_family() if self.options.engine == "local" else None})
 
     def sample(self, shard: int, samples: int, images: int) -> None:
         """A sample of a shard is made."""
-        self.made[shard] = samples
+        self._count(shard, samples)
         self.images += images
         self._show()
 
@@ -246,7 +271,11 @@ class _Run:
         if not is_finished(self.folder, staged.shard):
             commit(self.folder, staged)
             self.verified.add(staged.shard)
-        self.made[staged.shard] = len(self.plan.spec.shard_samples(staged.shard))
+            self.timed += len(self.plan.spec.shard_samples(staged.shard))
+            self.worker_seconds += staged.seconds
+            self.staged_images += staged.images
+            self.bytes += staged.bytes
+        self._count(staged.shard, len(self.plan.spec.shard_samples(staged.shard)))
         self.rejected += staged.rejected
         self.given_up += staged.given_up
         self._log(
@@ -263,13 +292,17 @@ class _Run:
     def retry(self, shard: int, reason: str, tries: int) -> None:
         """A shard's worker ended."""
         self.retries += 1
-        self.made.pop(shard, None)
+        self._count(shard, 0)
         what = "a worker" if shard == NO_SHARD else f"shard {shard}"
         self.say(f"{what}: {reason} (try {tries})")
         self._log("retry", shard=shard, reason=reason, tries=tries)
 
+    def _count(self, shard: int, samples: int) -> None:
+        self.samples += samples - self.made.get(shard, 0)
+        self.made[shard] = samples
+
     def _show(self) -> None:
-        samples, seconds = sum(self.made.values()), time.monotonic() - self.start
+        samples, seconds = self.samples, time.monotonic() - self.start
         rate = self.images / seconds if seconds > 0 else 0.0
         left = (self.total - samples) * seconds / samples if samples else 0.0
         note = f"samples, {rate:.2f} images/s, {_clock(left)} left"

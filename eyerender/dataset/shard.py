@@ -65,6 +65,7 @@ _DONE_KEYS: dict[str, Callable[[Any], bool]] = {
     "shard": _is_count,
     "samples": lambda v: _are(v, _is_count) and len(v) == 2,
     "images": _is_count,
+    "images_saturated": lambda v: v is None or _is_count(v),  # older versions did not count them
     "digest": lambda v: isinstance(v, str),
     "versions": lambda v: isinstance(v, Mapping),
     "backend": lambda v: isinstance(v, Mapping) and all(isinstance(v.get(key), str) for key in ("name", "device")),
@@ -90,6 +91,7 @@ class Staged:
     rejected: int
     given_up: int
     seconds: float
+    bytes: int  # on disk in the end: metadata stands in the shard and in the whole
 
 
 def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int, int], None]) -> Staged:
@@ -108,7 +110,7 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
         for kind in kinds:
             (stage / kind).mkdir(parents=True)
         (stage / "shard").mkdir()
-        count, rejections, given_up = 0, [], []
+        count, saturated, rejections, given_up = 0, 0, [], []
         with open(stage / "shard" / LINES, "w", encoding="utf-8") as lines:
             for k, index in enumerate(samples):
                 made = maker.make(index)
@@ -119,14 +121,17 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
                     names = _write_image(stage, shard, image)
                     lines.write(json.dumps({"schema": IMAGE_SCHEMA, **names, **image.line}, allow_nan=False) + "\n")
                 count += len(made.images)
+                saturated += sum(image.saturated for image in made.images)
                 on_sample(k + 1, len(made.images))
         maker.plan.check_files()  # a shard is of one state of them
         seconds = time.monotonic() - start
+        files = _checksums(stage, shard, kinds)
         done = {
             "schema": SHARD_SCHEMA,
             "shard": shard,
             "samples": [samples.start, samples.stop],
             "images": count,
+            "images_saturated": saturated,
             "digest": maker.plan.digest,
             "versions": run_versions(),
             "backend": maker.backend,
@@ -134,14 +139,15 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
             "rejections": rejections,
             "given_up": given_up,
             "seconds": round(seconds, 3),
-            "files": _checksums(stage, shard, kinds),
+            "files": files,
         }
+        size = sum(entry["bytes"] for entry in files.values()) + files[_place(SHARDS, shard, LINES)]["bytes"]
         write_json(stage / DONE, done, sync=False)
         sync_tree(stage)
     except BaseException:
         shutil.rmtree(stage, ignore_errors=True)
         raise
-    return Staged(shard, str(stage), count, len(rejections), len(given_up), seconds)
+    return Staged(shard, str(stage), count, len(rejections), len(given_up), seconds, size)
 
 
 def _write_image(stage: Path, shard: int, image: MadeImage) -> dict[str, str]:

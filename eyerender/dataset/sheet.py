@@ -13,8 +13,9 @@ from PIL import Image, ImageDraw
 
 from ..analytic.observer import observe
 from ..capture import BackendName, make_renderer, render_windows
-from ..errors import EyerenderError, InputError
+from ..errors import EyerenderError, InputError, Warn
 from ..imagefile import preview
+from ..plausibility import is_saturated, saturation_warnings
 from ..scene import Scene
 from .maker import Maker
 from .plan import Plan
@@ -34,8 +35,11 @@ def write_sheet(
     backend: BackendName = "auto",
     threads: int | None = None,
     progress: Progress | None = None,
+    warn: Warn | None = None,
 ) -> int:
     """Render a contact sheet into a picture file; returns the number of images on it.
+
+    `warn` hears of saturated images before the file is written; if it raises, nothing is.
 
     Raises:
         InputError: a file ending that is no picture's, or a spec none of whose samples can be made.
@@ -46,10 +50,14 @@ def write_sheet(
         raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(path))
     maker = _of_plan(what, backend, threads) if isinstance(what, Plan) else _of_scene(what, backend, threads)
     tiles: list[Tile] = []
-    for total, tile in maker:
+    saturated = 0
+    for total, tile, is_white in maker:
         tiles.append(tile)
+        saturated += is_white
         if progress is not None:
             progress(len(tiles), total, "")
+    if warn is not None:
+        warn(saturation_warnings(saturated, len(tiles), what.source))
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
         contact_sheet(tiles).save(part)
@@ -81,7 +89,7 @@ def contact_sheet(tiles: list[Tile]) -> Image.Image:
     return sheet
 
 
-def _of_plan(plan: Plan, backend: BackendName, threads: int | None) -> Iterator[tuple[int, Tile]]:
+def _of_plan(plan: Plan, backend: BackendName, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:
     maker = Maker(plan, frames_of(plan), backend=backend, threads=threads)
     count = min(TILES, plan.spec.count)
     for k in range(count):
@@ -90,16 +98,17 @@ def _of_plan(plan: Plan, backend: BackendName, threads: int | None) -> Iterator[
             raise InputError(f"sample {made.index} cannot be made: {made.rejections[-1].reason}", source=plan.source)
         image = made.images[0]
         caption = f"{image.line['split']} sample {made.index} subject {image.line['subject']}"
-        yield count, _tile(image.pictures["images"], image.line["bit_depth"], caption)
+        yield count, _tile(image.pictures["images"], image.line["bit_depth"], caption), image.saturated
 
 
-def _of_scene(scene: Scene, backend: BackendName, threads: int | None) -> Iterator[tuple[int, Tile]]:
+def _of_scene(scene: Scene, backend: BackendName, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:
     observed = observe(scene)
     count = min(TILES, len(observed))
     rows = np.array([k * len(observed) // count for k in range(count)])
     renderer = make_renderer(backend, threads)
     for image in render_windows(scene, observed.take(rows), renderer=renderer):
-        yield count, _tile(image.dn, scene.spec.sensor.bit_depth, image.name)
+        tile = _tile(image.dn, scene.spec.sensor.bit_depth, image.name)
+        yield count, tile, is_saturated(image.dn, scene.spec.sensor)
 
 
 def _tile(dn: Any, bit_depth: int, caption: str) -> Tile:

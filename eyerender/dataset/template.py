@@ -157,7 +157,14 @@ def sobol_block(seed: int, unit: str, dimensions: int, block: int) -> Floats:
     generator = np.random.default_rng([seed, 1 if unit == "subject" else 0])
     engine = qmc.Sobol(dimensions, scramble=True, rng=generator)
     if block:
-        engine.fast_forward(block * _BLOCK)
+        # As `fast_forward`, which takes a step for each point that it leaves out: point n is the shift and, for each
+        # bit of n's Gray code, a direction number, all combined by exclusive or (Antonov and Saleev 1979).
+        last = block * _BLOCK - 1
+        gray = last ^ (last >> 1)
+        for bit in range(gray.bit_length()):
+            if gray >> bit & 1:
+                engine._quasi ^= engine._sv[:, bit]
+        engine.num_generated = last + 1
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about counts that are no powers of two: a sequence may stop anywhere
         return np.asarray(engine.random(_BLOCK))

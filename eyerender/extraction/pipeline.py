@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.ellipse import signed_distance
-from .glints.classification import judge_spots
+from .glints.classification import classify_spots
 from .glints.deblending import give_edges, split_blends
 from .glints.detection import Spots, detect_spots, widest
 from .glints.fits import SpotFit, joined
 from .glints.fitting import fit_spots
 from .glints.gaussian_model import Limits
-from .glints.subtraction import covered, told, without_light
+from .glints.subtraction import affected_pixels, subtract_spots, well_fitted
 from .glints.windows import window_radius
 from .preprocessing import DN, Image, Prepared, invert, prepare
 from .pupil.consensus import relative_to
 from .pupil.covariance import boundary_deviation
 from .pupil.edge_model import EdgeModel
-from .pupil.fallback import SURE, second_look
+from .pupil.fallback import FALLBACK_CONFIDENCE, fallback_search
 from .pupil.refinement import PixelFit, refine
 from .pupil.scoring import pupil_of
 from .pupil.search import Found, search
@@ -31,7 +31,7 @@ from .statistics import median
 
 Array = NDArray[np.float64]
 
-SAME_LIGHT = 0.5  # noises: a change of the spots' light by less does not move the boundary
+SAME_LIGHT = 0.5  # in noise standard deviations; a smaller change of the spots' light does not move the boundary
 
 
 def extract(
@@ -62,9 +62,9 @@ def extract(
     first = _explained(prepared, found, settings)
     if first.pupil.status == "ok" or work.inverted:
         return first
-    other = second_look(work, found, settings)
+    other = fallback_search(work, found, settings)
     again = None if other is None else _explained(prepared, other, settings)
-    return again if again is not None and again.pupil.confidence >= SURE else first
+    return again if again is not None and again.pupil.confidence >= FALLBACK_CONFIDENCE else first
 
 
 def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -> Extraction:
@@ -84,7 +84,7 @@ def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -
         pupil = pupil_of(found, pixel_fit, settings)
     if pupil.status == "missing":
         return Extraction(pupil, (), (), noise, size)
-    accepted, rejected = judge_spots(spots, fit, prepared, abs(model.step_dn), model.sigma_px, settings)
+    accepted, rejected = classify_spots(spots, fit, prepared, abs(model.step_dn), model.sigma_px, settings)
     return Extraction(pupil, accepted, rejected, noise, size)
 
 
@@ -106,10 +106,10 @@ def _refined(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tu
 def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[Image, NDArray[np.bool_]]:
     """The image less the light of spots that their fits tell, and the pixels where spots are still in the way."""
     if found.image.inverted:
-        return found.image.linear, covered(prepared, spots)
-    known = told(prepared, fit)
-    linear, bright = without_light(prepared, fit, known, found.boundary.ellipse)
-    return linear, bright | covered(prepared, spots, ~known)
+        return found.image.linear, affected_pixels(prepared, spots)
+    known = well_fitted(prepared, fit)
+    linear, bright = subtract_spots(prepared, fit, known, found.boundary.ellipse)
+    return linear, bright | affected_pixels(prepared, spots, ~known)
 
 
 def _boundary_fit(
@@ -133,7 +133,7 @@ def _fitted_again(
     prepared: Prepared, work: Prepared, spots: Spots, fit: SpotFit, on_boundary: NDArray[np.bool_], model: EdgeModel
 ) -> SpotFit:
     """The spots on the boundary fitted before the refined boundary, where that explains them as well."""
-    linear, _ = without_light(prepared, fit, fit.converged & ~on_boundary, model.ellipse)
+    linear, _ = subtract_spots(prepared, fit, fit.converged & ~on_boundary, model.ellipse)
     starts = (spots.xy_px[on_boundary], spots.width_px[on_boundary], spots.height_dn[on_boundary])
     again = fit_spots(linear, _background(work, model), *starts, _limits(prepared, model)).fit
     good = again.converged & (again.residual_dn < 1.05 * fit.residual_dn[on_boundary])

@@ -16,14 +16,14 @@ from ..rig.camera import CalibrationSpec, Camera
 from ..rig.light import MAX_LIGHTS, Light
 from ..rig.rig import MAX_CAMERAS, Rig
 from ..rig.screen import Screen
-from ..scene import load_scene
+from ..scene import Scene, load_scene
 from ..spec import LARGEST
 
 # Records of some 40,000 observations. All of them are held at once.
 MAX_RECORDS_BYTES = 128 * 2**20
 
 
-def load_observations(path: str | Path, scene: str | None = None) -> tuple[Observations, Rig]:
+def load_observations(path: str | Path, scene: str | Scene | None = None) -> tuple[Observations, Rig]:
     """Observations and rig of a file of records.
 
     The file is JSON as `features` writes it, with the rig inside, or JSONL with one record a line; `scene` gives the
@@ -38,7 +38,7 @@ def load_observations(path: str | Path, scene: str | None = None) -> tuple[Obser
         raise InputError("holds no records", source=source)
     observations = Observations.from_records(records, source=source)
     if scene is not None:
-        return observations, load_scene(scene).rig
+        return observations, (scene if isinstance(scene, Scene) else load_scene(scene)).rig
     if rig is None:
         raise InputError("holds no rig; give --scene", source=source)
     return observations, rig_from_mapping(rig, source=source)

@@ -11,9 +11,10 @@ import numpy as np
 from pydantic import Field
 
 from ..arrays import Floats, frozen
-from ..errors import InputError
+from ..errors import InputError, Warn
 from ..files import read_json, shown, write_json
 from ..observation import EYES, Observations
+from ..plausibility import target_warnings
 from ..rig.rig import Rig
 from ..spec import Positive, Spec
 from .crossratio import CrossRatio
@@ -23,10 +24,12 @@ from .hennessey import Hennessey
 from .homography import HomographyNormalisation
 from .parameters import MEAN_EYE, Calibration, EyeParameters
 from .recalibration import Recalibration
+from .records import rig_from_mapping
 from .regression import EyeFit, PupilGlintRegression
 from .twocamera import ShihWuLiu
 
-CALIBRATION_SCHEMA = "eyerender/gaze-calibration/1"
+CALIBRATION_SCHEMA = "eyerender/gaze-calibration/2"
+_WITHOUT_RIG = "eyerender/gaze-calibration/1"  # still read
 FIT_SCHEMA = "eyerender/gaze-fit/1"
 PREDICT_SCHEMA = "eyerender/gaze/1"
 
@@ -69,8 +72,11 @@ def fit_estimator(
     fixations: Sequence[int] | None = None,
     *,
     source: str = "",
+    warn: Warn | None = None,
 ) -> tuple[Estimator, dict[str, Any]]:
     """A calibrated estimator and a summary (schema eyerender/gaze-fit/1).
+
+    `warn` hears of targets off the screen before anything is calibrated; it may raise.
 
     Raises:
         InputError: no targets, an unknown fixation, or what the estimator itself refuses.
@@ -85,6 +91,8 @@ def fit_estimator(
     if not rows.any():
         raise InputError("a calibration needs records with target_mm", source=source)
     used = observations.take(rows)
+    if warn is not None:
+        warn(target_warnings(used.index.target_mm, rig.screen, source))
     try:
         with np.errstate(all="ignore"):
             fitted = spec.build().fit(used, used.index.target_mm, rig)
@@ -146,18 +154,36 @@ def predictions(estimator: Estimator, observations: Observations, rig: Rig) -> d
     return {"schema": PREDICT_SCHEMA, "gaze": single, "binocular": binocular}
 
 
-def save_estimator(path: str | Path, spec: EstimatorSpec, estimator: Estimator) -> None:
-    """Write a calibration as JSON."""
-    write_json(path, {"schema": CALIBRATION_SCHEMA, "estimator": spec.to_mapping(), "eyes": _state(estimator)})
+def save_estimator(path: str | Path, spec: EstimatorSpec, estimator: Estimator, rig: Rig | None = None) -> None:
+    """Write a calibration as JSON, with the rig that it was made on where that is known."""
+    write_json(
+        path,
+        {
+            "schema": CALIBRATION_SCHEMA,
+            "estimator": spec.to_mapping(),
+            "rig": None if rig is None else rig.to_mapping(),
+            "eyes": _state(estimator),
+        },
+    )
 
 
 def load_estimator(path: str | Path) -> Estimator:
-    """Read a calibration back; raises `InputError` naming the file and the key."""
+    """The estimator of a calibration; raises as `load_calibration` does."""
+    return load_calibration(path)[0]
+
+
+def load_calibration(path: str | Path) -> tuple[Estimator, Rig | None]:
+    """Read a calibration back: the estimator, and the rig that it was made on (None where the file does not say).
+
+    Raises:
+        InputError: naming the file and the key.
+    """
     source = str(path)
     data = read_json(path)
-    if data.get("schema") != CALIBRATION_SCHEMA:
+    if data.get("schema") not in (CALIBRATION_SCHEMA, _WITHOUT_RIG):
         found = shown(data.get("schema"))
         raise InputError(f"is {found}; this version reads {CALIBRATION_SCHEMA!r}", source=source, path="schema")
+    rig = None if data.get("rig") is None else rig_from_mapping(data["rig"], source=source)
     try:
         spec = EstimatorSpec.from_mapping(data.get("estimator"))
         estimator = spec.build()
@@ -174,7 +200,7 @@ def load_estimator(path: str | Path) -> Estimator:
         except InputError as error:
             path_of = ".".join(part for part in ("eyes", name, error.path) if part)
             raise InputError(error.reason, source=source, path=path_of) from None
-    return _restored(estimator, found_eyes)
+    return _restored(estimator, found_eyes), rig
 
 
 class _RegressionState(Spec):

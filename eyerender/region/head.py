@@ -10,18 +10,21 @@ g the centre of the eye's globe. An eye whose centre is not given gets the other
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ..arrays import ArrayValue, Floats, Ints, frozen
 from ..errors import InputError
+from ..files import opened, read_bytes, shown
 from ..spec import file_digest
 from .anatomy import RegionSpec
 from .globe import Globe
@@ -35,6 +38,8 @@ _SMALLEST_MM, _LARGEST_MM = 15.0, 1500.0
 _NEAR_MM = 40.0
 _PAD, _BAND, _PLAIN = 4, 8, 8
 _TEXTURE = 2048
+# Pillow knows many more, some of which start other programs.
+_PICTURES = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "WEBP")
 _HAIR_GLOSS = 0.12
 
 
@@ -72,10 +77,8 @@ def file_states(spec: HeadSpec) -> tuple[tuple[int, int], ...]:
     """Time of change and size of each file of a spec with absolute paths; raises `InputError` where one is missing."""
     states = []
     for file in (*spec.files, *(() if spec.texture is None else (spec.texture,))):
-        try:
-            state = Path(file).stat()
-        except OSError:
-            raise InputError("no such file", source=file) from None
+        with opened(file) as stream:
+            state = os.fstat(stream.fileno())
         states.append((state.st_mtime_ns, state.st_size))
     return tuple(states)
 
@@ -202,12 +205,13 @@ def _picture(path: Path, changed_ns: int) -> Floats:
     """The red channel of a picture, linear, 0 to 1, at most 2048 rows and columns."""
     del changed_ns
     try:
-        with Image.open(path) as file:
+        with opened(path) as stream, Image.open(stream, formats=_PICTURES) as file:
             file.thumbnail((_TEXTURE, _TEXTURE))
             data = np.asarray(file if file.mode.startswith(("I", "F", "L")) else file.convert("RGB"))
-    except FileNotFoundError:
-        raise InputError("no such file", source=str(path)) from None
-    except (OSError, UnidentifiedImageError, ValueError) as error:
+    except InputError:
+        raise
+    except Exception as error:
+        # A damaged file makes Pillow's decoders raise whatever their arithmetic comes upon.
         raise InputError(f"is not a readable picture ({error})", source=str(path)) from None
     values = (data[..., 0] if data.ndim == 3 else data).astype(float)
     if data.dtype != np.uint8:
@@ -222,15 +226,17 @@ def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
     source, kind = str(path), path.suffix.lower()
     if kind not in (".obj", ".ply"):
         raise InputError("must end with .obj or .ply", source=source)
-    options: dict[str, Any] = {}
+    # Without its materials a file names no other files.
+    options: dict[str, Any] = {"skip_materials": True}
+    data = read_bytes(path)
     try:
         if kind == ".obj":
-            text = "\n" + path.read_text(encoding="utf-8", errors="replace")
+            text = "\n" + data.decode("utf-8", errors="replace")
             divided = "split_objects" if "\no " in text else "split_groups"
-            options = {"skip_materials": True, "group_material": False, divided: True}
+            options |= {"group_material": False, divided: True}
             if "\no " not in text and "\ng " not in text:
                 options.pop(divided)
-        scene = trimesh.load_scene(path, process=False, **options)
+        scene = trimesh.load_scene(BytesIO(data), file_type=kind[1:], process=False, **options)
         found = {name: g for name, g in scene.geometry.items() if isinstance(g, trimesh.Trimesh) and len(g.faces)}
     except Exception as error:
         # Readers of meshes raise whatever a broken file makes of them.
@@ -241,9 +247,9 @@ def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
     for name, mesh in found.items():
         v, f = np.asarray(mesh.vertices), np.asarray(mesh.faces)
         if not np.all(np.isfinite(v)):
-            raise InputError(f"object {name!r} holds coordinates that are not finite", source=source)
+            raise InputError(f"object {shown(name)} holds coordinates that are not finite", source=source)
         if f.min() < 0 or f.max() >= len(v):
-            raise InputError(f"object {name!r} has faces without vertices", source=source)
+            raise InputError(f"object {shown(name)} has faces without vertices", source=source)
     if kind == ".ply" or not options.keys() & {"split_objects", "split_groups"}:
         return {path.stem: next(iter(found.values()))}
     return found
@@ -256,7 +262,7 @@ def _named(spec: HeadSpec, part: str, objects: dict[str, Any], source: str) -> t
     for name in names:
         if name not in objects:
             raise InputError(
-                f"no object {name!r}; there are {', '.join(sorted(objects))}", source=source, path=f"parts.{part}"
+                f"no object {shown(name)}; there are {', '.join(sorted(objects))}", source=source, path=f"parts.{part}"
             )
     return names
 

@@ -3,14 +3,15 @@ stand. It may stand in the scene, or in a manifest beside the mesh that the scen
 
 from __future__ import annotations
 
-import json
+import os
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from ..errors import InputError
+from ..files import opened, read_json
 from ..spec import NonNegative, Spec, Vec3
 
 SCHEMA = "eyerender/head/1"
@@ -104,12 +105,8 @@ def read_manifest(path: Path) -> HeadSpec:
     Raises:
         InputError: it is missing, not readable, or no manifest of a head.
     """
-    try:
-        state = path.stat()
-    except FileNotFoundError:
-        raise InputError("no such file", source=str(path)) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror or error})", source=str(path)) from None
+    with opened(path) as stream:
+        state = os.fstat(stream.fileno())
     return _manifest(path, (state.st_mtime_ns, state.st_size))
 
 
@@ -117,11 +114,8 @@ def read_manifest(path: Path) -> HeadSpec:
 def _manifest(path: Path, state: tuple[int, int]) -> HeadSpec:
     del state
     source = str(path)
-    try:
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"is not a readable manifest ({error})", source=source) from None
-    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+    data = read_json(path)
+    if data.get("schema") != SCHEMA:
         raise InputError(f"is no manifest of a head; its schema must be {SCHEMA}", source=source)
     if "sha256" not in data:
         raise InputError("missing; a manifest holds the check sums of its files", source=source, path="sha256")

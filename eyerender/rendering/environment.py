@@ -9,6 +9,9 @@ order 2 (Ramamoorthi and Hanrahan 2001, equations 4 to 12; on average within a f
 
 from __future__ import annotations
 
+import math
+import re
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +22,7 @@ import numpy as np
 
 from ..arrays import ArrayValue, Floats, frozen
 from ..errors import InputError
+from ..files import opened
 from ..rig.imaging import MapSpec
 from ..spec import file_digest
 from .exr import second_thread
@@ -31,6 +35,13 @@ _FORMATS = (".hdr", ".exr", ".pfm", ".npy")
 # Rec. 709.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _KEPT = 4
+# 16384 x 8192, of which 1024 x 512 are used.
+MAX_MAP_PIXELS = 2**27
+_HEADER_BYTES = 65536
+_SIDES = {
+    ".hdr": rb"[-+][XY] *([0-9]{1,20}) *[-+][XY] *([0-9]{1,20})",
+    ".pfm": rb"^P[fF]\s+([0-9]{1,20})\s+([0-9]{1,20})",
+}
 _ENTRIES = 21  # even irradiance, 9 of the rotation, scale, rows, 9 of the irradiance
 
 
@@ -55,16 +66,22 @@ def read_map(path: str | Path, channel: str = "red") -> Floats:
     source, path = str(path), Path(path)
     if path.suffix.lower() not in _FORMATS:
         raise InputError(f"must end with one of {', '.join(_FORMATS)}", source=source)
-    if not path.is_file():
-        raise InputError("no such file", source=source)
+    with opened(path) as file:
+        size = _size(path.suffix.lower(), file.read(_HEADER_BYTES))
+    if size is not None and size > MAX_MAP_PIXELS:
+        raise InputError(f"has {size} pixels; at most {MAX_MAP_PIXELS}", source=source)
     try:
         if path.suffix.lower() == ".npy":
-            data = np.load(path, allow_pickle=False)
+            with opened(path) as file:
+                data = np.lib.format.read_array(file, allow_pickle=False)
         else:
             with second_thread():
                 bitmap = mi.Bitmap(str(path))
             data = np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
-    except (RuntimeError, OSError, ValueError, EOFError) as error:
+    except InputError:
+        raise
+    except Exception as error:
+        # Readers of pictures raise whatever a broken file makes of them.
         detail = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"is not a readable map ({detail})", source=source) from None
     if data.dtype.kind not in "fiu" or data.ndim not in (2, 3):
@@ -83,6 +100,22 @@ def read_map(path: str | Path, channel: str = "red") -> Floats:
     if not np.all(np.isfinite(values)) or np.min(values) < 0:
         raise InputError("holds values that are negative or not finite", source=source)
     return values
+
+
+def _size(kind: str, head: bytes) -> int | None:
+    """The number of pixels that the beginning of a map's file tells of; None where it tells of none.
+
+    The reader allocates all of them before it finds out that the file is short.
+    """
+    if kind == ".npy":
+        shape = re.search(rb"'shape': *\(([0-9, ]{1,99})\)", head)
+        return math.prod(int(n) for n in shape[1].split(b",") if n.strip()) if shape else None
+    if kind == ".exr":
+        window = re.search(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", head, re.DOTALL)
+        x0, y0, x1, y1 = struct.unpack("<4i", window[1]) if window else (0, 0, -1, -1)
+        return max(int(x1 - x0) + 1, 0) * max(int(y1 - y0) + 1, 0)
+    sides = re.search(_SIDES[kind], head)
+    return int(sides[1]) * int(sides[2]) if sides else None
 
 
 def surrounding(values: Floats) -> Surrounding:
@@ -197,10 +230,10 @@ class Ambience:
         self._even, self._scale, self._rows, self._harmonics = n[0], n[10], n[11], n[12:]
         self._axes = tuple(mi.Vector3f(*n[k : k + 3]) for k in (1, 4, 7))
 
-    def _in_map(self, v: Any) -> Any:
+    def _in_map(self, v: mi.Vector3f) -> mi.Vector3f:
         return mi.Vector3f(*(dr.dot(axis, v) for axis in self._axes))
 
-    def radiance(self, o: Any, d: Any, active: Any) -> Any:
+    def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Radiance (mW/mm^2/sr) that rays of the scene's frame meet, even light left out; panels that overlap add up
         and do not hide the map behind them."""
         w = self._in_map(d)
@@ -209,7 +242,7 @@ class Ambience:
         place = mi.Point2f(u, (1 + v * self._rows) / (self._rows + 2))
         return self._panels.radiance(o, d, active) + self._scale * self._texture.eval(place, active)[0]
 
-    def irradiance(self, x: Any, n: Any) -> Any:
+    def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) of a matte surface at points x with unit normals n of the scene's frame, unshadowed."""
         w = self._in_map(n)
         h = self._harmonics

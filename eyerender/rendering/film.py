@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -37,14 +36,14 @@ class Exposed:
     `plain` says which tiles of a window show nothing but skin, and how large they are (px).
     """
 
-    scene: Any
+    scene: mi.Scene
     values: Values
     lights: Lights
     textures: Textures
     plain: Callable[[Window], tuple[Bools, int]]
 
 
-def pixels_of(pixel: Any, window: Window) -> tuple[Any, Any]:
+def pixels_of(pixel: mi.UInt32, window: Window) -> tuple[mi.Int32, mi.Int32]:
     """Full-sensor pixel coordinates, as signed integers, of the window's pixels in row order."""
     width = dr.opaque(mi.UInt32, window[2])
     row = pixel // width
@@ -62,7 +61,9 @@ def group_size(spp: int) -> int:
     return size
 
 
-def mean_radiance(integrator: Any, shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Floats, int]:
+def mean_radiance(
+    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, spp: int, seed: int
+) -> tuple[Floats, int]:
     """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
     width, height = window[2:]
     grouped = shown.values.structure.region and integrator.bounces == 0
@@ -81,13 +82,13 @@ def mean_radiance(integrator: Any, shown: Exposed, window: Window, spp: int, see
     return (total / spp).reshape(height, width), failed
 
 
-def _samples(u: Any, v: Any, spp: int, seed: int) -> Samples:
+def _samples(u: mi.Int32, v: mi.Int32, spp: int, seed: int) -> Samples:
     # A pixel's place on the whole sensor, so that a window shows the same samples wherever it lies.
     return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), spp, seed)
 
 
 def _singles(
-    integrator: Any, shown: Exposed, window: Window, spp: int, seed: int, first: int, count: int
+    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, spp: int, seed: int, first: int, count: int
 ) -> tuple[Floats, int]:
     """Sums over `count` samples of each pixel, one a lane."""
     index = dr.arange(mi.UInt32, window[2] * window[3] * count)
@@ -128,10 +129,10 @@ def _groups(
     samples = _samples(u, v, spp, seed)
     each = dr.opaque(mi.UInt32, size)
 
-    def number(j: Any) -> Any:
+    def number(j: mi.UInt32) -> mi.UInt32:
         return group * each + j
 
-    def ray(j: Any) -> tuple[Any, Any, Any]:
+    def ray(j: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
         spot = samples.in_pixel(number(j))
         o, d, cosine = camera_ray(shown.values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
         cosine = cosine * cosine
@@ -142,12 +143,12 @@ def _groups(
     # With fewer samples than lamps, chance says with which a pixel begins.
     start = mi.UInt32(samples.pair(mi.UInt32(0), 1).x * mi.Float(lamps))
 
-    def lamp(j: Any) -> tuple[Lamp, Any]:
+    def lamp(j: mi.UInt32) -> tuple[Lamp, mi.Float]:
         which = dr.select(all_samples < lamps, number(j) + start, number(j)) % lamps
         share = mi.Float(all_samples) / mi.Float((all_samples + lamps - 1 - which) // lamps)
         return lights[which], dr.select(all_samples < lamps, mi.Float(lamps), share)
 
-    def shared(k: Any) -> tuple[Lamp, Any]:
+    def shared(k: mi.UInt32) -> tuple[Lamp, mi.Float]:
         which = group % lamps + k * groups
         return lights[which], mi.Float(groups) / mi.Float(dr.maximum((groups + lamps - 1 - which) // lamps, 1))
 
@@ -175,7 +176,7 @@ def _groups(
     return seen.reshape(-1)[:pixels], int(dr.sum(failures).numpy()[0])
 
 
-def _plain(plain: tuple[Bools, int], window: Window, u: Any, v: Any) -> Any:
+def _plain(plain: tuple[Bools, int], window: Window, u: mi.Int32, v: mi.Int32) -> mi.Bool:
     """Whether pixels of a window show nothing but skin."""
     tiles, across = plain
     x, y, size, rows, columns = (dr.opaque(mi.Int32, k) for k in (*window[:2], across, *tiles.shape))

@@ -1,4 +1,4 @@
-"""From eye, pose, camera, lamps and look to the numbers that a kernel takes: host side, float64, no Mitsuba."""
+"""From eye, pose, camera, lamps and look to the parameters of a frame: on the host, in float64, without Mitsuba."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..arrays import ArrayValue, Floats
 from ..errors import InputError
@@ -20,6 +19,17 @@ from ..rig.camera import Camera
 from ..rig.imaging import AmbientSpec, LensSpec
 from ..rig.light import Light
 from ..rig.sensor import SensorSpec
+from .parameters import (
+    CameraParameters,
+    ImageParameters,
+    IrisParameters,
+    LimbusParameters,
+    Parameters,
+    PoseParameters,
+    ScleraParameters,
+    StopParameters,
+    SurfaceParameters,
+)
 
 _SENSOR, _LOOK, _LENS, _AMBIENT = SensorSpec(), LookSpec(), LensSpec(), AmbientSpec()
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
@@ -65,41 +75,61 @@ def kinds(eye: Eye) -> tuple[tuple[bool, bool], ...]:
     return tuple((isinstance(s, Biconic), not np.array_equal(s.rotation, np.eye(3))) for s in eye.front)
 
 
-def eye_numbers(eye: Eye) -> dict[str, ArrayLike]:
-    """The eye's part of a kernel's numbers."""
-    numbers: dict[str, ArrayLike] = {}
+def parameters_of(job: RenderJob) -> Parameters:
+    """The parameters of a frame on the host."""
+    eye, look, anchor, camera = job.eye, job.look, job.anchor_mm, job.camera
     indices = np.asarray(eye.front_indices, dtype=float)
-    before = 1.0
-    for i, (surface, index) in enumerate(zip(eye.front, indices, strict=True)):
-        numbers |= {f"s{i}.origin": surface.origin_mm, f"s{i}.shape": _shape(surface), f"s{i}.eta": before / index}
-        numbers |= {f"s{i}.row{k}": np.asarray(surface.rotation)[:, k] for k in range(3)}
-        before = float(index)
-    front = eye.front[0]
+    surfaces = tuple(
+        _surface_parameters(surface, before / index)
+        for surface, index, before in zip(eye.front, indices, [1.0, *indices[:-1]], strict=True)
+    )
+    front, stop, sclera = eye.front[0], eye.stop, eye.sclera
     angle = np.linspace(0, 2 * np.pi, 64)
-    rim = front.sag(eye.limbus_radius_mm * np.cos(angle), eye.limbus_radius_mm * np.sin(angle))
-    scale, shift = _image(eye.front, indices, float(eye.stop.centre_mm[0]))
-    numbers |= {
-        "inner_index": before,
-        "stop.centre": eye.stop.centre_mm,
-        "stop.normal": eye.stop.rotation[:, 0],
-        "stop.u": eye.stop.rotation[:, 1],
-        "stop.v": eye.stop.rotation[:, 2],
-        "stop.axes": eye.stop.semi_axes_mm,
-        "iris_root": eye.iris_root_radius_mm,
-        "limbus_radius": eye.limbus_radius_mm,
-        "limbus_floor": float(np.min(rim)) - 2.0,
-        "sclera.centre": eye.sclera.centre_mm,
-        "sclera.radius": eye.sclera.radius_mm,
-        # Of the sphere about the sclera's centre that holds the cornea too.
-        "globe.reach": max(float(eye.sclera.radius_mm), float(np.linalg.norm(apex_of(front) - eye.sclera.centre_mm)))
-        + 0.5,
-        "image.scale": scale,
-        "image.shift": shift,
-    }
-    return numbers
+    edge = front.sag(eye.limbus_radius_mm * np.cos(angle), eye.limbus_radius_mm * np.sin(angle))
+    cornea_reach = float(np.linalg.norm(apex_of(front) - sclera.centre_mm))
+    return Parameters(
+        surfaces=surfaces,
+        inner_index=float(indices[-1]),
+        stop=StopParameters(
+            centre=stop.centre_mm,
+            normal=stop.rotation[:, 0],
+            u=stop.rotation[:, 1],
+            v=stop.rotation[:, 2],
+            axes=tuple(stop.semi_axes_mm),
+        ),
+        iris=IrisParameters(eye.iris_root_radius_mm, look.iris_albedo, look.iris_contrast),
+        limbus=LimbusParameters(
+            radius=eye.limbus_radius_mm,
+            floor=float(np.min(edge)) - 2.0,
+            gain=1 / max(look.limbus_width_mm, 1e-6),
+            albedo=look.limbus_albedo,
+        ),
+        sclera=ScleraParameters(sclera.centre_mm, sclera.radius_mm, look.sclera_albedo, look.sclera_contrast),
+        image=ImageParameters(*_image(eye.front, indices, float(stop.centre_mm[0]))),
+        pose=PoseParameters((job.M[:, 0], job.M[:, 1], job.M[:, 2]), job.t - anchor),
+        camera=CameraParameters(
+            centre=camera.nodal_point_mm - anchor,
+            right=camera.R[0],
+            down=camera.R[1],
+            forward=camera.R[2],
+            focal=(camera.K[0, 0], camera.K[1, 1]),
+            principal=(camera.K[0, 2], camera.K[1, 2]),
+            distortion=tuple(camera.distortion),
+        ),
+        pupil_albedo=look.pupil_albedo,
+        globe_reach=max(float(sclera.radius_mm), cornea_reach) + 0.5,
+        backdrop_x=-look.backdrop_distance_mm,
+        ambient_irradiance=job.ambient.irradiance_w_m2 * 1e-3,
+    )
 
 
-def margin_waves(eye: Eye) -> Floats:
+def _surface_parameters(surface: Surface, eta: float) -> SurfaceParameters:
+    rotation = np.asarray(surface.rotation)
+    axes = None if np.array_equal(rotation, np.eye(3)) else (rotation[:, 0], rotation[:, 1], rotation[:, 2])
+    return SurfaceParameters(surface.origin_mm, tuple(_shape(surface)), eta, axes)
+
+
+def boundary_waves(eye: Eye) -> Floats:
     """Fourier coefficients (k, 2) of the pupil's relative radius over the angle in the stop's plane, as c_k and -s_k.
 
     The stop's own angle runs the other way about for a left eye: f' = pi - f, cos(k f') = (-1)^k cos(k f),
@@ -110,45 +140,6 @@ def margin_waves(eye: Eye) -> Floats:
         turned = (-1.0) ** np.arange(1, len(cosines) + 1)
         cosines, sines = turned * cosines, -turned * sines
     return np.stack([cosines, -sines], axis=1)
-
-
-def look_numbers(look: LookSpec) -> dict[str, ArrayLike]:
-    """The look's part of a kernel's numbers."""
-    return {
-        "limbus_width": look.limbus_width_mm,
-        "limbus_gain": 1 / max(look.limbus_width_mm, 1e-6),
-        "iris.albedo": look.iris_albedo,
-        "iris.contrast": look.iris_contrast,
-        "pupil.albedo": look.pupil_albedo,
-        "sclera.albedo": look.sclera_albedo,
-        "sclera.contrast": look.sclera_contrast,
-        "limbus.albedo": look.limbus_albedo,
-        "backdrop.x": -look.backdrop_distance_mm,
-    }
-
-
-def pose_numbers(M: Floats, t: Floats, anchor: Floats) -> dict[str, ArrayLike]:
-    """The pose's part: eye frame to scene's frame (the world's axes, origin at `anchor`)."""
-    numbers: dict[str, ArrayLike] = {f"pose.col{k}": M[:, k] for k in range(3)}
-    return numbers | {"pose.shift": t - anchor}
-
-
-def camera_numbers(camera: Camera, anchor: Floats) -> dict[str, ArrayLike]:
-    """The camera's part, in the scene's frame."""
-    return {
-        "camera.centre": camera.nodal_point_mm - anchor,
-        "camera.right": camera.R[0],
-        "camera.down": camera.R[1],
-        "camera.forward": camera.R[2],
-        "camera.focal": (camera.K[0, 0], camera.K[1, 1]),
-        "camera.principal": (camera.K[0, 2], camera.K[1, 2]),
-        "camera.distortion": camera.distortion,
-    }
-
-
-def ambient_numbers(ambient: AmbientSpec) -> dict[str, ArrayLike]:
-    """The ambient light's part: irradiance in mW/mm^2."""
-    return {"ambient.irradiance": ambient.irradiance_w_m2 * 1e-3}
 
 
 def panel_table(ambient: AmbientSpec, anchor: Floats) -> Floats:

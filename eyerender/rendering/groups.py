@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +12,10 @@ import mitsuba as mi
 from .lighting import lamp_blocked, straight, through_cornea
 from .shading import direct, indirect
 from .values import Lamp, Lights, Values
-from .view import Textures, look_at_skin, meet, outer_albedo
+from .view import Textures, View, look_at_skin, meet, outer_albedo
+
+if TYPE_CHECKING:
+    from .region import Skin
 
 _LIDS_MM = 18.0  # about the axis of the unrotated eye: the lids, and where lashes cast shadows
 
@@ -32,55 +35,92 @@ class Group:
         plain: nothing but the sheet of skin is to be seen in the samples' pixel.
     """
 
-    count: Any
-    ray: Callable[[Any], tuple[Any, Any, Any]]
-    spot: Callable[[Any], Any]
-    lamp: Callable[[Any], tuple[Lamp, Any]]
-    lamps: Any
-    shared: Callable[[Any], tuple[Lamp, Any]]
-    fine: Any
-    plain: Any
+    count: mi.UInt32
+    ray: Callable[[mi.UInt32], tuple[mi.Vector3f, mi.Vector3f, mi.Float]]
+    spot: Callable[[mi.UInt32], mi.Point2f]
+    lamp: Callable[[mi.UInt32], tuple[Lamp, mi.Float]]
+    lamps: mi.UInt32
+    shared: Callable[[mi.UInt32], tuple[Lamp, mi.Float]]
+    fine: mi.Bool
+    plain: mi.Bool
 
 
-def shade_group(values: Values, lights: Lights, textures: Textures, scene: Any, group: Group) -> tuple[Any, Any]:
+def shade_group(
+    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, group: Group
+) -> tuple[mi.Float, mi.UInt32]:
     """Sums over a group's samples before an eye region: radiance, and failed light paths.
 
-    Every sample has a ray of its own, and the globe is shaded for each. What the region shows of a group is shaded once
-    for the sheet of skin and once for all that stands before it (hairs, tears), at the sample that comes first, and
-    counts as often as it was hit. In a plain pixel the first sample that meets the sheet says what all would.
+    Every sample has a ray of its own, and the globe is shaded for each. The region is shaded once for the sheet of skin
+    and once for everything in front of it (hairs, tears), at the first sample that hits it. The result counts as often
+    as the surface was hit. In a plain pixel the first sample that hits the skin speaks for the others.
     """
-    skin = textures.region
-    middle = group.count >> 1
+    assert textures.region is not None
+    shading = _GroupShading(values, lights, textures, textures.region, scene, group)
+    no = mi.Bool(False)
+    state = (mi.UInt32(0), no, mi.Float(0), Kept.none(), Kept.none(), no, no, mi.UInt32(0))
+    names = ("i", "settled", "total", "sheet", "before", "known", "blocked", "failures")
+    i, settled, total, sheet, before, _, _, failures = dr.while_loop(
+        state, shading.goes_on, shading.trace_sample, labels=names, label="group"
+    )
+    sheet = shading.with_untraced(sheet, i, settled)
+    for kept in (sheet, before):
+        (total,) = dr.if_stmt(
+            (total,),
+            kept.weight > 0,
+            lambda total, kept=kept: (shading.add_region(total, kept),),
+            lambda total: (total,),
+        )
+    return total, failures
 
-    def number(i: Any) -> Any:
-        """The middle sample first, then the others in turn."""
+
+@dataclass(frozen=True, slots=True)
+class _GroupShading:
+    """The steps of `shade_group` for one frame."""
+
+    values: Values
+    lights: Lights
+    textures: Textures
+    skin: Skin
+    scene: mi.Scene
+    group: Group
+
+    def number(self, i: mi.UInt32) -> mi.UInt32:
+        """The i-th sample to trace: the middle one first, then the others in turn."""
+        middle = self.group.count >> 1
         return dr.select(i == 0, middle, dr.select(i <= middle, i - 1, i))
 
-    def place(lamp: Lamp, j: Any) -> Any:
-        u, v = group.spot(j)
+    def lamp_point(self, lamp: Lamp, j: mi.UInt32) -> mi.Vector3f:
+        """Sample j's point on a lamp."""
+        u, v = self.group.spot(j)
         return lamp.point(u, *dr.sincos(v * (2 * dr.pi)))
 
-    def going(i: Any, settled: Any, *_: Any) -> Any:
-        return (i < group.count) & ~settled
+    def goes_on(self, i: mi.UInt32, settled: mi.Bool, *_: object) -> mi.Bool:
+        """Whether samples are left to trace."""
+        return (i < self.group.count) & ~settled
 
-    def one(
-        i: Any, settled: Any, total: Any, sheet: Kept, before: Kept, known: Any, blocked: Any, failures: Any
-    ) -> Any:
-        j = number(i)
+    def trace_sample(
+        self,
+        i: mi.UInt32,
+        settled: mi.Bool,
+        total: mi.Float,
+        sheet: Kept,
+        before: Kept,
+        known: mi.Bool,
+        blocked: mi.Bool,
+        failures: mi.UInt32,
+    ) -> tuple[mi.UInt32, mi.Bool, mi.Float, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32]:
+        """Trace one sample: shade the globe where it hits that, else keep the hit on the region.
+
+        `known`, `blocked`: whether the sample before has sent its own ray to the lamp, and what that met.
+        """
+        values, group, skin = self.values, self.group, self.skin
+        j = self.number(i)
         o, d, weight = group.ray(j)
-        view, hit = meet(values, scene, o, d, True)
+        view, hit = meet(values, self.scene, o, d, mi.Bool(True))
 
-        def globe(total: Any, failures: Any) -> tuple[Any, Any]:
-            seen = replace(view, other=mi.Bool(False))
-            lamp, share = group.lamp(j)
-            source = place(lamp, j)
-            outer, shine = straight(lamp, source, seen, -values.vector_to_eye(d))
-            inner, missed = through_cornea(values, lights, scene, seen.inner, seen.lit_inside, *group.spot(j))
-            albedo = outer_albedo(values, textures, seen, True)
-            lit = direct(seen, albedo, outer, shine)
-            barred = lamp_blocked(values, scene, seen.point, source, False, ~seen.cornea, lit > 0)
-            rest = indirect(values, textures, scene, seen, d, albedo, inner)
-            return total + (rest + dr.select(barred, 0, lit * share)) * weight, failures + missed
+        def globe(total: mi.Float, failures: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
+            radiance, missed = self.globe_radiance(view, d, j)
+            return total + radiance * weight, failures + missed
 
         total, failures = dr.if_stmt((total, failures), view.cornea | view.sclera, globe, lambda *unchanged: unchanged)
         face = skin.face(hit)
@@ -92,9 +132,9 @@ def shade_group(values: Values, lights: Lights, textures: Textures, scene: Any, 
         known &= (i & 1) == 1
         asked = alone & ~known
 
-        def own_ray(_: Any) -> Any:
-            source = place(group.shared(mi.UInt32(0))[0], j)
-            return lamp_blocked(values, scene, values.point_to_eye(at), source, True, True, asked)
+        def own_ray(_: mi.Bool) -> mi.Bool:
+            source = self.lamp_point(group.shared(mi.UInt32(0))[0], j)
+            return lamp_blocked(values, self.scene, values.point_to_eye(at), source, True, True, asked)
 
         blocked = dr.if_stmt((blocked,), asked, own_ray, lambda blocked: blocked)
         known |= asked
@@ -103,46 +143,54 @@ def shade_group(values: Values, lights: Lights, textures: Textures, scene: Any, 
         settled = group.plain & view.other & on_sheet & ~alone
         return i + 1, settled, total, sheet, before, known, blocked, failures
 
-    no = mi.Bool(False)
-    state = (mi.UInt32(0), no, mi.Float(0), Kept.none(), Kept.none(), no, no, mi.UInt32(0))
-    names = ("i", "settled", "total", "sheet", "before", "known", "blocked", "failures")
-    i, settled, total, sheet, before, _, _, failures = dr.while_loop(state, going, one, labels=names, label="group")
+    def globe_radiance(self, view: View, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
+        """Radiance of the globe along sample j's ray, and failed light paths."""
+        values, lights, textures, scene, group = self.values, self.lights, self.textures, self.scene, self.group
+        seen = replace(view, other=mi.Bool(False))
+        lamp, share = group.lamp(j)
+        source = self.lamp_point(lamp, j)
+        outer, shine = straight(lamp, source, seen, -values.vector_to_eye(d))
+        inner, missed = through_cornea(values, lights, scene, seen.inner, seen.lit_inside, *group.spot(j))
+        albedo = outer_albedo(values, textures, seen, mi.Bool(True))
+        lit = direct(seen, albedo, outer, shine)
+        barred = lamp_blocked(values, scene, seen.point, source, False, ~seen.cornea, lit > 0)
+        rest = indirect(values, textures, scene, seen, d, albedo, inner)
+        return rest + dr.select(barred, 0, lit * share), missed
 
-    def left(i: Any, *_: Any) -> Any:
-        return settled & (i < group.count)
+    def with_untraced(self, sheet: Kept, i: mi.UInt32, settled: mi.Bool) -> Kept:
+        """The skin's hit with the weights of the samples that a plain pixel left untraced, from the i-th on."""
 
-    def weigh(i: Any, weight: Any, shared: Any) -> Any:
-        rest = group.ray(number(i))[2]
-        return i + 1, weight + rest, shared + rest
+        def more(i: mi.UInt32, *_: object) -> mi.Bool:
+            return settled & (i < self.group.count)
 
-    weights = (i, sheet.weight, sheet.shared)
-    _, weight, shared = dr.while_loop(weights, left, weigh, labels=("i", "weight", "shared"), label="settled")
-    sheet = replace(sheet, weight=weight, shared=shared)
+        def add(i: mi.UInt32, weight: mi.Float, shared: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+            rest = self.group.ray(self.number(i))[2]
+            return i + 1, weight + rest, shared + rest
 
-    for kept in (sheet, before):
+        state = (i, sheet.weight, sheet.shared)
+        _, weight, shared = dr.while_loop(state, more, add, labels=("i", "weight", "shared"), label="settled")
+        return replace(sheet, weight=weight, shared=shared)
 
-        def surface(total: Any, kept: Kept = kept) -> tuple[Any]:
-            _, d, _ = group.ray(kept.j)
-            view = look_at_skin(values, skin, kept.face, kept.uv, d, kept.weight > 0)
-            total += indirect(values, textures, scene, view, d, view.albedo, mi.Float(0)) * kept.weight
+    def add_region(self, total: mi.Float, kept: Kept) -> mi.Float:
+        """`total` with the radiance of a kept hit on the region, by the lamps that the group looks at."""
+        values, group = self.values, self.group
+        _, d, _ = group.ray(kept.j)
+        view = look_at_skin(values, self.skin, kept.face, kept.uv, d, kept.weight > 0)
+        total += indirect(values, self.textures, self.scene, view, d, view.albedo, mi.Float(0)) * kept.weight
 
-            def more(k: Any, *_: Any) -> Any:
-                return k < group.lamps
+        def more(k: mi.UInt32, *_: object) -> mi.Bool:
+            return k < group.lamps
 
-            def lamp_light(k: Any, total: Any) -> Any:
-                lamp, share = group.shared(k)
-                source = place(lamp, kept.j)
-                outer, shine = straight(lamp, source, view, -values.vector_to_eye(d))
-                lit = direct(view, view.albedo, outer, shine) * share
-                asked = (kept.shared > 0) & (lit > 0)
-                blocked = lamp_blocked(values, scene, view.point, source, True, True, asked)
-                return k + 1, total + lit * (kept.clear + dr.select(blocked, 0, kept.shared))
+        def lamp_light(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            lamp, share = group.shared(k)
+            source = self.lamp_point(lamp, kept.j)
+            outer, shine = straight(lamp, source, view, -values.vector_to_eye(d))
+            lit = direct(view, view.albedo, outer, shine) * share
+            asked = (kept.shared > 0) & (lit > 0)
+            blocked = lamp_blocked(values, self.scene, view.point, source, True, True, asked)
+            return k + 1, total + lit * (kept.clear + dr.select(blocked, 0, kept.shared))
 
-            total = dr.while_loop((mi.UInt32(0), total), more, lamp_light, labels=("k", "total"), label="its lamps")[1]
-            return (total,)
-
-        (total,) = dr.if_stmt((total,), kept.weight > 0, surface, lambda total: (total,))
-    return total, failures
+        return dr.while_loop((mi.UInt32(0), total), more, lamp_light, labels=("k", "total"), label="its lamps")[1]
 
 
 @dataclass
@@ -150,19 +198,28 @@ class Kept:
     """The hit of a group's samples that stands for all on one kind of surface, its number, and what all weigh: those
     without a ray of their own to the lamp (`shared`), and those of the others that see it (`clear`)."""
 
-    j: Any = None
-    face: Any = None
-    uv: Any = None
-    weight: Any = None
-    shared: Any = None
-    clear: Any = None
+    j: mi.UInt32 = None
+    face: mi.UInt32 = None
+    uv: mi.Point2f = None
+    weight: mi.Float = None
+    shared: mi.Float = None
+    clear: mi.Float = None
 
     @classmethod
     def none(cls) -> Kept:
         """No hit yet."""
         return cls(mi.UInt32(0), mi.UInt32(0), mi.Point2f(0), mi.Float(0), mi.Float(0), mi.Float(0))
 
-    def with_(self, met: Any, j: Any, face: Any, uv: Any, weight: Any, alone: Any, blocked: Any) -> Kept:
+    def with_(
+        self,
+        met: mi.Bool,
+        j: mi.UInt32,
+        face: mi.UInt32,
+        uv: mi.Point2f,
+        weight: mi.Float,
+        alone: mi.Bool,
+        blocked: mi.Bool,
+    ) -> Kept:
         """With sample `j` where it has `met` the surface; the first stands for all."""
         taken = met & (self.weight == 0)
         weight = dr.select(met, weight, 0)

@@ -92,7 +92,7 @@ def cornea_depth_mm(place: RegionScene, globe: Globe) -> Floats:
     buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 6
     o = [dr.gather(mi.Float, buffer, row + k) for k in range(6)]
     ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:]))
-    ray.maxt = dr.opaque(mi.Float, _DEPTH_MM)  # type: ignore[assignment]
+    ray.maxt = dr.opaque(mi.Float, _DEPTH_MM)
     hit = place.scene.ray_intersect_preliminary(ray, coherent=False, active=True)
     t = np.where(hit.is_valid().numpy(), hit.t.numpy(), _DEPTH_MM)
     return np.asarray(_DEPTH_MM - t, dtype=float)

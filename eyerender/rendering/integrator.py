@@ -13,7 +13,7 @@ its own frame, so that a pose moves numbers and never geometry.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,10 +22,15 @@ from .shading import Shaded, shade
 from .values import Lights, Values
 from .view import EPSILON_MM, Textures
 
+if TYPE_CHECKING:
+    from .sampling import Sampler
+
 NAME = "eyerender"
 
 
-def onward(values: Values, shaded: Shaded, d: Any, u: Any, v: Any) -> tuple[Any, Any, Any, Any]:
+def onward(
+    values: Values, shaded: Shaded, d: mi.Vector3f, u: mi.Float, v: mi.Float
+) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Bool]:
     """How a path goes on: origin, direction (scene's frame), weight, and whether it does.
 
     From matte points in a cosine-distributed direction; from the clear cornea in the mirror's direction.
@@ -44,14 +49,16 @@ def onward(values: Values, shaded: Shaded, d: Any, u: Any, v: Any) -> tuple[Any,
     return start, way, weight, view.met
 
 
-def _random(base: Any, i: Any) -> tuple[Any, Any]:
+def _random(base: mi.Point2f, i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
     """Two numbers in [0, 1) that are independent for every i: a hash of a sample's own pair (Tea)."""
     tea: Any = mi.sample_tea_32
     a, b = tea(mi.UInt32(base.x * 2.0**24) + i * mi.UInt32(0x9E3779B9), mi.UInt32(base.y * 2.0**24))
     return mi.Float(a >> 8) * 2.0**-24, mi.Float(b >> 8) * 2.0**-24
 
 
-def _start(values: Values, first: Shaded, d: Any, turn: Any) -> tuple[Any, Any, Any, Any]:
+def _start(
+    values: Values, first: Shaded, d: mi.Vector3f, turn: mi.Point2f
+) -> tuple[mi.Bool, mi.Vector3f, mi.Vector3f, mi.Float]:
     o, way, weight, on = onward(values, first, d, turn.x, turn.y)
     return on, o, way, weight
 
@@ -65,13 +72,13 @@ def integrator_class() -> type:
     if variant in _registered:
         return _registered[variant]
 
-    class EyeIntegrator(mi.SamplingIntegrator):
+    class EyeIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
         """Radiance (mW/mm^2/sr) along rays of the scene's frame; `bind` gives it the eye, the lamps and the look.
 
         `bounces` counts how often light goes on between sclera, surround and the cornea's mirror before it is seen.
         """
 
-        def __init__(self, props: Any = None) -> None:
+        def __init__(self, props: mi.Properties | None = None) -> None:
             super().__init__(mi.Properties() if props is None else props)
             self.bounces = 0
             self.values: Values | None = None
@@ -84,8 +91,8 @@ def integrator_class() -> type:
             self.values, self.lights, self.textures = values, lights, textures
 
         def sample(
-            self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
-        ) -> tuple[Any, Any, list[Any]]:
+            self, scene: mi.Scene, sampler: Sampler, ray: mi.Ray3f, medium: object = None, active: mi.Bool | bool = True
+        ) -> tuple[mi.Color1f, mi.Bool, list[mi.Float]]:
             """Radiance along `ray`; the third item is empty, failed light paths are counted in `failures`."""
             del medium
             if self.values is None or self.lights is None or self.textures is None:
@@ -101,10 +108,18 @@ def integrator_class() -> type:
                 turn = sampler.next_2d(active)
                 limit = dr.opaque(mi.UInt32, self.bounces)
 
-                def going(i: Any, on: Any, *_: Any) -> Any:
+                def going(i: mi.UInt32, on: mi.Bool, *_: object) -> mi.Bool:
                     return on & (i < limit)
 
-                def bounce(i: Any, on: Any, o: Any, d: Any, weight: Any, total: Any, failures: Any) -> Any:
+                def bounce(
+                    i: mi.UInt32,
+                    on: mi.Bool,
+                    o: mi.Vector3f,
+                    d: mi.Vector3f,
+                    weight: mi.Float,
+                    total: mi.Float,
+                    failures: mi.UInt32,
+                ) -> tuple[mi.UInt32, mi.Bool, mi.Vector3f, mi.Vector3f, mi.Float, mi.Float, mi.UInt32]:
                     u, v = _random(turn, 2 * i)
                     seen = shade(values, lights, textures, scene, o, d, on, u, v)
                     total += dr.select(on, weight * seen.radiance, 0)

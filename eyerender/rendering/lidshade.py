@@ -11,8 +11,6 @@ are taken upwards and downwards, h is the upper margin's thickness; the part tha
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -37,7 +35,7 @@ class LidShade:
         # Upper and lower heights beside each other, so that both are read at once.
         self._buffer = mi.Float(np.append(table.T.ravel(), height_mm * height_mm).astype(np.float32))
 
-    def share(self, x: Any) -> Any:
+    def share(self, x: mi.Vector3f) -> mi.Float:
         """Share of the ambient light that reaches points of the globe, given in the scene's frame."""
         place = dr.clip((x.y + _HALF_MM) * ((_PLACES - 1) / (2 * _HALF_MM)), 0, _PLACES - 1.001)
         i = mi.UInt32(place)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +13,15 @@ from .values import Lamp, Lights, Values
 from .view import EPSILON_MM, View, meet_sphere, opacity
 
 
-def lamp_blocked(values: Values, scene: Any, x: Any, lamp: Any, sphere: Any, cornea: Any, active: Any) -> Any:
+def lamp_blocked(
+    values: Values,
+    scene: mi.Scene,
+    x: mi.Vector3f,
+    lamp: mi.Vector3f,
+    sphere: mi.Bool,
+    cornea: mi.Bool,
+    active: mi.Bool,
+) -> mi.Bool:
     """Whether anything stands between a point of the eye frame and a lamp.
 
     `sphere`, `cornea`: lanes whose way can be barred by the globe's sphere, by the cornea's bulge.
@@ -21,9 +29,9 @@ def lamp_blocked(values: Values, scene: Any, x: Any, lamp: Any, sphere: Any, cor
     d = lamp - x
     distance = dr.norm(d)
     d /= distance
-    r = x - values["sclera.centre"]
+    r = x - values.sclera.centre
     past = r - dr.dot(r, d) * d
-    reach = values["globe.reach"]
+    reach = values.globe_reach
     blocked = dr.if_stmt(
         (x, r, d, distance, mi.Bool(sphere), mi.Bool(cornea)),
         dr.squared_norm(past) < reach * reach,
@@ -31,26 +39,28 @@ def lamp_blocked(values: Values, scene: Any, x: Any, lamp: Any, sphere: Any, cor
         lambda x, r, d, distance, sphere, cornea: mi.Bool(False),
     )
     if not values.structure.obstacles:
-        return blocked | (values.point_to_scene(lamp).x < values["backdrop.x"])
+        return blocked | (values.point_to_scene(lamp).x < values.backdrop_x)
     ray = mi.Ray3f(mi.Point3f(values.point_to_scene(x + EPSILON_MM * d)), values.vector_to_scene(d))
     ray.maxt = distance * (1 - 1e-4)
     return blocked | scene.ray_test(ray, coherent=True, active=active & ~blocked)
 
 
-def _globe_blocks(values: Values, x: Any, r: Any, d: Any, distance: Any, sphere: Any, cornea: Any) -> Any:
+def _globe_blocks(
+    values: Values, x: mi.Vector3f, r: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
+) -> mi.Bool:
     """Whether the globe stands in the way; r: the point from the sclera's centre."""
-    t, met = meet_sphere(r, d, values["sclera.radius"])
+    t, met = meet_sphere(r, d, values.sclera.radius)
     blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
     front = values.surfaces[0]
     o, dl = front.point_in(x), front.vector_in(d)
     t, met = front.hit(o, dl)
     y = o + t * dl
     rho2 = y.y * y.y + y.z * y.z
-    met &= (rho2 < values["limbus_radius"] * values["limbus_radius"]) & (y.x > values["limbus_floor"])
+    met &= (rho2 < values.limbus.radius * values.limbus.radius) & (y.x > values.limbus.floor)
     return blocked | (met & cornea & (t > EPSILON_MM) & (t < distance))
 
 
-def straight(lamp: Lamp, source: Any, view: View, back: Any = None) -> tuple[Any, Any]:
+def straight(lamp: Lamp, source: mi.Vector3f, view: View, back: mi.Vector3f | None = None) -> tuple[mi.Float, mi.Float]:
     """What a lamp gives matte points in the air when nothing stands in the way: irradiance (mW/mm^2), and the radiance
     of their sheen towards the unit direction `back` (eye frame), if it is given.
 
@@ -65,8 +75,8 @@ def straight(lamp: Lamp, source: Any, view: View, back: Any = None) -> tuple[Any
 
 
 def light(
-    values: Values, lights: Lights, scene: Any, view: View, back: Any, u: Any, v: Any
-) -> tuple[Any, Any, Any, Any]:
+    values: Values, lights: Lights, scene: mi.Scene, view: View, back: mi.Vector3f, u: mi.Float, v: mi.Float
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.UInt32]:
     """Irradiance (mW/mm^2) at the first surface where it is matte, the radiance of its sheen towards the unit direction
     `back` (eye frame), the irradiance in the plane of the iris, and failed paths.
 
@@ -84,7 +94,7 @@ def light(
         bent, failures = through_cornea(values, lights, scene, view.inner, view.lit_inside, u, v)
         return direct * share, shine * share, bent, failures
 
-    def onto_matte(lamp: Lamp, source: Any) -> Any:
+    def onto_matte(lamp: Lamp, source: mi.Vector3f) -> mi.Float:
         direct, _ = straight(lamp, source, view)
         blocked = lamp_blocked(values, scene, view.point, source, view.other, ~view.cornea, direct > 0)
         return dr.select(blocked, 0, direct)
@@ -94,8 +104,8 @@ def light(
 
 
 def through_cornea(
-    values: Values, lights: Lights, scene: Any, inner: Any, inside: Any, u: Any, v: Any
-) -> tuple[Any, Any]:
+    values: Values, lights: Lights, scene: mi.Scene, inner: mi.Vector3f, inside: mi.Bool, u: mi.Float, v: mi.Float
+) -> tuple[mi.Float, mi.UInt32]:
     """Irradiance (mW/mm^2) of all lamps at points `inner` in the plane of the iris, where `inside`; failed paths.
 
     u, v: place on each lamp's disc, [0, 1).
@@ -105,27 +115,38 @@ def through_cornea(
 
 
 def _all_lamps(
-    values: Values, lights: Lights, scene: Any, inner: Any, inside: Any, u: Any, v: Any, onto_matte: Any
-) -> tuple[Any, Any, Any]:
+    values: Values,
+    lights: Lights,
+    scene: mi.Scene,
+    inner: mi.Vector3f,
+    inside: mi.Bool,
+    u: mi.Float,
+    v: mi.Float,
+    onto_matte: Callable[[Lamp, mi.Vector3f], mi.Float] | None,
+) -> tuple[mi.Float, mi.Float, mi.UInt32]:
     """Sum over the lamps of `onto_matte` (lamp, its points) and of the irradiance behind the cornea; failed paths."""
-    n = values["stop.normal"]
+    n = values.stop.normal
     # The point's Gaussian image: where the straight line from a lamp must aim to be bent on to the point.
-    scale, shift = values["image.scale"], values["image.shift"]
+    scale, shift = values.image.scale, values.image.shift
     aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
 
     sine, cosine_v = dr.sincos(v * (2 * dr.pi))
 
-    def more(i: Any, *_: Any) -> Any:
+    def more(i: mi.UInt32, *_: object) -> mi.Bool:
         return i < lights.count
 
-    def body(i: Any, direct: Any, bent: Any, failures: Any) -> Any:
+    def body(
+        i: mi.UInt32, direct: mi.Float, bent: mi.Float, failures: mi.UInt32
+    ) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.UInt32]:
         lamp: Lamp = lights[i]
         source = lamp.point(u, sine, cosine_v)
         if onto_matte is not None:
             direct += onto_matte(lamp, source)
 
-        def bend(source: Any, inner: Any, aim: Any, bent: Any, failures: Any) -> Any:
-            path = connect(values.surfaces, source, inner, n, aim, values["limbus_radius"], inside)
+        def bend(
+            source: mi.Vector3f, inner: mi.Vector3f, aim: mi.Vector3f, bent: mi.Float, failures: mi.UInt32
+        ) -> tuple[mi.Float, mi.UInt32]:
+            path = connect(values.surfaces, source, inner, n, aim, values.limbus.radius, inside)
             local = values.surfaces[0].point_in(path.entry)
             clear = 1 - opacity(values, dr.sqrt(local.y * local.y + local.z * local.z))
             enters = path.found & (clear > 0)

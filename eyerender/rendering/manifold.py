@@ -15,7 +15,6 @@ lamps light the far side of the iris.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -38,15 +37,21 @@ class Connection:
     horizon.
     """
 
-    transfer: Any
-    entry: Any
-    leaving: Any
-    found: Any
-    failed: Any
+    transfer: mi.Float
+    entry: mi.Vector3f
+    leaving: mi.Vector3f
+    found: mi.Bool
+    failed: mi.Bool
 
 
 def connect(
-    surfaces: tuple[Surface, ...], lamp: Any, x: Any, normal: Any, aim: Any, reach: Any, active: Any
+    surfaces: tuple[Surface, ...],
+    lamp: mi.Vector3f,
+    x: mi.Vector3f,
+    normal: mi.Vector3f,
+    aim: mi.Vector3f,
+    reach: mi.Float,
+    active: mi.Bool,
 ) -> Connection:
     """Paths from `lamp` to `x` through all `surfaces`, all points in the eye frame (mm).
 
@@ -61,10 +66,12 @@ def connect(
     front = surfaces[0]
     start = _entry_guess(front, lamp, aim)
 
-    def going(y: Any, last: Any, step: Any, on: Any, *_: Any) -> Any:
+    def going(y: mi.Vector3f, last: mi.Vector3f, step: mi.UInt32, on: mi.Bool, *_: object) -> mi.Bool:
         return on
 
-    def newton(y: Any, last: Any, step: Any, on: Any, dark: Any, transfer: Any) -> Any:
+    def newton(
+        y: mi.Vector3f, last: mi.Vector3f, step: mi.UInt32, on: mi.Bool, dark: mi.Bool, transfer: mi.Float
+    ) -> tuple[mi.Vector3f, mi.Vector3f, mi.UInt32, mi.Bool, mi.Bool, mi.Float]:
         d = y - lamp
         distance = dr.norm(d)
         d /= distance
@@ -106,7 +113,7 @@ def connect(
     return Connection(transfer, y, dr.normalize(y - lamp), found, failed)
 
 
-def _entry_guess(front: Surface, lamp: Any, aim: Any) -> Any:
+def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vector3f:
     """Where the straight line to `aim` enters; where it does so under grazing incidence or misses, the point whose
     normal halves the angle between the lamp and the axis, which any lamp in front of the eye lights well."""
     d = dr.normalize(aim - lamp)

@@ -25,11 +25,11 @@ _WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
 class Panel:
     """One rectangle of the scene's frame; `right` and `up` are over the half sizes, so that |q . right| < 1 inside."""
 
-    centre: Any
-    normal: Any
-    right: Any
-    up: Any
-    radiance: Any
+    centre: mi.Vector3f
+    normal: mi.Vector3f
+    right: mi.Vector3f
+    up: mi.Vector3f
+    radiance: mi.Float
 
 
 class Panels:
@@ -40,15 +40,15 @@ class Panels:
         data = np.ascontiguousarray(table, dtype=np.float32).reshape(-1)
         self._buffer = mi.Float(data if data.size else np.zeros(_WIDTH, np.float32))
 
-    def __getitem__(self, i: Any) -> Panel:
+    def __getitem__(self, i: mi.UInt32) -> Panel:
         row = [dr.gather(mi.Float, self._buffer, i * _WIDTH + k) for k in range(_WIDTH)]
         centre, normal, right, up = (mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9))
         return Panel(centre, normal, right, up, row[12])
 
-    def radiance(self, o: Any, d: Any, active: Any) -> Any:
+    def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Radiance (mW/mm^2/sr) that rays of the scene's frame meet; panels that overlap add up."""
 
-        def met(panel: Panel) -> Any:
+        def met(panel: Panel) -> mi.Float:
             facing = -dr.dot(d, panel.normal)
             t = dr.dot(o - panel.centre, panel.normal) / dr.select(dr.abs(facing) > 1e-6, facing, 1)
             q = o + t * d - panel.centre
@@ -57,10 +57,10 @@ class Panels:
 
         return self._sum(met, mi.Float(0) * d.x, "panels")
 
-    def irradiance(self, x: Any, n: Any) -> Any:
+    def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points x with unit normals n of the scene's frame, unshadowed."""
 
-        def received(panel: Panel) -> Any:
+        def received(panel: Panel) -> mi.Float:
             right, up = panel.right / dr.squared_norm(panel.right), panel.up / dr.squared_norm(panel.up)
             middle = panel.centre - x
             seen = polygon_irradiance(
@@ -70,17 +70,17 @@ class Panels:
 
         return self._sum(received, mi.Float(0) * n.x, "panel light")
 
-    def _sum(self, share: Callable[[Panel], Any], zero: Any, label: str) -> Any:
-        def more(i: Any, *_: Any) -> Any:
+    def _sum(self, share: Callable[[Panel], mi.Float], zero: mi.Float, label: str) -> mi.Float:
+        def more(i: mi.UInt32, *_: object) -> mi.Bool:
             return i < self.count
 
-        def body(i: Any, total: Any) -> Any:
+        def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             return i + 1, total + share(self[i])
 
         return dr.while_loop((mi.UInt32(0), zero), more, body, labels=("i", "total"), label=label)[1]
 
 
-def polygon_irradiance(corners: list[Any], n: Any) -> Any:
+def polygon_irradiance(corners: list[mi.Vector3f], n: mi.Vector3f) -> mi.Float:
     """Irradiance per radiance of a convex polygon, its corners given from the lit point, on a surface of normal n.
 
     What lies below the horizon is cut off: the edges' parts above it and the arc of the horizon between them remain.
@@ -99,7 +99,7 @@ def polygon_irradiance(corners: list[Any], n: Any) -> Any:
     return 0.5 * dr.abs(total)
 
 
-def _arc(a: Any, b: Any, n: Any) -> Any:
+def _arc(a: mi.Vector3f, b: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
     """The angle between two directions times n . unit(a x b)."""
     c = dr.cross(a, b)
     s = dr.norm(c)

@@ -24,6 +24,7 @@ from ..region.head import file_states
 from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh
 from ..region.skin import skin_map
 from .surround import clear_between, rays_between
+from .values import aligned
 
 _F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, about the same (n 1.40 and 1.33)
 _ROUGH_SKIN, _ROUGH_WET = 0.19, 0.04
@@ -67,9 +68,8 @@ class RegionScene:
         self.scene = mi.load_dict(parts)
         self._params: Any = mi.traverse(self.scene)
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
-        look = texture(
-            mi.TensorXf16(self._look(spec).astype(np.float16)), use_accel=False, wrap_mode=dr.WrapMode.Repeat
-        )
+        pixels = aligned(self._look(spec).astype(np.float16))
+        look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         moving = next((s for s in self.scene.shapes() if s.id() == "shown_moving"), None)
         self.skin = Skin(look, layout, faces, moving, -1.0 if globe.mirrored else 1.0)
         self.skin.pose(posed)
@@ -113,11 +113,11 @@ class RegionScene:
         return clear_between(self.scene, a, b)
 
 
-def _floats(values: Floats) -> Any:
+def _floats(values: Floats) -> mi.Float:
     return mi.Float(values.astype(np.float32).ravel())
 
 
-def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> Any:
+def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
     """Some of the triangles."""
     corners, triangles = posed.vertices[vertices], posed.layout.faces[faces] - (vertices.start or 0)
     mesh = mi.Mesh("region", len(corners), len(triangles))
@@ -128,7 +128,7 @@ def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> Any:
     return mesh
 
 
-def _instance(name: str, mesh: Any) -> dict[str, Any]:
+def _instance(name: str, mesh: mi.Mesh) -> dict[str, Any]:
     """A mesh as a group of its own, and the group's only instance."""
     group = {"type": "shapegroup", "mesh": mesh}
     return {name: group, f"shown_{name}": {"type": "instance", "of": {"type": "ref", "id": name}}}
@@ -138,20 +138,22 @@ def _instance(name: str, mesh: Any) -> dict[str, Any]:
 class Surface:
     """What is known of points of the region: place, shading normal (scene's frame), albedo, gloss."""
 
-    point: Any
-    normal: Any
-    albedo: Any
-    gloss: Any
+    point: mi.Vector3f
+    normal: mi.Vector3f
+    albedo: mi.Float
+    gloss: mi.Float
 
 
 class Skin:
     """A posed region as kernels read it: the corners of its triangles, and the map."""
 
-    def __init__(self, look: Any, layout: RegionLayout, moving: int, instance: Any, mirror: float) -> None:
+    def __init__(
+        self, look: mi.Texture2f, layout: RegionLayout, moving: int, instance: mi.Shape | None, mirror: float
+    ) -> None:
         self._map = look
         corners = np.zeros((len(layout.faces), 4), np.uint32)  # of four, which are gathered together
         corners[:, :3] = layout.faces
-        self._corners = mi.UInt32(corners.ravel())
+        self._corners = mi.UInt32(aligned(corners.ravel()))
         self._records = np.zeros((len(layout.uv), 8), np.float32)
         self._records[:, 3], self._records[:, 7] = layout.uv.T
         self._buffer = mi.Float(0)
@@ -162,17 +164,17 @@ class Skin:
     def pose(self, posed: RegionMesh) -> None:
         """Bring the corners to a pose."""
         self._records[:, 0:3], self._records[:, 4:7] = posed.vertices, posed.normals
-        self._buffer = mi.Float(self._records.ravel().copy())
+        self._buffer = mi.Float(aligned(self._records.ravel()))
 
-    def face(self, hit: Any) -> Any:
+    def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
         """Which of the layout's triangles was hit."""
         return hit.prim_index + dr.select(hit.instance == self._moving, 0, self._first_still)
 
-    def on_sheet(self, face: Any) -> Any:
+    def on_sheet(self, face: mi.UInt32) -> mi.Bool:
         """Whether a triangle belongs to the sheet of skin, not to what stands before it."""
         return face < self._sheet
 
-    def surface(self, face: Any, uv: Any, active: Any) -> Surface:
+    def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Surface:
         """The surface at barycentric coordinates `uv` of triangles.
 
         The relief tilts the normal n by its slope g over the tangent plane: n - (g - n (n . g)).
@@ -199,7 +201,7 @@ def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:
     return [place.parts[int(w)] if v else None for v, w in zip(valid.numpy(), which, strict=True)]
 
 
-def sheen(normal: Any, to_lamp: Any, to_camera: Any, gloss: Any) -> Any:
+def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, gloss: mi.Float) -> mi.Float:
     """Mirror-like reflectance f (1/sr) of skin (gloss below 0.5) and of wet tissue (above).
 
         f = w D F / (4 (l . h)^2),  D = a^2 / (pi ((n . h)^2 (a^2 - 1) + 1)^2)
@@ -220,19 +222,19 @@ def sheen(normal: Any, to_lamp: Any, to_camera: Any, gloss: Any) -> Any:
     return weight * D * _schlick(lh) * 0.25 / (lh * lh)
 
 
-def film_normal(normal: Any) -> Any:
+def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
     """The normal of the film of tears (eye frame): the conjunctiva under it is uneven, and its highlights break up."""
     p, q = 71 * normal.y + 23 * normal.z, 67 * normal.z - 29 * normal.y
     ripple = _RIPPLE * mi.Vector3f(0, dr.sin(p + 1.7 * dr.sin(q)), dr.sin(q + 1.7 * dr.sin(p)))
     return dr.normalize(normal + ripple)
 
 
-def film_reflectance(cosine: Any, gloss: Any) -> Any:
+def film_reflectance(cosine: mi.Float, gloss: mi.Float) -> mi.Float:
     """What the film of wet tissue mirrors of light from wide surroundings."""
     return (2 * gloss - 1) * _schlick(dr.clip(cosine, 0, 1))
 
 
-def _schlick(cosine: Any) -> Any:
+def _schlick(cosine: mi.Float) -> mi.Float:
     s = 1 - cosine
     s2 = s * s
     return _F0 + (1 - _F0) * s2 * s2 * s

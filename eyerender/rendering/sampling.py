@@ -51,7 +51,7 @@ def lattice_generator(count: int) -> int:
 class Samples:
     """The `count` samples of every pixel of a frame, for lanes with a place on the sensor (`pixel`)."""
 
-    def __init__(self, pixel: Any, count: int, seed: int, calls: int = 3) -> None:
+    def __init__(self, pixel: mi.UInt32, count: int, seed: int, calls: int = 3) -> None:
         self.pixel = pixel
         self._n, self._a = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, lattice_generator(count))
         self._keys = [
@@ -59,12 +59,12 @@ class Samples:
             for call in range(calls)
         ]
 
-    def in_pixel(self, k: Any) -> Any:
+    def in_pixel(self, k: mi.UInt32) -> mi.Point2f:
         """Place of sample `k` in the pixel, [0, 1)^2."""
         scale = dr.rcp(mi.Float(self._n))
         return mi.Point2f((mi.Float(k) + 0.5) * scale, (mi.Float((k * self._a) % self._n) + 0.5) * scale)
 
-    def pair(self, k: Any, call: int) -> Any:
+    def pair(self, k: mi.UInt32, call: int) -> mi.Point2f:
         """Two further numbers of sample `k`, [0, 1)^2: each call of a pixel has a shift of its own."""
         tea: Any = mi.sample_tea_32
         return mi.Point2f(
@@ -78,24 +78,24 @@ class Samples:
 class Sampler:
     """Sample `k` as Mitsuba's integrators ask for it."""
 
-    def __init__(self, samples: Samples, k: Any) -> None:
+    def __init__(self, samples: Samples, k: mi.UInt32) -> None:
         self._samples, self._k, self._calls = samples, k, 0
 
-    def next_2d(self, active: Any = True) -> Any:
+    def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
         """The next pair, [0, 1)^2."""
         del active
         self._calls += 1
         return self._samples.pair(self._k, self._calls - 1)
 
 
-def camera_ray(values: Values, u: Any, v: Any) -> tuple[Any, Any, Any]:
+def camera_ray(values: Values, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
     """Ray of the scene's frame through pixel (u, v), centres at integers: origin, unit direction, cos to the axis."""
-    fx, fy = values["camera.focal"]
-    cx, cy = values["camera.principal"]
+    fx, fy = values.camera.focal
+    cx, cy = values.camera.principal
     xd, yd = (u - cx) / fx, (v - cy) / fy
     x, y = mi.Float(xd), mi.Float(yd)
     if values.structure.distorted:
-        k1, k2, p1, p2, k3 = values["camera.distortion"]
+        k1, k2, p1, p2, k3 = values.camera.distortion
         for _ in range(_UNDISTORT_STEPS):
             r2 = x * x + y * y
             radial = dr.rcp(1 + r2 * (k1 + r2 * (k2 + r2 * k3)))
@@ -103,6 +103,6 @@ def camera_ray(values: Values, u: Any, v: Any) -> tuple[Any, Any, Any]:
                 (xd - (2 * p1 * x * y + p2 * (r2 + 2 * x * x))) * radial,
                 (yd - (p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)) * radial,
             )
-    d = values["camera.right"] * x + values["camera.down"] * y + values["camera.forward"]
+    d = values.camera.right * x + values.camera.down * y + values.camera.forward
     inv = dr.rsqrt(dr.squared_norm(d))
-    return values["camera.centre"], d * inv, inv
+    return values.camera.centre, d * inv, inv

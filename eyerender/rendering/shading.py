@@ -9,7 +9,6 @@ lit directly.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,14 +25,22 @@ _THROUGH = 0.7  # share of the outer hemisphere that the iris sees, times transm
 class Shaded:
     """What a ray sees: radiance (mW/mm^2/sr), what it met, the albedo there where it is matte, failed light paths."""
 
-    radiance: Any
+    radiance: mi.Float
     view: View
-    albedo: Any
-    failures: Any
+    albedo: mi.Float
+    failures: mi.UInt32
 
 
 def shade(
-    values: Values, lights: Lights, textures: Textures, scene: Any, o: Any, d: Any, active: Any, u: Any, v: Any
+    values: Values,
+    lights: Lights,
+    textures: Textures,
+    scene: mi.Scene,
+    o: mi.Vector3f,
+    d: mi.Vector3f,
+    active: mi.Bool,
+    u: mi.Float,
+    v: mi.Float,
 ) -> Shaded:
     """Radiance along rays of the scene's frame by light that comes from the lamps on the shortest way.
 
@@ -46,25 +53,30 @@ def shade(
     return Shaded(seen, view, albedo, failures)
 
 
-def direct(view: View, albedo: Any, outer: Any, shine: Any) -> Any:
+def direct(view: View, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
     """Radiance by the lamps' light on matte surfaces: of their irradiance, and of their sheen."""
     cover = dr.select(view.cornea, view.opacity, 1)
     return dr.select(view.met, cover * (albedo * outer * dr.inv_pi + shine), 0)
 
 
-def indirect(values: Values, textures: Textures, scene: Any, view: View, d: Any, albedo: Any, inner: Any) -> Any:
+def indirect(
+    values: Values, textures: Textures, scene: mi.Scene, view: View, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float
+) -> mi.Float:
     """Radiance but for that; `inner` is the lamps' irradiance in the plane of the iris."""
     rest = mi.Float(0)
-    index = values["inner_index"]
+    index = values.inner_index
     if values.structure.ambient:
+        ambience = textures.ambience
+        assert ambience is not None
         # Even light from all sides; through the cornea the iris sees n^2 times its radiance in a smaller cone.
         cover = dr.select(view.cornea, view.opacity, 1)
         scene_of = values.point_to_scene
-        axis = values.vector_to_scene(values["stop.normal"])
-        even = textures.ambience.irradiance(scene_of(view.point), values.vector_to_scene(view.normal))
-        within = textures.ambience.irradiance(scene_of(view.inner), axis) * _THROUGH * index * index
+        axis = values.vector_to_scene(values.stop.normal)
+        even = ambience.irradiance(scene_of(view.point), values.vector_to_scene(view.normal))
+        within = ambience.irradiance(scene_of(view.inner), axis) * _THROUGH * index * index
         if values.structure.region:
-            reaching = textures.ambience.lids.share(scene_of(view.point))
+            assert ambience.lids is not None
+            reaching = ambience.lids.share(scene_of(view.point))
             # Of the region only what is wet lies between the lids.
             even *= 1 - dr.clip(10 * view.gloss - 4.5, 0, 1) * (1 - reaching)
             within *= reaching
@@ -75,14 +87,16 @@ def indirect(values: Values, textures: Textures, scene: Any, view: View, d: Any,
         (view.inner,),
         view.cornea & ~view.pupil,
         lambda inner: iris_albedo(values, textures, inner),
-        lambda inner: mi.Float(values["pupil.albedo"]),
+        lambda inner: mi.Float(values.pupil_albedo),
     )
     through = (1 - view.opacity) * view.passed * behind * inner * dr.inv_pi / (index * index)
     rest += dr.select(view.cornea, through, 0)
     return dr.select(view.met, rest, 0)
 
 
-def _mirrored(values: Values, textures: Textures, scene: Any, view: View, d: Any, clear: Any) -> Any:
+def _mirrored(
+    values: Values, textures: Textures, scene: mi.Scene, view: View, d: mi.Vector3f, clear: mi.Float
+) -> mi.Float:
     """Radiance of the ambient light that wet surfaces mirror to the camera: the front cornea where it is `clear`, the
     film of tears elsewhere."""
     back = -values.vector_to_eye(d)
@@ -93,10 +107,11 @@ def _mirrored(values: Values, textures: Textures, scene: Any, view: View, d: Any
         normal = dr.select(film, film_normal(view.normal), view.normal)
         share = dr.select(film, film_reflectance(dr.dot(normal, back), view.gloss), share)
         wet |= film
+    assert textures.ambience is not None
     normal = values.vector_to_scene(normal)
     way = d - 2 * dr.dot(d, normal) * normal
     start = values.point_to_scene(view.point) + EPSILON_MM * normal
-    seen = values["ambient.irradiance"] * dr.inv_pi + textures.ambience.radiance(start, way, wet)
+    seen = values.ambient_irradiance * dr.inv_pi + textures.ambience.radiance(start, way, wet)
     if values.structure.obstacles:
         barred = scene.ray_test(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet)
         seen = dr.select(barred, 0, seen)

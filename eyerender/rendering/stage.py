@@ -8,23 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import frozen
+from ..arrays import Bools, frozen
 from ..errors import InputError
 from ..rig.imaging import AmbientSpec
 from .environment import Ambience, Maps
 from .film import Exposed, Window
-from .frame import (
-    RenderJob,
-    ambient_numbers,
-    camera_numbers,
-    eye_numbers,
-    kinds,
-    light_table,
-    look_numbers,
-    margin_waves,
-    panel_table,
-    pose_numbers,
-)
+from .frame import RenderJob, boundary_waves, kinds, light_table, panel_table, parameters_of
 from .head import place_scene
 from .lidshade import LidShade
 from .plain import plain_tiles
@@ -58,14 +47,7 @@ class Stage:
             job.ambient != AmbientSpec(),
         )
         anchor = job.anchor_mm
-        numbers = {
-            **eye_numbers(job.eye),
-            **look_numbers(job.look),
-            **pose_numbers(job.M, job.t, anchor),
-            **camera_numbers(job.camera, anchor),
-            **ambient_numbers(job.ambient),
-        }
-        values = Values(structure, structure.pack(numbers), margin_waves(job.eye))
+        values = Values(structure, parameters_of(job), boundary_waves(job.eye))
         lights = Lights(light_table(job.lights, job.M, job.t))
         textures = self._textures_of(job)
         if structure.ambient:
@@ -76,7 +58,7 @@ class Stage:
             ambience = Ambience(even, panel_table(job.ambient, anchor), job.ambient.map, self._maps, lids)
             textures = replace(textures, ambience=ambience)
 
-        def plain(window: Window) -> Any:
+        def plain(window: Window) -> tuple[Bools, int]:
             if region is None:
                 return _NOTHING_PLAIN, max(window[2:])
             return plain_tiles(region.posed, job.camera, anchor, window)

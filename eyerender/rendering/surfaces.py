@@ -11,58 +11,60 @@ Lengths are in mm. The differentials follow Igehy (1999), 'Tracing ray different
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+_SETTLED_MM = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
     """A ray (point y, unit direction w) with two differentials (da, db of the point; wa, wb of the direction)."""
 
-    y: Any
-    w: Any
-    da: Any
-    db: Any
-    wa: Any
-    wb: Any
+    y: mi.Vector3f
+    w: mi.Vector3f
+    da: mi.Vector3f
+    db: mi.Vector3f
+    wa: mi.Vector3f
+    wb: mi.Vector3f
 
 
 @dataclass(frozen=True, slots=True)
 class Surface:
     """One refracting surface; every number is a Dr.Jit array of size one.
 
-    `rows` are the unit axes of the surface's frame in the eye frame, or None where they are the eye's own. `shape` is
+    `axes` are the unit axes of the surface's frame in the eye frame, or None if they are the eye's own. `shape` is
     (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic. `eta` is the index before over the index
     behind, for light that enters the eye.
     """
 
-    origin: Any
-    rows: tuple[Any, Any, Any] | None
-    shape: tuple[Any, ...]
-    eta: Any
+    origin: mi.Vector3f
+    axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f] | None
+    shape: tuple[mi.Float, ...]
+    eta: mi.Float
     biconic: bool
 
-    def point_in(self, x: Any) -> Any:
+    def point_in(self, x: mi.Vector3f) -> mi.Vector3f:
         """A point of the eye frame in the surface's frame."""
         return self.vector_in(x - self.origin)
 
-    def vector_in(self, v: Any) -> Any:
+    def vector_in(self, v: mi.Vector3f) -> mi.Vector3f:
         """A direction of the eye frame in the surface's frame."""
-        if self.rows is None:
+        if self.axes is None:
             return v
-        return mi.Vector3f(*(dr.dot(row, v) for row in self.rows))
+        return mi.Vector3f(*(dr.dot(axis, v) for axis in self.axes))
 
-    def vector_out(self, v: Any) -> Any:
+    def vector_out(self, v: mi.Vector3f) -> mi.Vector3f:
         """A direction of the surface's frame in the eye frame."""
-        if self.rows is None:
+        if self.axes is None:
             return v
-        a, b, c = self.rows
+        a, b, c = self.axes
         return a * v.x + b * v.y + c * v.z
 
-    def hit(self, o: Any, d: Any) -> tuple[Any, Any]:
+    def hit(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool]:
         """Distance to where a ray from outside enters, and whether it does; in the surface's frame.
 
         The origin must stand within some centimetres, or single precision costs more than a micrometre.
@@ -83,16 +85,18 @@ class Surface:
         if self.biconic:
             for _ in range(3):
                 value, slope = self._sag_form(o + t * d)
-                t -= value / dr.dot(slope, d)
-            ok &= dr.isfinite(t)
+                step = value / dr.dot(slope, d)
+                t -= step
+            # A ray that meets the quadric and just misses the biconic jumps to and fro by centimetres.
+            ok &= dr.abs(step) < _SETTLED_MM
         return t, ok
 
-    def _sag_form(self, x: Any) -> tuple[Any, Any]:
+    def _sag_form(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f]:
         """The biconic's F = x + g(y, z) and its gradient."""
         g, gy, gz, *_ = self._sag(x.y, x.z)
         return x.x + g, mi.Vector3f(1, gy, gz)
 
-    def _sag(self, y: Any, z: Any) -> tuple[Any, ...]:
+    def _sag(self, y: mi.Float, z: mi.Float) -> tuple[mi.Float, ...]:
         """g, its two first and three second derivatives (yy, yz, zz)."""
         Ry, Rz, py, pz, _ = self.shape
         cy, cz = 1 / Ry, 1 / Rz
@@ -110,35 +114,35 @@ class Surface:
         gyz = (-gz * ry - gy * rz - g * ryz) * k
         return g, gy, gz, gyy, gyz, gzz
 
-    def normal(self, x: Any) -> Any:
+    def normal(self, x: mi.Vector3f) -> mi.Vector3f:
         """Outward unit normal at a point of the surface, in the surface's frame."""
         return dr.normalize(self._gradient(x))
 
-    def _gradient(self, x: Any) -> Any:
+    def _gradient(self, x: mi.Vector3f) -> mi.Vector3f:
         if self.biconic:
             return self._sag_form(x)[1]
         ax, ay, az, b, _ = self.shape
         return mi.Vector3f(ax * x.x + b, ay * x.y, az * x.z)
 
-    def _normal_form(self, x: Any) -> tuple[Any, Any, Any]:
+    def _normal_form(self, x: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float, Callable[[mi.Vector3f], mi.Vector3f]]:
         """Outward unit normal, inverse length of the gradient, and the Hessian as a function of a vector."""
         if self.biconic:
             _, gy, gz, gyy, gyz, gzz = self._sag(x.y, x.z)
             G = mi.Vector3f(1, gy, gz)
 
-            def hessian(v: Any) -> Any:
+            def hessian(v: mi.Vector3f) -> mi.Vector3f:
                 return mi.Vector3f(0, gyy * v.y + gyz * v.z, gyz * v.y + gzz * v.z)
         else:
             ax, ay, az, *_ = self.shape
             G = self._gradient(x)
 
-            def hessian(v: Any) -> Any:
+            def hessian(v: mi.Vector3f) -> mi.Vector3f:
                 return mi.Vector3f(ax * v.x, ay * v.y, az * v.z)
 
         inv = dr.rsqrt(dr.squared_norm(G))
         return G * inv, inv, hessian
 
-    def refract(self, o: Any, d: Any) -> tuple[Any, Any, Any, Any]:
+    def refract(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Bool]:
         """Enter the eye along a ray of the eye frame: hit point, direction behind, transmittance 1 - F, and success."""
         ol, dl = self.point_in(o), self.vector_in(d)
         t, ok = self.hit(ol, dl)
@@ -149,7 +153,7 @@ class Surface:
         w = self.eta * dl + (self.eta * c - c2) * N
         return o + t * d, self.vector_out(w), 1 - fresnel(c, c2, self.eta), ok & (c > 0)
 
-    def on_surface(self, x: Any) -> Any:
+    def on_surface(self, x: mi.Vector3f) -> mi.Vector3f:
         """The point of the surface (eye frame) over the same local (y, z) as a point near it."""
         l = self.point_in(x)
         if self.biconic:
@@ -161,13 +165,13 @@ class Surface:
         # Single precision: the change is small, the point is not.
         return x + self.vector_out(mi.Vector3f(sag - l.x, 0, 0))
 
-    def refract_bundle(self, b: Bundle) -> tuple[Bundle, Any, Any]:
+    def refract_bundle(self, b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
         """Enter the eye with ray differentials: the bundle behind, the transmittance 1 - F, and success."""
         t, ok = self.hit(self.point_in(b.y), self.vector_in(b.w))
         out, share, c = self.bend(Bundle(b.y + t * b.w, b.w, b.da + t * b.wa, b.db + t * b.wb, b.wa, b.wb))
         return out, share, ok & (c > 1e-4)
 
-    def bend(self, b: Bundle) -> tuple[Bundle, Any, Any]:
+    def bend(self, b: Bundle) -> tuple[Bundle, mi.Float, mi.Float]:
         """Refract a bundle whose ray has reached the surface: the bundle behind, 1 - F, and the cosine of incidence."""
         d = self.vector_in(b.w)
         N, inv, hessian = self._normal_form(self.point_in(b.y))
@@ -188,7 +192,7 @@ class Surface:
         return Bundle(b.y, self.vector_out(w), *moved, *turned), 1 - fresnel(c, c2, self.eta), c
 
 
-def fresnel(c1: Any, c2: Any, eta: Any) -> Any:
+def fresnel(c1: mi.Float, c2: mi.Float, eta: mi.Float) -> mi.Float:
     """Unpolarised Fresnel reflectance of a dielectric: cosines before and behind, eta = n_before / n_behind.
 
     F = (rs^2 + rp^2) / 2,  rs = (eta c1 - c2) / (eta c1 + c2),  rp = (c1 - eta c2) / (c1 + eta c2)   (Born & Wolf 1.5)

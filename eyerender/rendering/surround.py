@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats
+from ..arrays import ArrayValue, Bools, Floats, Ints
 from ..region.look import LookSpec
 from ..region.texture import skin_texture
 
@@ -65,18 +65,18 @@ class Surround:
         return clear_between(self.scene, a, b)
 
     @staticmethod
-    def _backdrop() -> Any:
+    def _backdrop() -> mi.Mesh:
         uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (2 * _HALF_MM / _TILE_MM)
         material = _matte(mi.TensorXf(np.full((2, 2, 1), 0.4, np.float32)))
         return _mesh("backdrop", _corners(10.0), np.array([[0, 1, 2], [0, 2, 3]]), uv, material)
 
 
-def clear_between(scene: Any, a: Floats, b: Floats) -> Bools:
+def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:
     """Whether nothing of a Mitsuba scene stands between points (n, 3) of its frame; ends not included."""
     return ~np.asarray(scene.ray_test(rays_between(a, b)).numpy(), dtype=bool)
 
 
-def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> Any:
+def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> mi.Ray3f:
     """Rays from points (n, 3) towards points b, both ends left out by `margin_mm`."""
     length = np.linalg.norm(b - a, axis=-1)
     d = (b - a) / length[:, None]
@@ -85,7 +85,7 @@ def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> Any:
     buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 7
     o = [dr.gather(mi.Float, buffer, row + k) for k in range(7)]
     ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:6]))
-    ray.maxt = o[6]  # type: ignore[assignment]
+    ray.maxt = o[6]
     return ray
 
 
@@ -94,12 +94,12 @@ def _corners(distance_mm: float) -> Floats:
     return np.array([[-distance_mm, y, z] for y, z in ((-h, -h), (h, -h), (h, h), (-h, h))])
 
 
-def _matte(data: Any) -> dict[str, Any]:
+def _matte(data: mi.TensorXf) -> dict[str, Any]:
     """A diffuse material; the integrator reads its albedo and turns normals to the viewer, so both sides are matte."""
     return {"type": "diffuse", "reflectance": {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "repeat"}}
 
 
-def _mesh(name: str, vertices: Floats, faces: Any, uv: Floats | None, material: dict[str, Any]) -> Any:
+def _mesh(name: str, vertices: Floats, faces: Ints, uv: Floats | None, material: dict[str, Any]) -> mi.Mesh:
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(material)
     mesh = mi.Mesh(name, len(vertices), len(faces), props=props, has_vertex_texcoords=uv is not None)

@@ -1,23 +1,37 @@
-"""The numbers of a frame, packed on the host and laid out as opaque Dr.Jit arrays of size one.
+"""The parameters of a frame on the device, as opaque Dr.Jit arrays of size one.
 
-A literal that changes between frames would be compiled into the kernel; everything that can change goes through here.
-What shapes the kernel (the kinds of surfaces, whether the lens distorts) is the `Structure`.
+A literal that changes between frames would be compiled into the kernel, so everything that can change goes through
+here. What shapes the kernel (the kinds of surfaces, whether the lens distorts) is the `Structure`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
+from .parameters import Parameters, packed, rebuilt
 from .surfaces import Surface
 
+_ALIGNMENT = 64  # bytes; the widest vector of a processor
 LIGHT_WIDTH = 10  # position 3, axis 3, radius, intensity, lobe exponent, inner radius
+
+
+def aligned(values: NDArray[Any]) -> NDArray[Any]:
+    """A copy that starts at a multiple of 64 bytes.
+
+    Dr.Jit shares NumPy's memory. It gathers several numbers at once only from memory that is aligned, so without this
+    the place of an allocation would decide which kernel a frame is compiled to.
+    """
+    memory = np.empty(values.nbytes + _ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % _ALIGNMENT
+    copy = memory[start : start + values.nbytes].view(values.dtype).reshape(values.shape)
+    copy[...] = values
+    return copy
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,116 +46,62 @@ class Structure:
     region: bool = False
     ambient: bool = False
 
-    @property
-    def layout(self) -> tuple[tuple[str, int], ...]:
-        """Names and sizes of the packed numbers."""
-        rows: list[tuple[str, int]] = []
-        for i, (_, tilted) in enumerate(self.surfaces):
-            rows += [(f"s{i}.origin", 3), (f"s{i}.shape", 5), (f"s{i}.eta", 1)]
-            if tilted:
-                rows += [(f"s{i}.row{k}", 3) for k in range(3)]
-        rows += [
-            ("inner_index", 1),
-            ("stop.centre", 3),
-            ("stop.normal", 3),
-            ("stop.u", 3),
-            ("stop.v", 3),
-            ("stop.axes", 2),
-            ("iris_root", 1),
-            ("limbus_radius", 1),
-            ("limbus_floor", 1),
-            ("limbus_width", 1),
-            ("limbus_gain", 1),
-            ("sclera.centre", 3),
-            ("sclera.radius", 1),
-            ("globe.reach", 1),
-            ("image.scale", 1),
-            ("image.shift", 1),
-            ("pose.col0", 3),
-            ("pose.col1", 3),
-            ("pose.col2", 3),
-            ("pose.shift", 3),
-            ("camera.centre", 3),
-            ("camera.right", 3),
-            ("camera.down", 3),
-            ("camera.forward", 3),
-            ("camera.focal", 2),
-            ("camera.principal", 2),
-            ("camera.distortion", 5),
-            ("iris.albedo", 1),
-            ("iris.contrast", 1),
-            ("pupil.albedo", 1),
-            ("sclera.albedo", 1),
-            ("sclera.contrast", 1),
-            ("limbus.albedo", 1),
-            ("backdrop.x", 1),
-            ("ambient.irradiance", 1),
-        ]
-        return tuple(rows)
-
-    def pack(self, numbers: Mapping[str, ArrayLike]) -> np.ndarray[Any, np.dtype[np.float32]]:
-        """The numbers as one vector in the order of the layout."""
-        parts = []
-        for name, size in self.layout:
-            part = np.asarray(numbers[name], dtype=np.float64).reshape(-1)
-            if part.size != size:
-                raise ValueError(f"{name} has {part.size} numbers, not {size}")
-            parts.append(part)
-        return np.concatenate(parts).astype(np.float32)
-
 
 class Values:
-    """The packed numbers on the device: `values["stop.centre"]` is a Float, a Vector3f or a tuple of Floats; `margin`
-    is the pupil's."""
+    """The parameters of a frame on the device, and the shape of the pupil's boundary (`boundary`)."""
 
     def __init__(
         self,
         structure: Structure,
-        packed: np.ndarray[Any, np.dtype[np.float32]],
+        parameters: Parameters,
         waves: np.ndarray[Any, np.dtype[np.float64]],
     ) -> None:
-        buffer = mi.Float(packed)
-        scalars = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in range(packed.size)]
+        numbers = packed(parameters)
+        buffer = mi.Float(numbers)
+        scalars = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in range(numbers.size)]
         dr.eval(scalars)
+        left = iter(scalars)
+
+        def leaf(size: int) -> mi.Float | mi.Vector3f | tuple[mi.Float, ...]:
+            part = [next(left) for _ in range(size)]
+            return part[0] if size == 1 else mi.Vector3f(*part) if size == 3 else tuple(part)
+
+        found = rebuilt(parameters, leaf)
         self.structure = structure
-        self.margin = Margin(waves)
-        self._items: dict[str, Any] = {}
-        at = 0
-        for name, size in structure.layout:
-            part = scalars[at : at + size]
-            at += size
-            self._items[name] = part[0] if size == 1 else mi.Vector3f(*part) if size == 3 else tuple(part)
-        self.surfaces = tuple(self._surface(i, *kind) for i, kind in enumerate(structure.surfaces))
+        self.boundary = PupilBoundary(waves)
+        self.surfaces = tuple(
+            Surface(one.origin, one.axes, one.shape, one.eta, biconic)
+            for one, (biconic, _) in zip(found.surfaces, structure.surfaces, strict=True)
+        )
+        self.stop, self.iris, self.limbus, self.sclera = found.stop, found.iris, found.limbus, found.sclera
+        self.image, self.pose, self.camera = found.image, found.pose, found.camera
+        self.inner_index, self.pupil_albedo = found.inner_index, found.pupil_albedo
+        self.globe_reach, self.backdrop_x = found.globe_reach, found.backdrop_x
+        self.ambient_irradiance = found.ambient_irradiance
 
-    def __getitem__(self, name: str) -> Any:
-        return self._items[name]
-
-    def _surface(self, i: int, biconic: bool, tilted: bool) -> Surface:
-        rows = (self[f"s{i}.row0"], self[f"s{i}.row1"], self[f"s{i}.row2"]) if tilted else None
-        return Surface(self[f"s{i}.origin"], rows, self[f"s{i}.shape"], self[f"s{i}.eta"], biconic)
-
-    def point_to_eye(self, x: Any) -> Any:
+    def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
         """A point of the scene's frame in the eye frame: M^T (x - t)."""
-        return self.vector_to_eye(x - self["pose.shift"])
+        return self.vector_to_eye(x - self.pose.shift)
 
-    def vector_to_eye(self, v: Any) -> Any:
+    def vector_to_eye(self, v: mi.Vector3f) -> mi.Vector3f:
         """A direction of the scene's frame in the eye frame: M^T v."""
-        return mi.Vector3f(*(dr.dot(self[f"pose.col{k}"], v) for k in range(3)))
+        return mi.Vector3f(*(dr.dot(column, v) for column in self.pose.columns))
 
-    def vector_to_scene(self, v: Any) -> Any:
+    def vector_to_scene(self, v: mi.Vector3f) -> mi.Vector3f:
         """A direction of the eye frame in the scene's frame: M v."""
-        return self["pose.col0"] * v.x + self["pose.col1"] * v.y + self["pose.col2"] * v.z
+        a, b, c = self.pose.columns
+        return a * v.x + b * v.y + c * v.z
 
-    def point_to_scene(self, x: Any) -> Any:
+    def point_to_scene(self, x: mi.Vector3f) -> mi.Vector3f:
         """A point of the eye frame in the scene's frame: M x + t."""
-        return self.vector_to_scene(x) + self["pose.shift"]
+        return self.vector_to_scene(x) + self.pose.shift
 
 
-HARMONICS = 32  # of the pupil's margin at most
+HARMONICS = 32  # of the pupil's boundary, at most
 
 
-class Margin:
-    """The pupil's margin: relative radius r(f) = 1 + Re sum_k z_k e^(i k f), f the angle in the stop's plane.
+class PupilBoundary:
+    """The pupil's boundary: relative radius r(f) = 1 + Re sum_k z_k e^(i k f), f the angle in the stop's plane.
 
     `waves` (n, 2) are the z_k = c_k - i s_k, k from 1, as pairs. An ellipse has none, and costs nothing.
     """
@@ -152,15 +112,15 @@ class Margin:
         table[: len(waves)] = waves
         self._buffer = mi.Float(table.ravel())
 
-    def radius(self, x: Any, y: Any) -> Any:
+    def radius(self, x: mi.Float, y: mi.Float) -> mi.Float:
         """r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
         inv = dr.rsqrt(dr.maximum(x * x + y * y, 1e-12))
         c, s = x * inv, y * inv
 
-        def more(k: Any, *_: Any) -> Any:
+        def more(k: mi.UInt32, *_: object) -> mi.Bool:
             return k > 0
 
-        def body(k: Any, re: Any, im: Any) -> Any:
+        def body(k: mi.UInt32, re: mi.Float, im: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
             k = k - 1
             re = re + dr.gather(mi.Float, self._buffer, 2 * k)
             im = im + dr.gather(mi.Float, self._buffer, 2 * k + 1)
@@ -181,7 +141,7 @@ class Lights:
     def __len__(self) -> int:
         return self._len
 
-    def __getitem__(self, i: Any) -> Any:
+    def __getitem__(self, i: mi.UInt32) -> Lamp:
         base = i * LIGHT_WIDTH
         row = [dr.gather(mi.Float, self._buffer, base + k) for k in range(LIGHT_WIDTH)]
         return Lamp(mi.Vector3f(*row[0:3]), mi.Vector3f(*row[3:6]), *row[6:10])
@@ -191,21 +151,21 @@ class Lights:
 class Lamp:
     """One LED on the device: I(w) = intensity * max(0, cos)^exponent, from an annulus of points across its axis."""
 
-    position: Any
-    axis: Any
-    radius: Any
-    intensity: Any
-    exponent: Any
-    inner_radius: Any
+    position: mi.Vector3f
+    axis: mi.Vector3f
+    radius: mi.Float
+    intensity: mi.Float
+    exponent: mi.Float
+    inner_radius: mi.Float
 
-    def point(self, u: Any, sine: Any, cosine: Any) -> Any:
+    def point(self, u: mi.Float, sine: mi.Float, cosine: mi.Float) -> mi.Vector3f:
         """A point of the emitting disc or ring, uniform by area: u in [0, 1) and a direction in its plane."""
         e1, e2 = mi.coordinate_system(self.axis)
         inner = self.inner_radius * self.inner_radius
         r = dr.sqrt(inner + u * (self.radius * self.radius - inner))
         return self.position + (r * cosine) * e1 + (r * sine) * e2
 
-    def radiant_intensity(self, direction: Any) -> Any:
+    def radiant_intensity(self, direction: mi.Vector3f) -> mi.Float:
         """Radiant intensity (mW/sr) into a unit direction that leaves the lamp."""
         c = dr.dot(direction, self.axis)
         # A Lambertian lamp, the usual one, is spared the power.

@@ -7,7 +7,7 @@ nearer counts. Through the clear cornea it goes on to the plane of the iris.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +16,10 @@ import numpy as np
 from ..region.texture import iris_texture, sclera_texture
 from .surfaces import fresnel
 from .values import Values
+
+if TYPE_CHECKING:
+    from .environment import Ambience
+    from .region import Skin
 
 EPSILON_MM = 2e-3  # lengths below are one and the same point in single precision
 _NEAR_MM = 20.0
@@ -27,35 +31,35 @@ _WET = 0.8  # gloss of the sclera
 class View:
     """What a camera ray meets, points and normals in the eye frame."""
 
-    cornea: Any  # it enters through the clear part of the cornea
-    sclera: Any
-    other: Any  # anything of the scene that is not the eye
-    distance: Any
-    point: Any  # on the first surface
-    normal: Any
-    opacity: Any  # of the tissue at the first surface: 0 clear cornea, 1 sclera
-    mirrored: Any  # reflectance of the front cornea
-    passed: Any  # transmittance of the refracted branch, 0 where it does not reach the plane of the iris
-    inner: Any  # point in the plane of the iris
-    pupil: Any  # the inner point lies in the pupil
-    interaction: Any  # with the scene
-    amodal_cornea: Any  # as if the eye stood alone
-    amodal_sclera: Any
-    albedo: Any  # of the region's mesh, where there is one
-    gloss: Any  # likewise, and of the wet sclera
+    cornea: mi.Bool  # it enters through the clear part of the cornea
+    sclera: mi.Bool
+    other: mi.Bool  # anything of the scene that is not the eye
+    distance: mi.Float
+    point: mi.Vector3f  # on the first surface
+    normal: mi.Vector3f
+    opacity: mi.Float  # of the tissue at the first surface: 0 clear cornea, 1 sclera
+    mirrored: mi.Float  # reflectance of the front cornea
+    passed: mi.Float  # transmittance of the refracted branch, 0 where it does not reach the plane of the iris
+    inner: mi.Vector3f  # point in the plane of the iris
+    pupil: mi.Bool  # the inner point lies in the pupil
+    interaction: mi.SurfaceInteraction3f | None  # with the scene
+    amodal_cornea: mi.Bool  # as if the eye stood alone
+    amodal_sclera: mi.Bool
+    albedo: mi.Float  # of the region's mesh, where there is one
+    gloss: mi.Float  # likewise, and of the wet sclera
 
     @property
-    def matte(self) -> Any:
+    def matte(self) -> mi.Bool:
         """Whether the first surface is matte, at least in part."""
         return (self.cornea & (self.opacity > 0)) | self.sclera | self.other
 
     @property
-    def lit_inside(self) -> Any:
+    def lit_inside(self) -> mi.Bool:
         """Whether light behind the cornea is seen."""
         return self.cornea & (self.opacity < 1) & (self.passed > 0)
 
     @property
-    def met(self) -> Any:
+    def met(self) -> mi.Bool:
         """Whether the ray meets anything."""
         return self.cornea | self.sclera | self.other
 
@@ -64,10 +68,10 @@ class View:
 class Textures:
     """Relative albedos with mean 1: the iris over (angle, pupil to root), the sclera over its front, the surround."""
 
-    iris: Any
-    sclera: Any
-    region: Any = None
-    ambience: Any = None
+    iris: mi.Texture2f
+    sclera: mi.Texture2f
+    region: Skin | None = None
+    ambience: Ambience | None = None
 
     @classmethod
     def of_seed(cls, seed: int) -> Textures:
@@ -81,13 +85,15 @@ class Textures:
         return cls(iris, sclera)
 
 
-def opacity(values: Values, rho: Any) -> Any:
+def opacity(values: Values, rho: mi.Float) -> mi.Float:
     """How much of the cornea's rim has turned to sclera at radius `rho` (mm): a smooth step that ends at the limbus."""
-    s = dr.clip((rho - values["limbus_radius"]) * values["limbus_gain"] + 1, 0, 1)
+    s = dr.clip((rho - values.limbus.radius) * values.limbus.gain + 1, 0, 1)
     return s * s * (3 - 2 * s)
 
 
-def look(values: Values, scene: Any, o: Any, d: Any, active: Any, region: Any = None) -> View:
+def look(
+    values: Values, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, region: Skin | None = None
+) -> View:
     """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris.
 
     `region` is the skin of an eye region, whose normals and albedos then count.
@@ -107,7 +113,9 @@ def look(values: Values, scene: Any, o: Any, d: Any, active: Any, region: Any = 
     )
 
 
-def meet(values: Values, scene: Any, o: Any, d: Any, active: Any) -> tuple[View, Any]:
+def meet(
+    values: Values, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool
+) -> tuple[View, mi.PreliminaryIntersection3f]:
     """The view of the globe along camera rays, and what Embree or OptiX hits: nothing is said yet of its surface."""
     # Single precision: start next to the eye.
     t0 = -dr.dot(o, d) - _NEAR_MM
@@ -117,8 +125,8 @@ def meet(values: Values, scene: Any, o: Any, d: Any, active: Any) -> tuple[View,
     tc, on_cornea = front.hit(ol, dl)
     yl = ol + tc * dl
     rho = dr.sqrt(yl.y * yl.y + yl.z * yl.z)
-    on_cornea &= (rho < values["limbus_radius"]) & (yl.x > values["limbus_floor"])
-    ts, on_sclera = meet_sphere(oe - values["sclera.centre"], de, values["sclera.radius"])
+    on_cornea &= (rho < values.limbus.radius) & (yl.x > values.limbus.floor)
+    ts, on_sclera = meet_sphere(oe - values.sclera.centre, de, values.sclera.radius)
     # The sphere's front lies behind the cornea, so a ray that meets it first has met no clear cornea: no cracks, even
     # where the rim of a tilted or toric cornea is no circle of the sphere.
     on_cornea &= ~on_sclera | (tc < ts)
@@ -145,7 +153,7 @@ def meet(values: Values, scene: Any, o: Any, d: Any, active: Any) -> tuple[View,
         other=hit.is_valid() & ~on_eye & active,
         distance=dr.select(on_eye, t_eye, hit.t),
         point=dr.select(on_cornea, oe + tc * de, xs),
-        normal=dr.normalize(dr.select(on_cornea, normal, xs - values["sclera.centre"])),
+        normal=dr.normalize(dr.select(on_cornea, normal, xs - values.sclera.centre)),
         opacity=dr.select(amodal_cornea, opacity(values, rho), 1),
         mirrored=mirrored,
         passed=passed,
@@ -160,7 +168,9 @@ def meet(values: Values, scene: Any, o: Any, d: Any, active: Any) -> tuple[View,
     return view, hit
 
 
-def _look_around(values: Values, hit: Any, o: Any, d: Any, other: Any) -> View:
+def _look_around(
+    values: Values, hit: mi.PreliminaryIntersection3f, o: mi.Vector3f, d: mi.Vector3f, other: mi.Bool
+) -> View:
     """The view of rays that meet something of the surround, where `other`."""
     flags = mi.RayFlags.Minimal | mi.RayFlags.UV
     interaction = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(o), d), flags, other)
@@ -168,14 +178,14 @@ def _look_around(values: Values, hit: Any, o: Any, d: Any, other: Any) -> View:
     return replace(view, interaction=interaction)
 
 
-def look_at_skin(values: Values, region: Any, face: Any, uv: Any, d: Any, other: Any) -> View:
+def look_at_skin(values: Values, region: Skin, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, other: mi.Bool) -> View:
     """The view of rays that meet places on triangles of an eye region, where `other`."""
     skin = region.surface(face, uv, other)
     view = _matte(values, skin.point, skin.normal, d, other)
     return replace(view, albedo=skin.albedo, gloss=skin.gloss)
 
 
-def _matte(values: Values, point: Any, facing: Any, d: Any, other: Any) -> View:
+def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector3f, other: mi.Bool) -> View:
     """The view of matte points of the scene; normals are turned to the viewer."""
     normal = values.vector_to_eye(facing)
     normal = dr.select(dr.dot(normal, values.vector_to_eye(d)) > 0, -normal, normal)
@@ -200,7 +210,9 @@ def _matte(values: Values, point: Any, facing: Any, d: Any, other: Any) -> View:
     )
 
 
-def _refracted(values: Values, yl: Any, y: Any, dl: Any) -> tuple[Any, Any, Any, Any, Any]:
+def _refracted(
+    values: Values, yl: mi.Vector3f, y: mi.Vector3f, dl: mi.Vector3f
+) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Vector3f, mi.Bool]:
     """From the front cornea to the plane of the iris: normal, reflectance, transmittance, point, whether in the pupil.
 
     yl, dl: hit point and direction in the front surface's frame; y: the point in the eye frame.
@@ -218,24 +230,24 @@ def _refracted(values: Values, yl: Any, y: Any, dl: Any) -> tuple[Any, Any, Any,
         inside, w, share, ok = surface.refract(inside, w)
         passed *= share
         reached &= ok
-    n = values["stop.normal"]
-    s = dr.dot(values["stop.centre"] - inside, n) / dr.dot(w, n)
+    n = values.stop.normal
+    s = dr.dot(values.stop.centre - inside, n) / dr.dot(w, n)
     inner = inside + s * w
     reached &= s > 0
     pu, pv = _stop_coordinates(values, inner)
-    margin = values.margin.radius(pu, pv)
+    margin = values.boundary.radius(pu, pv)
     pupil = reached & (pu * pu + pv * pv < margin * margin)
     return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, pupil
 
 
-def _stop_coordinates(values: Values, x: Any) -> tuple[Any, Any]:
+def _stop_coordinates(values: Values, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
     """Coordinates of points of the stop's plane along its semi-axes, in units of these."""
-    q = x - values["stop.centre"]
-    a, b = values["stop.axes"]
-    return dr.dot(q, values["stop.u"]) / a, dr.dot(q, values["stop.v"]) / b
+    q = x - values.stop.centre
+    a, b = values.stop.axes
+    return dr.dot(q, values.stop.u) / a, dr.dot(q, values.stop.v) / b
 
 
-def meet_sphere(o: Any, d: Any, radius: Any) -> tuple[Any, Any]:
+def meet_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Float, mi.Bool]:
     """Distance to the near side of a sphere about the origin, and whether it is met from outside."""
     b, c = dr.dot(o, d), dr.squared_norm(o) - radius * radius
     disc = b * b - c
@@ -243,27 +255,28 @@ def meet_sphere(o: Any, d: Any, radius: Any) -> tuple[Any, Any]:
     return c / q, (disc > 0) & (q > 0) & (c > 0)
 
 
-def iris_albedo(values: Values, textures: Textures, x: Any) -> Any:
+def iris_albedo(values: Values, textures: Textures, x: mi.Vector3f) -> mi.Float:
     """Albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
     pu, pv = _stop_coordinates(values, x)
-    a, b = values["stop.axes"]
-    beyond = (dr.sqrt(pu * pu + pv * pv) - values.margin.radius(pu, pv)) * dr.sqrt(a * b)
+    a, b = values.stop.axes
+    beyond = (dr.sqrt(pu * pu + pv * pv) - values.boundary.radius(pu, pv)) * dr.sqrt(a * b)
     rho = dr.sqrt(x.y * x.y + x.z * x.z)
-    left = values["iris_root"] - rho
+    left = values.iris.root_radius - rho
     s = dr.clip(beyond / dr.maximum(beyond + dr.maximum(left, 0), 1e-4), 0, 1)
     angle = dr.atan2(pv, pu) / (2 * dr.pi)
     rows = textures.iris.shape[0]
     texture = textures.iris.eval(mi.Point2f(angle, (1 + s * (rows - 2)) / rows))[0]
-    albedo = values["iris.albedo"] * dr.maximum(1 + values["iris.contrast"] * (texture - 1), 0.02)
-    return dr.select(left > 0, albedo, values["limbus.albedo"])
+    albedo = values.iris.albedo * dr.maximum(1 + values.iris.contrast * (texture - 1), 0.02)
+    return dr.select(left > 0, albedo, values.limbus.albedo)
 
 
-def outer_albedo(values: Values, textures: Textures, view: View, active: Any) -> Any:
+def outer_albedo(values: Values, textures: Textures, view: View, active: mi.Bool) -> mi.Float:
     """Albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
-    si = view.interaction
-    other = (
-        view.albedo if textures.region is not None else si.bsdf().eval_diffuse_reflectance(si, active & view.other)[0]
-    )
+    other = view.albedo
+    if textures.region is None:
+        si = view.interaction
+        assert si is not None
+        other = si.bsdf().eval_diffuse_reflectance(si, active & view.other)[0]
     return dr.if_stmt(
         (view.point, other),
         view.other,
@@ -272,17 +285,17 @@ def outer_albedo(values: Values, textures: Textures, view: View, active: Any) ->
     )
 
 
-def _sclera_albedo(values: Values, textures: Textures, point: Any) -> Any:
-    r = point - values["sclera.centre"]
+def _sclera_albedo(values: Values, textures: Textures, point: mi.Vector3f) -> mi.Float:
+    r = point - values.sclera.centre
     # Azimuthal equidistant map of the front of the globe, from the pole out to 108 degrees.
     polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / (0.6 * dr.pi)
     inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
     uv = mi.Point2f(0.5 + 0.5 * polar * r.y * inv, 0.5 + 0.5 * polar * r.z * inv)
     texture = textures.sclera.eval(uv)[0]
-    sclera = values["sclera.albedo"] * dr.maximum(1 + values["sclera.contrast"] * (texture - 1), 0.02)
+    sclera = values.sclera.albedo * dr.maximum(1 + values.sclera.contrast * (texture - 1), 0.02)
     # The limbus' grey ring fades into the white over its width, on the side of the sclera.
     local = values.surfaces[0].point_in(point)
-    away = dr.sqrt(local.y * local.y + local.z * local.z) - values["limbus_radius"]
-    s = dr.clip(0.5 + 0.5 * away * values["limbus_gain"], 0, 1)
+    away = dr.sqrt(local.y * local.y + local.z * local.z) - values.limbus.radius
+    s = dr.clip(0.5 + 0.5 * away * values.limbus.gain, 0, 1)
     s = s * s * (3 - 2 * s)
-    return values["limbus.albedo"] + s * (sclera - values["limbus.albedo"])
+    return values.limbus.albedo + s * (sclera - values.limbus.albedo)

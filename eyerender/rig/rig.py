@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
@@ -52,3 +52,28 @@ class Rig(ArrayValue):
     cameras: tuple[Camera, ...]
     lights: tuple[Light, ...]
     screen: Screen | None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The rig as `features --json` writes it (docs/formats.md)."""
+        screen = self.screen
+        return {
+            "cameras": [
+                {
+                    "K": c.K.tolist(),
+                    "R": c.R.tolist(),
+                    "t": c.t.tolist(),
+                    "distortion": c.distortion.tolist(),
+                    "resolution_px": list(c.resolution_px),
+                }
+                for c in self.cameras
+            ],
+            "lights_mm": [light.position_mm.tolist() for light in self.lights],
+            "screen": None
+            if screen is None
+            else {
+                "centre_mm": screen.centre_mm.tolist(),
+                "size_mm": list(screen.size_mm),
+                "right": screen.right.tolist(),
+                "up": screen.up.tolist(),
+            },
+        }

@@ -55,6 +55,11 @@ class SensorSpec(Spec):
         return self.full_scale_dn / 256 if self.black_level_dn is None else self.black_level_dn
 
     @property
+    def saturation_dn(self) -> float:
+        """From which number on a pixel counts as saturated: full scale, or a full well less three read noises."""
+        return min(self.full_scale_dn, self.black_dn + self.gain * (self.full_well_e - 3 * self.read_noise_e))
+
+    @property
     def gain(self) -> float:
         """The system gain K in DN per electron, with its default filled in."""
         if self.gain_dn_per_e is not None:

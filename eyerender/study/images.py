@@ -77,10 +77,8 @@ class StudyImages:
 
 def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[Shot]:
     """One shot an eye; with `facing` one an eye and head position, the cameras turned to the eye."""
-    data = scene.spec.to_mapping()
+    data = (scene.spec if spp is None else scene.spec.with_spp(spp)).to_mapping()
     data["sensor"]["noise"] = noise
-    if spp is not None:
-        data["image"]["spp"] = spp
     index, out = scene.frames().index, []
     heads = scene.spec.subject.head_positions_mm
     for head in range(len(heads)) if facing else (None,):

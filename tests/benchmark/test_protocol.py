@@ -75,6 +75,7 @@ def test_missing_and_errors_are_results():
         (reply({**GOOD, "centre_px": "12"}), "pupil.centre_px: must be two numbers"),
         (reply({**GOOD, "centre_px": [True, 1]}), "pupil.centre_px.0: must be a number, not True"),
         (reply({**GOOD, "semi_axes_px": [1e300, 1]}), "pupil.semi_axes_px.0: must be a finite number within"),
+        (reply({**GOOD, "semi_axes_px": [10**400, 1]}), "pupil.semi_axes_px.0: must be a finite number within"),
         (reply({**GOOD, "semi_axes_px": [5, 0]}), "semi-axes must be > 0"),
         (reply({**GOOD, "semi_axes_px": [5, -4]}), "semi-axes must be > 0"),
         (reply({**GOOD, "angle_rad": None}), "pupil.angle_rad: must be a number"),

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import stages
 import yaml
 from PIL import Image
 
@@ -152,6 +153,7 @@ TABLE = [
     (["generate", "draw.yaml", "out"], 2, "draw.yaml: scene.wavelength_nm.draw: must be one of"),
     (["generate", "template.yaml", "out"], 2, "template.yaml: sample 0 cannot be made"),
     (["generate", "behind.yaml", "out"], 2, "behind.yaml: sample 0 cannot be made"),
+    (["generate", "dataset_quick", "out", "--measure"], 2, "--measure: needs --dry-run"),
     (["generate", "dataset_quick", "taken"], 2, "taken: is not empty; give another folder or --overwrite"),
     (["generate", "dataset_quick", "taken", "--overwrite"], 2, "taken: was not made by this package"),
     (["generate", "dataset_quick", "file"], 2, "file: exists and is not a folder"),
@@ -203,6 +205,7 @@ TABLE = [
         2,
         "two are called 'own-fast'",
     ),
+    (["study", "observers", "-o", "out", "--spp", "70000"], 2, "error: --spp: must be <= 65536, not 70000"),
     (["study", "observers", "-o", "out", "--workers", "0"], 2, "error: --workers: must be >= 1, not 0"),
     (["schema", "car"], 2, "car"),
     (["doctor", "extra"], 2, "extra"),
@@ -232,26 +235,26 @@ def test_debug_shows_the_traceback(place):
         run(["features", "nonsense", "--debug"])
 
 
-def command(*argv, **keys):
+def command(*argv, env=None, **keys):
     return subprocess.Popen(
         [sys.executable, "-m", "eyerender", *argv],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        env={**(env or os.environ), "PYTHONUNBUFFERED": "1"},
         **keys,
     )
 
 
 @pytest.mark.render
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_says_so_and_leaves_nothing(place, number):
-    process = command("render", "blignaut2014", "-o", "out")
-    assert process.stderr is not None
-    line = process.stderr.readline()  # the first line of progress: it is at work
-    assert "rendering" in line
+def test_an_interrupted_run_says_so_and_leaves_nothing(place, tmp_path_factory, number):
+    hook = stages.environment(tmp_path_factory.mktemp("stages"), Path("out"), match=r"\.png$", at=2, how="stop")
+    process = command("render", "blignaut2014", "-o", "out", env=hook, start_new_session=True)
+    stages.wait_until_stopped(process)  # at work: its second file is about to be there
     process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    process.send_signal(signal.SIGCONT)
+    _, err = process.communicate()
     assert process.returncode == 130
     assert err.splitlines()[-1] == "interrupted"
     assert "Traceback" not in err

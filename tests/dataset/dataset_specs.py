@@ -94,12 +94,12 @@ def tree(folder: Path) -> dict[str, str]:
     }
 
 
-def command(*argv: str, **keys: Any) -> subprocess.Popen[str]:
+def command(*argv: str, env: dict[str, str] | None = None, **keys: Any) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "eyerender", *argv],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        env={**(env or os.environ), "PYTHONUNBUFFERED": "1"},
         **keys,
     )

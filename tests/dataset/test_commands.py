@@ -55,16 +55,59 @@ def test_a_dataset_without_several_targets_says_what_gaze_needs(tiny, capsys):
     assert "a calibration needs several targets in one scene, such as" in capsys.readouterr().out
 
 
+def disk_of(folder):
+    names = ("*.png", "lines.jsonl", "metadata.jsonl")
+    return sum(p.stat().st_size for name in names for p in folder.rglob(name))
+
+
 def test_a_dry_run_makes_nothing_and_tells_time_and_disk(tiny, spec, tmp_path, capsys):
-    assert run(["generate", spec, "--dry-run", "--workers", "2", "--threads", "2", "--json", "-"]) == 0
+    assert run(["generate", spec, "--dry-run", "--measure", "--workers", "2", "--threads", "2", "--json", "-"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["images"] == 24
     assert found["shards"] == 8
-    size = sum(p.stat().st_size for kind in ("images", "masks") for p in (tiny / kind).rglob("*.png"))
-    size += (tiny / "metadata.jsonl").stat().st_size
-    assert found["bytes"] == pytest.approx(size, rel=0.1)
+    assert found["bytes"] == pytest.approx(disk_of(tiny), rel=0.1)
     assert found["seconds"] > 0
+    assert found["rate"]["how"] == "measured"
     assert [p.name for p in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+def dry_run(spec, capsys, *options):
+    assert run(["generate", spec, "--dry-run", *options]) == 0
+    text = capsys.readouterr().out
+    assert run(["generate", spec, "--dry-run", *options, "--json", "-"]) == 0
+    return text, json.loads(capsys.readouterr().out)
+
+
+def test_a_dry_run_uses_the_last_rate_of_the_spec(spec, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    text, found = dry_run(spec, capsys)
+    assert "24 images in 8 shards" in text
+    assert "time and disk unknown, no rate of this spec on this machine; --measure makes a few samples" in text
+    assert (found["seconds"], found["bytes"], found["rate"]) == (None, None, None)
+    assert run(["generate", spec, "out", "--count", "6", "--workers", "1", "--threads", "1"]) == 0
+    size = disk_of(tmp_path / "out")
+    capsys.readouterr()
+    # Of a thousand million samples, with another seed.
+    many = ("--count", str(10**9), "--seed", "7", "--workers", "1")
+    text, found = dry_run(spec, capsys, *many)
+    assert found["rate"]["how"] == "run"
+    assert found["rate"]["samples"] == 6
+    assert found["images"] == 10**9
+    assert found["bytes"] == pytest.approx(10**9 * size / 6, rel=1e-9)
+    assert found["seconds"] == pytest.approx(10**9 * found["rate"]["seconds"])
+    assert (
+        f"about {found['seconds'] / 86400:.1f} days, {found['bytes'] / 1e12:.1f} TB (rate of a run with 6 samples"
+        in text
+    )
+    # Another spec, another backend, and a damaged cache: unknown.
+    other = write(tmp_path / "other.yaml", scene__image__spp=3)
+    assert "time and disk unknown" in dry_run(str(other), capsys)[0]
+    assert "time and disk unknown" in dry_run(spec, capsys, "--backend", "cuda")[0]
+    (file,) = (tmp_path / "cache" / "eyerender" / "rates").iterdir()
+    good = json.loads(file.read_text())
+    for bad in ("", "[" * 10**5, "{}", json.dumps(good | {"seconds": -1}), json.dumps(good | {"bytes": 10**400})):
+        file.write_text(bad)
+        assert "time and disk unknown" in dry_run(spec, capsys)[0]
 
 
 @pytest.mark.parametrize("what", ["dataset", "scene"])

@@ -13,7 +13,7 @@ from scipy.stats import kstest, qmc, truncnorm, uniform
 from eyerender.dataset.draws import parse_draw, random_value, truncated_normal, unit_number
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec
-from eyerender.dataset.template import Template, Turn
+from eyerender.dataset.template import Template, Turn, sobol_block
 from eyerender.errors import InputError
 
 
@@ -159,3 +159,17 @@ def test_bad_specs_are_refused_with_their_path(path, node, words):
         plan(**{path: node})
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("block", [0, 1, 2, 3, 255, 256, 3907])
+def test_a_block_of_the_sobol_sequence_is_found_without_walking_there(block):
+    engine = qmc.Sobol(3, scramble=True, rng=np.random.default_rng([11, 1]))
+    if block:
+        engine.fast_forward(256 * block)
+    np.testing.assert_array_equal(sobol_block(11, "subject", 3, block), engine.random(256))
+
+
+def test_the_last_sobol_points_of_a_thousand_million_samples_are_at_hand():
+    points = sobol_block(11, "sample", 3, (10**9 - 1) // 256)
+    assert points.shape == (256, 3)
+    assert len(np.unique((points * 64).astype(int), axis=0)) > 200  # they still fill the cube

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
-import time
+import signal
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
+import stages
 import trimesh
 from dataset_specs import command, make, mapping, tree, write
 
@@ -277,12 +279,14 @@ def test_a_file_that_changes_while_a_run_is_at_work_ends_it(made, tmp_path):
     shutil.copytree(made / "spec", spec)
     room = spec / "rooms" / "night.npy"
     kept = room.read_bytes()
-    process = command("generate", "spec/spec.yaml", "out", "--workers", "1", cwd=tmp_path)
-    end = time.monotonic() + 120
-    while process.poll() is None and not (folder / "shards").is_dir() and time.monotonic() < end:
-        time.sleep(0.002)
+    # When the first shard is about to be finished.
+    hook = stages.environment(tmp_path, folder, match="/shards/00000$", at=1, how="stop")
+    argv = ("generate", "spec/spec.yaml", "out", "--workers", "1")
+    process = command(*argv, cwd=tmp_path, env=hook, start_new_session=True)
+    stages.wait_until_stopped(process)
     np.save(room, np.full((8, 16), 0.75))
-    _, err = process.communicate(timeout=120)
+    os.killpg(process.pid, signal.SIGCONT)
+    _, err = process.communicate()
     assert process.returncode == 2, err
     errors = [line for line in err.splitlines() if not line.startswith("generating:")]
     assert errors == [f"error: {room}: has changed since the run began"]

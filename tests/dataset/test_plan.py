@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import pickle
-from collections import defaultdict
+from collections import Counter, defaultdict
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 import yaml
 from dataset_specs import plan, write
 
-from eyerender.dataset.plan import Plan
+from eyerender.dataset.draws import unit_number
+from eyerender.dataset.plan import RANKED_SUBJECTS, Plan
 from eyerender.dataset.realise import frames_of, realise
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.errors import InputError
@@ -234,3 +236,24 @@ def test_eyes_of_several_models():
         if model != "E2":
             assert sample.eye == load_eye(model).to_mapping()
     assert models == {"E1", "E2", "E5"}
+
+
+def test_a_million_subjects_are_split_by_rank_and_more_by_thresholds():
+    splits = {"b": 3.0, "a": 1.0, "c": 6.0}
+    few = plan(count=999, subjects=None, splits=splits)
+    counts = Counter(few.split_of(s) for s in range(999))
+    assert counts == {"a": 100, "b": 300, "c": 599}
+    numbers = [unit_number(5, "split", "subject", s, 0) for s in range(999)]
+    order = sorted(range(999), key=numbers.__getitem__)  # the rule in its plainest form
+    assert [few.split_of(s) for s in order] == ["a"] * 100 + ["b"] * 300 + ["c"] * 599
+    many = plan(count=RANKED_SUBJECTS + 1, subjects=None, splits=splits)
+    expected = ["a" if u < 0.1 else "b" if u < 0.4 else "c" for u in numbers]
+    assert [many.split_of(s) for s in range(999)] == expected
+    assert "_ranked" not in vars(many)
+    assert plan(count=10**9, subjects=None, splits={"all": 2}).split_of(10**9 - 1) == "all"
+
+
+def test_the_splits_of_existing_datasets_do_not_change():
+    made = plan(count=5000, subjects=2000)
+    found = hashlib.sha256(" ".join(map(made.split_of, range(2000))).encode()).hexdigest()
+    assert found == "67f7fc7319740a4a7dd4998db5847cf02ae8a72a32133067ee597ae571ef9197"

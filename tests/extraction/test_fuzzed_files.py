@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import resource
 import struct
 import zlib
@@ -15,7 +16,9 @@ import pytest
 from PIL import Image
 
 from eyerender.cli.app import run
+from eyerender.errors import InputError
 from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.imagefile import read_image
 
 Mutation = Callable[[bytes, np.random.Generator], bytes]
 
@@ -181,3 +184,39 @@ def test_sixty_damaged_files(ideal, tmp_path, capfd):
 @pytest.mark.timeout(1800)
 def test_thousand_damaged_files(ideal, tmp_path, capfd):
     _fuzz(ideal, tmp_path, capfd, 1000, 1000)
+
+
+def test_what_is_no_regular_file_is_not_opened(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "zero.png").symlink_to("/dev/zero")
+    (tmp_path / "folder.png").mkdir()
+    for name, words in (("pipe.png", "is a pipe"), ("zero.png", "is a device"), ("folder.png", "is a folder")):
+        with pytest.raises(InputError, match=words):
+            read_image(tmp_path / name)
+
+
+def test_texts_and_profiles_that_unpack_to_much_are_refused(tmp_path):
+    """Sixty megabytes of zeros take 58 KB in a PNG; so do two hundred texts of a megabyte."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    size = chunk(b"IHDR", struct.pack(">IIBBBBB", 16, 16, 8, 0, 0, 0, 0))
+    end = chunk(b"IDAT", zlib.compress(bytes(17 * 16))) + chunk(b"IEND", b"")
+    large, text = zlib.compress(bytes(60_000_000), 9), zlib.compress(bytes(1_000_000), 9)
+    bombs = (chunk(b"iCCP", b"a\0\0" + large), chunk(b"zTXt", b"a\0\0" + large),
+             b"".join(chunk(b"zTXt", b"%d\0\0" % k + text) for k in range(200)))  # fmt: skip
+    for bomb in bombs:
+        (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + size + bomb + end)
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        with pytest.raises(InputError, match="is not a readable image"):
+            read_image(tmp_path / "bomb.png")
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 150_000  # kB
+
+
+def test_images_of_a_file_are_not_counted(tmp_path):
+    """A TIFF of many small images takes a time that grows with the square of their number to count."""
+    frames = [Image.new("L", (16, 16), k) for k in range(3)]
+    frames[0].save(tmp_path / "many.tif", save_all=True, append_images=frames[1:])
+    with pytest.raises(InputError, match="holds several images; a file of one is read"):
+        read_image(tmp_path / "many.tif")

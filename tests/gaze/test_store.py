@@ -16,6 +16,7 @@ from eyerender.gaze.regression import EyeFit, PupilGlintRegression
 from eyerender.gaze.store import (
     EstimatorSpec,
     fit_estimator,
+    load_calibration,
     load_estimator,
     predictions,
     save_estimator,
@@ -130,6 +131,82 @@ def test_jsonl_and_folder_metadata_are_records_too(guestrin, tmp_path):
         assert len(rig.lights) == 2
     with pytest.raises(InputError, match="holds no rig; give --scene"):
         load_observations(lines)
+
+
+def test_targets_off_the_screen_are_told(guestrin, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    data = json.loads(guestrin.read_text())
+    for record in data["records"]:
+        if record["fixation"] == 4:
+            record["target_mm"][0] -= 60.0
+    (tmp_path / "off.json").write_text(json.dumps(data))
+    fit = ["gaze", "fit", "off.json", "--estimator", "regression", "-o", "c.json", "--json", "-"]
+    assert run(fit) == 0
+    out, err = capsys.readouterr()
+    words = "off.json: target_mm: 10 of 90 targets lie off the plane of the rig's screen, by up to 60 mm; gaze points"
+    assert err.startswith(f"warning: {words}")
+    assert [w["code"] for w in json.loads(out)["warnings"]] == ["off-screen-plane"]
+    (tmp_path / "c.json").unlink()
+    assert run([*fit, "--strict"]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {words}")
+    assert not (tmp_path / "c.json").exists()
+    # Only the targets that are calibrated on count.
+    assert run([*fit, "--fixations", "0,1,2,3,5,6,7,8", "--strict"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_rig_other_than_the_calibrations_is_told(guestrin, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "f.json").write_text(guestrin.read_text())
+    assert run(["gaze", "fit", "f.json", "--estimator", "regression", "-o", "c.json", "--strict"]) == 0
+    # The same rig, from the records or from its scene.
+    for more in ([], ["--scene", "guestrin2006"]):
+        assert run(["gaze", "predict", "f.json", "-c", "c.json", "--strict", *more]) == 0
+        assert capsys.readouterr().err == ""
+    other = json.loads(guestrin.read_text())
+    other["rig"]["lights_mm"][1][2] += 5.0
+    (tmp_path / "moved.json").write_text(json.dumps(other))
+    for name, more, path in (
+        ("moved.json", [], "moved.json: rig.lights_mm.1.2"),
+        ("f.json", ["--scene", "blignaut2014"], "blignaut2014: rig.cameras.0.K.0.0"),
+    ):
+        argv = ["gaze", "predict", name, "-c", "c.json", *more]
+        assert run([*argv, "--json", "-"]) == 0
+        out, err = capsys.readouterr()
+        words = f"{path}: differs from the rig of the calibration; calibrate on this one"
+        assert err == f"warning: {words}\n"
+        assert [w["code"] for w in json.loads(out)["warnings"]] == ["other-rig"]
+        assert run([*argv, "--strict"]) == 2
+        assert capsys.readouterr().err == f"error: {words} (--strict)\n"
+
+
+def test_calibrations_without_a_rig_are_still_read(guestrin, tmp_path, capsys):
+    seen, rig = load_observations(guestrin)
+    spec = EstimatorSpec.from_mapping({"name": "regression"})
+    fitted, _ = fit_estimator(spec, seen, rig)
+    save_estimator(tmp_path / "c.json", spec, fitted, rig)
+    data = json.loads((tmp_path / "c.json").read_text())
+    assert data["schema"] == "eyerender/gaze-calibration/2"
+    assert data["rig"] == json.loads(guestrin.read_text())["rig"]
+    del data["rig"]
+    (tmp_path / "c.json").write_text(json.dumps({**data, "schema": "eyerender/gaze-calibration/1"}))
+    again, calibrated = load_calibration(tmp_path / "c.json")
+    assert calibrated is None
+    np.testing.assert_array_equal(again.predict(seen, rig).point_mm, fitted.predict(seen, rig).point_mm)
+    assert run(["gaze", "predict", str(guestrin), "-c", str(tmp_path / "c.json"), "--strict"]) == 0
+    data["rig"] = {"cameras": 1}
+    (tmp_path / "c.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match="rig: must hold cameras"):
+        load_calibration(tmp_path / "c.json")
+
+
+def test_a_scene_given_for_its_rig_is_looked_at(guestrin, tmp_path, capsys):
+    mapping = load_scene("guestrin2006").spec.to_mapping()
+    mapping["rig"]["lights"][0]["position_mm"] = [0.615, 0.2085, 0.0]
+    (tmp_path / "metres.yaml").write_text(json.dumps(mapping))
+    argv = ["gaze", "fit", str(guestrin), "--estimator", "regression", "-o", str(tmp_path / "c.json")]
+    assert run([*argv, "--scene", str(tmp_path / "metres.yaml"), "--strict"]) == 2
+    assert "rig.lights.0.position_mm: the lamp is at (0.615, 0.2085, 0) mm" in capsys.readouterr().err
 
 
 FIT = ["gaze", "fit", "features.json", "--estimator"]

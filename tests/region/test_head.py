@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +11,7 @@ import trimesh
 from eyerender.errors import InputError
 from eyerender.region.anatomy import RegionSpec
 from eyerender.region.globe import Globe
-from eyerender.region.head import HEAD_PARTS, head_map, load_head, placed
+from eyerender.region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
 from eyerender.region.headspec import HeadSpec
 
 CENTRE_MM = np.array([-13.0, 0.4, 0.1])
@@ -112,3 +114,31 @@ def test_an_eye_far_from_the_mesh_is_refused(tmp_path):
     shell(tmp_path / "shell.ply")
     with pytest.raises(InputError, match=r"left_eye: lies .* mm from the nearest vertex"):
         load_head(spec_of(tmp_path, left_eye=[72.0, 20.0, -310.0]))
+
+
+READERS = {
+    "mesh.ply": lambda folder: load_head(spec_of(folder, file="mesh.ply")),
+    "mesh.obj": lambda folder: load_head(spec_of(folder, file="mesh.obj")),
+    "head.json": lambda folder: HeadSpec.from_mapping({"file": "head.json"}).resolved(folder),
+    "skin.png": lambda folder: texture_rows(spec_of(folder, texture="skin.png")),
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_what_is_no_regular_file_is_not_read(tmp_path, name):
+    """A pipe without a writer would wait for ever."""
+    shell(tmp_path / "shell.ply")
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match="is a pipe, not a file"):
+        READERS[name](tmp_path)
+
+
+def test_a_mesh_leads_to_no_other_file(tmp_path):
+    """Comments of a PLY and libraries of an OBJ may name files anywhere."""
+    os.mkfifo(tmp_path / "pipe")
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=90.0)
+    text = mesh.export(file_type="ply", encoding="ascii").decode()
+    (tmp_path / "a.ply").write_text(text.replace("\nelement", "\ncomment TextureFile pipe\nelement", 1))
+    (tmp_path / "b.obj").write_text("mtllib pipe\n" + mesh.export(file_type="obj"))
+    for name in ("a.ply", "b.obj"):
+        assert len(load_head(spec_of(tmp_path, file=name)).faces) == len(mesh.faces)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -240,6 +242,16 @@ def test_files_that_are_no_maps_are_refused(renderer, tmp_path):
     np.save(tmp_path / "negative.npy", np.full((8, 16), -1.0))
     np.save(tmp_path / "hole.npy", np.full((8, 16), np.nan))
     np.save(tmp_path / "good.npy", np.ones((8, 16)))
+    np.savez(tmp_path / "pair.npz", np.ones((8, 16)))
+    (tmp_path / "pair.npz").rename(tmp_path / "pair.npy")
+    # Files of a few bytes that claim to be 10^11 pixels large: a reader would allocate them first.
+    header = str({"descr": "<f8", "fortran_order": False, "shape": (400_000, 800_000)}).encode().ljust(118)
+    (tmp_path / "huge.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header)
+    (tmp_path / "huge.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 400000 +X 800000\n")
+    (tmp_path / "huge.pfm").write_bytes(b"Pf\n800000 400000\n-1.0\n")
+    window = struct.pack("<4i", 0, 0, 799_999, 399_999)
+    (tmp_path / "huge.exr").write_bytes(b"v/1\x01\x02\0\0\0dataWindow\0box2i\0\x10\0\0\0" + window)
+    os.mkfifo(tmp_path / "pipe.exr")
     for name, words in (
         ("cut.hdr", "not a readable map"),
         ("text.exr", "not a readable map"),
@@ -247,6 +259,9 @@ def test_files_that_are_no_maps_are_refused(renderer, tmp_path):
         ("negative.npy", "negative"),
         ("hole.npy", "not finite"),
         ("none.exr", "no such file"),
+        ("pair.npy", "not a readable map"),
+        *((f"huge.{kind}", "has 320000000000 pixels; at most") for kind in ("npy", "hdr", "pfm", "exr")),
+        ("pipe.exr", "is a pipe, not a file"),
         ("room.jpg", "must end with"),
     ):
         with pytest.raises(InputError, match=words):

@@ -12,7 +12,7 @@ from render_rigs import PLAIN, RIGS, head_rig, job_of, remote_rig
 
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.spec import ContourSpec
-from eyerender.rendering.frame import margin_waves
+from eyerender.rendering.frame import boundary_waves
 
 # About the size that Wyatt (1995) found: the second harmonic a few per cent of the radius, higher ones fewer.
 CONTOUR = ContourSpec(cosines=(0.0, 0.025, -0.012, 0.006), sines=(0.0, -0.018, 0.014, 0.0, 0.004))
@@ -29,11 +29,11 @@ def eye_with(contour, model="E2", side="right", pupil_mm=4.0):
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_the_waves_on_the_device_are_the_radius_of_the_stop(renderer, side):
-    from eyerender.rendering.values import Margin
+    from eyerender.rendering.values import PupilBoundary
 
     eye = eye_with(CONTOUR, side=side)
     angle = np.linspace(0, 2 * np.pi, 50)
-    margin = Margin(margin_waves(eye))
+    margin = PupilBoundary(boundary_waves(eye))
     import mitsuba as mi
 
     mine = np.array(margin.radius(mi.Float(3 * np.cos(angle)), mi.Float(3 * np.sin(angle))))

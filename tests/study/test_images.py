@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import stages
 
 from eyerender.analytic.observer import observe
 from eyerender.dataset.plan import Plan
@@ -136,7 +135,7 @@ def test_images_are_made_once_and_a_part_of_them_serves_too(tmp_path):
 KILLED = """
 import sys
 from pathlib import Path
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {tests!r}
 from test_images import ImageSettings, make_images, small_scenes
 make_images("small", small_scenes(), ImageSettings(Path({folder!r}), workers=1))
 """
@@ -145,16 +144,14 @@ make_images("small", small_scenes(), ImageSettings(Path({folder!r}), workers=1))
 @pytest.mark.render
 def test_a_killed_run_goes_on_where_it_was(tmp_path):
     folder = tmp_path / "killed"
-    script = KILLED.format(tests=str(Path(__file__).parent), folder=str(folder))
-    process = subprocess.Popen([sys.executable, "-c", script], start_new_session=True)
-    first = folder / "shards" / "00000"
-    while process.poll() is None and not first.is_dir():
-        time.sleep(0.002)
-    process.kill()
-    process.wait()
+    script = KILLED.format(tests=[str(p) for p in Path(__file__).parents[:2]], folder=str(folder))
+    # When its shards are finished and are about to be put together.
+    hook = stages.environment(tmp_path, folder, match=r"/metadata\.jsonl$", at=1)
+    process = subprocess.Popen([sys.executable, "-c", script], start_new_session=True, env=hook)
+    assert process.wait() == -signal.SIGKILL
     stamps = {p: p.stat().st_mtime_ns for p in (folder / "images" / "00000").glob("*.png")}
     assert stamps
-    assert read_images(folder) is None or process.returncode == 0
+    assert read_images(folder) is None
     scenes = small_scenes()
     after = make_images("small", scenes, ImageSettings(folder, workers=1))
     undisturbed = make_images("small", scenes, ImageSettings(tmp_path / "whole", workers=1))
@@ -192,23 +189,21 @@ def test_image_study_resumes(tmp_path):
 
 @pytest.mark.render
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_a_study_killed_again_and_again_ends_with_the_same_summary(tmp_path):
     command = [sys.executable, "-m", "eyerender", "study", "guestrin2006", "--observer", "both", "--eyes", "E2"]
     command += ["--protocol", "published", "--spp", "1", "--workers", "2"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    subprocess.run([*command, "-o", str(tmp_path / "whole")], check=True, **quiet)
-    when, kills, code = random.Random(5), 0, None
-    while code != 0:
-        process = subprocess.Popen([*command, "-o", str(tmp_path / "killed")], start_new_session=True, **quiet)
-        try:
-            # The first runs are killed somewhere on their way, in a random one of their phases; then one may finish.
-            code = process.wait(timeout=when.uniform(1.0, 12.0) if kills < 5 else 600)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL) if when.random() < 0.5 else process.kill()
-            process.wait()
-            kills += 1
-        assert code in (None, 0)
-    assert kills
+    hook = stages.environment(tmp_path, tmp_path / "whole")
+    subprocess.run([*command, "-o", str(tmp_path / "whole")], check=True, env=hook, **quiet)
+    draws = random.Random(5)
+    for at in [*stages.cuts(draws, stages.count(tmp_path), 5), 0]:
+        how = draws.choice(["kill", "kill all"])
+        hook = stages.environment(tmp_path, tmp_path / "killed", at=at, how=how)
+        process = subprocess.Popen(
+            [*command, "-o", str(tmp_path / "killed")], start_new_session=True, env=hook, **quiet
+        )
+        assert process.wait() == (-signal.SIGKILL if at else 0)
     summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "killed")]
     for summary in summaries:
         del summary["seconds"]

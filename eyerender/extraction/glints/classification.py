@@ -22,7 +22,7 @@ LONG, LONG_TWICE = 2.0, 2.4
 _PIXEL = 1.0 / 12.0  # variance of a pixel: keeps a spot of one row of pixels from being a line
 
 
-def judge_spots(
+def classify_spots(
     spots: Spots, fit: SpotFit, prepared: Prepared, step_dn: float, blur_px: float, settings: ExtractionSettings
 ) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
     """(accepted, rejected), brightest first."""

@@ -1,7 +1,7 @@
-"""Spots that one Gaussian on the expected background does not explain: two in one, or one beside an edge of its own.
+"""Spots that one Gaussian does not explain: two that overlap, or one beside an edge such as the limbus.
 
-A spot counts as unexplained when its residual is more than twice the image's noise, and more than what a light that
-is no point, and lenses whose blur is no Gaussian, leave of its height.
+A spot is unexplained if its residual exceeds twice the image's noise, and also exceeds what an extended LED and a
+non-Gaussian blur leave of its height.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ Array = NDArray[np.float64]
 Background = Callable[[Array, Array], Array]
 Starts = tuple[Array, Array, Array]
 
-UNLIKE_BELL = 0.002
-# What an edge beside a glint leaves of the glint's height, and a second glint: more is no glint's.
+UNLIKE_BELL = 0.002  # share of the height that an extended LED and a non-Gaussian blur may leave
+# Largest residual, as a share of the height, that an edge beside a glint or a second glint can leave.
 BESIDE_EDGE, BESIDE_TWIN = 0.1, 0.17
-LEAST_SHARE = 0.5  # of the squared residual, taken by an edge: the fit beside it must take as much
-# Two equal spots 2.5 sigma apart deviate by sqrt(1 + 1.25^2) = 1.6 sigma along their line; with some room. Of what
-# stands above a third of their height, the moments along and across differ by up to 8 : 1.
+LEAST_SHARE = 0.5  # an edge must explain at least this share of the squared residual
+# Two equal spots 2.5 sigma apart have a standard deviation of sqrt(1 + 1.25^2) = 1.6 sigma along their line; the first
+# limit leaves some room. Above a third of their height, the moments along and across differ by up to 8 : 1.
 LONGEST, LONGEST_FIT, LONGEST_PATCH = 1.8, 2.5, 8.0
-MOST_NEAR = 4  # spots about one that is split: more are skin or lashes
-MOST = 12  # spots that are mended: where there are more, they are no glints
+MOST_NEAR = 4  # neighbours of a spot that is split; more neighbours mean skin or lashes
+MOST = 12  # spots that are refitted; where more need it, they are not glints
 
 _DIRECTION = np.arange(12) * (np.pi / 12.0)
 _TURN = np.stack([np.cos(_DIRECTION), np.sin(_DIRECTION)], axis=1)
@@ -38,10 +38,16 @@ _OFFSET = np.linspace(-0.8, 0.8, 9)
 
 
 def give_edges(fitted: FittedSpots, blur_px: float, widest_px: float, limits: Limits) -> SpotFit:
-    """The fit with unexplained single spots refitted beside a straight blurred edge (the limbus, a lid's margin).
+    """Refit unexplained single spots beside a straight blurred edge (limbus or lid margin).
 
-    The model gains h Phi((x cos p + y sin p - o) / blur), with the edge that takes most of the residual to start from,
-    and the result is taken when the residual falls to 70 %. widest_px: the largest sigma of a glint.
+    The model gains h Phi((x cos p + y sin p - o) / blur). The fit starts from the edge that explains most of the
+    residual and is kept if the residual falls to 70 %.
+
+    Args:
+        fitted: the spots' fits.
+        blur_px: blur of the edge.
+        widest_px: largest standard deviation of a glint.
+        limits: noise, clip level and the prior of the slope.
     """
     fit = fitted.fit
     index = np.flatnonzero(_unexplained(fit, limits.noise_dn, BESIDE_EDGE))[:MOST]
@@ -66,17 +72,19 @@ def give_edges(fitted: FittedSpots, blur_px: float, widest_px: float, limits: Li
 
 
 def _unexplained(fit: SpotFit, noise_dn: float, most: float) -> NDArray[np.bool_]:
-    """(n,) which spots leave more than they should, and no more than `most` of their height."""
+    """(n,) which spots have a residual that is too large for a single glint, but at most `most` of their height."""
     least = np.maximum(UNEXPLAINED * noise_dn, UNLIKE_BELL * fit.amplitude_dn)
     most_dn = most * np.minimum(fit.amplitude_dn, DN)
     return np.asarray(fit.converged & (fit.residual_dn > least) & (fit.residual_dn < most_dn))
 
 
 def _best_edge(fitted: FittedSpots, blur_px: float) -> tuple[Array, Array]:
-    """((n,) share of a spot's squared residual that the best of many straight edges takes away, to first order in the
-    rest; (n, 3) that edge's height, direction and offset).
+    """The straight edge that explains most of each spot's residual, among 12 directions and 9 offsets.
 
-    12 directions and 9 offsets; the edges less what the spot's and its background's own parameters could do as well.
+    The part of an edge that the parameters of the spot and its background can explain is removed first.
+
+    Returns:
+        (n,) share of the squared residual that the edge explains, to first order; (n, 3) its height, direction, offset.
     """
     pixels, n = fitted.pixels, fitted.theta.shape[0]
     grid = Grid.of(pixels.radius, pixels.spot, pixels.dx, pixels.dy)
@@ -113,12 +121,22 @@ def split_blends(
     widest_px: float,
     limits: Limits,
 ) -> tuple[Starts, SpotFit]:
-    """(starts, fit) with every unexplained spot replaced by two, where two fit it much better.
+    """Replace every unexplained spot by two if two fit it much better.
 
-    starts: xy (n, 2), width (n,), height (n,), as given to `fit_spots`. Two spots less than 2.5 sigma apart have one
-    maximum; their patch is longer than wide, and one Gaussian leaves a residual of several times the noise. The halves
-    start at one deviation either way along the patch's longer axis; they must come out round and cut the residual to
-    60 %. widest_px: the largest sigma of a glint; a patch longer or narrower than two such make is left alone.
+    Two spots less than 2.5 sigma apart have one maximum. Their patch is elongated, and one Gaussian leaves a residual
+    of several times the noise. The two halves start one standard deviation either way along the longer axis. They must
+    become round and reduce the residual to 60 %.
+
+    Args:
+        linear: the image, DN.
+        known: gives the background B at pixels x and y.
+        starts: xy (n, 2), width (n,) and height (n,), as given to `fit_spots`.
+        fit: their fits.
+        widest_px: largest standard deviation of a glint. A patch that two such cannot form is left alone.
+        limits: noise, clip level and the prior of the slope.
+
+    Returns:
+        Starts and fits, with the halves in place of the spots that were split.
     """
     if fit.converged.size > MOST:
         return starts, fit
@@ -131,7 +149,7 @@ def split_blends(
         if math.hypot(*offset) > LONGEST * widest_px or float(sigma.max()) > LONGEST_FIT * float(sigma.min()):
             continue
         xy, width, height = starts
-        # Only the spots whose light reaches there are fitted anew.
+        # Only the spots whose light reaches the patch are fitted again.
         reach = 3.0 * (window_radius(width) + window_radius(width[i]))
         near = (np.hypot(*(xy - fit.xy_px[i]).T) < reach) & (np.arange(width.size) != i)
         if np.count_nonzero(near) > MOST_NEAR:
@@ -159,9 +177,9 @@ def split_blends(
 
 
 def _long_axis(moments: Array) -> tuple[Array, float] | None:
-    """((2,) one deviation along a patch's longer axis, deviation across it), or None for a round one.
+    """(2,) one standard deviation along a patch's longer axis, and the standard deviation across it; None if round.
 
-    moments (2, 2): the patch's second moments, px^2.
+    `moments` (2, 2) are the patch's second moments, px^2.
     """
     values, vectors = np.linalg.eigh(moments)
     if values[1] <= 1.3 * max(float(values[0]), 0.01) or values[1] > LONGEST_PATCH * (float(values[0]) + 0.05):

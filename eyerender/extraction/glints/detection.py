@@ -1,4 +1,4 @@
-"""Bright spots near the pupil: their detection."""
+"""Detection of bright spots near the pupil, which may be glints."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ from .prescreening import bell_shaped
 
 Array = NDArray[np.float64]
 
-SMOOTH_PX = 0.7
-MAX_SIGMA_PX = 8.0
-LEAST_OF_BLOCK = 0.5  # of a sharp peak's height, the mean of the 2 x 2 pixels about it
-RING_SHARE = 0.4  # of a glint's height above its darkest surroundings, that it has above its brightest
-MOST_PEAKS = 80  # maxima looked at, brightest first
+SMOOTH_PX = 0.7  # standard deviation of the Gaussian that the image is smoothed with first
+MAX_SIGMA_PX = 8.0  # widest spot
+# The mean of the 2 x 2 pixels around a sharp peak reaches at least this share of its height.
+LEAST_OF_BLOCK = 0.5
+# A glint stands above its brightest surroundings by at least this share of what it stands above the darkest.
+RING_SHARE = 0.4
+MOST_PEAKS = 80  # maxima that are examined, brightest first
 
 _COS, _SIN = np.cos(np.arange(12) * (np.pi / 6.0)), np.sin(np.arange(12) * (np.pi / 6.0))
-# Places on a ring: three circles, each turned against the one before.
+# Sample points of a ring: three circles, each turned against the previous one.
 _RING_STEPS = np.repeat((0.1, 0.5, 0.9), 24)
 _RING_ANGLE = (np.arange(72) % 24 + np.repeat((0.0, 1.0 / 3.0, 2.0 / 3.0), 24)) * (np.pi / 12.0)
 _RING_COS, _RING_SIN = np.cos(_RING_ANGLE), np.sin(_RING_ANGLE)
@@ -31,9 +33,16 @@ _RING_COS, _RING_SIN = np.cos(_RING_ANGLE), np.sin(_RING_ANGLE)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spots:
-    """Detected spots: xy_px (n, 2) of the peak pixels, width_px (n,) sigma guessed from the area above half height,
-    height_dn (n,) above the surroundings. patches_px (k, 2): peaks of bright places that are no spots. clutter: of the
-    spots that no bell explains, likewise xy, width and height; they are not fitted, and no boundary is fitted there."""
+    """Detected spots.
+
+    Attributes:
+        xy_px: (n, 2) peak pixels.
+        width_px: (n,) standard deviation, estimated from the area above half the height.
+        height_dn: (n,) height above the surroundings.
+        patches_px: (k, 2) peaks of bright patches that are not spots.
+        clutter: xy, width and height of spots that are not bell-shaped. They are not fitted, and the pixel model of the
+            pupil boundary leaves their pixels out.
+    """
 
     xy_px: Array
     width_px: Array
@@ -45,7 +54,7 @@ class Spots:
 def detect_spots(
     prepared: Prepared, ellipse: Ellipse, step_dn: float, blur_px: float, settings: ExtractionSettings
 ) -> Spots:
-    """Local maxima that stand out of their surroundings, a white top-hat, within the settings' reach of the pupil."""
+    """Find local maxima that stand out from their surroundings (white top-hat) within `settings.glint_reach`."""
     linear = prepared.linear
     reach = float(ellipse.semi_axes_px[0]) * settings.glint_reach + 8.0
     cx, cy = ellipse.centre_px
@@ -57,7 +66,7 @@ def detect_spots(
         return _no_spots()
     smooth = as_image(cv2.GaussianBlur(crop, (5, 5), SMOOTH_PX))
     size = 2 * math.ceil(3.0 * max(blur_px, 1.0) + 3.0) + 1
-    # A top-hat of noise alone is near 3 sigma of the smoothed noise everywhere.
+    # The top-hat of pure noise is about 3 standard deviations of the smoothed noise everywhere.
     noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * SMOOTH_PX)
     threshold = max(9.0 * noise, 0.6 * step_dn)
     blocks = (smooth.shape[1] // 2, smooth.shape[0] // 2)
@@ -88,7 +97,7 @@ def detect_spots(
 
 
 def _sampled(smooth: Image, xy: Array, x: Array, y: Array) -> NDArray[np.float32]:
-    """(n, k) levels of the pixels nearest to the offsets (x, y), (n, k) each, from the peaks xy (n, 2)."""
+    """(n, k) levels of the pixels nearest to the peaks xy (n, 2) plus the offsets x and y, (n, k) each."""
     height, width = smooth.shape
     column = np.rint(np.minimum(np.maximum(xy[:, :1] + x, 0.0), width - 1.0)).astype(np.intp)
     row = np.rint(np.minimum(np.maximum(xy[:, 1:] + y, 0.0), height - 1.0)).astype(np.intp)
@@ -96,9 +105,9 @@ def _sampled(smooth: Image, xy: Array, x: Array, y: Array) -> NDArray[np.float32
 
 
 def _above_ring(smooth: Image, xy: Array, width: Array) -> Array:
-    """(n,) how far each peak stands above the brightest tenth of a ring about it, the other spots left out.
+    """(n,) height of each peak above the brightest tenth of a ring around it. Pixels of other spots are left out.
 
-    Skin, lashes and the gaps between them have many peaks, and beside each others as bright.
+    Skin, lashes and the gaps between lashes have many peaks, with equally bright ones beside them.
     """
     inner, outer, disc = 2.2 * width + 1.0, 3.5 * width + 2.0, 2.5 * width + 1.0
     radius = inner[:, None] + (outer - inner)[:, None] * _RING_STEPS
@@ -122,19 +131,19 @@ def _above_ring(smooth: Image, xy: Array, width: Array) -> Array:
 
 
 def widest(blur_px: float) -> float:
-    """Largest sigma of a glint, px: a light's image in the cornea is a few pixels wide, and blurred by the optics."""
+    """Largest standard deviation of a glint, px: a few pixels for the LED's image, plus the blur of the optics."""
     return min(2.5 * optics_sigma(blur_px) + 2.0, MAX_SIGMA_PX)
 
 
 def optics_sigma(blur_px: float) -> float:
-    """The boundary's blur without the pixel's own share of it, 1/12 px^2."""
+    """Standard deviation of the optical blur, px: the edge's blur without the variance of a pixel, 1/12 px^2."""
     return math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0))
 
 
 def _compact(smooth: Image, xy: Array, width: Array, height: Array) -> NDArray[np.bool_]:
-    """Whether the level falls by a third of the height or more in at least 9 of 12 directions, 2.5 sigma away.
+    """Whether the level falls by at least a third of the height in 9 of 12 directions, 2.5 sigma from the peak.
 
-    Strips of sclera and corners between lid and iris do not; a glint beside another one, or on an edge, does.
+    This rejects strips of sclera and the corners between lid and iris. A glint beside another one or on an edge passes.
     """
     reach = (2.5 * width + 1.5)[:, None]
     top = np.take(smooth, (xy[:, 1] * smooth.shape[1] + xy[:, 0]).astype(np.intp))
@@ -143,10 +152,10 @@ def _compact(smooth: Image, xy: Array, width: Array, height: Array) -> NDArray[n
 
 
 def _parted(smooth: Image, xy: Array, size: int, dip: float) -> list[int]:
-    """The maxima, of those xy (n, 2) in their order, between which and all before them the level falls `dip` below the
-    lower one; farther apart than `size` they are two anyway.
+    """Indices of the maxima xy (n, 2) that are spots of their own, in the given order.
 
-    Flat tops of clipped spots give several maxima, and so does noise on wide ones.
+    Two maxima count as one spot unless the level between them falls by `dip` below the lower one, or they are farther
+    apart than `size`. The flat tops of clipped spots have several maxima, and so have wide spots with noise.
     """
     gap = xy[:, None] - xy
     one, other = np.nonzero(np.tril((gap**2).sum(axis=-1) <= size**2, -1))
@@ -171,8 +180,7 @@ def _no_spots() -> Spots:
 
 
 def _opening(half: Image, size: int) -> Image:
-    """A square opening of `size` px of an image at half resolution: the level about spots, for which blocks of 2 x 2
-    pixels do."""
+    """The level around spots: a square morphological opening of `size` px. Half resolution is enough for it."""
     side = 2 * (size // 4) + 1
     return as_image(cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)))
 
@@ -180,8 +188,7 @@ def _opening(half: Image, size: int) -> Image:
 def _maxima(
     smooth: Image, half: Image, opened: Image, threshold: float
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """(flat indices (n,) of the pixels that no neighbour surpasses and that stand more than the threshold above the
-    opened level; how far they do (n,))."""
+    """Flat indices (n,) of local maxima that exceed the opened level by the threshold, and by how much they do (n,)."""
     blocks = np.flatnonzero(half - opened > LEAST_OF_BLOCK * threshold)
     width, columns = smooth.shape[1], half.shape[1]
     row, column = np.divmod(blocks, columns)

@@ -1,4 +1,4 @@
-"""What a fit of bright spots gives, as a batch; and the profile of one."""
+"""The result of fitting bright spots, as a batch; the profile of a spot."""
 
 from __future__ import annotations
 
@@ -16,11 +16,19 @@ _ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpotFit:
-    """A batch of fitted spots. xy_px (n, 2), covariance (n, 2, 2), amplitude_dn (n,), sigma_px (n, 2) along x and y,
-    background_dn (n,) at the spot, residual_dn (n,) root mean square over the window, moments_px2 (n, 2, 2): second
-    moments of the bright patch, those of the Gaussian where it explains the pixels and else of what stands above a
-    third of the height, background and other spots taken away, clipped (n,) number of pixels at the clip level,
-    converged (n,).
+    """A batch of fitted spots.
+
+    Attributes:
+        xy_px: (n, 2) centres.
+        covariance: (n, 2, 2) of the centres, px^2.
+        amplitude_dn: (n,) peak above the background.
+        sigma_px: (n, 2) standard deviations along x and y.
+        background_dn: (n,) level of the background at the centre.
+        residual_dn: (n,) root mean square over the window.
+        moments_px2: (n, 2, 2) second moments of the bright patch: those of the Gaussian if it explains the pixels, else
+            those of the part above a third of the height, without background and other spots.
+        clipped: (n,) number of clipped pixels.
+        converged: (n,) whether the fit converged.
     """
 
     xy_px: Array
@@ -34,11 +42,11 @@ class SpotFit:
     converged: NDArray[np.bool_]
 
     def taken(self, index: NDArray[np.intp]) -> SpotFit:
-        """The chosen spots."""
+        """The spots with these indices."""
         return SpotFit(*(getattr(self, one.name)[index] for one in fields(self)))
 
     def replaced(self, index: NDArray[np.intp], other: SpotFit) -> SpotFit:
-        """The chosen spots replaced by those of `other`."""
+        """A copy in which `other` replaces the spots with these indices."""
         parts = []
         for one in fields(self):
             values = getattr(self, one.name).copy()
@@ -48,7 +56,7 @@ class SpotFit:
 
 
 def joined(parts: list[SpotFit]) -> SpotFit:
-    """Batches one after the other."""
+    """Several batches as one."""
     return SpotFit(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)))
 
 

@@ -1,8 +1,8 @@
-"""Censored fits of Gaussian spots on a known background, all spots of an image at once.
+"""Censored fits of Gaussian spots on a known background, for all spots of an image at once.
 
-Spots that reach into each other's windows are fitted each on the image less the others' light, which follows from step
-to step, until they settle. A spot that has grown or moved beyond what a glint's could, or wanders on when others have
-settled, is given up: its light is nobody's background.
+A spot that overlaps others is fitted to the image minus their light, which is updated as their fits change. A spot is
+abandoned if it grows or moves more than a glint can, or if it still moves when the others have settled. The light of an
+abandoned spot is not subtracted from the others' windows.
 """
 
 from __future__ import annotations
@@ -16,25 +16,24 @@ from scipy.special import ndtr
 
 from ..preprocessing import Image
 from .fits import SpotFit, no_spots
-from .gaussian_model import PARAMETERS, SAME_LIGHT, Descent, Limits, descend, hopeful, lost, prior
+from .gaussian_model import PARAMETERS, SAME_LIGHT, Descent, Limits, descend, lost, prior, promising
 from .windows import Others, SpotPixels, cut, window_radius
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Turns of several steps each; after PATIENCE turns a spot that still moves by WANDERING_PX is given up. The second
-# numbers are for hopeful spots, and those whose misfit still falls.
+# Rounds of several steps each. A spot that still moves by WANDERING_PX after PATIENCE rounds is abandoned. The second
+# numbers are for spots whose fit is promising or whose misfit still falls.
 TURNS, PATIENCE, WANDERING_PX = (1, 4), (1, 2), 0.3
-FEW_CLIPPED = 2  # pixels: a spot with more has a flat top
-SMOOTH_PX = 0.7  # of the image in which widths are guessed
-UNEXPLAINED = 2.0  # misfit in noises: below, a spot's pixels are as its Gaussian says
-NEARLY_STILL_PX = 0.02  # a pair that takes turns at that is settled
+FEW_CLIPPED = 2  # a spot with more clipped pixels has a flat top
+SMOOTH_PX = 0.7  # smoothing of the image in which detection estimated the widths
+UNEXPLAINED = 2.0  # with a smaller misfit, in noise standard deviations, the Gaussian explains the pixels
+NEARLY_STILL_PX = 0.02  # a spot that moves less has settled, even if its neighbour still answers its moves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedSpots:
-    """A fit with what it was made of: pixels (P of them), theta (n, PARAMETERS), rest (P,): the image less B and the
-    light of the other spots."""
+    """A fit and its data: P pixels, theta (n, PARAMETERS), rest (P,): the image minus B and the other spots' light."""
 
     fit: SpotFit
     pixels: SpotPixels
@@ -50,9 +49,15 @@ def fit_spots(
     height_dn: Array,
     limits: Limits,
 ) -> FittedSpots:
-    """Fit all spots. linear: image (DN). known: B at pixels (x, y), each (k,).
+    """Fit all spots.
 
-    start_px (n, 2), width_px (n,), height_dn (n,): from detection.
+    Args:
+        linear: the image, DN.
+        known: gives the background B at pixels x and y, (k,) each.
+        start_px: (n, 2) detected peaks.
+        width_px: (n,) their estimated standard deviations.
+        height_dn: (n,) their heights.
+        limits: noise, clip level and the prior of the slope.
     """
     if start_px.shape[0] == 0:
         return no_fit()
@@ -82,7 +87,7 @@ def fit_spots(
         moved, done, falling = np.zeros(n), np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
         moved[live], done[live], falling[live] = found.moved, found.settled, found.falling
         settled[live] = found.settled | (found.moved < NEARLY_STILL_PX)
-        likely = falling | hopeful(theta, gram, used, noise)
+        likely = falling | promising(theta, gram, used, noise)
         turns, patience = np.where(likely, TURNS[1], TURNS[0]), np.where(likely, PATIENCE[1], PATIENCE[0])
         gone |= lost(theta, begun) | (~done & (moved > WANDERING_PX) & (turn + 1 >= patience))
         if others is not None:
@@ -96,14 +101,14 @@ def fit_spots(
 
 
 def no_fit() -> FittedSpots:
-    """Of no spots."""
+    """The fit of no spots."""
     none, index, pairs = np.zeros(0), np.zeros(1, dtype=np.intp), np.zeros((0, 2))
     pixels = SpotPixels(pairs, none, index, index[:0], none, np.zeros((3, 0)), none, none, none > 0.0, False)
     return FittedSpots(no_spots(), pixels, np.zeros((0, PARAMETERS)), none)
 
 
 def _distance(start: Array) -> Array:
-    """(n, n) between spots; infinite from one to itself."""
+    """(n, n) distances between spots; infinite on the diagonal."""
     gap = start[:, None] - start
     out: Array = np.sqrt((gap * gap).sum(axis=-1))
     np.fill_diagonal(out, np.inf)
@@ -111,7 +116,7 @@ def _distance(start: Array) -> Array:
 
 
 def _start(pixels: SpotPixels, start: Array, width: Array, height: Array, touching: Mask) -> Array:
-    """(n, PARAMETERS) before the fit, without the background's level."""
+    """(n, PARAMETERS) start of the fit, without the background's level."""
     theta = np.zeros((width.size, PARAMETERS))
     theta[:, :2] = start
     theta[:, 2] = np.log(1.3 * np.maximum(height, 1.0))
@@ -123,17 +128,17 @@ def _start(pixels: SpotPixels, start: Array, width: Array, height: Array, touchi
         top = pixels.clip & (away2 < (3.0 + 2.5 * width[own]) ** 2)
         width_sum = 4.0 + 2.5 * width[:, None] + 1.5 * width
         near = touching & (((start[:, None] - start) ** 2).sum(axis=-1) < width_sum**2)
-        for i, k in zip(*np.nonzero(near), strict=True):  # no other's
+        for i, k in zip(*np.nonzero(near), strict=True):  # leave out pixels nearer to another spot
             part = slice(pixels.first[i], pixels.first[i + 1])
             top[part] &= ((at[part] - start[k]) ** 2).sum(axis=1) >= away2[part]
         area = pixels.total(top)
-        # A flat top's centre is its mean, its pixel of first maximum is anywhere.
+        # The centre of a flat top is its mean; its first brightest pixel may be anywhere.
         flat = area > FEW_CLIPPED
         share = top / np.maximum(area, 1.0)[own]
         mean = pixels.centre + np.stack([pixels.total(share * pixels.dx), pixels.total(share * pixels.dy)], axis=-1)
         theta[flat, :2] = mean[flat]
-        # The area of a Gaussian above a level is 2 pi sigma^2 ln(A / level): those above the clip level and above half
-        # of it, which tells the width, give the amplitude.
+        # A Gaussian exceeds a level on an area of 2 pi sigma^2 ln(A / level). The areas above the clip level and above
+        # half of it, from which the width was estimated, give the amplitude.
         full = 2.0 * np.pi * np.log(2.0) * (width**2 + SMOOTH_PX**2) + np.pi * SMOOTH_PX**2
         ratio = np.minimum(area / full, 0.8)[flat]
         beyond = np.log(2.0) * ratio / (1.0 - ratio)
@@ -144,19 +149,19 @@ def _start(pixels: SpotPixels, start: Array, width: Array, height: Array, touchi
 
 
 def _ring_level(pixels: SpotPixels, rest: Array) -> Array:
-    """(n,) mean along the windows' edges."""
+    """(n,) mean level along the edges of the windows."""
     ring = pixels.dx * pixels.dx + pixels.dy * pixels.dy > ((pixels.radius - 1.0) ** 2)[pixels.spot]
     return pixels.total(rest * ring) / np.maximum(pixels.total(ring), 1.0)
 
 
 def report(pixels: SpotPixels, ended: Descent, rest: Array, limits: Limits, blur_px: float | None = None) -> SpotFit:
-    """The fit that a descent ended at. rest (P,): image less B and the others' light. blur_px: of the edges."""
+    """The fit at the end of a descent; `rest` (P,) is the image minus B and the other spots' light."""
     theta, noise = ended.theta, limits.noise_dn
     k = theta.shape[1]
     penalty = prior(limits, blur_px is not None)
     data_cost = np.maximum(ended.gram[:, k, k] - np.einsum("nk,nk->n", theta @ penalty, theta), 0.0)
     inverse = np.linalg.inv(ended.gram[:, :k, :k] + 1e-9 * np.eye(k))
-    # What the noise does not explain counts as noise.
+    # A misfit beyond the noise counts as more noise.
     scale = np.maximum(data_cost / np.maximum(ended.used - k, 1.0), 1.0)
     at = theta[:, :2] - pixels.centre
     level = theta[:, 5] + (theta[:, 6:8] * at).sum(axis=1)
@@ -178,8 +183,8 @@ def report(pixels: SpotPixels, ended: Descent, rest: Array, limits: Limits, blur
 
 
 def _moments(pixels: SpotPixels, rest: Array, level: Array, which: Mask, sigma: Array) -> Array:
-    """(n, 2, 2) second moments of what stands above a third of the height, background `level` (n,) taken away; of the
-    spots that are not asked for, their fits'."""
+    """(n, 2, 2) second moments of the part above a third of the height, without the background `level` (n,). Spots
+    outside `which` get the moments of their fit."""
     out = np.zeros((level.size, 2, 2))
     out[:, 0, 0], out[:, 1, 1] = (sigma * sigma).T
     index = np.flatnonzero(which)

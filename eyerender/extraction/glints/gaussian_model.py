@@ -1,9 +1,9 @@
-"""The model of a bright spot in its window, and steps of Levenberg-Marquardt on many spots side by side.
+"""The Gaussian model of a bright spot, fitted to many spots at once by Levenberg-Marquardt.
 
-Model in pixel (x, y): B(x, y) + b0 + bx (x - xc) + by (y - yc) + A Gx(x) Gy(y), with Gx the mean over the pixel of
-exp(-(x - x0)^2 / (2 sx^2)). B is the image expected without spots (pupil, iris, the blurred edge between them). Beside
-an edge of its own a spot has h Phi(((x - xc) cos p + (y - yc) sin p - o) / blur) as well. A pixel at the clip level
-only says that the intensity is at least its own; it counts only where the model is below.
+The level in pixel (x, y) is B(x, y) + b0 + bx (x - xc) + by (y - yc) + A Gx(x) Gy(y). Gx is the mean over the pixel of
+exp(-(x - x0)^2 / (2 sx^2)), and Gy likewise. B is the image expected without spots: pupil, iris and the blurred edge
+between them. A spot beside an edge of its own (limbus, lid) adds h Phi(((x - xc) cos p + (y - yc) sin p - o) / blur).
+A clipped pixel only shows that its intensity is at least the clip level, so it counts only where the model is below.
 """
 
 from __future__ import annotations
@@ -20,28 +20,34 @@ from .windows import Grid, Others, SpotPixels
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; and of an edge h, p, o
-LOST_PX = 12.0  # no glint's fit is as wide as that, or as far from where it began
-ROUND_SD = 0.3  # standard deviation of ln sx - ln sy: glints are nearly round
-STEPS = 8
-# What the last step needed gains, in squared noises: it is that step's square in standard deviations. The second number
-# is for spots in the light of others, of which their gain does not tell.
+PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; with an edge also h, p, o
+LOST_PX = 12.0  # a spot that becomes wider or moves farther is not a glint
+ROUND_SD = 0.3  # prior standard deviation of ln sx - ln sy: glints are nearly round
+STEPS = 8  # of Levenberg-Marquardt in one descent
+# A descent ends when a step gains less, in squared standard deviations of the noise. That is also the squared length of
+# the step in standard deviations of the parameters. The second number is for spots that overlap others.
 SMALL_GAIN = (5e-2, 5e-3)
+# A fit is promising if its misfit is below ROUGH noise standard deviations or this share of the spot's height.
 ROUGH, ROUGH_SHARE = 3.0, 0.05
-STALLED = 0.97  # of the squared misfit, left by a step: no further one for a spot without hope
-SAME_LIGHT = 0.01  # change of the others' light, in noises, that asks for no further step
+STALLED = 0.97  # a step that leaves more of the squared misfit is the last one of an unpromising spot
+SAME_LIGHT = 0.01  # smaller changes of the other spots' light, in noise standard deviations, need no further step
 
 _FREE = np.inf
 _LEAST = np.array([-_FREE, -_FREE, -5.0, math.log(0.2), math.log(0.2), *[-_FREE] * 6])
 _MOST = np.array([_FREE, _FREE, 15.0, math.log(30.0), math.log(30.0), *[_FREE] * 6])
-_STRIDE = np.array([1.5, 1.5, 0.7, 0.7, 0.7, _FREE, _FREE, _FREE, _FREE, 0.5, 1.5])  # largest step
+_STRIDE = np.array([1.5, 1.5, 0.7, 0.7, 0.7, _FREE, _FREE, _FREE, _FREE, 0.5, 1.5])  # largest step of each parameter
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Limits:
-    """noise_dn, clip_dn; slope_dn: how steep the background may be beyond B, DN per px (standard deviation of its
-    prior)."""
+    """What a fit of spots knows of the image.
+
+    Attributes:
+        noise_dn: standard deviation of a pixel's noise.
+        clip_dn: level at which the sensor clips.
+        slope_dn: prior standard deviation of the background's slope beyond B, DN per px.
+    """
 
     noise_dn: float
     clip_dn: float
@@ -50,9 +56,16 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Descent:
-    """Where a descent ended: theta (n, K); gram (n, K + 1, K + 1), as `_gram` has it, priors included; used (n,)
-    pixels that count; settled (n,); moved (n,) px and falling (n,), whether the squared misfit has halved, in the last
-    half of the steps."""
+    """Where a descent ended.
+
+    Attributes:
+        theta: (n, K) parameters.
+        gram: (n, K + 1, K + 1) products of slopes and residual, priors included (see `_gram`).
+        used: (n,) number of pixels that count.
+        settled: (n,) whether the last step gained little.
+        moved: (n,) px moved during the second half of the steps.
+        falling: (n,) whether the squared misfit halved during the second half of the steps.
+    """
 
     theta: Array
     gram: Array
@@ -63,22 +76,28 @@ class Descent:
 
 
 def lost(theta: Array, start: Array) -> Mask:
-    """(n,) which spots have grown or moved beyond what a glint's fit could."""
+    """(n,) which spots have grown or moved more than a glint can."""
     wide = theta[:, 3:5].max(axis=1) > math.log(LOST_PX)
     away = theta[:, :2] - start
     return np.asarray(wide | ((away * away).sum(axis=1) > LOST_PX**2))
 
 
-def hopeful(theta: Array, gram: Array, used: Array, noise: float) -> Mask:
-    """(n,) which spots the fit explains to within ROUGH noises or that share of their height."""
+def promising(theta: Array, gram: Array, used: Array, noise: float) -> Mask:
+    """(n,) which spots the fit explains roughly (see ROUGH and ROUGH_SHARE)."""
     misfit = noise * np.sqrt(gram[:, -1, -1] / np.maximum(used, 1.0))
     return np.asarray(misfit < np.maximum(ROUGH * noise, ROUGH_SHARE * np.exp(theta[:, 2])))
 
 
 def slopes(pixels: SpotPixels, grid: Grid, theta: Array, rest: Array, blur_px: float | None = None) -> Array:
-    """(K + 1, P): the model's derivatives at every pixel and, last, the residual.
+    """(K + 1, P) derivatives of the model at every pixel and, in the last row, the residual.
 
-    rest (P,): image less all that is not fitted. blur_px: of the edges, where the spots have such."""
+    Args:
+        pixels: P pixels of n spots.
+        grid: their grid.
+        theta: (n, K) parameters.
+        rest: (P,) image minus everything that is not fitted.
+        blur_px: blur of the edges, if the spots have edges of their own.
+    """
     across, along = grid.profiles(theta[:, :2] - pixels.centre, np.exp(theta[:, 3:5]), np.exp(theta[:, 2]))
     out = np.empty((theta.shape[1] + 1, rest.size))
     np.multiply(across[0], along[1], out=out[0])
@@ -100,8 +119,8 @@ def slopes(pixels: SpotPixels, grid: Grid, theta: Array, rest: Array, blur_px: f
 
 
 def prior(limits: Limits, edge: bool) -> Array:
-    """(K, K) normal matrix of the priors, about 0: a nearly round spot, a background that is flat to within its slope,
-    an edge of no more than full scale within reach."""
+    """(K, K) normal matrix of the priors, all with mean 0: a nearly round spot, a background that is flat to within its
+    slope, and an edge of at most full scale within reach."""
     out = np.zeros((WITH_EDGE, WITH_EDGE))
     out[3, 3] = out[4, 4] = 1.0 / ROUND_SD**2
     out[3, 4] = out[4, 3] = -1.0 / ROUND_SD**2
@@ -111,8 +130,12 @@ def prior(limits: Limits, edge: bool) -> Array:
 
 
 def _gram(pixels: SpotPixels, rows: Array, theta: Array, noise: float, penalty: Array) -> tuple[Array, Array]:
-    """(n, K + 1, K + 1): products of `slopes`, summed over every spot's pixels, in units of the noise, with the priors;
-    and the number of pixels that count (n,): not the clipped ones where the model is brighter."""
+    """Products of the `slopes`, summed over each spot's pixels, with the priors, in units of the noise.
+
+    Returns:
+        (n, K + 1, K + 1) products, and (n,) number of pixels that count. A clipped pixel does not count where the model
+        is brighter than the clip level.
+    """
     used = pixels.count
     if pixels.clipped:
         idle = pixels.clip & (rows[-1] <= 0.0)
@@ -132,10 +155,10 @@ def _gram(pixels: SpotPixels, rows: Array, theta: Array, noise: float, penalty: 
 
 
 def _dimmed(pixels: SpotPixels, rows: Array, gram: Array, light: Array, noise: float) -> None:
-    """Takes more light (P,) of others from the residual, in the products (changed in place)."""
+    """Subtract more light (P,) of other spots from the residual; changes the products in place."""
     k = gram.shape[1] - 1
     for product, row, part in zip(gram, pixels.parts(rows), pixels.parts(light), strict=True):
-        part = part * row[5]  # none in pixels that do not count
+        part = part * row[5]  # 0 in pixels that do not count
         taken = row @ part
         product[:, k] -= taken * (1.0 / noise**2)
         product[k, k] += (part @ part - taken[k]) * (1.0 / noise**2)
@@ -150,10 +173,18 @@ def descend(
     blur_px: float | None = None,
     steps: int = STEPS,
 ) -> Descent:
-    """At most so many steps on every spot, its window's light of the others following theirs.
+    """Take at most `steps` Levenberg-Marquardt steps on every spot.
 
-    theta (n, K): the start. rest (P,): image less B and less the others' light at the start. others: among these spots.
-    blur_px: of the edges, where the spots have such.
+    The light of other spots in a spot's window is updated as they change.
+
+    Args:
+        pixels: P pixels of n spots.
+        theta: (n, K) start.
+        rest: (P,) image minus B and minus the other spots' light at the start.
+        others: which of these spots shine into each other's windows; None if none do.
+        limits: noise, clip level and the prior of the slope.
+        blur_px: blur of the edges, if the spots have edges of their own.
+        steps: how many at most.
     """
     noise, penalty, k = limits.noise_dn, prior(limits, blur_px is not None), theta.shape[1]
     theta, start, middle, cost = theta.copy(), theta[:, :2], theta[:, :2], np.full(theta.shape[0], np.inf)
@@ -177,7 +208,7 @@ def descend(
         over = gain < enough * np.maximum(gram[:, k, k] / np.maximum(used, 1.0), 1.0)
         if turn >= STEPS // 2:
             over |= (damping > 1e5) | lost(theta, start)
-            stalled &= ~hopeful(theta, gram, used, noise)
+            stalled &= ~promising(theta, gram, used, noise)
         if (over | stalled if turn >= STEPS // 2 else over).all():
             theta = np.where((np.abs(step) < 1.0).all(axis=1)[:, None], trial, theta)
             break

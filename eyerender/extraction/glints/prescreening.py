@@ -1,4 +1,4 @@
-"""Whether a bright place can be a glint at all: one linear look at it, before the costly fits."""
+"""A linear fit of a bell to each spot, which rejects most spots that are not glints before the expensive fits."""
 
 from __future__ import annotations
 
@@ -14,19 +14,24 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.intp]
 
-# Glints of the development images, rendered and ideal: at most 0.20 and 0.63, at least 0.85.
+# Largest misfit as a share of the height and of the scatter; smallest fitted peak as a share of the detected height.
+# Glints of the development images (rendered and ideal) reach 0.20 and 0.63, and 0.85.
 MISFIT_OF_HEIGHT = 0.23
 MISFIT_OF_SCATTER = 0.70
 LEAST_PEAK = 0.75
-MOST_CLIPPED = 1
-NARROWEST_PX = 0.9
-EXPLAINED = 2.0  # misfits below this many noises object to nothing
-LONGEST = 2.5  # deviations of the bright patch along and across; of glints, and two that run into one, at most 2.0
+MOST_CLIPPED = 1  # clipped pixels; a spot with more is not judged
+NARROWEST_PX = 0.9  # a narrower spot is mostly a single pixel
+EXPLAINED = 2.0  # a misfit below this many standard deviations of the noise is accepted
+LONGEST = 2.5  # largest elongation of the bright patch; glints, and two that touch, reach 2.0
 
 
 def about(xy: Array, reach: Array, shape: tuple[int, ...]) -> tuple[Index, NDArray[np.float32], Mask]:
-    """(flat index (n, k), offset (2, k), whether it is in the image and within reach (n, k)) of pixels about n peak
-    pixels xy (n, 2), reach (n,) px; places beyond the image have their nearest pixel's index."""
+    """The pixels around n peak pixels xy (n, 2) up to `reach` (n,) px.
+
+    Returns:
+        Flat index (n, k), offset (2, k), and whether the pixel lies in the image and within reach (n, k). A pixel
+        outside the image has the index of the nearest one inside.
+    """
     dx, dy, away2, offset = _disc(math.ceil(float(reach.max(initial=0.0))))
     x, y = xy.astype(np.intp).T[:, :, None]
     within = away2 <= (reach**2)[:, None]
@@ -56,16 +61,24 @@ def _disc(radius: int) -> tuple[Index, Index, Index, NDArray[np.float32]]:
 def bell_shaped(
     linear: Image, xy: Array, width: Array, height: Array, noise_dn: float, clip_dn: float, which: Mask | None = None
 ) -> Mask:
-    """(m,) bool, for each of `which` (all): False where no bell explains the pixels about a spot, as with skin,
-    lashes and the gaps between them.
+    """(m,) whether the pixels around each spot form a bell. Skin, lashes and the gaps between lashes do not.
 
-    Linear least squares of the level about the peak, within 2.2 sigma + 1 px and nearer to it than to any other spot:
+    Fits the level within 2.2 sigma + 1 px of the peak by linear least squares. Pixels nearer to another spot are left
+    out. The model is
 
         c + p dx + q dy + g (h + u dx + v dy + w r^2 / sigma^2),  g = exp(-r^2 / (2 sigma^2)),
 
-    a Gaussian on a plane to first order in its place and width. A glint leaves little of the height, explains most of
-    the pixels' scatter, and stands as high as it was detected. Spots that the sensor clipped are not judged.
-    xy (n, 2) peak pixels, width (n,) sigma, height (n,) DN.
+    a Gaussian on a plane, to first order in its position and width. For a glint the misfit is a small share of the
+    height and of the pixels' scatter, and the fitted peak is as high as the detected one. Clipped spots are accepted.
+
+    Args:
+        linear: the image, DN.
+        xy: (n, 2) peak pixels.
+        width: (n,) standard deviations, px.
+        height: (n,) DN.
+        noise_dn: standard deviation of a pixel's noise.
+        clip_dn: level at which the sensor clips.
+        which: (n,) spots to judge; None for all. The others only occupy their pixels.
     """
     index = np.arange(width.size) if which is None else np.flatnonzero(which)
     out = np.ones(index.size, dtype=bool)
@@ -76,7 +89,7 @@ def bell_shaped(
     clipped = patch >= clip_dn
     judged = np.ones(index.size, dtype=bool)
     if clipped.any():
-        # What is left of others are the flanks, which tell no height.
+        # Of other spots only the flanks remain, which do not show the height.
         judged = (use & clipped).sum(axis=1) <= MOST_CLIPPED
         use &= ~clipped
     _nearest(use, offset, xy[index], xy, reach)
@@ -95,7 +108,7 @@ def bell_shaped(
     terms[:, 4], terms[:, 5], terms[:, 6] = weight, u * weight, v * weight
     level = patch * weight
     level -= (level.sum(axis=1) / count).astype(np.float32)[:, None] * weight
-    # The ridge keeps patches whose other half is another spot's from being singular.
+    # The ridge keeps the matrix regular where half of the pixels belong to another spot.
     matrix = (terms @ terms.transpose(0, 2, 1)).astype(np.float64) + 1e-6 * np.eye(7)
     found = np.linalg.solve(matrix, (terms @ level[:, :, None]).astype(np.float64))
     rest = (found.transpose(0, 2, 1).astype(np.float32) @ terms)[:, 0] - level
@@ -108,7 +121,7 @@ def bell_shaped(
 
 
 def _elongation(patch: NDArray[np.float32], tall: Array, offset: NDArray[np.float32]) -> Array:
-    """(m,) deviation along over that across, of what stands above a third of the height in patches (m, k)."""
+    """(m,) standard deviation along over that across, of the part of each patch (m, k) above a third of the height."""
     weight = np.maximum(patch - (patch.max(axis=1) - 0.65 * tall).astype(np.float32)[:, None], np.float32(0.0))
     dx, dy = offset
     terms = np.stack([np.ones_like(dx), dx, dy, dx * dx, dx * dy, dy * dy], axis=1)
@@ -121,7 +134,7 @@ def _elongation(patch: NDArray[np.float32], tall: Array, offset: NDArray[np.floa
 
 
 def _nearest(use: Mask, offset: NDArray[np.float32], own: Array, xy: Array, reach: Array) -> None:
-    """Leaves in `use` (m, k) the pixels that are no nearer to any of the spots xy than to the own one."""
+    """Clear in `use` (m, k) the pixels that lie nearer to another of the spots `xy` than to the patch's own."""
     gx, gy = (xy[None] - own[:, None]).transpose(2, 0, 1)
     apart2 = gx * gx + gy * gy
     near, other = np.nonzero((apart2 < (4.0 * reach**2)[:, None]) & (apart2 > 0.0))

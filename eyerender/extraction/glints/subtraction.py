@@ -1,4 +1,4 @@
-"""What bright spots do to the pixels about the pupil's boundary: their light taken away, and the pixels left out."""
+"""Bright spots near the pupil boundary: their light is subtracted, or their pixels are left out."""
 
 from __future__ import annotations
 
@@ -15,18 +15,21 @@ from .fits import SpotFit, profile
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-TOLD, BRIGHT = 3.0, 3.0  # noises: residual of a spot whose light is known; light that leaves a pixel out all the same
-FAINT = 0.2  # noises: light that counts at all
+# In noise standard deviations: the largest residual of a spot whose light is subtracted; the light above which a pixel
+# is left out even so; the faintest light that matters.
+WELL_FITTED, BRIGHT, FAINT = 3.0, 3.0, 0.2
 
 
-def told(prepared: Prepared, fit: SpotFit) -> Mask:
-    """(n,) the spots whose fit tells their light."""
-    return np.asarray(fit.converged & (fit.residual_dn < TOLD * prepared.noise_dn))
+def well_fitted(prepared: Prepared, fit: SpotFit) -> Mask:
+    """(n,) which spots have a fit good enough to subtract their light."""
+    return np.asarray(fit.converged & (fit.residual_dn < WELL_FITTED * prepared.noise_dn))
 
 
-def covered(prepared: Prepared, spots: Spots, which: Mask | None = None) -> Mask:
-    """Pixels that a spot, or one of `which` of them, reaches as far as detection tells, and what is no spot, and those
-    that the sensor clipped."""
+def affected_pixels(prepared: Prepared, spots: Spots, which: Mask | None = None) -> Mask:
+    """Mask (h, w) of pixels affected by spots (`which` of them, or all), clutter or saturation.
+
+    The extent of a spot follows from its detected height and width.
+    """
     own = slice(None) if which is None else which
     parts = zip((spots.xy_px[own], spots.width_px[own], spots.height_dn[own]), spots.clutter, strict=True)
     xy, width, height = (np.concatenate(part) for part in parts)
@@ -39,11 +42,14 @@ def covered(prepared: Prepared, spots: Spots, which: Mask | None = None) -> Mask
     return mask
 
 
-def without_light(prepared: Prepared, fit: SpotFit, which: Mask, about: Ellipse) -> tuple[Image, Mask]:
-    """The image less the light of `which` spots where it reaches an ellipse, and the pixels where that light is bright.
+def subtract_spots(prepared: Prepared, fit: SpotFit, which: Mask, about: Ellipse) -> tuple[Image, Mask]:
+    """Subtract the light of `which` spots from the image where it reaches the ellipse `about`.
 
-    A spot's fit tells its flanks far better than the circle of `covered`; only where its light is more than three
-    times the noise is it not to be relied on.
+    A fit describes the flanks of a spot far better than the circle of `affected_pixels`. It is not relied on where the
+    light exceeds three standard deviations of the noise.
+
+    Returns:
+        The image (h, w) without that light, and the mask (h, w) of pixels where the light is too bright.
     """
     linear, bright = prepared.linear.copy(), np.zeros(prepared.linear.shape, dtype=bool)
     reach = float(about.semi_axes_px[0]) + 10.0 + 8.0 * fit.sigma_px.max(axis=1, initial=0.0)
@@ -61,7 +67,7 @@ def without_light(prepared: Prepared, fit: SpotFit, which: Mask, about: Ellipse)
 
 
 def _reach(sigma: float, peak: float, noise_dn: float) -> float:
-    """How far from its peak a Gaussian spot is brighter than FAINT noises."""
+    """Distance from the peak at which a Gaussian spot falls to FAINT standard deviations of the noise."""
     return sigma * math.sqrt(2.0 * math.log(max(peak / (FAINT * noise_dn), math.e)))
 
 

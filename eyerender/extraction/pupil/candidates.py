@@ -1,4 +1,4 @@
-"""The coarse search: dark, elliptical, enclosed blobs over a sweep of thresholds, the innermost of a nest first."""
+"""Candidates for the pupil: dark elliptical blobs over a sweep of thresholds; of nested blobs the innermost wins."""
 
 from __future__ import annotations
 
@@ -17,15 +17,23 @@ from ..statistics import median, quantile
 
 Array = NDArray[np.float64]
 
-LEVELS = 20
-ANGLES = 48
-DARKER = 0.6  # of the thresholds; pupils show at a third of them, and brighter ones are for where none of these does
+LEVELS = 20  # thresholds at even grey levels
+ANGLES = 48  # samples around a blob
+# Share of the thresholds, darkest first, that is tried first. The others are tried if these give no candidate.
+DARKER = 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A blob: its ellipse (by second moments), level inside, step to the ring outside, share of the ring that shows
-    the step, and the score the candidates are ranked by."""
+    """A dark blob.
+
+    Attributes:
+        ellipse: with the blob's second moments.
+        inside_dn: level inside.
+        step_dn: step from inside to a ring outside.
+        enclosed: share of the ring that shows the step.
+        score: by which candidates are ranked.
+    """
 
     ellipse: Ellipse
     inside_dn: float
@@ -37,10 +45,14 @@ class Candidate:
 def find_candidates(
     prepared: Prepared, settings: ExtractionSettings, most: int = 4, *, without_lines: bool = False
 ) -> list[Candidate]:
-    """Up to `most` places where a pupil may be, best first; empty where nothing dark and round stands out.
+    """Up to `most` candidates, best first; empty if nothing dark and round stands out.
 
-    without_lines: dark lines thinner than the smallest pupil are filled first: a lid's shadow and lashes are as dark
-    as the pupil that they touch, and one blob with it at every threshold.
+    Args:
+        prepared: the image.
+        settings: sizes and shapes to look for.
+        most: number of candidates.
+        without_lines: fill dark lines thinner than the smallest pupil first. Lid shadows and lashes that touch the
+            pupil are as dark as the pupil and form one blob with it at every threshold.
     """
     linear, noise_dn = prepared.linear, prepared.noise_dn
     factor = int(np.clip(settings.radius_min_px // 3.5, 1, 4))
@@ -63,7 +75,7 @@ def find_candidates(
 
 
 def _reduced(linear: Image, factor: int, removal: int) -> Image:
-    """Averaged, smoothed, and rid of glints: an opening removes bright spots (in a negative, a closing dark ones)."""
+    """Reduce, smooth, and remove glints by a morphological opening (by a closing in a negative)."""
     height, width = linear.shape
     size = (max(1, width // factor), max(1, height // factor))
     small = cv2.resize(linear[: size[1] * factor, : size[0] * factor], size, interpolation=cv2.INTER_AREA)
@@ -74,8 +86,8 @@ def _reduced(linear: Image, factor: int, removal: int) -> Image:
 
 
 def _levels(small: Image) -> Array:
-    """Thresholds, half of them even in level and half even in area, so that neither a faint step nor a small dark
-    backdrop can hide the pupil between two of them."""
+    """Thresholds at even levels and at even areas, so that some separate the pupil even if its step is faint or the
+    image has a small dark backdrop."""
     values = np.sort(small.ravel()[:: max(1, small.size // 8000)])
     n = values.size
     low, high = float(values[0]), float(values[int(0.98 * n)])
@@ -91,12 +103,11 @@ def _levels(small: Image) -> Array:
 
 
 def _sweep(small: Image, levels: Array, factor: int, settings: ExtractionSettings) -> Array:
-    """(n, 6) blobs of every threshold that could be a pupil: their ellipse (centre x, y, semi-axes a, b, angle) in
-    reduced pixels, and the share of it that they fill."""
+    """(n, 6) blobs that could be a pupil: ellipse (x, y, a, b, angle) in reduced pixels, and its filled share."""
     height, width = small.shape
     least = max(0.5 * settings.radius_min_px, settings.radius_min_px - 2.0 * factor) / factor
     most = 1.3 * settings.radius_max_px / factor
-    # A contour's length in pixels is at least half its ellipse's perimeter.
+    # The length of a contour in pixels is at least half the perimeter of its ellipse.
     shortest, longest = 3.0 * least, 15.0 * most
     blobs: list[tuple[float, ...]] = []
     for level in levels.tolist():
@@ -106,7 +117,7 @@ def _sweep(small: Image, levels: Array, factor: int, settings: ExtractionSetting
             if not shortest < len(contour) < longest or hierarchy[0, i, 3] >= 0:  # holes have a parent
                 continue
             x, y, w, h = cv2.boundingRect(contour)
-            # A backdrop touches two sides or more, a lid one along its width.
+            # A backdrop touches at least two sides of the frame; a lid touches one along its width.
             sides = (x == 0) + (y == 0) + (x + w == width) + (y + h == height)
             if (
                 sides >= 2
@@ -122,7 +133,7 @@ def _sweep(small: Image, levels: Array, factor: int, settings: ExtractionSetting
 
 
 def _on_border(contour: NDArray[Any], width: int, height: int) -> float:
-    """Share of a contour that runs along the frame: more than a little is a lid or backdrop, not a pupil cut off."""
+    """Share of a contour along the frame. A large share means a lid or a backdrop, not a pupil that the frame cuts."""
     x, y = contour[:, 0, 0], contour[:, 0, 1]
     return np.count_nonzero((x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)) / len(contour)
 
@@ -130,7 +141,7 @@ def _on_border(contour: NDArray[Any], width: int, height: int) -> float:
 def _blob_ellipse(
     m: dict[str, float], least: float, most: float, settings: ExtractionSettings
 ) -> tuple[float, ...] | None:
-    """The ellipse with a filled contour's second moments, and its filled share, if the contour fills it."""
+    """The ellipse with the second moments of a filled contour, and its filled share; None if it is not elliptical."""
     area = m["m00"]
     if area < math.pi * least**2 * 0.5:
         return None
@@ -178,7 +189,7 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Array, most: int) ->
         for j, (other_x, other_y, other_a, other_b, *_) in zip(kept, places, strict=True):
             inner = other_a * other_b < 0.6 * a * b and math.hypot(x - other_x, y - other_y) < 0.6 * b
             darker = edge_level[i] - edge_level[j] > max(0.1 * typical[i], 2.0 * noise)
-            # The iris holds the pupil: whatever holds a darker enclosed blob is not the pupil.
+            # The iris contains the pupil, so a blob that contains a darker enclosed blob is not the pupil.
             if inner and darker and enclosed[j] > 0.55 and typical[j] > 0.12 * typical[i]:
                 final[i] = min(final[i], 0.5 * final[j])
     kept.sort(key=lambda i: -final[i])
@@ -192,7 +203,7 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Array, most: int) ->
 
 
 def _sample(small: Image, centre: Array, axes: Array, angle: Array) -> Image:
-    """(n, ANGLES) levels at the nearest pixels of n ellipses; beyond the frame its border is repeated."""
+    """(n, ANGLES) levels along n ellipses at the nearest pixels; outside the frame its border is repeated."""
     points = np.rint(points_on_ellipse(centre, axes, angle, ANGLES)).astype(np.intp)
     column = np.minimum(np.maximum(points[..., 0], 0), small.shape[1] - 1)
     row = np.minimum(np.maximum(points[..., 1], 0), small.shape[0] - 1)
@@ -200,16 +211,20 @@ def _sample(small: Image, centre: Array, axes: Array, angle: Array) -> Image:
 
 
 def _same(first: list[float], second: list[float]) -> bool:
-    """Whether two blobs (as of `_sweep`) are one place at two thresholds."""
+    """Whether two blobs of `_sweep` are the same object at two thresholds."""
     near = math.hypot(first[0] - second[0], first[1] - second[1]) < 0.35 * min(first[3], second[3])
     return near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65
 
 
 @dataclass(frozen=True, slots=True)
 class Interior:
-    """What lies inside an ellipse. darker_dn: how much darker the middle is than the outer part; error_dn: the standard
-    error of that (infinite where the ellipse is too small to tell). spread_dn: scatter of the grey levels beyond the
-    image's noise."""
+    """Statistics of the pixels inside an ellipse.
+
+    Attributes:
+        darker_dn: how much darker the middle is than the outer part.
+        error_dn: its standard error; infinite if the ellipse is too small.
+        spread_dn: scatter of the grey levels beyond the image's noise.
+    """
 
     darker_dn: float
     error_dn: float
@@ -217,10 +232,10 @@ class Interior:
 
 
 def inspect_interior(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: float) -> Interior:
-    """Levels inside an ellipse, up to where the boundary's blur begins.
+    """Statistics of the pixels inside an ellipse, up to where the blur of the boundary begins.
 
-    A pupil's interior is even; an iris taken for one has the pupil in its middle, and other things have structure.
-    Medians and quartiles, because of glints.
+    The interior of a pupil is even. An iris has the pupil in its middle, and other objects have structure. Medians and
+    quartiles are used because of glints.
     """
     a, b = ellipse.semi_axes_px
     cx, cy = ellipse.centre_px
@@ -244,7 +259,7 @@ def inspect_interior(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: 
 
 
 def find_inside(prepared: Prepared, ellipse: Ellipse, settings: ExtractionSettings) -> list[Candidate]:
-    """Candidates inside an ellipse (an iris), searched for on a smoothed image: the step may be below the noise."""
+    """Candidates inside an ellipse (an iris), from a smoothed image because the step may be below the noise."""
     linear = prepared.linear
     a, b = ellipse.semi_axes_px
     cx, cy = ellipse.centre_px

@@ -1,7 +1,7 @@
-"""How uncertain an ellipse is: covariances that know of residuals which agree along the boundary.
+"""Covariance of an ellipse, with residuals that are correlated along the boundary.
 
-Parameters are (cx, cy) and the change of the shape matrix in the ellipse's own axes (aa, bb, ab), well defined for a
-circle too; what is reported is (cx, cy, a, b, angle).
+The parameters are (cx, cy) and the change of the shape matrix in the ellipse's own axes (aa, bb, ab), which are well
+defined for a circle too. The reported parameters are (cx, cy, a, b, angle).
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from .edge_model import SECTORS, Place, sector_of
 
 Array = NDArray[np.float64]
 
-SHAPE = 5
-SELECTION = 1.6  # edge points are selected by their residual, which understates the scatter (development images)
+SHAPE = 5  # number of parameters
+# Edge points are selected by their residual, so their scatter underestimates the noise; fitted on development images.
+SELECTION = 1.6
 
 
 def gram(slopes: Array) -> Array:
-    """S S^T of (p, n), in blocks of columns: a BLAS would start its threads for the whole, at several times the
-    cost."""
+    """S S^T of (p, n), in blocks of columns: for the whole, BLAS would start threads and take several times as long."""
     columns = max(1, 200_000 // slopes.shape[0] ** 2)
     out = np.zeros((slopes.shape[0], slopes.shape[0]))
     for start in range(0, slopes.shape[1], columns):
@@ -32,7 +32,7 @@ def gram(slopes: Array) -> Array:
 
 
 def project(slopes: Array, residual: Array) -> Array:
-    """S r of (p, n), without BLAS for the same reason."""
+    """S r of (p, n), without BLAS for the same reason as in `gram`."""
     out: Array = np.einsum("pn,n->p", slopes, residual)
     return out
 
@@ -52,8 +52,9 @@ def distance_slopes(ellipse: Ellipse, place: Place) -> Array:
 
 
 def sector_excess(plain: Array, inverse: Array, sums: Array) -> float:
-    """How much more the parameters scatter than independent residuals would make them: trace(plain^-1 S) / 5, S the sum
-    over k sectors of the outer square of inverse (5, p) times the sector's summed scores, `sums` (p, k).
+    """Factor by which correlated residuals increase the covariance: trace(plain^-1 S) / 5.
+
+    S is the sum over k sectors of the outer product of `inverse` (5, p) times the sector's summed scores `sums` (p, k).
 
     Source: the cluster-robust ("sandwich") covariance, Liang and Zeger (1986), reduced to one factor.
     """
@@ -64,14 +65,14 @@ def sector_excess(plain: Array, inverse: Array, sums: Array) -> float:
 def edge_covariance(ellipse: Ellipse, points: Array, residual_px: float) -> Array:
     """(5, 5) covariance of (cx, cy, a, b, angle) of an ellipse fitted to edge points with this residual.
 
-    Neighbouring edge points share their noise (the filter's reach, the texture), which the sector excess measures.
+    Neighbouring edge points share noise (through the filter) and texture. `sector_excess` accounts for that.
     """
     place = Place.of(ellipse, points[:, 0], points[:, 1])
     slopes = distance_slopes(ellipse, place)
     matrix = gram(slopes)
     inverse = np.linalg.inv(matrix + 1e-9 * np.trace(matrix) * np.eye(SHAPE))
     plain = inverse * max(residual_px, 1e-4) ** 2
-    # A third of the sectors, so that one is longer than the noise's reach; n / (n - 5) for the parameters fitted.
+    # A third of the sectors: each is then longer than the noise's correlation. n / (n - 5) for the fitted parameters.
     coarse = sector_of(place) // 3
     scores = slopes * place.distance
     sums = np.array([np.bincount(coarse, weights=row, minlength=SECTORS // 3) for row in scores], dtype=np.float64)
@@ -85,16 +86,16 @@ def boundary_deviation(ellipse: Ellipse, covariance: Array) -> float:
     """Root mean square, over the outline, of the boundary's standard deviation along its normal, px."""
     slopes = distance_slopes(ellipse, Place.middles(ellipse, 32))
     a, b = ellipse.semi_axes_px.tolist()
-    # By the angle instead of the shape matrix's off-diagonal term: d ab = (a - b) d angle.
+    # Use the angle in place of the off-diagonal term of the shape matrix: d ab = (a - b) d angle.
     slopes[4] *= a - b
     return math.sqrt(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1])
 
 
 def to_axes(covariance: Array, ellipse: Ellipse) -> Array:
-    """From the shape matrix's changes to (cx, cy, a, b, angle): d angle = d ab / (a - b), at most a uniform angle's."""
+    """Covariance of (cx, cy, a, b, angle) from that of the shape matrix: d angle = d ab / (a - b)."""
     a, b = ellipse.semi_axes_px
     jacobian = np.eye(SHAPE)
-    # The angle's deviation cannot exceed that of a uniform orientation, pi / sqrt(12).
+    # The standard deviation of the angle is at most that of a uniform orientation, pi / sqrt(12).
     floor = math.sqrt(covariance[4, 4] * 12.0) / math.pi
     jacobian[4, 4] = 1.0 / max(float(a - b), floor, 1e-9)
     return np.asarray(jacobian @ covariance @ jacobian.T)

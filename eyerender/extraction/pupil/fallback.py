@@ -16,7 +16,7 @@ from .scoring import pupil_of
 from .search import Found, boundary_about
 
 # The best of several wrong candidates looks better than one wrong candidate does, so more confidence is asked of it.
-SURE = 0.8
+FALLBACK_CONFIDENCE = 0.8
 LEAST_SUPPORT = 0.4
 LARGEST_GAP = 0.56  # with an arc of less than 160 deg, noise decides where the opposite side lies
 MOST_SPREAD = 0.8  # of the levels inside, in steps; more means lids and lashes inside
@@ -24,7 +24,7 @@ UNCERTAIN = 0.015  # largest standard deviation of the boundary over b; an arc t
 CANDIDATES = 3  # of each search
 
 
-def second_look(work: Prepared, refused: Found, settings: ExtractionSettings) -> Found | None:
+def fallback_search(work: Prepared, refused: Found, settings: ExtractionSettings) -> Found | None:
     """The most likely boundary among all candidates, judged by its edges alone; None if none is likely enough.
 
     A lid that crosses the pupil gives the dark region a straight side, so an ellipse through its whole outline is
@@ -33,7 +33,7 @@ def second_look(work: Prepared, refused: Found, settings: ExtractionSettings) ->
     out that lies inside the ellipse through the rest. A boundary that contains the rejected one, or that has a dark
     core, is an iris.
     """
-    choice = settings.model_copy(update={"method": "fast", "min_confidence": SURE})
+    choice = settings.model_copy(update={"method": "fast", "min_confidence": FALLBACK_CONFIDENCE})
     best: Found | None = None
     most = 0.0
     for found in _boundaries(work, settings):

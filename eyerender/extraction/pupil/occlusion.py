@@ -1,4 +1,4 @@
-"""Which pixels and sectors of a boundary its model explains, and how uneven the margin is."""
+"""Occlusion: which pixels and sectors of the boundary the pixel model explains, and how uneven the boundary is."""
 
 from __future__ import annotations
 
@@ -15,16 +15,21 @@ from .edge_model import SECTORS, EdgeModel, Place, sector_of
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-OUTLIER = 5.0  # pixels beyond this many standard deviations do not count
-LINEAR = 0.1  # of the blur: so small a displacement is
-FARTHEST = 3.5  # a sector's displacement, in what margins and the noise make likely
+OUTLIER = 5.0  # pixels with a larger residual, in standard deviations, are left out
+LINEAR = 0.1  # a displacement below this share of the blur changes the levels linearly
+FARTHEST = 3.5  # largest displacement of a sector, in standard deviations of what unevenness and noise make likely
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
-    """use: pixels that are no outliers. explained: (SECTORS,) where the model explains them. uneven_px: standard
-    deviation of the sectors' displacements from the ellipse; displaced: (SECTORS,) what they are likely to be, px
-    inward."""
+class Visible:
+    """What of a boundary the model explains.
+
+    Attributes:
+        use: (n,) pixels that are not outliers.
+        explained: (SECTORS,) sectors that the model explains.
+        uneven_px: standard deviation of the sectors' displacements from the ellipse.
+        displaced: (SECTORS,) most likely displacements, px inward.
+    """
 
     use: Mask
     explained: Mask
@@ -32,7 +37,7 @@ class Judged:
     displaced: Array
 
 
-def judge(
+def visible_part(
     model: EdgeModel,
     displaced: Array,
     level: Array,
@@ -41,17 +46,27 @@ def judge(
     seen: Mask,
     sectors: Mask,
     noise_dn: float,
-) -> Judged:
-    """What of the boundary the model explains: pixels (n,) that did count, `use`, and sectors, `seen`, as displaced.
+) -> Visible:
+    """Decide which pixels and sectors of the boundary the model explains.
 
-    A margin is not quite an ellipse; by how much its sectors scatter about one, by their median, is uneven_px. A
-    sector counts when it is displaced no more than margins are, its pixels' mean square there is at most a multiple of
-    the typical sector's, and few are outliers. Where the edges saw the boundary the limits are generous: iris texture
-    is no lid. Elsewhere the pixels must show by themselves that the boundary is there.
+    A pupil boundary is not exactly an ellipse. `uneven_px` is the scatter of its sectors around the ellipse, from their
+    median. A sector is explained if it is displaced no farther than unevenness and noise make likely, if its mean
+    squared residual is at most a multiple of a typical sector's, and if few of its pixels are outliers. The limits are
+    generous where edge points were found, because iris texture is not a lid, and strict elsewhere.
+
+    Args:
+        model: the fitted model.
+        displaced: (SECTORS,) displacements that the fit found, px inward.
+        level: (n,) grey levels.
+        place: their positions relative to the ellipse.
+        use: (n,) pixels that the fit used.
+        seen: (SECTORS,) sectors that the fit used.
+        sectors: (SECTORS,) sectors with edge points.
+        noise_dn: standard deviation of a pixel's noise.
     """
     bins = sector_of(place)
     whole = displaced
-    for _ in range(2):  # a displacement of about the blur is not linear in the levels
+    for _ in range(2):  # the levels are not linear in a displacement as large as the blur
         expected, slope = model.level_and_slope(replace(place, distance=place.distance + whole[bins]))
         residual = level - expected
         counted = slope * use
@@ -78,13 +93,13 @@ def judge(
     radius = math.sqrt(float(model.ellipse.semi_axes_px.prod()))
     likely2 = np.where(sectors, max(uneven2, (UNEVEN * radius) ** 2), uneven2) + by_noise
     explained &= np.abs(whole) < FARTHEST * np.sqrt(likely2)
-    return Judged(
+    return Visible(
         new_use, explained, math.sqrt(uneven2), np.where(explained, whole * uneven2 / (uneven2 + by_noise), 0.0)
     )
 
 
 def clear_of_lids(seen: Mask, model: EdgeModel) -> Mask:
-    """Leave out the neighbours of every gap of two sectors or more, as far as a lid's margin is blurred into them."""
+    """Leave out the sectors beside each gap of two or more, as far as the blur of a lid margin reaches into them."""
     if seen.all():
         return seen
     gap = ~seen & (~np.roll(seen, 1) | ~np.roll(seen, -1))

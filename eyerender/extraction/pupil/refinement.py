@@ -13,24 +13,33 @@ from ..preprocessing import Image
 from .covariance import SHAPE, distance_slopes, sector_excess, to_axes
 from .edge_model import SECTORS, EdgeModel, Place, sector_of
 from .least_squares import FIXED, NEAR, Normal, Pixels, Prior, Rows, Solution, gauss_newton
-from .occlusion import clear_of_lids, judge
+from .occlusion import clear_of_lids, visible_part
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Fourier orders of the outer level that are tried. The first is always there: lamps beside the camera light one side of
-# the iris more, by a few hundredths of the step, which noise hides from any test but not from the centre.
+# Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
+# side of the iris more, by a few hundredths of the step. Noise hides that from a test, but it shifts the centre.
 ORDERS = (1, 2, 4, 6, 8)
-# No pixel farther outside counts, px, however wide the blur: light falls off across the iris, faster than linearly.
+# Largest distance outside the boundary, px, however wide the blur: the light changes across the iris, and not linearly.
 OUTWARD_PX = 8.0
-TURNS = 4  # fits, each without what the one before could not explain
+TURNS = 4  # fits at most; each leaves out what the previous one could not explain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelFit:
-    """model; ellipse: the one that fits the margin, uneven as it is, best; covariance (5, 5) of its (cx, cy, a, b,
-    angle); reduced_chi2 against the image's noise; residual_dn; pixels used; sectors: (SECTORS,) which parts of the
-    outline count; uneven_px: standard deviation of their displacements."""
+    """The result of a refinement.
+
+    Attributes:
+        model: the fitted pixel model.
+        ellipse: the ellipse that fits the uneven boundary best.
+        covariance: (5, 5) of its (cx, cy, a, b, angle).
+        reduced_chi2: against the image's noise.
+        residual_dn: root mean square residual.
+        pixels: number of pixels used.
+        sectors: (SECTORS,) which parts of the outline were used.
+        uneven_px: standard deviation of the sectors' displacements.
+    """
 
     model: EdgeModel
     ellipse: Ellipse
@@ -45,20 +54,26 @@ class PixelFit:
 def refine(
     linear: Image, start: EdgeModel, sectors: Mask, masked: Mask, noise_dn: float, before: PixelFit | None = None
 ) -> PixelFit | str:
-    """The most likely boundary, or why the refinement failed.
+    """Fit the pixel model; returns the fit, or the reason why it failed.
 
-    linear: image. start: from the edges. sectors: (SECTORS,) parts of the outline that the edges saw. masked: image of
-    pixels that glints touch or the sensor clipped. before: what another image of the same boundary gave, to begin with.
-    The Fourier order of the outer level is the one of least BIC, by the drop of chi^2 that one linear step with its
-    columns promises. Pixels and sectors that the model cannot explain (lids, lashes, reflections) are put aside, and
-    the rest is fitted again; where the margin proves uneven, with displacements of its sectors.
+    The Fourier order of the outer level is the one with the least BIC, predicted by one linear step. Pixels and sectors
+    that the model cannot explain (lids, lashes, reflections) are left out and the rest is fitted again. If the boundary
+    is uneven, displacements of its sectors are fitted too.
+
+    Args:
+        linear: the image, DN.
+        start: model from the edges.
+        sectors: (SECTORS,) parts of the outline with edge points.
+        masked: (h, w) pixels that glints affect or the sensor clipped.
+        noise_dn: standard deviation of a pixel's noise.
+        before: an earlier fit of the same boundary to start from.
     """
     model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before.model
     prior = Prior.of(start, noise_dn, 0.0 if before is None else before.uneven_px)
     x, y, level = _band(linear, model, masked)
     place = Place.of(model.ellipse, x, y, steps=NEAR)
     use = np.ones(x.size, dtype=bool)
-    # The order of the outer level must not be learnt from a lid.
+    # A lid must not decide the order of the outer level.
     seen = clear_of_lids(sectors, start) if before is None else before.sectors
     displaced = np.zeros(SECTORS) if model.displaced is None else model.displaced.copy()
     for turn in range(TURNS):
@@ -75,20 +90,20 @@ def refine(
             return "the pixel model's fit ran away from the edges"
         place = Place.of(model.ellipse, x, y, steps=NEAR)
         displaced[pixels.sector] = found.displaced
-        judged = judge(model, displaced, level, place, use, seen, sectors, noise_dn)
-        new_seen = clear_of_lids(judged.explained, model)
-        same = bool((judged.use == use).all() and (new_seen == seen).all())
-        same &= abs(judged.uneven_px - prior.uneven_px) < max(0.2 * prior.uneven_px, 0.01)
+        visible = visible_part(model, displaced, level, place, use, seen, sectors, noise_dn)
+        new_seen = clear_of_lids(visible.explained, model)
+        same = bool((visible.use == use).all() and (new_seen == seen).all())
+        same &= abs(visible.uneven_px - prior.uneven_px) < max(0.2 * prior.uneven_px, 0.01)
         if not same:
-            prior = Prior.of(start, noise_dn, judged.uneven_px)
+            prior = Prior.of(start, noise_dn, visible.uneven_px)
         if turn == 0 and before is None:
-            # An uneven margin must not be taken for an uneven iris.
+            # An uneven boundary must not be mistaken for an uneven iris.
             order = _best_order(pixels, found, prior)
             model = replace(model, outer=_padded(model.outer, order))
             same &= order == ORDERS[0]
         if same or turn + 1 == TURNS:
             break
-        use, seen, displaced = judged.use, new_seen, judged.displaced
+        use, seen, displaced = visible.use, new_seen, visible.displaced
         if seen.sum() < 0.15 * SECTORS:
             return "too little of the boundary fits the pixel model"
     return _report(pixels, found, prior, noise_dn, new_seen)
@@ -98,8 +113,8 @@ def _band(linear: Image, model: EdgeModel, masked: Mask) -> tuple[Array, Array, 
     """(x, y, level) of the pixels near the boundary: up to 4 sigma + 1 px inside it and 3 sigma + 1 px outside it, but
     not beyond OUTWARD_PX.
 
-    Farther out the outer level would be told better, but it changes with the distance: 2 px more make the error on a
-    textured iris half as large again.
+    Pixels farther out would determine the outer level better, but it changes with distance: 2 px more increase the
+    error on a textured iris by half.
     """
     ellipse, sigma = model.ellipse, model.sigma_px
     a, b = ellipse.semi_axes_px
@@ -194,8 +209,10 @@ def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen
 
 
 def _through(start: Ellipse, displaced: Array) -> tuple[Ellipse, Array]:
-    """The ellipse that fits an uneven margin best, as one fits an ellipse to a margin traced all around; and the
-    derivatives (5, SECTORS) of its centre and shape by the sectors' displacements from `start`."""
+    """The ellipse that fits an uneven boundary best, as a direct fit to the traced boundary would.
+
+    Also returns the derivatives (5, SECTORS) of its centre and shape by the sectors' displacements from `start`.
+    """
     place = Place.middles(start)
     slopes = distance_slopes(start, place)
     outline = start.points_at(place.cos_t, place.sin_t)

@@ -23,8 +23,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A candidate in an image, the edge points about it, the boundary through them, and how much of it is seen and how
-    clearly; what follows from these is worked out once, when asked for."""
+    """A candidate, the edge points around it, and the boundary through them; derived values are computed on demand.
+
+    `quality` combines how much of the boundary is visible and how well the candidate was ranked.
+    """
 
     image: Prepared
     candidate: Candidate
@@ -34,7 +36,7 @@ class Found:
 
     @cached_property
     def model(self) -> EdgeModel:
-        """The pixel model's parameters as far as the edges tell them."""
+        """The pixel model, as far as the edges determine it."""
         candidate = self.candidate
         sigma = math.sqrt(max(self.edges.sigma_px**2 - self.edges.filter_px**2, 0.25))
         outer = np.array([candidate.inside_dn + candidate.step_dn])
@@ -42,17 +44,17 @@ class Found:
 
     @cached_property
     def covariance(self) -> Array:
-        """(5, 5) of the boundary's centre, semi-axes and angle, by the edges' scatter."""
+        """(5, 5) covariance of centre, semi-axes and angle, from the scatter of the edge points."""
         return edge_covariance(self.boundary.ellipse, self.boundary.points_px, self.boundary.residual_px)
 
     @cached_property
     def interior(self) -> Interior:
-        """What lies inside the boundary."""
+        """Statistics of the pixels inside the boundary."""
         return inspect_interior(self.image.linear, self.boundary.ellipse, self.model.sigma_px, self.image.noise_dn)
 
     @cached_property
     def sectors(self) -> NDArray[np.bool_]:
-        """(SECTORS,) parts of the outline with an edge point in them, and gaps of up to two parts between such."""
+        """(SECTORS,) sectors with an edge point, and gaps of up to two sectors between them."""
         hit = np.bincount(sector_of(Place.of(self.boundary.ellipse, *self.edges.points_px[self.boundary.inliers].T)),
                           minlength=SECTORS) > 0  # fmt: skip
         grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
@@ -60,7 +62,7 @@ class Found:
 
     @property
     def has_core(self) -> bool:
-        """Whether the middle is darker than the outer part, as an iris' is."""
+        """Whether the middle is darker than the outer part, as inside the outline of an iris."""
         inside = self.interior
         return not inside.darker_dn < max(4.0 * inside.error_dn, 0.15 * self.candidate.step_dn)
 
@@ -85,7 +87,7 @@ def _searched(work: Prepared, settings: ExtractionSettings, *, without_lines: bo
 
 
 def _first_good(work: Prepared, candidates: list[Candidate], settings: ExtractionSettings) -> tuple[Found | None, str]:
-    """The first candidate with a well-seen boundary, else the best-seen one; and the first one's objection."""
+    """The first candidate whose boundary is well visible, else the most visible one; and why the first one failed."""
     poor: list[Found] = []
     reason = ""
     for candidate in candidates:
@@ -93,7 +95,7 @@ def _first_good(work: Prepared, candidates: list[Candidate], settings: Extractio
         if isinstance(found, str):
             reason = reason or found
             continue
-        # The ranking knows what lies inside what; a later candidate must only stand in for a failed one.
+        # The ranking considers nesting, so a later candidate only replaces one that failed.
         if found.boundary.support > 0.45:
             return next((earlier for earlier in poor if _holds(found, earlier)), found), reason
         poor.append(found)
@@ -101,14 +103,14 @@ def _first_good(work: Prepared, candidates: list[Candidate], settings: Extractio
 
 
 def _holds(outer: Found, inner: Found) -> bool:
-    """Whether a smaller boundary found earlier, however little of it is seen, lies inside."""
+    """Whether a smaller boundary that was found earlier lies inside, even if little of it is visible."""
     ratio = inner.boundary.ellipse.area_px2 / outer.boundary.ellipse.area_px2
     apart = math.dist(inner.boundary.ellipse.centre_px, outer.boundary.ellipse.centre_px)
     return ratio < 0.7 and apart < 0.7 * float(outer.boundary.ellipse.semi_axes_px[1])
 
 
 def _without_core(work: Prepared, found: Found, settings: ExtractionSettings) -> Found | PupilResult:
-    """The same boundary if its inside is even; what lies inside it if there is a darker core, as an iris has."""
+    """The boundary itself if its interior is even; the boundary inside it if it has a darker core, as an iris has."""
     for _ in range(2):
         if not found.has_core:
             return found
@@ -121,12 +123,13 @@ def _without_core(work: Prepared, found: Found, settings: ExtractionSettings) ->
 
 
 def boundary_about(work: Prepared, candidate: Candidate, settings: ExtractionSettings) -> Found | str:
+    """The boundary around a candidate, or the reason why none was found."""
     bright = candidate.inside_dn + 4.0 * candidate.step_dn
     b = float(candidate.ellipse.semi_axes_px[1])
     sigma = filter_sigma(candidate.step_dn, work.noise_dn, b)
     edges = find_edges(work.linear, candidate, work.noise_dn, bright, sigma, band=0.4)
     blur = math.sqrt(max(edges.sigma_px**2 - sigma**2, 0.0))
-    if blur > 1.7 * sigma:  # a filter much sharper than the image only collects noise
+    if blur > 1.7 * sigma:  # a filter much sharper than the image only adds noise
         sigma = min(blur, max(1.0, 0.2 * b))
         edges = find_edges(work.linear, candidate, work.noise_dn, bright, sigma, band=0.4)
     expected = edge_noise_px(candidate.step_dn, work.noise_dn, sigma, edges.sigma_px)

@@ -1,0 +1,77 @@
+"""The last measured rate of a spec on this machine, kept in the user's cache folder.
+
+A file there is only a memory: without one, or with a damaged one, the rate is unknown.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from ..backends.libraries import cache_folder
+from ..errors import EyerenderError
+from ..files import read_json, write_json
+from ..spec import Positive, Spec
+from .plan import Plan
+from .shard import cpu_family
+
+_BYTES = 2**16
+_Count = Annotated[float, Field(ge=0, le=1e15)]
+
+
+class Rate(Spec):
+    """How fast samples of a spec were made, and how large they were."""
+
+    format: Literal["eyerender/rate/1"] = "eyerender/rate/1"
+    how: Literal["run", "measured"] = Field(description="by a run, or by a few samples that were made to measure it")
+    time: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z$")]
+    backend: Annotated[str, Field(max_length=20)]
+    samples: Annotated[int, Field(ge=1, le=10**9)] = Field(description="how many it was measured with")
+    seconds: Positive = Field(description="of one worker for a sample")
+    subject_seconds: _Count = Field(description="of one worker more for a subject's first sample; 0: contained above")
+    images: _Count = Field(description="a sample")
+    bytes: _Count = Field(description="a sample, metadata included")
+
+
+def now() -> str:
+    """The time of a rate that is measured now."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+
+
+def keep_rate(plan: Plan, rate: Rate) -> None:
+    """Remember a rate; where the cache cannot be written it is forgotten."""
+    path = _path(plan)
+    if path is not None:
+        with suppress(OSError, EyerenderError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(path, rate.to_mapping(), sync=False)
+
+
+def last_rate(plan: Plan, backend: str = "auto") -> Rate | None:
+    """The rate that was last measured on this machine with a backend; None where none is known."""
+    path = _path(plan)
+    if path is None:
+        return None
+    try:
+        rate = Rate.from_mapping(read_json(path, limit=_BYTES, follow=False))
+    except EyerenderError:
+        return None
+    return rate if backend in ("auto", rate.backend) else None
+
+
+def _path(plan: Plan) -> Path | None:
+    """Where the rate of a plan stands, whatever its seed and number of samples, on this machine."""
+    folder = cache_folder()
+    if folder is None:
+        return None
+    data = plan.to_mapping()
+    data["spec"] = {k: v for k, v in data["spec"].items() if k not in ("count", "planned", "seed")}
+    key = json.dumps([data, platform.node(), cpu_family()], sort_keys=True)
+    return folder / "rates" / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.json"

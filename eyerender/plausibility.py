@@ -1,0 +1,232 @@
+"""What a person probably did not mean: values that can be computed with but make no sense.
+
+Every function is pure and returns warnings. A scene collects its own (`Scene.warnings`), and a dataset's plan those of
+some of its samples (`Plan.warnings`). The command line prints them, or refuses them with `--strict`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import Floats
+from .errors import InputWarning
+from .rig.camera import Camera
+from .rig.rig import Rig
+from .rig.screen import Screen
+from .rig.sensor import SensorSpec
+
+# Human pupils are about 2 to 8 mm wide (Watson and Yellott 2012, J. Vision 12(10):12); drugs add a little.
+PUPIL_MM = (1.0, 9.0)
+# Lengths of a scene below which they were probably written in metres: 2 mm is a screen or an interpupillary distance
+# of 2 m, 0.02 mm an LED of 20 mm.
+_LEAST_MM = {
+    "rig.screen.size_mm": 2.0,
+    "subject.ipd_mm": 2.0,
+    "lens.focus_mm": 2.0,
+    "rig.lights.*.ring.radius_mm": 0.5,
+    "rig.cameras.*.focal_length_mm": 0.2,
+    "rig.cameras.*.sensor_mm": 0.2,
+    "rig.lights.*.radius_mm": 0.02,
+}
+# The same for places: this near to the world's origin, the bridge of the nose, nothing can stand.
+_LEAST_DISTANCE_MM = 2.0
+# A globe and a head about the corneal apex and the head's position. Both are smaller than real ones, so that what is
+# fixed to a face (a headset's lamps, a frame of glasses) is not taken for a part of it.
+_GLOBE_CENTRE_MM, _GLOBE_RADIUS_MM = np.array([-12.0, 0.0, 0.0]), 13.0
+_HEAD_CENTRE_MM, _HEAD_SEMI_AXES_MM = np.array([-100.0, 0.0, 0.0]), np.array([85.0, 70.0, 115.0])
+# How far behind a screen's surface something counts as behind it: frames of screens are uneven.
+_BEHIND_MM = 1.0
+# What of an eye must be in view: the corneal apex or a point of the limbus, to within what its turning moves.
+_LIMBUS_MM = np.array([[0, 0, 0], [-3, 6, 0], [-3, -6, 0], [-3, 0, 6], [-3, 0, -6]], dtype=float)
+# A camera that is further than this from an eye's axis sees no cornea, wherever the eye turns.
+_FURTHEST_RAD = np.radians(140.0)
+
+# How far a target may lie off the screen's plane: screens are not flat to less.
+_OFF_PLANE_MM = 1.0
+# An image is called saturated where more than this share of its pixels is.
+SATURATED_SHARE = 0.2
+
+Window = tuple[int, int, int, int]
+
+
+def pupil_warnings(diameter_mm: float, path: str) -> list[InputWarning]:
+    """A pupil that no human eye has; `path` is where its diameter stands."""
+    low, high = PUPIL_MM
+    if low <= diameter_mm <= high:
+        return []
+    return [InputWarning("pupil", f"is {diameter_mm:g} mm; human pupils are {low:g} to {high:g} mm wide", path=path)]
+
+
+def length_warnings(scene: Mapping[str, Any]) -> list[InputWarning]:
+    """Lengths of a scene's mapping that were probably written in metres."""
+    found = []
+    for pattern, least in _LEAST_MM.items():
+        for path, value in _values(scene, pattern.split(".")):
+            sizes = value if isinstance(value, list | tuple) else [value]
+            # A lamp of no size is a point.
+            if any(0 < size < least for size in sizes):
+                found.append(InputWarning("metres", f"is {_shown(sizes, ' x ')} mm; {_METRES}", path=path))
+    return found
+
+
+def place_warnings(
+    rig: Rig,
+    eyes_mm: Mapping[str, Floats],
+    heads_mm: Mapping[str, Floats],
+    camera_paths: Sequence[str],
+    light_paths: Sequence[str],
+) -> list[InputWarning]:
+    """Cameras and lamps where none can stand: in a face, in a head, behind the screen; and a screen in a face.
+
+    Args:
+        rig: the rig.
+        eyes_mm: corneal apexes (3,) in the world by what a message calls them.
+        heads_mm: head positions (3,) in the world by what a message calls them.
+        camera_paths: where each camera of the rig stands in the input.
+        light_paths: the same for the lamps; lamps of one ring share a path and get one warning.
+    """
+    places = [
+        *((path, "camera", camera.nodal_point_mm) for path, camera in zip(camera_paths, rig.cameras, strict=True)),
+        *((path, "lamp", light.position_mm) for path, light in zip(light_paths, rig.lights, strict=True)),
+    ]
+    found: dict[str, InputWarning] = {}
+    for path, what, place in places:
+        code, reason = _misplaced(place, what, rig.screen, eyes_mm, heads_mm) or (None, None)
+        if code is not None and reason is not None:
+            found.setdefault(path, InputWarning(code, reason, path=path))
+    if rig.screen is not None and np.linalg.norm(rig.screen.centre_mm) < _LEAST_DISTANCE_MM:
+        path = "rig.screen.centre_mm"
+        found[path] = InputWarning("metres", f"is ({_shown(rig.screen.centre_mm)}) mm; {_METRES}", path=path)
+    return list(found.values())
+
+
+def view_warnings(
+    rig: Rig, views: Mapping[int, Iterable[tuple[Window, Floats]]], camera_paths: Sequence[str]
+) -> list[InputWarning]:
+    """Cameras whose images show no eye at any head position.
+
+    Args:
+        rig: the rig.
+        views: camera -> the windows (x0, y0, width, height) that are made, each with the corneal apex (3,) it is for.
+        camera_paths: where each camera of the rig stands in the input.
+    """
+    blind = [c for c, camera in enumerate(rig.cameras) if not any(_in_view(camera, w, eye) for w, eye in views[c])]
+    everywhere = "; nothing of any eye is in view" if len(blind) == len(rig.cameras) else ""
+    return [InputWarning("out-of-view", f"sees no eye{everywhere}", path=camera_paths[c]) for c in blind]
+
+
+def is_saturated(dn: NDArray[Any], sensor: SensorSpec) -> bool:
+    """Whether more than 20 % of an image's pixels, counts `dn` (h, w), are saturated."""
+    return bool(np.count_nonzero(dn >= sensor.saturation_dn) > SATURATED_SHARE * dn.size)
+
+
+def saturation_warnings(saturated: int, images: int, source: str) -> list[InputWarning]:
+    """Images, `saturated` of `images`, that show little but white."""
+    if not saturated:
+        return []
+    reason = (
+        f"in {saturated} of {images} images more than {SATURATED_SHARE:.0%} of the pixels are saturated; "
+        "lower sensor.exposure_ms or the lights' intensity_mw_sr"
+    )
+    return [InputWarning("saturated", reason, source)]
+
+
+def target_warnings(targets_mm: Floats, screen: Screen | None, source: str) -> list[InputWarning]:
+    """Targets (n, 3) in the world that do not lie on the screen, on which estimators put every gaze point."""
+    if screen is None or not len(targets_mm):
+        return []
+    off = np.abs((targets_mm - screen.centre_mm) @ screen.normal)
+    count = int(np.count_nonzero(off > _OFF_PLANE_MM))
+    if not count:
+        return []
+    reason = (
+        f"{count} of {len(off)} targets lie off the plane of the rig's screen, by up to {off.max():.4g} mm; "
+        "gaze points are always on that plane"
+    )
+    return [InputWarning("off-screen-plane", reason, source, "target_mm")]
+
+
+def rig_warnings(rig: Rig, calibrated: Rig, source: str) -> list[InputWarning]:
+    """A rig that is not the one an estimator was calibrated on."""
+    path = next(_differences(rig.to_mapping(), calibrated.to_mapping(), "rig"), None)
+    if path is None:
+        return []
+    return [InputWarning("other-rig", "differs from the rig of the calibration; calibrate on this one", source, path)]
+
+
+def _differences(one: Any, other: Any, path: str) -> Iterator[str]:
+    """Where two values of the same kind differ by more than rounding does."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for key in one:
+            yield from _differences(one[key], other.get(key), f"{path}.{key}")
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        for k, (a, b) in enumerate(zip(one, other, strict=True)):
+            yield from _differences(a, b, f"{path}.{k}")
+    elif isinstance(one, int | float) and isinstance(other, int | float):
+        if not np.isclose(one, other, rtol=1e-6, atol=1e-6):
+            yield path
+    elif one != other:
+        yield path
+
+
+def _misplaced(
+    place: Floats,
+    what: str,
+    screen: Screen | None,
+    eyes_mm: Mapping[str, Floats],
+    heads_mm: Mapping[str, Floats],
+) -> tuple[str, str] | None:
+    """The code and the reason of a warning about one place, if there is one."""
+    if np.linalg.norm(place) < _LEAST_DISTANCE_MM:
+        return "metres", f"the {what} is at ({_shown(place)}) mm, in the face; {_METRES}"
+    for name, eye in eyes_mm.items():
+        if np.linalg.norm(place - eye - _GLOBE_CENTRE_MM) < _GLOBE_RADIUS_MM:
+            away = np.linalg.norm(place - eye)
+            return "in-eye", f"the {what} is in the {name} ({away:.3g} mm from its corneal apex)"
+    for name, head in heads_mm.items():
+        if np.linalg.norm((place - head - _HEAD_CENTRE_MM) / _HEAD_SEMI_AXES_MM) < 1:
+            behind = head[0] - place[0]
+            return "in-head", f"the {what} is in the {name}, {behind:.3g} mm behind the corneas"
+    if screen is not None and (screen.centre_mm - place) @ screen.normal > _BEHIND_MM:
+        for name, eye in eyes_mm.items():
+            on_screen, ok = screen.intersect(place, eye - place)
+            if ok and np.all(np.abs(on_screen) < np.array(screen.size_mm) / 2):
+                return "behind-screen", f"the {what} is behind the screen, as the {name} sees it"
+    return None
+
+
+def _in_view(camera: Camera, window: Window, apex: Floats) -> bool:
+    """Whether a window shows anything of an eye's front."""
+    towards = camera.nodal_point_mm - apex
+    if towards[0] < np.cos(_FURTHEST_RAD) * np.linalg.norm(towards):
+        return False
+    pixels, front = camera.project(apex + _LIMBUS_MM)
+    x0, y0, width, height = window
+    middle, half = np.array([x0 + (width - 1) / 2, y0 + (height - 1) / 2]), np.array([width, height]) / 2
+    with np.errstate(invalid="ignore"):
+        inside = (np.abs(pixels - middle) <= half).all(axis=-1)
+    return bool(np.any(front & inside))
+
+
+_METRES = "lengths are in mm, was it meant in metres?"
+
+
+def _values(node: Any, keys: Sequence[str], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every value at a dotted path of a mapping in which `*` stands for each entry of a list, with its own path."""
+    if not keys:
+        if node is not None:
+            yield path, node
+        return
+    if keys[0] == "*":
+        for k, entry in enumerate(node if isinstance(node, list | tuple) else ()):
+            yield from _values(entry, keys[1:], f"{path}.{k}")
+    elif isinstance(node, Mapping) and keys[0] in node:
+        yield from _values(node[keys[0]], keys[1:], f"{path}.{keys[0]}" if path else keys[0])
+
+
+def _shown(values: Iterable[float], between: str = ", ") -> str:
+    return between.join(f"{value:.4g}" for value in values)

@@ -1,0 +1,168 @@
+"""The parameters of a frame: the numbers that change from frame to frame, by name.
+
+The same classes serve on both sides. On the host (`frame.parameters_of`) their leaves are NumPy numbers in float64. On
+the device (`values.Values`) they are Dr.Jit arrays of size one: a Float, a Vector3f for three numbers, or a tuple of
+Floats. Nothing here depends on Mitsuba.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+_Tree = TypeVar("_Tree")
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceParameters:
+    """One refracting surface in the eye frame, lengths in mm.
+
+    Attributes:
+        origin: (3,) origin of the surface's own frame.
+        shape: (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic (see `surfaces`).
+        eta: index of refraction before the surface over that behind it, for light that enters the eye.
+        axes: the unit axes of its frame, three (3,); None if they are the eye's own.
+    """
+
+    origin: mi.Vector3f
+    shape: tuple[mi.Float, ...]
+    eta: mi.Float
+    axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f] | None
+
+
+@dataclass(frozen=True, slots=True)
+class StopParameters:
+    """The aperture stop: centre, normal, the directions u and v of its semi-axes (all (3,)), and these two (mm)."""
+
+    centre: mi.Vector3f
+    normal: mi.Vector3f
+    u: mi.Vector3f
+    v: mi.Vector3f
+    axes: tuple[mi.Float, mi.Float]
+
+
+@dataclass(frozen=True, slots=True)
+class IrisParameters:
+    """Radius of the root (mm), mean albedo and contrast of the texture."""
+
+    root_radius: mi.Float
+    albedo: mi.Float
+    contrast: mi.Float
+
+
+@dataclass(frozen=True, slots=True)
+class LimbusParameters:
+    """Radius about the front surface's axis (mm), lowest x of the cornea (mm), 1 / width of the transition (1/mm)."""
+
+    radius: mi.Float
+    floor: mi.Float
+    gain: mi.Float
+    albedo: mi.Float
+
+
+@dataclass(frozen=True, slots=True)
+class ScleraParameters:
+    """Centre (3,) and radius of the sphere (mm), mean albedo and contrast of the texture."""
+
+    centre: mi.Vector3f
+    radius: mi.Float
+    albedo: mi.Float
+    contrast: mi.Float
+
+
+@dataclass(frozen=True, slots=True)
+class PoseParameters:
+    """x_scene = columns x_eye + shift: the three columns of the rotation (3,) each, and the shift (3,) mm."""
+
+    columns: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]
+    shift: mi.Vector3f
+
+
+@dataclass(frozen=True, slots=True)
+class CameraParameters:
+    """Centre of projection (3,) mm, the axes right, down and forward (3,), focal lengths and principal point (px), and
+    the lens distortion (k1, k2, p1, p2, k3)."""
+
+    centre: mi.Vector3f
+    right: mi.Vector3f
+    down: mi.Vector3f
+    forward: mi.Vector3f
+    focal: tuple[mi.Float, mi.Float]
+    principal: tuple[mi.Float, mi.Float]
+    distortion: tuple[mi.Float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ImageParameters:
+    """The stop's Gaussian image seen from outside: lateral magnification, and shift along x (mm)."""
+
+    scale: mi.Float
+    shift: mi.Float
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """All parameters of a frame, eye frame and scene's frame in mm.
+
+    Attributes:
+        surfaces: the refracting surfaces in front of the iris, from outside inwards.
+        inner_index: index of refraction of the medium before the iris.
+        pupil_albedo: what the pupil reflects back.
+        globe_reach: radius (mm) of the sphere about the sclera's centre that holds the cornea too.
+        backdrop_x: the surround's plane, x in the scene's frame (mm).
+        ambient_irradiance: even light from all sides, mW/mm^2.
+    """
+
+    surfaces: tuple[SurfaceParameters, ...]
+    inner_index: mi.Float
+    stop: StopParameters
+    iris: IrisParameters
+    limbus: LimbusParameters
+    sclera: ScleraParameters
+    image: ImageParameters
+    pose: PoseParameters
+    camera: CameraParameters
+    pupil_albedo: mi.Float
+    globe_reach: mi.Float
+    backdrop_x: mi.Float
+    ambient_irradiance: mi.Float
+
+
+def packed(tree: Any) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """The leaves of host parameters as one vector, in the order of the fields."""
+    return np.concatenate([np.asarray(leaf, dtype=np.float64).reshape(-1) for leaf in _leaves(tree)]).astype(np.float32)
+
+
+def rebuilt(tree: _Tree, leaf: Callable[[int], Any]) -> _Tree:
+    """The same tree with other leaves: `leaf(size)` gives each, called in the order of `packed`."""
+    node: Any = tree
+    made: Any
+    if is_dataclass(node):
+        made = replace(node, **{f.name: rebuilt(getattr(node, f.name), leaf) for f in fields(node)})  # type: ignore[type-var]
+    elif _is_branch(node):
+        made = tuple(rebuilt(part, leaf) for part in node)
+    else:
+        made = None if node is None else leaf(np.size(node))
+    return made  # type: ignore[no-any-return]
+
+
+def _leaves(node: Any) -> Iterator[Any]:
+    if is_dataclass(node):
+        for f in fields(node):
+            yield from _leaves(getattr(node, f.name))
+    elif _is_branch(node):
+        for part in node:
+            yield from _leaves(part)
+    elif node is not None:
+        yield node
+
+
+def _is_branch(node: Any) -> bool:
+    """Whether a tuple holds parameters or vectors; a tuple of plain numbers is a leaf."""
+    return isinstance(node, tuple) and any(is_dataclass(part) or np.ndim(part) for part in node)

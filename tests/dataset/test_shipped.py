@@ -1,0 +1,79 @@
+"""Every scene and dataset spec that comes with the package validates once it is made: no false alarms."""
+
+from __future__ import annotations
+
+import pytest
+from dataset_specs import make
+
+from eyerender.capture import render_folder
+from eyerender.dataset.plan import Plan
+from eyerender.dataset.spec import DatasetSpec, shipped_datasets
+from eyerender.dataset.validate import validate
+from eyerender.errors import BackendError
+from eyerender.scene import Scene, SceneSpec, load_scene, shipped_scenes
+
+pytestmark = pytest.mark.render
+
+# Bare eyes and one with lids and an uneven pupil take a few seconds; skin of several subjects takes more.
+QUICK = ("guestrin2006", "head_mounted", "headset")
+NAMES = sorted({*shipped_scenes(), *shipped_datasets()})
+
+
+def small(name):
+    """A shipped scene with one sample a pixel, and of its directions and head positions the first and the last."""
+    scene = load_scene(name, spp=1)
+    data = scene.spec.to_mapping()
+    if data.get("targets"):
+        data["targets"] = {"grid": [2, 2]}
+    else:
+        data["poses"] = [data["poses"][0], data["poses"][-1]]
+    heads = data["subject"]["head_positions_mm"]
+    data["subject"]["head_positions_mm"] = heads if len(heads) == 1 else [heads[0], heads[-1]]
+    return Scene.of(SceneSpec.from_mapping(data))
+
+
+def few(name):
+    """A shipped dataset spec with one sample a pixel, two subjects and four samples."""
+    data = DatasetSpec.load(shipped_datasets()[name]).to_mapping()
+    data |= {"count": 4, "subjects": 2, "shard_size": 2}
+    data["scene"]["image"]["spp"] = 1
+    return Plan.of(DatasetSpec.from_mapping(data))
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
+)
+def test_it_validates_once_it_is_made(name, tmp_path):
+    folder = tmp_path / "out"
+    try:
+        if name in shipped_datasets():
+            make(folder, few(name))
+        else:
+            render_folder(small(name), folder)
+    except BackendError as error:
+        pytest.skip(f"nothing to render with: {error}")
+    report = validate(folder, deep=True)
+    assert report["ok"], report["problems"]
+    assert report["recomputed"] == report["images"] >= 2
+    assert report["notes"] == []
+
+
+@pytest.mark.parametrize("eye", ["E5", pytest.param("E3", marks=pytest.mark.slow)])
+def test_eyes_seen_from_the_side_validate(eye, tmp_path):
+    """The outlines hold for tilted and biconic corneas too, up to where rays just miss the rim."""
+    data = load_scene("head_mounted", spp=1).spec.to_mapping()
+    data["eye"] = {"model": eye, "pupil_diameter_mm": 6.0}
+    data["poses"] = [{"azimuth_deg": -35, "elevation_deg": -25}, {"azimuth_deg": 35, "elevation_deg": -25}]
+    try:
+        render_folder(Scene.of(SceneSpec.from_mapping(data)), tmp_path / "out")
+    except BackendError as error:
+        pytest.skip(f"nothing to render with: {error}")
+    report = validate(tmp_path / "out")
+    assert report["ok"], report["problems"]
+
+
+def test_all_are_covered():
+    assert NAMES == [
+        "blignaut2014", "dataset_quick", "dataset_region", "desktop_tracker", "guestrin2006", "head_mounted", "headset",
+        "quickstart", "stress", "webcam",
+    ]  # fmt: skip
