@@ -5,7 +5,6 @@ Two kinds are read: what this package renders (docs/formats.md), and folders of 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,9 +15,11 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..files import inside, read_json
 from ..geometry.ellipse import Ellipse
 from ..imagefile import read_image
 from ..imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
+from ..jsonlines import JsonLines
 from ..observation import OK, Observations
 from ..rig.camera import Camera
 from ..rig.rig import Rig
@@ -191,26 +192,19 @@ def _rig_of(folder: ImageFolder) -> Rig | None:
 
 def _is_ideal(folder: Path) -> bool:
     try:
-        found = json.loads((folder / DATASET).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_json(folder / DATASET, follow=False).get("schema") == IDEAL_SCHEMA
+    except InputError:
         return False
-    return isinstance(found, dict) and found.get("schema") == IDEAL_SCHEMA
 
 
 def _load_ideal(folder: Path) -> list[LabelledImage]:
     source = str(folder / METADATA)
-    try:
-        lines = (folder / METADATA).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        raise InputError("cannot be read", source=source) from None
+    lines = JsonLines.index(folder / METADATA)
     out = []
-    for k, raw in enumerate(lines):
+    for k, line in enumerate(lines.read(range(len(lines)))):
         try:
-            line = json.loads(raw)
-            name, record, said = line["file_name"], line["records"][0], line["parameters"]
-            if Path(name).is_absolute() or ".." in Path(name).parts:
-                raise ValueError
-            out.append(_ideal(folder, name, record, said))
+            path = inside(folder, line["file_name"], source=source, path=f"line {k + 1}.file_name")
+            out.append(_ideal(path, line["file_name"], line["records"][0], line["parameters"]))
         except InputError:
             raise
         except (ValueError, KeyError, TypeError, IndexError, AttributeError):
@@ -220,8 +214,8 @@ def _load_ideal(folder: Path) -> list[LabelledImage]:
     return out
 
 
-def _ideal(folder: Path, name: str, record: Mapping[str, Any], said: Mapping[str, Any]) -> LabelledImage:
-    image, _ = read_image(folder / name)
+def _ideal(path: Path, name: str, record: Mapping[str, Any], said: Mapping[str, Any]) -> LabelledImage:
+    image, _ = read_image(path)
     label = record["pupil"]
     pupil = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"]) if label["status"] == OK else None
     visible = said.get("visible_fraction")
@@ -232,7 +226,7 @@ def _ideal(folder: Path, name: str, record: Mapping[str, Any], said: Mapping[str
     known = {"noise_dn": float(said["noise_dn"]), "blur_px": float(said["blur_px"]), "step_dn": float(said["step_dn"])}
     return LabelledImage(
         name,
-        folder / name,
+        path,
         int(said["bit_depth"]),
         (image.shape[1], image.shape[0]),
         pupil,

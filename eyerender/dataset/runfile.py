@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -26,11 +27,17 @@ _SHOWN = 4
 
 
 def refuse_taken(folder: Path) -> None:
-    """Raise `InputError` where a folder holds something else than a run, before anything is put into it."""
+    """Raise `InputError` where a folder holds something else than a run, before anything is put into it.
+
+    A link in the place of what a run writes is refused too: making or removing shards would change what it leads to.
+    """
     try:
-        taken = folder.is_dir() and _is_taken(folder)
+        link = next(_links(folder), None)
+        taken = folder.is_dir() and link is None and _is_taken(folder)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", source=str(folder)) from None
+    if link is not None:
+        raise InputError(f"{link}: is a symbolic link; {_ELSE}", source=str(folder))
     if taken:
         raise InputError("is not empty; give another folder or --overwrite", source=str(folder))
 
@@ -120,6 +127,17 @@ def _is_taken(folder: Path) -> bool:
         return False
     # A run has a log and shards from its start, and puts the dataset together when all shards are finished.
     return not names & {LOG, SHARDS} or (RUN not in names and bool(names & {METADATA, DATASET}))
+
+
+def _links(folder: Path) -> Iterator[str]:
+    """What a run writes into that is a symbolic link."""
+    for name in sorted(_OWN):
+        place = folder / name
+        if place.is_symlink():
+            yield name
+        elif name in {*KINDS, SHARDS} and place.is_dir():
+            with os.scandir(place) as entries:
+                yield from (f"{name}/{entry.name}" for entry in entries if entry.is_symlink())
 
 
 def _is_passing(name: str) -> bool:

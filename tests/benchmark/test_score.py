@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -222,3 +224,15 @@ def test_images_of_two_eyes_and_damaged_folders_are_refused(drawn, tmp_path):
     (tmp_path / "metadata.jsonl").write_text("")
     with pytest.raises(InputError, match="holds no images"):
         load_labelled(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../x.png", "images/link.png", "images", 3])
+def test_images_outside_of_a_folder_of_ideal_images_are_refused(drawn, tmp_path, name):
+    shutil.copytree(drawn, tmp_path / "copy")
+    folder = tmp_path / "copy"
+    line = json.loads((folder / "metadata.jsonl").read_text().splitlines()[0])
+    (tmp_path / "x.png").write_bytes((folder / line["file_name"]).read_bytes())
+    (folder / "images" / "link.png").symlink_to(tmp_path / "x.png")
+    (folder / "metadata.jsonl").write_text(json.dumps(line | {"file_name": name}))
+    with pytest.raises(InputError, match=r"metadata\.jsonl: line 1\.file_name: "):
+        load_labelled(folder)

@@ -235,3 +235,18 @@ def test_a_part_withdraws_what_is_damaged_in_another(tiny, tmp_path):
     assert not (folder / "dataset.json").exists()
     assert make(folder, plan(), part=(2, 2))["complete"]
     assert tree(folder) == tree(tiny)
+
+
+@pytest.mark.parametrize("name", ["images", "shards", "masks/00002", "shards/00002", "log.jsonl", "metadata.jsonl"])
+def test_a_run_does_not_go_on_in_a_folder_with_links(tiny, tmp_path, name):
+    """Shards are made and removed, lines appended: where a link leads, all of it would happen elsewhere."""
+    folder, away = shutil.copytree(tiny, tmp_path / "copy"), tmp_path / "away"
+    (folder / name).rename(away)
+    (folder / name).symlink_to(away)
+    edit_done(folder, 2, digest="another")  # it would be made again
+    before = tree(tmp_path)
+    with pytest.raises(InputError, match=f"{name}: is a symbolic link"):
+        make(folder, plan())
+    with pytest.raises(InputError, match=f"holds '{name}', which this package did not make"):
+        make(folder, plan(), overwrite=True)
+    assert tree(tmp_path) == before
