@@ -252,9 +252,17 @@ def write_dataset(folder: Path, lines: list[dict[str, Any]], *, spec: dict[str, 
     write_json(folder / DATASET, dataset)
 
 
+RESULTS = 1
+"""Version of what this package computes: records, labels and pixels of the same spec.
+
+A change of the code that changes them raises it. A run that was begun with another version is not resumed.
+`tests/test_results_version.py` fails when results change and this number does not.
+"""
+
+
 def versions() -> dict[str, str]:
     """The versions a result depends on."""
-    out = {"python": platform.python_version()}
+    out = {"python": platform.python_version(), "results": str(RESULTS)}
     for name in ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless"):
         try:
             out[name] = version(name)

@@ -34,7 +34,8 @@ def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
     """The text of README.md."""
     spec = plan.spec
     splits = sorted(statistics["images_by_split"])
-    versions = ", ".join(f"{name} {number}" for name, number in run_versions().items() if name != "python")
+    shown = {name: number for name, number in run_versions().items() if name not in ("python", "results")}
+    versions = ", ".join(f"{name} {number}" for name, number in shown.items())
     by_split = "\n".join(
         f"| {name} | {statistics['subjects_by_split'][name]} | {statistics['images_by_split'][name]} |"
         for name in splits

@@ -16,7 +16,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +36,6 @@ KINDS = {
     "amodal_masks": "amodal_mask_file_name",
     "noiseless": "noiseless_file_name",
 }
-# The rooms and modules that a sample's bytes come from.
-SHAPING = {
-    "analytic", "arrays", "capture", "dataset", "eye", "geometry", "imagefile", "imagefolder", "observation", "optics",
-    "backends", "region", "rendering", "rig", "scene", "spec",
-}  # fmt: skip
 
 
 def _is_count(value: object) -> bool:
@@ -290,24 +284,11 @@ def run_versions() -> dict[str, str]:
 
     found = versions()
     found.pop("opencv-python-headless", None)  # nothing here uses it
-    found["eyerender_source"] = source_digest()
     try:
         found["pillow"] = version("pillow")
     except PackageNotFoundError:
         found["pillow"] = "unknown"
     return found
-
-
-@cache
-def source_digest() -> str:
-    """A short digest of the package's code that shapes a dataset's bytes; it tells versions of a checkout apart."""
-    package = Path(__file__).resolve().parent.parent
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        place = path.relative_to(package)
-        if place.parts[0].removesuffix(".py") in SHAPING:
-            digest.update(str(place).encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
 
 
 def cpu_family() -> str:

@@ -122,7 +122,8 @@ class SceneTruth:
         if digest != dataset.get("digest"):
             # An eye, a default or a file of the scene may have changed since; a present folder must agree.
             here = dataset.get("versions")
-            if not isinstance(here, dict) or here.get("eyerender") != versions()["eyerender"]:
+            ours = versions()
+            if not isinstance(here, dict) or any(here.get(key) != ours[key] for key in ("eyerender", "results")):
                 raise NoTruth("it was made by another version")
             problems.add(f"{DATASET}: its digest is not that of its scene, its eye and its files")
         return cls(scene, found)
