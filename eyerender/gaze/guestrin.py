@@ -27,7 +27,7 @@ from .cornea import CorneaCentres, from_all_glints, from_plane, optic_axis
 from .estimate import GazePoints, GazeRays, gaze_points
 from .parameters import HUMAN_BOUNDS, MEAN_EYE, NAMES, Calibration, EyeParameters, ParameterBounds
 from .rays import FeatureRays, feature_rays, nasal_sign, screen_of
-from .search import Objective, calibrate
+from .search import Misses, calibrate
 
 # Chebyshev degree of the centre as a function of sqrt(R): its last terms are below 1e-6 mm over 3 to 20 mm.
 _DEGREE = 14
@@ -44,13 +44,10 @@ class GuestrinEizenman:
         start: parameters to start the calibration from; its index is kept unless `free_index`.
         bounds: where the parameters may lie.
         free_index: calibrate the index too.
-        visual_axis: "angles" adds alpha and beta to azimuth and elevation; "rotation" turns the optic axis by a
-        rotation
-            that is fixed in the world (beta about y, then alpha about z).
-        objective: "least_squares" of the distances on the screen, or "sum_of_errors": their plain sum, as angles
-            atan(d / viewing_distance_mm) where that is given.
         tolerance: relative change of cost and parameters at which the search ends.
         calibrations: by eye (0 right, 1 left); `fit` fills it in.
+
+    A subclass may define another visual axis (`turned`) or another search (`search`).
     """
 
     lights: tuple[int, ...] | None = None
@@ -58,9 +55,6 @@ class GuestrinEizenman:
     start: EyeParameters = MEAN_EYE
     bounds: ParameterBounds = HUMAN_BOUNDS
     free_index: bool = False
-    visual_axis: Literal["angles", "rotation"] = "angles"
-    objective: Literal["least_squares", "sum_of_errors"] = "least_squares"
-    viewing_distance_mm: float | None = None
     tolerance: float = 1e-12
     calibrations: Mapping[int, Calibration] = field(default_factory=dict)
 
@@ -102,7 +96,7 @@ class GuestrinEizenman:
             rows = observations.index.eye == eye
             p = calibration.parameters.vector()
             sign = nasal_sign(observations.index.eye[rows])
-            direction[rows] = self._turned(optic.direction[rows], np.radians(p[3]) * sign, np.radians(p[4]))
+            direction[rows] = self.turned(optic.direction[rows], np.radians(p[3]) * sign, np.radians(p[4]))
         return GazeRays.of(optic.origin_mm, direction, optic.reason)
 
     def optic_axes(self, observations: Observations, rig: Rig) -> GazeRays:
@@ -134,15 +128,15 @@ class GuestrinEizenman:
             return from_plane(origin, glints, rays.light_mm, radius)
         return from_all_glints(origin, glints, rays.light_mm, radius)
 
-    def _turned(self, w: Floats, alpha: Any, beta: Any) -> Floats:
-        """The visual axis of optic axes w (..., 3); alpha towards +y and beta upwards, in radians."""
-        if self.visual_axis == "angles":
-            theta = np.arctan2(w[..., 1], w[..., 0]) + alpha
-            phi = np.arcsin(np.clip(w[..., 2], -1.0, 1.0)) + beta
-            return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
-        ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
-        x, z = cb * w[..., 0] - sb * w[..., 2], sb * w[..., 0] + cb * w[..., 2]
-        return np.stack([ca * x - sa * w[..., 1], sa * x + ca * w[..., 1], z], axis=-1)
+    def turned(self, w: Floats, alpha: ArrayLike, beta: ArrayLike) -> Floats:
+        """The visual axes (..., 3) of optic axes w (..., 3); alpha towards +y and beta upwards, in radians."""
+        theta = np.arctan2(w[..., 1], w[..., 0]) + alpha
+        phi = np.arcsin(np.clip(w[..., 2], -1.0, 1.0)) + beta
+        return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
+
+    def search(self, misses: Misses, start: EyeParameters) -> Calibration:
+        """One eye's parameters with the least sum of squared misses, searched for from `start`."""
+        return calibrate(misses, start, self.bounds, self.free, self.tolerance)
 
     @property
     def free(self) -> Bools:
@@ -204,7 +198,7 @@ class _Model:
         w, _, _ = optic_axis(self.origin, self.pupil, centre, R, K, index)
         alpha, beta = np.radians(parameters[:, 3, None]) * self.sign, np.radians(parameters[:, 4, None])
         # Both in the screen's axes: right, up, and towards the eye.
-        v, c = self.estimator._turned(w, alpha, beta) @ self.axes, (centre - self.screen.centre_mm) @ self.axes
+        v, c = self.estimator.turned(w, alpha, beta) @ self.axes, (centre - self.screen.centre_mm) @ self.axes
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = -c[..., 2] / v[..., 2]
             flat = c[..., :2] + reach[..., None] * v[..., :2] - self.wanted
@@ -214,11 +208,9 @@ class _Model:
         return out
 
     def calibrate(self, start: EyeParameters) -> Calibration:
-        estimator = self.estimator
-        objective = Objective(estimator.objective, self.misses, estimator.viewing_distance_mm)
-        if not estimator.free_index:
-            start = replace(start, index=estimator.start.index)
-        return calibrate(objective, start, estimator.bounds, estimator.free, estimator.tolerance)
+        if not self.estimator.free_index:
+            start = replace(start, index=self.estimator.start.index)
+        return self.estimator.search(self.misses, start)
 
 
 def _why(found: CorneaCentres, meets: Bools, inside: Bools) -> Objects:

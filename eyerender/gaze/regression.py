@@ -84,7 +84,6 @@ class PupilGlintRegression:
     Args:
         function: R1 to R12 of Table 2, or the terms of x and y, as ("x + y + 1", "x + y2 + 1").
         light: which light's glint the vector runs from.
-        minimum_norm: allow fewer targets than terms and take the minimum-norm solution, as the study's authors did.
         normalised: divide by the distance of the two pupils; False takes the vector in pixels, of one eye alone.
         centred: take the polynomial about the calibration vectors' mean. That is another function wherever the terms
             are not closed under a shift, as in R4 and R6 to R12.
@@ -92,7 +91,6 @@ class PupilGlintRegression:
 
     function: str | tuple[str, str] = "R3"
     light: int = 0
-    minimum_norm: bool = False
     normalised: bool = True
     centred: bool = False
     fits: Mapping[int, EyeFit] = field(default_factory=dict, repr=False)
@@ -115,24 +113,30 @@ class PupilGlintRegression:
         wanted = np.stack([targets @ screen.right, targets @ screen.up], axis=-1)
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
         usable = np.array([r is None for r in reason], dtype=bool) & np.isfinite(wanted).all(axis=1)
-        x_terms, y_terms = self.terms
         fits = {}
         for eye in np.unique(observations.index.eye):
             rows = usable & (observations.index.eye == eye)
-            need = max(len(x_terms), len(y_terms))
             name = "right" if eye == 0 else "left"
-            if rows.sum() < (1 if self.minimum_norm else need):
-                raise InputError(
-                    f"{name} eye: {rows.sum()} usable calibration targets, but {self.function} has {need} terms"
-                )
-            origin = v[rows].mean(axis=0) if self.centred else np.zeros(2)
-            # Scaling leaves the function the same. The minimum norm depends on it; the study's is the unscaled one.
-            scale = np.ones(2) if self.minimum_norm else np.maximum(np.abs(v[rows] - origin).max(axis=0), 1e-300)
-            u = (v[rows] - origin) / scale
-            a = self._solve(_monomials(u, x_terms), wanted[rows, 0], name)
-            b = self._solve(_monomials(u, y_terms), wanted[rows, 1], name)
-            fits[int(eye)] = EyeFit(origin, scale, a, b)
+            fits[int(eye)] = self.fit_eye(v[rows], wanted[rows], name)
         return replace(self, fits=fits)
+
+    def fit_eye(self, vectors: Floats, wanted: Floats, name: str) -> EyeFit:
+        """The coefficients of one eye: vectors (n, 2) to points on the screen (n, 2) mm; raises as `fit` does.
+
+        The polynomial is of scaled vectors, which leaves the function the same. A subclass may solve otherwise.
+        """
+        x_terms, y_terms = self.terms
+        need = max(len(x_terms), len(y_terms))
+        if len(vectors) < need:
+            raise InputError(
+                f"{name} eye: {len(vectors)} usable calibration targets, but {self.function} has {need} terms"
+            )
+        origin = vectors.mean(axis=0) if self.centred else np.zeros(2)
+        scale = np.maximum(np.abs(vectors - origin).max(axis=0), 1e-300)
+        u = (vectors - origin) / scale
+        a = self._solve(monomials(u, x_terms), wanted[:, 0], name)
+        b = self._solve(monomials(u, y_terms), wanted[:, 1], name)
+        return EyeFit(origin, scale, a, b)
 
     def predict(self, observations: Observations, rig: Rig) -> GazePoints:
         """Gaze points on the screen's plane."""
@@ -150,12 +154,12 @@ class PupilGlintRegression:
                 reason[rows] = "this eye is not calibrated"
                 continue
             u = (v[rows] - fit.origin) / fit.scale
-            on_screen[rows] = np.stack([_monomials(u, x_terms) @ fit.a, _monomials(u, y_terms) @ fit.b], axis=-1)
+            on_screen[rows] = np.stack([monomials(u, x_terms) @ fit.a, monomials(u, y_terms) @ fit.b], axis=-1)
         return gaze_points(screen.world(on_screen), reason)
 
     def _solve(self, design: Floats, wanted: Floats, eye: str) -> Floats:
         solution, _, rank, _ = np.linalg.lstsq(design, wanted, rcond=None)
-        if rank < design.shape[1] and not self.minimum_norm:
+        if rank < design.shape[1]:
             raise InputError(f"{eye} eye: the calibration targets do not determine {self.function} (rank {rank})")
         return np.asarray(solution)
 
@@ -196,5 +200,6 @@ def _partners(frame: Ints, eye: Ints) -> Ints:
     return np.where(found, order[at], -1)
 
 
-def _monomials(v: Floats, terms: Terms) -> Floats:
+def monomials(v: Floats, terms: Terms) -> Floats:
+    """The design matrix (n, m) of vectors (n, 2): x^i y^j for each of the m terms (i, j)."""
     return np.stack([v[:, 0] ** i * v[:, 1] ** j for i, j in terms], axis=1)

@@ -15,6 +15,7 @@ from ..gaze.regression import FUNCTIONS, PupilGlintRegression
 from ..observation import Observations
 from ..rig.rig import Rig
 from ..scene import Scene, SceneSpec, load_scene
+from .authors_estimators import MinimumNormRegression
 from .literature import CALIBRATION_SETS
 from .results import Departure, Row, mean_row
 
@@ -109,9 +110,8 @@ def run(observations: Observations, rig: Rig, departures: Collection[str], *, ce
     for name, targets in CALIBRATION_SETS.items():
         calibration = observations.take(np.isin(fixation, np.array(targets) - 1))
         for function in FUNCTIONS:
-            regression = PupilGlintRegression(
-                terms(function, departures), minimum_norm="minimum_norm" in departures, centred=centred
-            )
+            kind = MinimumNormRegression if "minimum_norm" in departures else PupilGlintRegression
+            regression = kind(terms(function, departures), centred=centred)
             try:
                 fitted = regression.fit(calibration, calibration.index.target_mm, rig)
             except InputError as error:

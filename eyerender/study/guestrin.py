@@ -13,11 +13,11 @@ import numpy as np
 
 from ..arrays import Floats, frozen
 from ..gaze.estimate import GazePoints, angular_error_deg
-from ..gaze.guestrin import GuestrinEizenman
 from ..gaze.parameters import Calibration, EyeParameters, ParameterBounds
 from ..observation import EYES, Observations
 from ..rig.rig import Rig
 from ..scene import Scene, SceneSpec, load_scene
+from .authors_estimators import AuthorsGuestrinEizenman
 from .results import Departure, Row, mean_row
 
 SCENE = "guestrin2006"
@@ -96,7 +96,7 @@ class Outcome:
     observations: Observations
     gaze: GazePoints
     error_deg: Floats
-    estimator: GuestrinEizenman
+    estimator: AuthorsGuestrinEizenman
 
     def mean_deg(self, head: str) -> float | None:
         """Mean over the fixations and eyes of H1 or H2."""
@@ -136,18 +136,17 @@ def scene_key(departures: Collection[str]) -> frozenset[str]:
     return frozenset(departures) & {"eyes", "lights", "heads"}
 
 
-def estimator(departures: Collection[str], *, free_index: bool = False) -> GuestrinEizenman:
+def estimator(departures: Collection[str], *, free_index: bool = False) -> AuthorsGuestrinEizenman:
     """The estimator of a set of departures."""
     index = 1.376 if "index" in departures else 1.3375
     software = "objective" in departures
-    return GuestrinEizenman(
+    return AuthorsGuestrinEizenman(
         centre="plane" if "centre" in departures else "all_glints",
         start=replace(SOFTWARE_START if software else EyeParameters(), index=index),
         bounds=SOFTWARE_BOUNDS if software else ParameterBounds(),
         free_index=free_index and "index" not in departures,
         visual_axis="rotation" if "visual_axis" in departures else "angles",
         objective="sum_of_errors" if software else "least_squares",
-        viewing_distance_mm=650.0,
         # A sum of distances has a kink wherever one of them vanishes, where the last digits cost hundreds of steps.
         tolerance=1e-10 if software else 1e-12,
     )
