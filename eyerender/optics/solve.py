@@ -203,7 +203,7 @@ def _confirmed(
 def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target: Xyz, rays: Rays) -> Rays:
     """The refracted rays, with those that were not found searched from the object.
 
-    A cone of rays is launched from it; the one that leaves closest to the viewpoint's direction starts the search.
+    A cone of rays is launched from it; those that leave closest to the viewpoint's direction start a search each.
     """
     lost = (rays.status != RayStatus.OK) & (rays.status != RayStatus.OUTSIDE_LIMBUS)
     if not lost.any():
@@ -221,16 +221,20 @@ def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target
         gap = places[part, None, :] - out.points_mm[-1]
         with np.errstate(all="ignore"):
             cosine = np.sum(gap * out.directions[-1], axis=-1) / np.linalg.norm(gap, axis=-1)
-        best = _CONE[np.argmax(np.where(out.status == RayStatus.OK, cosine, -2.0), axis=1)]
-        shot = connect(
-            outward, indices[-1], components(ends[part]), components(places[part]), components(ends[part] + best)
-        )
+        order = np.argsort(np.where(out.status == RayStatus.OK, -cosine, 2.0), axis=1)
         index = tuple(axis[part] for axis in rows)
-        aims[index], found[index] = join(shot.last), shot.status == RayStatus.OK
+        for best in order[:, :_TRIED].T:
+            aim = ends[part] + _CONE[best]
+            shot = connect(outward, indices[-1], components(ends[part]), components(places[part]), components(aim))
+            good = ~found[index] & (shot.status == RayStatus.OK)
+            aims[index] = np.where(good[:, None], join(shot.last), aims[index])
+            found[index] |= good
+            if found[index].all():
+                break
     if not found.any():
         return rays
-    aim = components(aims.reshape(*lost.shape, 3))
-    return _searched(path, n_outside, viewpoint, target, aim, rays, found.reshape(lost.shape))
+    seen_at = components(aims.reshape(*lost.shape, 3))
+    return _searched(path, n_outside, viewpoint, target, seen_at, rays, found.reshape(lost.shape))
 
 
 def _cone(count: int, reach_rad: float) -> Array:
@@ -240,7 +244,8 @@ def _cone(count: int, reach_rad: float) -> Array:
     return np.column_stack([np.cos(angle), np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn)])
 
 
-_CONE = _cone(64, 1.45)
+_CONE = _cone(256, 1.45)
+_TRIED = 3
 _LAUNCHED_AT_ONCE = 200
 
 
