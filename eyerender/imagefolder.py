@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -146,7 +147,7 @@ class ImageFolder:
                 it is read.
         """
         folder = Path(path)
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             raise InputError("no such folder", source=str(path))
         if (folder / RUN).is_file() and not (folder / DATASET).is_file():
             raise InputError("holds a run that is not finished; start generate again on it", source=str(path))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -115,7 +116,7 @@ class ImageObserver:
 
         Each image shows one eye and counts as a frame; with a scene its glints are identified by light.
         """
-        if len(paths) == 1 and Path(paths[0]).is_dir():
+        if len(paths) == 1 and os.path.isdir(paths[0]):
             folder = ImageFolder.load(paths[0])
             return self.observe_folder(folder, scene or scene_of(folder), progress=progress)
         parts = []

@@ -6,6 +6,7 @@ Frames are ordered by head position, then fixation, then camera; within a frame 
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -216,7 +217,7 @@ class Scene:
         try:
             scene.eye("right")
             for file in scene.files if base is not None else ():
-                if not file.is_file():
+                if not os.path.isfile(file):
                     raise InputError("no such file", source=str(file))
         except InputError as error:
             raise InputError(error.reason, source=error.source or source, path=error.path) from None
@@ -442,7 +443,7 @@ def is_dataset(path: Path) -> bool:
 
 def refuse_folder(path: Path, wanted: str) -> None:
     """Raise `InputError` where a folder was given instead of a file, and say which file of it may have been meant."""
-    if not path.is_dir():
+    if not os.path.isdir(path):
         return
     hint = ""
     if (path / "scene.yaml").is_file():
@@ -466,12 +467,12 @@ def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = N
     """
     path = Path(scene)
     shipped = shipped_scenes()
-    if not path.is_file():
+    if not os.path.isfile(path):
         if str(scene) in shipped:
             path = shipped[str(scene)]
         elif str(scene) in shipped_files():
             raise InputError(NOT_A_SCENE, source=str(scene))
-        elif path.suffix not in (".yaml", ".yml") and not path.exists():
+        elif path.suffix not in (".yaml", ".yml") and not os.path.exists(path):
             raise InputError(f"no such scene file; shipped scenes: {', '.join(shipped)}", source=str(scene))
     refuse_folder(path, "a scene file, or the name of a shipped scene")
     spec = SceneSpec.load(path)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -120,7 +121,7 @@ class Plan:
                 raise InputError(f"must be names of eyes, not {name!r}", source=source, path="scene.eye.model")
             file = str(base / name) if base is not None and name not in catalogue_names() else name
             try:
-                if name not in catalogue_names() and Path(file).is_file():
+                if name not in catalogue_names() and os.path.isfile(file):
                     # Before it is read, so that a change in between is found when the run checks its files.
                     sums[name] = sum_of_file(Path(file))
                 eyes[name] = load_eye(file).to_mapping()

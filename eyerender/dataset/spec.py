@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -115,12 +116,12 @@ def shipped_datasets() -> dict[str, Path]:
 def find_dataset(spec: str | Path) -> Path:
     """The file of a dataset spec, by its path or by the bare name of a shipped one; raises `InputError`."""
     path, shipped = Path(spec), shipped_datasets()
-    if not path.is_file():
+    if not os.path.isfile(path):
         if str(spec) in shipped:
             return shipped[str(spec)]
         if str(spec) in shipped_files():
             raise InputError(NOT_A_DATASET, source=str(spec))
-        if path.suffix not in (".yaml", ".yml") and not path.exists():
+        if path.suffix not in (".yaml", ".yml") and not os.path.exists(path):
             raise InputError(f"no such dataset file; shipped: {', '.join(shipped)}", source=str(spec))
     refuse_folder(path, "the spec of a dataset: a file, or the name of a shipped one")
     return path

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,10 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files import write_json, write_text
-from ...imagefolder import DATASET, ImageFolder
+from ...imagefolder import DATASET, METADATA, ImageFolder
 from ...outfolder import staged
 from ..assemble import verify_dataset
+from ..validation.problems import WRONG
 from . import coco, ellseg, openeds, table, teyed, webdataset
 from .card import export_card
 from .encoding import SAMPLED, Curve, Encoding, check, measured_gain
@@ -64,8 +66,8 @@ def export(
         progress: called with images done, images in all and "".
 
     Raises:
-        InputError: no such layout or encoding, no generated dataset, a file that its checksum does not fit, or OUT is
-            taken.
+        InputError: no such layout or encoding, no generated dataset, a file that its checksum does not fit, labels of
+            another shape than this version writes, or OUT is taken.
         EyerenderError: OUT cannot be written.
     """
     if format not in FORMATS:
@@ -78,10 +80,12 @@ def export(
         raise InputError("is no generated dataset (no kind: dataset)", source=str(Path(path) / DATASET))
     for problem in verify_dataset(folder.path):
         raise InputError(f"{problem}; start generate again on the folder to repair it", source=str(path))
-    total = len(folder.entries)
-    with staged(out, overwrite=overwrite) as stage:
+    total, made = len(folder.entries), 0
+    with staged(out, overwrite=overwrite) as stage, _blamed(folder, lambda: made + 1):
 
         def step(done: int) -> None:
+            nonlocal made
+            made = done
             if progress is not None:
                 progress(done, total, "")
 
@@ -101,6 +105,19 @@ def export(
         write_text(stage / CARD, export_card(items.name, done, layout, chosen), sync=False)
         write_json(stage / EXPORT, done, sync=False)
     return {**done, "path": str(out)}
+
+
+@contextmanager
+def _blamed(folder: ImageFolder, number: Callable[[], int]) -> Iterator[None]:
+    """Labels of another shape than this package writes make a writer fail: say so, and at which image."""
+    try:
+        yield
+    except WRONG as error:
+        raise InputError(
+            f"image {number()}, in the order of samples, has not the labels it should have "
+            f"({type(error).__name__}: {error})",
+            source=str(folder.path / METADATA),
+        ) from None
 
 
 def _encoding(folder: ImageFolder, bits: int, curve: Curve, gain: float | None) -> Encoding:

@@ -5,6 +5,7 @@ Files live beside this module; each value carries its source.
 
 from __future__ import annotations
 
+import os
 from functools import cache
 from pathlib import Path
 
@@ -24,7 +25,8 @@ def load_eye(name_or_path: str | Path) -> EyeSpec:
     if isinstance(name_or_path, str) and name_or_path in catalogue_names():
         return _shipped(name_or_path)
     path = Path(name_or_path)
-    if path.suffix not in (".yaml", ".yml") and not path.exists():
+    # os.path finds nothing under a name that no file can have, where Path raises.
+    if path.suffix not in (".yaml", ".yml") and not os.path.exists(path):
         raise InputError(f"no such eye; the catalogue holds {', '.join(catalogue_names())}", source=str(name_or_path))
     return EyeSpec.load(path)
 
