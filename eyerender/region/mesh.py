@@ -14,11 +14,11 @@ import trimesh
 from ..arrays import ArrayValue, Floats, Ints, frozen
 from .anatomy import RegionSpec
 from .brow import brow
-from .contour import COLUMNS
+from .contour import COLUMNS, Contour, contour
 from .globe import Globe
 from .hairs import SEGMENTS, Hairs, tube_faces
 from .lashes import lashes
-from .lids import ROWS, Sheet, grid_normals, sheet
+from .lids import ROWS, grid_normals, sheet
 from .skin import BROW, LASH, TEAR, band_row, sheet_v
 from .tears import ROWS as TEAR_ROWS
 from .tears import meniscus
@@ -61,6 +61,21 @@ class RegionMesh(ArrayValue):
         return trimesh.Trimesh(self.vertices[v0:v1], self.layout.faces[f0:f1] - v0, process=False)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LidMargins(ArrayValue):
+    """Landmarks (k, 3) along the lids' inner edges, as a `RegionMesh` has them."""
+
+    upper_margin: Floats
+    lower_margin: Floats
+
+
+def lid_margins(spec: RegionSpec, globe: Globe) -> LidMargins:
+    """The lids' inner edges alone, without the mesh around them."""
+    mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    upper, lower = (frozen(edge * mirror) for edge in _margins(contour(spec, globe)))
+    return LidMargins(upper, lower)
+
+
 def region_mesh(spec: RegionSpec, globe: Globe) -> RegionMesh:
     """The region of a subject around a posed globe."""
     s = sheet(spec, globe)
@@ -70,7 +85,7 @@ def region_mesh(spec: RegionSpec, globe: Globe) -> RegionMesh:
     lash_tubes = lash.tubes()
     vertices = np.concatenate([_closed(s.vertices), _closed(tears), lash_tubes, hair_tubes])
     normals = np.concatenate([_closed(s.normals), _closed(grid_normals(tears)), _round(lash, lash_tubes), hair_normals])
-    upper, lower = _margins(s)
+    upper, lower = _margins(s.contour)
     curves = [upper, lower, s.vertices[-1], lash.points, hair.points, np.concatenate([tears, tears[:, :1]], axis=1)]
     if globe.mirrored:
         mirror = np.array([1.0, -1.0, 1.0])
@@ -101,8 +116,8 @@ def _round(hairs: Hairs, tubes: Floats) -> Floats:
     return np.asarray(away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-12))
 
 
-def _margins(s: Sheet) -> tuple[Floats, Floats]:
-    point = s.contour.point
+def _margins(fissure: Contour) -> tuple[Floats, Floats]:
+    point = fissure.point
     half = COLUMNS // 2
     return point[: half + 1][::-1], np.concatenate([point[half:], point[:1]])
 

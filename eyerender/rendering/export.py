@@ -24,8 +24,7 @@ from ..region.anatomy import RegionSpec
 from ..region.head import HEAD_PARTS, load_head, placed
 from ..region.mesh import region_mesh
 from ..rig.imaging import AmbientSpec
-from .frame import RenderJob
-from .region import globe_of
+from .frame import RenderJob, globe_of
 
 _BACKDROP_HALF_MM = 500.0
 

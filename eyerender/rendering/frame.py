@@ -14,6 +14,7 @@ from ..geometry.surfaces import Surface
 from ..geometry.surfaces_biconic import Biconic
 from ..geometry.surfaces_quadric import Quadric
 from ..region.anatomy import RegionSpec
+from ..region.globe import Globe
 from ..region.look import LookSpec
 from ..rig.camera import Camera
 from ..rig.imaging import AmbientSpec, LensSpec
@@ -68,6 +69,20 @@ class RenderJob(ArrayValue):
         if self.apex_mm is not None:
             return np.asarray(self.apex_mm, dtype=float)
         return np.asarray(self.M @ _GLOBE_CENTRE_MM + self.t - _GLOBE_CENTRE_MM)
+
+
+def globe_of(eye: Eye, M: Floats, t: Floats) -> Globe:
+    """The posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
+    sclera = eye.sclera
+    return Globe(
+        eye.front[0],
+        float(eye.limbus_radius_mm),
+        np.asarray(sclera.centre_mm),
+        float(sclera.radius_mm),
+        M,
+        t,
+        eye.side == "left",
+    )
 
 
 def kinds(eye: Eye) -> tuple[tuple[bool, bool], ...]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ..arrays import Bools, Floats
-from ..region.mesh import RegionMesh
+from ..region.mesh import LidMargins, RegionMesh
 from ..rig.camera import Camera
 
 _BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
@@ -66,7 +66,9 @@ def visible_arcs_deg(part: NDArray[np.uint8], pupil: int, points_px: Floats, ori
     return [[float(angle[a]), float(angle[b - 1])] for a, b in edges.reshape(-1, 2)]
 
 
-def lid_margins_px(region: RegionMesh, camera: Camera, anchor_mm: Floats) -> dict[str, list[list[float]]] | None:
+def lid_margins_px(
+    region: RegionMesh | LidMargins, camera: Camera, anchor_mm: Floats
+) -> dict[str, list[list[float]]] | None:
     """Landmarks along the inner edges of both margins, canthus to canthus from temple to nose, full-sensor pixels; None
     for a mesh of which none are known, and where one of them lies behind the camera."""
     if len(region.upper_margin) == 0:

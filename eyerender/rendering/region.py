@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats
-from ..eye.model import Eye
 from ..region.anatomy import RegionSpec
 from ..region.globe import Globe
 from ..region.head import file_states
@@ -29,20 +28,6 @@ from .values import aligned
 _F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, about the same (n 1.40 and 1.33)
 _ROUGH_SKIN, _ROUGH_WET = 0.19, 0.04
 _RIPPLE = 0.032  # slope of wet tissue
-
-
-def globe_of(eye: Eye, M: Floats, t: Floats) -> Globe:
-    """The posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
-    sclera = eye.sclera
-    return Globe(
-        eye.front[0],
-        float(eye.limbus_radius_mm),
-        np.asarray(sclera.centre_mm),
-        float(sclera.radius_mm),
-        M,
-        t,
-        eye.side == "left",
-    )
 
 
 class RegionScene:

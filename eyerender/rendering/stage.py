@@ -13,11 +13,11 @@ from ..errors import InputError
 from ..rig.imaging import AmbientSpec
 from .environment import Ambience, Maps
 from .film import Exposed, Window
-from .frame import RenderJob, boundary_waves, kinds, light_table, panel_table, parameters_of
+from .frame import RenderJob, boundary_waves, globe_of, kinds, light_table, panel_table, parameters_of
 from .head import place_scene
 from .lidshade import LidShade
 from .plain import plain_tiles
-from .region import RegionScene, globe_of
+from .region import RegionScene
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
 from .view import Textures

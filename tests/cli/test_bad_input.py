@@ -184,6 +184,8 @@ TABLE = [
     (["generate", "dataset_quick", "out", "--eye", "missing.yaml"], 2, "missing.yaml: no such file"),
     (["validate", "hollow"], 2, "hollow: holds no metadata.jsonl"),
     (["validate", "nowhere"], 2, "nowhere: no such folder"),
+    (["validate", "nowhere", "--deep"], 2, "nowhere: no such folder"),
+    (["validate", "hollow", "--deep", "5"], 2, "5"),
     (["export-dataset", "hollow", "out", "--format", "coco"], 2, "hollow: holds no metadata.jsonl"),
     (["export-dataset", "hollow", "out", "--format", "zip"], 2, "zip"),
     (["export-dataset", "hollow", "out"], 2, "--format"),

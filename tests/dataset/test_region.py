@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, find_dataset
 from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
-from eyerender.imagefile import read_image
+from eyerender.imagefile import read_image, write_png
 from eyerender.imagefolder import ImageFolder
 
 pytestmark = pytest.mark.render
@@ -37,6 +38,29 @@ def folder(tmp_path_factory):
 def test_it_is_a_sound_dataset(folder):
     report = validate(folder)
     assert report["ok"], report["problems"]
+
+
+@pytest.mark.parametrize("shift", [2, 3])
+def test_shifted_masks_are_found_behind_lids(folder, tmp_path, shift):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    paths = sorted(copy.glob("masks/*/*.png"))
+    for path in paths:
+        write_png(path, np.roll(read_image(path)[0], shift, axis=1))
+    found = validate(copy)["problems"]
+    for path in paths:
+        mine = [p for p in found if p.startswith(f"images/00000/{path.name}: ")]
+        assert any("the mask of its pupil" in p and "its outline" in p for p in mine)
+        assert any("the mask of its iris" in p and "its outline" in p for p in mine)
+
+
+def test_a_moved_lid_is_found(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    for path in [copy / "metadata.jsonl", *copy.glob("shards/*/lines.jsonl")]:
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        lines[1]["labels"]["lid_margins_px"]["upper"][8][1] += 5
+        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    found = validate(copy, quick=True)["problems"]
+    assert sum("computed again: labels.lid_margins_px.upper.8.1" in p for p in found) == 1
 
 
 def test_its_lines_have_the_keys_of_bare_eyes(tiny, folder):

@@ -20,7 +20,10 @@ from ...arrays import Bools, Floats
 from ...errors import InputError
 from ...imagefolder import DATASET, ImageFolder, versions
 from ...observation import EYES, Observations
+from ...region.mesh import lid_margins
+from ...rendering.frame import globe_of
 from ...rendering.glints import GlintScene
+from ...rendering.occlusion import lid_margins_px
 from ...scene import Scene, SceneSpec
 from ..labels import EyeInWindow, known_labels, limbus_px
 from ..line import image_line, image_name
@@ -34,6 +37,8 @@ from .problems import WRONG, Problems, differences
 TOLERANCE = 1e-7
 # The centre of a lamp's image, of which hidden points may be missing, is a mean of points that are traced as exactly.
 SPOT_PX = 1e-3
+# Landmarks of the lids are written with four decimals.
+ROUNDED = 1e-6
 _LIMBUS_POINTS = 360
 _SHOWN = 2
 
@@ -98,7 +103,8 @@ class DatasetTruth:
         _, expected = image_line(found, row, self.frames, view.window, known_labels(scene, observations, view))
         texts = ("scene_json", "eye_json")
         problems = _differences(_open(expected, texts), _open(line, texts))
-        return Again((*problems, *_spots(scene, view, line)), _limbus(scene, view))
+        problems += [*_spots(scene, view, line), *_lids(scene, observations, view, line)]
+        return Again(tuple(problems), _limbus(scene, view))
 
 
 @dataclass
@@ -154,7 +160,8 @@ class SceneTruth:
                 "camera": view.camera,
             },
         }
-        return Again(tuple(_differences(expected, line)), _limbus(scene, view))
+        problems = [*_differences(expected, line), *_lids(scene, found, view, line)]
+        return Again(tuple(problems), _limbus(scene, view))
 
 
 def truth_of(folder: ImageFolder, problems: Problems) -> DatasetTruth | SceneTruth | None:
@@ -177,8 +184,12 @@ def _open(line: dict[str, Any], texts: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _differences(expected: dict[str, Any], line: dict[str, Any]) -> list[str]:
-    """The first differences by part of the line, and how many more there are."""
-    found = list(differences(expected, line, TOLERANCE))
+    return _summed(differences(expected, line, TOLERANCE))
+
+
+def _summed(texts: Iterator[str]) -> list[str]:
+    """The first of several differences, and how many more there are."""
+    found = list(texts)
     if len(found) > _SHOWN:
         found = [*found[:_SHOWN], f"{len(found) - _SHOWN} more values differ"]
     return [f"computed again: {text}" for text in found]
@@ -210,6 +221,17 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
         if not (np.all(spot >= low - SPOT_PX) and np.all(spot <= high + SPOT_PX)):
             x, y = (float(v) for v in (low + high) / 2)
             yield f"computed again: the spot of light {glint['light']} is at {spot}, not at [{x:.3f}, {y:.3f}]"
+
+
+def _lids(scene: Scene, observations: Observations, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
+    """The landmarks along the lids; those of a head mesh, which are not known, are null."""
+    expected = None
+    if scene.spec.region is not None and scene.spec.region.head is None:
+        index = observations.index
+        anchor = index.head_mm[view.row] + index.eye_position_mm[view.row]
+        margins = lid_margins(scene.spec.region, globe_of(view.eye, view.M, view.t - anchor))
+        expected = lid_margins_px(margins, scene.rig.cameras[view.camera], anchor)
+    yield from _summed(differences(expected, line["labels"]["lid_margins_px"], ROUNDED, "labels.lid_margins_px"))
 
 
 def _all_clear(a: Floats, b: Floats) -> Bools:
