@@ -136,15 +136,19 @@ class LocalPool:
 
     def _listen(self, worker: _Worker, events: Events) -> str | None:
         """Take in a worker's messages; the reason why it must be ended, if so."""
-        try:
-            while worker.pipe.poll():
+        while True:
+            try:
+                if not worker.pipe.poll():
+                    break
                 message = worker.pipe.recv()
-                worker.heard = time.monotonic()
-                reason = self._take(worker, message, events)
-                if reason is not None:
-                    return reason
-        except (EOFError, OSError):
-            worker.process.join(5)
+            except (EOFError, OSError):
+                worker.process.join(5)
+                break
+            worker.heard = time.monotonic()
+            # An error of the events' receiver, such as a full disk, is none of the pipe's.
+            reason = self._take(worker, message, events)
+            if reason is not None:
+                return reason
         if not worker.process.is_alive():
             return end_of(worker.process.exitcode)
         if time.monotonic() - worker.heard > self.timeout_s and (worker.shard is not None or not worker.is_ready):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
@@ -174,6 +175,16 @@ def test_a_crashed_worker_is_replaced(tmp_path):
     assert sorted(listener.made) == [0, 1]
     assert [reason for _, reason in listener.retries] == ["the worker was ended by SIGABRT"]
     assert len(set(listener.pids)) == 2
+
+
+def test_a_shard_that_cannot_be_put_in_place_ends_the_run(tmp_path):
+    def staged(_staged, _worker):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    listener = Listener()
+    listener.staged = staged
+    with pytest.raises(OSError, match="No space left on device"):
+        pool(tmp_path, timeout_s=60.0).run([0], listener)
 
 
 @pytest.mark.slow
