@@ -53,7 +53,10 @@ def validate(
         compare_lines(path, problems)
     total = len(folder.entries)
     rows = range(total) if deep else sampled(total, str(folder.dataset.get("digest")))
-    chosen = frozenset(rows) if truth is not None and not deep else frozenset()
+    if truth is not None and truth.stale is not None:
+        notes.append(f"records and labels are not computed again: {truth.stale}")
+    able = truth is not None and truth.stale is None
+    chosen = frozenset(rows if able and not deep else ())
     lines = Lines(folder, truth)
     for start, batch in _batches(folder.entries, problems):
         records = check_records([entry.line for entry in batch])
@@ -64,7 +67,7 @@ def validate(
                 problems.extend(f"{where}: {text}" for text in lines.take(k, entry))
                 problems.extend(f"{named}: {text}" for text in wrong)
                 again = Again(())
-                if truth is not None and (deep or k in chosen) and not wrong:
+                if truth is not None and able and (deep or k in chosen) and not wrong:
                     again = truth.again(entry.line)
                     problems.extend(f"{named}: {text}" for text in again.problems)
                 if quick:
@@ -84,7 +87,7 @@ def validate(
         "path": str(path),
         "ok": not problems.count,
         "images": total,
-        "recomputed": 0 if truth is None else len(rows),
+        "recomputed": len(rows) if able else 0,
         "notes": notes,
         "problem_count": problems.count,
         "problems": problems.shown,

@@ -317,6 +317,27 @@ def test_every_kind_of_wrong_value_in_a_line_is_a_problem_and_no_traceback(copy)
         assert all("\n" not in p and len(p) <= 400 for p in report["problems"])
 
 
+def test_a_line_nested_too_deeply_is_a_problem(copy):
+    path = copy / "metadata.jsonl"
+    lines = path.read_text().splitlines()
+    deep = "[" * 900 + "]" * 900
+    lines[5] = lines[5].replace('"failed_paths": 0', f'"failed_paths": {deep}')
+    assert deep in lines[5]
+    path.write_text("\n".join(lines) + "\n")
+    assert not validate(copy, quick=True)["ok"]
+
+
+def test_results_of_another_version_are_not_computed_again(copy):
+    path = copy / "dataset.json"
+    dataset = json.loads(path.read_text())
+    dataset["versions"]["results"] = "0"
+    path.write_text(json.dumps(dataset))
+    report = validate(copy, quick=True)
+    assert report["ok"], report["problems"]
+    assert report["recomputed"] == 0
+    assert any("results of version '0'" in note for note in report["notes"])
+
+
 def test_the_sample_is_spread_and_the_same_each_time():
     assert sampled(SAMPLE, "a") == list(range(SAMPLE))
     rows = sampled(1_000_000, "a")

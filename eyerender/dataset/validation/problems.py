@@ -10,7 +10,7 @@ from typing import Any
 SHOWN = 50
 MAX_LENGTH = 400
 # What a value that is not what it should be makes the code that reads it raise.
-WRONG = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
+WRONG = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError)
 
 
 class Problems:

@@ -79,11 +79,14 @@ def compare_lines(folder: Path, problems: Problems) -> None:
 
 def _values(files: Sequence[Path], numbers: Numbers) -> NDArray[np.void]:
     """Some lines of a few files: their numbers, and hashes of their images' names and of their values."""
-    rows = (
-        (number, _hash(str(line.get("file_name")).encode()), _hash(json.dumps(_plain(line), sort_keys=True).encode()))
-        for number, line in _objects(files, numbers)
-    )
-    return np.fromiter(rows, dtype=[("number", np.int64), ("name", np.uint64), ("value", np.uint64)])
+
+    def rows() -> Iterator[tuple[int, int, int]]:
+        for number, line in _objects(files, numbers):
+            with suppress(RecursionError):  # nested too deeply for a line; it is found elsewhere
+                values = json.dumps(_plain(line), sort_keys=True)
+                yield number, _hash(str(line.get("file_name")).encode()), _hash(values.encode())
+
+    return np.fromiter(rows(), dtype=[("number", np.int64), ("name", np.uint64), ("value", np.uint64)])
 
 
 def _objects(files: Sequence[Path], numbers: Numbers) -> Iterator[tuple[int, dict[str, Any]]]:

@@ -18,7 +18,8 @@ import numpy as np
 from ...analytic.observer import observe
 from ...arrays import Bools, Floats
 from ...errors import InputError
-from ...imagefolder import DATASET, ImageFolder, versions
+from ...files import shown
+from ...imagefolder import DATASET, RESULTS, ImageFolder, versions
 from ...observation import EYES, Observations
 from ...region.mesh import lid_margins
 from ...rendering.frame import globe_of
@@ -57,10 +58,14 @@ class Again:
 
 @dataclass
 class DatasetTruth:
-    """Lines of a generated dataset, from its plan; `frames` is how many each sample has."""
+    """Lines of a generated dataset, from its plan; `frames` is how many each sample has.
+
+    `stale` says why records and labels cannot be computed again, None where they can.
+    """
 
     plan: Plan
     frames: int
+    stale: str | None
     _last: Realised | None = field(default=None, init=False)
 
     @classmethod
@@ -71,7 +76,7 @@ class DatasetTruth:
             text = json.dumps({k: dataset[k] for k in plan.to_mapping()}, sort_keys=True, separators=(",", ":"))
             if hashlib.sha256(text.encode()).hexdigest() != dataset["digest"]:
                 problems.add(f"{DATASET}: its digest is not that of its spec, eyes and files")
-            return cls(plan, frames_of(plan))
+            return cls(plan, frames_of(plan), _other_results(dataset))
         except InputError as error:
             problems.add(f"{DATASET}: its plan cannot be used: {error}")
         except WRONG as error:
@@ -113,10 +118,18 @@ class SceneTruth:
 
     scene: Scene
     observations: Observations
+    stale: None = None
 
     @classmethod
     def of(cls, dataset: Mapping[str, Any], problems: Problems) -> SceneTruth:
-        """From dataset.json; raises `NoTruth` where a file of the scene is not at hand, or the folder is no scene's."""
+        """From dataset.json.
+
+        Raises:
+            NoTruth: a file of the scene is not at hand, another version rendered it, or the folder is no scene's.
+        """
+        stale = _other_results(dataset)
+        if stale is not None:
+            raise NoTruth(stale)
         if not isinstance(dataset.get("spec"), dict):
             raise NoTruth(f"{DATASET} has no scene")
         try:
@@ -126,11 +139,10 @@ class SceneTruth:
         except InputError as error:
             raise NoTruth(str(error)) from None
         if digest != dataset.get("digest"):
-            # An eye, a default or a file of the scene may have changed since; a present folder must agree.
-            here = dataset.get("versions")
-            ours = versions()
-            if not isinstance(here, dict) or any(here.get(key) != ours[key] for key in ("eyerender", "results")):
-                raise NoTruth("it was made by another version")
+            # Another version of the package may know keys that this digest does not have.
+            made_by = dataset.get("versions")
+            if isinstance(made_by, dict) and made_by.get("eyerender") != versions()["eyerender"]:
+                raise NoTruth("another version of the package made it")
             problems.add(f"{DATASET}: its digest is not that of its scene, its eye and its files")
         return cls(scene, found)
 
@@ -169,6 +181,13 @@ def truth_of(folder: ImageFolder, problems: Problems) -> DatasetTruth | SceneTru
     if folder.dataset.get("kind") == "dataset":
         return DatasetTruth.of(folder.dataset, problems)
     return SceneTruth.of(folder.dataset, problems)
+
+
+def _other_results(dataset: Mapping[str, Any]) -> str | None:
+    """Whether a folder says that another version of the results made it, in words."""
+    made_by = dataset.get("versions")
+    results = made_by.get("results", RESULTS) if isinstance(made_by, dict) else RESULTS
+    return None if str(results) == str(RESULTS) else f"it has results of version {shown(results)}, not {RESULTS}"
 
 
 def _row(observations: Observations, frame: int, eye: str) -> int | None:
