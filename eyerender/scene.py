@@ -136,15 +136,14 @@ class SceneSpec(FileSpec):
         return self
 
     @classmethod
-    def from_mapping(cls, data: object, *, source: str = "") -> Self:
-        """Validate a plain mapping; raises `InputError`, which says so where it is a file of another kind."""
-        if isinstance(data, Mapping) and data.get("kind") == DATASET_KIND:
+    def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
+        """Raise `InputError` where a mapping is a dataset's or an eye's, and say what to do with it."""
+        if data.get("kind") == DATASET_KIND:
             raise InputError(NOT_A_SCENE, source=source)
-        if isinstance(data, Mapping) and "cornea" in data:
+        if "cornea" in data:
             raise InputError(
                 "is an eye file, not a scene; give it with --eye, or as 'eye.model' of a scene", source=source
             )
-        return super().from_mapping(data, source=source)
 
     def _check_size(self) -> None:
         targets = self.targets

@@ -1,7 +1,8 @@
 """The strict, frozen base of everything a person writes: load, dump, digest, JSON Schema.
 
-A file carries `format: 1`. Unknown keys, wrong types and non-finite numbers are refused with the dotted path of the key
-(`lights.1.radius_mm: must be > 0`). YAML is loaded by the safe loader; nothing in a spec is executed.
+A file carries the version of its format (`format: 1`). Unknown keys, wrong types and non-finite numbers are refused
+with the dotted path of the key (`lights.1.radius_mm: must be > 0`). YAML is loaded by the safe loader; nothing in a
+spec is executed.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
@@ -94,7 +95,10 @@ class Spec(BaseModel):
 
 
 class FileSpec(Spec):
-    """A spec that is a YAML file of its own, with `format: 1`."""
+    """A spec that is a YAML file of its own and says in which version of its format."""
+
+    FORMATS: ClassVar[tuple[int, ...]] = (FORMAT,)
+    """The versions that `load` reads; the last one is written."""
 
     format: int = Field(default=FORMAT, description="version of this file format")
 
@@ -102,13 +106,26 @@ class FileSpec(Spec):
     def load(cls, path: str | Path) -> Self:
         """Read a YAML file; raises `InputError` with one line for anything that is wrong with it."""
         data = read_yaml(path)
+        cls.refuse_other_kinds(data, source=str(path))
         if "format" not in data:
-            raise InputError(f"missing; write 'format: {FORMAT}'", source=str(path), path="format")
-        if data["format"] != FORMAT or isinstance(data["format"], bool):
+            raise InputError(f"missing; write 'format: {cls.FORMATS[-1]}'", source=str(path), path="format")
+        if data["format"] not in cls.FORMATS or not isinstance(data["format"], int) or data["format"] is True:
+            known = " and ".join(map(str, cls.FORMATS))
             raise InputError(
-                f"is {shown(data['format'])}; this version reads format {FORMAT}", source=str(path), path="format"
+                f"is {shown(data['format'])}; this version reads format {known}", source=str(path), path="format"
             )
         return cls.from_mapping(data, source=str(path))
+
+    @classmethod
+    def from_mapping(cls, data: object, *, source: str = "") -> Self:
+        """Validate a plain mapping; raises `InputError`, which says so where it is a file of another kind."""
+        if isinstance(data, Mapping):
+            cls.refuse_other_kinds(data, source=source)
+        return super().from_mapping(data, source=source)
+
+    @classmethod
+    def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
+        """Raise `InputError` where a mapping is of another kind of file, whose formats have numbers of their own."""
 
     def dump(self, path: str | Path) -> None:
         """Write as YAML that `load` reads back as an equal object."""

@@ -75,13 +75,12 @@ class DatasetSpec(FileSpec):
         return self
 
     @classmethod
-    def from_mapping(cls, data: object, *, source: str = "") -> Self:
-        """Validate a plain mapping; raises `InputError`, which says so where it is a file of another kind."""
-        if isinstance(data, Mapping) and data.get("kind") != DATASET_KIND:
+    def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
+        """Raise `InputError` where a mapping does not say that it is a dataset's."""
+        if data.get("kind") != DATASET_KIND:
             if "rig" in data:
                 raise InputError(NOT_A_DATASET, source=source)
             raise InputError(f"is no dataset; write 'kind: {DATASET_KIND}'", source=source, path="kind")
-        return super().from_mapping(data, source=source)
 
     @property
     def planned_count(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -19,7 +20,7 @@ from ..optics.interface import Number
 from ..optics.media import CauchyMedium, ConstantMedium, Medium
 from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
 from .model import Eye, LineOfSight, RotationCentres, Sphere, Stop
-from .shells import SHELLS, lens_shells, passing_shells
+from .shells import SHELLS, Layers, even_layers, lens_shells, passing_shells
 from .spec import (
     LARGEST_INDEX,
     BiconicSpec,
@@ -106,20 +107,18 @@ def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> Eye:
 def surface_of(placed: PlacedSpec) -> Surface:
     """A placed shape as a surface of the eye frame."""
     shape = placed.shape
-    rotation = tilt_rotation(np.radians(placed.tilt_deg), placed.tilt_order)
+    rotation = tilt_rotation(np.radians(placed.tilt_deg))
     position = np.array(placed.position_mm)
-    by_centre = placed.placed_by == "centre"
     if isinstance(shape, PlaneSpec):
         return Quadric.plane(position, rotation)
     if isinstance(shape, SphereSpec | ConicSpec):
         conic_constant = shape.conic_constant if isinstance(shape, ConicSpec) else 0.0
-        lead = shape.radius_mm / (1.0 + conic_constant) if by_centre else 0.0
-        return Quadric.conic(shape.radius_mm, conic_constant, position + rotation[:, 0] * lead, rotation)
+        return Quadric.conic(shape.radius_mm, conic_constant, position, rotation)
     if isinstance(shape, BiconicSpec):
         return Biconic(position, rotation, np.array(shape.radii_mm), np.array(shape.conic_constants))
     if isinstance(shape, EllipsoidSpec):
         front = shape.side == "front"
-        lead = 0.0 if by_centre else shape.semi_axes_mm[0] * (-1.0 if front else 1.0)
+        lead = shape.semi_axes_mm[0] * (-1.0 if front else 1.0)
         return Quadric.ellipsoid(shape.semi_axes_mm, position + rotation[:, 0] * lead, rotation, front)
     return _general_quadric(shape, position, rotation)
 
@@ -193,10 +192,13 @@ def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Array]:
     for name, shape in (("front", lens.front.shape), ("back", lens.back.shape)):
         if not isinstance(shape, SphereSpec | ConicSpec | BiconicSpec):
             raise InputError("a gradient lens is made of spheres, conics or biconics", path=f"lens.{name}.shape")
-        if lens.shells is None and isinstance(shape, BiconicSpec):
+        if lens.shells is None and lens.layers is None and isinstance(shape, BiconicSpec):
             raise InputError("give a number: a gradient between biconics is traced as shells", path="lens.shells")
-    if lens.shells is None and lens.index_rate != 1:
-        raise InputError("must be 1 without 'shells'", path="lens.index_rate")
+    if lens.shells is not None and lens.layers is not None:
+        raise InputError("give either 'shells' or 'layers'", path="lens.layers")
+    for k, (outer, inner) in enumerate(pairwise(lens.layers or ()), start=1):
+        if inner.size > outer.size:
+            raise InputError("must be <= that of the layer around it", path=f"lens.layers.{k}.size")
     front, back = surface_of(lens.front), surface_of(lens.back)
     if lens.centre_mm is None:
         centre = front.origin_mm + lens.centre_fraction * (back.origin_mm - front.origin_mm)
@@ -217,11 +219,14 @@ def gradient_lens(
         for name, medium in (("edge", lens.edge), ("core", lens.core), ("vitreous", lens.vitreous))
     )
     rim = _equator_radius(front, back)
-    if isinstance(front, Quadric) and isinstance(back, Quadric) and lens.shells is None:
+    if isinstance(front, Quadric) and isinstance(back, Quadric) and lens.shells is None and lens.layers is None:
         medium = GradientMedium.between(front, back, centre, edge, core)
         return (front, back), (edge, vitreous), (rim, rim), medium
-    count = SHELLS if lens.shells is None else lens.shells
-    return *lens_shells(front, back, centre, (edge, core, vitreous), rim, count, lens.index_rate), None
+    if lens.layers is None:
+        layers = even_layers(lens.shells or SHELLS)
+    else:
+        layers = Layers(*np.array([(layer.size, layer.index_share) for layer in lens.layers]).T)
+    return *lens_shells(front, back, centre, (edge, core, vitreous), rim, layers), None
 
 
 def _equator_radius(front: Surface, back: Surface) -> float:

@@ -12,7 +12,6 @@ from ..geometry.transforms import Array
 from .spec import (
     BiconicSpec,
     ConicSpec,
-    EllipsoidSpec,
     EyeSpec,
     GradientLensSpec,
     MediumSpec,
@@ -159,9 +158,4 @@ def _shape_problem(placed: PlacedSpec) -> tuple[str, str] | None:
             return "shape.radii_mm", "must both be > 0 or both be < 0"
     if isinstance(shape, QuadricSpec) and not any(shape.coefficients[:9]):
         return "shape.coefficients", "must not all be 0"
-    if placed.placed_by == "centre":
-        if isinstance(shape, ConicSpec) and shape.conic_constant == -1.0:
-            return "placed_by", "a paraboloid has no centre"
-        if not isinstance(shape, SphereSpec | ConicSpec | EllipsoidSpec):
-            return "placed_by", f"a {shape.kind} is placed by its apex"
     return None

@@ -16,6 +16,13 @@ SHELLS = 21
 """Shells a half where a lens has to be made of bodies: in meshes and drawings."""
 
 
+class Layers(NamedTuple):
+    """Sizes of shells from outside in, and how far the index inside each has gone from edge to core; (k,) each."""
+
+    sizes: Array
+    index_shares: Array
+
+
 class Shells(NamedTuple):
     """Surfaces outside in, front shells and then back shells; the index behind each; their rims."""
 
@@ -30,26 +37,23 @@ def lens_shells(
     centre_mm: Array,
     indices: tuple[float, float, float],
     rim_mm: float,
-    count: int = SHELLS,
-    index_rate: int = 1,
+    layers: Layers,
 ) -> Shells:
-    """The shells of the lens between two single surfaces; indices: of its edge, of its core, behind it.
-
-    `count` and `index_rate` as in `GradientLensSpec`.
-    """
+    """The shells of the lens between two single surfaces; indices: of its edge, of its core, behind it."""
     edge, core, behind = indices
-    steps = np.arange(count)
-    size = np.sqrt(1.0 - steps / (index_rate * count))
-    inside = edge + (core - edge) * (steps + (0.5 if index_rate == 1 else 1.0)) / count
-    if index_rate != 1:
-        # That software has the first shell stand on the lens' own surface, with nothing of the edge between.
-        size, inside = np.insert(size, 0, 1.0), np.insert(inside, 0, edge)
+    size, inside = layers.sizes, edge + (core - edge) * layers.index_shares
     fronts = tuple(front.scaled(centre_mm, float(p)) for p in size)
     backs = tuple(back.scaled(centre_mm, float(p)) for p in size[::-1])
     media = [*inside, *inside[-2::-1], behind]
     return Shells(
         fronts + backs, tuple(float(n) for n in media), tuple(float(rim_mm * p) for p in (*size, *size[::-1]))
     )
+
+
+def even_layers(count: int) -> Layers:
+    """Layers of equal steps of the index, which is taken in the middle of each; `count` as in `GradientLensSpec`."""
+    steps = np.arange(count)
+    return Layers(np.sqrt(1.0 - steps / count), (steps + 0.5) / count)
 
 
 def shelled(eye: Eye, count: int = SHELLS) -> Eye:
@@ -64,7 +68,7 @@ def shelled(eye: Eye, count: int = SHELLS) -> Eye:
         gradient.centre_mm,
         (edge, core, float(eye.back_indices[-1])),
         float(eye.back_rims_mm[0]),
-        count,
+        even_layers(count),
     )
     return replace(
         eye,

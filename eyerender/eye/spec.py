@@ -8,11 +8,10 @@ surface.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import Discriminator, Field, Tag
 
-from ..geometry.transforms import TiltOrder
 from ..spec import FileSpec, Number, Positive, Spec, Vec2, Vec3
 
 if TYPE_CHECKING:
@@ -105,13 +104,14 @@ class MediumSpec(Spec):
 
 
 class PlacedSpec(Spec):
-    """A shape in the eye: moved to `position_mm`, turned about it by `tilt_deg` = (about x, y, z)."""
+    """A shape in the eye: its apex at `position_mm` (a quadric's origin), turned about it by `tilt_deg`.
+
+    The angles (t_x, t_y, t_z) about the axes make the rotation Rz(t_z) Ry(t_y) Rx(t_x).
+    """
 
     shape: ShapeSpec
     position_mm: Vec3 = (0.0, 0.0, 0.0)
-    placed_by: Literal["apex", "centre"] = "apex"
     tilt_deg: Vec3 = (0.0, 0.0, 0.0)
-    tilt_order: TiltOrder = Field(default="zyx", description="zyx: Rz Ry Rx; xyz: Rx Ry Rz")
 
 
 class SurfaceSpec(PlacedSpec):
@@ -128,6 +128,17 @@ class SurfaceLensSpec(Spec):
     surfaces: tuple[SurfaceSpec, ...] = Field(min_length=1, max_length=MAX_SURFACES)
 
 
+class LayerSpec(Spec):
+    """A shell of a lens and the medium inside it.
+
+    The shell is the lens' outer surface scaled by `size` about the lens' centre; inside it the index has gone
+    `index_share` of the way from edge to core.
+    """
+
+    size: float = Field(gt=0.0, le=1.0)
+    index_share: float = Field(ge=0.0, le=1.0)
+
+
 class GradientLensSpec(Spec):
     """A gradient-index lens.
 
@@ -135,9 +146,8 @@ class GradientLensSpec(Spec):
     `centre_mm`, or on the line between the two apexes at `centre_fraction` of it, counted from the front;
     n(p) = n_core - (n_core - n_edge) p^2. Rays are traced through the gradient itself, or through as many `shells` a
     half as are given: shell k stands where n has gone k / shells of the way from edge to core, and the medium inside it
-    has the index half a step farther. `index_rate` 2 reproduces software that steps the index inside twice as fast as
-    the shells: shell k stands at k / (2 shells) of the way and has (k + 1) / shells inside; the lens' own surfaces lie
-    on the first shell.
+    has the index half a step farther. `layers` in place of `shells` gives each shell a size and an index of its own,
+    from outside in.
     """
 
     kind: Literal["gradient"]
@@ -149,7 +159,7 @@ class GradientLensSpec(Spec):
     shells: int | None = Field(default=None, ge=1, le=200)
     centre_fraction: float = Field(default=0.4, gt=0.0, lt=1.0)
     centre_mm: Vec3 | None = None
-    index_rate: Literal[1, 2] = 1
+    layers: tuple[LayerSpec, ...] | None = Field(default=None, min_length=1, max_length=MAX_SURFACES // 2)
 
 
 def _lens_tag(value: object) -> str | None:
@@ -232,6 +242,9 @@ class FoveaSpec(Spec):
 class EyeSpec(FileSpec):
     """A right eye. `sources` says where values come from: dotted path (or the beginning of one) -> text."""
 
+    FORMATS: ClassVar[tuple[int, ...]] = (1, 2)
+
+    format: int = Field(default=2, description="version of this file format")
     name: str
     description: str = ""
     cornea: tuple[SurfaceSpec, ...] = Field(
@@ -249,9 +262,15 @@ class EyeSpec(FileSpec):
 
     @classmethod
     def from_mapping(cls, data: object, *, source: str = "") -> Self:
-        """Validate a plain mapping and the geometry it describes; raises `InputError` with the path of the bad key."""
-        from .check import check_eye
+        """Validate a plain mapping and the geometry it describes; raises `InputError` with the path of the bad key.
 
+        A mapping of format 1 gives the same eye in format 2.
+        """
+        from .check import check_eye
+        from .format1 import upgraded
+
+        if isinstance(data, Mapping) and data.get("format") == 1:
+            data = upgraded(data, source=source)
         spec = super().from_mapping(data, source=source)
         check_eye(spec, source=source)
         return spec

@@ -5,13 +5,10 @@ All rotations are right-handed and active: `rotation_z(a) @ (1, 0, 0) = (cos a, 
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-TiltOrder = Literal["zyx", "xyz"]
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 """Right eye <-> left eye: (x, y, z) -> (x, -y, z)."""
@@ -40,11 +37,11 @@ def rotation_z(angle_rad: npt.ArrayLike) -> Array:
     return _plane_rotation(angle_rad, 0, 1)
 
 
-def tilt_rotation(tilt_rad: npt.ArrayLike, order: TiltOrder = "zyx") -> Array:
-    """Rz(t_z) Ry(t_y) Rx(t_x), or Rx Ry Rz for order 'xyz'; `tilt_rad` about (x, y, z), shape (..., 3)."""
+def tilt_rotation(tilt_rad: npt.ArrayLike) -> Array:
+    """Rz(t_z) Ry(t_y) Rx(t_x); `tilt_rad` about (x, y, z), shape (..., 3)."""
     tilt = np.asarray(tilt_rad, dtype=np.float64)
     about_x, about_y, about_z = rotation_x(tilt[..., 0]), rotation_y(tilt[..., 1]), rotation_z(tilt[..., 2])
-    whole: Array = about_z @ about_y @ about_x if order == "zyx" else about_x @ about_y @ about_z
+    whole: Array = about_z @ about_y @ about_x
     return whole
 
 

@@ -1,11 +1,13 @@
-"""The catalogue of eyes: E1 to E5 of the complexity study, its variants, and any eye file.
+"""The catalogue of eyes: E1 to E5, and any eye file.
 
-Files live beside this module; each value carries its source.
+E1 to E5 lie beside this module; each value carries its source. A package of eyerender may bring eyes of its own in a
+folder `eyes/`. The catalogue finds them by their files, so it knows their names and imports nothing from there.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
@@ -13,11 +15,18 @@ from ...errors import InputError
 from ..spec import EyeSpec
 
 FOLDER = Path(__file__).parent
+_PACKAGE = FOLDER.parents[1]
 
 
 def catalogue_names() -> tuple[str, ...]:
-    """The names of the catalogue, in order."""
-    return tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))
+    """The names of the catalogue, in order, those that other packages bring among them."""
+    return tuple(sorted(catalogue_files()))
+
+
+@cache
+def catalogue_files() -> Mapping[str, Path]:
+    """The eye file of each name."""
+    return {path.stem: path for path in (*_PACKAGE.glob("*/eyes/*.yaml"), *FOLDER.glob("*.yaml"))}
 
 
 def load_eye(name_or_path: str | Path) -> EyeSpec:
@@ -33,4 +42,4 @@ def load_eye(name_or_path: str | Path) -> EyeSpec:
 
 @cache
 def _shipped(name: str) -> EyeSpec:
-    return EyeSpec.load(FOLDER / f"{name}.yaml")
+    return EyeSpec.load(catalogue_files()[name])
