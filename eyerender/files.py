@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from io import BufferedReader
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -136,15 +137,15 @@ def sync_tree(path: str | Path) -> None:
     Files are synced by several threads, because a file system writes one journal entry for all that wait: 0.4 ms a file
     instead of 4 on ext4.
     """
-    folders, files = [], []
-    for place, _, names in os.walk(path):
-        folders.append(place)
-        files += [file for name in names if stat.S_ISREG(os.lstat(file := os.path.join(place, name)).st_mode)]
     with ThreadPoolExecutor(8) as threads:
-        for _ in threads.map(sync_file, files):
-            pass
-        for _ in threads.map(sync_folder, folders):
-            pass
+        for place, _, names in os.walk(path, topdown=False):
+            paths = (os.path.join(place, name) for name in names)
+            files = (file for file in paths if stat.S_ISREG(os.lstat(file).st_mode))
+            # Some at a time: what waits for a thread takes some KB.
+            while batch := list(islice(files, 1024)):
+                for _ in threads.map(sync_file, batch):
+                    pass
+            sync_folder(place)
 
 
 @contextmanager

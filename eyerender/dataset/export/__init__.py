@@ -12,8 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from ...errors import InputError
 from ...files import write_json, write_text
 from ...imagefolder import DATASET, METADATA, ImageFolder
@@ -22,7 +20,7 @@ from ..assemble import verify_dataset
 from ..validation.problems import WRONG
 from . import coco, ellseg, openeds, table, teyed, webdataset
 from .card import export_card
-from .encoding import SAMPLED, Curve, Encoding, check, measured_gain
+from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain
 from .item import Item, Items
 
 Progress = Callable[[int, int, str], None]
@@ -80,17 +78,16 @@ def export(
         raise InputError("is no generated dataset (no kind: dataset)", source=str(Path(path) / DATASET))
     for problem in verify_dataset(folder.path):
         raise InputError(f"{problem}; start generate again on the folder to repair it", source=str(path))
-    total, made = len(folder.entries), 0
-    with staged(out, overwrite=overwrite) as stage, _blamed(folder, lambda: made + 1):
+    total = len(folder.entries)
 
-        def step(done: int) -> None:
-            nonlocal made
-            made = done
-            if progress is not None:
-                progress(done, total, "")
+    def step(done: int) -> None:
+        if progress is not None:
+            progress(done, total, "")
 
-        chosen = _encoding(folder, bits, encoding or ("gamma" if bits == 8 else "linear"), gain)
-        items = Items(folder, step, chosen)
+    items = Items(folder, step)
+    with staged(out, overwrite=overwrite) as stage, _labels_as_made(items):
+        items.survey()
+        items.encoding = _encoding(items, bits, encoding or ("gamma" if bits == 8 else "linear"), gain)
         FORMATS[format](items, stage)
         done = {
             "schema": SCHEMA,
@@ -98,42 +95,33 @@ def export(
             "dataset": items.name,
             "images": total,
             "images_by_split": items.images_by_split,
-            "source_bit_depths": items.bit_depths,
-            "image": chosen.to_mapping(),
+            "source_bit_depths": sorted(items.bit_depths),
+            "image": items.encoding.to_mapping(),
         }
         layout = sys.modules[FORMATS[format].__module__].__doc__ or ""
-        write_text(stage / CARD, export_card(items.name, done, layout, chosen), sync=False)
+        write_text(stage / CARD, export_card(items.name, done, layout, items.encoding), sync=False)
         write_json(stage / EXPORT, done, sync=False)
     return {**done, "path": str(out)}
 
 
+def _encoding(items: Items, bits: int, curve: Curve, gain: float | None) -> Encoding:
+    if gain is not None:
+        return Encoding(bits, curve, float(gain), "given")
+    if curve == "linear" and bits == 16:
+        return RAW
+    measured = measured_gain((item.image, item.bit_depth) for item in items.sample(SAMPLED))
+    return Encoding(bits, curve, measured, "measured")
+
+
 @contextmanager
-def _blamed(folder: ImageFolder, number: Callable[[], int]) -> Iterator[None]:
-    """Labels of another shape than this package writes make a writer fail: say so, and at which image."""
+def _labels_as_made(items: Items) -> Iterator[None]:
+    """Labels that are not as this package writes them are the user's mistake: a line that was changed by hand."""
     try:
         yield
     except WRONG as error:
-        raise InputError(
-            f"image {number()}, in the order of samples, has not the labels it should have "
-            f"({type(error).__name__}: {error})",
-            source=str(folder.path / METADATA),
-        ) from None
-
-
-def _encoding(folder: ImageFolder, bits: int, curve: Curve, gain: float | None) -> Encoding:
-    if gain is not None:
-        return Encoding(bits, curve, float(gain), "given")
-    raw = Encoding(bits, curve, 1.0, "none")
-    if curve == "linear" and bits == 16:
-        return raw
-
-    def sample() -> Iterator[tuple[NDArray[Any], int]]:
-        total = len(folder.entries)
-        for k in range(min(SAMPLED, total)):
-            item = Item(folder.entries[k * total // min(SAMPLED, total)], raw)
-            yield item.image, item.bit_depth
-
-    return Encoding(bits, curve, measured_gain(sample()), "measured")
+        reason = f"cannot be exported, for it is not as this version writes it ({type(error).__name__}: {error})"
+        source = str(items.folder.path / METADATA)
+        raise InputError(reason, source=source, path=f"line {items.row + 1}") from error
 
 
 __all__ = ["FORMATS", "Encoding", "Item", "Items", "export"]

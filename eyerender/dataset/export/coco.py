@@ -5,13 +5,16 @@ Glints are instances of their own with one keypoint each: [x, y, v], v 2 visible
 
 from __future__ import annotations
 
+import json
+import shutil
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...files import write_json
 from ...geometry.ellipse import Ellipse
 from ...imagefile import write_png
 from .item import Items
@@ -28,49 +31,65 @@ CATEGORIES: list[dict[str, Any]] = [
 def write(items: Items, out: Path) -> None:
     """Images and annotations of every split."""
     (out / "annotations").mkdir()
-    images: dict[str, list[dict[str, Any]]] = {split: [] for split in items.splits}
-    marks: dict[str, list[dict[str, Any]]] = {split: [] for split in items.splits}
-    for split in items.splits:
+    with ExitStack() as stack:
+        files = {split: stack.enter_context(_Annotations(items, out, split)) for split in items.splits}
+        for number, item in enumerate(items, start=1):
+            mask, line, file = item.mask, item.line, files[item.split]
+            write_png(out / item.split / f"{item.name}.png", item.encoded)
+            h, w = mask.shape
+            size = {"width": w, "height": h}
+            file.add_image({"id": number, "file_name": f"{item.name}.png", **size, "subject": line["subject"]})
+            for value, part in ((1, "sclera"), (2, "iris"), (3, "pupil")):
+                inside = mask == value
+                if inside.any():
+                    ellipse = item.ellipse(part) if part != "sclera" else None
+                    file.add_mark(number, _instance(value, inside, ellipse))
+            for light, x, y, visible in item.glints():
+                file.add_mark(number, _glint(light, x, y, visible))
+
+
+class _Annotations:
+    """annotations/instances_SPLIT.json, written as it comes: images at once, annotations beside them until the end."""
+
+    def __init__(self, items: Items, out: Path, split: str) -> None:
         (out / split).mkdir()
-    for number, item in enumerate(items, start=1):
-        mask, line = item.mask, item.line
-        write_png(out / item.split / f"{item.name}.png", item.encoded)
-        h, w = mask.shape
-        images[item.split].append(
-            {"id": number, "file_name": f"{item.name}.png", "width": w, "height": h, "subject": line["subject"]}
-        )
-        found = marks[item.split]
-        for value, part in ((1, "sclera"), (2, "iris"), (3, "pupil")):
-            inside = mask == value
-            if inside.any():
-                ellipse = item.ellipse(part) if part != "sclera" else None
-                found.append(_instance(len(found) + 1, number, value, inside, ellipse))
-        for light, x, y, visible in item.glints():
-            found.append(
-                {
-                    "id": len(found) + 1,
-                    "image_id": number,
-                    "category_id": 4,
-                    "keypoints": [x, y, 2 if visible else 1],
-                    "num_keypoints": 1,
-                    "bbox": [x - 1, y - 1, 3.0, 3.0],
-                    "area": 9.0,
-                    "iscrowd": 0,
-                    "segmentation": [[x - 1, y - 1, x + 2, y - 1, x + 2, y + 2, x - 1, y + 2]],
-                    "light": light,
-                }
-            )
-    for split in items.splits:
-        write_json(
-            out / "annotations" / f"instances_{split}.json",
-            {
-                "info": {"description": items.name, "version": "1"},
-                "licenses": [],
-                "categories": CATEGORIES,
-                "images": images[split],
-                "annotations": marks[split],
-            },
-        )
+        self._path = out / "annotations" / f"instances_{split}.json"
+        self._beside = self._path.with_suffix(".annotations")
+        self._images: IO[str] = open(self._path, "w", encoding="utf-8")  # noqa: SIM115  (closed by __exit__)
+        self._marks: IO[str] = open(self._beside, "w+", encoding="utf-8")  # noqa: SIM115
+        self._image_count = self._mark_count = 0
+        head = {
+            "info": {"description": items.name, "version": "1", "image": items.encoding.to_mapping()},
+            "licenses": [],
+            "categories": CATEGORIES,
+        }
+        self._images.write(json.dumps(head)[:-1] + ', "images": [')
+
+    def add_image(self, image: dict[str, Any]) -> None:
+        """One more image."""
+        self._image_count = _append(self._images, self._image_count, image)
+
+    def add_mark(self, image: int, mark: dict[str, Any]) -> None:
+        """One more annotation of an image."""
+        mark = {"id": self._mark_count + 1, "image_id": image, **mark}
+        self._mark_count = _append(self._marks, self._mark_count, mark)
+
+    def __enter__(self) -> _Annotations:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        with self._images, self._marks:
+            if error is None:
+                self._images.write('\n], "annotations": [')
+                self._marks.seek(0)
+                shutil.copyfileobj(self._marks, self._images)
+                self._images.write("\n]}\n")
+        self._beside.unlink()
+
+
+def _append(file: IO[str], count: int, value: dict[str, Any]) -> int:
+    file.write((",\n" if count else "\n") + json.dumps(value, allow_nan=False))
+    return count + 1
 
 
 def run_lengths(inside: NDArray[np.bool_]) -> list[int]:
@@ -81,20 +100,29 @@ def run_lengths(inside: NDArray[np.bool_]) -> list[int]:
     return [0, *runs] if flat[0] else runs
 
 
-def _instance(
-    number: int, image: int, category: int, inside: NDArray[np.bool_], ellipse: Ellipse | None
-) -> dict[str, Any]:
+def _instance(category: int, inside: NDArray[np.bool_], ellipse: Ellipse | None) -> dict[str, Any]:
     v, u = np.nonzero(inside)
     box = [int(u.min()), int(v.min()), int(u.max() - u.min() + 1), int(v.max() - v.min() + 1)]
     return {
-        "id": number,
-        "image_id": image,
         "category_id": category,
         "segmentation": {"size": list(inside.shape), "counts": run_lengths(inside)},
         "area": len(u),
         "bbox": box,
         "iscrowd": 0,
         "ellipse": None if ellipse is None else _ellipse(ellipse),
+    }
+
+
+def _glint(light: int, x: float, y: float, visible: bool) -> dict[str, Any]:
+    return {
+        "category_id": 4,
+        "keypoints": [x, y, 2 if visible else 1],
+        "num_keypoints": 1,
+        "bbox": [x - 1, y - 1, 3.0, 3.0],
+        "area": 9.0,
+        "iscrowd": 0,
+        "segmentation": [[x - 1, y - 1, x + 2, y - 1, x + 2, y + 2, x - 1, y + 2]],
+        "light": light,
     }
 
 

@@ -24,49 +24,45 @@ def write(items: Items, out: Path) -> None:
         h5py: Any = import_module("h5py")
     except ImportError:
         raise InputError("needs h5py (the extra 'ellseg'); run: pip install h5py", source="--format ellseg") from None
-    sizes = {entry.window[2:] for entry in items.folder.entries}
-    if len(sizes) > 1:
+    if len(items.sizes) > 1:
         raise InputError("needs images of one size", source="--format ellseg")
-    (w, h) = sizes.pop()
+    ((w, h),) = items.sizes
     (out / "All").mkdir()
     (out / "MasterKey").mkdir()
-    counts = {split: sum(e.line["split"] == split for e in items.folder.entries) for split in items.splits}
     archives: dict[str, Any] = {}
-    places: dict[str, list[NDArray[np.float64]]] = {split: [] for split in items.splits}
-    infos: dict[str, list[str]] = {split: [] for split in items.splits}
+    done = dict.fromkeys(items.splits, 0)
     try:
-        for split, n in counts.items():
+        for split, n in items.images_by_split.items():
             file = archives[split] = h5py.File(out / "All" / f"{items.name}_{split}.h5", "w")
             for name in ("Images", "Masks", "Masks_noSkin"):
                 file.create_dataset(name, (n, h, w), dtype="u1" if name == "Images" else "i1", chunks=(1, h, w))
             file.create_dataset("pupil_loc", (n, 2), dtype="f8")
             for name in ("pupil", "iris"):
                 file.create_dataset(f"Fits/{name}", (n, 5), dtype="f8")
+            file.create_dataset("Info", (n,), dtype=f"S{items.file_name_bytes}")
         for item in items:
-            file, k = archives[item.split], len(infos[item.split])
+            file, k = archives[item.split], done[item.split]
+            done[item.split] += 1
             file["Images"][k], file["Masks"][k], file["Masks_noSkin"][k] = item.encoded, item.mask, item.amodal
             fits = {name: fit_of(item, name) for name in ("pupil", "iris")}
             for name, fit in fits.items():
                 file[f"Fits/{name}"][k] = fit
             file["pupil_loc"][k] = fits["pupil"][:2]
-            places[item.split].append(fits["pupil"][:2])
-            infos[item.split].append(item.line["file_name"])
+            file["Info"][k] = item.entry.name.encode()
         for split, file in archives.items():
-            file.create_dataset("Info", data=np.array(infos[split], dtype="S"))
+            archive = f"{items.name}_{split}"
+            key = {
+                "dataset": items.name,
+                "subset": split,
+                "archive": np.full(done[split], archive),
+                "resolution": np.tile([h, w], (done[split], 1)),
+                "pupil_loc": file["pupil_loc"][...],
+                "Info": np.char.decode(file["Info"][...], "utf-8"),
+            }
+            savemat(out / "MasterKey" / f"{archive}.mat", key)
     finally:
         for file in archives.values():
             file.close()
-    for split, n in counts.items():
-        archive = f"{items.name}_{split}"
-        key = {
-            "dataset": items.name,
-            "subset": split,
-            "archive": np.array([archive] * n),
-            "resolution": np.tile([h, w], (n, 1)),
-            "pupil_loc": np.stack(places[split]),
-            "Info": np.array(infos[split]),
-        }
-        savemat(out / "MasterKey" / f"{archive}.mat", key)
 
 
 def fit_of(item: Item, part: str) -> NDArray[np.float64]:

@@ -68,6 +68,9 @@ class Encoding:
         return f"{self.bits} bits, {self.curve}, gain {self.gain:g}"
 
 
+RAW = Encoding(16, "linear", 1.0, "none")
+
+
 def measured_gain(images: Iterable[tuple[NDArray[Any], int]]) -> float:
     """The gain that takes the quantile `SHARE` of all pixels to `LEVEL`: 1 to `LARGEST_GAIN`, to four digits.
 

@@ -7,18 +7,19 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Ints
 from ...errors import InputError
-from ...files import read_bytes, shown
+from ...files import read_bytes
 from ...geometry.ellipse import Ellipse, signed_distance
 from ...imagefile import encode_png, read_image
 from ...imagefolder import METADATA, ImageEntry, ImageFolder
-from .encoding import Encoding
+from .encoding import RAW, Encoding
 
 IRIS, PUPIL = 2, 3
 
@@ -28,7 +29,7 @@ class Item:
     """An image of a dataset and its labels, moved into the window's pixels; `encoding` is that of the export."""
 
     entry: ImageEntry
-    encoding: Encoding
+    encoding: Encoding = RAW
 
     @property
     def line(self) -> dict[str, Any]:
@@ -38,7 +39,7 @@ class Item:
     @property
     def name(self) -> str:
         """The image's name without folder and ending."""
-        return self.entry.path.stem
+        return PurePosixPath(self.entry.name).stem
 
     @property
     def split(self) -> str:
@@ -50,7 +51,7 @@ class Item:
         """Of the counts in the dataset; raises `InputError` where it is not 1 to 16."""
         depth = self.line.get("bit_depth")
         if not isinstance(depth, int) or isinstance(depth, bool) or not 1 <= depth <= 16:
-            raise InputError(f"{shown(self.line['file_name'])}: bit_depth must be 1 to 16", source=self._source)
+            raise InputError("must be 1 to 16", source=str(self.entry.folder / METADATA), path=self._where("bit_depth"))
         return depth
 
     @cached_property
@@ -76,9 +77,8 @@ class Item:
         own = {"bit_depth": self.encoding.bits, "encoding": self.encoding.curve, "gain": self.encoding.gain}
         return {**self.line, **own, "source_bit_depth": self.bit_depth}
 
-    @property
-    def _source(self) -> str:
-        return str(self.entry.folder / METADATA)
+    def _where(self, key: str) -> str:
+        return f"line {self.entry.number}.{key}"
 
     def _counts(self, path: Path) -> NDArray[Any]:
         image = read_image(path)[0]
@@ -135,33 +135,73 @@ class Item:
         return np.asarray(x[:2] / x[2] - self.entry.window[:2])
 
 
-@dataclass(frozen=True, slots=True)
 class Items:
-    """The images of a dataset in the order of its samples; going through them tells how far it is."""
+    """The images of a dataset in the order of its samples; going through them tells how far it is.
 
-    folder: ImageFolder
-    step: Callable[[int], None]
-    encoding: Encoding
+    The lines of metadata are read once by `survey`, for what must be known before the first image is written, and again
+    with each image. No more than some bytes of a line are kept.
+
+    Attributes:
+        encoding: that of the export.
+        order: (n,) the rows of metadata.jsonl in the order of samples.
+        images_by_split: how many images each split has, by name.
+        bit_depths: those of the images.
+        sizes: (width, height) of the images.
+        lights: the largest number of reflections that a line names.
+        file_name_bytes: length of the longest name of an image, in UTF-8.
+        row: the row that is being read, for messages.
+    """
+
+    def __init__(self, folder: ImageFolder, step: Callable[[int], None]) -> None:
+        self.folder, self.step = folder, step
+        self.encoding = RAW
+        self.order: Ints = np.arange(len(folder.entries))
+        self.images_by_split: dict[str, int] = {}
+        self.bit_depths: set[int] = set()
+        self.sizes: set[tuple[int, int]] = set()
+        self.lights = self.file_name_bytes = self.row = 0
+
+    def survey(self) -> None:
+        """Read all lines once; raises `InputError` where a line is wrong or two images have one name."""
+        splits: Counter[str] = Counter()
+        samples = np.empty(len(self), dtype=np.int64)
+        names = np.empty(len(self), dtype=np.int64)
+        for row, entry in enumerate(self.folder.entries):
+            self.row, item = row, Item(entry)
+            samples[row], names[row] = entry.line["sample"], hash(item.name)
+            splits[item.split] += 1
+            self.bit_depths.add(item.bit_depth)
+            self.sizes.add(entry.window[2:])
+            self.lights = max(self.lights, len(entry.line["labels"]["glints"]))
+            self.file_name_bytes = max(self.file_name_bytes, len(entry.name.encode()))
+        if len(np.unique(names)) < len(names):
+            raise InputError("two images have the same name", source=str(self.folder.path / METADATA))
+        self.order = np.argsort(samples, kind="stable")
+        self.images_by_split = dict(sorted(splits.items()))
+
+    def __len__(self) -> int:
+        return len(self.order)
 
     def __iter__(self) -> Iterator[Item]:
-        for k, entry in enumerate(sorted(self.folder.entries, key=lambda entry: int(entry.line["sample"]))):
-            yield Item(entry, self.encoding)
-            self.step(k + 1)
+        done = 0
+        # Rows that follow each other in the file are read in one go.
+        for rows in np.split(self.order, np.flatnonzero(np.diff(self.order) != 1) + 1):
+            for entry in self.folder.entries[int(rows[0]) : int(rows[-1]) + 1]:
+                self.row = entry.number - 1
+                yield Item(entry, self.encoding)
+                done += 1
+                self.step(done)
 
-    @property
-    def images_by_split(self) -> dict[str, int]:
-        """The number of images of each split."""
-        return dict(sorted(Counter(str(entry.line["split"]) for entry in self.folder.entries).items()))
-
-    @property
-    def bit_depths(self) -> list[int]:
-        """The bit depths that images of the dataset have."""
-        return sorted({Item(entry, self.encoding).bit_depth for entry in self.folder.entries})
+    def sample(self, count: int) -> Iterator[Item]:
+        """At most `count` images, spread evenly over the samples."""
+        for at in np.unique(np.linspace(0, len(self), min(count, len(self)), endpoint=False, dtype=np.int64)):
+            self.row = int(self.order[at])
+            yield Item(self.folder.entries[self.row])
 
     @property
     def splits(self) -> list[str]:
         """The names of the splits."""
-        return sorted({entry.line["split"] for entry in self.folder.entries})
+        return list(self.images_by_split)
 
     @property
     def name(self) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import struct
+from array import array
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -26,8 +27,8 @@ class PngVideo:
         self.size = (width, height)
         self.rate = frames_per_second
         self._file: Any = open(path, "wb")  # noqa: SIM115  (closed by close)
-        self._offsets: list[int] = []
-        self._sizes: list[int] = []
+        self._offsets = array("Q")
+        self._sizes = array("L")
         self._file.write(_box(b"ftyp", b"isom" + struct.pack(">I", 0x200) + b"isomiso2mp41"))
         self._start = self._file.tell()
         self._file.write(struct.pack(">I4sQ", 1, b"mdat", 0))  # 64-bit size, filled in at the end
@@ -81,8 +82,8 @@ class PngVideo:
             _full(b"stsd", _u32(1) + mp4v)
             + _full(b"stts", struct.pack(">III", 1, n, 1))
             + _full(b"stsc", struct.pack(">IIII", 1, 1, 1, 1))
-            + _full(b"stsz", struct.pack(f">II{n}I", 0, n, *self._sizes))
-            + _full(b"co64", struct.pack(f">I{n}Q", n, *self._offsets))
+            + _full(b"stsz", struct.pack(">II", 0, n) + np.array(self._sizes, dtype=">u4").tobytes())
+            + _full(b"co64", struct.pack(">I", n) + np.array(self._offsets, dtype=">u8").tobytes())
         )
         media = _box(b"mdia", mdhd + hdlr + _box(b"minf", vmhd + dinf + _box(b"stbl", table)))
         return _box(b"moov", mvhd + _box(b"trak", tkhd + media))

@@ -5,6 +5,7 @@ Labels are uint8: 0 background, 1 sclera, 2 iris, 3 pupil. Garbin et al. (2019),
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +20,13 @@ def write(items: Items, out: Path) -> None:
     for split in items.splits:
         (out / split / "images").mkdir(parents=True)
         (out / split / "labels").mkdir()
-    with open(out / "files.csv", "w", encoding="utf-8") as table:
-        table.write("file,from,subject\n")
+    with open(out / "files.csv", "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["file", "from", "subject"])
         for item in items:
             # Names of digits only: readers strip letters of '.png' off both ends of a name.
             name = f"{counts.get(item.split, 0):06d}"
             counts[item.split] = counts.get(item.split, 0) + 1
             write_png(out / item.split / "images" / f"{name}.png", item.encoded)
             np.save(out / item.split / "labels" / f"{name}.npy", item.mask)
-            table.write(f"{item.split}/images/{name}.png,{item.line['file_name']},{item.line['subject']}\n")
+            table.writerow([f"{item.split}/images/{name}.png", item.entry.name, item.line["subject"]])

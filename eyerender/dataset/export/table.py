@@ -21,7 +21,6 @@ def write(items: Items, out: Path) -> None:
     """images/, masks/ and labels.csv; a place that does not exist is an empty field."""
     (out / "images").mkdir()
     (out / "masks").mkdir()
-    lights = max(len(entry.line["labels"]["glints"]) for entry in items.folder.entries)
     writer = None
     with open(out / "labels.csv", "w", newline="", encoding="utf-8") as file:
         for item in items:
@@ -29,7 +28,7 @@ def write(items: Items, out: Path) -> None:
             if item.entry.mask_path is not None:
                 data = read_bytes(item.entry.mask_path, follow=False)
                 write_bytes(out / "masks" / f"{item.name}.png", data, sync=False)
-            row = row_of(item, lights)
+            row = row_of(item, items.lights)
             if writer is None:
                 writer = csv.DictWriter(file, list(row))
                 writer.writeheader()

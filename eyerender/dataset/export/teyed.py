@@ -15,12 +15,14 @@ frames (8 bits, lossless), which FFmpeg and OpenCV read.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import IO
 
 import numpy as np
 
+from ...errors import InputError
 from ...geometry.ellipse import Ellipse
 from .item import Item, Items
 from .mp4 import PngVideo
@@ -45,45 +47,66 @@ _COLUMNS: dict[str, tuple[str, ...]] = {
 
 def write(items: Items, out: Path) -> None:
     """A video and its annotations for each (subject, eye, camera); splits.csv says which split each is in."""
-    groups: dict[str, list[Item]] = {}
-    for entry in items.folder.entries:
-        item = Item(entry, items.encoding)
-        record = entry.line["records"][0]
-        name = f"{items.name}_{entry.line['subject']:06d}_{record['eye']}_{record['camera']}.mp4"
-        groups.setdefault(name, []).append(item)
     (out / "VIDEOS").mkdir()
     (out / "ANNOTATIONS").mkdir()
-    done = 0
-    with open(out / "splits.csv", "w", newline="", encoding="utf-8") as file:
+    # A subject's samples follow each other, so its videos are all that is open at a time.
+    subject, videos = None, dict[str, _Video]()
+    with open(out / "splits.csv", "w", newline="", encoding="utf-8") as file, ExitStack() as stack:
         table = csv.writer(file)
         table.writerow(["video", "split", "subject", "frames"])
-        for name, group in groups.items():
-            _video(name, group, out)
-            table.writerow([name, group[0].split, group[0].line["subject"], len(group)])
-            done += len(group)
-            items.step(done)
+
+        def finish() -> None:
+            stack.close()
+            for name, video in videos.items():
+                table.writerow([name, video.split, subject, video.frames])
+            videos.clear()
+
+        for item in items:
+            if item.line["subject"] != subject:
+                finish()
+                subject = item.line["subject"]
+            record = item.line["records"][0]
+            name = f"{items.name}_{subject:06d}_{record['eye']}_{record['camera']}.mp4"
+            if name not in videos:
+                videos[name] = stack.enter_context(_Video(name, item, out))
+            videos[name].add(item)
+        finish()
 
 
-def _video(name: str, group: list[Item], out: Path) -> None:
-    h, w = group[0].image.shape
-    notes = out / "ANNOTATIONS"
-    rows: dict[str, list[Iterable[Any]]] = {kind: [] for kind in _COLUMNS}
-    with (
-        PngVideo(out / "VIDEOS" / name, w, h) as video,
-        PngVideo(notes / f"{name}pupil_seg_2D.mp4", w, h) as pupils,
-        PngVideo(notes / f"{name}iris_seg_2D.mp4", w, h) as irises,
-    ):
-        for item in group:
-            video.add(item.encoded)
-            pupils.add(np.where(item.mask == 3, 255, 0).astype(np.uint8))
-            irises.add(np.where(item.mask >= 2, 255, 0).astype(np.uint8))
-            for kind, values in rows_of(item).items():
-                rows[kind].append(values)
-    for kind, columns in _COLUMNS.items():
-        with open(notes / f"{name}{kind}.txt", "w", encoding="utf-8") as file:
-            file.write(";".join(("FRAME", *columns)) + ";\n")
-            for k, row in enumerate(rows[kind], start=1):
-                file.write(";".join([str(k), *(_number(value) for value in row)]) + ";\n")
+class _Video:
+    """The files of a video, open until its last frame is added."""
+
+    def __init__(self, name: str, first: Item, out: Path) -> None:
+        self.split, self.frames = first.split, 0
+        (h, w), notes = first.image.shape, out / "ANNOTATIONS"
+        if (out / "VIDEOS" / name).exists():
+            raise ValueError(f"the samples of subject {first.line['subject']} do not follow each other")
+        with ExitStack() as stack:
+            places = (out / "VIDEOS" / name, notes / f"{name}pupil_seg_2D.mp4", notes / f"{name}iris_seg_2D.mp4")
+            self._pictures = [stack.enter_context(PngVideo(place, w, h)) for place in places]
+            self._texts: dict[str, IO[str]] = {}
+            for kind, columns in _COLUMNS.items():
+                file = stack.enter_context(open(notes / f"{name}{kind}.txt", "w", encoding="utf-8"))
+                file.write(";".join(("FRAME", *columns)) + ";\n")
+                self._texts[kind] = file
+            self._open = stack.pop_all()
+
+    def add(self, item: Item) -> None:
+        """One more frame."""
+        if item.image.shape != self._pictures[0].size[::-1]:
+            raise InputError("needs images of one size", source="--format teyed")
+        self.frames += 1
+        pupil, iris = (np.where(item.mask >= least, 255, 0).astype(np.uint8) for least in (3, 2))
+        for video, picture in zip(self._pictures, (item.encoded, pupil, iris), strict=True):
+            video.add(picture)
+        for kind, values in rows_of(item).items():
+            self._texts[kind].write(";".join([str(self.frames), *(_number(value) for value in values)]) + ";\n")
+
+    def __enter__(self) -> _Video:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._open.__exit__(kind, error, at)
 
 
 def rows_of(item: Item) -> dict[str, list[float]]:

@@ -49,3 +49,4 @@ def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
     member = tarfile.TarInfo(name)  # no times or owners: the same dataset gives the same bytes
     member.size = len(data)
     tar.addfile(member, io.BytesIO(data))
+    tar.members.clear()  # type: ignore[attr-defined]  # they are kept for reading
