@@ -19,6 +19,7 @@ from .errors import InputError
 from .extraction import Extraction, ExtractionSettings, extract
 from .extraction.glints.matching import assign_lights, predict_glints
 from .eye.spec import EyeSpec
+from .files import parse_json
 from .imagefile import read_image
 from .imagefolder import DATASET, ImageEntry, ImageFolder
 from .observation import MISSING, OK, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
@@ -182,19 +183,25 @@ def _scene_of_samples(folder: ImageFolder) -> Scene:
         source = str(folder.path / entry.name)
         try:
             text, eye = entry.line["parameters"]["scene_json"], entry.line["parameters"]["eye_json"]
-            rig = json.loads(text)["rig"]
+            rig = parse_json(text)["rig"]
             key = json.dumps([rig["cameras"], [{**light, "intensity_mw_sr": 0} for light in rig["lights"]]])
-        except (KeyError, TypeError, ValueError):
+        except (InputError, KeyError, TypeError, ValueError):
             raise InputError("has no parameters", source=source) from None
         if first is None:
-            spec = SceneSpec.from_mapping(json.loads(text), source=source)
-            first = Scene(spec, EyeSpec.from_mapping(json.loads(eye), source=source), spec.rig.build())
+            spec = SceneSpec.from_mapping(parse_json(text), source=source)
+            first = Scene(spec, EyeSpec.from_mapping(_parsed(eye, source), source=source), spec.rig.build())
         seen.add(key)
         if len(seen) > 1:
             raise InputError("the rig differs from image to image; nothing can be calibrated", source=str(folder.path))
     if first is None:
         raise InputError("holds no images", source=str(folder.path))
     return first
+
+
+def _parsed(text: Any, source: str) -> Any:
+    if not isinstance(text, str):
+        raise InputError("must be text", source=source, path="parameters.eye_json")
+    return parse_json(text, source=source, path="parameters.eye_json")
 
 
 def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: float) -> tuple[NDArray[Any], Floats]:

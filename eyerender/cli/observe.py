@@ -9,7 +9,7 @@ import numpy as np
 from cyclopts import Parameter
 
 from ..errors import InputError
-from ..observation import EYES, Observations
+from ..observation import EYES, MAX_BOUNDARY_POINTS, Observations
 from .app import app
 from .options import Eye, Result, Strict
 from .output import Heed, emit, progress
@@ -43,6 +43,8 @@ def features(
 
     if points < 6:
         raise InputError("must be >= 6", source="--points")
+    if points > MAX_BOUNDARY_POINTS:
+        raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", source="--points")
     heed = Heed(strict)
     loaded = load_scene(scene, eye=eye)
     heed(loaded.warnings())

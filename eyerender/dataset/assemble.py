@@ -29,6 +29,7 @@ from .shard import (
     sum_of,
     verify,
 )
+from .spec import MAX_COUNT
 
 FAILURES, CARD = "failures.jsonl", "README.md"
 
@@ -117,7 +118,7 @@ def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
     dataset = read_json(folder / DATASET, limit=MAX_FILE_BYTES, follow=False)
     spec = dataset.get("spec")
     count, size = (spec.get(key) if isinstance(spec, dict) else None for key in ("count", "shard_size"))
-    if not (isinstance(count, int) and isinstance(size, int) and count > 0 and size > 0):
+    if not (isinstance(count, int) and isinstance(size, int) and 0 < count <= MAX_COUNT and size > 0):
         yield f"{DATASET}: spec: has no count and shard_size"
         return
     for shard in range(-(-count // size)):
@@ -135,7 +136,7 @@ def _lines(folder: Path, shards: Iterable[int], take: Callable[[dict[str, Any]],
     try:
         for line in type_first(lines, take):
             yield line.encode()
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise InputError(
             f"the lines of a shard are not as this version writes them ({reason})", source=str(folder)

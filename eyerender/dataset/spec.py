@@ -14,6 +14,8 @@ from ..errors import InputError
 from ..scene import DATASET_KIND, NOT_A_DATASET, is_shipped_dataset, refuse_folder, shipped_files
 from ..spec import FileSpec, Positive, Spec
 
+# Samples of a run; a Sobol sequence has no more points.
+MAX_COUNT = 10**9
 _SPLIT = re.compile(r"[a-z][a-z0-9]*")
 
 
@@ -37,12 +39,12 @@ class DatasetSpec(FileSpec):
     kind: Literal["dataset"]
     name: Annotated[str, Field(min_length=1, max_length=100)]
     description: str = ""
-    count: Annotated[int, Field(ge=1, le=10**9)] = Field(description="samples")
-    planned: Annotated[int, Field(ge=1, le=10**9)] | None = Field(
+    count: Annotated[int, Field(ge=1, le=MAX_COUNT)] = Field(description="samples")
+    planned: Annotated[int, Field(ge=1, le=MAX_COUNT)] | None = Field(
         default=None, description="samples of the whole plan, of which the first `count` are made; default: all"
     )
     shard_size: Annotated[int, Field(ge=1, le=100_000)] = Field(default=64, description="samples in a shard")
-    subjects: Annotated[int, Field(ge=1, le=10**9)] | None = Field(
+    subjects: Annotated[int, Field(ge=1, le=MAX_COUNT)] | None = Field(
         default=None, description="identities; each has a run of consecutive samples; default: one a sample"
     )
     splits: dict[str, Positive] = Field(

@@ -20,7 +20,9 @@ import numpy as np
 
 from ..arrays import Ints, frozen
 from ..errors import InputError
+from ..files import read_json
 from ..imagefolder import DATASET, METADATA, RUN, ImageEntry
+from ..jsonlines import JsonLines
 from ..observation import EYES, Observations
 from ..scene import Scene, SceneSpec
 
@@ -200,19 +202,18 @@ def read_images(folder: Path) -> StudyImages | None:
     from ..dataset.shard import run_versions
 
     try:
-        if json.loads((folder / DATASET).read_text(encoding="utf-8"))["versions"] != run_versions():
+        if read_json(folder / DATASET)["versions"] != run_versions():
             return None
         found: dict[str, list[tuple[int, ImageEntry]]] = {}
-        with open(folder / METADATA, encoding="utf-8") as lines:
-            for text in lines:
-                line = json.loads(text)
-                eye, frame = line["parameters"]["eye_json"], line["records"][0]["frame"]
-                # Only what extraction reads is kept: a line's labels take many times as much memory.
-                kept = {key: line[key] for key in ("window_px", "bit_depth")} | {"records": [{}]}
-                for scene, name in _exposures(line):
-                    entry = ImageEntry(folder, {"file_name": name, **kept})
-                    found.setdefault(_digest_of(scene, eye), []).append((frame, entry))
-    except (OSError, ValueError, KeyError, TypeError, IndexError):
+        lines = JsonLines.index(folder / METADATA)
+        for line in lines.read(range(len(lines))):
+            eye, frame = line["parameters"]["eye_json"], line["records"][0]["frame"]
+            # Only what extraction reads is kept: a line's labels take many times as much memory.
+            kept = {key: line[key] for key in ("window_px", "bit_depth")} | {"records": [{}]}
+            for scene, name in _exposures(line):
+                entry = ImageEntry(folder, {"file_name": name, **kept})
+                found.setdefault(_digest_of(scene, eye), []).append((frame, entry))
+    except (InputError, ValueError, KeyError, TypeError, IndexError):
         return None
     # A dataset's lines need not stand in the order of its samples.
     in_order = {key: sorted(those, key=lambda pair: pair[0]) for key, those in found.items()}
@@ -226,9 +227,9 @@ def _begun(folder: Path, plan: Any) -> bool:
     if not folder.exists():
         return True
     try:
-        found = json.loads((folder / RUN).read_text(encoding="utf-8"))
+        found = read_json(folder / RUN)
         return bool(found["digest"] == plan.digest and found["versions"] == run_versions())
-    except (OSError, ValueError, KeyError, TypeError):
+    except (InputError, KeyError):
         return False
 
 

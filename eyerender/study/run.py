@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +14,7 @@ from typing import Any, Literal
 
 from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
-from ..files import write_json, write_text
+from ..files import read_json, write_json, write_text
 from ..lock import writer_lock
 from ..outfolder import clear, refuse_non_empty
 from ..report.study import write_page
@@ -217,9 +216,9 @@ def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterato
         InputError: the folder holds something else, or another writer is at work in it.
     """
     try:
-        found = json.loads((folder / MARKER).read_text(encoding="utf-8"))
+        found = read_json(folder / MARKER)
         same = found.get("schema") == RUN_SCHEMA and found.get("settings", {}).get("study") == settings["study"]
-    except (OSError, ValueError, AttributeError):
+    except (InputError, AttributeError):
         same = False
     if not same:
         refuse_non_empty(folder, overwrite)

@@ -48,6 +48,10 @@ def place(tmp_path, monkeypatch):
     Path("contour.yaml").write_text(yaml.safe_dump(contour), encoding="utf-8")
     Path("text.yaml").write_text("format: 1\nname: [", encoding="utf-8")
     Path("binary.yaml").write_bytes(bytes(range(256)))
+    Path("date.yaml").write_text("format: 1\nseed: 2020-13-45", encoding="utf-8")
+    scene("focal.yaml", "rig.cameras.0.focal_length_mm", 1e300)
+    scene("grid.yaml", "targets", {"grid": [10**9, 1]})
+    os.mkfifo("pipe.yaml")
     Path("empty.png").write_bytes(b"")
     Path("noise.png").write_bytes(np.random.default_rng(0).bytes(400))
     colour = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
@@ -95,6 +99,17 @@ TABLE = [
     (["features", "quickstart", "--eye", "E9"], 2, "E9"),
     (["features", "quickstart", "--eye", "missing.yaml"], 2, "missing.yaml"),
     (["features", "quickstart", "--points", "3"], 2, "--points: must be >= 6"),
+    (["features", "quickstart", "--points", "1000000000"], 2, "--points: must be <= 3600"),
+    (["features", "pipe.yaml"], 2, "pipe.yaml: is a pipe, not a file"),
+    (["features", "/dev/zero"], 2, "/dev/zero: is a device, not a file"),
+    (["features", "quickstart", "--eye", "pipe.yaml"], 2, "pipe.yaml: is a pipe, not a file"),
+    (["features", "n" * 300], 2, "no such scene file"),
+    (["extract", "pipe.yaml"], 2, "pipe.yaml: is a pipe, not a file"),
+    (["generate", "pipe.yaml", "out"], 2, "pipe.yaml: is a pipe, not a file"),
+    (["gaze", "predict", "pipe.yaml", "-c", "pipe.yaml"], 2, "pipe.yaml: is a pipe, not a file"),
+    (["features", "date.yaml"], 2, "date.yaml: line 2: not valid YAML: is no timestamp (month must be in 1..12)"),
+    (["features", "focal.yaml"], 2, "focal.yaml: rig.cameras.0.focal_length_mm: must be <= 1e+09"),
+    (["features", "grid.yaml"], 2, "grid.yaml: targets.grid.0: must be <= 1000"),
     (["features", "quickstart", "--points", "many"], 2, "--points"),
     (["features", "quickstart", "--json", "no/such/folder/f.json"], 1, "no/such/folder/f.json: cannot be written"),
     (["features", "quickstart", "--nonsense"], 2, "--nonsense"),

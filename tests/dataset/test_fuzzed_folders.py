@@ -30,9 +30,9 @@ from eyerender.observers import scene_of
 from eyerender.quickstart import compare_folder
 
 SECRET = b"the secret of another folder"
-JSON = ("dataset.json", "run.json", "shards/000000/done.json")
-LINES = ("metadata.jsonl", "shards/000000/lines.jsonl")
-FILES = (*JSON, *LINES, "images/000000", "masks/000000", "README.md")
+JSON = ("dataset.json", "run.json", "shards/00000/done.json")
+LINES = ("metadata.jsonl", "shards/00000/lines.jsonl")
+FILES = (*JSON, *LINES, "images/00000", "masks/00000", "README.md")
 ACTIONS = ("read", "validate", "deep", "resume", "compare", "records", *FORMATS)
 HARMS = ("json", "json", "line", "line", "line", "bytes", "link", "link up", "pipe", "folder", "gone")
 
@@ -187,11 +187,39 @@ def fuzz(four: Path, tmp_path: Path, examples: int, actions: tuple[str, ...]) ->
 
 
 def test_the_unharmed_folder_can_be_used(four, tmp_path):
+    assert all((four / name).exists() for name in FILES)
     shutil.copytree(four, tmp_path / "folder")
     signed(tmp_path / "folder")
     for action in ACTIONS:
         assert action != "validate" or use(tmp_path / "folder", action, tmp_path / action)["ok"]
         use(tmp_path / "folder", action, tmp_path / action)
+
+
+@pytest.mark.parametrize(
+    ("file", "keys", "value"),
+    [
+        ("dataset.json", ("spec", "count"), 10**9),
+        ("dataset.json", ("spec", "count"), 10**299),
+        ("metadata.jsonl", ("parameters", "scene_json"), "[" * 100_000),
+        ("metadata.jsonl", ("parameters", "eye_json"), "[" * 100_000),
+        ("metadata.jsonl", ("parameters", "eye_json"), 3),
+        ("metadata.jsonl", ("labels", "pupil"), []),
+    ],
+)
+@pytest.mark.parametrize("action", ["read", "deep", "compare", "csv"])
+def test_lies_that_fuzzing_found(four, tmp_path, file, keys, value, action):
+    """Shards without end, deeply nested JSON in a text, labels of another shape; all checksums are right."""
+    shutil.copytree(four, tmp_path / "folder")
+    for name in LINES if file in LINES else (file,):
+        path = tmp_path / "folder" / name
+        first, *others = path.read_text(encoding="utf-8").splitlines() if file in LINES else [path.read_text()]
+        data = node = json.loads(first)
+        for key in keys[:-1]:
+            node = node[key]
+        node[keys[-1]] = value
+        path.write_text("\n".join([json.dumps(data), *others]) + "\n", encoding="utf-8")
+    signed(tmp_path / "folder")
+    proper(lambda: use(tmp_path / "folder", action, tmp_path / "out"))
 
 
 def test_harmed_folders(four, tmp_path):

@@ -19,6 +19,7 @@ from ...imagefolder import METADATA
 from ...jsonlines import MAX_BYTES, MAX_LINE_BYTES
 from ..assemble import damage
 from ..shard import LINES, SHARDS, finished, shard_name, verify
+from ..spec import MAX_COUNT
 from .problems import SHOWN, Problems, differences
 
 _EXACT_INTEGER = 2**53
@@ -38,7 +39,7 @@ def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: P
         step(k + 1, len(there), "shards")
     spec = dataset.get("spec")
     count, size = (spec.get(key) if isinstance(spec, dict) else None for key in ("count", "shard_size"))
-    if not (isinstance(count, int) and isinstance(size, int) and count > 0 and size > 0):
+    if not (isinstance(count, int) and isinstance(size, int) and 0 < count <= MAX_COUNT and size > 0):
         return  # the plan cannot be read either
     asked = range(-(-count // size))
     known = frozenset(there)

@@ -18,7 +18,7 @@ import numpy as np
 from ...analytic.observer import observe
 from ...arrays import Bools, Floats
 from ...errors import InputError
-from ...files import shown
+from ...files import parse_json, shown
 from ...imagefolder import DATASET, RESULTS, ImageFolder, versions
 from ...observation import EYES, Observations
 from ...region.mesh import lid_margins
@@ -199,7 +199,7 @@ def _row(observations: Observations, frame: int, eye: str) -> int | None:
 def _open(line: dict[str, Any], texts: tuple[str, ...]) -> dict[str, Any]:
     """A line with JSON that it holds as text as values."""
     parameters = line["parameters"]
-    return {**line, "parameters": {**parameters, **{key: json.loads(parameters[key]) for key in texts}}}
+    return {**line, "parameters": {**parameters, **{key: parse_json(parameters[key]) for key in texts}}}
 
 
 def _differences(expected: dict[str, Any], line: dict[str, Any]) -> list[str]:
