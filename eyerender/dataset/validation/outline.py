@@ -50,16 +50,11 @@ class Outline:
 
     def inside(self, window: tuple[int, int, int, int]) -> Bools:
         """Whether each pixel's centre of a window (x0, y0, width, height) lies inside, (height, width)."""
+        from skimage.draw import polygon2mask
+
         x0, y0, width, height = window
-        p = self.curve - np.array([x0, y0])
-        q = np.roll(p, -1, axis=0)
-        rows = np.arange(height)[:, None]
-        row, edge = np.nonzero((p[:, 1] <= rows) != (q[:, 1] <= rows))
-        share = (row - p[edge, 1]) / (q[edge, 1] - p[edge, 1])
-        x = p[edge, 0] + share * (q[edge, 0] - p[edge, 0])
-        crossings = np.zeros((height, width + 1), dtype=np.int64)
-        np.add.at(crossings, (row, np.clip(np.ceil(x), 0, width).astype(int)), 1)
-        return np.asarray(np.cumsum(crossings, axis=1)[:, :width] % 2 == 1)
+        corners = (self.curve - np.array([x0, y0]))[:, ::-1]  # (row, column)
+        return np.asarray(polygon2mask((height, width), corners))  # type: ignore[no-untyped-call]
 
     def beyond(self, pixels: Bools, window: tuple[int, int, int, int]) -> Floats:
         """How far from the outline those of a window's pixels are that lie farther from it than the tolerance, px."""
