@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import observe
+from eyerender.dataset.plan import Plan
+from eyerender.dataset.spec import DatasetSpec
 from eyerender.geometry.ellipse import Ellipse, signed_distance
 from eyerender.imagefile import write_png
 from eyerender.imagefolder import write_dataset
@@ -112,11 +114,59 @@ def rows_of(path, count):
     return path
 
 
+def dataset_of(path, count, size):
+    """A dataset of `count` samples in shards of `size`: a plan, and lines without labels or pictures."""
+    scene = {key: value for key, value in SCENE.items() if key not in ("format", "name")} | {
+        "targets": {"grid": [1, 1]}
+    }
+    spec = {"format": 1, "kind": "dataset", "name": "many", "count": count, "shard_size": size, "subjects": count // 10}
+    spec |= {"scene": scene | {"subject": {"eyes": ["right"]}}, "splits": {"train": 0.8, "test": 0.2}}
+    plan = Plan.of(DatasetSpec.from_mapping(spec))
+    (record,) = observe(plan.draw(0).build(), boundary_points=6).records()
+    sums = {"bytes": 1, "sha256": ""}
+    done = {"schema": "eyerender/shard/1", "digest": plan.digest, "versions": {}, "cpu": "", "rejections": []}
+    done |= {"backend": {"name": "", "device": ""}, "given_up": []}
+    path.mkdir()
+    with open(path / "metadata.jsonl", "w", encoding="utf-8") as metadata:
+        for shard in range(count // size):
+            folder = path / "shards" / f"{shard:05d}"
+            folder.mkdir(parents=True)
+            with open(folder / "lines.jsonl", "w", encoding="utf-8") as lines:
+                for sample in range(shard * size, (shard + 1) * size):
+                    subject, sequence = plan.subject_of(sample)
+                    name = f"{shard:05d}/{sample:08d}-right.png"
+                    line = {
+                        "schema": "eyerender/image/1",
+                        "file_name": f"images/{name}",
+                        "mask_file_name": f"masks/{name}",
+                    }
+                    line |= {"sample": sample, "subject": subject, "split": plan.split_of(subject), "labels": {}}
+                    line |= {"sequence_index": sequence, "records": [record | {"frame": sample}]}
+                    line |= {"window_px": {"x0": 0, "y0": 0, "width": WIDTH, "height": HEIGHT}, "bit_depth": 8}
+                    text = json.dumps(line) + "\n"
+                    lines.write(text)
+                    metadata.write(text)
+            files = {f"shards/{shard:05d}/lines.jsonl": sums} | {
+                f"images/{shard:05d}/{k}.png": sums for k in range(size)
+            }
+            here = {"shard": shard, "samples": [shard * size, (shard + 1) * size], "images": size, "files": files}
+            (folder / "done.json").write_text(json.dumps(done | here))
+    dataset = {"schema": "eyerender/dataset/1", "kind": "dataset", "digest": plan.digest, **plan.to_mapping()}
+    (path / "dataset.json").write_text(json.dumps(dataset))
+    return path
+
+
 ITERATE = """from eyerender.imagefolder import ImageFolder
 
 folder = ImageFolder.load({path!r})
 assert sum(1 for entry in folder.entries if entry.window[2]) == {count}
 assert folder.entries[-1].name == "images/{last:07d}.png"
+"""
+VALIDATE = """from eyerender.dataset.validate import validate
+
+report = validate({path!r}, quick=True)
+assert report["problem_count"] > {count}
+assert len(report["problems"]) == 50
 """
 COMPARE = """from eyerender.quickstart import compare_folder
 
@@ -134,6 +184,18 @@ assert result.gaze_truth.ok.all()
 def test_going_through_a_folder_holds_no_lines(tmp_path, count, most):
     path = rows_of(tmp_path / "folder", count)
     found = grown(ITERATE.format(path=str(path), count=count, last=count - 1))
+    print(f"{count} rows: {found:.0f} MiB")
+    assert found < most
+
+
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize(
+    ("count", "most"), [(6_000, 40), pytest.param(1_000_000, 300, marks=pytest.mark.slow)], ids=["few", "many"]
+)
+def test_validating_a_folder_holds_no_lines(tmp_path, count, most):
+    """Every line has something wrong, and every file is missing: that takes no more than if all were well."""
+    path = dataset_of(tmp_path / "folder", count, count // 20)
+    found = grown(VALIDATE.format(path=str(path), count=count))
     print(f"{count} rows: {found:.0f} MiB")
     assert found < most
 

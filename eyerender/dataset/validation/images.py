@@ -13,7 +13,7 @@ from ...imagefile import read_image
 from ...imagefolder import ImageEntry
 from ...observation import OK
 from ..labels import IRIS, PUPIL, moments_ellipse
-from .outline import EXACT_PX, Outline
+from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
 
 SKIN, SCLERA = 0, 1
 Mask = NDArray[Any]
@@ -154,7 +154,7 @@ def pupil_outline(line: dict[str, Any]) -> Outline | None:
     points = np.array(pupil["points_px"] or [], dtype=float)
     if len(points) >= 6 and np.isfinite(points).all():
         return Outline.through(points)
-    return _ellipse(pupil)
+    return _ellipse(pupil, PUPIL_PX)
 
 
 def iris_outline(line: dict[str, Any], limbus_px: Floats | None) -> Outline | None:
@@ -164,11 +164,12 @@ def iris_outline(line: dict[str, Any], limbus_px: Floats | None) -> Outline | No
     own = line.get("labels", {}).get("iris")
     if not isinstance(own, dict) or own["amodal"]["status"] != OK:
         return None
-    return _ellipse(own["amodal"])
+    return _ellipse(own["amodal"], LIMBUS_PX)
 
 
-def _ellipse(values: dict[str, Any]) -> Outline:
-    return Outline.ellipse(np.array(values["centre_px"]), np.array(values["semi_axes_px"]), values["angle_rad"])
+def _ellipse(values: dict[str, Any], tolerance_px: float) -> Outline:
+    centre, axes = np.array(values["centre_px"]), np.array(values["semi_axes_px"])
+    return Outline.ellipse(centre, axes, values["angle_rad"], tolerance_px)
 
 
 def _share(labels: dict[str, Any], name: str) -> float | None:
