@@ -2,13 +2,13 @@
 
 Both observers report this type and gaze estimators take nothing else. A frame is one exposure of one camera and may
 hold both eyes; an observation belongs to (frame, eye). Where a status is not OK the numbers beside it are NaN in memory
-and null in the record; the reason says why.
+and null in the record; the reason says why. A pupil of which only arcs are seen has a status of its own, PARTIAL.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,8 +17,10 @@ from .arrays import ArrayValue, Bools, Floats, Ints, Objects, frozen
 from .errors import InputError
 from .files import shown
 
-SCHEMA = "eyerender/record/1"
-OK, MISSING = "ok", "missing"
+RECORD = 2
+"""The record's version that is written unless another one is asked for; `SCHEMAS` are those that are read."""
+SCHEMAS = {1: "eyerender/record/1", 2: "eyerender/record/2"}
+OK, PARTIAL, MISSING = "ok", "partial", "missing"
 EYES = ("right", "left")
 
 # Boundary points of one pupil (ten a degree) and of all pupils of a batch, which take 25 bytes each.
@@ -69,6 +71,11 @@ class PupilFeatures(ArrayValue):
     `centre_px` (n, 2), `semi_axes_px` (n, 2) with a >= b and `angle_rad` (n,) of a in [0, pi) are the direct
     least-squares ellipse of the boundary; `points_px` (n, k, 2) the boundary itself; `anatomical_centre_px` (n, 2) the
     image of the stop's centre; `covariance` (n, 5, 5) over (cx, cy, a, b, angle).
+
+    `arcs_deg` (n, m, 2) are the arcs of the true boundary that are seen, from and to in degrees of the stop's
+    parameter, NaN where there is no further one. Where the status is PARTIAL, `points_px` holds the points that are
+    seen, NaN in place of the others, and `arc_ellipse` (n, 5) the ellipse (cx, cy, a, b px, angle rad) of those, NaN
+    where they do not determine one; centre, axes and angle above are NaN.
     """
 
     status: Objects
@@ -80,10 +87,19 @@ class PupilFeatures(ArrayValue):
     anatomical_centre_px: Floats
     points_px: Floats
     covariance: Floats
+    arcs_deg: Floats = field(default_factory=lambda: frozen(np.zeros((0, 0, 2))))
+    arc_ellipse: Floats = field(default_factory=lambda: frozen(np.zeros((0, 5))))
+
+    def __post_init__(self) -> None:
+        # Left out, they are not known.
+        if len(self.arcs_deg) != len(self.status):
+            object.__setattr__(self, "arcs_deg", frozen(np.full((len(self.status), 0, 2), np.nan)))
+        if len(self.arc_ellipse) != len(self.status):
+            object.__setattr__(self, "arc_ellipse", frozen(np.full((len(self.status), 5), np.nan)))
 
     @property
     def ok(self) -> Bools:
-        """Where the pupil was found, (n,)."""
+        """Where the pupil was found, (n,); the whole of it."""
         return np.asarray(self.status == OK)
 
 
@@ -137,15 +153,19 @@ class Observations(ArrayValue):
 
         return Observations(part(self.index), part(self.pose), part(self.pupil), part(self.glints))
 
-    def records(self) -> Iterator[dict[str, Any]]:
-        """One record (docs/formats.md) an observation; every key always present, null where it does not apply."""
-        for i in range(len(self)):
-            yield self._record(i)
+    def records(self, version: int = RECORD) -> Iterator[dict[str, Any]]:
+        """One record (docs/formats.md) an observation; every key always present, null where it does not apply.
 
-    def _record(self, i: int) -> dict[str, Any]:
+        version : of the record; in version 1 a partial pupil is a missing one.
+        """
+        for i in range(len(self)):
+            yield self._record(i, version)
+
+    def _record(self, i: int, version: int) -> dict[str, Any]:
         at, pose, pupil, glints = self.index, self.pose, self.pupil, self.glints
+        status = MISSING if version == 1 and pupil.status[i] == PARTIAL else pupil.status[i]
         return {
-            "schema": SCHEMA,
+            "schema": SCHEMAS[version],
             "frame": int(at.frame[i]),
             "fixation": _count(at.fixation[i]),
             "camera": _count(at.camera[i]),
@@ -161,15 +181,16 @@ class Observations(ArrayValue):
                 "residual_mm": _numbers(pose.residual_mm[i]),
             },
             "pupil": {
-                "status": pupil.status[i],
+                "status": status,
                 "reason": pupil.reason[i] or None,
-                "in_image": bool(pupil.in_image[i]) if pupil.status[i] == OK else None,
+                "in_image": bool(pupil.in_image[i]) if status in (OK, PARTIAL) else None,
                 "centre_px": _numbers(pupil.centre_px[i]),
                 "semi_axes_px": _numbers(pupil.semi_axes_px[i]),
                 "angle_rad": _numbers(pupil.angle_rad[i]),
                 "anatomical_centre_px": _numbers(pupil.anatomical_centre_px[i]),
                 "points_px": _points(pupil.points_px[i]),
                 "covariance": _numbers(pupil.covariance[i]),
+                **(_arcs_of(pupil, i) if version > 1 else {}),
             },
             "glints": [
                 {
@@ -187,14 +208,14 @@ class Observations(ArrayValue):
 
     @classmethod
     def from_records(cls, records: Sequence[dict[str, Any]], *, source: str = "") -> Observations:
-        """Read records back; raises `InputError` naming the record and the key."""
+        """Read records of any version back; raises `InputError` naming the record and the key."""
         rows = list(records)
         for k, record in enumerate(rows):
             if not isinstance(record, dict):
                 raise InputError("must be a record", source=source, path=f"records.{k}")
-            if record.get("schema") != SCHEMA:
+            if record.get("schema") not in SCHEMAS.values():
                 raise InputError(
-                    f"is {shown(record.get('schema'))}; this version reads {SCHEMA!r}",
+                    f"is {shown(record.get('schema'))}; this version reads {' and '.join(map(repr, SCHEMAS.values()))}",
                     source=source,
                     path=f"records.{k}.schema",
                 )
@@ -236,6 +257,8 @@ class Observations(ArrayValue):
                 reader.array("pupil.anatomical_centre_px", (2,)),
                 reader.points("pupil.points_px"),
                 reader.array("pupil.covariance", (5, 5)),
+                reader.arcs(status),
+                reader.arc_ellipses(),
             ),
             reader.glints(),
         )
@@ -317,6 +340,51 @@ class _Reader:
                 out[k, : len(value)] = found
         return frozen(out)
 
+    def second(self, path: str) -> list[Any]:
+        """The values of a key that records have from version 2 on; None in those of version 1."""
+        newer = [k for k, record in enumerate(self.records) if record["schema"] != SCHEMAS[1]]
+        out: list[Any] = [None] * len(self.records)
+        for k in newer:
+            value: Any = self.records[k]
+            for key in path.split("."):
+                if not isinstance(value, dict) or key not in value:
+                    self.refuse(k, path, "missing")
+                value = value[key]
+            out[k] = value
+        return out
+
+    def arcs(self, status: Objects) -> Floats:
+        values = self.second("pupil.arcs_deg")
+        for k, record in enumerate(self.records):
+            if record["schema"] != SCHEMAS[1] and status[k] not in (OK, PARTIAL, MISSING):
+                self.refuse(k, "pupil.status", f"must be {OK!r}, {PARTIAL!r} or {MISSING!r}")
+        for k, value in enumerate(values):
+            if not (value is None or (isinstance(value, list) and len(value) <= MAX_BOUNDARY_POINTS)):
+                self.refuse(k, "pupil.arcs_deg", f"must be null or a list of at most {MAX_BOUNDARY_POINTS} arcs")
+        width = max((len(value) for value in values if value), default=0)
+        _check_width(len(values), width, MAX_POINTS, "arcs", self.source)
+        out = np.full((len(values), width, 2), np.nan)
+        for k, value in enumerate(values):
+            if value:
+                found = _array(value)
+                if found is None or found.shape != (len(value), 2):
+                    self.refuse(k, "pupil.arcs_deg", "must be null or a list of arcs [from, to]")
+                out[k, : len(value)] = found
+        return frozen(out)
+
+    def arc_ellipses(self) -> Floats:
+        out = np.full((len(self.records), 5), np.nan)
+        for k, value in enumerate(self.second("pupil.arc_ellipse")):
+            if value is None:
+                continue
+            parts = [value.get(key) for key in _ELLIPSE_KEYS] if isinstance(value, dict) else []
+            arrays = [_array(part) for part in parts]
+            shapes = [None if a is None else a.shape for a in arrays]
+            if shapes != [(2,), (2,), ()]:
+                self.refuse(k, "pupil.arc_ellipse", f"must be null or an object of {', '.join(_ELLIPSE_KEYS)}")
+            out[k] = np.concatenate([np.ravel(a) for a in arrays])  # type: ignore[arg-type]
+        return frozen(out)
+
     def glints(self) -> GlintFeatures:
         rows = self.values("glints")
         for k, entries in enumerate(rows):
@@ -346,6 +414,19 @@ class _Reader:
             frozen(xy),
             frozen(covariance),
         )
+
+
+def _arcs_of(pupil: PupilFeatures, i: int) -> dict[str, Any]:
+    """What version 2 of the record adds."""
+    ellipse = _numbers(pupil.arc_ellipse[i])
+    parts = None if ellipse is None else (ellipse[:2], ellipse[2:4], ellipse[4])
+    return {
+        "arcs_deg": _points(pupil.arcs_deg[i]),
+        "arc_ellipse": None if parts is None else dict(zip(_ELLIPSE_KEYS, parts, strict=True)),
+    }
+
+
+_ELLIPSE_KEYS = ("centre_px", "semi_axes_px", "angle_rad")
 
 
 def _glint_problem(g: Any) -> str | None:
@@ -399,6 +480,11 @@ def count_heads(head_mm: Floats) -> Ints:
     """
     heads: dict[bytes, int] = {}
     return frozen([heads.setdefault((np.round(h, 9) + 0.0).tobytes(), len(heads)) for h in head_mm], np.int64)
+
+
+def version_of(record: dict[str, Any]) -> int:
+    """The version of a record; raises `KeyError` or `ValueError` where it is none."""
+    return {schema: version for version, schema in SCHEMAS.items()}[str(record["schema"])]
 
 
 def concatenate(parts: Iterable[Observations]) -> Observations:

@@ -101,7 +101,7 @@ def test_record_has_every_key_and_null_where_it_does_not_apply():
         assert list(record["pose"]) == ["azimuth_deg", "elevation_deg", "torsion_deg", "residual_mm"]
         assert list(record["pupil"]) == [
             "status", "reason", "in_image", "centre_px", "semi_axes_px", "angle_rad", "anatomical_centre_px",
-            "points_px", "covariance",
+            "points_px", "covariance", "arcs_deg", "arc_ellipse",
         ]  # fmt: skip
         for glint in record["glints"]:
             assert list(glint) == ["light", "status", "reason", "in_image", "xy_px", "covariance"]

@@ -45,7 +45,7 @@ class Features(ArrayValue):
     semi_axes_px (n, 2), angle_rad (n,), ellipse_residual_px (n,): its direct least-squares ellipse and how far (rms)
     the boundary is from one. anatomical_centre_px (n, 2): the image of the stop's centre. glints_px (n, m, p, 2),
     glint_status, glint_residual_mm (n, m, p): for each of m lights the Purkinje images asked for, the first is the
-    glint. pupil_in_image (n,), glint_in_image (n, m, p).
+    glint. point_in_image (n, k), glint_in_image (n, m, p).
     """
 
     points_px: Floats
@@ -56,7 +56,7 @@ class Features(ArrayValue):
     angle_rad: Floats
     ellipse_residual_px: Floats
     anatomical_centre_px: Floats
-    pupil_in_image: Bools
+    point_in_image: Bools
     glints_px: Floats
     glint_status: Statuses
     glint_residual_mm: Floats
@@ -67,6 +67,17 @@ class Features(ArrayValue):
         """The first boundary point's status that is not 0, or 0, (n,)."""
         first = np.argmax(self.point_status != 0, axis=1)
         return np.asarray(self.point_status[np.arange(len(first)), first])
+
+    @property
+    def seen_in_image(self) -> Bools:
+        """Whether all boundary points that are seen lie in the image, and there are some, (n,)."""
+        seen = self.point_status == 0
+        return np.asarray((self.point_in_image | ~seen).all(axis=1) & seen.any(axis=1))
+
+    @property
+    def pupil_in_image(self) -> Bools:
+        """Whether all boundary points are seen and lie in the image, (n,)."""
+        return np.asarray(self.point_in_image.all(axis=1))
 
     def __len__(self) -> int:
         return len(self.centre_px)
@@ -135,7 +146,7 @@ def features(
     points, anatomical = np.full((n, boundary_points, 2), np.nan), np.full((n, 2), np.nan)
     point_status = np.zeros((n, boundary_points), dtype=np.int8)
     point_residual = np.full((n, boundary_points), np.nan)
-    ellipse, in_image = np.full((n, 6), np.nan), np.zeros(n, dtype=bool)
+    ellipse, in_image = np.full((n, 6), np.nan), np.zeros((n, boundary_points), dtype=bool)
     glints, glint_residual = np.full((n, m, p, 2), np.nan), np.full((n, m, p), np.nan)
     glint_status, glint_in_image = np.zeros((n, m, p), dtype=np.int8), np.zeros((n, m, p), dtype=bool)
     for group, rows in _groups(eyes, which):
@@ -158,7 +169,7 @@ def features(
                     fit = fit_ellipse_direct(pixels[:, :-1])
                     ellipse[part, :2], ellipse[part, 2:4] = fit.centre_px, fit.semi_axes_px
                     ellipse[part, 4], ellipse[part, 5] = fit.angle_rad, fit.residual_px
-                    in_image[part] = camera.in_image(pixels[:, :-1]).all(axis=1)
+                    in_image[part] = camera.in_image(pixels[:, :-1])
     results: list[npt.NDArray[Any]] = [points, point_status, point_residual, ellipse, anatomical, in_image]
     results += [glints, glint_status, glint_residual, glint_in_image]
     for array in results:

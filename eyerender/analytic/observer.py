@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,14 @@ from ..arrays import Floats, frozen
 from ..errors import InputError
 from ..eye.fixation import FixationStatus
 from ..eye.pose import Poses, listing_torsion
-from ..observation import EYES, MISSING, OK, GlintFeatures, Observations, PoseTruth, PupilFeatures
+from ..geometry.ellipse import fit_ellipse_direct
+from ..observation import EYES, MISSING, OK, PARTIAL, GlintFeatures, Observations, PoseTruth, PupilFeatures
 from ..scene import Frames, Scene
 from .features import Features, features, fixations, reason_of
+
+ARC_POINTS = 6
+ARC_GAP_DEG = 120.0
+"""What an ellipse of a partial pupil needs: as many points that are seen, and no longer stretch between two of them."""
 
 
 def observe(scene: Scene, *, boundary_points: int = 30) -> Observations:
@@ -112,28 +118,73 @@ def poses_of(scene: Scene, frames: Frames) -> PoseTruth:
 
 
 def pupil_features(seen: Features) -> PupilFeatures:
-    """The apparent pupils of a batch; missing where a boundary point has no ray, or no ellipse fits."""
-    status = seen.pupil_status
-    ok = (status == 0) & np.isfinite(seen.ellipse_residual_px)
+    """The apparent pupils of a batch: missing where no boundary point has a ray, or no ellipse fits; partial where
+    some have one and others do not.
+
+    The arcs of a partial pupil run from the first to the last point of each run of points that are seen; the true ones
+    end less than one spacing of the points farther. An ellipse is fitted to these points where there are at least
+    `ARC_POINTS` and no stretch of more than `ARC_GAP_DEG` is hidden.
+    """
+    status, found = seen.pupil_status, seen.point_status == 0
+    whole = status == 0
+    ok = whole & np.isfinite(seen.ellipse_residual_px)
+    partial = ~whole & found.any(axis=1)
+    count = found.shape[1]
     reasons = np.full(len(seen), None, dtype=object)
     for k in np.flatnonzero(~ok):
-        lost = int(np.count_nonzero(seen.point_status[k]))
         reasons[k] = (
-            f"{reason_of(int(status[k]))} ({lost} of {seen.point_status.shape[1]} boundary points)"
-            if lost
-            else "no ellipse fits the boundary"
+            "no ellipse fits the boundary"
+            if whole[k]
+            else f"{reason_of(int(status[k]))} ({np.count_nonzero(~found[k])} of {count} boundary points)"
         )
+    runs = {row: seen_arcs_deg(found[row]) for row in np.flatnonzero(partial).tolist()}
+    arcs = np.full((len(seen), max((len(arc) for arc in runs.values()), default=1), 2), np.nan)
+    arcs[ok, 0] = (0.0, 360.0)
+    ellipses = np.full((len(seen), 5), np.nan)
+    for row, arc in runs.items():
+        arcs[row, : len(arc)] = arc
+        ellipses[row] = _arc_ellipse(seen.points_px[row][found[row]], arc)
+    inside = np.where(partial, seen.seen_in_image, seen.pupil_in_image & ok)
     return PupilFeatures(
-        frozen(np.where(ok, OK, MISSING).astype(object), object),
+        frozen(np.select([ok, partial], [OK, PARTIAL], MISSING).astype(object), object),
         frozen(reasons, object),
-        frozen(seen.pupil_in_image & ok, bool),
+        frozen(inside, bool),
         _where(ok, seen.centre_px),
         _where(ok, seen.semi_axes_px),
         _where(ok, seen.angle_rad),
         seen.anatomical_centre_px,
         seen.points_px,
         frozen(np.full((len(seen), 5, 5), np.nan)),
+        frozen(arcs),
+        frozen(ellipses),
     )
+
+
+def seen_arcs_deg(found: npt.NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """Runs of points (k,), evenly spaced around the margin, that are seen: (from, to) in degrees of its parameter.
+
+    `from` lies in [0, 360) and `to` is not below it; an arc over the first point ends beyond 360.
+    """
+    count = len(found)
+    if found.all():
+        return [(0.0, 360.0)]
+    starts = np.flatnonzero(found & ~np.roll(found, 1))
+    ends = np.flatnonzero(found & ~np.roll(found, -1))
+    # The end that belongs to a start is the next one around.
+    after = [int(ends[ends >= start][0]) if (ends >= start).any() else int(ends[0]) + count for start in starts]
+    step = 360.0 / count
+    return [(float(start * step), float(end * step)) for start, end in zip(starts, after, strict=True)]
+
+
+def _arc_ellipse(points_px: Floats, arcs: Sequence[tuple[float, float]]) -> Floats:
+    """(cx, cy, a, b, angle) of the ellipse of the points that are seen; NaN where they do not determine it."""
+    gaps = [following[0] - arc[1] for arc, following in pairwise([*arcs, (arcs[0][0] + 360.0, 0.0)])]
+    if len(points_px) < ARC_POINTS or max(gaps) > ARC_GAP_DEG + 1e-9:
+        return np.full(5, np.nan)
+    fit = fit_ellipse_direct(points_px)
+    if not fit.ok:
+        return np.full(5, np.nan)
+    return np.concatenate([fit.centre_px, fit.semi_axes_px, [fit.angle_rad]])
 
 
 def glint_features(seen: Features) -> GlintFeatures:

@@ -7,36 +7,49 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..eye.model import Eye
-from ..geometry.surfaces import Xyz, components, join
+from ..geometry.surfaces import Xyz, components, fit, join, shift, turn
+from ..optics.interface import dot
 from ..optics.purkinje import purkinje_points
 from ..optics.solve import mirrored_rays, refracted_rays
-from ..optics.trace import RayStatus
+from ..optics.trace import RayStatus, mark
 
 Statuses = npt.NDArray[np.int8]
 
 _AHEAD_MM = 500.0
+_ASIDE = 0.1
+_RIM_POINTS = 36
 
 
 def pupil_exits(eye: Eye, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
     """Where the rays from `count` points of the stop's margin, and last from its centre, leave the cornea.
 
     camera_mm : nodal points (n,) in the eye frame. Returns exit points as three arrays (n, count + 1), residuals,
-    status.
+    status. A camera may stand behind the plane of the iris: the cornea bends light round to it. A ray that would have
+    to pass the iris is BEHIND_IRIS, one that meets the eyeball on its way to the camera BEHIND_SCLERA.
     """
     points = np.concatenate([eye.stop.boundary(count), eye.stop.centre_mm[..., None, :]], axis=-2)
     target, viewpoint = components(points), (camera_mm[0][:, None], camera_mm[1][:, None], camera_mm[2][:, None])
     if points.ndim == 2:
         target = (target[0][None], target[1][None], target[2][None])
-    hidden = _behind_stop(eye, camera_mm)
+    height, distance = eye.stop.height_mm(camera_mm), np.sqrt(dot(camera_mm, camera_mm))
+    # Farther to the front no ray to the camera can meet the iris or the sclera.
+    aside = height < _ASIDE * distance
+    hidden = aside & _sees_no_cornea(eye, camera_mm) if aside.any() else aside
     if hidden.any():
         # Nothing is to be found there: those rows look from straight ahead instead, and are struck out afterwards.
         ahead = (_AHEAD_MM, 0.0, 0.0)
         x, y, z = (np.where(hidden[:, None], ahead[i], viewpoint[i]) for i in range(3))
         viewpoint = (x, y, z)
     found = refracted_rays(eye.front, eye.front_indices, target, viewpoint, rim_mm=eye.limbus_radius_mm)
-    found.status[hidden] = RayStatus.BEHIND_IRIS
-    found.residual_mm[hidden] = np.nan
-    return found.exit, found.residual_mm, found.status
+    status, residual = np.array(found.status), np.array(found.residual_mm)
+    if aside.any():
+        nx, ny, nz = (fit(eye.stop.normal[..., i], 2) for i in range(3))
+        rises = nx * found.end[0] + ny * found.end[1] + nz * found.end[2] < 0.0
+        mark(status, aside[:, None] & ~rises, RayStatus.BEHIND_IRIS)
+        mark(status, aside[:, None] & _meets_sclera(eye, found.exit, found.way), RayStatus.BEHIND_SCLERA)
+    status[hidden] = RayStatus.BEHIND_IRIS
+    residual[hidden] = np.nan
+    return found.exit, residual, status
 
 
 def glint_exits(eye: Eye, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
@@ -73,6 +86,28 @@ def glint_exits(eye: Eye, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[X
     return components(found.exit_points_mm), found.residual_mm, status.astype(np.int8)
 
 
-def _behind_stop(eye: Eye, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
-    """Whether the camera stands behind the plane of the iris, (n,)."""
-    return ~(eye.stop.height_mm(camera_mm) > 0.0)
+def _sees_no_cornea(eye: Eye, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
+    """Whether the camera stands behind the tangent planes of the whole cornea, (n,); in doubt it does not.
+
+    Of a convex cap its rim faces farthest to the back: points of the limbus are asked, and a tenth of the distance is
+    allowed for what lies between them.
+    """
+    surface = eye.front[0]
+    angle = 2.0 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
+    rim = np.asarray(eye.limbus_radius_mm)[..., None]
+    y, z = np.atleast_2d(rim * np.cos(angle)), np.atleast_2d(rim * np.sin(angle))
+    point = shift(turn(surface.rotation, (surface.local_sag(y, z), y, z)), surface.origin_mm, 1.0)
+    gradient = surface.gradient_at(point)
+    size = np.sqrt(dot(gradient, gradient))
+    x, y, z = (axis[:, None] for axis in camera_mm)
+    height = dot((x - point[0], y - point[1], z - point[2]), gradient) / size
+    return np.asarray((height < -0.1 * np.sqrt(dot((x, y, z), (x, y, z)))).all(axis=1))
+
+
+def _meets_sclera(eye: Eye, exits: Xyz, way: Xyz) -> npt.NDArray[np.bool_]:
+    """Whether the rays from the exits back along `way` (unit, from the camera) enter the ball of the sclera."""
+    gap = shift(exits, eye.sclera.centre_mm, -1.0)
+    along = -dot(gap, way)
+    radius = fit(np.asarray(eye.sclera.radius_mm, dtype=np.float64), gap[0].ndim)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((along < 0.0) & (dot(gap, gap) - along * along < radius * radius))

@@ -6,7 +6,7 @@
                     or  {"id", "error": "why this image could not be looked at"}
 
 One object a line, the greeting once, then an answer to each request in turn; end of input is the end. The record is the
-package's (eyerender/record/1); only `pupil.status` is needed of it, and with "ok" centre, axes and angle: either
+package's (eyerender/record/2); only `pupil.status` is needed of it, and with "ok" centre, axes and angle: either
 `semi_axes_px` and `angle_rad`, which say what they are, or `axes_px` and `angle` as `conventions` declares. Places are
 relative to the image.
 """

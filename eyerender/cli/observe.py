@@ -9,7 +9,7 @@ import numpy as np
 from cyclopts import Parameter
 
 from ..errors import InputError
-from ..observation import EYES, MAX_BOUNDARY_POINTS, Observations
+from ..observation import EYES, MAX_BOUNDARY_POINTS, RECORD, SCHEMAS, Observations
 from .app import app
 from .options import Eye, Result, Strict
 from .output import Heed, emit, progress
@@ -23,6 +23,7 @@ def features(
     eye: Eye = None,
     points: int = 30,
     purkinje: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (),
+    record: int = RECORD,
     strict: Strict = False,
     json: Result = None,
 ) -> int:
@@ -34,6 +35,8 @@ def features(
         A scene file, or the bare name of a shipped scene.
     points
         Boundary points of the pupil.
+    record
+        Version of the records in the JSON, 1 or 2; in 1 a pupil of which only arcs are seen is missing.
     purkinje
         Also compute these Purkinje images (1 to 4) and how far the pupil is from an ellipse; in the JSON.
     """
@@ -45,6 +48,7 @@ def features(
         raise InputError("must be >= 6", source="--points")
     if points > MAX_BOUNDARY_POINTS:
         raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", source="--points")
+    _check_record(record)
     heed = Heed(strict)
     loaded = load_scene(scene, eye=eye)
     heed(loaded.warnings())
@@ -52,7 +56,7 @@ def features(
     data: dict[str, Any] = {
         "schema": "eyerender/features/1",
         "rig": loaded.rig_mapping(),
-        "records": list(observed.records()),
+        "records": list(observed.records(record)),
     }
     if purkinje:
         data["purkinje"] = purkinje_records(observed, seen, (1, *sorted(set(purkinje) - {1})))
@@ -66,6 +70,7 @@ def extract(
     *images: Path,
     scene: str | None = None,
     gamma: float = 1.0,
+    record: int = RECORD,
     strict: Strict = False,
     json: Result = None,
 ) -> int:
@@ -79,6 +84,8 @@ def extract(
         A scene whose rig identifies the glints by light.
     gamma
         Encoding gamma of the images' values; 1 is linear.
+    record
+        Version of the records in the JSON, 1 or 2.
     """
     from ..observers import ImageObserver
     from ..scene import load_scene
@@ -87,12 +94,13 @@ def extract(
         raise InputError("give at least one image", source="extract")
     if not (np.isfinite(gamma) and 0.1 <= gamma <= 10):
         raise InputError("must be between 0.1 and 10", source="--gamma")
+    _check_record(record)
     heed = Heed(strict)
     loaded = load_scene(scene) if scene is not None else None
     heed(loaded.warnings() if loaded is not None else ())
     with progress("extracting") as steps:
         observed = ImageObserver(gamma=gamma).observe_files(images, scene=loaded, progress=steps)
-    data = {"schema": "eyerender/features/1", "rig": None, "records": list(observed.records())}
+    data = {"schema": "eyerender/features/1", "rig": None, "records": list(observed.records(record))}
     names = [str(path) for path in images]
     emit(data, _feature_table(observed, names if len(names) == len(observed) else None), json, heed)
     return 0
@@ -150,6 +158,11 @@ def comparison_text(data: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _check_record(version: int) -> None:
+    if version not in SCHEMAS:
+        raise InputError(f"must be {' or '.join(map(str, SCHEMAS))}", source="--record")
+
+
 def _feature_table(observed: Observations, names: list[str] | None = None) -> str:
     """One line an observation."""
     index, pupil, glints = observed.index, observed.pupil, observed.glints
@@ -161,7 +174,7 @@ def _feature_table(observed: Observations, names: list[str] | None = None) -> st
             text = f"{x:>10.4f} {y:>10.4f} {a:>8.4f} {b:>8.4f} {np.degrees(pupil.angle_rad[i]):>9.3f}"
             text += "" if pupil.in_image[i] else " (off the sensor)"
         else:
-            text = f"{'missing: ' + str(pupil.reason[i]):<49}"
+            text = f"{f'{pupil.status[i]}: {pupil.reason[i]}':<49}"
         spots = []
         for j in range(glints.status.shape[1]):
             light = "?" if glints.light[i, j] < 0 else str(glints.light[i, j])

@@ -17,7 +17,7 @@ from ..arrays import Bools, Floats
 from ..capture import WindowImage, eye_motion
 from ..eye.model import Eye
 from ..geometry.ellipse import fit_ellipse_direct
-from ..observation import EYES, Observations
+from ..observation import EYES, MISSING, OK, Observations
 from ..rig.camera import Camera
 from ..scene import Scene
 
@@ -165,7 +165,8 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
     pupil = observations.pupil
     ok = bool(pupil.ok[row])
     return {
-        "status": pupil.status[row],
+        # The whole outline: one of which only arcs are seen is missing here.
+        "status": OK if ok else MISSING,
         "reason": pupil.reason[row] or None,
         "centre_px": pupil.centre_px[row].tolist() if ok else None,
         "semi_axes_px": pupil.semi_axes_px[row].tolist() if ok else None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from ..observation import EYES
+from ..observation import EYES, RECORD
 from .realise import Realised
 
 
@@ -15,7 +15,12 @@ def image_name(sample: int, frame: int, frames: int, side: str) -> str:
 
 
 def image_line(
-    found: Realised, row: int, frames: int, window: tuple[int, int, int, int], labels: dict[str, Any]
+    found: Realised,
+    row: int,
+    frames: int,
+    window: tuple[int, int, int, int],
+    labels: dict[str, Any],
+    record_version: int = RECORD,
 ) -> tuple[str, dict[str, Any]]:
     """The name and the line of observation `row` of a sample that was made; `frames` is how many each sample has."""
     sample, scene, observations = found.sample, found.scene, found.observations
@@ -23,7 +28,7 @@ def image_line(
     assert scene is not None
     assert observations is not None
     turn = sample.turn
-    (record,) = observations.take([row]).records()
+    (record,) = observations.take([row]).records(record_version)
     frame = record["frame"]
     side = EYES[int(observations.index.eye[row])]
     line = {

@@ -28,6 +28,7 @@ class RayStatus(IntEnum):
     BEHIND_IRIS = 4
     NOT_CONVERGED = 5
     NO_MIRROR_POINT = 6
+    BEHIND_SCLERA = 7
 
     @property
     def reason(self) -> str | None:
@@ -42,6 +43,7 @@ _REASONS = {
     RayStatus.BEHIND_IRIS: "behind the iris",
     RayStatus.NOT_CONVERGED: "the solver did not converge",
     RayStatus.NO_MIRROR_POINT: "no point of the surface mirrors the light to the viewpoint",
+    RayStatus.BEHIND_SCLERA: "behind the sclera",
 }
 
 

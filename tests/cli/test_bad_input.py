@@ -83,6 +83,8 @@ TABLE = [
     (["features"], 2, "SCENE"),
     (["features", "nonsense"], 2, "nonsense: no such scene file; shipped scenes: blignaut2014"),
     (["features", "missing.yaml"], 2, "missing.yaml: no such file"),
+    (["features", "quickstart", "--record", "3"], 2, "--record: must be 1 or 2"),
+    (["features", "quickstart", "--record", "one"], 2, "--record"),
     (["features", "key.yaml"], 2, "key.yaml: rig.lights.0.colour: unknown key"),
     (["features", "type.yaml"], 2, "type.yaml: subject.ipd_mm: must be a valid number, not 'wide'"),
     (["features", "eye.yaml"], 2, "E9"),

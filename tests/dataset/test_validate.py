@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 from dataset_specs import mapping
 
+from eyerender.analytic.observer import observe
 from eyerender.dataset.export import export
+from eyerender.dataset.labels import EyeInWindow
 from eyerender.dataset.validate import validate
+from eyerender.dataset.validation.truth import SceneTruth
 from eyerender.errors import InputError
 from eyerender.imagefile import read_image, write_png
+from eyerender.scene import load_scene
 
 pytestmark = pytest.mark.render
 
@@ -114,3 +118,28 @@ def test_what_is_no_finished_dataset_is_refused(copy, tmp_path):
         export(copy, tmp_path / "out", "csv")
     with pytest.raises(InputError, match="no such folder"):
         validate(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_lines_of_either_version_of_the_record_are_computed_again(version):
+    scene = load_scene("guestrin2006")
+    observed = observe(scene)
+    truth = SceneTruth(scene, observed)
+    view = EyeInWindow.of(scene, observed, 0)
+    line = {
+        "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
+        "bit_depth": scene.spec.sensor.bit_depth,
+        "records": list(observed.take([0]).records(version)),
+        "labels": {"lid_margins_px": None},
+        "parameters": {
+            "eye_model": scene.eye_spec.name,
+            "pupil_diameter_mm": scene.pupil_diameter_mm,
+            "wavelength_nm": scene.spec.wavelength_nm,
+            "spp": scene.spec.image.spp,
+            "seed": scene.spec.seed,
+            "camera": view.camera,
+        },
+    }
+    assert truth.again(line).problems == ()
+    line["records"][0]["pupil"]["points_px"][3][0] += 0.01
+    assert any("points_px" in problem for problem in truth.again(line).problems)

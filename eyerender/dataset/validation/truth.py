@@ -20,7 +20,7 @@ from ...arrays import Bools, Floats
 from ...errors import InputError
 from ...files import parse_json, shown
 from ...imagefolder import DATASET, RESULTS, ImageFolder, versions
-from ...observation import EYES, Observations
+from ...observation import EYES, Observations, version_of
 from ...region.mesh import lid_margins
 from ...rendering.frame import globe_of
 from ...rendering.glints import GlintScene
@@ -105,7 +105,9 @@ class DatasetTruth:
         if row is None:
             return Again((f"sample {number} has no such image",))
         view = EyeInWindow.of(scene, observations, row)
-        _, expected = image_line(found, row, self.frames, view.window, known_labels(scene, observations, view))
+        _, expected = image_line(
+            found, row, self.frames, view.window, known_labels(scene, observations, view), version_of(record)
+        )
         texts = ("scene_json", "eye_json")
         problems = _differences(_open(expected, texts), _open(line, texts))
         problems += [*_spots(scene, view, line), *_lids(scene, observations, view, line)]
@@ -162,7 +164,7 @@ class SceneTruth:
         expected = {
             "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
             "bit_depth": scene.spec.sensor.bit_depth,
-            "records": list(found.take([row]).records()),
+            "records": list(found.take([row]).records(version_of(record))),
             "parameters": {
                 "eye_model": scene.eye_spec.name,
                 "pupil_diameter_mm": scene.pupil_diameter_mm,
