@@ -119,9 +119,9 @@ def test_the_files_content_is_a_part_of_the_plan(tmp_path):
         ("rooms/night.npy", Path.unlink, "night.npy: no such file"),
         ("heads/bar.json", Path.unlink, "bar.json: no such file"),
         ("heads/bar.ply", Path.unlink, "bar.ply: no such file"),
-        ("heads/bar.json", lambda path: path.write_text("{"), "bar.json: is not a readable manifest"),
+        ("heads/bar.json", lambda path: path.write_text("{"), "bar.json: line 1: is not valid JSON"),
         ("rooms/day.npy", lambda path: (path.unlink(), path.mkdir()), "day.npy: is a folder, not a file"),
-        ("heads/bar.json", lambda path: (path.unlink(), path.mkdir()), "bar.json: is not a readable manifest"),
+        ("heads/bar.json", lambda path: (path.unlink(), path.mkdir()), "bar.json: is a folder, not a file"),
     ],
 )
 def test_files_that_cannot_be_read_are_refused_before_anything_is_written(

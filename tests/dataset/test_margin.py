@@ -21,8 +21,9 @@ def plan_with(margin):
 
 
 def test_the_shipped_spec_draws_it_once_a_subject():
-    plan = Plan.load("dataset_region", count=16)
-    samples = [plan.draw(i) for i in range(16)]
+    plan = Plan.load("dataset_region")
+    frames = plan.spec.count // plan.spec.subject_count
+    samples = [plan.draw(subject * frames + k) for subject in range(8) for k in (0, 1)]
     margins: dict[int, set[bytes]] = {}
     for sample in samples:
         stop = sample.build().eye("right").stop
