@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -125,6 +126,16 @@ def test_imports_point_down(path):
 def test_heavy_libraries_stay_in_their_packages(libraries, homes):
     users = {room(p) for p in modules() for name, _ in imports(p) if name.split(".")[0] in libraries}
     assert users == homes
+
+
+def test_what_reproduces_a_papers_software_stays_in_the_studies():
+    switches = "placed_by|tilt_order|index_rate|visual_axis|sum_of_errors|minimum_norm|E5-published"
+    # The reader of old eye files knows the first three.
+    core = [p for p in modules() if room(p) not in ("study", "cli") and p.name != "format1.py"]
+    found = [p.name for p in core if re.search(rf"\b({switches})\b", p.read_text(encoding="utf-8"))]
+    assert found == []
+    assert {p.stem for p in (PACKAGE / "eye" / "catalogue").glob("*.yaml")} == {"E1", "E2", "E3", "E4", "E5"}
+    assert not list((PACKAGE / "report").rglob("*study*"))
 
 
 def test_import_is_light():

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .study import Card, Figure, Page, Section, Table, write_page
+from .page import Card, Figure, Page, Section, Table, write_page
 from .style import TARGET, figure, svg
 
 Row = dict[str, Any]

@@ -1,4 +1,4 @@
-"""An eye's section, drawn: surfaces, stop, fovea, axes and centres of rotation (as the study's Figure 1)."""
+"""An eye's section, drawn: surfaces, stop, fovea, axes and centres of rotation."""
 
 from __future__ import annotations
 

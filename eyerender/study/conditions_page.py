@@ -1,4 +1,4 @@
-"""The report of the study of conditions."""
+"""The findings, the summary and the values of the report of the study of conditions."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..report.study import Card, Figure, Page, Section, Table
-from ..report.study_figures import lines_figure, map_figure, sensitivity_figure
 from . import conditions as c
 from .conditions import ConditionsPart
+from .figures import lines_figure, map_figure, sensitivity_figure
+from .page_parts import Report, Values, number
 from .results import Finding
 
 _WHO = {
@@ -64,142 +64,63 @@ def more(parts: Sequence[ConditionsPart]) -> dict[str, Any]:
     }
 
 
-def page(parts: Sequence[ConditionsPart], found: Sequence[Finding]) -> Page:
+def page(parts: Sequence[ConditionsPart], found: Sequence[Finding]) -> Report:
     """The report."""
-    models = [p.eye_model for p in parts]
-    cards = [
-        Card(
-            " ".join(f"{p.eye_model}\u00a0{np.nanmax(p.head_maps[t]):.2f}" for p in parts),
-            f"largest mean error (deg) over heads within 40 mm, {t}",
-        )
-        for t in c.TRACKERS
-    ]
+    head = np.array(c.HEAD_MM)
+    moved = ("to the subject's left (mm)", "towards the screen (mm)", "mean error (deg)", [(0.0, 0.0)])
+    across = ("to the subject's right (mm)", "up (mm)", "error (deg)")
+    values: Values = {
+        "trackers": {t: _WHO[t] for t in c.TRACKERS},
+        "models": [p.eye_model for p in parts],
+        "largest": [
+            (" ".join(f"{p.eye_model}\u00a0{np.nanmax(p.head_maps[t]):.2f}" for p in parts), t) for t in c.TRACKERS
+        ],
+        "screen_maps": {
+            t: map_figure(
+                {p.eye_model: p.screen_maps[t] for p in parts}, *_screen_axes(t, parts[0].screen_maps[t]), *across
+            )
+            for t in c.TRACKERS
+        },
+        "head_maps": {
+            t: map_figure({p.eye_model: p.head_maps[t] for p in parts}, head, head, *moved) for t in c.TRACKERS
+        },
+        "diameters": lines_figure(
+            {t: {p.eye_model: p.diameters[t] for p in parts} for t in c.TRACKERS},
+            c.DIAMETERS_MM,
+            "diameter of the anatomical pupil (mm)",
+            "mean error (deg)",
+        ),
+        "sensitivity": _sensitivity_figure(parts),
+        "failed": [text for p in parts if (text := _failed(p))],
+        "noise_px": f"{c.NOISE_PX:g}",
+        "samples": c.SAMPLES,
+        "seed": c.SEED,
+        "precision": [
+            (t, p.eye_model, *(f"{p.precision[t][k]:.4f}" for k in _QUALITY)) for t in c.TRACKERS for p in parts
+        ],
+        "values": [(f.id, f.rule, f"{f.value:.4f}", f.detail) for f in found],
+        "rows": [
+            (r.eye_model, r.variant or "", number(r.mean_deg), number(r.sd_deg), str(r.n), str(r.missing))
+            for p in parts
+            for r in p.rows
+        ],
+    }
+    return Report("conditions.html.j2", values)
+
+
+def _sensitivity_figure(parts: Sequence[ConditionsPart]) -> str:
     order = [name for name, *_ in c.PARAMETERS]
     entries = sorted((e for p in parts for e in p.sensitivity), key=lambda e: order.index(e["parameter"]))
     names = list(dict.fromkeys(_label(e) for e in entries))
     steps = {(p.eye_model, _label(e)): e for p in parts for e in p.sensitivity}
     changes = {
-        t: {m: [_thousandths(steps[m, n][t]["per_step"]) if (m, n) in steps else np.nan for n in names] for m in models}
+        t: {
+            m: [_thousandths(steps[m, n][t]["per_step"]) if (m, n) in steps else np.nan for n in names]
+            for m in (p.eye_model for p in parts)
+        }
         for t in c.TRACKERS
     }
-    sections = [
-        Section(
-            "Over the screen",
-            ("Error of each target at the central head position; 4 mm pupil.",),
-            [
-                Figure(
-                    map_figure(
-                        {p.eye_model: p.screen_maps[t] for p in parts},
-                        *_screen_axes(t, parts[0].screen_maps[t]),
-                        "to the subject's right (mm)",
-                        "up (mm)",
-                        "error (deg)",
-                    ),
-                    f"{t}: {_WHO[t]}. Screen coordinates from the screen's centre.",
-                )
-                for t in c.TRACKERS
-            ],
-        ),
-        Section(
-            "Over head positions",
-            ("Mean error over 3 x 3 targets with the head moved after the calibration at (0, 0).",),
-            [
-                Figure(
-                    map_figure(
-                        {p.eye_model: p.head_maps[t] for p in parts},
-                        np.array(c.HEAD_MM),
-                        np.array(c.HEAD_MM),
-                        "to the subject's left (mm)",
-                        "towards the screen (mm)",
-                        "mean error (deg)",
-                        [(0.0, 0.0)],
-                    ),
-                    f"{t}: {_WHO[t]}. The cross marks where it was calibrated.",
-                )
-                for t in c.TRACKERS
-            ],
-        ),
-        Section(
-            "Over the pupil's diameter",
-            ("Calibrated with a 4 mm pupil, tested with others. The models' pupils widen about a fixed centre.",),
-            [
-                Figure(
-                    lines_figure(
-                        {t: {p.eye_model: p.diameters[t] for p in parts} for t in c.TRACKERS},
-                        c.DIAMETERS_MM,
-                        "diameter of the anatomical pupil (mm)",
-                        "mean error (deg)",
-                    ),
-                    "Mean error by pupil diameter and eye model.",
-                )
-            ],
-        ),
-        Section(
-            "Sensitivity to the eye's parameters",
-            (
-                "Change of the mean error when one parameter of the eye grows by one step and the tracker is "
-                "calibrated on the changed eye: half the difference between plus and minus one step.",
-            ),
-            [
-                Figure(
-                    sensitivity_figure(names, changes, "change of the mean error (thousandths of a degree)"),
-                    "A row a parameter, its step in brackets. Parameters that a model has not (asphericity of a "
-                    f"sphere, a posterior cornea) have no marker. {'; '.join(_failed(p) for p in parts if _failed(p))}",
-                )
-            ],
-        ),
-        Section(
-            "Accuracy and precision",
-            (
-                f"Gaussian noise of {c.NOISE_PX:g} px in x and y on pupil centres and glints, {c.SAMPLES} samples a "
-                f"fixation, seed {c.SEED}. Accuracy: angle from the target to the mean estimate. RMS-S2S: root mean "
-                "square angle between successive samples. SD: standard deviation about the mean. Means "
-                "over all fixations, in degrees.",
-            ),
-            (),
-            [
-                Table(
-                    ("tracker", "eye model", "accuracy", "RMS-S2S", "SD"),
-                    [
-                        (t, p.eye_model, *(f"{p.precision[t][k]:.4f}" for k in _QUALITY))
-                        for t in c.TRACKERS
-                        for p in parts
-                    ],
-                )
-            ],
-        ),
-        Section(
-            "Values",
-            (),
-            (),
-            [
-                Table(
-                    ("id", "statement", "value", "detail"),
-                    [(f.id, f.rule, f"{f.value:.4f}", f.detail) for f in found],
-                    wide=(1,),
-                ),
-                Table(
-                    ("eye model", "condition", "mean (deg)", "SD (deg)", "n", "missing"),
-                    [
-                        (
-                            r.eye_model, r.variant or "", "-" if r.mean_deg is None else f"{r.mean_deg:.4f}",
-                            "-" if r.sd_deg is None else f"{r.sd_deg:.4f}", str(r.n), str(r.missing),
-                        )
-                        for p in parts
-                        for r in p.rows
-                    ],
-                    "Every condition",
-                    folded=True,
-                ),
-            ],
-        ),
-    ]  # fmt: skip
-    lead = (
-        "How the errors of two trackers depend on the target, the head, the pupil and the eye, with analytic features. "
-        + "; ".join(f"{t}: {w}" for t, w in _WHO.items())
-        + f". Eye models: {', '.join(models)}.",
-    )
-    return Page("Beyond the paper: conditions", lead, cards, sections)
+    return sensitivity_figure(names, changes, "change of the mean error (thousandths of a degree)")
 
 
 def _screen_axes(tracker: str, values: Floats) -> tuple[Floats, Floats]:

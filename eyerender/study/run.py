@@ -17,7 +17,6 @@ from ..eye.catalogue import load_eye
 from ..files import read_json, write_json, write_text
 from ..lock import writer_lock
 from ..outfolder import clear, refuse_non_empty
-from ..report.study import write_page
 from ..scene import Scene
 from . import blignaut, guestrin, head_mounted, together
 from .conditions import conditions_part
@@ -120,7 +119,7 @@ def run_study(
         summary = write_results(folder, name, rows, found, more)
         if "waterfall" in more:
             write_text(folder / "waterfall.csv", _waterfall_csv(more["waterfall"]))
-        write_page(folder / REPORT, page)
+        page.write(folder / REPORT)
         return summary
 
 

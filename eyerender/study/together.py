@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from ..report.study import Page
 from . import (
     blignaut,
     blignaut_page,
@@ -24,11 +23,11 @@ from .budget import Budget, budgets
 from .conditions import ConditionsPart
 from .head_mounted import HeadMountedPart
 from .literature import VARIANTS
-from .page_parts import Apart
+from .page_parts import Apart, Report
 from .replicate import BlignautPart, GuestrinPart
 from .results import Finding, Row
 
-Results = tuple[list[Row], list[Finding], dict[str, Any], Page]
+Results = tuple[list[Row], list[Finding], dict[str, Any], Report]
 
 
 def guestrin_results(parts: Sequence[GuestrinPart], protocols: Sequence[str]) -> Results:

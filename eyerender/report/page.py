@@ -1,12 +1,17 @@
-"""The page of a study: cards, sections of text, figures and tables, in one self-contained HTML file."""
+"""Pages: cards, sections of text, figures and tables, in one self-contained HTML file.
+
+A page is a `Page`, or a template of its own that extends `page.html.j2` and fills its blocks with the macros of
+`parts.html.j2`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from ..files import write_text
 
@@ -60,8 +65,17 @@ class Page:
 
 def write_page(path: Path, page: Page) -> None:
     """Write one self-contained HTML file, complete or not at all."""
+    write_template(path, "page.html.j2", {"page": page})
+
+
+def write_template(path: Path, template: str, values: Mapping[str, Any], package: str = "eyerender.report") -> None:
+    """Write a template of a package, filled with values, as one self-contained HTML file, complete or not at all."""
     environment = Environment(
-        loader=PackageLoader("eyerender.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+        loader=ChoiceLoader([PackageLoader(package), PackageLoader("eyerender.report")]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    text = environment.get_template("study.html.j2").render(page=page)
-    write_text(path, text)
+    # `contents` gathers the headings while the sections are rendered; the page lists them above.
+    write_text(path, environment.get_template(template).render(contents=[], **values))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from .style import figure, svg
+from ..report.style import figure, svg
 
 _LOOK = {
     "E1": ("#E69F00", "o"),
