@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..files import MAX_FILE_BYTES, PART, read_json, remove_parts, write_json
 from ..imagefolder import DATASET, METADATA, RUN, STAGE
 from ..lock import LOCK
-from ..outfolder import clear
+from ..outfolder import MARKER, clear
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
 from .plan import Plan
@@ -141,8 +141,11 @@ def _links(folder: Path) -> Iterator[str]:
 
 
 def _is_passing(name: str) -> bool:
-    """Whether a name is that of a lock, of a staged shard or of a file of ours that was not finished."""
-    return name.startswith((LOCK, STAGE)) or (name.endswith(PART) and any(name.startswith(f".{own}.") for own in _OWN))
+    """Whether a name is that of a lock, of a staged shard, of a file of ours that was not finished, or of the marker
+    that stands in a folder while it is cleared."""
+    if name == MARKER or name.startswith((LOCK, STAGE)):
+        return True
+    return name.endswith(PART) and any(name.startswith(f".{own}.") for own in (*_OWN, MARKER))
 
 
 def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:

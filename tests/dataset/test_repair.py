@@ -10,8 +10,11 @@ from dataset_specs import make, plan, tree
 
 from eyerender.cli.app import run
 from eyerender.dataset.assemble import damage, verify_dataset
+from eyerender.dataset.runfile import begin, refuse_taken
 from eyerender.dataset.shard import verify
 from eyerender.errors import InputError
+from eyerender.files import write_json
+from eyerender.outfolder import MARKER
 
 pytestmark = pytest.mark.render
 
@@ -250,3 +253,15 @@ def test_a_run_does_not_go_on_in_a_folder_with_links(tiny, tmp_path, name):
     with pytest.raises(InputError, match=f"holds '{name}', which this package did not make"):
         make(folder, plan(), overwrite=True)
     assert tree(tmp_path) == before
+
+
+def test_a_run_goes_on_in_a_folder_that_was_being_cleared(tmp_path):
+    """All that stands in it is the marker, or what was to become the marker."""
+    for name in (MARKER, f".{MARKER}.0123abcd.part"):
+        folder = tmp_path / name
+        folder.mkdir()
+        write_json(folder / MARKER, {"schema": "eyerender/folder/1", "files": []})
+        (folder / MARKER).rename(folder / name)
+        refuse_taken(folder)
+        assert not begin(folder, plan(), pytest.fail)
+        assert [p.name for p in folder.iterdir()] == ["run.json"]
