@@ -52,7 +52,11 @@ def folders(tiny, tmp_path_factory):
     return made
 
 
-@pytest.mark.parametrize("format", FORMATS)
+# These two write one file for many images; the others are tried among the long proofs.
+COLLECTING = ("coco", "ellseg")
+
+
+@pytest.mark.parametrize("format", [f if f in COLLECTING else pytest.param(f, marks=pytest.mark.slow) for f in FORMATS])
 def test_an_image_more_takes_few_bytes_more(folders, tmp_path, format):
     few, many = 50, 250
     argv = [str(folders(few)), str(folders(many)), str(tmp_path / "out"), format]
