@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -103,14 +104,15 @@ def test_the_folder_holds_report_table_and_json(bench):
 
 
 def test_an_earlier_bench_is_replaced_and_other_files_are_not(bench, drawn, tmp_path, capsys):
-    out, _ = bench
+    out = shutil.copytree(bench[0], tmp_path / "bench")
     dead = ["--extractor", f"{sys.executable} -c 0"]
     assert run(["bench-extractors", str(drawn), "-o", str(out), *dead, "--json", "-"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert [e["summary"]["error"] for e in shown["extractors"]] == [6]
-    (tmp_path / "report.html").write_text("mine")
-    assert run(["bench-extractors", str(drawn), "-o", str(tmp_path), *dead]) == 2
-    assert (tmp_path / "report.html").read_text() == "mine"
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "report.html").write_text("mine")
+    assert run(["bench-extractors", str(drawn), "-o", str(tmp_path / "other"), *dead]) == 2
+    assert (tmp_path / "other" / "report.html").read_text() == "mine"
 
 
 @pytest.mark.render
