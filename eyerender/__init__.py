@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .comparison import Comparison, compare
     from .errors import BackendError, EyerenderError, InputError
     from .eye.catalogue import load_eye
-    from .eye.model import Eye
+    from .eye.model import EyeModel
     from .eye.spec import EyeSpec
     from .gaze.regression import PupilGlintRegression
     from .gaze.validation import GazeErrors, leave_one_target_out
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from .observation import Observations
     from .observers import AnalyticObserver, ImageObserver
     from .report.comparison import write_report
-    from .rig.rig import Rig
+    from .rig.rig import RigGeometry
     from .scene import Scene, SceneSpec, load_scene, shipped_scenes
 
 _HOMES = {
     "AnalyticObserver": "observers",
     "BackendError": "errors",
     "Comparison": "comparison",
-    "Eye": "eye.model",
+    "EyeModel": "eye.model",
     "EyeSpec": "eye.spec",
     "EyerenderError": "errors",
     "GazeErrors": "gaze.validation",
@@ -38,7 +38,7 @@ _HOMES = {
     "InputError": "errors",
     "Observations": "observation",
     "PupilGlintRegression": "gaze.regression",
-    "Rig": "rig.rig",
+    "RigGeometry": "rig.rig",
     "Scene": "scene",
     "SceneSpec": "scene",
     "compare": "comparison",
@@ -55,7 +55,7 @@ __all__ = [
     "AnalyticObserver",
     "BackendError",
     "Comparison",
-    "Eye",
+    "EyeModel",
     "EyeSpec",
     "EyerenderError",
     "GazeErrors",
@@ -64,7 +64,7 @@ __all__ = [
     "InputError",
     "Observations",
     "PupilGlintRegression",
-    "Rig",
+    "RigGeometry",
     "Scene",
     "SceneSpec",
     "__version__",

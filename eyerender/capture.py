@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .analytic.observer import observe
 from .arrays import Floats
 from .errors import InputError, Warn
-from .eye.model import Eye
+from .eye.model import EyeModel
 from .eye.pose import Poses, rigid_motion
 from .imagefile import MAX_PIXELS, write_png
 from .imagefolder import write_dataset
@@ -49,7 +49,7 @@ class WindowImage:
     irradiance: NDArray[np.float32]
     mask: NDArray[np.uint8]
     labels: dict[str, Any]
-    eye: Eye
+    eye: EyeModel
     M: Floats
     t: Floats
     rendered: RenderedWindow
@@ -75,7 +75,7 @@ def render_windows(
     if renderer is None:
         renderer = make_renderer(backend, threads)
     index = observations.index
-    eyes: dict[str, Eye] = {side: scene.eye(side) for side in scene.spec.subject.eyes}
+    eyes: dict[str, EyeModel] = {side: scene.eye(side) for side in scene.spec.subject.eyes}
     for row in range(len(observations)):
         side, camera = EYES[index.eye[row]], int(index.camera[row])
         job = render_job(scene, observations, row, eyes[side])
@@ -105,7 +105,7 @@ def render_windows(
             progress(row + 1, len(observations), "")
 
 
-def render_job(scene: Scene, observations: Observations, row: int, eye: Eye | None = None) -> RenderJob:
+def render_job(scene: Scene, observations: Observations, row: int, eye: EyeModel | None = None) -> RenderJob:
     """What the renderer is asked for one observation: the eye in its pose, the rig, the window, the seed."""
     from .rendering.frame import RenderJob
 
@@ -263,7 +263,7 @@ def _stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
     return dn.astype(np.uint8) if scene.spec.sensor.bit_depth == 8 else dn
 
 
-def eye_motion(eye: Eye, observations: Observations, row: int) -> tuple[Floats, Floats]:
+def eye_motion(eye: EyeModel, observations: Observations, row: int) -> tuple[Floats, Floats]:
     """The pose of one observation as a rigid motion of the eye frame: M (3, 3), t (3,)."""
     pose = observations.pose
     M, t = rigid_motion(

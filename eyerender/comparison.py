@@ -12,7 +12,7 @@ from .errors import InputError
 from .gaze.estimate import Estimator
 from .gaze.validation import GazeErrors, leave_one_target_out
 from .observation import Observations
-from .rig.rig import Rig
+from .rig.rig import RigGeometry
 
 SCHEMA = "eyerender/compare/1"
 
@@ -101,7 +101,9 @@ def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
     )
 
 
-def compare(truth: Observations, found: Observations, rig: Rig, estimator: Estimator, name: str = "") -> Comparison:
+def compare(
+    truth: Observations, found: Observations, rig: RigGeometry, estimator: Estimator, name: str = ""
+) -> Comparison:
     """Compare two observers' reports of the same frames, in features and in gaze."""
     gaze: list[GazeErrors | None] = []
     reason = None

@@ -23,7 +23,7 @@ from .files import parse_json
 from .imagefile import read_image
 from .imagefolder import DATASET, ImageEntry, ImageFolder
 from .observation import MISSING, OK, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
-from .rig.camera import Camera
+from .rig.camera import PinholeCamera
 from .scene import Scene, SceneSpec
 
 Progress = Callable[[int, int, str], None]
@@ -234,7 +234,7 @@ def _anonymous(frame: int) -> Index:
 
 
 def _lights(
-    found: Extraction, corner: Floats, scene: Scene, camera: Camera, eye_mm: Floats
+    found: Extraction, corner: Floats, scene: Scene, camera: PinholeCamera, eye_mm: Floats
 ) -> tuple[list[int], Sequence[str | None]]:
     """The light of each glint (-1: none) and why it has none, from the rig and a rough position of the eye."""
     if not found.glints or found.pupil.ellipse is None:

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from .arrays import Floats
 from .errors import InputWarning
-from .rig.camera import Camera
-from .rig.rig import Rig
-from .rig.screen import Screen
-from .rig.sensor import SensorSpec
+from .rig.camera import PinholeCamera
+from .rig.rig import RigGeometry
+from .rig.screen import ScreenPlane
+from .rig.sensor import Sensor
 
 # Human pupils are about 2 to 8 mm wide (Watson and Yellott 2012, J. Vision 12(10):12); drugs add a little.
 PUPIL_MM = (1.0, 9.0)
@@ -74,7 +74,7 @@ def length_warnings(scene: Mapping[str, Any]) -> list[InputWarning]:
 
 
 def place_warnings(
-    rig: Rig,
+    rig: RigGeometry,
     eyes_mm: Mapping[str, Floats],
     heads_mm: Mapping[str, Floats],
     camera_paths: Sequence[str],
@@ -105,7 +105,7 @@ def place_warnings(
 
 
 def view_warnings(
-    rig: Rig, views: Mapping[int, Iterable[tuple[Window, Floats]]], camera_paths: Sequence[str]
+    rig: RigGeometry, views: Mapping[int, Iterable[tuple[Window, Floats]]], camera_paths: Sequence[str]
 ) -> list[InputWarning]:
     """Cameras whose images show no eye at any head position.
 
@@ -119,7 +119,7 @@ def view_warnings(
     return [InputWarning("out-of-view", f"sees no eye{everywhere}", path=camera_paths[c]) for c in blind]
 
 
-def is_saturated(dn: NDArray[Any], sensor: SensorSpec) -> bool:
+def is_saturated(dn: NDArray[Any], sensor: Sensor) -> bool:
     """Whether more than 20 % of an image's pixels, counts `dn` (h, w), are saturated."""
     return bool(np.count_nonzero(dn >= sensor.saturation_dn) > SATURATED_SHARE * dn.size)
 
@@ -135,7 +135,7 @@ def saturation_warnings(saturated: int, images: int, source: str) -> list[InputW
     return [InputWarning("saturated", reason, source)]
 
 
-def target_warnings(targets_mm: Floats, screen: Screen | None, source: str) -> list[InputWarning]:
+def target_warnings(targets_mm: Floats, screen: ScreenPlane | None, source: str) -> list[InputWarning]:
     """Targets (n, 3) in the world that do not lie on the screen, on which estimators put every gaze point."""
     if screen is None or not len(targets_mm):
         return []
@@ -150,7 +150,7 @@ def target_warnings(targets_mm: Floats, screen: Screen | None, source: str) -> l
     return [InputWarning("off-screen-plane", reason, source, "target_mm")]
 
 
-def rig_warnings(rig: Rig, calibrated: Rig, source: str) -> list[InputWarning]:
+def rig_warnings(rig: RigGeometry, calibrated: RigGeometry, source: str) -> list[InputWarning]:
     """A rig that is not the one an estimator was calibrated on."""
     path = next(_differences(rig.to_mapping(), calibrated.to_mapping(), "rig"), None)
     if path is None:
@@ -176,7 +176,7 @@ def _differences(one: Any, other: Any, path: str) -> Iterator[str]:
 def _misplaced(
     place: Floats,
     what: str,
-    screen: Screen | None,
+    screen: ScreenPlane | None,
     eyes_mm: Mapping[str, Floats],
     heads_mm: Mapping[str, Floats],
 ) -> tuple[str, str] | None:
@@ -199,7 +199,7 @@ def _misplaced(
     return None
 
 
-def _in_view(camera: Camera, window: Window, apex: Floats) -> bool:
+def _in_view(camera: PinholeCamera, window: Window, apex: Floats) -> bool:
     """Whether a window shows anything of an eye's front."""
     towards = camera.nodal_point_mm - apex
     if towards[0] < np.cos(_FURTHEST_RAD) * np.linalg.norm(towards):

@@ -19,16 +19,16 @@ from pydantic import Field, model_validator
 from .arrays import ArrayValue, Floats, frozen
 from .errors import InputError, InputWarning
 from .eye.catalogue import load_eye
-from .eye.margin import PupilMarginSpec
-from .eye.model import Eye
+from .eye.margin import PupilMargin
+from .eye.model import EyeModel
 from .eye.spec import EyeSpec
 from .observation import EYES, MAX_GLINTS, Index
 from .plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
-from .region.anatomy import RegionSpec
-from .region.look import LookSpec
-from .rig.imaging import AmbientSpec, LensSpec, MotionSpec
-from .rig.rig import Rig, RigSpec
-from .rig.sensor import SensorSpec
+from .region.anatomy import Region
+from .region.look import Look
+from .rig.imaging import Ambient, Lens, Motion
+from .rig.rig import Rig, RigGeometry
+from .rig.sensor import Sensor
 from .spec import FileSpec, Positive, Spec, Vec2, Vec3, file_digest, read_yaml
 
 DATASET_KIND = "dataset"
@@ -37,16 +37,16 @@ Count = Annotated[int, Field(ge=1, le=1000)]
 MAX_OBSERVATIONS = 200_000
 
 
-class EyeChoiceSpec(Spec):
+class Eye(Spec):
     """Which eye looks, and how."""
 
     model: str = Field(default="E2", description="a name of the catalogue, or an eye file (relative to the scene)")
     pupil_diameter_mm: Positive | None = Field(default=None, description="of the anatomical pupil; default: the eye's")
     line_of_sight: Literal["chief_ray", "entrance_window"] = "chief_ray"
-    margin: PupilMarginSpec | None = Field(default=None, description="of the pupil; default: the eye's")
+    margin: PupilMargin | None = Field(default=None, description="of the pupil; default: the eye's")
 
 
-class SubjectSpec(Spec):
+class Subject(Spec):
     """Which eyes are there, how far apart, and where the head stands."""
 
     eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = ("right", "left")
@@ -60,7 +60,7 @@ class SubjectSpec(Spec):
         return self
 
 
-class TargetsSpec(Spec):
+class Targets(Spec):
     """What is fixated: a grid out to the screen's edges, points on the screen, or points in the world."""
 
     grid: tuple[Count, Count] | None = Field(default=None, description="columns and rows")
@@ -76,14 +76,14 @@ class TargetsSpec(Spec):
         return self
 
 
-class PoseSpec(Spec):
+class EyeDirection(Spec):
     """An eye's direction without a target: of the optic axis; torsion follows Listing's law."""
 
     azimuth_deg: Annotated[float, Field(gt=-90, lt=90)]
     elevation_deg: Annotated[float, Field(gt=-90, lt=90)]
 
 
-class ImageSpec(Spec):
+class Picture(Spec):
     """What part of the sensor is rendered, and how finely."""
 
     window_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = Field(
@@ -107,19 +107,19 @@ class SceneSpec(FileSpec):
 
     name: Annotated[str, Field(min_length=1)]
     description: str = ""
-    eye: EyeChoiceSpec = EyeChoiceSpec()
-    subject: SubjectSpec = SubjectSpec()
-    rig: RigSpec
-    targets: TargetsSpec | None = None
-    poses: Annotated[tuple[PoseSpec, ...], Field(min_length=1)] | None = None
+    eye: Eye = Eye()
+    subject: Subject = Subject()
+    rig: Rig
+    targets: Targets | None = None
+    poses: Annotated[tuple[EyeDirection, ...], Field(min_length=1)] | None = None
     wavelength_nm: Annotated[float, Field(ge=350, le=1100)] = 850.0
-    image: ImageSpec = ImageSpec()
-    sensor: SensorSpec = SensorSpec()
-    look: LookSpec = LookSpec()
-    region: RegionSpec | None = None
-    lens: LensSpec = LensSpec()
-    motion: MotionSpec | None = None
-    ambient: AmbientSpec = AmbientSpec()
+    image: Picture = Picture()
+    sensor: Sensor = Sensor()
+    look: Look = Look()
+    region: Region | None = None
+    lens: Lens = Lens()
+    motion: Motion | None = None
+    ambient: Ambient = Ambient()
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
 
     @model_validator(mode="after")
@@ -195,7 +195,7 @@ class Scene:
 
     spec: SceneSpec
     eye_spec: EyeSpec
-    rig: Rig
+    rig: RigGeometry
     base: Path | None = None
     source: str = ""
 
@@ -273,7 +273,7 @@ class Scene:
         return hashlib.sha256("".join(parts).encode()).hexdigest()
 
     @property
-    def ambient(self) -> AmbientSpec:
+    def ambient(self) -> Ambient:
         """The ambient light, its map's file as an absolute path."""
         ambient = self.spec.ambient
         if ambient.map is None:
@@ -282,7 +282,7 @@ class Scene:
         return ambient.model_copy(update={"map": ambient.map.model_copy(update={"file": file})})
 
     @property
-    def region(self) -> RegionSpec | None:
+    def region(self) -> Region | None:
         """The eye region, a head mesh's files as absolute paths."""
         region = self.spec.region
         if region is None or region.head is None:
@@ -304,7 +304,7 @@ class Scene:
         """The spec with its files as absolute paths, a head's manifest read: it means the same in every folder."""
         return self.spec.model_copy(update={"ambient": self.ambient, "region": self.region})
 
-    def eye(self, side: Literal["right", "left"] | str) -> Eye:
+    def eye(self, side: Literal["right", "left"] | str) -> EyeModel:
         """The numeric eye of one side at the scene's wavelength, with its pupil's size and margin."""
         eye = self.spec.eye
         same = _Same(self.eye_spec)
@@ -405,8 +405,8 @@ class _Same:
 
 @lru_cache(maxsize=32)
 def _built_eye(
-    eye: _Same, left: bool, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMarginSpec | None
-) -> Eye:
+    eye: _Same, left: bool, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMargin | None
+) -> EyeModel:
     """A numeric eye; observers, renderer and labels ask for the same one again and again."""
     spec = eye.spec if margin is None else margin.applied(eye.spec)
     return spec.build(eye="left" if left else "right", wavelength_nm=wavelength_nm, pupil_diameter_mm=pupil_diameter_mm)

@@ -77,12 +77,12 @@ class Bench:
         from eyerender.rendering.film import pixels_of
         from eyerender.rendering.sampling import camera_ray
         from eyerender.rendering.view import look
-        from eyerender.rig.camera import CameraSpec
-        from eyerender.rig.light import Light
+        from eyerender.rig.camera import Camera
+        from eyerender.rig.light import Lamp
 
         rigs, n = self.rigs, 72
         eye = rigs.eye_of("E2")
-        camera = CameraSpec(
+        camera = Camera(
             resolution_px=(n, n),
             position_mm=(600.0, 0.0, 0.0),
             look_at_mm=(0.0, 0.0, 0.0),
@@ -92,7 +92,7 @@ class Bench:
         for side in (1, -1):
             a = np.radians(65.0)
             place = 300 * np.array([np.cos(a), side * np.sin(a), 0.0])
-            lights.append(Light(frozen(place), frozen(-place / 300), 100.0, 1000.0, 1.0))
+            lights.append(Lamp(frozen(place), frozen(-place / 300), 100.0, 1000.0, 1.0))
         black = rigs.BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
         rig = rigs.LampRig(camera, tuple(lights))
         job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
@@ -142,13 +142,13 @@ class Bench:
         from render_oracles import RINGS_MM, flux_on_rings, ring_points
 
         from eyerender.arrays import frozen
-        from eyerender.rig.light import Light
+        from eyerender.rig.light import Lamp
 
         rigs = self.rigs
         for model in ("E4", "E5"):
             eye = rigs.eye_of(model)
             for where, place in (("remote", (500.0, 0.0, -150.0)), ("head-mounted", (30.0, -6.0, -14.0))):
-                lamp = Light(frozen(place), frozen([-1.0, 0, 0]), 0.0, 100.0, 0.0)
+                lamp = Lamp(frozen(place), frozen([-1.0, 0, 0]), 0.0, 100.0, 0.0)
                 rig = rigs.LampRig(rigs.remote_rig().camera, (lamp,))
                 plain = rigs.PLAIN.model_copy(update={"limbus_width_mm": 0.0})
                 job = rigs.job_of(eye, rig, (0, 0, 16, 16), look=plain)
@@ -325,10 +325,10 @@ class Bench:
         from eyerender.analytic.observer import observe
         from eyerender.capture import render_job
         from eyerender.eye.pose import Poses, rigid_motion
-        from eyerender.region.anatomy import RegionSpec
+        from eyerender.region.anatomy import Region
         from eyerender.scene import Scene, SceneSpec
 
-        rigs, region = self.rigs, RegionSpec(seed=11)
+        rigs, region = self.rigs, Region(seed=11)
         rig = rigs.remote_rig()
         lamps = (rig.lights[0], replace(rig.lights[0], position_mm=rig.lights[0].position_mm + np.array([0, 80.0, 0])))
         remote = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(640, 480), lights=lamps, labels=False)
@@ -365,7 +365,7 @@ class Bench:
         for _ in range(count):
             eye = rigs.eye_of(str(rng.choice(["E1", "E2"])), "right", float(rng.uniform(2.5, 6.0)))
             shift = rng.uniform(-2, 2, 3)
-            camera = rigs.CameraSpec(
+            camera = rigs.Camera(
                 resolution_px=(640, 480),
                 position_mm=tuple(float(x) for x in 35 * np.array([0.87, -0.2, -0.4]) + shift),
                 look_at_mm=(0.0, 0.0, 0.0), focal_length_px=float(rng.uniform(500, 700)),

@@ -21,10 +21,10 @@ import trimesh
 
 from eyerender import load_eye
 from eyerender.errors import InputError
-from eyerender.region.anatomy import RegionSpec
+from eyerender.region.anatomy import Region
 from eyerender.region.globe import Globe
 from eyerender.region.head import HEAD_PARTS, load_head
-from eyerender.region.headspec import SCHEMA, HeadSpec
+from eyerender.region.headspec import SCHEMA, Head
 from eyerender.region.mesh import PARTS, region_mesh
 
 
@@ -38,7 +38,7 @@ def describe(files: list[Path], keys: dict[str, Any]) -> Path:
         **{k: v for k, v in keys.items() if v is not None},
         "sha256": sums if len(sums) > 1 else sums[0],
     }
-    head = load_head(HeadSpec.from_mapping(data, source=str(files[0])).resolved(folder))
+    head = load_head(Head.from_mapping(data, source=str(files[0])).resolved(folder))
     for part, end, start in zip(HEAD_PARTS, head.face_ends, [0, *head.face_ends[:-1]], strict=True):
         print(f"{part:<7} {int(end) - int(start)} triangles")
     path = folder / "manifest.json"
@@ -52,7 +52,7 @@ def example(folder: Path) -> Path:
     eye = load_eye("E2").build()
     limbus, centre = float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm)
     globe = Globe(eye.front[0], limbus, centre, float(eye.sclera.radius_mm), np.eye(3), np.zeros(3))
-    mesh = region_mesh(RegionSpec(), globe)
+    mesh = region_mesh(Region(), globe)
     lines, start = [], 1
     for name in PARTS:
         part: trimesh.Trimesh = mesh.part(name)

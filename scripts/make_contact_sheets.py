@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw
 
 from eyerender.analytic.observer import observe
 from eyerender.capture import make_renderer, render_windows
-from eyerender.region.anatomy import RegionSpec
+from eyerender.region.anatomy import Region
 from eyerender.scene import Scene, SceneSpec, load_scene
 
 PRESETS = ("desktop_tracker", "headset", "webcam", "stress")
@@ -62,7 +62,7 @@ def rows(spec: dict[str, Any], quick: bool) -> Iterator[tuple[str, list[tuple[st
     )
     subjects = []
     for i in range(n):
-        drawn = RegionSpec.drawn(100 + i, spread=0.8).to_mapping()
+        drawn = Region.drawn(100 + i, spread=0.8).to_mapping()
         subjects.append((f"subject {100 + i}", scene(look={"iris_seed": 100 + i}, region=drawn)))
     yield "subjects", subjects
 

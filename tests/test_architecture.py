@@ -147,8 +147,8 @@ def test_import_is_light():
 
 def test_public_names_are_pinned():
     assert eyerender.__all__ == [
-        "AnalyticObserver", "BackendError", "Comparison", "Eye", "EyeSpec", "EyerenderError", "GazeErrors",
-        "ImageFolder", "ImageObserver", "InputError", "Observations", "PupilGlintRegression", "Rig", "Scene",
+        "AnalyticObserver", "BackendError", "Comparison", "EyeModel", "EyeSpec", "EyerenderError", "GazeErrors",
+        "ImageFolder", "ImageObserver", "InputError", "Observations", "PupilGlintRegression", "RigGeometry", "Scene",
         "SceneSpec", "__version__", "compare", "leave_one_target_out", "load_eye", "load_scene", "render_folder",
         "render_windows", "shipped_scenes", "write_report",
     ]  # fmt: skip

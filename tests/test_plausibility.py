@@ -16,7 +16,7 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import shipped_datasets
 from eyerender.errors import InputError
 from eyerender.plausibility import is_saturated
-from eyerender.rig.sensor import SensorSpec
+from eyerender.rig.sensor import Sensor
 from eyerender.scene import Scene, SceneSpec, load_scene, shipped_scenes
 
 BASE = yaml.safe_load(shipped_scenes()["guestrin2006"].read_text(encoding="utf-8"))
@@ -157,7 +157,7 @@ def test_a_dataset_tells_each_thing_once_with_a_sample(tmp_path):
 def test_an_image_is_saturated_where_a_fifth_is_white(share, sensor, white, expected):
     dn = np.full(10000, 100)
     dn[: round(share * dn.size)] = white
-    assert is_saturated(dn.reshape(100, 100), SensorSpec(**sensor)) is expected
+    assert is_saturated(dn.reshape(100, 100), Sensor(**sensor)) is expected
 
 
 @pytest.fixture

@@ -18,13 +18,13 @@ from ..arrays import ArrayValue, Bools, Floats, frozen
 from ..errors import InputError
 from ..eye.batch import stack_eyes, structure_of, take_eyes
 from ..eye.fixation import Fixations, FixationStatus, LineOfSightKind, fixate
-from ..eye.model import Eye
+from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
 from ..geometry.ellipse import fit_ellipse_direct
 from ..geometry.surfaces import Xyz
 from ..observation import MAX_BOUNDARY_POINTS, MAX_POINTS
 from ..optics.trace import RayStatus
-from ..rig.camera import Camera, distort
+from ..rig.camera import PinholeCamera, distort
 from .rays import glint_exits, pupil_exits
 
 Statuses = npt.NDArray[np.int8]
@@ -84,7 +84,7 @@ class Features(ArrayValue):
 
 
 def fixations(
-    eyes: Sequence[Eye],
+    eyes: Sequence[EyeModel],
     eye_index: npt.ArrayLike,
     target_mm: npt.ArrayLike,
     position_mm: npt.ArrayLike,
@@ -109,11 +109,11 @@ def fixations(
 
 
 def features(
-    eyes: Sequence[Eye],
+    eyes: Sequence[EyeModel],
     eye_index: npt.ArrayLike,
     poses: Poses,
     position_mm: npt.ArrayLike,
-    cameras: Sequence[Camera],
+    cameras: Sequence[PinholeCamera],
     camera_index: npt.ArrayLike,
     lights_mm: npt.ArrayLike,
     *,
@@ -204,10 +204,10 @@ class _View:
     translation: Floats
     camera_mm: Xyz
     motion: tuple[Floats, Floats]
-    camera: Camera
+    camera: PinholeCamera
 
     @classmethod
-    def of(cls, eye: Eye, poses: Poses, position_mm: Floats, camera: Camera) -> _View:
+    def of(cls, eye: EyeModel, poses: Poses, position_mm: Floats, camera: PinholeCamera) -> _View:
         turn, shift = rigid_motion(poses, eye)
         whole = shift + position_mm
         rotation = np.asarray(camera.R) @ turn
@@ -253,13 +253,13 @@ class _View:
 
 
 def _groups(
-    eyes: Sequence[Eye], which: npt.NDArray[np.intp]
-) -> list[tuple[tuple[Eye, npt.NDArray[np.intp] | None], npt.NDArray[np.intp]]]:
+    eyes: Sequence[EyeModel], which: npt.NDArray[np.intp]
+) -> list[tuple[tuple[EyeModel, npt.NDArray[np.intp] | None], npt.NDArray[np.intp]]]:
     """Rows whose eyes can be traced together: ((eye or stacked eyes, row -> eye of the stack), rows)."""
     kinds: dict[object, list[int]] = {}
     for k in np.unique(which):
         kinds.setdefault(structure_of(eyes[k]), []).append(int(k))
-    out: list[tuple[tuple[Eye, npt.NDArray[np.intp] | None], npt.NDArray[np.intp]]] = []
+    out: list[tuple[tuple[EyeModel, npt.NDArray[np.intp] | None], npt.NDArray[np.intp]]] = []
     for members in kinds.values():
         if len(members) <= FEW_EYES:
             out += [((eyes[k], None), np.flatnonzero(which == k)) for k in members]
@@ -272,8 +272,8 @@ def _groups(
 
 
 def _chunks(
-    group: tuple[Eye, npt.NDArray[np.intp] | None], rows: npt.NDArray[np.intp], size: int
-) -> list[tuple[npt.NDArray[np.intp], Eye]]:
+    group: tuple[EyeModel, npt.NDArray[np.intp] | None], rows: npt.NDArray[np.intp], size: int
+) -> list[tuple[npt.NDArray[np.intp], EyeModel]]:
     eye, place = group
     parts = [rows[part] for part in _slices(len(rows), size)]
     return [(part, eye if place is None else take_eyes(eye, place[part])) for part in parts]

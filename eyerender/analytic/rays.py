@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats
-from ..eye.model import Eye
+from ..eye.model import EyeModel
 from ..geometry.surfaces import Xyz, components, fit, join, shift, turn
 from ..optics.interface import dot
 from ..optics.purkinje import purkinje_points
@@ -20,7 +20,7 @@ _ASIDE = 0.1
 _RIM_POINTS = 36
 
 
-def pupil_exits(eye: Eye, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
+def pupil_exits(eye: EyeModel, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
     """Where the rays from `count` points of the stop's margin, and last from its centre, leave the cornea.
 
     camera_mm : nodal points (n,) in the eye frame. Returns exit points as three arrays (n, count + 1), residuals,
@@ -52,7 +52,7 @@ def pupil_exits(eye: Eye, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Stat
     return found.exit, residual, status
 
 
-def glint_exits(eye: Eye, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
+def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
     """Where the light of m lights (n, m) leaves the cornea for the camera, reflected at the surface of Purkinje's
     `order`.
 
@@ -86,7 +86,7 @@ def glint_exits(eye: Eye, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[X
     return components(found.exit_points_mm), found.residual_mm, status.astype(np.int8)
 
 
-def _sees_no_cornea(eye: Eye, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
+def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
     """Whether the camera stands behind the tangent planes of the whole cornea, (n,); in doubt it does not.
 
     Of a convex cap its rim faces farthest to the back: points of the limbus are asked, and a tenth of the distance is
@@ -104,7 +104,7 @@ def _sees_no_cornea(eye: Eye, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
     return np.asarray((height < -0.1 * np.sqrt(dot((x, y, z), (x, y, z)))).all(axis=1))
 
 
-def _meets_sclera(eye: Eye, exits: Xyz, way: Xyz) -> npt.NDArray[np.bool_]:
+def _meets_sclera(eye: EyeModel, exits: Xyz, way: Xyz) -> npt.NDArray[np.bool_]:
     """Whether the rays from the exits back along `way` (unit, from the camera) enter the ball of the sclera."""
     gap = shift(exits, eye.sclera.centre_mm, -1.0)
     along = -dot(gap, way)

@@ -21,8 +21,8 @@ from ..imagefile import read_image
 from ..imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ..jsonlines import JsonLines
 from ..observation import OK, Observations
-from ..rig.camera import Camera
-from ..rig.rig import Rig
+from ..rig.camera import PinholeCamera
+from ..rig.rig import RigGeometry
 from ..scene import Scene, SceneSpec
 
 IDEAL_SCHEMA = "eyerender/ideal-images/1"
@@ -84,7 +84,7 @@ def load_labelled(folder: str | Path) -> list[LabelledImage]:
     return out
 
 
-def _rendered(entry: ImageEntry, truth: Observations, row: int, rig: Rig | None) -> LabelledImage:
+def _rendered(entry: ImageEntry, truth: Observations, row: int, rig: RigGeometry | None) -> LabelledImage:
     image, stored = read_image(entry.path)
     x0, y0, width, height = entry.window
     if image.shape != (height, width):
@@ -145,7 +145,7 @@ def _ellipse_factors(pupil: Ellipse | None, visible: float | None) -> dict[str, 
 
 
 def _hints(
-    line: Mapping[str, Any], truth: Observations, row: int, scene_rig: Rig | None, corner: Floats
+    line: Mapping[str, Any], truth: Observations, row: int, scene_rig: RigGeometry | None, corner: Floats
 ) -> dict[str, Any]:
     """What an extractor may know: the rig, roughly where the eye is, and so the range of sizes; never the truth."""
     eye_mm = truth.index.eye_position_mm[row] + truth.index.head_mm[row]
@@ -169,19 +169,21 @@ def _hints(
     }
 
 
-def _camera_and_lights(line: Mapping[str, Any], camera: int, rig: Rig | None) -> tuple[Camera | None, Floats]:
+def _camera_and_lights(
+    line: Mapping[str, Any], camera: int, rig: RigGeometry | None
+) -> tuple[PinholeCamera | None, Floats]:
     """An image's own camera and lights where its labels hold them (datasets vary theirs), else the scene's."""
     labels = line.get("labels") or {}
     own, lights = labels.get("camera"), labels.get("lights_mm")
     if own and lights is not None:
-        seen = Camera.of(own["K"], own["R"], own["t_mm"], tuple(own["resolution_px"]), own["distortion"])
+        seen = PinholeCamera.of(own["K"], own["R"], own["t_mm"], tuple(own["resolution_px"]), own["distortion"])
         return seen, np.asarray(lights, dtype=np.float64).reshape(-1, 3)
     if rig is None or not 0 <= camera < len(rig.cameras):
         return None, np.zeros((0, 3))
     return rig.cameras[camera], np.array([light.position_mm for light in rig.lights]).reshape(-1, 3)
 
 
-def _rig_of(folder: ImageFolder) -> Rig | None:
+def _rig_of(folder: ImageFolder) -> RigGeometry | None:
     """The rig of the scene that the folder was rendered from; None for a dataset, whose images carry their own."""
     spec = folder.dataset.get("spec")
     if not isinstance(spec, dict) or folder.dataset.get("kind") == "dataset":

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..extraction import FAST, REFINED, Extraction, ExtractionSettings, extract, identify
-from ..rig.camera import Camera
+from ..rig.camera import PinholeCamera
 from .registry import Command
 
 PUPIL_LABS_PYTHON = "EYERENDER_PUPIL_DETECTORS"
@@ -102,7 +102,7 @@ def _lights(found: Extraction, rig: Mapping[str, Any] | None) -> list[int | None
     """The light of each glint, where the rig is told."""
     if rig is None or not found.glints or found.pupil.ellipse is None:
         return [None] * len(found.glints)
-    camera = Camera.of(rig["K"], rig["R"], rig["t_mm"], (1, 1), rig["distortion"])
+    camera = PinholeCamera.of(rig["K"], rig["R"], rig["t_mm"], (1, 1), rig["distortion"])
     spots = np.array([g.xy_px if g.xy_px is not None else [np.nan, np.nan] for g in found.glints])
     assigned = identify(
         camera.ideal(spots),

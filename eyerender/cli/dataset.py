@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from ..errors import EyerenderError, InputError
 from .app import app
-from .options import Backend, Eye, Overwrite, Result, Seed, Strict, Threads, positive
+from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads, positive
 from .output import Heed, emit, progress, say
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def generate(
     address: str | None = None,
     dry_run: bool = False,
     measure: bool = False,
-    eye: Eye = None,
+    eye: EyeModel = None,
     seed: Seed = None,
     count: int | None = None,
     backend: Backend = "auto",
@@ -113,7 +113,7 @@ def sample(
     /,
     *,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
-    eye: Eye = None,
+    eye: EyeModel = None,
     seed: Seed = None,
     strict: Strict = False,
     json: Result = None,
@@ -161,7 +161,7 @@ def preview(
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    eye: Eye = None,
+    eye: EyeModel = None,
     seed: Seed = None,
     backend: Backend = "auto",
     threads: Threads = None,

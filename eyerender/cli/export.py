@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from ..errors import InputError
 from .app import app
-from .options import Eye, Overwrite, Result, Strict, positive
+from .options import EyeModel, Overwrite, Result, Strict, positive
 from .output import Heed, emit
 
 
@@ -19,7 +19,7 @@ def export_scene(
     folder: Annotated[Path, Parameter(name="DIR")],
     /,
     *,
-    eye: Eye = None,
+    eye: EyeModel = None,
     frame: int = 0,
     side: str | None = None,
     spp: int = 64,

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from .app import app
 from .observe import comparison_text
-from .options import Backend, Eye, Overwrite, Result, Seed, Strict, Threads, positive
+from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads, positive
 from .output import Heed, emit, progress
 
 
@@ -19,7 +19,7 @@ def render(
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    eye: Eye = None,
+    eye: EyeModel = None,
     spp: int | None = None,
     seed: Seed = None,
     backend: Backend = "auto",
@@ -62,7 +62,7 @@ def quickstart(
     folder: Annotated[Path, Parameter(name="DIR")],
     /,
     *,
-    eye: Eye = None,
+    eye: EyeModel = None,
     backend: Backend = "auto",
     threads: Threads = None,
     overwrite: Overwrite = False,

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from ..errors import InputError
 from ..observation import EYES, MAX_BOUNDARY_POINTS, RECORD, SCHEMAS, Observations
 from .app import app
-from .options import Eye, Result, Strict
+from .options import EyeModel, Result, Strict
 from .output import Heed, emit, progress
 
 
@@ -20,7 +20,7 @@ def features(
     scene: str,
     /,
     *,
-    eye: Eye = None,
+    eye: EyeModel = None,
     points: int = 30,
     purkinje: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (),
     record: int = RECORD,

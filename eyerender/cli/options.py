@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from ..errors import InputError
 
-Eye = Annotated[str | None, Parameter(help="Replace the eye model: a name of the catalogue, or an eye file.")]
+EyeModel = Annotated[str | None, Parameter(help="Replace the eye model: a name of the catalogue, or an eye file.")]
 Seed = Annotated[int | None, Parameter(help="Replace the seed.")]
 Backend = Annotated[Literal["auto", "cuda", "llvm"], Parameter(help="Where to render.")]
 Threads = Annotated[int | None, Parameter(help="Processor threads in all (default: all there are).")]

@@ -15,10 +15,10 @@ import numpy as np
 from ..analytic.features import fixations
 from ..arrays import Bools, Floats
 from ..capture import WindowImage, eye_motion
-from ..eye.model import Eye
+from ..eye.model import EyeModel
 from ..geometry.ellipse import fit_ellipse_direct
 from ..observation import EYES, MISSING, OK, Observations
-from ..rig.camera import Camera
+from ..rig.camera import PinholeCamera
 from ..scene import Scene
 
 _OUTLINE_POINTS = 60
@@ -36,7 +36,7 @@ class EyeInWindow:
     row: int
     camera: int
     window: tuple[int, int, int, int]
-    eye: Eye
+    eye: EyeModel
     M: Floats
     t: Floats
 
@@ -153,7 +153,7 @@ def limbus_px(scene: Scene, view: EyeInWindow | WindowImage, count: int) -> tupl
     return np.asarray(pixels), reason
 
 
-def cornea_centre(eye: Eye) -> Floats:
+def cornea_centre(eye: EyeModel) -> Floats:
     """Centre of curvature of the front cornea at its apex, eye frame, (3,) mm: apex - R axis, R the mean radius."""
     surface = eye.front[0]
     apex = float(surface.sag(0.0, 0.0))
@@ -209,7 +209,9 @@ def _seen_glint(image: WindowImage, k: int, known: dict[str, Any]) -> dict[str, 
     }
 
 
-def _space(scene: Scene, observations: Observations, view: EyeInWindow | WindowImage, camera: Camera) -> dict[str, Any]:
+def _space(
+    scene: Scene, observations: Observations, view: EyeInWindow | WindowImage, camera: PinholeCamera
+) -> dict[str, Any]:
     """Points (mm) and lines in the world and in the camera's frame."""
     eye, M, t, row = view.eye, view.M, view.t, view.row
     index = observations.index

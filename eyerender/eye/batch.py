@@ -12,19 +12,19 @@ from ..geometry.surfaces import Surface
 from ..geometry.transforms import Array, read_only
 from ..optics.gradient import GradientMedium
 from ..optics.interface import Number
-from .model import Eye, LineOfSight, RotationCentres, Sphere, Stop
+from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
 
 Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str]
 S = TypeVar("S", bound=Surface)
 
 
-def structure_of(eye: Eye) -> Structure:
+def structure_of(eye: EyeModel) -> Structure:
     """What must agree between eyes that are to be stacked: kinds and numbers of surfaces."""
     front, back = (tuple(s.kind for s in surfaces) for surfaces in (eye.front, eye.back))
     return front, back, eye.back_passing, eye.lens_gradient is not None, eye.retina.kind
 
 
-def stack_eyes(eyes: Sequence[Eye]) -> Eye:
+def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
     """A batch of n eyes of one structure; name and side are those of the first."""
     first = eyes[0]
     if any(structure_of(eye) != structure_of(first) for eye in eyes):
@@ -38,7 +38,7 @@ def stack_eyes(eyes: Sequence[Eye]) -> Eye:
 
     gradients = [e.lens_gradient for e in eyes if e.lens_gradient is not None]
     waves = max(e.stop.contour.shape[-1] for e in eyes)
-    return Eye(
+    return EyeModel(
         name=first.name,
         side=first.side,
         wavelength_nm=first.wavelength_nm,
@@ -67,7 +67,7 @@ def stack_eyes(eyes: Sequence[Eye]) -> Eye:
     )
 
 
-def take_eyes(eye: Eye, index: npt.NDArray[np.intp]) -> Eye:
+def take_eyes(eye: EyeModel, index: npt.NDArray[np.intp]) -> EyeModel:
     """The eyes at `index` of a batch; a single eye is returned as it is."""
     if eye.fovea_mm.ndim == 1:
         return eye
@@ -76,7 +76,7 @@ def take_eyes(eye: Eye, index: npt.NDArray[np.intp]) -> Eye:
         return tuple(np.asarray(v)[index] for v in values)
 
     rotation, ray = eye.rotation, eye.chief_ray
-    return Eye(
+    return EyeModel(
         name=eye.name,
         side=eye.side,
         wavelength_nm=eye.wavelength_nm,

@@ -19,7 +19,7 @@ from ..optics.gradient import GradientMedium
 from ..optics.interface import Number
 from ..optics.media import CauchyMedium, ConstantMedium, Medium
 from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
-from .model import Eye, LineOfSight, RotationCentres, Sphere, Stop
+from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
 from .shells import SHELLS, Layers, even_layers, lens_shells, passing_shells
 from .spec import (
     LARGEST_INDEX,
@@ -38,7 +38,7 @@ from .spec import (
 )
 
 
-def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm: float | None) -> Eye:
+def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm: float | None) -> EyeModel:
     """The numeric eye; raises `InputError` for a pupil that does not fit or an index below 1 at this wavelength."""
     if not (np.isfinite(wavelength_nm) and wavelength_nm > 0.0):
         raise InputError("must be a positive number", path="wavelength_nm")
@@ -58,7 +58,7 @@ def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm
     return eye if side == "right" else mirrored_eye(eye)
 
 
-def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> Eye:
+def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> EyeModel:
     """The right eye without its landmarks (fovea, node, chief ray: zeros): enough to trace with."""
     front = tuple(surface_of(s) for s in spec.cornea)
     front_indices = tuple(index_at(s.medium, wavelength_nm, f"cornea.{k}.medium") for k, s in enumerate(spec.cornea))
@@ -77,7 +77,7 @@ def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> Eye:
         back, back_indices, rims, gradient = gradient_lens(spec.lens, wavelength_nm)
         passing = passing_shells(len(back))
     zero = read_only(np.zeros(3))
-    return Eye(
+    return EyeModel(
         name=spec.name,
         side="right",
         wavelength_nm=float(wavelength_nm),
@@ -243,10 +243,10 @@ def _equator_radius(front: Surface, back: Surface) -> float:
     return float(brentq(gap, reach - 0.1, reach)) if gap(reach) <= 0.0 else np.inf
 
 
-def mirrored_eye(eye: Eye) -> Eye:
+def mirrored_eye(eye: EyeModel) -> EyeModel:
     """The other eye: every point (x, y, z) -> (x, -y, z)."""
     side: Literal["right", "left"] = "left" if eye.side == "right" else "right"
-    return Eye(
+    return EyeModel(
         name=eye.name,
         side=side,
         wavelength_nm=eye.wavelength_nm,
@@ -295,7 +295,7 @@ class _Key:
 
 
 @lru_cache(maxsize=256)
-def _compiled(key: _Key, wavelength_nm: float, stop_centre_mm: tuple[float, float, float]) -> Eye:
+def _compiled(key: _Key, wavelength_nm: float, stop_centre_mm: tuple[float, float, float]) -> EyeModel:
     """The right eye with its landmarks, which depend on the stop by its centre alone."""
     spec = key.spec
     nominal = stop_of(spec, spec.stop.diameter_mm)

@@ -29,7 +29,7 @@ from ..geometry.transforms import Array, normalize
 from ..optics.solve import apparent_points
 from ..optics.trace import RayStatus, trace
 from .landmarks import path_to_retina
-from .model import Eye
+from .model import EyeModel
 from .pose import Poses, Turning, into_eye
 
 LineOfSightKind = Literal["chief_ray", "entrance_window"]
@@ -89,7 +89,7 @@ class Fixations(ArrayValue):
         return len(self.residual_mm)
 
 
-def fixate(eye: Eye, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKind = "chief_ray") -> Fixations:
+def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKind = "chief_ray") -> Fixations:
     """The poses of `eye` (one, or a batch of n) that fixate targets (n, 3).
 
     target_mm : in the eye frame, i.e. the world's target minus the eye's position minus the head's.
@@ -104,7 +104,7 @@ def fixate(eye: Eye, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKind = 
     raise InputError(f"must be chief_ray or entrance_window, not {line_of_sight!r}", path="line_of_sight")
 
 
-def _by_chief_ray(eye: Eye, target_mm: Array) -> Fixations:
+def _by_chief_ray(eye: EyeModel, target_mm: Array) -> Fixations:
     """Turn the fixed line p + s u through the target: e1.(q - p) = e2.(q - p) = 0, q the target seen by the turned
     eye.
     """
@@ -122,7 +122,7 @@ def _by_chief_ray(eye: Eye, target_mm: Array) -> Fixations:
     )
 
 
-def _turn_line(eye: Eye, target: Xyz, point: Xyz, direction: Xyz) -> tuple[Array, Array, Array, Array]:
+def _turn_line(eye: EyeModel, target: Xyz, point: Xyz, direction: Xyz) -> tuple[Array, Array, Array, Array]:
     """(azimuth, elevation, distance of the target from the line, its distance along the line), Newton with Listing."""
     e1, e2 = _tangents(direction)
     centre = eye.rotation.azimuth_centre_mm
@@ -154,7 +154,7 @@ def _turn_line(eye: Eye, target: Xyz, point: Xyz, direction: Xyz) -> tuple[Array
     return azimuth, elevation, np.hypot(r1, r2), _dot(direction, gap)
 
 
-def _seen(eye: Eye, target: Xyz, azimuth: Array, elevation: Array) -> tuple[Xyz, Xyz, Xyz]:
+def _seen(eye: EyeModel, target: Xyz, azimuth: Array, elevation: Array) -> tuple[Xyz, Xyz, Xyz]:
     """The target as the turned eye has it, with its derivatives by azimuth and elevation (Listing's torsion
     included).
     """
@@ -185,7 +185,7 @@ def _seen(eye: Eye, target: Xyz, azimuth: Array, elevation: Array) -> tuple[Xyz,
     return (x, y + ct[1], z + ct[2]), by_a, by_e
 
 
-def _by_entrance_window(eye: Eye, target_mm: Array) -> Fixations:
+def _by_entrance_window(eye: EyeModel, target_mm: Array) -> Fixations:
     """Broyden on the pose, started at the chief ray's; the error is the miss at the fovea across the line of sight."""
     start = _by_chief_ray(eye, target_mm)
     angles = np.stack([start.poses.azimuth_rad, start.poses.elevation_rad], axis=-1)
@@ -217,7 +217,7 @@ def _by_entrance_window(eye: Eye, target_mm: Array) -> Fixations:
     return Fixations(Poses.listing(angles[:, 0], angles[:, 1]), residual, status, entry, way)
 
 
-def _window_miss(eye: Eye, target_mm: Array, angles: Array) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
+def _window_miss(eye: EyeModel, target_mm: Array, angles: Array) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
     """(miss at the fovea (n, 2), point on the cornea, direction to the target, whether there is no such ray)."""
     poses = Poses.listing(angles[:, 0], angles[:, 1])
     seen = join(into_eye(Turning.of(poses), eye, components(target_mm)))
@@ -231,7 +231,7 @@ def _window_miss(eye: Eye, target_mm: Array, angles: Array) -> tuple[Array, Arra
     return np.where(lost[:, None], 0.0, miss), traced.points_mm[1], -direction, lost
 
 
-def entrance_window_centre(eye: Eye, viewpoint_mm: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+def entrance_window_centre(eye: EyeModel, viewpoint_mm: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
     """The centre of the entrance window seen from viewpoints (n, 3) of the eye frame (mm), and where there is none.
 
     c = mean(p_i) - t mean(u_i) with exit points p_i and directions u_i; t makes c come closest to the optic axis.
@@ -251,7 +251,7 @@ def entrance_window_centre(eye: Eye, viewpoint_mm: Array) -> tuple[Array, npt.ND
     return point - length[:, None] * way, lost
 
 
-def _mean_ray(eye: Eye, viewpoint_mm: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+def _mean_ray(eye: EyeModel, viewpoint_mm: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
     """Mean exit point and mean direction (n, 3) of the rays from the stop's margin, and where one does not exist."""
     margin = eye.stop.boundary(WINDOW_POINTS)
     found = apparent_points(eye.front, eye.front_indices, margin, viewpoint_mm[:, None, :])

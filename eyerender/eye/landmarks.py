@@ -13,7 +13,7 @@ from ..geometry.transforms import Array, normalize, read_only
 from ..optics.gradient import GradientMedium
 from ..optics.shooting import connect
 from ..optics.trace import Crossing, RayStatus, Traced, outward_path, trace
-from .model import Eye, LineOfSight
+from .model import EyeModel, LineOfSight
 
 NODE_RING_DEG = 14.3
 """Field angle of the ring of nodal rays whose waist is the node (Harris 2010, example 3)."""
@@ -21,7 +21,7 @@ NODE_RAYS = 16
 NODE_DISTANCE_MM = 1500.0
 
 
-def path_to_retina(eye: Eye) -> tuple[Crossing, ...]:
+def path_to_retina(eye: EyeModel) -> tuple[Crossing, ...]:
     """All crossings from air to the retina; light ends there, so the last one does not bend it."""
     last = eye.back_indices[-1] if eye.back else eye.front_indices[-1]
     lens = zip(eye.back, eye.back_indices, eye.back_rims_mm, eye.back_passing, _through(eye, 1), strict=True)
@@ -35,12 +35,12 @@ def path_to_retina(eye: Eye) -> tuple[Crossing, ...]:
     )
 
 
-def _through(eye: Eye, last: int) -> list[GradientMedium | None]:
+def _through(eye: EyeModel, last: int) -> list[GradientMedium | None]:
     """What lies before each surface of the lens on a way on which a gradient lens ends with its surface `last`."""
     return [eye.lens_gradient if k == last else None for k in range(len(eye.back))]
 
 
-def nodal_rays(eye: Eye, objects_mm: Array, guess_mm: Array) -> tuple[Array, Array]:
+def nodal_rays(eye: EyeModel, objects_mm: Array, guess_mm: Array) -> tuple[Array, Array]:
     """The rays from objects (m, 3) that reach the retina parallel to themselves: directions (m, 3), retina points (m,
     3).
 
@@ -87,7 +87,7 @@ def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
     )
 
 
-def incident_node(eye: Eye) -> Array:
+def incident_node(eye: EyeModel) -> Array:
     """The waist of a ring of nodal rays (3,).
 
     16 nodal rays from (h, v) = 14.3 deg (sin f, cos f), objects 1500 mm from the apex; the node is the mean of the
@@ -109,7 +109,7 @@ def incident_node(eye: Eye) -> Array:
     return np.asarray(np.mean(middle, axis=0))
 
 
-def fovea_by_nodal_ray(eye: Eye, node_mm: Array, field_rad: Array, distance_mm: float) -> Array:
+def fovea_by_nodal_ray(eye: EyeModel, node_mm: Array, field_rad: Array, distance_mm: float) -> Array:
     """Where the nodal ray from the field direction (h nasal, v up) meets the retina, (3,).
 
     The object lies in the direction (1, tan h, tan v) from the incident node, `distance_mm` from the corneal apex.
@@ -121,7 +121,7 @@ def fovea_by_nodal_ray(eye: Eye, node_mm: Array, field_rad: Array, distance_mm: 
     return np.asarray(retina[0])
 
 
-def chief_ray_in_air(eye: Eye, fovea_mm: Array) -> LineOfSight:
+def chief_ray_in_air(eye: EyeModel, fovea_mm: Array) -> LineOfSight:
     """The ray that leaves the fovea, passes the stop's centre and goes out into the air.
 
     It is fixed in the eye, so that fixation by chief ray only has to turn the eye until it meets the target.

@@ -30,7 +30,7 @@ _FALL = -2.0
 Shift = Annotated[float, Field(ge=-0.5, le=0.5)]
 
 
-class PupilMarginSpec(Spec):
+class PupilMargin(Spec):
     """The margin of the pupil and its shift, in place of those of the eye file; a left eye has the mirror image.
 
     With a `seed` or a `contour` the outline is that about a circle, else it stays the eye file's.

@@ -28,7 +28,7 @@ import trimesh
 
 from ..arrays import Floats, Ints
 from ..geometry.surfaces import Surface
-from .model import Eye
+from .model import EyeModel
 from .shells import shelled
 
 _LENS_RADIUS_MM = 4.5
@@ -63,7 +63,7 @@ class EyeMeshes:
     bodies: dict[str, Any] = field(default_factory=dict)
 
 
-def eye_meshes(eye: Eye, rings: int = 48, sectors: int = 128) -> EyeMeshes:
+def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
     """All meshes of an eye, in the eye frame (mm); a gradient lens is made of shells."""
     eye = shelled(eye)
     angle = 2 * np.pi * np.arange(sectors) / sectors
@@ -158,7 +158,7 @@ def _band(
     return Patch(name, vertices, np.asarray(mesh.vertex_normals), faces, exterior, interior)
 
 
-def _chamber_rim(eye: Eye, surface: Surface, angle: Floats) -> Floats:
+def _chamber_rim(eye: EyeModel, surface: Surface, angle: Floats) -> Floats:
     """Radius (sectors,) at which the posterior cornea meets the plane of the iris, at most the limbus'."""
     low, high = np.zeros_like(angle), np.full_like(angle, float(eye.limbus_radius_mm) * 0.995)
     for _ in range(60):
@@ -170,7 +170,7 @@ def _chamber_rim(eye: Eye, surface: Surface, angle: Floats) -> Floats:
     return low
 
 
-def _lenses(eye: Eye, outside: float, rings: int, sectors: int, angle: Floats) -> list[tuple[Patch, Patch, Patch]]:
+def _lenses(eye: EyeModel, outside: float, rings: int, sectors: int, angle: Floats) -> list[tuple[Patch, Patch, Patch]]:
     """(front, equator, back) of the lens and of every shell inside it; all facing out of the lens."""
     found = []
     count = len(eye.back) // 2
@@ -208,7 +208,7 @@ def _meeting(front: Surface, back: Surface, rim: float, angle: Floats) -> float:
     return low
 
 
-def _retinal_wall(eye: Eye, depth: float, rings: int, sectors: int, angle: Floats) -> tuple[Patch, Floats]:
+def _retinal_wall(eye: EyeModel, depth: float, rings: int, sectors: int, angle: Floats) -> tuple[Patch, Floats]:
     """The sphere 1 mm inside the sclera from the plane x = depth to its back pole, and its first ring."""
     centre, radius = np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm) - _WALL_MM
     start = np.arccos(np.clip((depth - centre[0]) / radius, -1, 1))
@@ -217,7 +217,7 @@ def _retinal_wall(eye: Eye, depth: float, rings: int, sectors: int, angle: Float
     return patch, patch.vertices[:sectors]
 
 
-def _sclera(eye: Eye, rim: Floats, rings: int) -> Patch:
+def _sclera(eye: EyeModel, rim: Floats, rings: int) -> Patch:
     """The sclera's sphere from the cornea's rim to its back pole; its first ring is that rim."""
     centre, radius = np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm)
     r = rim - centre
@@ -242,7 +242,7 @@ def _polar(name: str, centre: Floats, radius: float, polar: Floats, angle: Float
     return Patch(name, centre + radius * normals, normals, faces)
 
 
-def _iris(eye: Eye, sectors: int) -> Patch:
+def _iris(eye: EyeModel, sectors: int) -> Patch:
     """The annulus in the stop's plane from the pupil's margin to the root, facing the cornea."""
     inner = eye.stop.boundary(sectors)
     if float(eye.stop.handed) < 0:
@@ -267,7 +267,7 @@ def _closed(*parts: tuple[Patch, int]) -> Any:
     return mesh
 
 
-def crossing(eye: Eye, meshes: EyeMeshes, tolerance_mm: float = 1e-6) -> Sequence[str]:
+def crossing(eye: EyeModel, meshes: EyeMeshes, tolerance_mm: float = 1e-6) -> Sequence[str]:
     """Names of refracting patches that poke through the next surface outside them; empty for a sound eye."""
     eye = shelled(eye)
     order: list[tuple[str, Surface]] = [("cornea_front", eye.front[0])]

@@ -15,7 +15,7 @@ from ..optics.gradient import GradientMedium
 from ..optics.interface import Number
 from .spec import EyeSpec, Side
 
-__all__ = ["Eye", "EyeSpec", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
+__all__ = ["EyeModel", "EyeSpec", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
 
 
 def _no_contour() -> Array:
@@ -134,7 +134,7 @@ class LineOfSight(ArrayValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Eye(ArrayValue):
+class EyeModel(ArrayValue):
     """An eye in the eye frame, at one wavelength and with one pupil.
 
     front, front_indices : refracting surfaces between air and the stop, outside in; the index behind each.

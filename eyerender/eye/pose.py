@@ -20,7 +20,7 @@ import numpy.typing as npt
 from ..arrays import ArrayValue
 from ..geometry.surfaces import Xyz
 from ..geometry.transforms import Array, read_only, rotation_x, rotation_y, rotation_z
-from .model import Eye
+from .model import EyeModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +62,7 @@ def rotation_matrices(poses: Poses) -> Array:
     return np.asarray(rotation_z(poses.azimuth_rad) @ rotation_y(-poses.elevation_rad) @ rotation_x(poses.torsion_rad))
 
 
-def rigid_motion(poses: Poses, eye: Eye) -> tuple[Array, Array]:
+def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Array, Array]:
     """(M (n, 3, 3), t (n, 3)): x_turned = M x + t in the eye frame.
 
     The world's point is x_turned + the eye's position + the head's position. `eye` may be a batch of n.
@@ -93,7 +93,7 @@ class Turning(NamedTuple):
         )
 
 
-def into_eye(turning: Turning, eye: Eye, point: Xyz) -> Xyz:
+def into_eye(turning: Turning, eye: EyeModel, point: Xyz) -> Xyz:
     """Where points (n,) of the space around the eye lie for the turned eye: the inverse of the rigid motion."""
     ca, ce, ct = (_split(c) for c in _centres(eye))
     (cos_a, sin_a), (cos_e, sin_e), (cos_t, sin_t) = turning
@@ -106,7 +106,7 @@ def into_eye(turning: Turning, eye: Eye, point: Xyz) -> Xyz:
     return x + ct[0], y + ct[1], z + ct[2]
 
 
-def _centres(eye: Eye) -> tuple[Array, Array, Array]:
+def _centres(eye: EyeModel) -> tuple[Array, Array, Array]:
     r = eye.rotation
     return r.azimuth_centre_mm, r.elevation_centre_mm, r.torsion_centre_mm
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..geometry.surfaces import Surface
 from ..geometry.transforms import Array
 from ..optics.interface import Number
-from .model import Eye
+from .model import EyeModel
 
 SHELLS = 21
 """Shells a half where a lens has to be made of bodies: in meshes and drawings."""
@@ -56,7 +56,7 @@ def even_layers(count: int) -> Layers:
     return Layers(np.sqrt(1.0 - steps / count), (steps + 0.5) / count)
 
 
-def shelled(eye: Eye, count: int = SHELLS) -> Eye:
+def shelled(eye: EyeModel, count: int = SHELLS) -> EyeModel:
     """A single eye with its gradient lens made of shells; any other eye as it is."""
     gradient = eye.lens_gradient
     if gradient is None:

@@ -15,7 +15,7 @@ from pydantic import Discriminator, Field, Tag
 from ..spec import FileSpec, Number, Positive, Spec, Vec2, Vec3
 
 if TYPE_CHECKING:
-    from .model import Eye
+    from .model import EyeModel
 
 # As many surfaces as the finest lens of shells has.
 MAX_SURFACES = 400
@@ -167,7 +167,7 @@ def _lens_tag(value: object) -> str | None:
     return {"surfaces": "SurfaceLensSpec", "gradient": "GradientLensSpec"}.get(str(kind), "UnknownSpec")
 
 
-LensSpec = Annotated[
+Lens = Annotated[
     Annotated[SurfaceLensSpec, Tag("SurfaceLensSpec")] | Annotated[GradientLensSpec, Tag("GradientLensSpec")],
     Discriminator(
         _lens_tag,
@@ -250,7 +250,7 @@ class EyeSpec(FileSpec):
     cornea: tuple[SurfaceSpec, ...] = Field(
         min_length=1, max_length=MAX_SURFACES, description="surfaces between air and the stop"
     )
-    lens: LensSpec | None = None
+    lens: Lens | None = None
     retina: PlacedSpec
     stop: StopSpec
     limbus_radius_mm: Positive = 5.85
@@ -277,7 +277,7 @@ class EyeSpec(FileSpec):
 
     def build(
         self, *, eye: Side = "right", wavelength_nm: float = 850.0, pupil_diameter_mm: float | None = None
-    ) -> Eye:
+    ) -> EyeModel:
         """The numeric model at a wavelength (nm) with a pupil (mm; the file's own if None)."""
         from .build import build_eye
 

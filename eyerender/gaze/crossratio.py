@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Floats
 from ..errors import InputError
 from ..observation import EYES, Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from .estimate import GazePoints, gaze_points
 from .homography import glints_of, homography, transformed
 from .rays import chosen_lights, screen_of
@@ -41,7 +41,7 @@ class CrossRatio:
     tolerance: float = 0.05
     alphas: Mapping[int, Floats] = field(default_factory=dict)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
         """Calibrate alpha_i of each eye on its fixations of the four corner lights (averaged, where repeated).
 
         Raises:
@@ -66,7 +66,7 @@ class CrossRatio:
             found[int(eye)] = alpha
         return replace(self, alphas=found)
 
-    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
         """Gaze points on the screen's plane."""
         if not self.alphas:
             raise InputError("the estimator is not calibrated; call fit first")
@@ -89,7 +89,7 @@ class CrossRatio:
             reason[rows[~ok]] = "three of the glints lie on a line"
         return gaze_points(screen.world(on_screen), reason)
 
-    def _corners_mm(self, rig: Rig) -> Floats:
+    def _corners_mm(self, rig: RigGeometry) -> Floats:
         if len(set(self.corners)) != 4 or self.at_camera in self.corners:
             raise InputError("the cross ratio needs four corner lights and another one at the camera")
         chosen_lights(rig, (*self.corners, self.at_camera), 5)

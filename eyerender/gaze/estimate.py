@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import ArrayValue, Bools, Floats, Objects, frozen
 from ..observation import MISSING, OK, Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,11 +55,11 @@ class GazeRays(ArrayValue):
 class Estimator(Protocol):
     """A gaze estimator; `fit` returns a fitted copy."""
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
         """Calibrate on observations of known targets (n, 3) mm; raises `InputError` where that is impossible."""
         ...
 
-    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
         """Gaze points of observations, one row each."""
         ...
 

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError
 from ..observation import EYES, Observations
-from ..rig.rig import Rig
-from ..rig.screen import Screen
+from ..rig.rig import RigGeometry
+from ..rig.screen import ScreenPlane
 from .cornea import CorneaCentres, from_all_glints, from_plane, optic_axis
 from .estimate import GazePoints, GazeRays, gaze_points
 from .parameters import HUMAN_BOUNDS, MEAN_EYE, NAMES, Calibration, EyeParameters, ParameterBounds
@@ -63,7 +63,7 @@ class GuestrinEizenman:
         known = {k: Calibration(p, p, 0.0, "given", 0, True, "given", ()) for k, p in parameters.items()}
         return replace(self, calibrations=known)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
         """Calibrate R, K, alpha, beta (and n) of each eye by bounded nonlinear least squares.
 
         Raises:
@@ -73,13 +73,13 @@ class GuestrinEizenman:
         return replace(self, calibrations={eye: model.calibrate(self.start) for eye, model in models.items()})
 
     def restarts(
-        self, observations: Observations, targets_mm: ArrayLike, rig: Rig, starts: Sequence[EyeParameters]
+        self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry, starts: Sequence[EyeParameters]
     ) -> dict[int, list[Calibration]]:
         """Calibrations of each eye from several starts, to see whether the search finds one minimum."""
         models = self._models(observations, targets_mm, rig)
         return {eye: [model.calibrate(start) for start in starts] for eye, model in models.items()}
 
-    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
         """Gaze points on the screen's plane."""
         screen = screen_of(rig)
         rays = self.visual_axes(observations, rig)
@@ -88,7 +88,7 @@ class GuestrinEizenman:
         reason[(reason == None) & ~hits] = "the visual axis does not meet the screen"  # noqa: E711
         return gaze_points(screen.world(on_screen), reason)
 
-    def visual_axes(self, observations: Observations, rig: Rig) -> GazeRays:
+    def visual_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Visual axes: from the centre of corneal curvature, in the direction of gaze."""
         optic = self.optic_axes(observations, rig)
         direction = np.full((len(observations), 3), np.nan)
@@ -99,7 +99,7 @@ class GuestrinEizenman:
             direction[rows] = self.turned(optic.direction[rows], np.radians(p[3]) * sign, np.radians(p[4]))
         return GazeRays.of(optic.origin_mm, direction, optic.reason)
 
-    def optic_axes(self, observations: Observations, rig: Rig) -> GazeRays:
+    def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Optic axes: from the centre of corneal curvature through the pupil centre."""
         if not self.calibrations:
             raise InputError("the estimator is not calibrated; call fit first")
@@ -143,7 +143,7 @@ class GuestrinEizenman:
         """Which of the five parameters are calibrated."""
         return np.array([self.free_index or name != "index" for name in NAMES])
 
-    def _models(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> dict[int, _Model]:
+    def _models(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> dict[int, _Model]:
         screen = screen_of(rig)
         targets = np.asarray(targets_mm, dtype=float)
         rays = feature_rays(observations, rig, self.lights, least=2)
@@ -171,7 +171,7 @@ class _Model:
         rays: FeatureRays,
         rows: Ints,
         targets_mm: Floats,
-        screen: Screen,
+        screen: ScreenPlane,
         sign: float,
     ) -> None:
         self.estimator, self.screen, self.sign = estimator, screen, sign

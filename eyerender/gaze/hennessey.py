@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..observation import Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from .estimate import GazePoints, GazeRays
 from .guestrin import GuestrinEizenman
 from .parameters import MEAN_EYE, EyeParameters
@@ -37,18 +37,18 @@ class Hennessey:
     lights: tuple[int, ...] | None = None
     correction: Recalibration | None = field(default=None, repr=False)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
         """Calibrate the correction of each eye; raises `InputError` for fewer than six usable targets."""
         rays = self.optic_axes(observations, rig)
         targets = np.asarray(targets_mm, dtype=float)
         return replace(self, correction=Recalibration(self.recalibration).fit(observations, rays, targets, rig))
 
-    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
         """Gaze points on the screen's plane."""
         correction = self.correction or Recalibration(self.recalibration)
         return correction.apply(observations, self.optic_axes(observations, rig), rig)
 
-    def optic_axes(self, observations: Observations, rig: Rig) -> GazeRays:
+    def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Optic axes of the assumed eye, from the centre of corneal curvature."""
         eyes = {int(e): self.parameters for e in np.unique(observations.index.eye)}
         return GuestrinEizenman(lights=self.lights).with_parameters(eyes).optic_axes(observations, rig)

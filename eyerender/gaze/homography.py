@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Bools, Floats, Objects
 from ..errors import InputError
 from ..observation import EYES, Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from .estimate import GazePoints, gaze_points
 from .rays import chosen_lights, screen_of
 
@@ -44,7 +44,7 @@ class HomographyNormalisation:
     conditioned: bool = True
     homographies: Mapping[int, Floats] = field(default_factory=dict)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
         """Calibrate H_c of each eye; raises `InputError` for fewer than four targets or collinear ones."""
         screen = screen_of(rig)
         targets = np.asarray(targets_mm, dtype=float) - screen.centre_mm
@@ -63,7 +63,7 @@ class HomographyNormalisation:
             found[int(eye)] = H
         return replace(self, homographies=found)
 
-    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
         """Gaze points on the screen's plane."""
         if not self.homographies:
             raise InputError("the estimator is not calibrated; call fit first")
@@ -82,7 +82,7 @@ class HomographyNormalisation:
             reason[at_infinity & (reason == None)] = "the gaze point lies at infinity"  # noqa: E711
         return gaze_points(screen.world(on_screen), reason)
 
-    def normalised(self, observations: Observations, rig: Rig) -> tuple[Floats, Objects]:
+    def normalised(self, observations: Observations, rig: RigGeometry) -> tuple[Floats, Objects]:
         """The pupil centre in the unit square of the glints (n, 2), and why there is none (n,)."""
         chosen_lights(rig, self.lights, 4)
         glints, reason = glints_of(observations, self.lights)

@@ -13,8 +13,8 @@ import numpy as np
 from ..arrays import ArrayValue, Floats, Ints, Objects, frozen
 from ..errors import InputError
 from ..observation import Observations
-from ..rig.rig import Rig
-from ..rig.screen import Screen
+from ..rig.rig import RigGeometry
+from ..rig.screen import ScreenPlane
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +31,9 @@ class FeatureRays(ArrayValue):
     reason: Objects
 
 
-def feature_rays(observations: Observations, rig: Rig, lights: Sequence[int] | None, *, least: int) -> FeatureRays:
+def feature_rays(
+    observations: Observations, rig: RigGeometry, lights: Sequence[int] | None, *, least: int
+) -> FeatureRays:
     """Rays to the pupil centre and to the glints of `lights` (None: all of the rig's).
 
     Raises:
@@ -56,7 +58,7 @@ def feature_rays(observations: Observations, rig: Rig, lights: Sequence[int] | N
     return FeatureRays(frozen(origin), frozen(pupil), frozen(glints), frozen(light_mm), frozen(reason, object))
 
 
-def chosen_lights(rig: Rig, lights: Sequence[int] | None, least: int) -> tuple[int, ...]:
+def chosen_lights(rig: RigGeometry, lights: Sequence[int] | None, least: int) -> tuple[int, ...]:
     """The lights to use, at least `least` different ones of the rig's; raises `InputError`."""
     wanted = tuple(range(len(rig.lights))) if lights is None else tuple(lights)
     if len(set(wanted)) != len(wanted) or any(not 0 <= k < len(rig.lights) for k in wanted):
@@ -66,7 +68,7 @@ def chosen_lights(rig: Rig, lights: Sequence[int] | None, least: int) -> tuple[i
     return wanted
 
 
-def camera_of(observations: Observations, rig: Rig) -> tuple[Ints, Objects]:
+def camera_of(observations: Observations, rig: RigGeometry) -> tuple[Ints, Objects]:
     """The camera of each observation (n,), -1 with a reason (n,) where it is not known; one camera is always known."""
     camera = np.array(observations.index.camera, dtype=np.int64)
     if len(rig.cameras) == 1:
@@ -78,7 +80,7 @@ def camera_of(observations: Observations, rig: Rig) -> tuple[Ints, Objects]:
     return camera, reason
 
 
-def screen_of(rig: Rig) -> Screen:
+def screen_of(rig: RigGeometry) -> ScreenPlane:
     """The rig's screen; raises `InputError` without one."""
     if rig.screen is None:
         raise InputError("this estimator needs a screen in the rig")

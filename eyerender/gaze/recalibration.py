@@ -17,7 +17,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..observation import EYES, Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from .estimate import GazePoints, GazeRays, gaze_points
 from .rays import screen_of
 
@@ -32,7 +32,7 @@ class Recalibration:
     kind: Kind = "angle"
     coefficients: Mapping[int, Floats] = field(default_factory=dict)
 
-    def fit(self, observations: Observations, rays: GazeRays, targets_mm: Floats, rig: Rig) -> Recalibration:
+    def fit(self, observations: Observations, rays: GazeRays, targets_mm: Floats, rig: RigGeometry) -> Recalibration:
         """Calibrate on rays (n) of observations (n) of targets (n, 3) mm.
 
         Raises:
@@ -66,7 +66,7 @@ class Recalibration:
             out[int(eye)] = (solution / scale[:, None]).T
         return Recalibration(self.kind, out)
 
-    def apply(self, observations: Observations, rays: GazeRays, rig: Rig) -> GazePoints:
+    def apply(self, observations: Observations, rays: GazeRays, rig: RigGeometry) -> GazePoints:
         """Corrected gaze points on the screen's plane."""
         screen = screen_of(rig)
         reason = rays.reason.copy()

@@ -12,10 +12,10 @@ from ..arrays import Floats, frozen
 from ..errors import InputError
 from ..files import parse_json, read_text
 from ..observation import Observations
-from ..rig.camera import CalibrationSpec, Camera
-from ..rig.light import MAX_LIGHTS, Light
-from ..rig.rig import MAX_CAMERAS, Rig
-from ..rig.screen import Screen
+from ..rig.camera import CameraCalibration, PinholeCamera
+from ..rig.light import MAX_LIGHTS, Lamp
+from ..rig.rig import MAX_CAMERAS, RigGeometry
+from ..rig.screen import ScreenPlane
 from ..scene import Scene, load_scene
 from ..spec import LARGEST
 
@@ -23,7 +23,7 @@ from ..spec import LARGEST
 MAX_RECORDS_BYTES = 128 * 2**20
 
 
-def load_observations(path: str | Path, scene: str | Scene | None = None) -> tuple[Observations, Rig]:
+def load_observations(path: str | Path, scene: str | Scene | None = None) -> tuple[Observations, RigGeometry]:
     """Observations and rig of a file of records.
 
     The file is JSON as `features` writes it, with the rig inside, or JSONL with one record a line; `scene` gives the
@@ -64,7 +64,7 @@ def _read(text: str, source: str) -> tuple[list[Any], Any]:
     return data["records"], data.get("rig")
 
 
-def rig_from_mapping(data: Any, *, source: str = "") -> Rig:
+def rig_from_mapping(data: Any, *, source: str = "") -> RigGeometry:
     """The rig as `features --json` writes it; raises `InputError` naming the part that is wrong."""
 
     def array(value: Any, shape: tuple[int, ...], path: str) -> Floats:
@@ -93,21 +93,20 @@ def rig_from_mapping(data: Any, *, source: str = "") -> Rig:
         # The same rules as those of a camera in a scene.
         calibration = {"K": K.tolist(), "R": R.tolist(), "t_mm": t.tolist(), "distortion": distortion.tolist()}
         try:
-            CalibrationSpec.from_mapping(calibration)
+            CameraCalibration.from_mapping(calibration)
         except InputError as error:
             raise InputError(error.reason, source=source, path=at) from None
-        cameras.append(Camera.of(K, R, t, (int(size[0]), int(size[1])), distortion))
+        cameras.append(PinholeCamera.of(K, R, t, (int(size[0]), int(size[1])), distortion))
     places = data.get("lights_mm") or []
     if not isinstance(places, list) or len(places) > MAX_LIGHTS:
         raise InputError(f"must be a list of at most {MAX_LIGHTS} points", source=source, path="rig.lights_mm")
     lights = tuple(
-        Light(array(p, (3,), f"rig.lights_mm.{k}"), frozen([1.0, 0.0, 0.0]), 0.0, 1.0, 0.0)
-        for k, p in enumerate(places)
+        Lamp(array(p, (3,), f"rig.lights_mm.{k}"), frozen([1.0, 0.0, 0.0]), 0.0, 1.0, 0.0) for k, p in enumerate(places)
     )
-    return Rig(tuple(cameras), lights, _screen(data.get("screen"), array, source))
+    return RigGeometry(tuple(cameras), lights, _screen(data.get("screen"), array, source))
 
 
-def _screen(data: Any, array: Callable[[Any, tuple[int, ...], str], Floats], source: str) -> Screen | None:
+def _screen(data: Any, array: Callable[[Any, tuple[int, ...], str], Floats], source: str) -> ScreenPlane | None:
     if data is None:
         return None
     if not isinstance(data, dict):
@@ -121,7 +120,7 @@ def _screen(data: Any, array: Callable[[Any, tuple[int, ...], str], Floats], sou
     if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
         raise InputError("right and up must be unit vectors at a right angle", source=source, path="rig.screen")
     centre = array(data.get("centre_mm"), (3,), "rig.screen.centre_mm")
-    return Screen(centre, right, up, (float(w), float(h)))
+    return ScreenPlane(centre, right, up, (float(w), float(h)))
 
 
 def _is_image_line(line: Any) -> bool:

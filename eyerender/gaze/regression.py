@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError
 from ..observation import Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from .estimate import GazePoints, gaze_points
 from .rays import screen_of
 
@@ -106,7 +106,7 @@ class PupilGlintRegression:
             x, y = self.function
         return _terms(x), _terms(y)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
         """Calibrate each eye; raises `InputError` for too few usable targets or targets that do not determine it."""
         screen = screen_of(rig)
         targets = np.asarray(targets_mm, dtype=float) - screen.centre_mm
@@ -138,7 +138,7 @@ class PupilGlintRegression:
         b = self._solve(monomials(u, y_terms), wanted[:, 1], name)
         return EyeFit(origin, scale, a, b)
 
-    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
         """Gaze points on the screen's plane."""
         if not self.fits:
             raise InputError("the estimator is not calibrated; call fit first")

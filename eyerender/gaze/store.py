@@ -15,7 +15,7 @@ from ..errors import InputError, Warn
 from ..files import read_json, shown, write_json
 from ..observation import EYES, Observations
 from ..plausibility import target_warnings
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from ..spec import Positive, Spec
 from .crossratio import CrossRatio
 from .estimate import Estimator, angular_error_deg, binocular_average
@@ -68,7 +68,7 @@ class EstimatorSpec(Spec):
 def fit_estimator(
     spec: EstimatorSpec,
     observations: Observations,
-    rig: Rig,
+    rig: RigGeometry,
     fixations: Sequence[int] | None = None,
     *,
     source: str = "",
@@ -114,7 +114,7 @@ def fit_estimator(
     }
 
 
-def predictions(estimator: Estimator, observations: Observations, rig: Rig) -> dict[str, Any]:
+def predictions(estimator: Estimator, observations: Observations, rig: RigGeometry) -> dict[str, Any]:
     """Gaze points of every observation and of every frame with two eyes (schema eyerender/gaze/1).
 
     Errors are angles at the eye's place, or at the mid-point of the eyes; null without a target or a place.
@@ -154,7 +154,7 @@ def predictions(estimator: Estimator, observations: Observations, rig: Rig) -> d
     return {"schema": PREDICT_SCHEMA, "gaze": single, "binocular": binocular}
 
 
-def save_estimator(path: str | Path, spec: EstimatorSpec, estimator: Estimator, rig: Rig | None = None) -> None:
+def save_estimator(path: str | Path, spec: EstimatorSpec, estimator: Estimator, rig: RigGeometry | None = None) -> None:
     """Write a calibration as JSON, with the rig that it was made on where that is known."""
     write_json(
         path,
@@ -172,7 +172,7 @@ def load_estimator(path: str | Path) -> Estimator:
     return load_calibration(path)[0]
 
 
-def load_calibration(path: str | Path) -> tuple[Estimator, Rig | None]:
+def load_calibration(path: str | Path) -> tuple[Estimator, RigGeometry | None]:
     """Read a calibration back: the estimator, and the rig that it was made on (None where the file does not say).
 
     Raises:

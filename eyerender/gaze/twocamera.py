@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError
 from ..observation import Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from .cornea import line_to_centre
 from .estimate import GazePoints, GazeRays
 from .rays import FeatureRays, feature_rays, unit
@@ -44,7 +44,7 @@ class ShihWuLiu:
     lights: tuple[int, ...] | None = None
     correction: Recalibration | None = field(default=None, repr=False)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: Rig) -> Self:
+    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
         """Calibrate the correction of each eye; raises `InputError` for fewer than six usable targets."""
         rays = self.optic_axes(observations, rig)
         # One row of each pair, so that every fixation counts once.
@@ -55,12 +55,12 @@ class ShihWuLiu:
             self, correction=Recalibration(self.recalibration).fit(observations.take(rows), part, targets, rig)
         )
 
-    def predict(self, observations: Observations, rig: Rig) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
         """Gaze points on the screen's plane."""
         correction = self.correction or Recalibration(self.recalibration)
         return correction.apply(observations, self.optic_axes(observations, rig), rig)
 
-    def optic_axes(self, observations: Observations, rig: Rig) -> GazeRays:
+    def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Optic axes from the centre of corneal curvature, one row an observation."""
         if len(set(self.cameras)) != 2 or not all(0 <= k < len(rig.cameras) for k in self.cameras):
             raise InputError(f"this estimator needs two cameras, the rig has {len(rig.cameras)}")

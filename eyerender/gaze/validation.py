@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import ArrayValue, Bools, Floats, Objects
 from ..errors import InputError
 from ..observation import Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from .estimate import Estimator, GazePoints, angular_error_deg, binocular_average, gaze_points
 
 
@@ -42,7 +42,7 @@ class GazeErrors(ArrayValue):
         return float(self.error_deg[self.ok].max()) if self.ok.any() else None
 
 
-def leave_one_target_out(estimator: Estimator, observations: Observations, rig: Rig) -> GazeErrors:
+def leave_one_target_out(estimator: Estimator, observations: Observations, rig: RigGeometry) -> GazeErrors:
     """Errors of each target estimated by a calibration on all the others.
 
     A residual at the calibration targets themselves would flatter every estimator with many terms.

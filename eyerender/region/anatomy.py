@@ -28,7 +28,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from ..spec import Spec
-from .headspec import HeadSpec
+from .headspec import Head
 
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -37,7 +37,7 @@ def _number(default: float, low: float, high: float, text: str) -> Any:
     return Field(default=default, ge=low, le=high, description=f"{text}; {low:g} to {high:g}")
 
 
-class FissureSpec(Spec):
+class Fissure(Spec):
     """The palpebral fissure of a relaxed eye that looks straight ahead."""
 
     width_mm: float = _number(28.5, 25.0, 33.0, "canthus to canthus (Knezi, van den Bosch)")
@@ -49,7 +49,7 @@ class FissureSpec(Spec):
     peak: float = _number(0.02, -0.15, 0.15, "place of the upper margin's peak, -1 temporal to 1 nasal (chosen)")
 
 
-class LidSpec(Spec):
+class Lid(Spec):
     """The lids themselves and how they move."""
 
     margin_mm: float = _number(1.9, 1.4, 2.5, "of the upper margin; the lower is thinner (Zhu, and rows of lashes)")
@@ -65,7 +65,7 @@ class LidSpec(Spec):
     bags_mm: float = _number(0.5, 0.0, 1.5, "fullness below the lower lid (chosen)")
 
 
-class LashSpec(Spec):
+class Lashes(Spec):
     """Lashes of both lids."""
 
     upper_count: Annotated[int, Field(ge=0, le=180)] = Field(default=120, description="of the upper lid (textbooks)")
@@ -81,7 +81,7 @@ class LashSpec(Spec):
     albedo: float = _number(0.05, 0.02, 0.5, "at 850 nm; melanin absorbs little there, hair is still dark (chosen)")
 
 
-class BrowSpec(Spec):
+class Brow(Spec):
     """The brow's hairs."""
 
     count: Annotated[int, Field(ge=0, le=700)] = Field(default=470, description="number of hairs (chosen)")
@@ -93,7 +93,7 @@ class BrowSpec(Spec):
     albedo: float = _number(0.18, 0.02, 0.6, "at 850 nm (chosen)")
 
 
-class FaceSpec(Spec):
+class Face(Spec):
     """The face around the lids; differences from the average face."""
 
     brow_ridge_mm: float = _number(0.0, -4.0, 5.0, "ridge further forward (chosen)")
@@ -102,7 +102,7 @@ class FaceSpec(Spec):
     cheek_mm: float = _number(0.0, -4.0, 4.0, "cheek further forward (chosen)")
 
 
-class SkinSpec(Spec):
+class Skin(Spec):
     """How the surfaces look at 850 nm."""
 
     albedo: float = _number(0.55, 0.30, 0.75, "of the skin (chosen; forearms: Cooksey, Allen, Tsai 2017)")
@@ -115,25 +115,25 @@ class SkinSpec(Spec):
     wet_albedo: float = _number(0.40, 0.25, 0.55, "of the margins and the caruncle (chosen)")
 
 
-class TearSpec(Spec):
+class TearFilm(Spec):
     """The tear meniscus along both margins."""
 
     height_mm: float = _number(0.21, 0.0, 0.6, "on the globe (Doughty)")
 
 
-class RegionSpec(Spec):
+class Region(Spec):
     """The eye region of one subject. Without this key a scene shows the bare eye before a matte surround."""
 
-    fissure: FissureSpec = FissureSpec()
-    lids: LidSpec = LidSpec()
-    lashes: LashSpec = LashSpec()
-    brow: BrowSpec = BrowSpec()
-    face: FaceSpec = FaceSpec()
-    skin: SkinSpec = SkinSpec()
-    tears: TearSpec = TearSpec()
+    fissure: Fissure = Fissure()
+    lids: Lid = Lid()
+    lashes: Lashes = Lashes()
+    brow: Brow = Brow()
+    face: Face = Face()
+    skin: Skin = Skin()
+    tears: TearFilm = TearFilm()
     blink: Share = Field(default=0.0, description="closure of the lids, 0 open to 1 shut")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="which hairs, which skin")
-    head: HeadSpec | None = Field(default=None, description="a head mesh of one's own in place of all of this")
+    head: Head | None = Field(default=None, description="a head mesh of one's own in place of all of this")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

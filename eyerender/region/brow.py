@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..arrays import Floats, frozen
-from .anatomy import RegionSpec
+from .anatomy import Region
 from .contour import step
 from .face import face_depth
 from .hairs import Hairs, taper
@@ -20,7 +20,7 @@ POINTS = 5
 
 
 @lru_cache(maxsize=16)
-def brow(spec: RegionSpec) -> Hairs:
+def brow(spec: Region) -> Hairs:
     """The brow of a subject in the region's frame."""
     b = spec.brow
     rng = np.random.default_rng((0xB405, spec.seed))
@@ -53,7 +53,7 @@ def brow(spec: RegionSpec) -> Hairs:
     return Hairs(frozen(points), frozen(taper(length, b.diameter_mm, POINTS)))
 
 
-def brow_band(spec: RegionSpec, s: Floats) -> tuple[Floats, Floats, Floats]:
+def brow_band(spec: Region, s: Floats) -> tuple[Floats, Floats, Floats]:
     """(y, lower z, upper z) of the band at s."""
     b = spec.brow
     y = 21.0 - 46.0 * s
@@ -63,6 +63,6 @@ def brow_band(spec: RegionSpec, s: Floats) -> tuple[Floats, Floats, Floats]:
     return y, low, low + width
 
 
-def _skin(spec: RegionSpec, y: Floats, z: Floats) -> Floats:
+def _skin(spec: Region, y: Floats, z: Floats) -> Floats:
     # Up here nothing but the face is under the hairs; the joint with the lids' shell adds less than a tenth of a mm.
     return face_depth(spec.face, y, z)

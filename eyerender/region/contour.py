@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import ArrayValue, Floats
-from .anatomy import RegionSpec
+from .anatomy import Region
 from .globe import Globe
 
 COLUMNS = 176
@@ -58,7 +58,7 @@ def unit(v: Floats) -> Floats:
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))
 
 
-def canthi(spec: RegionSpec) -> tuple[Floats, Floats]:
+def canthi(spec: Region) -> tuple[Floats, Floats]:
     """(y, z) of the middle of the chord between the canthi, and half the chord from there to the medial one."""
     f = spec.fissure
     tilt = np.radians(f.tilt_deg)
@@ -67,7 +67,7 @@ def canthi(spec: RegionSpec) -> tuple[Floats, Floats]:
     return middle, half
 
 
-def contour(spec: RegionSpec, globe: Globe, columns: int = COLUMNS) -> Contour:
+def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
     """The fissure's contour for a posed globe."""
     angle = 2 * np.pi * np.arange(columns) / columns
     a = np.cos(angle)
@@ -86,7 +86,7 @@ def contour(spec: RegionSpec, globe: Globe, columns: int = COLUMNS) -> Contour:
     return Contour(angle, a, upper, point, normal, away, along_lid, openness)
 
 
-def _outline(spec: RegionSpec, globe: Globe, a: Floats, upper: Floats) -> tuple[Floats, float]:
+def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floats, float]:
     """(y, z) of the inner edge as seen from the front (n, 2), and the openness."""
     f, lids = spec.fissure, spec.lids
     middle, half = canthi(spec)

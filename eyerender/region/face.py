@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from ..arrays import Floats
-from .anatomy import FaceSpec
+from .anatomy import Face
 
 MIDDLE_MM = 31.5
 _Y = np.array([-75.0, -60.0, -46.0, -36.0, -27.0, -19.0, -11.0, 0.0, 10.0, 16.5, 22.0, 27.0, 31.5])
@@ -40,7 +40,7 @@ _DEPTH = np.array([
 ])  # fmt: skip
 
 
-def face_depth(face: FaceSpec, y_mm: Floats, z_mm: Floats) -> Floats:
+def face_depth(face: Face, y_mm: Floats, z_mm: Floats) -> Floats:
     """x (mm) of the face over points (y, z) of the region's frame."""
     off = MIDDLE_MM - y_mm
     # Mirrored, and rounded where the halves meet: as far off as it was beyond a centimetre.
@@ -50,7 +50,7 @@ def face_depth(face: FaceSpec, y_mm: Floats, z_mm: Floats) -> Floats:
 
 
 @lru_cache(maxsize=32)
-def _spline(face: FaceSpec) -> RectBivariateSpline:
+def _spline(face: Face) -> RectBivariateSpline:
     y, z = _Y[None, :], _Z[:, None]
 
     def hill(cy: float, cz: float, wy: float, wz: float) -> Floats:

@@ -26,9 +26,9 @@ from ..arrays import ArrayValue, Floats, Ints, frozen
 from ..errors import InputError
 from ..files import opened, read_bytes, shown
 from ..spec import file_digest
-from .anatomy import RegionSpec
+from .anatomy import Region
 from .globe import Globe
-from .headspec import HeadSpec
+from .headspec import Head
 from .mesh import PARTS, RegionLayout, RegionMesh
 
 HEAD_PARTS = (*PARTS, "head")
@@ -61,8 +61,8 @@ class HeadMesh(ArrayValue):
     left_eye: Floats
 
 
-def load_head(spec: HeadSpec) -> HeadMesh:
-    """Read and check the files of a spec with absolute paths (`HeadSpec.resolved`); kept while they do not change.
+def load_head(spec: Head) -> HeadMesh:
+    """Read and check the files of a spec with absolute paths (`Head.resolved`); kept while they do not change.
 
     Raises:
         InputError: a file that is missing, not readable, or not the one that its check sum belongs to; a part that is
@@ -73,7 +73,7 @@ def load_head(spec: HeadSpec) -> HeadMesh:
     return _loaded(spec, file_states(spec))
 
 
-def file_states(spec: HeadSpec) -> tuple[tuple[int, int], ...]:
+def file_states(spec: Head) -> tuple[tuple[int, int], ...]:
     """Time of change and size of each file of a spec with absolute paths; raises `InputError` where one is missing."""
     states = []
     for file in (*spec.files, *(() if spec.texture is None else (spec.texture,))):
@@ -84,7 +84,7 @@ def file_states(spec: HeadSpec) -> tuple[tuple[int, int], ...]:
 
 
 @lru_cache(maxsize=4)
-def _loaded(spec: HeadSpec, states: tuple[tuple[int, int], ...]) -> HeadMesh:
+def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
     del states
     source = spec.files[0]
     for file, wanted in zip(spec.files, spec.sums, strict=False):
@@ -146,7 +146,7 @@ def placed(head: HeadMesh, globe: Globe, texture: int = 0) -> RegionMesh:
     return RegionMesh(frozen(vertices), frozen(head.normals * mirror), layout, nothing, nothing, nothing, ())
 
 
-def head_map(spec: RegionSpec, head: HeadMesh) -> NDArray[np.float32]:
+def head_map(spec: Region, head: HeadMesh) -> NDArray[np.float32]:
     """The map (rows, columns, 4) of a head: albedo, two slopes (0), gloss; the texture, then a band for each part.
 
     The texture's red channel counts, made linear and relative to its mean over the skin's vertices: the level is that
@@ -195,7 +195,7 @@ def _map_uv(head: HeadMesh, texture: int) -> Floats:
     return np.stack([u, v], axis=-1)
 
 
-def texture_rows(spec: HeadSpec) -> int:
+def texture_rows(spec: Head) -> int:
     """Rows of the texture as the map holds it, 0 without one."""
     return 0 if spec.texture is None else len(_picture(Path(spec.texture), Path(spec.texture).stat().st_mtime_ns))
 
@@ -255,7 +255,7 @@ def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
     return found
 
 
-def _named(spec: HeadSpec, part: str, objects: dict[str, Any], source: str) -> tuple[str, ...]:
+def _named(spec: Head, part: str, objects: dict[str, Any], source: str) -> tuple[str, ...]:
     if spec.parts is None:
         return tuple(objects) if part == "skin" else ()
     names: tuple[str, ...] = getattr(spec.parts, part)
@@ -267,7 +267,7 @@ def _named(spec: HeadSpec, part: str, objects: dict[str, Any], source: str) -> t
     return names
 
 
-def _axes(spec: HeadSpec, source: str) -> Floats:
+def _axes(spec: Head, source: str) -> Floats:
     forward, up = np.array(spec.forward), np.array(spec.up)
     left = np.cross(up, forward)
     if np.linalg.norm(left) <= 1e-6 * np.linalg.norm(up) * np.linalg.norm(forward):

@@ -20,7 +20,7 @@ Names = tuple[Name, ...]
 Sum = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
-class HeadPartsSpec(Spec):
+class HeadParts(Spec):
     """What the mesh's objects are: names of an OBJ's objects (or groups, where it has none), of a PLY its file's stem.
 
     What stands in no list is left out, such as the head's own eyeballs.
@@ -33,7 +33,7 @@ class HeadPartsSpec(Spec):
     head: Names = Field(default=(), description="hair, glasses' frames and other things: 'occluded by head'")
 
 
-class HeadSpec(Spec):
+class Head(Spec):
     """A head mesh in place of the procedural lids, lashes, brow and skin. It does not move with the eye."""
 
     file: Name | Annotated[tuple[Name, ...], Field(min_length=1)] = Field(
@@ -42,7 +42,7 @@ class HeadSpec(Spec):
     unit: Literal["mm", "cm", "m"] | None = Field(default=None, description="of the files' coordinates")
     licence: Name | None = Field(default=None, description="under which the mesh is used")
     sha256: Sum | tuple[Sum, ...] | None = Field(default=None, description="of the files, in their order")
-    parts: HeadPartsSpec | None = Field(default=None, description="default: everything is skin")
+    parts: HeadParts | None = Field(default=None, description="default: everything is skin")
     forward: Vec3 = Field(default=(0.0, 0.0, 1.0), description="where the face looks, in the files' axes")
     up: Vec3 = Field(default=(0.0, 1.0, 0.0), description="the vertical, in the files' axes")
     right_eye: Vec3 | None = Field(default=None, description="centre of the globe, in the files' coordinates")
@@ -83,7 +83,7 @@ class HeadSpec(Spec):
         """The check sums that are given."""
         return () if self.sha256 is None else (self.sha256,) if isinstance(self.sha256, str) else self.sha256
 
-    def resolved(self, base: Path | None) -> HeadSpec:
+    def resolved(self, base: Path | None) -> Head:
         """The same with absolute paths (relative ones start at `base`, or the current folder), a manifest read."""
         base = Path.cwd() if base is None else base.resolve()
         if self.manifest:
@@ -99,7 +99,7 @@ def is_manifest(name: str) -> bool:
     return name.lower().endswith(".json")
 
 
-def read_manifest(path: Path) -> HeadSpec:
+def read_manifest(path: Path) -> Head:
     """What a manifest says, its paths relative to it; read again when the file has changed.
 
     Raises:
@@ -111,7 +111,7 @@ def read_manifest(path: Path) -> HeadSpec:
 
 
 @lru_cache(maxsize=16)
-def _manifest(path: Path, state: tuple[int, int]) -> HeadSpec:
+def _manifest(path: Path, state: tuple[int, int]) -> Head:
     del state
     source = str(path)
     data = read_json(path)
@@ -119,7 +119,7 @@ def _manifest(path: Path, state: tuple[int, int]) -> HeadSpec:
         raise InputError(f"is no manifest of a head; its schema must be {SCHEMA}", source=source)
     if "sha256" not in data:
         raise InputError("missing; a manifest holds the check sums of its files", source=source, path="sha256")
-    spec = HeadSpec.from_mapping({k: v for k, v in data.items() if k != "schema"}, source=source)
+    spec = Head.from_mapping({k: v for k, v in data.items() if k != "schema"}, source=source)
     if spec.manifest:
         raise InputError("names another manifest", source=source, path="file")
     return spec

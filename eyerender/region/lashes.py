@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
-from .anatomy import LashSpec, RegionSpec
+from .anatomy import Lashes, Region
 from .contour import step, unit
 from .globe import Globe
 from .hairs import SEGMENTS, Hairs, taper
@@ -45,13 +45,13 @@ class LashPlan(ArrayValue):
 
 
 @lru_cache(maxsize=16)
-def plan(spec: LashSpec, seed: int) -> LashPlan:
+def plan(spec: Lashes, seed: int) -> LashPlan:
     """The lashes of a subject; upper ones first."""
     parts = [_lid(spec, seed, True), _lid(spec, seed, False)]
     return LashPlan(*(frozen(np.concatenate([p[i] for p in parts])) for i in range(7)))
 
 
-def _lid(spec: LashSpec, seed: int, upper: bool) -> tuple[Floats, ...]:
+def _lid(spec: Lashes, seed: int, upper: bool) -> tuple[Floats, ...]:
     rng = np.random.default_rng((0x1A5, seed, int(upper)))
     count = spec.upper_count if upper else spec.lower_count
     # Beside the nose, from the lacrimal puncta on, margins have none.
@@ -95,7 +95,7 @@ def _lean(a: Floats, group: Ints, clumping: float, length: float) -> Floats:
     return out
 
 
-def lashes(spec: RegionSpec, globe: Globe, sheet: Sheet) -> Hairs:
+def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
     """The lashes of a posed sheet."""
     p = plan(spec.lashes, spec.seed)
     c = sheet.contour

@@ -20,7 +20,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..arrays import ArrayValue, Floats, Ints, frozen
-from .anatomy import RegionSpec
+from .anatomy import Region
 from .contour import COLUMNS, LATERAL, Contour, canthi, contour, step, unit
 from .face import face_depth
 from .globe import Globe
@@ -48,7 +48,7 @@ class Sheet(ArrayValue):
     lash_line: Floats
 
 
-def sheet(spec: RegionSpec, globe: Globe) -> Sheet:
+def sheet(spec: Region, globe: Globe) -> Sheet:
     """The sheet for a posed globe, in the region's frame."""
     c = contour(spec, globe)
     margin, lash_line = _margin(spec, globe, c)
@@ -86,7 +86,7 @@ def grid_normals(vertices: Floats) -> Floats:
     return unit(normal)
 
 
-def margin_width(spec: RegionSpec, c: Contour) -> Floats:
+def margin_width(spec: Region, c: Contour) -> Floats:
     """Thickness of the margin (columns,): it thins towards the canthi; the lower one is thinner (Zhu et al. 2022).
 
     Shut, both are as thick, so that neither overhangs the other's lashes.
@@ -97,7 +97,7 @@ def margin_width(spec: RegionSpec, c: Contour) -> Floats:
     )
 
 
-def _margin(spec: RegionSpec, globe: Globe, c: Contour) -> tuple[Floats, Floats]:
+def _margin(spec: Region, globe: Globe, c: Contour) -> tuple[Floats, Floats]:
     # The upper margin faces down and is seen edge-on from the front; the lower one opens upwards.
     tilt = np.radians(np.where(c.upper > 0, 0.0, 1.0) * 16.0 + spec.lids.margin_tilt_deg)[:, None]
     tilt = tilt * (0.25 + 0.75 * min(c.openness, 1.0))
@@ -112,7 +112,7 @@ def _margin(spec: RegionSpec, globe: Globe, c: Contour) -> tuple[Floats, Floats]
     return rows, rows[-1]
 
 
-def _conjunctiva(spec: RegionSpec, globe: Globe, c: Contour) -> Floats:
+def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     """From under the globe's surface to the inner edge (exclusive)."""
     away = c.point - globe.centre
     distance = np.linalg.norm(away, axis=-1)
@@ -163,7 +163,7 @@ def _spread(c: Contour, y: Floats, z: Floats, y_line: float, nasal: bool) -> Flo
     return out
 
 
-def _skin(spec: RegionSpec, globe: Globe, c: Contour, edge: Floats, lash_line: Floats) -> Floats:
+def _skin(spec: Region, globe: Globe, c: Contour, edge: Floats, lash_line: Floats) -> Floats:
     """Rows from the lash line (exclusive) outwards."""
     crease = _crease(spec, c)
     v, y, z = _spokes(c, crease, lash_line)
@@ -195,7 +195,7 @@ def _spokes(c: Contour, crease: Floats, lash_line: Floats) -> tuple[Floats, Floa
 
 
 @lru_cache(maxsize=8)
-def _at_rest(spec: RegionSpec) -> tuple[Floats, Floats]:
+def _at_rest(spec: Region) -> tuple[Floats, Floats]:
     """y and z (rows, columns) of the skin with the eye open and straight ahead."""
     globe = Globe.sphere()
     c = contour(spec, globe)
@@ -214,7 +214,7 @@ def _border(c: Contour) -> tuple[Floats, Floats]:
     )
 
 
-def _crease(spec: RegionSpec, c: Contour) -> Floats:
+def _crease(spec: Region, c: Contour) -> Floats:
     """Distance (columns,) of the crease from the lash line, mm; below the lower lid that of its own faint crease."""
     lids = spec.lids
     openness = min(c.openness, 1.2)
@@ -242,7 +242,7 @@ def _distances(crease: Floats, length: Floats) -> Floats:
     return np.concatenate([lid, face])
 
 
-def _fold(spec: RegionSpec, c: Contour, v: Floats, crease: Floats, strength: Floats) -> tuple[Floats, Floats]:
+def _fold(spec: Region, c: Contour, v: Floats, crease: Floats, strength: Floats) -> tuple[Floats, Floats]:
     """What the fold adds to the depth, and how far it hangs over the crease (both rows x columns, mm)."""
     lids = spec.lids
     open_ = min(max(c.openness, 0.0), 1.15)
@@ -262,13 +262,13 @@ def _fold(spec: RegionSpec, c: Contour, v: Floats, crease: Floats, strength: Flo
     return lift + bags + line, drop
 
 
-def _fullness(spec: RegionSpec, c: Contour, y: Floats, z: Floats) -> Floats:
+def _fullness(spec: Region, c: Contour, y: Floats, z: Floats) -> Floats:
     """How far the hollow above the lid fills (mm) as the lid comes down and brings its skin and fat along."""
     shut = 1 - min(c.openness, 1.0)
     return np.asarray(spec.lids.fill_mm * shut * np.exp(-(((z - 10.5) / 6.0) ** 2) - ((y - 1.0) / 18.0) ** 4))
 
 
-def skin_depth(spec: RegionSpec, globe: Globe, y: Floats, z: Floats) -> Floats:
+def skin_depth(spec: Region, globe: Globe, y: Floats, z: Floats) -> Floats:
     """x (mm) of the skin over (y, z) without margins and folds: the lids' shell and the face, joined smoothly."""
     centre = 0.5 * (globe.centre + globe.rest)
     dy, dz = y - centre[1], z - centre[2]
@@ -289,7 +289,7 @@ def skin_depth(spec: RegionSpec, globe: Globe, y: Floats, z: Floats) -> Floats:
     return np.asarray(joined - _canthal_hollow(spec, y, z))
 
 
-def _canthal_hollow(spec: RegionSpec, y: Floats, z: Floats) -> Floats:
+def _canthal_hollow(spec: Region, y: Floats, z: Floats) -> Floats:
     """How far the canthal tendons hold the skin about either canthus back, mm."""
     middle, half = canthi(spec)
     out = np.zeros_like(y)

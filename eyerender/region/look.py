@@ -19,7 +19,7 @@ Albedo = Annotated[float, Field(ge=0, le=0.95)]
 Contrast = Annotated[float, Field(ge=0, le=1.5)]
 
 
-class LookSpec(Spec):
+class Look(Spec):
     """Albedos (diffuse reflectance, 0 to 1) and textures; contrast 0 is a uniform surface, 1 the natural texture."""
 
     iris_albedo: Albedo = Field(default=0.30, description="mean over the iris; chosen, see the module")

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 from ..arrays import ArrayValue, Floats, Ints, frozen
-from .anatomy import RegionSpec
+from .anatomy import Region
 from .brow import brow
 from .contour import COLUMNS, Contour, contour
 from .globe import Globe
@@ -69,14 +69,14 @@ class LidMargins(ArrayValue):
     lower_margin: Floats
 
 
-def lid_margins(spec: RegionSpec, globe: Globe) -> LidMargins:
+def lid_margins(spec: Region, globe: Globe) -> LidMargins:
     """The lids' inner edges alone, without the mesh around them."""
     mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
     upper, lower = (frozen(edge * mirror) for edge in _margins(contour(spec, globe)))
     return LidMargins(upper, lower)
 
 
-def region_mesh(spec: RegionSpec, globe: Globe) -> RegionMesh:
+def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
     """The region of a subject around a posed globe."""
     s = sheet(spec, globe)
     tears = meniscus(spec, globe, s)
@@ -101,7 +101,7 @@ def _closed(grid: Floats) -> Floats:
 
 
 @lru_cache(maxsize=16)
-def _brow(spec: RegionSpec) -> tuple[Hairs, Floats, Floats]:
+def _brow(spec: Region) -> tuple[Hairs, Floats, Floats]:
     """The brow, its tubes and their normals; it does not blink."""
     hairs = brow(spec)
     tubes = frozen(hairs.tubes())

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ..arrays import Floats, frozen
-from .anatomy import RegionSpec
+from .anatomy import Region
 from .brow import brow_band
 from .contour import step
 from .globe import Globe
 from .lids import CONJUNCTIVA, LID, MARGIN, ROWS, sheet, skin_depth
-from .look import LookSpec
+from .look import Look
 from .noise import band, furrows, sampled
 
 SHEET_ROWS, BANDS = 960, 64
@@ -48,14 +48,14 @@ def sheet_v(row: Floats) -> Floats:
 @lru_cache(maxsize=1)
 def _texels() -> Floats:
     """Where in the map each row of the sheet stands, in texels: the wider rows lie apart, the more they have."""
-    rest = sheet(RegionSpec(blink=_REFERENCE_BLINK), Globe.sphere()).vertices
+    rest = sheet(Region(blink=_REFERENCE_BLINK), Globe.sphere()).vertices
     width = np.linalg.norm(np.diff(rest, axis=0), axis=-1).mean(axis=1) ** 0.6
     place = np.concatenate([[0.0], np.cumsum(width)])
     return frozen(place / place[-1] * (SHEET_ROWS - 1))
 
 
 @lru_cache(maxsize=4)
-def skin_map(spec: RegionSpec) -> NDArray[np.float32]:
+def skin_map(spec: Region) -> NDArray[np.float32]:
     """The map (rows, columns, 4) of a subject; its blink does not matter."""
     reference = spec.model_copy(update={"blink": _REFERENCE_BLINK})
     rest = sheet(reference, Globe.sphere()).vertices
@@ -107,7 +107,7 @@ def _field(seed: int, y: Floats, z: Floats, across: tuple[float, float], up: tup
     return sampled(band(seed, _TILE, across, up), y, z, _TILE_MM * 2)
 
 
-def _cells(spec: RegionSpec, y: Floats, z: Floats, level: Floats, near: Floats) -> Floats:
+def _cells(spec: Region, y: Floats, z: Floats, level: Floats, near: Floats) -> Floats:
     """Plateaus (about 1) parted by furrows (0): wide fields, on the lids narrow ones drawn out across; both hold finer
     ones.
     """
@@ -125,7 +125,7 @@ def _along_lids(y: Floats, z: Floats) -> Floats:
     return np.asarray(z + 0.017 * np.minimum(y * y, 480.0) * np.tanh(z / 4.0))
 
 
-def _relief(spec: RegionSpec, y: Floats, z: Floats, level: Floats, cells: Floats) -> Floats:
+def _relief(spec: Region, y: Floats, z: Floats, level: Floats, cells: Floats) -> Floats:
     """Height (mm) of cells parted by furrows, and lines along the lids and, at the temple, away from the canthus."""
     skin = spec.skin
     grain = _field(spec.seed + 3, y, z, (60, 200), (60, 200))
@@ -147,7 +147,7 @@ def _from_line(rest: Floats) -> Floats:
     return np.concatenate([way, way[:, :1]], axis=1)
 
 
-def _creases(spec: RegionSpec, y: Floats, out_mm: Floats, upper: Floats) -> Floats:
+def _creases(spec: Region, y: Floats, out_mm: Floats, upper: Floats) -> Floats:
     """Depth, 0 to about 1, of the lids' thin skin's creases, which run along the margin, begin and end, and branch:
     fine ones all over the lid, wider ones where it folds.
     """
@@ -166,7 +166,7 @@ def _creases(spec: RegionSpec, y: Floats, out_mm: Floats, upper: Floats) -> Floa
     return depth
 
 
-def _pores(spec: RegionSpec, y: Floats, z: Floats, near: Floats) -> Floats:
+def _pores(spec: Region, y: Floats, z: Floats, near: Floats) -> Floats:
     """Pits, 0 to 1, a third of a millimetre wide: on cheek, nose and forehead; the lids have next to none."""
     spots = np.maximum(_field(spec.seed + 41, y, z, (20, 42), (20, 42)) - 1.25, 0.0)
     lids = np.exp(-((np.hypot(y / 19.0, z / 13.0)) ** 4)) * near
@@ -191,7 +191,7 @@ def _slopes(height: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
     return np.clip(sy, -0.5, 0.5), np.clip(sz, -0.5, 0.5)
 
 
-def _under_brow(spec: RegionSpec, y: Floats, z: Floats) -> Floats:
+def _under_brow(spec: Region, y: Floats, z: Floats) -> Floats:
     """Loss of light between the brow's hairs, and in the points of short ones below it and between the brows."""
     count = min(spec.brow.count / 470, 1.0)
     along = (21.0 - y) / 46.0
@@ -207,7 +207,7 @@ def _under_brow(spec: RegionSpec, y: Floats, z: Floats) -> Floats:
     return np.asarray(count * np.clip(0.16 * hairs + 0.30 * short * points, 0, 0.5))
 
 
-def _hollows(spec: RegionSpec, y: Floats, z: Floats) -> Floats:
+def _hollows(spec: Region, y: Floats, z: Floats) -> Floats:
     """Loss of light, -0.05 to 0.25, where the face is hollow: by how far it stands behind its own surroundings."""
     at = np.arange(-76.0, 76.5)
     depth = skin_depth(spec, Globe.sphere(), *np.meshgrid(at, at))
@@ -230,7 +230,7 @@ def _veins(seed: int, y: Floats, z: Floats) -> Floats:
 
 
 def _albedo(
-    spec: RegionSpec, y: Floats, z: Floats, rows: Floats, upper: Floats, near: Floats, open_: Floats, flesh: Floats
+    spec: Region, y: Floats, z: Floats, rows: Floats, upper: Floats, near: Floats, open_: Floats, flesh: Floats
 ) -> Floats:
     skin, seed = spec.skin, spec.seed
     slow = _field(seed + 21, y, z, (0, 4), (0, 4))
@@ -257,7 +257,7 @@ def _albedo(
         spots[near_it] -= rng.uniform(0.1, 0.45) * np.exp(-away2 / r**2)
     outer = skin.albedo * tone * np.maximum(spots, 0.3)
     # Where it lies on the globe the conjunctiva is as white as the sclera that it goes on from.
-    white = LookSpec().sclera_albedo
+    white = Look().sclera_albedo
     moist = white + step(rows, 1.0, CONJUNCTIVA - 1.0) * (skin.wet_albedo - white)
     moist = moist * (1 - 0.40 * flesh) * (1 + 0.04 * blotch + 0.04 * fine)
     s = step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN)

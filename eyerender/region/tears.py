@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Floats
-from .anatomy import RegionSpec
+from .anatomy import Region
 from .contour import step
 from .globe import Globe
 from .lids import Sheet
@@ -18,7 +18,7 @@ from .lids import Sheet
 ROWS = 5
 
 
-def meniscus(spec: RegionSpec, globe: Globe, sheet: Sheet) -> Floats:
+def meniscus(spec: Region, globe: Globe, sheet: Sheet) -> Floats:
     """The strip's vertices (ROWS, columns, 3), from the globe to the margin."""
     c = sheet.contour
     on_globe = step(np.abs(np.sin(c.angle)), 0.25, 0.6)

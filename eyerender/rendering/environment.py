@@ -23,7 +23,7 @@ import numpy as np
 from ..arrays import ArrayValue, Floats, frozen
 from ..errors import InputError
 from ..files import opened
-from ..rig.imaging import MapSpec
+from ..rig.imaging import RadianceMap
 from ..spec import file_digest
 from .exr import second_thread
 from .lidshade import LidShade
@@ -162,7 +162,7 @@ def irradiance_harmonics(values: Floats) -> Floats:
     return np.asarray(moments * squares * band, dtype=np.float64)
 
 
-def map_rotation(spec: MapSpec) -> Floats:
+def map_rotation(spec: RadianceMap) -> Floats:
     """M (3, 3) from the map's frame (x its middle, y to the left of it, z up) to the world: Rz(az) Ry(-el) Rx(roll)."""
     az, el, roll = np.radians([spec.azimuth_deg, spec.elevation_deg, spec.roll_deg])
     (ca, sa), (ce, se), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (az, el, roll))
@@ -179,7 +179,7 @@ class Maps:
         self._kept: dict[Any, tuple[Any, Surrounding]] = {}
         self._none = self._sent(Surrounding(frozen(np.zeros((2, 4)), np.float32), frozen(np.zeros(9))))
 
-    def of(self, spec: MapSpec | None) -> tuple[Any, Surrounding]:
+    def of(self, spec: RadianceMap | None) -> tuple[Any, Surrounding]:
         """Texture and map of a spec (its file's path absolute or relative to the current folder)."""
         if spec is None:
             return self._none
@@ -212,7 +212,7 @@ class Ambience:
         self,
         even_mw_mm2: float,
         panels: np.ndarray[Any, np.dtype[np.float64]],
-        spec: MapSpec | None,
+        spec: RadianceMap | None,
         maps: Maps,
         lids: LidShade | None = None,
     ) -> None:

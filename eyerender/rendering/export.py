@@ -19,11 +19,11 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..eye.meshes import Patch, eye_meshes
-from ..eye.model import Eye
-from ..region.anatomy import RegionSpec
+from ..eye.model import EyeModel
+from ..region.anatomy import Region
 from ..region.head import HEAD_PARTS, load_head, placed
 from ..region.mesh import region_mesh
-from ..rig.imaging import AmbientSpec
+from ..rig.imaging import Ambient
 from .frame import RenderJob, globe_of
 
 _BACKDROP_HALF_MM = 500.0
@@ -83,7 +83,7 @@ def export_scene(
     return path
 
 
-def bake_meshes(eye: Eye, folder: str | Path, *, rings: int = 24, sectors: int = 96) -> Path:
+def bake_meshes(eye: EyeModel, folder: str | Path, *, rings: int = 24, sectors: int = 96) -> Path:
     """Write every patch of an eye as PLY, and `manifest.json`: what it is, unit, frame, licence, indices, SHA-256.
 
     Returns:
@@ -129,7 +129,7 @@ def _notes(job: RenderJob) -> list[str]:
         notes.append("Lamps with a lobe other than cos^1 are shown as Lambertian discs.")
     if any(lamp.radius_mm == 0 for lamp in job.lights):
         notes.append("Point lamps: a path tracer cannot light what lies behind the cornea with them.")
-    if job.ambient != AmbientSpec():
+    if job.ambient != Ambient():
         notes.append("Ambient light, panels and the surrounding's map are left out.")
     notes.append("Textures, the limbus' soft rim and the point-spread function are left out.")
     return notes
@@ -196,7 +196,7 @@ def _lamp(root: ET.Element, k: int, position: Floats, axis: Floats, radius: floa
     _value(emitter, "rgb", "radiance", intensity / (np.pi * radius**2))
 
 
-def _region(job: RenderJob, spec: RegionSpec) -> list[tuple[Patch, float]]:
+def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
     """The parts of the eye region or of the head mesh, each with its mean albedo; the sheen is left out."""
     globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
     mesh = region_mesh(spec, globe) if spec.head is None else placed(load_head(spec.head), globe)

@@ -9,17 +9,17 @@ import numpy as np
 
 from ..arrays import ArrayValue, Floats
 from ..errors import InputError
-from ..eye.model import Eye
+from ..eye.model import EyeModel
 from ..geometry.surfaces import Surface
 from ..geometry.surfaces_biconic import Biconic
 from ..geometry.surfaces_quadric import Quadric
-from ..region.anatomy import RegionSpec
+from ..region.anatomy import Region
 from ..region.globe import Globe
-from ..region.look import LookSpec
-from ..rig.camera import Camera
-from ..rig.imaging import AmbientSpec, LensSpec
-from ..rig.light import Light
-from ..rig.sensor import SensorSpec
+from ..region.look import Look
+from ..rig.camera import PinholeCamera
+from ..rig.imaging import Ambient, Lens
+from ..rig.light import Lamp
+from ..rig.sensor import Sensor
 from .parameters import (
     CameraParameters,
     ImageParameters,
@@ -32,7 +32,7 @@ from .parameters import (
     SurfaceParameters,
 )
 
-_SENSOR, _LOOK, _LENS, _AMBIENT = SensorSpec(), LookSpec(), LensSpec(), AmbientSpec()
+_SENSOR, _LOOK, _LENS, _AMBIENT = Sensor(), Look(), Lens(), Ambient()
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
 
@@ -46,22 +46,22 @@ class RenderJob(ArrayValue):
     noise. `purkinje` lists the mirror images of the lamps to show, 1 (the glint) to 4.
     """
 
-    eye: Eye
+    eye: EyeModel
     M: Floats
     t: Floats
-    camera: Camera
+    camera: PinholeCamera
     window: tuple[int, int, int, int]
-    lights: tuple[Light, ...]
-    sensor: SensorSpec = _SENSOR
-    look: LookSpec = _LOOK
+    lights: tuple[Lamp, ...]
+    sensor: Sensor = _SENSOR
+    look: Look = _LOOK
     wavelength_nm: float = 850.0
     seed: int = 0
     labels: bool = True
     purkinje: tuple[int, ...] = (1,)
     apex_mm: Floats | None = None
-    region: RegionSpec | None = None
-    lens: LensSpec = _LENS
-    ambient: AmbientSpec = _AMBIENT
+    region: Region | None = None
+    lens: Lens = _LENS
+    ambient: Ambient = _AMBIENT
 
     @property
     def anchor_mm(self) -> Floats:
@@ -71,7 +71,7 @@ class RenderJob(ArrayValue):
         return np.asarray(self.M @ _GLOBE_CENTRE_MM + self.t - _GLOBE_CENTRE_MM)
 
 
-def globe_of(eye: Eye, M: Floats, t: Floats) -> Globe:
+def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
     """The posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
     sclera = eye.sclera
     return Globe(
@@ -85,7 +85,7 @@ def globe_of(eye: Eye, M: Floats, t: Floats) -> Globe:
     )
 
 
-def kinds(eye: Eye) -> tuple[tuple[bool, bool], ...]:
+def kinds(eye: EyeModel) -> tuple[tuple[bool, bool], ...]:
     """(biconic, tilted) of each refracting surface in front of the iris."""
     return tuple((isinstance(s, Biconic), not np.array_equal(s.rotation, np.eye(3))) for s in eye.front)
 
@@ -144,7 +144,7 @@ def _surface_parameters(surface: Surface, eta: float) -> SurfaceParameters:
     return SurfaceParameters(surface.origin_mm, tuple(_shape(surface)), eta, axes)
 
 
-def boundary_waves(eye: Eye) -> Floats:
+def boundary_waves(eye: EyeModel) -> Floats:
     """Fourier coefficients (k, 2) of the pupil's relative radius over the angle in the stop's plane, as c_k and -s_k.
 
     The stop's own angle runs the other way about for a left eye: f' = pi - f, cos(k f') = (-1)^k cos(k f),
@@ -157,7 +157,7 @@ def boundary_waves(eye: Eye) -> Floats:
     return np.stack([cosines, -sines], axis=1)
 
 
-def panel_table(ambient: AmbientSpec, anchor: Floats) -> Floats:
+def panel_table(ambient: Ambient, anchor: Floats) -> Floats:
     """The panels in the scene's frame, (n, 13): centre, normal to the origin, right, up (over half sizes), radiance.
 
     A panel faces the origin; its width is level.
@@ -175,7 +175,7 @@ def panel_table(ambient: AmbientSpec, anchor: Floats) -> Floats:
     return np.reshape(rows, (-1, 13))
 
 
-def light_table(lights: Sequence[Light], M: Floats, t: Floats) -> Floats:
+def light_table(lights: Sequence[Lamp], M: Floats, t: Floats) -> Floats:
     """The lamps in the eye frame, (n, 10): position, axis, radius, intensity, lobe exponent, inner radius."""
     rows = [
         [*(M.T @ (lamp.position_mm - t)), *(M.T @ lamp.axis), lamp.radius_mm, lamp.intensity_mw_sr,
@@ -185,7 +185,7 @@ def light_table(lights: Sequence[Light], M: Floats, t: Floats) -> Floats:
     return np.reshape(rows, (-1, 10))
 
 
-def ring_radius_mm(lamp: Light) -> float:
+def ring_radius_mm(lamp: Lamp) -> float:
     """The radius of the dark middle of a ring-shaped lamp; 0 for points and discs."""
     return lamp.inner_radius_mm
 

@@ -27,8 +27,8 @@ from ..optics.interface import fresnel
 from ..optics.shooting import ray_tube
 from ..optics.solve import mirrored_rays
 from ..optics.trace import Crossing, RayStatus
-from ..rig.camera import Camera
-from ..rig.light import Light
+from ..rig.camera import PinholeCamera
+from ..rig.light import Lamp
 from .frame import ring_radius_mm
 
 Visibility = Callable[[Floats, Floats], Bools]
@@ -78,10 +78,10 @@ class GlintScene:
     sclera_radius_mm: float
     M: Floats
     t: Floats
-    camera: Camera
+    camera: PinholeCamera
     clear: Visibility
 
-    def images(self, lights: Sequence[Light], sigma_px: float) -> list[Image]:
+    def images(self, lights: Sequence[Lamp], sigma_px: float) -> list[Image]:
         """The image of each lamp, as finely as its size and the point-spread function ask for."""
         if all(lamp.radius_mm == 0 for lamp in lights):
             return self._trace(lights, [POINT] * len(lights))
@@ -98,7 +98,7 @@ class GlintScene:
             nodes.append(quadrature(radial, 4 * radial + 2))
         return self._trace(lights, nodes)
 
-    def _trace(self, lights: Sequence[Light], nodes: Sequence[Nodes]) -> list[Image]:
+    def _trace(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:
         """Images of lamps by the given points of their discs; all lamps in one batch."""
         camera = self.camera
         points = np.concatenate([disc_points(lamp, n) for lamp, n in zip(lights, nodes, strict=True)])
@@ -189,7 +189,7 @@ def quadrature(radial: int, angular: int) -> Nodes:
     return Nodes(point, np.repeat(0.5 * weight, angular) / angular)
 
 
-def disc_points(light: Light, nodes: Nodes) -> Floats:
+def disc_points(light: Lamp, nodes: Nodes) -> Floats:
     """Points (k, 3) of a lamp's disc or ring in the world."""
     axis = light.axis
     e1 = normalize(np.cross(axis, (1.0, 0.0, 0.0) if abs(axis[0]) < 0.6 else (0.0, 1.0, 0.0)))
@@ -202,7 +202,7 @@ def disc_points(light: Light, nodes: Nodes) -> Floats:
     return np.asarray(light.position_mm + offset[:, :1] * e1 + offset[:, 1:] * e2)
 
 
-def distortion_determinant(camera: Camera, x: Floats, y: Floats) -> Floats:
+def distortion_determinant(camera: PinholeCamera, x: Floats, y: Floats) -> Floats:
     """det of d(distorted) / d(undistorted) normalised coordinates."""
     k1, k2, p1, p2, k3 = camera.distortion
     r2 = x * x + y * y

@@ -15,7 +15,7 @@ from .values import Lamp, Lights, Values
 from .view import Textures, View, look_at_skin, meet, outer_albedo
 
 if TYPE_CHECKING:
-    from .region import Skin
+    from .region import SkinGeometry
 
 _LIDS_MM = 18.0  # about the axis of the unrotated eye: the lids, and where lashes cast shadows
 
@@ -80,7 +80,7 @@ class _GroupShading:
     values: Values
     lights: Lights
     textures: Textures
-    skin: Skin
+    skin: SkinGeometry
     scene: mi.Scene
     group: Group
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..region.anatomy import RegionSpec
+from ..region.anatomy import Region
 from ..region.globe import Globe
 from ..region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
-from ..region.headspec import HeadSpec
+from ..region.headspec import Head
 from ..region.mesh import RegionMesh
 from .region import RegionScene
 
@@ -20,7 +20,7 @@ _DEPTH_MM = 4.0
 _RINGS, _TURNS = 40, 240
 
 
-def place_scene(spec: RegionSpec, globe: Globe) -> RegionScene:
+def place_scene(spec: Region, globe: Globe) -> RegionScene:
     """The scene of a spec: its head mesh, or the procedural region."""
     return RegionScene(spec, globe) if spec.head is None else HeadScene(spec, globe)
 
@@ -35,11 +35,11 @@ class HeadScene(RegionScene):
     parts = HEAD_PARTS
     moving = 0  # it keeps still
 
-    def __init__(self, spec: RegionSpec, globe: Globe) -> None:
+    def __init__(self, spec: Region, globe: Globe) -> None:
         super().__init__(spec, globe)
         self._refuse_crossing(spec, globe)
 
-    def show(self, spec: RegionSpec, globe: Globe) -> RegionMesh:
+    def show(self, spec: Region, globe: Globe) -> RegionMesh:
         """Turn to an eye and its pose; the mesh itself moves only with where the globe is at rest."""
         new = self._shown != (spec, globe)
         posed = super().show(spec, globe)
@@ -47,7 +47,7 @@ class HeadScene(RegionScene):
             self._refuse_crossing(spec, globe)
         return posed
 
-    def _posed(self, spec: RegionSpec, globe: Globe) -> RegionMesh:
+    def _posed(self, spec: Region, globe: Globe) -> RegionMesh:
         head = _head(spec)
         key = (head, globe.mirrored, tuple(globe.centre_mm.tolist()))
         if getattr(self, "_stands", None) != key:
@@ -56,10 +56,10 @@ class HeadScene(RegionScene):
         return self._still
 
     @staticmethod
-    def _look(spec: RegionSpec) -> NDArray[np.float32]:
+    def _look(spec: Region) -> NDArray[np.float32]:
         return head_map(spec, load_head(_head(spec)))
 
-    def _refuse_crossing(self, spec: RegionSpec, globe: Globe) -> None:
+    def _refuse_crossing(self, spec: Region, globe: Globe) -> None:
         """Raise where the mesh reaches deeper into the cornea than it may: seen along lines from the globe's centre
         that are 0.15 mm apart on the cornea."""
         head = _head(spec)
@@ -98,7 +98,7 @@ def cornea_depth_mm(place: RegionScene, globe: Globe) -> Floats:
     return np.asarray(_DEPTH_MM - t, dtype=float)
 
 
-def _head(spec: RegionSpec) -> HeadSpec:
+def _head(spec: Region) -> Head:
     if spec.head is None:
         raise ValueError("the region has no head mesh")
     return spec.head

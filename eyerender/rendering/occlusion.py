@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from ..arrays import Bools, Floats
 from ..region.mesh import LidMargins, RegionMesh
-from ..rig.camera import Camera
+from ..rig.camera import PinholeCamera
 
 _BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
 _MARKS = 17
@@ -67,7 +67,7 @@ def visible_arcs_deg(part: NDArray[np.uint8], pupil: int, points_px: Floats, ori
 
 
 def lid_margins_px(
-    region: RegionMesh | LidMargins, camera: Camera, anchor_mm: Floats
+    region: RegionMesh | LidMargins, camera: PinholeCamera, anchor_mm: Floats
 ) -> dict[str, list[list[float]]] | None:
     """Landmarks along the inner edges of both margins, canthus to canthus from temple to nose, full-sensor pixels; None
     for a mesh of which none are known, and where one of them lies behind the camera."""

@@ -22,7 +22,7 @@ _WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class Rectangle:
     """One rectangle of the scene's frame; `right` and `up` are over the half sizes, so that |q . right| < 1 inside."""
 
     centre: mi.Vector3f
@@ -40,15 +40,15 @@ class Panels:
         data = np.ascontiguousarray(table, dtype=np.float32).reshape(-1)
         self._buffer = mi.Float(data if data.size else np.zeros(_WIDTH, np.float32))
 
-    def __getitem__(self, i: mi.UInt32) -> Panel:
+    def __getitem__(self, i: mi.UInt32) -> Rectangle:
         row = [dr.gather(mi.Float, self._buffer, i * _WIDTH + k) for k in range(_WIDTH)]
         centre, normal, right, up = (mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9))
-        return Panel(centre, normal, right, up, row[12])
+        return Rectangle(centre, normal, right, up, row[12])
 
     def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Radiance (mW/mm^2/sr) that rays of the scene's frame meet; panels that overlap add up."""
 
-        def met(panel: Panel) -> mi.Float:
+        def met(panel: Rectangle) -> mi.Float:
             facing = -dr.dot(d, panel.normal)
             t = dr.dot(o - panel.centre, panel.normal) / dr.select(dr.abs(facing) > 1e-6, facing, 1)
             q = o + t * d - panel.centre
@@ -60,7 +60,7 @@ class Panels:
     def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points x with unit normals n of the scene's frame, unshadowed."""
 
-        def received(panel: Panel) -> mi.Float:
+        def received(panel: Rectangle) -> mi.Float:
             right, up = panel.right / dr.squared_norm(panel.right), panel.up / dr.squared_norm(panel.up)
             middle = panel.centre - x
             seen = polygon_irradiance(
@@ -70,7 +70,7 @@ class Panels:
 
         return self._sum(received, mi.Float(0) * n.x, "panel light")
 
-    def _sum(self, share: Callable[[Panel], mi.Float], zero: mi.Float, label: str) -> mi.Float:
+    def _sum(self, share: Callable[[Rectangle], mi.Float], zero: mi.Float, label: str) -> mi.Float:
         def more(i: mi.UInt32, *_: object) -> mi.Bool:
             return i < self.count
 

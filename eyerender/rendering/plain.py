@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..region.mesh import RegionMesh
-from ..rig.camera import Camera
+from ..rig.camera import PinholeCamera
 
 _TILE_PX = 8
 _STEP_PX = 4.0  # between marked points of a curve
@@ -21,7 +21,7 @@ _NEAREST_MM = 3.0  # with hairs nearer to the camera nothing is plain
 
 
 def plain_tiles(
-    region: RegionMesh, camera: Camera, anchor_mm: Floats, window: tuple[int, int, int, int]
+    region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: tuple[int, int, int, int]
 ) -> tuple[Bools, int]:
     """Which tiles (rows, columns) of a window show nothing but skin, and the size of a tile in pixels.
 

@@ -17,19 +17,19 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..errors import InputError
-from ..eye.model import Eye
+from ..eye.model import EyeModel
 from ..geometry.surfaces import Surface, components, join
 from ..optics.gradient import GradientMedium
 from ..optics.interface import fresnel
 from ..optics.purkinje import purkinje_path, purkinje_points
 from ..optics.shooting import ray_tube
 from ..optics.trace import Crossing, Traced, trace
-from ..rig.light import Light
+from ..rig.light import Lamp
 from .glints import GlintScene, Image, Nodes, disc_points, distortion_determinant
 
 
 def purkinje_images(
-    scene: GlintScene, eye: Eye, order: int, lights: Sequence[Light], nodes: Sequence[Nodes]
+    scene: GlintScene, eye: EyeModel, order: int, lights: Sequence[Lamp], nodes: Sequence[Nodes]
 ) -> list[Image]:
     """Images of the lamps by the given points of their discs."""
     camera, M, t = scene.camera, scene.M, scene.t
@@ -81,7 +81,7 @@ def transmittance(path: Sequence[Crossing], traced: Traced, behind: float) -> Fl
     return share
 
 
-def _through_pupil(eye: Eye, points: Floats, corneal: int) -> Bools:
+def _through_pupil(eye: EyeModel, points: Floats, corneal: int) -> Bools:
     """Whether rays cross the plane of the stop inside the pupil, on the way in and out."""
     n, c = eye.stop.normal, eye.stop.centre_mm
     inside = np.ones(points.shape[1], dtype=bool)
@@ -92,7 +92,7 @@ def _through_pupil(eye: Eye, points: Floats, corneal: int) -> Bools:
 
 
 def stack(
-    eye: Eye, order: int
+    eye: EyeModel, order: int
 ) -> tuple[tuple[Surface, ...], tuple[float, ...], tuple[float, ...], tuple[bool, ...], GradientMedium | None]:
     """Surfaces down to the mirror, indices behind, rims, which a ray may pass by, and the gradient before the mirror.
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats
-from ..region.anatomy import RegionSpec
+from ..region.anatomy import Region
 from ..region.globe import Globe
 from ..region.head import file_states
 from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh
@@ -37,7 +37,7 @@ class RegionScene:
     parts: tuple[str, ...] = PARTS
     moving = 3  # parts that the eye moves, the first ones
 
-    def __init__(self, spec: RegionSpec, globe: Globe) -> None:
+    def __init__(self, spec: Region, globe: Globe) -> None:
         posed = self._posed(spec, globe)
         layout = posed.layout
         moved = [int(ends[self.moving - 1]) if self.moving else 0 for ends in (layout.vertex_ends, layout.face_ends)]
@@ -56,18 +56,18 @@ class RegionScene:
         pixels = aligned(self._look(spec).astype(np.float16))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         moving = next((s for s in self.scene.shapes() if s.id() == "shown_moving"), None)
-        self.skin = Skin(look, layout, faces, moving, -1.0 if globe.mirrored else 1.0)
+        self.skin = SkinGeometry(look, layout, faces, moving, -1.0 if globe.mirrored else 1.0)
         self.skin.pose(posed)
-        self._shown: tuple[RegionSpec, Globe] | None = (spec, globe)
+        self._shown: tuple[Region, Globe] | None = (spec, globe)
         self.posed = posed
 
     @staticmethod
-    def key(spec: RegionSpec, globe: Globe) -> tuple[Any, ...]:
+    def key(spec: Region, globe: Globe) -> tuple[Any, ...]:
         """What a scene is made for: a subject and a side, and a head mesh's files as they are."""
         files = () if spec.head is None else file_states(spec.head)
         return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files
 
-    def show(self, spec: RegionSpec, globe: Globe) -> RegionMesh:
+    def show(self, spec: Region, globe: Globe) -> RegionMesh:
         """Move lids and lashes to a pose and a blink."""
         if self._shown != (spec, globe):
             posed = self._posed(spec, globe)
@@ -86,11 +86,11 @@ class RegionScene:
         self._params.update()
         self.skin.pose(posed)
 
-    def _posed(self, spec: RegionSpec, globe: Globe) -> RegionMesh:
+    def _posed(self, spec: Region, globe: Globe) -> RegionMesh:
         return region_mesh(spec, globe)
 
     @staticmethod
-    def _look(spec: RegionSpec) -> NDArray[np.float32]:
+    def _look(spec: Region) -> NDArray[np.float32]:
         return skin_map(spec)
 
     def clear(self, a: Floats, b: Floats) -> Bools:
@@ -129,7 +129,7 @@ class Surface:
     gloss: mi.Float
 
 
-class Skin:
+class SkinGeometry:
     """A posed region as kernels read it: the corners of its triangles, and the map."""
 
     def __init__(

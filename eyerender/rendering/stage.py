@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Bools, frozen
 from ..errors import InputError
-from ..rig.imaging import AmbientSpec
+from ..rig.imaging import Ambient
 from .environment import Ambience, Maps
 from .film import Exposed, Window
 from .frame import RenderJob, boundary_waves, globe_of, kinds, light_table, panel_table, parameters_of
@@ -44,7 +44,7 @@ class Stage:
             bool(np.any(job.camera.distortion)),
             place.obstructed,
             region is not None,
-            job.ambient != AmbientSpec(),
+            job.ambient != Ambient(),
         )
         anchor = job.anchor_mm
         values = Values(structure, parameters_of(job), boundary_waves(job.eye))

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import ArrayValue, Bools, Floats, Ints
-from ..region.look import LookSpec
+from ..region.look import Look
 from ..region.texture import skin_texture
 
 _HALF_MM = 500.0
@@ -46,7 +46,7 @@ class Surround:
         self.obstructed = len(obstacles) > 0
         self._shown: tuple[float, float, float] | None = None
 
-    def show(self, look: LookSpec) -> None:
+    def show(self, look: Look) -> None:
         """Bring the surround to a look: its plane, albedo and unevenness."""
         wanted = (look.backdrop_distance_mm, look.backdrop_albedo, look.backdrop_contrast)
         if wanted == self._shown:

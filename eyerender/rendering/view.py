@@ -19,7 +19,7 @@ from .values import Values
 
 if TYPE_CHECKING:
     from .environment import Ambience
-    from .region import Skin
+    from .region import SkinGeometry
 
 EPSILON_MM = 2e-3  # lengths below are one and the same point in single precision
 _NEAR_MM = 20.0
@@ -70,7 +70,7 @@ class Textures:
 
     iris: mi.Texture2f
     sclera: mi.Texture2f
-    region: Skin | None = None
+    region: SkinGeometry | None = None
     ambience: Ambience | None = None
 
     @classmethod
@@ -92,7 +92,7 @@ def opacity(values: Values, rho: mi.Float) -> mi.Float:
 
 
 def look(
-    values: Values, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, region: Skin | None = None
+    values: Values, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, region: SkinGeometry | None = None
 ) -> View:
     """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris.
 
@@ -178,7 +178,9 @@ def _look_around(
     return replace(view, interaction=interaction)
 
 
-def look_at_skin(values: Values, region: Skin, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, other: mi.Bool) -> View:
+def look_at_skin(
+    values: Values, region: SkinGeometry, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, other: mi.Bool
+) -> View:
     """The view of rays that meet places on triangles of an eye region, where `other`."""
     skin = region.surface(face, uv, other)
     view = _matte(values, skin.point, skin.normal, d, other)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..eye.model import Eye
+from ..eye.model import EyeModel
 from ..eye.shells import shelled
 from ..geometry.surfaces import Surface
 from .style import ANALYTIC, IMAGE, TARGET, figure
@@ -18,7 +18,7 @@ _GRID, _LENS_GRID = 900, 300
 _LENS_MM = 4.8
 
 
-def eye_section(eye: Eye, title: str = "") -> Any:
+def eye_section(eye: EyeModel, title: str = "") -> Any:
     """A matplotlib figure with the horizontal section (from above) and the vertical one (from the temporal side)."""
     with figure(13.0, 5.4, 2) as (fig, axes):
         _draw(axes[0], eye, 1)
@@ -33,7 +33,7 @@ def eye_section(eye: Eye, title: str = "") -> Any:
         return fig
 
 
-def _draw(ax: Any, eye: Eye, across: int) -> None:
+def _draw(ax: Any, eye: EyeModel, across: int) -> None:
     """One section: the plane of x and the coordinate `across` (1: y, 2: z)."""
     centre, radius = np.asarray(eye.sclera.centre_mm), eye.sclera.radius_mm
     low = float(min(centre[0] - radius, eye.fovea_mm[0])) - 1.2
@@ -104,13 +104,13 @@ def _axis_distance(surface: Surface, x: Floats, s: Floats, across: int) -> Float
     return np.hypot(local[..., 1], local[..., 2])
 
 
-def _iris_x(eye: Eye, s: Floats, across: int) -> Floats:
+def _iris_x(eye: EyeModel, s: Floats, across: int) -> Floats:
     """x of the iris' plane over the coordinate across."""
     normal, centre = eye.stop.normal, eye.stop.centre_mm
     return np.asarray(centre[0] - (s - centre[across]) * normal[across] / normal[0])
 
 
-def _iris(ax: Any, eye: Eye, across: int) -> None:
+def _iris(ax: Any, eye: EyeModel, across: int) -> None:
     """The iris and the gap of the pupil, in the section's plane."""
     stop = eye.stop
     axis = np.asarray(stop.rotation)[:, across]

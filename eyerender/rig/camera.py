@@ -26,7 +26,7 @@ Pixels = Annotated[int, Field(gt=0, le=65536)]
 _REST = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-class CalibrationSpec(Spec):
+class CameraCalibration(Spec):
     """A camera as OpenCV calibrates it: x_cam = R x_world + t."""
 
     K: Matrix3 = Field(description="camera matrix, px")
@@ -47,7 +47,7 @@ class CalibrationSpec(Spec):
         return self
 
 
-class CameraSpec(Spec):
+class Camera(Spec):
     """A camera: by place, direction and focal length, or by `calibration`."""
 
     name: str = "camera"
@@ -62,7 +62,7 @@ class CameraSpec(Spec):
     sensor_mm: tuple[Positive, Positive] | None = Field(default=None, description="sensor width and height")
     principal_point_px: Vec2 | None = Field(default=None, description="default: the centre of the sensor")
     distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description="k1, k2, p1, p2, k3 (OpenCV)")
-    calibration: CalibrationSpec | None = None
+    calibration: CameraCalibration | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -96,11 +96,11 @@ class CameraSpec(Spec):
             raise ValueError("focal_length_mm and sensor_mm belong together")
         return self
 
-    def build(self) -> Camera:
+    def build(self) -> PinholeCamera:
         """The numeric camera."""
         if self.calibration is not None:
             c = self.calibration
-            return Camera.of(c.K, c.R, c.t_mm, self.resolution_px, c.distortion, self.name)
+            return PinholeCamera.of(c.K, c.R, c.t_mm, self.resolution_px, c.distortion, self.name)
         width, height = self.resolution_px
         if self.focal_length_px is not None:
             fx = fy = self.focal_length_px
@@ -119,11 +119,11 @@ class CameraSpec(Spec):
         turn = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1.0]])
         R = (axes @ turn).T
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        return Camera.of(K, R, -R @ position, self.resolution_px, self.distortion, self.name)
+        return PinholeCamera.of(K, R, -R @ position, self.resolution_px, self.distortion, self.name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Camera(ArrayValue):
+class PinholeCamera(ArrayValue):
     """A pinhole camera: K (3, 3) px, R (3, 3), t (3,) mm, distortion (k1, k2, p1, p2, k3), resolution (w, h) px."""
 
     K: Floats
@@ -142,7 +142,7 @@ class Camera(ArrayValue):
         resolution_px: tuple[int, int],
         distortion: ArrayLike = (0, 0, 0, 0, 0),
         name: str = "camera",
-    ) -> Camera:
+    ) -> PinholeCamera:
         """A camera from anything array-like."""
         return cls(frozen(K), frozen(R), frozen(t), frozen(distortion), resolution_px, name)
 

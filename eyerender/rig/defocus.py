@@ -16,16 +16,16 @@ from scipy import signal
 
 from ..arrays import Floats
 from ..errors import InputError
-from .camera import Camera
-from .imaging import LensSpec
-from .sensor import SensorSpec
+from .camera import PinholeCamera
+from .imaging import Lens
+from .sensor import Sensor
 
 _FINE = 9
 # Nothing of an eye is left in a picture that is blurred over more, and the kernel grows with the square.
 MAX_CONFUSION_PX = 400
 
 
-def confusion_px(lens: LensSpec, camera: Camera, sensor: SensorSpec, depth_mm: float) -> float:
+def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: float) -> float:
     """Diameter (px) of the circle of confusion of a point at a depth along the axis; `InputError` beyond 400 px."""
     if lens.focus_mm is None:
         return 0.0
@@ -61,7 +61,7 @@ def defocused(picture: Floats, kernel: Floats) -> Floats:
     return np.asarray(np.maximum(signal.fftconvolve(picture, kernel, mode="valid"), 0.0))
 
 
-def vignette(lens: LensSpec, camera: Camera, window: tuple[int, int, int, int]) -> Floats | float:
+def vignette(lens: Lens, camera: PinholeCamera, window: tuple[int, int, int, int]) -> Floats | float:
     """What of the light is left at each pixel of a window."""
     if lens.vignetting == 0:
         return 1.0

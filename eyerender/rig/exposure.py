@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 from scipy import special
 
 from ..arrays import Floats
-from .sensor import SensorSpec
+from .sensor import Sensor
 
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0
 _FEW = 12.0  # below this mean the expansion of a Poisson quantile is not good enough, and probabilities are summed
 
 
-def radiance_to_irradiance(sensor: SensorSpec) -> float:
+def radiance_to_irradiance(sensor: Sensor) -> float:
     """Irradiance (W/m^2) of a pixel per radiance times cos^4 of the field angle (mW/mm^2/sr).
 
     E = pi tau L cos^4(theta) / (4 N^2), N the working f-number.
@@ -22,14 +22,14 @@ def radiance_to_irradiance(sensor: SensorSpec) -> float:
     return 1e3 * np.pi * sensor.lens_transmission / (4 * sensor.f_number**2)
 
 
-def electrons(sensor: SensorSpec, irradiance: Floats, wavelength_nm: float) -> Floats:
+def electrons(sensor: Sensor, irradiance: Floats, wavelength_nm: float) -> Floats:
     """Mean photo-electrons of a pixel: eta E A t lambda / (h c)."""
     area = (sensor.pixel_pitch_um * 1e-6) ** 2
     energy = irradiance * area * sensor.exposure_ms * 1e-3
     return np.asarray(sensor.quantum_efficiency * energy * wavelength_nm * 1e-9 / (_PLANCK_J_S * _LIGHT_M_S))
 
 
-def expose(sensor: SensorSpec, irradiance: Floats, wavelength_nm: float, seed: int) -> NDArray[np.uint16]:
+def expose(sensor: Sensor, irradiance: Floats, wavelength_nm: float, seed: int) -> NDArray[np.uint16]:
     """Digital numbers of an exposure; the noise of a pixel is a pure function of `seed`, its place and its mean.
 
     Scenes that differ little so have the same noise where they agree, and rounding in the last digit of an irradiance,

@@ -9,7 +9,7 @@ from pydantic import Field
 from ..spec import NonNegative, Positive, Spec, Vec2, Vec3
 
 
-class LensSpec(Spec):
+class Lens(Spec):
     """A thin lens out of focus, and the shade towards the picture's corners beyond cos^4."""
 
     focus_mm: Positive | None = Field(
@@ -20,7 +20,7 @@ class LensSpec(Spec):
     )
 
 
-class MotionSpec(Spec):
+class Motion(Spec):
     """What moves during the exposure, evenly about its middle."""
 
     eye_deg_s: Vec2 = Field(default=(0.0, 0.0), description="turn of the eye: azimuth and elevation per second")
@@ -28,7 +28,7 @@ class MotionSpec(Spec):
     steps: Annotated[int, Field(ge=2, le=64)] = Field(default=8, description="moments that are averaged")
 
 
-class PanelSpec(Spec):
+class Panel(Spec):
     """A rectangle that emits evenly to its front, as a screen or a window does; seen mirrored in the cornea."""
 
     centre_mm: Vec3
@@ -36,7 +36,7 @@ class PanelSpec(Spec):
     radiance_w_m2_sr: NonNegative = Field(description="within the camera's filter")
 
 
-class MapSpec(Spec):
+class RadianceMap(Spec):
     """A surrounding, infinitely far away, as a picture over all directions (latitude and longitude, twice as wide as
     high): its upper edge is straight up, its middle the forward direction, and it runs on to the subject's right."""
 
@@ -61,9 +61,9 @@ class MapSpec(Spec):
     )
 
 
-class AmbientSpec(Spec):
+class Ambient(Spec):
     """Light that does not come from the lamps: even from all sides, a surrounding, and panels that face the head."""
 
     irradiance_w_m2: NonNegative = Field(default=0.0, description="on a matte surface, within the camera's filter")
-    panels: Annotated[tuple[PanelSpec, ...], Field(max_length=16)] = ()
-    map: MapSpec | None = Field(default=None, description="an HDR picture of what surrounds the head")
+    panels: Annotated[tuple[Panel, ...], Field(max_length=16)] = ()
+    map: RadianceMap | None = Field(default=None, description="an HDR picture of what surrounds the head")

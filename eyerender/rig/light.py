@@ -13,13 +13,13 @@ from pydantic import Field, model_validator
 
 from ..arrays import ArrayValue, Floats, frozen
 from ..spec import NonNegative, Number, Positive, Spec, Vec3
-from .camera import Camera
+from .camera import PinholeCamera
 
 # Of a rig, those of rings counted one by one: each has a glint in every frame, with a status and a reason.
 MAX_LIGHTS = 1000
 
 
-class RingSpec(Spec):
+class LedRing(Spec):
     """LEDs evenly spaced on a circle about a camera's axis, in the plane of its nodal point."""
 
     camera: Annotated[int, Field(ge=0)] = Field(default=0, description="which camera the ring surrounds")
@@ -28,11 +28,11 @@ class RingSpec(Spec):
     phase_deg: Number = Field(default=0.0, description="of the first LED, from the image's right towards its bottom")
 
 
-class LightSpec(Spec):
+class Led(Spec):
     """One LED at `position_mm`, or a `ring` of equal ones."""
 
     position_mm: Vec3 | None = None
-    ring: RingSpec | None = None
+    ring: LedRing | None = None
     radius_mm: NonNegative = Field(default=0.0, description="radius of the emitting disc; 0 is a point")
     inner_radius_mm: NonNegative = Field(default=0.0, description="of the hole of a ring-shaped emitter")
     aim_mm: Vec3 = Field(default=(0, 0, 0), description="world point its axis goes through")
@@ -49,7 +49,7 @@ class LightSpec(Spec):
             raise ValueError("aim_mm is the light's own position")
         return self
 
-    def build(self, cameras: tuple[Camera, ...]) -> tuple[Light, ...]:
+    def build(self, cameras: tuple[PinholeCamera, ...]) -> tuple[Lamp, ...]:
         """The numeric lights of this entry."""
         if self.position_mm is not None:
             places = [np.array(self.position_mm, dtype=float)]
@@ -63,7 +63,7 @@ class LightSpec(Spec):
             ]
         aim = np.array(self.aim_mm, dtype=float)
         return tuple(
-            Light(
+            Lamp(
                 frozen(p),
                 frozen((aim - p) / np.linalg.norm(aim - p)),
                 self.radius_mm,
@@ -76,7 +76,7 @@ class LightSpec(Spec):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Light(ArrayValue):
+class Lamp(ArrayValue):
     """An LED: position (3,) mm and axis (3,), a unit vector, in the world."""
 
     position_mm: Floats

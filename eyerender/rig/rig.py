@@ -9,20 +9,20 @@ from pydantic import Field, model_validator
 
 from ..arrays import ArrayValue
 from ..spec import Spec
-from .camera import Camera, CameraSpec
-from .light import MAX_LIGHTS, Light, LightSpec
-from .screen import Screen, ScreenSpec
+from .camera import Camera, PinholeCamera
+from .light import MAX_LIGHTS, Lamp, Led
+from .screen import Screen, ScreenPlane
 
 # Each has frames of its own for every target and head position.
 MAX_CAMERAS = 100
 
 
-class RigSpec(Spec):
+class Rig(Spec):
     """What stands before the subject; it does not move with the head."""
 
-    cameras: Annotated[tuple[CameraSpec, ...], Field(min_length=1, max_length=MAX_CAMERAS)]
-    lights: Annotated[tuple[LightSpec, ...], Field(min_length=1, max_length=MAX_LIGHTS)]
-    screen: ScreenSpec | None = None
+    cameras: Annotated[tuple[Camera, ...], Field(min_length=1, max_length=MAX_CAMERAS)]
+    lights: Annotated[tuple[Led, ...], Field(min_length=1, max_length=MAX_LIGHTS)]
+    screen: Screen | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -38,20 +38,20 @@ class RigSpec(Spec):
         """How many lights there are, those of rings counted one by one."""
         return sum(1 if light.ring is None else light.ring.count for light in self.lights)
 
-    def build(self) -> Rig:
+    def build(self) -> RigGeometry:
         """The numeric rig."""
         cameras = tuple(camera.build() for camera in self.cameras)
         lights = tuple(light for spec in self.lights for light in spec.build(cameras))
-        return Rig(cameras, lights, self.screen.build() if self.screen else None)
+        return RigGeometry(cameras, lights, self.screen.build() if self.screen else None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rig(ArrayValue):
+class RigGeometry(ArrayValue):
     """Cameras, lights and, where there is one, the screen."""
 
-    cameras: tuple[Camera, ...]
-    lights: tuple[Light, ...]
-    screen: Screen | None
+    cameras: tuple[PinholeCamera, ...]
+    lights: tuple[Lamp, ...]
+    screen: ScreenPlane | None
 
     def to_mapping(self) -> dict[str, Any]:
         """The rig as `features --json` writes it (docs/formats.md)."""

@@ -12,17 +12,17 @@ from ..arrays import ArrayValue, Bools, Floats, frozen
 from ..spec import Positive, Spec, Vec3
 
 
-class ScreenSpec(Spec):
+class Screen(Spec):
     """A screen by its centre and size."""
 
     centre_mm: Vec3
     size_mm: tuple[Positive, Positive] = Field(description="width and height")
     tilt_deg: float = Field(default=0.0, gt=-90, lt=90, description="its face turned upwards from facing -x")
 
-    def build(self) -> Screen:
+    def build(self) -> ScreenPlane:
         """The numeric screen."""
         a = np.radians(self.tilt_deg)
-        return Screen(
+        return ScreenPlane(
             frozen(self.centre_mm),
             # As the subject sees it: +y is to the left, so the screen's right is -y.
             frozen([0.0, -1.0, 0.0]),
@@ -32,7 +32,7 @@ class ScreenSpec(Spec):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Screen(ArrayValue):
+class ScreenPlane(ArrayValue):
     """Centre (3,) mm, unit vectors to the subject's right and up along the screen, size (w, h) mm."""
 
     centre_mm: Floats

@@ -20,7 +20,7 @@ from ..spec import NonNegative, Positive, Spec
 _WELL_AT_FULL_SCALE = 0.98
 
 
-class SensorSpec(Spec):
+class Sensor(Spec):
     """Lens aperture, exposure and sensor of a camera; `gain_dn_per_e` defaults to full scale at 98 % of the well."""
 
     f_number: Positive = Field(default=2.0, description="working f-number: image distance over aperture diameter")

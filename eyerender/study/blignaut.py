@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..gaze.estimate import angular_error_deg, binocular_average
 from ..gaze.regression import FUNCTIONS, PupilGlintRegression
 from ..observation import Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from ..scene import Scene, SceneSpec, load_scene
 from .authors_estimators import MinimumNormRegression
 from .literature import CALIBRATION_SETS
@@ -103,7 +103,9 @@ def terms(function: str, departures: Collection[str]) -> tuple[str, str]:
     return x, ys[xs.index(x)]
 
 
-def run(observations: Observations, rig: Rig, departures: Collection[str], *, centred: bool = False) -> list[Outcome]:
+def run(
+    observations: Observations, rig: RigGeometry, departures: Collection[str], *, centred: bool = False
+) -> list[Outcome]:
     """Every function calibrated on every set, tested on all targets; `centred` as in `PupilGlintRegression`."""
     out = []
     fixation = observations.index.fixation

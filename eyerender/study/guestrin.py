@@ -15,7 +15,7 @@ from ..arrays import Floats, frozen
 from ..gaze.estimate import GazePoints, angular_error_deg
 from ..gaze.parameters import Calibration, EyeParameters, ParameterBounds
 from ..observation import EYES, Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from ..scene import Scene, SceneSpec, load_scene
 from .authors_estimators import AuthorsGuestrinEizenman
 from .results import Departure, Row, mean_row
@@ -152,7 +152,7 @@ def estimator(departures: Collection[str], *, free_index: bool = False) -> Autho
     )
 
 
-def estimation_rig(rig: Rig, departures: Collection[str]) -> Rig:
+def estimation_rig(rig: RigGeometry, departures: Collection[str]) -> RigGeometry:
     """The rig that the estimator is told: its screen lies 1 mm too far in the authors' software."""
     if "plane" not in departures or rig.screen is None:
         return rig
@@ -169,7 +169,9 @@ def errors_deg(observations: Observations, gaze: GazePoints, departures: Collect
     return angular_error_deg(gaze.point_mm, index.target_mm, index.eye_position_mm + index.head_mm)
 
 
-def run(observations: Observations, rig: Rig, departures: Collection[str], *, free_index: bool = False) -> Outcome:
+def run(
+    observations: Observations, rig: RigGeometry, departures: Collection[str], *, free_index: bool = False
+) -> Outcome:
     """Calibrate at H1 and estimate everywhere."""
     told = estimation_rig(rig, departures)
     central = observations.take(observations.index.head == 0)
@@ -235,7 +237,7 @@ class Restarts:
 
 
 def restarts(
-    outcome: Outcome, rig: Rig, departures: Collection[str], *, starts: int = STARTS, eyes: Sequence[int] = (0,)
+    outcome: Outcome, rig: RigGeometry, departures: Collection[str], *, starts: int = STARTS, eyes: Sequence[int] = (0,)
 ) -> list[Restarts]:
     """Calibrate from random starts within the bounds; of `eyes` that were observed."""
     told = estimation_rig(rig, departures)

@@ -20,7 +20,7 @@ import numpy as np
 from ..arrays import Bools, Floats
 from ..gaze.estimate import angular_error_deg
 from ..observation import Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from ..scene import Scene, SceneSpec, load_scene
 from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
 from .observing import Observing
@@ -38,7 +38,7 @@ class HeadMountedPart:
 
     eye_model: str
     rows: list[Row] = field(default_factory=list)
-    seen: dict[tuple[str, str], tuple[Rig, Observations]] = field(default_factory=dict)
+    seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
     errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import Floats
 from ..comparison import feature_errors
 from ..observation import Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from .budget import paired
 
 ALL_GLINTS = "all glints"
@@ -64,7 +64,7 @@ class GazeDifference:
 
 
 def features(
-    truth: Observations, found: Observations, rig: Rig, protocol: str, observer: str, eye_model: str
+    truth: Observations, found: Observations, rig: RigGeometry, protocol: str, observer: str, eye_model: str
 ) -> list[FeatureDifference]:
     """Differences of the pupil's centre, its semi-axes (where both have them) and each light's glint."""
     errors = feature_errors(truth, found)

@@ -21,7 +21,7 @@ from ..arrays import Floats, Ints, frozen
 from ..errors import InputError
 from ..geometry.ellipse import fit_ellipse_direct, points_on_ellipse
 from ..observation import Observations, concatenate
-from ..rig.camera import Camera
+from ..rig.camera import PinholeCamera
 from ..scene import Scene
 from .images import Shot, StudyImages, shots
 
@@ -63,7 +63,7 @@ class Observing:
         return [] if self.kind == "analytic" else shots(scene, noise=self.kind == "image", facing=facing, spp=spp)
 
 
-def moved(observations: Observations, seen_by: Camera, told: Camera) -> Observations:
+def moved(observations: Observations, seen_by: PinholeCamera, told: PinholeCamera) -> Observations:
     """Pupil ellipses and glints as another camera with the same nodal point has them; covariances are left out."""
 
     def pixels(places: Floats) -> Floats:

@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..observation import Observations
-from ..rig.rig import Rig
+from ..rig.rig import RigGeometry
 from ..scene import Scene
 from . import blignaut, guestrin
 from .clouds import Cloud
@@ -31,7 +31,7 @@ class GuestrinPart:
     rows: list[Row] = field(default_factory=list)
     calibrations: list[dict[str, Any]] = field(default_factory=list)
     means: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
-    seen: dict[tuple[str, str], tuple[Rig, Observations]] = field(default_factory=dict)
+    seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
     errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
     h1_errors: dict[tuple[str, str], Floats] = field(default_factory=dict)
     waterfall: list[WaterfallStep] = field(default_factory=list)
@@ -49,7 +49,7 @@ class BlignautPart:
     rows: list[Row] = field(default_factory=list)
     outcomes: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
     centred: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
-    seen: dict[tuple[str, str], tuple[Rig, Observations]] = field(default_factory=dict)
+    seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
     errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
     clouds: dict[tuple[str, str], Cloud] = field(default_factory=dict)
     waterfall: list[WaterfallStep] = field(default_factory=list)

@@ -18,7 +18,7 @@ from eyerender.geometry.transforms import normalize, tilt_rotation
 from eyerender.optics.purkinje import purkinje_points
 from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import RayStatus, inward_path, trace
-from eyerender.rig.camera import Camera, distort
+from eyerender.rig.camera import PinholeCamera, distort
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 # Reference world (X, Y, Z) = (y, z, x).
@@ -48,7 +48,7 @@ def test_images_agree_with_the_reference_to_1e_7_px(name):
         view = np.array(scene["R_world_from_cam_before_flip"]) @ np.diag([1.0, -1.0, -1.0])
         camera_rotation = view.T @ AXES
         position = AXES.T @ np.array(scene["camera_translation_world"], dtype=float)
-        camera = Camera.of(scene["K"], camera_rotation, -camera_rotation @ position, (4000, 4000))
+        camera = PinholeCamera.of(scene["K"], camera_rotation, -camera_rotation @ position, (4000, 4000))
         lights = np.atleast_2d(np.array(scene["lights_world"], dtype=float)) @ AXES
         eye = spec.build(pupil_diameter_mm=2.0 * record["stop_radius"])
         seen = features(
@@ -88,7 +88,7 @@ def rig(distorted=False):
         rotation = np.stack([right, np.cross(forward, right), forward])
         k = [[3600.0, 0.0, 800.0], [0.0, 3600.0, 600.0], [0.0, 0.0, 1.0]]
         lens = (-0.2, 0.1, 1e-3, -2e-3, 0.05) if distorted else (0.0,) * 5
-        cameras.append(Camera.of(k, rotation, -rotation @ np.array(place), (1600, 1200), lens))
+        cameras.append(PinholeCamera.of(k, rotation, -rotation @ np.array(place), (1600, 1200), lens))
     return cameras, np.array([[560.0, 0.0, -250.0], [600.0, 150.0, 40.0]])
 
 
@@ -112,7 +112,7 @@ def test_moving_the_whole_rig_changes_nothing():
     eyes, which, position, target, camera = batch(("E2", "E5"))
     _, seen = observed(eyes, which, position, target, camera, cameras, lights)
     shift = np.array([130.0, -70.0, 25.0])
-    moved = [Camera.of(c.K, c.R, c.t - c.R @ shift, c.resolution_px) for c in cameras]
+    moved = [PinholeCamera.of(c.K, c.R, c.t - c.R @ shift, c.resolution_px) for c in cameras]
     _, again = observed(eyes, which, position + shift, target + shift, camera, moved, lights + shift)
     # 1e-13 of 600 mm is 5e-10 px at 3600 px focal length.
     assert np.abs(again.points_px - seen.points_px).max() < 1e-8
@@ -126,7 +126,8 @@ def test_turning_camera_lights_and_eye_together_changes_nothing():
     turn = tilt_rotation([0.0, 0.0, angle])
     centre = eye.rotation.azimuth_centre_mm
     turned = [
-        Camera.of(c.K, c.R @ turn.T, c.t + c.R @ centre - c.R @ turn.T @ centre, c.resolution_px) for c in cameras
+        PinholeCamera.of(c.K, c.R @ turn.T, c.t + c.R @ centre - c.R @ turn.T @ centre, c.resolution_px)
+        for c in cameras
     ]
     one = features([eye], [0], Poses.from_degrees(0.0, 0.0), np.zeros((1, 3)), cameras, [0], lights)
     other = features(
@@ -321,13 +322,13 @@ def test_what_cannot_be_seen_has_a_status_and_no_number():
     assert not away.pupil_in_image.any()
     assert not away.glint_in_image.any()
     # Behind the camera.
-    back = Camera.of(
+    back = PinholeCamera.of(
         cameras[0].K, np.diag([-1.0, 1.0, -1.0]) @ cameras[0].R, np.diag([-1.0, 1.0, -1.0]) @ cameras[0].t, (1600, 1200)
     )
     behind = features([eye], [0], Poses.from_degrees(0.0, -20.0), np.zeros((1, 3)), [back], [0], lights)
     assert (behind.pupil_status > max(RayStatus)).all()
     # Off the sensor, but with all its numbers.
-    small = Camera.of(cameras[0].K, cameras[0].R, cameras[0].t, (100, 100))
+    small = PinholeCamera.of(cameras[0].K, cameras[0].R, cameras[0].t, (100, 100))
     off = features([eye], [0], Poses.from_degrees(0.0, -20.0), np.zeros((1, 3)), [small], [0], lights)
     assert (off.pupil_status == 0).all()
     assert np.isfinite(off.centre_px).all()

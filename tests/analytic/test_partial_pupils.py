@@ -17,7 +17,7 @@ from eyerender.eye.pose import Poses
 from eyerender.gaze.regression import pupil_glint_vectors
 from eyerender.observation import MISSING, OK, PARTIAL, Observations
 from eyerender.optics.trace import RayStatus
-from eyerender.rig.camera import Camera
+from eyerender.rig.camera import PinholeCamera
 from eyerender.scene import Scene, SceneSpec
 
 
@@ -27,7 +27,7 @@ def looking_at(place):
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     rotation = np.array([right, np.cross(ahead, right), ahead])
-    return Camera.of([[4000, 0, 320], [0, 4000, 240], [0, 0, 1]], rotation, -rotation @ place, (640, 480))
+    return PinholeCamera.of([[4000, 0, 320], [0, 4000, 240], [0, 0, 1]], rotation, -rotation @ place, (640, 480))
 
 
 def scene(angle_deg, model="E2", azimuth_deg=0.0):

@@ -11,7 +11,7 @@ import pytest
 from eyerender.analytic.observer import observe
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
-from eyerender.eye.margin import HARMONICS, PupilMarginSpec, drawn_contour
+from eyerender.eye.margin import HARMONICS, PupilMargin, drawn_contour
 from eyerender.eye.spec import EyeSpec
 from eyerender.scene import Scene, SceneSpec, load_scene
 
@@ -187,5 +187,5 @@ def test_a_pupil_that_its_margin_makes_too_wide_is_refused():
 
 def test_it_reads_back_equal():
     for data in ({}, {"seed": 4}, {"seed": 4, "noncircularity": 0.02}, {"contour": {"sines": [0.0, 0.01]}}):
-        spec = PupilMarginSpec.from_mapping(data)
-        assert PupilMarginSpec.from_mapping(spec.to_mapping()) == spec
+        spec = PupilMargin.from_mapping(data)
+        assert PupilMargin.from_mapping(spec.to_mapping()) == spec

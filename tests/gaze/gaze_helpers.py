@@ -15,10 +15,10 @@ import numpy as np
 
 from eyerender.arrays import frozen
 from eyerender.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
-from eyerender.rig.camera import Camera
-from eyerender.rig.light import Light
-from eyerender.rig.rig import Rig
-from eyerender.rig.screen import Screen
+from eyerender.rig.camera import PinholeCamera
+from eyerender.rig.light import Lamp
+from eyerender.rig.rig import RigGeometry
+from eyerender.rig.screen import ScreenPlane
 
 DATA = Path(__file__).parents[1] / "data"
 ETS_TO_WORLD = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -64,16 +64,18 @@ def observations(pupil, glints, targets=None, *, eye=None, camera=None, fixation
 
 
 def rig(cameras, lights, screen_centre, size=(400.0, 300.0)):
-    lamps = tuple(Light(frozen(p), frozen([1.0, 0, 0]), 0.0, 1.0, 1.0) for p in np.asarray(lights, dtype=float))
-    screen = Screen(frozen(screen_centre), frozen([0.0, -1.0, 0.0]), frozen([0.0, 0.0, 1.0]), size)
-    return Rig(tuple(cameras), lamps, screen)
+    lamps = tuple(Lamp(frozen(p), frozen([1.0, 0, 0]), 0.0, 1.0, 1.0) for p in np.asarray(lights, dtype=float))
+    screen = ScreenPlane(frozen(screen_centre), frozen([0.0, -1.0, 0.0]), frozen([0.0, 0.0, 1.0]), size)
+    return RigGeometry(tuple(cameras), lamps, screen)
 
 
 def camera_of(trans, focal_px, to_world):
     """A camera of the vectors' convention (4x4 pose, looking along -z, image y up) in this package's."""
     trans = np.asarray(trans, dtype=float)
     R = (to_world @ trans[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
-    return Camera.of([[focal_px, 0, 0], [0, focal_px, 0], [0, 0, 1]], R, -R @ to_world @ trans[:3, 3], (1280, 1024))
+    return PinholeCamera.of(
+        [[focal_px, 0, 0], [0, focal_px, 0], [0, 0, 1]], R, -R @ to_world @ trans[:3, 3], (1280, 1024)
+    )
 
 
 def ets_rig(data):

@@ -16,7 +16,7 @@ from eyerender.gaze.hennessey import Hennessey
 from eyerender.gaze.parameters import EyeParameters, ParameterBounds
 from eyerender.gaze.rays import unit
 from eyerender.gaze.twocamera import ShihWuLiu
-from eyerender.rig.camera import CameraSpec
+from eyerender.rig.camera import Camera
 
 EYE = EyeParameters(7.9, 4.3, 1.3375, 5.2, 1.8)
 LIGHTS = np.array([[615.0, 208.5, 0.0], [615.0, -208.5, 0.0], [640.0, 30.0, 180.0], [600.0, -90.0, -190.0]])
@@ -24,9 +24,7 @@ SCREEN = (650.0, 0.0, 0.0)
 
 
 def camera(x, y, z):
-    return CameraSpec(
-        position_mm=(x, y, z), look_at_mm=(0, 0, 0), focal_length_px=4666.0, resolution_px=(640, 480)
-    ).build()
+    return Camera(position_mm=(x, y, z), look_at_mm=(0, 0, 0), focal_length_px=4666.0, resolution_px=(640, 480)).build()
 
 
 CAMERAS = [camera(615.0, 0.0, -150.5), camera(600.0, -160.0, -120.0)]

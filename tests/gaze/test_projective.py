@@ -9,9 +9,9 @@ from gaze_helpers import observations, rig
 from eyerender.errors import InputError
 from eyerender.gaze.crossratio import CrossRatio
 from eyerender.gaze.homography import HomographyNormalisation, homography, transformed
-from eyerender.rig.camera import CameraSpec
+from eyerender.rig.camera import Camera
 
-CAMERA = CameraSpec(
+CAMERA = Camera(
     position_mm=(600, 0, -100), look_at_mm=(0, 0, 0), focal_length_px=3000, resolution_px=(640, 480)
 ).build()
 # As the subject sees them: top left, top right, bottom right, bottom left; and at the camera.

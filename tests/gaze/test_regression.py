@@ -11,9 +11,9 @@ from eyerender.gaze.estimate import angular_error_deg, binocular_average
 from eyerender.gaze.regression import FUNCTIONS, PupilGlintRegression, pupil_glint_vectors
 from eyerender.gaze.validation import gaze_errors, leave_one_target_out
 from eyerender.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
-from eyerender.rig.rig import RigSpec
+from eyerender.rig.rig import Rig
 
-RIG = RigSpec.from_mapping(
+RIG = Rig.from_mapping(
     {
         "cameras": [
             {"position_mm": [520, 0, -300], "tilt_deg": 30, "focal_length_px": 3571, "resolution_px": [1600, 1200]}

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses, rigid_motion
-from eyerender.region.anatomy import RegionSpec
+from eyerender.region.anatomy import Region
 from eyerender.region.globe import Globe
 from eyerender.region.hairs import SEGMENTS
 from eyerender.region.lids import CONJUNCTIVA, ROWS
@@ -51,7 +51,7 @@ def instance(i):
     rng = np.random.default_rng((0x9E0, i))
     blink = float(rng.choice([0.0, rng.uniform(), 1.0], p=[0.5, 0.4, 0.1]))
     side = ("right", "left")[i % 2]
-    spec = RegionSpec.drawn(i, spread=float(rng.uniform(0.3, 1.0)), blink=blink)
+    spec = Region.drawn(i, spread=float(rng.uniform(0.3, 1.0)), blink=blink)
     eye, globe = posed(MODELS[i % 5], *rng.uniform(-25, 25, 2), side)
     return spec, eye, globe, region_mesh(spec, globe)
 

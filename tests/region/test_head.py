@@ -9,10 +9,10 @@ import pytest
 import trimesh
 
 from eyerender.errors import InputError
-from eyerender.region.anatomy import RegionSpec
+from eyerender.region.anatomy import Region
 from eyerender.region.globe import Globe
 from eyerender.region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
-from eyerender.region.headspec import HeadSpec
+from eyerender.region.headspec import Head
 
 CENTRE_MM = np.array([-13.0, 0.4, 0.1])
 
@@ -30,10 +30,10 @@ def shell(path, scale: float = 1.0) -> trimesh.Trimesh:
     return mesh
 
 
-def spec_of(tmp_path, **more) -> HeadSpec:
+def spec_of(tmp_path, **more) -> Head:
     keys = {"file": "shell.ply", "unit": "mm", "licence": "CC0", "forward": [1, 0, 0], "up": [0, 1, 0],
             "right_eye": [72.0, 20.0, 31.0]}  # fmt: skip
-    return HeadSpec.from_mapping({**keys, **more}).resolved(tmp_path)
+    return Head.from_mapping({**keys, **more}).resolved(tmp_path)
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("mm", 1.0), ("cm", 0.1), ("m", 0.001)])
@@ -100,9 +100,7 @@ def test_groups_name_parts_where_there_are_no_objects(tmp_path):
 def test_each_part_has_its_look(tmp_path):
     shell(tmp_path / "shell.ply")
     spec = spec_of(tmp_path, parts={"lashes": ["shell"]})
-    region = RegionSpec.from_mapping({"lashes": {"albedo": 0.3}, "skin": {"albedo": 0.6}}).model_copy(
-        update={"head": spec}
-    )
+    region = Region.from_mapping({"lashes": {"albedo": 0.3}, "skin": {"albedo": 0.6}}).model_copy(update={"head": spec})
     head = load_head(spec)
     looks, uv = head_map(region, head), placed(head, globe()).layout.uv
     row = (uv[:, 1] * len(looks)).astype(int)
@@ -119,7 +117,7 @@ def test_an_eye_far_from_the_mesh_is_refused(tmp_path):
 READERS = {
     "mesh.ply": lambda folder: load_head(spec_of(folder, file="mesh.ply")),
     "mesh.obj": lambda folder: load_head(spec_of(folder, file="mesh.obj")),
-    "head.json": lambda folder: HeadSpec.from_mapping({"file": "head.json"}).resolved(folder),
+    "head.json": lambda folder: Head.from_mapping({"file": "head.json"}).resolved(folder),
     "skin.png": lambda folder: texture_rows(spec_of(folder, texture="skin.png")),
 }
 

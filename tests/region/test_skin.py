@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.region.anatomy import RegionSpec
+from eyerender.region.anatomy import Region
 from eyerender.region.globe import Globe
 from eyerender.region.lashes import lashes
 from eyerender.region.lids import CONJUNCTIVA, FACE, LID, MARGIN, ROWS, sheet
@@ -13,7 +13,7 @@ from eyerender.region.skin import SHEET_ROWS, sheet_v, skin_map
 
 
 def at(blink, **more):
-    spec = RegionSpec.from_mapping({"seed": 5, "blink": blink, **more})
+    spec = Region.from_mapping({"seed": 5, "blink": blink, **more})
     return spec, sheet(spec, Globe.sphere())
 
 
@@ -59,8 +59,8 @@ def test_texels_are_fine_enough_everywhere():
 
 
 def test_the_map_is_its_specs_and_strengths_darken_their_own_places():
-    spec = RegionSpec.from_mapping({"seed": 6, "skin": {"pores": 1.0, "veins": 1.0}})
-    bare = RegionSpec.from_mapping({"seed": 6, "skin": {"pores": 0.0, "veins": 0.0}})
+    spec = Region.from_mapping({"seed": 6, "skin": {"pores": 1.0, "veins": 1.0}})
+    bare = Region.from_mapping({"seed": 6, "skin": {"pores": 0.0, "veins": 0.0}})
     full, none = skin_map(spec), skin_map(bare)
     skin_map.cache_clear()
     assert np.array_equal(skin_map(spec), full)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from eyerender.region.look import LookSpec
+from eyerender.region.look import Look
 from eyerender.region.texture import iris_texture, sclera_texture, skin_texture
 
 
@@ -47,6 +47,6 @@ def test_the_iris_closes_around_the_pupil():
 
 def test_a_look_refuses_impossible_albedos():
     with pytest.raises(ValidationError):
-        LookSpec(iris_albedo=1.2)
+        Look(iris_albedo=1.2)
     with pytest.raises(ValidationError):
-        LookSpec(limbus_width_mm=-1.0)
+        Look(limbus_width_mm=-1.0)

@@ -6,14 +6,14 @@ import numpy as np
 from matplotlib.path import Path
 from scipy.optimize import least_squares
 
-from eyerender.eye.model import Eye
+from eyerender.eye.model import EyeModel
 from eyerender.optics.solve import apparent_points
 
 RINGS_MM = ((2.1, 3.1), (3.1, 4.1), (4.1, 5.1))
 HARMONICS = 12
 
 
-def flux_on_rings(eye: Eye, lamp_mm: np.ndarray, intensity: float, rays: int = 800) -> np.ndarray:
+def flux_on_rings(eye: EyeModel, lamp_mm: np.ndarray, intensity: float, rays: int = 800) -> np.ndarray:
     """Mean irradiance (mW/mm^2) of rings of the iris by forward tracing in float64: light leaves an isotropic point in
     even steps of solid angle about the eye, is refracted at every surface by Snell's law, and is counted per ring."""
     axis = -lamp_mm / np.linalg.norm(lamp_mm)
@@ -55,7 +55,7 @@ def flux_on_rings(eye: Eye, lamp_mm: np.ndarray, intensity: float, rays: int = 8
     return np.array([power[(rho >= p) & (rho < q)].sum() / (np.pi * (q * q - p * p)) for p, q in RINGS_MM])
 
 
-def ring_points(eye: Eye, p: float, q: float, count: int = 20000) -> np.ndarray:
+def ring_points(eye: EyeModel, p: float, q: float, count: int = 20000) -> np.ndarray:
     k = np.arange(count)
     r = np.sqrt(p * p + (q * q - p * p) * (k + 0.5) / count)
     a = k * np.pi * (3 - np.sqrt(5))

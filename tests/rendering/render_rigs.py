@@ -9,29 +9,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eyerender.eye.catalogue import load_eye
-from eyerender.eye.model import Eye
+from eyerender.eye.model import EyeModel
 from eyerender.eye.pose import Poses, rigid_motion
-from eyerender.region.look import LookSpec
-from eyerender.rig.camera import Camera, CameraSpec
-from eyerender.rig.light import Light, LightSpec, RingSpec
-from eyerender.rig.sensor import SensorSpec
+from eyerender.region.look import Look
+from eyerender.rig.camera import Camera, PinholeCamera
+from eyerender.rig.light import Lamp, Led, LedRing
+from eyerender.rig.sensor import Sensor
 
 if TYPE_CHECKING:
     from eyerender.rendering.frame import RenderJob
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
-BLACK = LookSpec(
+BLACK = Look(
     iris_albedo=0.0, pupil_albedo=0.0, sclera_albedo=0.0, limbus_albedo=0.0, backdrop_albedo=0.0, limbus_width_mm=0.0
 )
-PLAIN = LookSpec(iris_contrast=0.0, sclera_contrast=0.0, backdrop_contrast=0.0)
+PLAIN = Look(iris_contrast=0.0, sclera_contrast=0.0, backdrop_contrast=0.0)
 
 
 @dataclass(frozen=True)
 class LampRig:
     """A camera with its lamps, and the pixel that the apex of an unrotated eye at the origin falls on."""
 
-    camera: Camera
-    lights: tuple[Light, ...]
+    camera: PinholeCamera
+    lights: tuple[Lamp, ...]
 
     def window(self, width: int, height: int, centre_px: Any = None) -> tuple[int, int, int, int]:
         """A window of the sensor about the apex, or about a pixel."""
@@ -41,10 +41,10 @@ class LampRig:
 
 def remote_rig(radius_mm: float = 2.5) -> LampRig:
     """The remote tracker of Blignaut (2014) with a strong LED."""
-    camera = CameraSpec(
+    camera = Camera(
         resolution_px=(1600, 1200), position_mm=(520.0, 0.0, -300.0), tilt_deg=30.0, focal_length_px=3571.43
     ).build()
-    light = LightSpec(position_mm=(560.0, 0.0, -250.0), radius_mm=radius_mm, intensity_mw_sr=450.0)
+    light = Led(position_mm=(560.0, 0.0, -250.0), radius_mm=radius_mm, intensity_mw_sr=450.0)
     return LampRig(camera, light.build((camera,)))
 
 
@@ -52,22 +52,22 @@ def head_rig(radius_mm: float = 0.5, count: int = 6) -> LampRig:
     """A camera 35 mm from the apex, 25 degrees below and 15 degrees temporal, in a ring of LEDs."""
     a, b = np.radians(25.0), np.radians(15.0)
     place = 35.0 * np.array([np.cos(a) * np.cos(b), -np.cos(a) * np.sin(b), -np.sin(a)])
-    camera = CameraSpec(
+    camera = Camera(
         resolution_px=(640, 480), position_mm=tuple(place), look_at_mm=(0.0, 0.0, 0.0), focal_length_px=600.0
     ).build()
-    light = LightSpec(ring=RingSpec(radius_mm=12.0, count=count), radius_mm=radius_mm, intensity_mw_sr=0.3)
+    light = Led(ring=LedRing(radius_mm=12.0, count=count), radius_mm=radius_mm, intensity_mw_sr=0.3)
     return LampRig(camera, light.build((camera,)))
 
 
 RIGS: dict[str, Callable[..., LampRig]] = {"remote": remote_rig, "head": head_rig}
 
 
-def eye_of(model: str, side: str = "right", pupil_mm: float = 4.0) -> Eye:
+def eye_of(model: str, side: str = "right", pupil_mm: float = 4.0) -> EyeModel:
     return load_eye(model).build(eye=side, pupil_diameter_mm=pupil_mm)  # type: ignore[arg-type]
 
 
 def job_of(
-    eye: Eye,
+    eye: EyeModel,
     rig: LampRig,
     window: tuple[int, int, int, int],
     pose_deg: tuple[float, float] = (0.0, 0.0),
@@ -77,7 +77,5 @@ def job_of(
     from eyerender.rendering.frame import RenderJob
 
     M, t = rigid_motion(Poses.from_degrees([pose_deg[0]], [pose_deg[1]]), eye)
-    job = RenderJob(
-        eye, M[0], t[0], rig.camera, window, rig.lights, SensorSpec(noise=False), apex_mm=np.zeros(3), seed=1
-    )
+    job = RenderJob(eye, M[0], t[0], rig.camera, window, rig.lights, Sensor(noise=False), apex_mm=np.zeros(3), seed=1)
     return replace(job, **changes)

@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from eyerender.cli.app import run
 from eyerender.errors import InputError
-from eyerender.rig.imaging import AmbientSpec, MapSpec, PanelSpec
+from eyerender.rig.imaging import Ambient, Panel, RadianceMap
 
 WINDOW = (120, 120)
 
@@ -37,9 +37,9 @@ def patch(height: int, azimuth_deg: float, elevation_deg: float, radius_deg: flo
     return np.where(near, value, 0.0)
 
 
-def ambient_of(path, values, **more) -> AmbientSpec:
+def ambient_of(path, values, **more) -> Ambient:
     np.save(path, values.astype(np.float32))
-    return AmbientSpec(map=MapSpec(file=str(path), **more))
+    return Ambient(map=RadianceMap(file=str(path), **more))
 
 
 def dark_rig() -> LampRig:
@@ -55,7 +55,7 @@ def radiance(renderer, ambient, spp=16, **more):
 
 def test_an_even_map_is_even_light(renderer, tmp_path):
     # E = pi L: the same picture as that of the irradiance itself, mirror, sclera, iris and surround.
-    _, even = radiance(renderer, AmbientSpec(irradiance_w_m2=np.pi * 2.5))
+    _, even = radiance(renderer, Ambient(irradiance_w_m2=np.pi * 2.5))
     ambient = ambient_of(tmp_path / "even.npy", np.full((16, 32), 0.5), scale_w_m2_sr=5.0, azimuth_deg=33.0)
     _, mapped = radiance(renderer, ambient)
     assert even.min() > 0
@@ -109,9 +109,9 @@ def test_a_bright_patch_is_seen_where_a_far_lamp_is(renderer, tmp_path, patch_de
 
 
 def test_brow_and_lids_hide_what_lies_behind_them(renderer, tmp_path):
-    from eyerender.region.anatomy import RegionSpec
+    from eyerender.region.anatomy import Region
 
-    region = RegionSpec.from_mapping({"lashes": {"upper_count": 0, "lower_count": 0}, "brow": {"count": 0}})
+    region = Region.from_mapping({"lashes": {"upper_count": 0, "lower_count": 0}, "brow": {"count": 0}})
     sums = {}
     for elevation in (5.0, 70.0):
         ambient = ambient_of(tmp_path / f"{elevation}.npy", patch(128, 10, elevation, 6, 50.0))
@@ -141,7 +141,7 @@ def test_irradiance_against_the_integral(renderer, tmp_path):
     from eyerender.rendering.environment import Ambience, Maps, map_rotation
 
     rng = np.random.default_rng(5)
-    spec = MapSpec(file=str(tmp_path / "m.npy"), azimuth_deg=40.0, elevation_deg=-20.0, roll_deg=65.0)
+    spec = RadianceMap(file=str(tmp_path / "m.npy"), azimuth_deg=40.0, elevation_deg=-20.0, roll_deg=65.0)
     w = directions(64)
     values = 1 + w[..., 2] + 0.5 * (w[..., 1] > 0.3) * (w[..., 2] > 0)
     np.save(tmp_path / "m.npy", values)
@@ -169,8 +169,8 @@ def test_a_panels_irradiance_against_the_integral(renderer, point, normal):
     from eyerender.rendering.environment import Ambience, Maps
     from eyerender.rendering.frame import panel_table
 
-    panel = PanelSpec(centre_mm=(500.0, 60.0, 90.0), size_mm=(520.0, 290.0), radiance_w_m2_sr=2.0)
-    table = panel_table(AmbientSpec(panels=(panel,)), np.zeros(3))
+    panel = Panel(centre_mm=(500.0, 60.0, 90.0), size_mm=(520.0, 290.0), radiance_w_m2_sr=2.0)
+    table = panel_table(Ambient(panels=(panel,)), np.zeros(3))
     # E = integral of L cos cos' / r^2 dA over 600 x 600 pieces of the panel, those below the horizon dark.
     centre, front = table[0, 0:3], table[0, 3:6]
     right, up = (v / (v @ v) for v in (table[0, 6:9], table[0, 9:12]))
@@ -191,9 +191,9 @@ def test_maps_strength_and_turn_compile_nothing_and_send_nothing_anew(renderer, 
 
     first = ambient_of(tmp_path / "a.npy", patch(64, 20, 10, 10, 5.0))
     radiance(renderer, first)
-    radiance(renderer, AmbientSpec(irradiance_w_m2=1.0))
+    radiance(renderer, Ambient(irradiance_w_m2=1.0))
     other = ambient_of(tmp_path / "b.npy", patch(100, -20, 10, 10, 5.0), scale_w_m2_sr=0.3, azimuth_deg=12.0)
-    panel = PanelSpec(centre_mm=(500.0, 60.0, 90.0), size_mm=(520.0, 290.0), radiance_w_m2_sr=2.0)
+    panel = Panel(centre_mm=(500.0, 60.0, 90.0), size_mm=(520.0, 290.0), radiance_w_m2_sr=2.0)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         radiance(renderer, other)
@@ -267,7 +267,7 @@ def test_files_that_are_no_maps_are_refused(renderer, tmp_path):
         with pytest.raises(InputError, match=words):
             read_map(tmp_path / name)
     with pytest.raises(InputError, match="sha256"):
-        Maps().of(MapSpec(file=str(tmp_path / "good.npy"), sha256="0" * 64))
+        Maps().of(RadianceMap(file=str(tmp_path / "good.npy"), sha256="0" * 64))
 
 
 def test_a_scene_with_a_bad_map_ends_in_one_line(renderer, tmp_path, capsys, monkeypatch):

@@ -10,7 +10,7 @@ from render_oracles import centroid, mirror_pixel
 from render_rigs import BLACK, MODELS, RIGS, eye_of, head_rig, job_of, remote_rig
 
 from eyerender.rendering.surround import Obstacle
-from eyerender.rig.sensor import SensorSpec
+from eyerender.rig.sensor import Sensor
 
 
 @pytest.mark.parametrize("rig_name", RIGS)
@@ -80,9 +80,7 @@ def test_energy_does_not_depend_on_the_point_spread_function(renderer):
     xy = renderer.render(job_of(eye_of("E2"), rig, rig.window(64, 64), look=BLACK), spp=1).glints.xy_px[0]
     sums = [
         renderer.render(
-            job_of(
-                eye_of("E2"), rig, rig.window(64, 64, xy), look=BLACK, sensor=SensorSpec(psf_sigma_px=s, noise=False)
-            ),
+            job_of(eye_of("E2"), rig, rig.window(64, 64, xy), look=BLACK, sensor=Sensor(psf_sigma_px=s, noise=False)),
             spp=1,
         ).irradiance.sum(dtype=float)
         for s in (0.0, 0.5, 1.0, 2.5)

@@ -9,8 +9,8 @@ from eyerender.analytic.observer import observe
 from eyerender.capture import make_renderer, render_windows
 from eyerender.errors import InputError
 from eyerender.rig.defocus import confusion_px, defocused, disc, vignette
-from eyerender.rig.imaging import LensSpec
-from eyerender.rig.sensor import SensorSpec
+from eyerender.rig.imaging import Lens
+from eyerender.rig.sensor import Sensor
 from eyerender.scene import Scene, SceneSpec
 
 pytestmark = pytest.mark.render
@@ -59,19 +59,19 @@ def test_the_disc_is_even_and_centred(diameter):
 
 
 def test_the_circle_of_confusion_follows_similar_triangles():
-    from eyerender.rig.camera import CameraSpec
+    from eyerender.rig.camera import Camera
 
-    camera = CameraSpec.from_mapping(
+    camera = Camera.from_mapping(
         {"position_mm": [600, 0, 0], "look_at_mm": [0, 0, 0], "focal_length_px": 5000, "resolution_px": [640, 480]}
     ).build()
-    sensor = SensorSpec(f_number=4.0, pixel_pitch_um=5.0)
+    sensor = Sensor(f_number=4.0, pixel_pitch_um=5.0)
     focal, aperture, s, z = 25.0, 25.0 / 4, 650.0, 600.0
     # The image of the plane in focus, and of the point, behind the lens: a cone from the aperture to the point's image.
     image_s, image_z = 1 / (1 / focal - 1 / s), 1 / (1 / focal - 1 / z)
     expected = aperture * abs(image_z - image_s) / image_z / 5e-3
-    assert confusion_px(LensSpec(focus_mm=s), camera, sensor, z) == pytest.approx(expected, rel=1e-9)
-    assert confusion_px(LensSpec(focus_mm=z), camera, sensor, z) == 0
-    corner = vignette(LensSpec(vignetting=0.4), camera, (0, 0, 640, 480))
+    assert confusion_px(Lens(focus_mm=s), camera, sensor, z) == pytest.approx(expected, rel=1e-9)
+    assert confusion_px(Lens(focus_mm=z), camera, sensor, z) == 0
+    corner = vignette(Lens(vignetting=0.4), camera, (0, 0, 640, 480))
     assert corner[0, 0] == pytest.approx(0.6, abs=1e-9)
     assert corner[239:241, 319:321].min() > 0.9999
 

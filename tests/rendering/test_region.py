@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from eyerender.analytic.observer import observe
 from eyerender.capture import make_renderer, render_windows
-from eyerender.region.anatomy import RegionSpec
+from eyerender.region.anatomy import Region
 from eyerender.rendering.occlusion import glint_reason, visible_arcs_deg
 from eyerender.scene import Scene, SceneSpec
 
@@ -204,7 +204,7 @@ def test_arcs_of_a_half_hidden_disc():
 
 
 def test_drawn_subjects_are_valid_and_differ():
-    a, b, again = RegionSpec.drawn(1), RegionSpec.drawn(2), RegionSpec.drawn(1)
+    a, b, again = Region.drawn(1), Region.drawn(2), Region.drawn(1)
     assert a == again
     assert a != b
     assert a.digest() == again.digest()

@@ -13,8 +13,8 @@ import pytest
 from matplotlib.path import Path as Outline
 from render_rigs import eye_of, head_rig, job_of, remote_rig
 
-from eyerender.rig.camera import Camera
-from eyerender.rig.sensor import SensorSpec
+from eyerender.rig.camera import PinholeCamera
+from eyerender.rig.sensor import Sensor
 
 
 def digest(window) -> str:
@@ -23,7 +23,7 @@ def digest(window) -> str:
 
 def noisy_job():
     rig = head_rig()
-    return job_of(eye_of("E4"), rig, (200, 150, 160, 120), (5.0, 3.0), sensor=SensorSpec(), seed=77)
+    return job_of(eye_of("E4"), rig, (200, 150, 160, 120), (5.0, 3.0), sensor=Sensor(), seed=77)
 
 
 def test_a_seed_gives_the_same_bytes_with_any_threads_and_after_other_frames(renderer):
@@ -74,7 +74,7 @@ def test_later_frames_launch_the_kernels_of_the_first(renderer):
         job_of(eye_of("E1"), other, (100, 100, 64, 48)),
         job_of(eye_of("E2", pupil_mm=2.5), other, (100, 100, 64, 48), lights=other.lights[:3], wavelength_nm=780.0),
         replace(first, look=first.look.model_copy(update={"iris_seed": 4, "iris_albedo": 0.2, "limbus_width_mm": 0.0})),
-        replace(first, sensor=SensorSpec(psf_sigma_px=1.3, bit_depth=8)),
+        replace(first, sensor=Sensor(psf_sigma_px=1.3, bit_depth=8)),
     ]
     assert kernels(renderer, jobs) == kernels(renderer, [first])
 
@@ -104,7 +104,7 @@ def test_lens_distortion_moves_the_picture_as_the_camera_says(renderer):
     rig = remote_rig()
     plain = rig.camera
     k = (-1.2, 0.8, 0.01, -0.008, 0.1)
-    bent = Camera.of(plain.K, plain.R, plain.t, plain.resolution_px, k)
+    bent = PinholeCamera.of(plain.K, plain.R, plain.t, plain.resolution_px, k)
     # The eye stands at the edge of the field, where the distortion amounts to dozens of pixels.
     shift = np.array([0.0, 95.0, 45.0])
     centre = bent.project(shift)[0]
@@ -149,7 +149,7 @@ def test_head_movement_is_a_movement_of_rig_and_surround(renderer):
         job,
         t=job.t + shift,
         apex_mm=shift,
-        camera=Camera.of(camera.K, camera.R, camera.t - camera.R @ shift, camera.resolution_px),
+        camera=PinholeCamera.of(camera.K, camera.R, camera.t - camera.R @ shift, camera.resolution_px),
         lights=tuple(replace(lamp, position_mm=lamp.position_mm + shift) for lamp in job.lights),
     )
     a, b = renderer.render(job), renderer.render(moved)

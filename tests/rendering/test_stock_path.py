@@ -10,8 +10,8 @@ from render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of, remote_rig
 
 from eyerender.arrays import frozen
 from eyerender.rendering.export import export_scene
-from eyerender.rig.camera import CameraSpec
-from eyerender.rig.light import Light
+from eyerender.rig.camera import Camera
+from eyerender.rig.light import Lamp
 
 MATTE = PLAIN.model_copy(
     update={
@@ -61,12 +61,12 @@ def test_iris_under_large_lamps_against_path(renderer, tmp_path):
     # The path tracer finds a lamp behind a cornea only by chance; two lamps of 100 mm at 300 mm make that bearable.
     eye = eye_of("E2")
     n = 48
-    camera = CameraSpec(
+    camera = Camera(
         resolution_px=(n, n), position_mm=(600.0, 0.0, 0.0), look_at_mm=(0.0, 0.0, 0.0), focal_length_px=600 * n / 11.4
     ).build()
     a = np.radians(65.0)
     places = [300 * np.array([np.cos(a), side * np.sin(a), 0.0]) for side in (1, -1)]
-    lights = tuple(Light(frozen(p), frozen(-p / 300), 100.0, 1000.0, 1.0) for p in places)
+    lights = tuple(Lamp(frozen(p), frozen(-p / 300), 100.0, 1000.0, 1.0) for p in places)
     look = BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
     job = job_of(eye, LampRig(camera, lights), (0, 0, n, n), look=look)
     mine = renderer.radiance(job, spp=512) / cos4(job)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from eyerender.errors import InputError
-from eyerender.rig.camera import CameraSpec
+from eyerender.rig.camera import Camera
 
 
 def camera(**keys):
@@ -19,7 +19,7 @@ def camera(**keys):
         "sensor_mm": [4.48, 3.36],
     }
     base.update(keys)
-    return CameraSpec.from_mapping({k: v for k, v in base.items() if v is not None}).build()
+    return Camera.from_mapping({k: v for k, v in base.items() if v is not None}).build()
 
 
 def test_rest_camera_looks_at_the_subject_with_the_left_eye_on_the_right():
@@ -89,7 +89,7 @@ def test_sensor_ends_at_the_far_edges_of_its_outer_pixels():
 
 def test_calibration_is_taken_as_it_is():
     c = camera(roll_deg=7, distortion=[0.1, 0, 0, 0, 0])
-    same = CameraSpec.from_mapping(
+    same = Camera.from_mapping(
         {
             "resolution_px": [1600, 1200],
             "calibration": {

@@ -8,26 +8,24 @@ from scipy import ndimage, special, stats
 
 from eyerender.rig import psf
 from eyerender.rig.exposure import electrons, expose, photon_counts, radiance_to_irradiance
-from eyerender.rig.sensor import SensorSpec
+from eyerender.rig.sensor import Sensor
 
 
 def test_electrons_by_counting_photons():
     # 1 W/m^2 at 850 nm on (5 um)^2 for 2 ms: energy 5e-14 J over hc/lambda = 2.33699e-19 J is 213950 photons.
-    sensor = SensorSpec(pixel_pitch_um=5.0, exposure_ms=2.0, quantum_efficiency=0.5)
+    sensor = Sensor(pixel_pitch_um=5.0, exposure_ms=2.0, quantum_efficiency=0.5)
     assert float(electrons(sensor, np.array(1.0), 850.0)) == pytest.approx(0.5 * 5e-14 / 2.336989e-19, rel=1e-5)
 
 
 def test_an_aperture_collects_its_solid_angle():
     # A lens of diameter D at image distance v sends L (pi/4) (D/v)^2 on to the axis, for D small against v.
-    assert radiance_to_irradiance(SensorSpec(f_number=8.0, lens_transmission=1.0)) == pytest.approx(
-        1e3 * np.pi / 4 / 64
-    )
+    assert radiance_to_irradiance(Sensor(f_number=8.0, lens_transmission=1.0)) == pytest.approx(1e3 * np.pi / 4 / 64)
 
 
 @pytest.mark.parametrize(("bits", "well"), [(8, 1000.0), (10, 5000.0), (12, 20000.0), (16, 20000.0)])
 def test_photon_transfer(bits, well):
     # Variance of DN against mean: K^2 (read^2 + electrons) + 1/12 of rounding; 250 k pixels give .3 %.
-    sensor = SensorSpec(bit_depth=bits, full_well_e=well, read_noise_e=8.0, black_level_dn=0.05 * (2**bits - 1))
+    sensor = Sensor(bit_depth=bits, full_well_e=well, read_noise_e=8.0, black_level_dn=0.05 * (2**bits - 1))
     scale = float(electrons(sensor, np.array(1.0), 850.0))
     for wanted in (0.01 * well, 0.1 * well, 0.6 * well):
         dn = expose(sensor, np.full((500, 500), wanted / scale), 850.0, 3).astype(float)
@@ -37,13 +35,13 @@ def test_photon_transfer(bits, well):
 
 
 def test_full_well_and_range_clip():
-    sensor = SensorSpec(bit_depth=10, noise=False)
+    sensor = Sensor(bit_depth=10, noise=False)
     dn = expose(sensor, np.array([[0.0, 1e9]]), 850.0, 0)
     assert dn.tolist() == [[round(sensor.black_dn), 1023]]
 
 
 def test_noise_belongs_to_the_seed():
-    sensor = SensorSpec()
+    sensor = Sensor()
     image = np.full((20, 20), 0.01)
     assert np.array_equal(expose(sensor, image, 850.0, 5), expose(sensor, image, 850.0, 5))
     assert not np.array_equal(expose(sensor, image, 850.0, 5), expose(sensor, image, 850.0, 6))
@@ -64,7 +62,7 @@ def test_a_pixel_does_not_move_the_noise_of_others():
     image = rng.uniform(0.0, 0.02, (40, 30))
     other = image.copy()
     other[7, 11] *= 1.5
-    changed = expose(SensorSpec(), image, 850.0, 5) != expose(SensorSpec(), other, 850.0, 5)
+    changed = expose(Sensor(), image, 850.0, 5) != expose(Sensor(), other, 850.0, 5)
     assert np.argwhere(changed).tolist() == [[7, 11]]
 
 

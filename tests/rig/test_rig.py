@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from eyerender.errors import InputError
-from eyerender.rig.rig import RigSpec
-from eyerender.rig.screen import ScreenSpec
+from eyerender.rig.rig import Rig
+from eyerender.rig.screen import Screen
 
 CAMERA = {
     "position_mm": [30, -40, -15],
@@ -18,7 +18,7 @@ CAMERA = {
 
 
 def test_ring_lies_in_the_nodal_plane_around_the_axis():
-    rig = RigSpec.from_mapping(
+    rig = Rig.from_mapping(
         {"cameras": [CAMERA], "lights": [{"ring": {"radius_mm": 12, "count": 6}, "radius_mm": 0.5}]}
     ).build()
     camera = rig.cameras[0]
@@ -31,14 +31,14 @@ def test_ring_lies_in_the_nodal_plane_around_the_axis():
 
 
 def test_light_axis_points_at_its_aim():
-    rig = RigSpec.from_mapping(
+    rig = Rig.from_mapping(
         {"cameras": [CAMERA], "lights": [{"position_mm": [100, 0, 0], "aim_mm": [0, 50, 0]}]}
     ).build()
     np.testing.assert_allclose(rig.lights[0].axis, np.array([-2, 1, 0]) / np.sqrt(5), atol=1e-12)
 
 
 def test_screen_grid_is_in_the_studys_order():
-    screen = ScreenSpec.from_mapping({"centre_mm": [800, 0, -131.5], "size_mm": [495, 280]}).build()
+    screen = Screen.from_mapping({"centre_mm": [800, 0, -131.5], "size_mm": [495, 280]}).build()
     targets = screen.grid(15, 9)
     assert targets.shape == (135, 3)
     np.testing.assert_allclose(targets[0], [800, 247.5, -131.5 + 140])  # column from the left (+y), row from the top
@@ -48,7 +48,7 @@ def test_screen_grid_is_in_the_studys_order():
 
 
 def test_screen_intersection_reverses_world():
-    screen = ScreenSpec.from_mapping({"centre_mm": [600, 20, -50], "size_mm": [400, 300], "tilt_deg": 15}).build()
+    screen = Screen.from_mapping({"centre_mm": [600, 20, -50], "size_mm": [400, 300], "tilt_deg": 15}).build()
     rng = np.random.default_rng(2)
     on_screen = rng.uniform(-150, 150, (50, 2))
     origin = rng.uniform(-30, 30, (50, 3))
@@ -71,4 +71,4 @@ def test_screen_intersection_reverses_world():
 )
 def test_bad_rigs_are_refused(lights, words):
     with pytest.raises(InputError, match=words):
-        RigSpec.from_mapping({"cameras": [CAMERA], "lights": lights})
+        Rig.from_mapping({"cameras": [CAMERA], "lights": lights})
