@@ -1,4 +1,4 @@
-"""Values made of arrays: read-only storage, equality, hash.
+"""Arrays: the names of their types, and values made of them with read-only storage, equality and hash.
 
 A computed result is a frozen, slotted dataclass whose arrays nobody can write to. `ArrayValue` gives such a class the
 equality and the hash that the dataclass machinery cannot (arrays compare element by element).
@@ -13,9 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
+Indices = NDArray[np.intp]
+Bytes = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
 Objects = NDArray[np.object_]
+Statuses = NDArray[np.int8]
+FloatLike = Floats | float
+"""One number for all eyes or rays of a batch, or one for each."""
 
 
 def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .analytic.observer import observe
-from .arrays import Floats
+from .arrays import Bytes, Floats, Singles
+from .backends.choose import BackendChoice
 from .errors import InputError, Warn
 from .eye.model import EyeModel
 from .eye.pose import Poses, rigid_motion
@@ -20,14 +21,14 @@ from .imagefolder import write_dataset
 from .observation import EYES, Observations
 from .outfolder import refuse_non_empty, staged
 from .plausibility import is_saturated, saturation_warnings
+from .progress import Progress
+from .rig.camera import Window
 from .scene import Scene
 
 if TYPE_CHECKING:
     from .rendering.frame import RenderJob
     from .rendering.renderer import RenderedWindow, Renderer
 
-Progress = Callable[[int, int, str], None]
-BackendName = Literal["auto", "cuda", "llvm"]
 # Of one image: a day's work of a fast processor.
 MAX_SAMPLES = 10**12
 
@@ -44,10 +45,10 @@ class WindowImage:
     name: str
     row: int
     camera: int
-    window: tuple[int, int, int, int]
+    window: Window
     dn: NDArray[Any]
-    irradiance: NDArray[np.float32]
-    mask: NDArray[np.uint8]
+    irradiance: Singles
+    mask: Bytes
     labels: dict[str, Any]
     eye: EyeModel
     M: Floats
@@ -59,7 +60,7 @@ def render_windows(
     scene: Scene,
     observations: Observations,
     *,
-    backend: BackendName = "auto",
+    backend: BackendChoice = "auto",
     threads: int | None = None,
     renderer: Renderer | None = None,
     progress: Progress | None = None,
@@ -167,7 +168,7 @@ def check_windows(scene: Scene) -> None:
             )
 
 
-def make_renderer(backend: BackendName = "auto", threads: int | None = None) -> Renderer:
+def make_renderer(backend: BackendChoice = "auto", threads: int | None = None) -> Renderer:
     """A renderer on a backend that works; raises `BackendError`, which says how to fix it, if there is none."""
     from .backends.choose import choose_backend
 
@@ -187,7 +188,7 @@ def render_folder(
     scene: Scene,
     path: str | Path,
     *,
-    backend: BackendName = "auto",
+    backend: BackendChoice = "auto",
     threads: int | None = None,
     overwrite: bool = False,
     exr: bool = False,

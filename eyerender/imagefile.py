@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from .arrays import Bytes
 from .errors import InputError
 from .files import opened, written
 
@@ -97,14 +98,14 @@ def _decoded(file: Image.Image, source: str) -> tuple[NDArray[Any], int]:
     return data.astype(np.uint16), 16
 
 
-def _same_channels(file: Image.Image) -> NDArray[np.uint8] | None:
+def _same_channels(file: Image.Image) -> Bytes | None:
     """The one grey channel of a colour file whose channels are all equal; None for real colour."""
     rgb = np.asarray(file.convert("RGB"))
     equal = np.array_equal(rgb[..., 0], rgb[..., 1]) and np.array_equal(rgb[..., 0], rgb[..., 2])
     return np.ascontiguousarray(rgb[..., 0]) if equal else None
 
 
-def preview(image: NDArray[Any], full_scale: float, gamma: float = 2.2) -> NDArray[np.uint8]:
+def preview(image: NDArray[Any], full_scale: float, gamma: float = 2.2) -> Bytes:
     """An 8-bit, gamma-encoded copy for people to look at; never to measure in."""
     linear = np.clip(np.asarray(image, dtype=float) / full_scale, 0, 1)
     return np.asarray(np.round(255 * linear ** (1 / gamma)), dtype=np.uint8)

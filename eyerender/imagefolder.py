@@ -15,6 +15,7 @@ from .errors import InputError
 from .files import inside, is_plain, read_json, shown, write_json
 from .jsonlines import JsonLines
 from .observation import EYES, Observations, concatenate, count_heads
+from .rig.camera import Window
 
 IMAGE_SCHEMA = "eyerender/image/1"
 DATASET_SCHEMA = "eyerender/dataset/1"
@@ -79,7 +80,7 @@ class ImageEntry:
         return inside(self.folder, name, source=str(self.folder / METADATA), path=self._where(key))
 
     @property
-    def window(self) -> tuple[int, int, int, int]:
+    def window(self) -> Window:
         """x0, y0, width, height in full-sensor pixels."""
         w = self.line["window_px"]
         return w["x0"], w["y0"], w["width"], w["height"]

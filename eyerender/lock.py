@@ -8,11 +8,12 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from .errors import EyerenderError, InputError
+from .progress import Say
 
 try:
     import fcntl
@@ -24,7 +25,7 @@ _UNSUPPORTED = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
 
 
 @contextmanager
-def writer_lock(folder: Path, warn: Callable[[str], None] = lambda _text: None) -> Iterator[None]:
+def writer_lock(folder: Path, warn: Say = lambda _text: None) -> Iterator[None]:
     """Hold a whole folder while the block runs, and leave no file of the lock behind.
 
     Raises:
@@ -42,7 +43,7 @@ def writer_lock(folder: Path, warn: Callable[[str], None] = lambda _text: None) 
 
 
 @contextmanager
-def run_lock(folder: Path, part: tuple[int, int], warn: Callable[[str], None]) -> Iterator[None]:
+def run_lock(folder: Path, part: tuple[int, int], warn: Say) -> Iterator[None]:
     """Hold a folder while the block runs; `part` = (K, N) of --shard K/N, (1, 1) for all of it.
 
     Raises:
@@ -64,7 +65,7 @@ def run_lock(folder: Path, part: tuple[int, int], warn: Callable[[str], None]) -
 
 
 @contextmanager
-def final_lock(folder: Path, warn: Callable[[str], None]) -> Iterator[None]:
+def final_lock(folder: Path, warn: Say) -> Iterator[None]:
     """Hold the right to put the finished dataset together, waiting for it."""
     with contextlib.ExitStack() as stack:
         _take(stack, folder / f"{LOCK}-final", shared=False, folder=folder, warn=warn, wait=True)
@@ -77,7 +78,7 @@ def _take(
     *,
     shared: bool,
     folder: Path,
-    warn: Callable[[str], None],
+    warn: Say,
     wait: bool = False,
 ) -> None:
     while True:

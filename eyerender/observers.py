@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .analytic.observer import observe
-from .arrays import Floats, Ints, frozen
+from .arrays import Floats, Ints, Objects, frozen
+from .backends.choose import BackendChoice
 from .capture import render_windows
 from .errors import InputError
 from .extraction import Extraction, ExtractionSettings, extract
@@ -23,10 +24,9 @@ from .files import parse_json
 from .imagefile import read_image
 from .imagefolder import DATASET, ImageEntry, ImageFolder
 from .observation import MISSING, OK, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
+from .progress import Progress
 from .rig.camera import PinholeCamera
 from .scene import Scene, SceneSpec
-
-Progress = Callable[[int, int, str], None]
 
 # How far the reflections of a real eye lie from those of a typical one that is placed by its pupil.
 _PLACE_MM = 1.5
@@ -64,7 +64,7 @@ class ImageObserver:
         self,
         scene: Scene,
         *,
-        backend: Literal["auto", "cuda", "llvm"] = "auto",
+        backend: BackendChoice = "auto",
         threads: int | None = None,
         only: Sequence[int] | None = None,
         progress: Progress | None = None,
@@ -295,7 +295,7 @@ def _observation(
     )
 
 
-def _texts(values: Sequence[str | None]) -> NDArray[np.object_]:
+def _texts(values: Sequence[str | None]) -> Objects:
     out = np.empty(len(values), dtype=object)
     out[:] = values
     return out

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .arrays import Floats
 from .errors import InputWarning
-from .rig.camera import PinholeCamera
+from .rig.camera import PinholeCamera, Window
 from .rig.rig import RigGeometry
 from .rig.screen import ScreenPlane
 from .rig.sensor import Sensor
@@ -49,8 +49,6 @@ _FURTHEST_RAD = np.radians(140.0)
 _OFF_PLANE_MM = 1.0
 # An image is called saturated where more than this share of its pixels is.
 SATURATED_SHARE = 0.2
-
-Window = tuple[int, int, int, int]
 
 
 def pupil_warnings(diameter_mm: float, path: str) -> list[InputWarning]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
 
+from .backends.choose import BackendChoice
 from .capture import render_folder
 from .comparison import Comparison, compare
 from .errors import InputError, Warn
@@ -14,10 +13,10 @@ from .gaze.regression import FUNCTIONS, PupilGlintRegression
 from .imagefolder import ImageFolder, same_run
 from .observers import ImageObserver, scene_of
 from .plausibility import saturation_warnings
+from .progress import Progress
 from .report.comparison import Timing, write_report
 from .scene import Scene, load_scene
 
-Progress = Callable[[int, int, str], None]
 REPORT = "report.html"
 
 
@@ -27,7 +26,7 @@ def run_quickstart(
     scene: str = "quickstart",
     eye: str | None = None,
     function: str = "R3",
-    backend: Literal["auto", "cuda", "llvm"] = "auto",
+    backend: BackendChoice = "auto",
     threads: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,

@@ -26,6 +26,7 @@ from .observation import EYES, MAX_GLINTS, Index
 from .plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
 from .region.anatomy import Region
 from .region.look import Look
+from .rig.camera import Window
 from .rig.imaging import Ambient, Lens, Motion
 from .rig.rig import Rig, RigGeometry
 from .rig.sensor import Sensor
@@ -255,7 +256,7 @@ class Scene:
             for i, light in enumerate(spec.rig.lights)
             for _ in range(1 if light.ring is None else light.ring.count)
         ]
-        views: dict[int, list[tuple[tuple[int, int, int, int], Floats]]] = {c: [] for c in range(len(rig.cameras))}
+        views: dict[int, list[tuple[Window, Floats]]] = {c: [] for c in range(len(rig.cameras))}
         for (c, k, side), window in self.windows().items():
             views[c].append((window, self.eye_position_mm(EYES[side]) + positions[k]))
         pupil = "eye.pupil_diameter_mm" if spec.eye.pupil_diameter_mm is not None else "eye.model"
@@ -363,7 +364,7 @@ class Scene:
         )
         return Frames(index, frozen(directions))
 
-    def windows(self) -> dict[tuple[int, int, int], tuple[int, int, int, int]]:
+    def windows(self) -> dict[tuple[int, int, int], Window]:
         """The rendered window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.
 
         A window is centred on the image of the unrotated eye's apex, so it does not move with the gaze; it is kept on

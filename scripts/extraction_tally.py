@@ -7,12 +7,11 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 from make_ideal_images import Drawing
-from numpy.typing import NDArray
 
+from eyerender.arrays import Floats
 from eyerender.extraction import Extraction
 from eyerender.geometry.ellipse import Ellipse, iou
 
-Array = NDArray[np.float64]
 MATCH_PX = 2.0  # a glint within this of a true one is that one
 
 # condition -> centre error allowed: median, 95th percentile, px
@@ -35,9 +34,9 @@ class Tally:
     """What one row of images gave."""
 
     centre: list[float] = field(default_factory=list)
-    offset: list[Array] = field(default_factory=list)
+    offset: list[Floats] = field(default_factory=list)
     bound: list[float] = field(default_factory=list)
-    axes: list[Array] = field(default_factory=list)
+    axes: list[Floats] = field(default_factory=list)
     iou: list[float] = field(default_factory=list)
     distance: dict[int, list[float]] = field(default_factory=lambda: {2: [], 5: []})
     glint: list[tuple[int, float]] = field(default_factory=list)
@@ -92,7 +91,7 @@ def compare(tally: Tally, found: Extraction, drawing: Drawing) -> None:
             tally.glint_distance.append(float(error @ np.linalg.solve(near[0].covariance, error)))
 
 
-def _shape_error(ellipse: Ellipse, truth: Ellipse, covariance: Array) -> tuple[Array, Array]:
+def _shape_error(ellipse: Ellipse, truth: Ellipse, covariance: Floats) -> tuple[Floats, Floats]:
     """Error and covariance of (cx, cy, shape matrix aa, bb, ab in the found axes), well defined for circles too."""
     turn = truth.angle_rad - ellipse.angle_rad
     rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])

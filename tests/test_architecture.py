@@ -21,6 +21,7 @@ FLOORS = {
     "files": 0,
     "jsonlines": 0,
     "lock": 0,
+    "progress": 0,
     "spec": 0,
     "backends": 1,
     "geometry": 1,
@@ -54,6 +55,7 @@ FLOORS = {
 ORDER = [
     "errors",
     "arrays",
+    "progress",
     "files",
     "jsonlines",
     "lock",
@@ -136,6 +138,27 @@ def test_what_reproduces_a_papers_software_stays_in_the_studies():
     assert found == []
     assert {p.stem for p in (PACKAGE / "eye" / "catalogue").glob("*.yaml")} == {"E1", "E2", "E3", "E4", "E5"}
     assert not list((PACKAGE / "report").rglob("*study*"))
+
+
+def aliases():
+    """(name, definition) of every type alias at the top of a module."""
+    kinds = {"NDArray", "Callable", "Literal", "tuple", "list", "dict"}
+    for path in modules():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Assign) and isinstance(node.value, (ast.Subscript, ast.BinOp)):
+                definition = ast.unparse(node.value).replace("npt.", "")
+                of_a_type = isinstance(node.value, ast.Subscript) and definition.split("[")[0] in kinds
+                if of_a_type or " | " in definition:
+                    yield ast.unparse(node.targets[0]), definition
+
+
+def test_a_type_alias_is_defined_once():
+    found = list(aliases())
+    assert {"Floats", "Bools", "Progress", "Window"} <= {name for name, _ in found}
+    names = [name for name, _ in found]
+    assert sorted({n for n in names if names.count(n) > 1}) == []
+    shared = [d for _, d in found if d.startswith(("NDArray", "Callable", "Literal"))]
+    assert sorted({d for d in shared if shared.count(d) > 1}) == []
 
 
 def test_import_is_light():

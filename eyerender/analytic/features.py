@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..arrays import ArrayValue, Bools, Floats, Indices, Statuses, frozen
 from ..errors import InputError
 from ..eye.batch import stack_eyes, structure_of, take_eyes
 from ..eye.fixation import Fixations, FixationStatus, LineOfSightKind, fixate
@@ -26,8 +26,6 @@ from ..observation import MAX_BOUNDARY_POINTS, MAX_POINTS
 from ..optics.trace import RayStatus
 from ..rig.camera import PinholeCamera, distort
 from .rays import glint_exits, pupil_exits
-
-Statuses = npt.NDArray[np.int8]
 
 CHUNK_POINTS = 12000
 """Points refracted at once: fewer leave the time to the interpreter, more leave the cache (measured: 8,000 to
@@ -252,14 +250,12 @@ class _View:
         return pixels, status
 
 
-def _groups(
-    eyes: Sequence[EyeModel], which: npt.NDArray[np.intp]
-) -> list[tuple[tuple[EyeModel, npt.NDArray[np.intp] | None], npt.NDArray[np.intp]]]:
+def _groups(eyes: Sequence[EyeModel], which: Indices) -> list[tuple[tuple[EyeModel, Indices | None], Indices]]:
     """Rows whose eyes can be traced together: ((eye or stacked eyes, row -> eye of the stack), rows)."""
     kinds: dict[object, list[int]] = {}
     for k in np.unique(which):
         kinds.setdefault(structure_of(eyes[k]), []).append(int(k))
-    out: list[tuple[tuple[EyeModel, npt.NDArray[np.intp] | None], npt.NDArray[np.intp]]] = []
+    out: list[tuple[tuple[EyeModel, Indices | None], Indices]] = []
     for members in kinds.values():
         if len(members) <= FEW_EYES:
             out += [((eyes[k], None), np.flatnonzero(which == k)) for k in members]
@@ -271,9 +267,7 @@ def _groups(
     return out
 
 
-def _chunks(
-    group: tuple[EyeModel, npt.NDArray[np.intp] | None], rows: npt.NDArray[np.intp], size: int
-) -> list[tuple[npt.NDArray[np.intp], EyeModel]]:
+def _chunks(group: tuple[EyeModel, Indices | None], rows: Indices, size: int) -> list[tuple[Indices, EyeModel]]:
     eye, place = group
     parts = [rows[part] for part in _slices(len(rows), size)]
     return [(part, eye if place is None else take_eyes(eye, place[part])) for part in parts]
@@ -286,7 +280,7 @@ def _slices(count: int, size: int) -> list[slice]:
     return [slice(low, high) for low, high in pairwise(edges)]
 
 
-def _pose_rows(poses: Poses, rows: npt.NDArray[np.intp]) -> Poses:
+def _pose_rows(poses: Poses, rows: Indices) -> Poses:
     return Poses(poses.azimuth_rad[rows], poses.elevation_rad[rows], poses.torsion_rad[rows])
 
 

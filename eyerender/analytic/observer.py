@@ -7,9 +7,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ..arrays import Floats, frozen
+from ..arrays import Bools, Floats, frozen
 from ..errors import InputError
 from ..eye.fixation import FixationStatus
 from ..eye.pose import Poses, listing_torsion
@@ -160,7 +159,7 @@ def pupil_features(seen: Features) -> PupilFeatures:
     )
 
 
-def seen_arcs_deg(found: npt.NDArray[np.bool_]) -> list[tuple[float, float]]:
+def seen_arcs_deg(found: Bools) -> list[tuple[float, float]]:
     """Runs of points (k,), evenly spaced around the margin, that are seen: (from, to) in degrees of its parameter.
 
     `from` lies in [0, 360) and `to` is not below it; an arc over the first point ends beyond 360.
@@ -205,6 +204,6 @@ def glint_features(seen: Features) -> GlintFeatures:
     )
 
 
-def _where(ok: npt.NDArray[np.bool_], values: Floats) -> Floats:
+def _where(ok: Bools, values: Floats) -> Floats:
     mask = ok.reshape(ok.shape + (1,) * (values.ndim - 1))
     return frozen(np.where(mask, values, np.nan))

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from ..arrays import Floats
+from ..arrays import Bools, Floats, Statuses
 from ..eye.model import EyeModel
 from ..geometry.surfaces import Xyz, components, fit, join, shift, turn
 from ..optics.interface import dot
 from ..optics.purkinje import purkinje_points
 from ..optics.solve import mirrored_rays, refracted_rays
 from ..optics.trace import RayStatus, mark
-
-Statuses = npt.NDArray[np.int8]
 
 _AHEAD_MM = 500.0
 _ASIDE = 0.1
@@ -86,7 +83,7 @@ def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tu
     return components(found.exit_points_mm), found.residual_mm, status.astype(np.int8)
 
 
-def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
+def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> Bools:
     """Whether the camera stands behind the tangent planes of the whole cornea, (n,); in doubt it does not.
 
     Of a convex cap its rim faces farthest to the back: points of the limbus are asked, and a tenth of the distance is
@@ -104,7 +101,7 @@ def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> npt.NDArray[np.bool_]:
     return np.asarray((height < -0.1 * np.sqrt(dot((x, y, z), (x, y, z)))).all(axis=1))
 
 
-def _meets_sclera(eye: EyeModel, exits: Xyz, way: Xyz) -> npt.NDArray[np.bool_]:
+def _meets_sclera(eye: EyeModel, exits: Xyz, way: Xyz) -> Bools:
     """Whether the rays from the exits back along `way` (unit, from the camera) enter the ball of the sclera."""
     gap = shift(exits, eye.sclera.centre_mm, -1.0)
     along = -dot(gap, way)

@@ -9,18 +9,17 @@ from __future__ import annotations
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from ..errors import BackendError
+from ..progress import Say
 from .apt import Apt
 from .libraries import RUNTIME, llvm_store
 from .llvm import VARIANT, LibLlvm, find_llvm, version_of
 from .probe import probe, run_probe
 from .remedies import has_archive, llvm_command
-
-Say = Callable[[str], None]
 
 
 def _silent(line: str) -> None:

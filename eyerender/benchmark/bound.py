@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import erf
 
-from ..arrays import Floats
+from ..arrays import Bools, Floats
 from ..geometry.ellipse import Ellipse, signed_distance
 
 MEDIAN_OF_RADIAL = math.sqrt(2.0 * math.log(2.0))
@@ -86,7 +86,7 @@ def measure_edge(grey_dn: Floats, pupil: Ellipse, glints_px: Floats, quantum_dn:
 
 def _profile(
     grey_dn: Floats, pupil: Ellipse, glints_px: Floats, reach: float
-) -> tuple[float, float, Floats, NDArray[np.bool_]] | None:
+) -> tuple[float, float, Floats, Bools] | None:
     """Step, sigma, the part of the image about the pupil, and its pixels off the edge and the glints."""
     x0, y0 = np.maximum(np.floor(pupil.centre_px - pupil.semi_axes_px[0] - reach - 2), 0).astype(int)
     x1, y1 = np.ceil(pupil.centre_px + pupil.semi_axes_px[0] + reach + 3).astype(int)
@@ -121,7 +121,7 @@ def _profile(
     return float(fit.x[1]), sigma, part, flat
 
 
-def _noise(grey_dn: Floats, free: NDArray[np.bool_], quantum_dn: float) -> float:
+def _noise(grey_dn: Floats, free: Bools, quantum_dn: float) -> float:
     whole = free[:-1, :-1] & free[1:, :-1] & free[:-1, 1:] & free[1:, 1:]
     difference = (grey_dn[:-1, :-1] - grey_dn[:-1, 1:] - grey_dn[1:, :-1] + grey_dn[1:, 1:])[whole]
     if difference.size < 20:

@@ -19,6 +19,7 @@ from ..files import write_json
 from ..imagefile import read_image
 from ..imagefolder import versions
 from ..outfolder import refuse_non_empty, staged
+from ..progress import Progress
 from ..report.benchmark import write_bench_report
 from .bound import Edge, edge_of
 from .folder import LabelledImage, load_labelled
@@ -33,8 +34,6 @@ REPORT, RESULTS, TABLE = "report.html", "results.json", "results.csv"
 # Consecutive deaths after which an extractor is not started again.
 PATIENCE = 3
 START_S = 60.0
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
+from ..backends.choose import BackendChoice
 from ..errors import InputError
 
 EyeModel = Annotated[str | None, Parameter(help="Replace the eye model: a name of the catalogue, or an eye file.")]
 Seed = Annotated[int | None, Parameter(help="Replace the seed.")]
-Backend = Annotated[Literal["auto", "cuda", "llvm"], Parameter(help="Where to render.")]
+Backend = Annotated[BackendChoice, Parameter(help="Where to render.")]
 Threads = Annotated[int | None, Parameter(help="Processor threads in all (default: all there are).")]
 Overwrite = Annotated[bool, Parameter(help="Replace what the folder holds.")]
 Strict = Annotated[bool, Parameter(help="Treat warnings as errors: nothing is done, exit code 2.")]

@@ -18,7 +18,7 @@ from ..capture import WindowImage, eye_motion
 from ..eye.model import EyeModel
 from ..geometry.ellipse import fit_ellipse_direct
 from ..observation import EYES, MISSING, OK, Observations
-from ..rig.camera import PinholeCamera
+from ..rig.camera import PinholeCamera, Window
 from ..scene import Scene
 
 _OUTLINE_POINTS = 60
@@ -35,7 +35,7 @@ class EyeInWindow:
 
     row: int
     camera: int
-    window: tuple[int, int, int, int]
+    window: Window
     eye: EyeModel
     M: Floats
     t: Floats
@@ -95,7 +95,7 @@ def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | W
     }
 
 
-def moments_ellipse(inside: Bools, window: tuple[int, int, int, int]) -> dict[str, Any]:
+def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:
     """The ellipse with the moments of a mask's pixels, in full-sensor pixels; null numbers where there are none.
 
     `pixels` is their count, `cut` whether they reach the window's edge.

@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 from ..observation import EYES, RECORD
+from ..rig.camera import Window
 from .realise import Realised
 
 
@@ -18,7 +19,7 @@ def image_line(
     found: Realised,
     row: int,
     frames: int,
-    window: tuple[int, int, int, int],
+    window: Window,
     labels: dict[str, Any],
     record_version: int = RECORD,
 ) -> tuple[str, dict[str, Any]]:

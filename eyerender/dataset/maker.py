@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import BackendName, WindowImage, make_renderer, noiseless, render_windows
+from ..arrays import Bytes
+from ..backends.choose import BackendChoice
+from ..capture import WindowImage, make_renderer, noiseless, render_windows
 from ..plausibility import is_saturated
 from ..scene import Scene
 from .labels import image_labels
@@ -44,7 +45,7 @@ class MadeSample:
 class Maker:
     """Makes samples of one plan on one backend."""
 
-    def __init__(self, plan: Plan, frames: int, *, backend: BackendName = "auto", threads: int | None = None) -> None:
+    def __init__(self, plan: Plan, frames: int, *, backend: BackendChoice = "auto", threads: int | None = None) -> None:
         self.plan = plan
         self.frames = frames
         self.renderer: Renderer = make_renderer(backend, threads)
@@ -72,7 +73,7 @@ class Maker:
             yield MadeImage(name, pictures, line, is_saturated(image.dn, scene.spec.sensor))
 
 
-def _amodal(scene: Scene, image: WindowImage) -> NDArray[np.uint8]:
+def _amodal(scene: Scene, image: WindowImage) -> Bytes:
     labels = image.rendered.labels
     assert labels is not None
     return labels.amodal

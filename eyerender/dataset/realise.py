@@ -16,6 +16,7 @@ from ..arrays import Bools, Floats
 from ..capture import check_windows
 from ..errors import InputError
 from ..observation import Observations
+from ..rig.camera import Window
 from ..scene import Scene
 from .plan import Plan, Sample
 
@@ -84,7 +85,7 @@ def frames_of(plan: Plan) -> int:
     return int(first.observations.index.frame.max()) + 1
 
 
-def windows_of(scene: Scene, observations: Observations) -> list[tuple[int, int, int, int]]:
+def windows_of(scene: Scene, observations: Observations) -> list[Window]:
     """The rendered window of each observation."""
     index, windows = observations.index, scene.windows()
     return [windows[int(index.camera[r]), int(index.head[r]), int(index.eye[r])] for r in range(len(observations))]

@@ -7,17 +7,19 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+from ..backends.choose import BackendChoice
 from ..errors import EyerenderError, InputError
 from ..files import make_folder, remove_file
 from ..imagefolder import DATASET
 from ..lock import LOCK, final_lock, run_lock
 from ..outfolder import clear, refuse_non_empty
+from ..progress import Progress, Say
 from .assemble import assemble, damage
 from .plan import Plan
 from .pool import NO_SHARD, Events, LocalPool
@@ -38,9 +40,6 @@ from .worker import Job
 
 MEMORY_A_WORKER = 0.8e9  # bytes, measured resident size with head-room
 
-Progress = Callable[[int, int, str], None]
-Say = Callable[[str], None]
-
 
 class Engine(Protocol):
     """Makes shards somewhere."""
@@ -57,7 +56,7 @@ class Options:
     part: tuple[int, int] = (1, 1)
     engine: Literal["local", "ray"] = "local"
     address: str | None = None
-    backend: Literal["auto", "cuda", "llvm"] = "auto"
+    backend: BackendChoice = "auto"
     threads: int | None = None
     timeout_s: float = 600.0
     overwrite: bool = False

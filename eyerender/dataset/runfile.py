@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from ..files import MAX_FILE_BYTES, PART, read_json, remove_parts, write_json
 from ..imagefolder import DATASET, METADATA, RUN, STAGE
 from ..lock import LOCK
 from ..outfolder import MARKER, clear
+from ..progress import Say
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
 from .plan import Plan
@@ -42,7 +43,7 @@ def refuse_taken(folder: Path) -> None:
         raise InputError("is not empty; give another folder or --overwrite", source=str(folder))
 
 
-def begin(folder: Path, plan: Plan, repaired: Callable[[str], None]) -> bool:
+def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
     """Claim a folder for a plan, or find that it was claimed for the same one before (True).
 
     Where run.json is damaged or missing, the finished shards tell whose the folder is, for each names its plan. Where

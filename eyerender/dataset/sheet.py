@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from ..analytic.observer import observe
-from ..capture import BackendName, make_renderer, render_windows
+from ..arrays import Bytes
+from ..backends.choose import BackendChoice
+from ..capture import make_renderer, render_windows
 from ..errors import EyerenderError, InputError, Warn
 from ..imagefile import preview
 from ..plausibility import is_saturated, saturation_warnings
+from ..progress import Progress
 from ..scene import Scene
 from .maker import Maker
 from .plan import Plan
@@ -24,15 +26,14 @@ from .realise import frames_of
 TILES = 16
 _COLUMNS, _WIDTH, _GAP = 4, 320, 4
 FORMATS = (".png", ".jpg", ".jpeg", ".webp")
-Progress = Callable[[int, int, str], None]
-Tile = tuple[NDArray[np.uint8], str]
+Tile = tuple[Bytes, str]
 
 
 def write_sheet(
     what: Plan | Scene,
     path: str | Path,
     *,
-    backend: BackendName = "auto",
+    backend: BackendChoice = "auto",
     threads: int | None = None,
     progress: Progress | None = None,
     warn: Warn | None = None,
@@ -89,7 +90,7 @@ def contact_sheet(tiles: list[Tile]) -> Image.Image:
     return sheet
 
 
-def _of_plan(plan: Plan, backend: BackendName, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:
+def _of_plan(plan: Plan, backend: BackendChoice, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:
     maker = Maker(plan, frames_of(plan), backend=backend, threads=threads)
     count = min(TILES, plan.spec.count)
     for k in range(count):
@@ -101,7 +102,7 @@ def _of_plan(plan: Plan, backend: BackendName, threads: int | None) -> Iterator[
         yield count, _tile(image.pictures["images"], image.line["bit_depth"], caption), image.saturated
 
 
-def _of_scene(scene: Scene, backend: BackendName, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:
+def _of_scene(scene: Scene, backend: BackendChoice, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:
     observed = observe(scene)
     count = min(TILES, len(observed))
     rows = np.array([k * len(observed) // count for k in range(count)])

@@ -7,12 +7,13 @@ Memory does not grow with the folder, but for some tens of bytes an image.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
 from ..imagefolder import FILE_KEYS, METADATA, Entries, ImageEntry, ImageFolder
+from ..progress import Progress
 from .validation.images import Tally, check_images
 from .validation.lines import Lines, check_records
 from .validation.problems import WRONG, Problems
@@ -22,7 +23,6 @@ from .validation.truth import Again, DatasetTruth, NoTruth, SceneTruth, truth_of
 SAMPLE = 64
 """So many lines are computed again where not all are; folders of no more lines are checked whole."""
 _BATCH = 256
-Progress = Callable[[int, int, str], None]
 
 
 def validate(

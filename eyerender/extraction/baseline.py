@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Bytes
+
 RotatedRect = tuple[tuple[float, float], tuple[float, float], float]
 
 _RADIUS_PX = (7.0, 160.0)
@@ -56,7 +58,7 @@ def contour_pupil(
     return (float(cx), float(cy)), (float(first), float(second)), float(degrees)
 
 
-def _levels(smooth: NDArray[np.uint8]) -> list[float]:
+def _levels(smooth: Bytes) -> list[float]:
     """Otsu's threshold of all that lies below Otsu's threshold; then the first one."""
     first = float(cv2.threshold(smooth, 0, 255, cv2.THRESH_OTSU)[0])
     dark = smooth[smooth <= first]

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Bools, Floats
 from ..geometry.ellipse import signed_distance
 from .glints.classification import classify_spots
 from .glints.deblending import give_edges, split_blends
@@ -28,8 +28,6 @@ from .pupil.search import Found, search
 from .result import Extraction, PupilResult
 from .settings import ExtractionSettings
 from .statistics import median
-
-Array = NDArray[np.float64]
 
 SAME_LIGHT = 0.5  # in noise standard deviations; a smaller change of the spots' light does not move the boundary
 
@@ -103,7 +101,7 @@ def _refined(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tu
     return _boundary_fit(found, again, first) or first, fit
 
 
-def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[Image, NDArray[np.bool_]]:
+def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[Image, Bools]:
     """The image less the light of spots that their fits tell, and the pixels where spots are still in the way."""
     if found.image.inverted:
         return found.image.linear, affected_pixels(prepared, spots)
@@ -112,9 +110,7 @@ def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tu
     return linear, bright | affected_pixels(prepared, spots, ~known)
 
 
-def _boundary_fit(
-    found: Found, cleared: tuple[Image, NDArray[np.bool_]], before: PixelFit | None = None
-) -> PixelFit | None:
+def _boundary_fit(found: Found, cleared: tuple[Image, Bools], before: PixelFit | None = None) -> PixelFit | None:
     try:
         fit = refine(cleared[0], found.model, found.sectors, cleared[1], found.image.noise_dn, before)
     except np.linalg.LinAlgError:  # the pixels do not tell the parameters apart
@@ -122,7 +118,7 @@ def _boundary_fit(
     return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None
 
 
-def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> NDArray[np.bool_] | None:
+def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> Bools | None:
     """(n,) the spots whose window reaches the boundary, or None."""
     apart = np.abs(signed_distance(model.ellipse, spots.xy_px))
     on_boundary = fit.converged & (apart < window_radius(spots.width_px) + 3.0 * model.sigma_px)
@@ -130,7 +126,7 @@ def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> NDArray[np.boo
 
 
 def _fitted_again(
-    prepared: Prepared, work: Prepared, spots: Spots, fit: SpotFit, on_boundary: NDArray[np.bool_], model: EdgeModel
+    prepared: Prepared, work: Prepared, spots: Spots, fit: SpotFit, on_boundary: Bools, model: EdgeModel
 ) -> SpotFit:
     """The spots on the boundary fitted before the refined boundary, where that explains them as well."""
     linear, _ = subtract_spots(prepared, fit, fit.converged & ~on_boundary, model.ellipse)
@@ -171,7 +167,7 @@ def _fit_spots(prepared: Prepared, found: Found, spots: Spots) -> tuple[Spots, S
     return Spots(*starts, spots.patches_px, spots.clutter), fit
 
 
-def _background(work: Prepared, model: EdgeModel) -> Callable[[Array, Array], Array]:
+def _background(work: Prepared, model: EdgeModel) -> Callable[[Floats, Floats], Floats]:
     """Level without spots at pixels (x, y), up to a constant, which their fit has anyway."""
     return (lambda x, y: -model.level(x, y)) if work.inverted else model.level
 

@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Singles
 from ..errors import InputError
 from .statistics import median, quantile
 
-Image = NDArray[np.float32]
+Image = Singles
 
 MAX_PIXELS = 64_000_000
 MIN_SIDE = 16

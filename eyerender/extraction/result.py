@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import frozen
+from ..arrays import Floats, frozen
 from ..geometry.ellipse import Ellipse
-
-Array = NDArray[np.float64]
 
 Stage = Literal["input", "coarse search", "edges", "fit", "refinement"]
 
@@ -64,10 +61,10 @@ class PupilResult:
     stage: Stage | None
     reason: str | None
     ellipse: Ellipse | None
-    covariance: Array | None
+    covariance: Floats | None
     confidence: float
     goodness: Goodness | None
-    contour_px: Array
+    contour_px: Floats
 
     @staticmethod
     def missing(stage: Stage, reason: str) -> PupilResult:
@@ -86,8 +83,8 @@ class GlintResult:
 
     status: Literal["ok", "missing", "rejected"]
     reason: str | None
-    xy_px: Array | None
-    covariance: Array | None
+    xy_px: Floats | None
+    covariance: Floats | None
     amplitude: float
     sigma_px: float
     saturated: bool

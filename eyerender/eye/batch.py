@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import FloatLike, Floats, Indices
 from ..geometry.surfaces import Surface
-from ..geometry.transforms import Array, read_only
+from ..geometry.transforms import read_only
 from ..optics.gradient import GradientMedium
-from ..optics.interface import Number
 from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
 
 Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str]
@@ -30,10 +29,10 @@ def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
     if any(structure_of(eye) != structure_of(first) for eye in eyes):
         raise ValueError("eyes of different structure cannot be stacked")
 
-    def numbers(values: Sequence[Number]) -> Array:
+    def numbers(values: Sequence[FloatLike]) -> Floats:
         return read_only([float(v) for v in values])
 
-    def points(values: Sequence[Array]) -> Array:
+    def points(values: Sequence[Floats]) -> Floats:
         return read_only(np.stack(values))
 
     gradients = [e.lens_gradient for e in eyes if e.lens_gradient is not None]
@@ -67,12 +66,12 @@ def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
     )
 
 
-def take_eyes(eye: EyeModel, index: npt.NDArray[np.intp]) -> EyeModel:
+def take_eyes(eye: EyeModel, index: Indices) -> EyeModel:
     """The eyes at `index` of a batch; a single eye is returned as it is."""
     if eye.fovea_mm.ndim == 1:
         return eye
 
-    def numbers(values: Sequence[Number]) -> tuple[Number, ...]:
+    def numbers(values: Sequence[FloatLike]) -> tuple[FloatLike, ...]:
         return tuple(np.asarray(v)[index] for v in values)
 
     rotation, ray = eye.rotation, eye.chief_ray
@@ -105,7 +104,7 @@ def _stack(surfaces: tuple[S, ...]) -> S:
     return type(surfaces[0]).stack(surfaces)
 
 
-def _stop_parts(stop: Stop, waves: int) -> tuple[Array, ...]:
+def _stop_parts(stop: Stop, waves: int) -> tuple[Floats, ...]:
     """The stop's numbers, its contour continued by zeros to as many `waves`."""
     contour = np.zeros((*stop.contour.shape[:-1], waves))
     contour[..., : stop.contour.shape[-1]] = stop.contour

@@ -10,13 +10,13 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import brentq
 
+from ..arrays import FloatLike, Floats
 from ..errors import InputError
 from ..geometry.surfaces import Surface
 from ..geometry.surfaces_biconic import Biconic
 from ..geometry.surfaces_quadric import Quadric
-from ..geometry.transforms import Array, flip_y, mirror_rotation, read_only, rotation_x, tilt_rotation
+from ..geometry.transforms import flip_y, mirror_rotation, read_only, rotation_x, tilt_rotation
 from ..optics.gradient import GradientMedium
-from ..optics.interface import Number
 from ..optics.media import CauchyMedium, ConstantMedium, Medium
 from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
 from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
@@ -63,8 +63,8 @@ def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> EyeModel:
     front = tuple(surface_of(s) for s in spec.cornea)
     front_indices = tuple(index_at(s.medium, wavelength_nm, f"cornea.{k}.medium") for k, s in enumerate(spec.cornea))
     back: tuple[Surface, ...] = ()
-    back_indices: tuple[Number, ...] = ()
-    rims: tuple[Number, ...] = ()
+    back_indices: tuple[FloatLike, ...] = ()
+    rims: tuple[FloatLike, ...] = ()
     passing: tuple[bool, ...] = ()
     gradient: GradientMedium | None = None
     if isinstance(spec.lens, SurfaceLensSpec):
@@ -123,7 +123,7 @@ def surface_of(placed: PlacedSpec) -> Surface:
     return _general_quadric(shape, position, rotation)
 
 
-def _general_quadric(shape: QuadricSpec, position: Array, rotation: Array) -> Quadric:
+def _general_quadric(shape: QuadricSpec, position: Floats, rotation: Floats) -> Quadric:
     a, b, c, d, e, f, g, h, i, k = shape.coefficients
     # Scaled so that distances, not the coefficients' own unit, set the size of rounding.
     scale = max(abs(v) for v in (a, b, c, d, e, f)) or max(abs(v) for v in (g, h, i))
@@ -187,7 +187,7 @@ def sclera_of(spec: EyeSpec, cornea: Surface) -> Sphere:
     return Sphere(read_only(cornea.to_eye(local)), radius)
 
 
-def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Array]:
+def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Floats]:
     """(front, back, centre (3,)) of a gradient lens; raises `InputError` for what cannot be one."""
     for name, shape in (("front", lens.front.shape), ("back", lens.back.shape)):
         if not isinstance(shape, SphereSpec | ConicSpec | BiconicSpec):
@@ -211,7 +211,7 @@ def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Array]:
 
 def gradient_lens(
     lens: GradientLensSpec, wavelength_nm: float
-) -> tuple[tuple[Surface, ...], tuple[Number, ...], tuple[Number, ...], GradientMedium | None]:
+) -> tuple[tuple[Surface, ...], tuple[FloatLike, ...], tuple[FloatLike, ...], GradientMedium | None]:
     """(surfaces outside in, the index behind each, rims, the medium between the two if they are no shells)."""
     front, back, centre = gradient_geometry(lens)
     edge, core, vitreous = (

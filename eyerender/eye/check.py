@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from ..arrays import Bools, Floats
 from ..errors import InputError
-from ..geometry.surfaces import Mask, Surface, components
-from ..geometry.transforms import Array
+from ..geometry.surfaces import Surface, components
 from .spec import (
     BiconicSpec,
     ConicSpec,
@@ -108,25 +108,25 @@ def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:
         path_before, ahead = path, depth
 
 
-def _depth(surface: Surface, grid: Array) -> Array:
+def _depth(surface: Surface, grid: Floats) -> Floats:
     """x (mm, eye frame) of the surface over points (y, z), (m, 2) -> (m,); NaN where it is not met."""
     start = np.column_stack([np.full(len(grid), _FAR_MM), grid])
     hit = surface.hit(components(start), components(np.broadcast_to([-1.0, 0.0, 0.0], start.shape)), inward=True)
     return np.where(hit.ok, _FAR_MM - hit.distance, np.nan)
 
 
-def _stop_depth(centre: Array, normal: Array, grid: Array) -> Array:
+def _stop_depth(centre: Floats, normal: Floats, grid: Floats) -> Floats:
     offset = grid - centre[1:]
     return np.asarray(centre[0] - (offset @ normal[1:]) / normal[0])
 
 
-def _disc(radius_mm: float, centre: Array) -> Array:
+def _disc(radius_mm: float, centre: Floats) -> Floats:
     """Points (y, z) that fill a disc."""
     radius, angle = np.meshgrid(np.linspace(0.0, radius_mm, 25), np.linspace(0.0, 2 * np.pi, 32, endpoint=False))
     return centre + np.column_stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()])
 
 
-def _where(grid: Array, mask: Mask) -> str:
+def _where(grid: Floats, mask: Bools) -> str:
     return f"{np.min(np.linalg.norm(grid[mask], axis=1)):.3g} mm from the axis"
 
 

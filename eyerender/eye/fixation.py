@@ -22,10 +22,10 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue
+from ..arrays import ArrayValue, Bools, Floats, Statuses
 from ..errors import InputError
 from ..geometry.surfaces import Xyz, components, join
-from ..geometry.transforms import Array, normalize
+from ..geometry.transforms import normalize
 from ..optics.solve import apparent_points
 from ..optics.trace import RayStatus, trace
 from .landmarks import path_to_retina
@@ -76,10 +76,10 @@ class Fixations(ArrayValue):
     """
 
     poses: Poses
-    residual_mm: Array
-    status: npt.NDArray[np.int8]
-    line_of_sight_mm: Array
-    line_of_sight_direction: Array
+    residual_mm: Floats
+    status: Statuses
+    line_of_sight_mm: Floats
+    line_of_sight_direction: Floats
 
     def reason(self, item: int) -> str | None:
         """Why fixation `item` failed; None if it did not."""
@@ -104,7 +104,7 @@ def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKi
     raise InputError(f"must be chief_ray or entrance_window, not {line_of_sight!r}", path="line_of_sight")
 
 
-def _by_chief_ray(eye: EyeModel, target_mm: Array) -> Fixations:
+def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:
     """Turn the fixed line p + s u through the target: e1.(q - p) = e2.(q - p) = 0, q the target seen by the turned
     eye.
     """
@@ -122,7 +122,7 @@ def _by_chief_ray(eye: EyeModel, target_mm: Array) -> Fixations:
     )
 
 
-def _turn_line(eye: EyeModel, target: Xyz, point: Xyz, direction: Xyz) -> tuple[Array, Array, Array, Array]:
+def _turn_line(eye: EyeModel, target: Xyz, point: Xyz, direction: Xyz) -> tuple[Floats, Floats, Floats, Floats]:
     """(azimuth, elevation, distance of the target from the line, its distance along the line), Newton with Listing."""
     e1, e2 = _tangents(direction)
     centre = eye.rotation.azimuth_centre_mm
@@ -154,7 +154,7 @@ def _turn_line(eye: EyeModel, target: Xyz, point: Xyz, direction: Xyz) -> tuple[
     return azimuth, elevation, np.hypot(r1, r2), _dot(direction, gap)
 
 
-def _seen(eye: EyeModel, target: Xyz, azimuth: Array, elevation: Array) -> tuple[Xyz, Xyz, Xyz]:
+def _seen(eye: EyeModel, target: Xyz, azimuth: Floats, elevation: Floats) -> tuple[Xyz, Xyz, Xyz]:
     """The target as the turned eye has it, with its derivatives by azimuth and elevation (Listing's torsion
     included).
     """
@@ -185,7 +185,7 @@ def _seen(eye: EyeModel, target: Xyz, azimuth: Array, elevation: Array) -> tuple
     return (x, y + ct[1], z + ct[2]), by_a, by_e
 
 
-def _by_entrance_window(eye: EyeModel, target_mm: Array) -> Fixations:
+def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
     """Broyden on the pose, started at the chief ray's; the error is the miss at the fovea across the line of sight."""
     start = _by_chief_ray(eye, target_mm)
     angles = np.stack([start.poses.azimuth_rad, start.poses.elevation_rad], axis=-1)
@@ -217,7 +217,7 @@ def _by_entrance_window(eye: EyeModel, target_mm: Array) -> Fixations:
     return Fixations(Poses.listing(angles[:, 0], angles[:, 1]), residual, status, entry, way)
 
 
-def _window_miss(eye: EyeModel, target_mm: Array, angles: Array) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
+def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floats, Floats, Floats, Bools]:
     """(miss at the fovea (n, 2), point on the cornea, direction to the target, whether there is no such ray)."""
     poses = Poses.listing(angles[:, 0], angles[:, 1])
     seen = join(into_eye(Turning.of(poses), eye, components(target_mm)))
@@ -231,7 +231,7 @@ def _window_miss(eye: EyeModel, target_mm: Array, angles: Array) -> tuple[Array,
     return np.where(lost[:, None], 0.0, miss), traced.points_mm[1], -direction, lost
 
 
-def entrance_window_centre(eye: EyeModel, viewpoint_mm: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+def entrance_window_centre(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Bools]:
     """The centre of the entrance window seen from viewpoints (n, 3) of the eye frame (mm), and where there is none.
 
     c = mean(p_i) - t mean(u_i) with exit points p_i and directions u_i; t makes c come closest to the optic axis.
@@ -251,7 +251,7 @@ def entrance_window_centre(eye: EyeModel, viewpoint_mm: Array) -> tuple[Array, n
     return point - length[:, None] * way, lost
 
 
-def _mean_ray(eye: EyeModel, viewpoint_mm: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+def _mean_ray(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Floats, Bools]:
     """Mean exit point and mean direction (n, 3) of the rays from the stop's margin, and where one does not exist."""
     margin = eye.stop.boundary(WINDOW_POINTS)
     found = apparent_points(eye.front, eye.front_indices, margin, viewpoint_mm[:, None, :])
@@ -259,13 +259,13 @@ def _mean_ray(eye: EyeModel, viewpoint_mm: Array) -> tuple[Array, Array, npt.NDA
     return np.mean(found.exit_points_mm, axis=1), np.mean(found.directions, axis=1), lost
 
 
-def _to_the_axis(point: Array, way: Array) -> Array:
+def _to_the_axis(point: Floats, way: Floats) -> Floats:
     """t for which point - t way comes closest to the x axis, (n,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.sum(way[:, 1:] * point[:, 1:], axis=-1) / np.sum(way[:, 1:] ** 2, axis=-1))
 
 
-def _status(target_mm: Array, azimuth: Array, elevation: Array, residual: Array) -> npt.NDArray[np.int8]:
+def _status(target_mm: Floats, azimuth: Floats, elevation: Floats, residual: Floats) -> Statuses:
     status = np.full(residual.shape, int(FixationStatus.OK), dtype=np.int8)
     status[~(residual <= RESIDUAL_LIMIT_MM)] = FixationStatus.NOT_CONVERGED
     turned = ~((np.abs(azimuth) <= REACH_RAD) & (np.abs(elevation) <= REACH_RAD))
@@ -282,11 +282,11 @@ def _tangents(direction: Xyz) -> tuple[Xyz, Xyz]:
     return e1, (-z * e1[1], z * e1[0], x * e1[1] - y * e1[0])
 
 
-def _dot(a: Xyz, b: Xyz) -> Array:
+def _dot(a: Xyz, b: Xyz) -> Floats:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def _split(vector: Array) -> Xyz:
+def _split(vector: Floats) -> Xyz:
     return vector[..., 0], vector[..., 1], vector[..., 2]
 
 

@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..files import shown
-from ..geometry.transforms import Array, rotation_x, rotation_y, rotation_z, tilt_rotation
+from ..geometry.transforms import rotation_x, rotation_y, rotation_z, tilt_rotation
 from ..spec import LARGEST
 
 
@@ -92,7 +93,7 @@ def _apex_from_centre(shape: Any, path: str) -> float | None:
     return None
 
 
-def _tilt_deg(rotation: Array) -> Array:
+def _tilt_deg(rotation: Floats) -> Floats:
     """The angles (deg) about x, y, z of a rotation (3, 3) as Rz Ry Rx."""
     about_y = np.arctan2(-rotation[2, 0], np.hypot(rotation[2, 1], rotation[2, 2]))
     about_z = np.arctan2(rotation[1, 0], rotation[0, 0])
@@ -128,7 +129,7 @@ def _choice(data: dict[str, Any], key: str, known: tuple[Any, Any], path: str) -
     return value
 
 
-def _numbers(value: Any, count: int) -> Array | None:
+def _numbers(value: Any, count: int) -> Floats | None:
     """A list of finite numbers within the limits of a spec, as an array; None where it is none."""
     if not isinstance(value, list | tuple) or len(value) != count:
         return None

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.surfaces import components, join
-from ..geometry.transforms import Array, normalize, read_only
+from ..geometry.transforms import normalize, read_only
 from ..optics.gradient import GradientMedium
 from ..optics.shooting import connect
 from ..optics.trace import Crossing, RayStatus, Traced, outward_path, trace
@@ -40,7 +41,7 @@ def _through(eye: EyeModel, last: int) -> list[GradientMedium | None]:
     return [eye.lens_gradient if k == last else None for k in range(len(eye.back))]
 
 
-def nodal_rays(eye: EyeModel, objects_mm: Array, guess_mm: Array) -> tuple[Array, Array]:
+def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Floats, Floats]:
     """The rays from objects (m, 3) that reach the retina parallel to themselves: directions (m, 3), retina points (m,
     3).
 
@@ -58,7 +59,7 @@ def nodal_rays(eye: EyeModel, objects_mm: Array, guess_mm: Array) -> tuple[Array
     return direction, retina
 
 
-def _parallel_rays(path: Sequence[Crossing], objects_mm: Array, direction: Array) -> tuple[Array, Array, Array]:
+def _parallel_rays(path: Sequence[Crossing], objects_mm: Floats, direction: Floats) -> tuple[Floats, Floats, Floats]:
     """Newton on the change of direction, with differences over 1e-5 rad: directions, |change|, retina points."""
     for _ in range(30):
         first, second = _tangents(direction)
@@ -87,7 +88,7 @@ def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
     )
 
 
-def incident_node(eye: EyeModel) -> Array:
+def incident_node(eye: EyeModel) -> Floats:
     """The waist of a ring of nodal rays (3,).
 
     16 nodal rays from (h, v) = 14.3 deg (sin f, cos f), objects 1500 mm from the apex; the node is the mean of the
@@ -109,7 +110,7 @@ def incident_node(eye: EyeModel) -> Array:
     return np.asarray(np.mean(middle, axis=0))
 
 
-def fovea_by_nodal_ray(eye: EyeModel, node_mm: Array, field_rad: Array, distance_mm: float) -> Array:
+def fovea_by_nodal_ray(eye: EyeModel, node_mm: Floats, field_rad: Floats, distance_mm: float) -> Floats:
     """Where the nodal ray from the field direction (h nasal, v up) meets the retina, (3,).
 
     The object lies in the direction (1, tan h, tan v) from the incident node, `distance_mm` from the corneal apex.
@@ -121,7 +122,7 @@ def fovea_by_nodal_ray(eye: EyeModel, node_mm: Array, field_rad: Array, distance
     return np.asarray(retina[0])
 
 
-def chief_ray_in_air(eye: EyeModel, fovea_mm: Array) -> LineOfSight:
+def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
     """The ray that leaves the fovea, passes the stop's centre and goes out into the air.
 
     It is fixed in the eye, so that fixation by chief ray only has to turn the eye until it meets the target.
@@ -157,13 +158,13 @@ def chief_ray_in_air(eye: EyeModel, fovea_mm: Array) -> LineOfSight:
     return LineOfSight(read_only(traced.points_mm[-1]), read_only(traced.directions[-1]))
 
 
-def field_direction(field_rad: Array) -> Array:
+def field_direction(field_rad: Floats) -> Floats:
     """(1, tan h, tan v), normalized; field angles (..., 2) -> (..., 3)."""
     field = np.asarray(field_rad, dtype=np.float64)
     return normalize(np.stack([np.ones(field.shape[:-1]), np.tan(field[..., 0]), np.tan(field[..., 1])], axis=-1))
 
 
-def _tangents(direction: Array) -> tuple[Array, Array]:
+def _tangents(direction: Floats) -> tuple[Floats, Floats]:
     first = normalize(np.cross(direction, np.array([0.0, 0.0, 1.0])))
     return first, np.cross(direction, first)
 

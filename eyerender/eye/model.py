@@ -8,17 +8,16 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue
+from ..arrays import ArrayValue, Bools, FloatLike, Floats
 from ..geometry.surfaces import Surface, Xyz, components, fit, shift, turn_back
-from ..geometry.transforms import Array, read_only
+from ..geometry.transforms import read_only
 from ..optics.gradient import GradientMedium
-from ..optics.interface import Number
 from .spec import EyeSpec, Side
 
 __all__ = ["EyeModel", "EyeSpec", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
 
 
-def _no_contour() -> Array:
+def _no_contour() -> Floats:
     return read_only(np.zeros((2, 0)))
 
 
@@ -32,22 +31,22 @@ class Stop(ArrayValue):
     all arrays have a leading axis, `handed` too.
     """
 
-    centre_mm: Array
-    rotation: Array
-    semi_axes_mm: Array
-    handed: Array
-    contour: Array = field(default_factory=_no_contour)
+    centre_mm: Floats
+    rotation: Floats
+    semi_axes_mm: Floats
+    handed: Floats
+    contour: Floats = field(default_factory=_no_contour)
 
     def __post_init__(self) -> None:
         for name in ("centre_mm", "rotation", "semi_axes_mm", "handed", "contour"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @property
-    def normal(self) -> Array:
+    def normal(self) -> Floats:
         """Unit normal of the plane, towards the cornea, (..., 3)."""
         return np.asarray(self.rotation[..., :, 0])
 
-    def relative_radius(self, angle_rad: npt.ArrayLike) -> Array:
+    def relative_radius(self, angle_rad: npt.ArrayLike) -> Floats:
         """r at the parameter f of the ellipse, from the first semi-axis of the right eye's stop towards up, mirrored
         for a left one; angle () or (m,), or (n, ...) for a batch of n stops.
         """
@@ -59,7 +58,7 @@ class Stop(ArrayValue):
             out = out + cosine * np.cos((k + 1) * angle) + sine * np.sin((k + 1) * angle)
         return out
 
-    def boundary(self, count: int) -> Array:
+    def boundary(self, count: int) -> Floats:
         """`count` points of the margin evenly spaced in the ellipse's parameter, (..., count, 3).
 
         The first lies on the first semi-axis (nasal where it is not turned), the next follow towards up; those of a
@@ -74,24 +73,24 @@ class Stop(ArrayValue):
         r, c = self.rotation[..., None, :, :], self.centre_mm[..., None, :]
         return np.asarray(c + first[..., None] * r[..., :, 1] + second[..., None] * r[..., :, 2])
 
-    def contains(self, points_mm: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def contains(self, points_mm: npt.ArrayLike) -> Bools:
         """Whether points (..., 3) of the plane lie inside the margin; for a batch of stops (n, ..., 3)."""
         point = components(points_mm)
         ndim = point[0].ndim
         _, y, z = turn_back(self.rotation, shift(point, self.centre_mm, -1.0))
         first, second = y / fit(self.semi_axes_mm[..., 0], ndim), z / fit(self.semi_axes_mm[..., 1], ndim)
-        limit: Number = 1.0
+        limit: FloatLike = 1.0
         if self.contour.shape[-1]:
             limit = self.relative_radius(np.arctan2(second, fit(self.handed, ndim) * first))
         return np.asarray(first * first + second * second <= limit * limit)
 
-    def height_mm(self, point: Xyz) -> Array:
+    def height_mm(self, point: Xyz) -> Floats:
         """Height of points above the stop's plane, towards the cornea."""
         ndim = point[0].ndim
         gap = shift(point, self.centre_mm, -1.0)
         return np.asarray(sum(gap[i] * fit(self.rotation[..., i, 0], ndim) for i in range(3)))
 
-    def lets_through(self, course_mm: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def lets_through(self, course_mm: npt.ArrayLike) -> Bools:
         """Whether rays pass inside the margin wherever they cross the stop's plane.
 
         course_mm : their points (k, ..., 3) in order, inside the eye; (k, n, ..., 3) for a batch of n stops.
@@ -110,17 +109,17 @@ class Stop(ArrayValue):
 class Sphere(ArrayValue):
     """centre_mm (3,), radius_mm."""
 
-    centre_mm: Array
-    radius_mm: Number
+    centre_mm: Floats
+    radius_mm: FloatLike
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RotationCentres(ArrayValue):
     """Where the eye turns: azimuth about z, elevation about y, torsion about x; (3,) each."""
 
-    azimuth_centre_mm: Array
-    elevation_centre_mm: Array
-    torsion_centre_mm: Array
+    azimuth_centre_mm: Floats
+    elevation_centre_mm: Floats
+    torsion_centre_mm: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,8 +128,8 @@ class LineOfSight(ArrayValue):
     each.
     """
 
-    point_mm: Array
-    direction: Array
+    point_mm: Floats
+    direction: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,19 +147,19 @@ class EyeModel(ArrayValue):
     side: Side
     wavelength_nm: float
     front: tuple[Surface, ...]
-    front_indices: tuple[Number, ...]
+    front_indices: tuple[FloatLike, ...]
     back: tuple[Surface, ...]
-    back_indices: tuple[Number, ...]
-    back_rims_mm: tuple[Number, ...]
+    back_indices: tuple[FloatLike, ...]
+    back_rims_mm: tuple[FloatLike, ...]
     back_passing: tuple[bool, ...]
     retina: Surface
     stop: Stop
-    limbus_radius_mm: Number
-    iris_root_radius_mm: Number
+    limbus_radius_mm: FloatLike
+    iris_root_radius_mm: FloatLike
     sclera: Sphere
     rotation: RotationCentres
-    fovea_mm: Array
-    incident_node_mm: Array
+    fovea_mm: Floats
+    incident_node_mm: Floats
     chief_ray: LineOfSight
     lens_gradient: GradientMedium | None = None
 

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue
+from ..arrays import ArrayValue, Floats
 from ..geometry.surfaces import Xyz
-from ..geometry.transforms import Array, read_only, rotation_x, rotation_y, rotation_z
+from ..geometry.transforms import read_only, rotation_x, rotation_y, rotation_z
 from .model import EyeModel
 
 
@@ -27,9 +27,9 @@ from .model import EyeModel
 class Poses(ArrayValue):
     """A batch of poses, (n,) each, in radians."""
 
-    azimuth_rad: Array
-    elevation_rad: Array
-    torsion_rad: Array
+    azimuth_rad: Floats
+    elevation_rad: Floats
+    torsion_rad: Floats
 
     def __post_init__(self) -> None:
         for name in ("azimuth_rad", "elevation_rad", "torsion_rad"):
@@ -51,18 +51,18 @@ class Poses(ArrayValue):
         return len(self.azimuth_rad)
 
 
-def listing_torsion(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Array:
+def listing_torsion(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Floats:
     """tau = -asin(sin az sin el / (1 + cos az cos el))."""
     azimuth, elevation = np.asarray(azimuth_rad), np.asarray(elevation_rad)
     return np.asarray(-np.arcsin(np.sin(azimuth) * np.sin(elevation) / (1.0 + np.cos(azimuth) * np.cos(elevation))))
 
 
-def rotation_matrices(poses: Poses) -> Array:
+def rotation_matrices(poses: Poses) -> Floats:
     """M, (n, 3, 3)."""
     return np.asarray(rotation_z(poses.azimuth_rad) @ rotation_y(-poses.elevation_rad) @ rotation_x(poses.torsion_rad))
 
 
-def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Array, Array]:
+def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Floats, Floats]:
     """(M (n, 3, 3), t (n, 3)): x_turned = M x + t in the eye frame.
 
     The world's point is x_turned + the eye's position + the head's position. `eye` may be a batch of n.
@@ -79,9 +79,9 @@ def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Array, Array]:
 class Turning(NamedTuple):
     """Sines and cosines of poses, one array an angle: what moves points in and out of the turned eye cheaply."""
 
-    azimuth: tuple[Array, Array]
-    elevation: tuple[Array, Array]
-    torsion: tuple[Array, Array]
+    azimuth: tuple[Floats, Floats]
+    elevation: tuple[Floats, Floats]
+    torsion: tuple[Floats, Floats]
 
     @classmethod
     def of(cls, poses: Poses) -> Turning:
@@ -106,19 +106,19 @@ def into_eye(turning: Turning, eye: EyeModel, point: Xyz) -> Xyz:
     return x + ct[0], y + ct[1], z + ct[2]
 
 
-def _centres(eye: EyeModel) -> tuple[Array, Array, Array]:
+def _centres(eye: EyeModel) -> tuple[Floats, Floats, Floats]:
     r = eye.rotation
     return r.azimuth_centre_mm, r.elevation_centre_mm, r.torsion_centre_mm
 
 
-def _split(centre: Array) -> tuple[Array, Array, Array]:
+def _split(centre: Floats) -> tuple[Floats, Floats, Floats]:
     return centre[..., 0], centre[..., 1], centre[..., 2]
 
 
-def _apply(matrix: Array, vector: Array) -> Array:
+def _apply(matrix: Floats, vector: Floats) -> Floats:
     return np.asarray((matrix @ vector[..., None])[..., 0])
 
 
-def _about(matrix: Array, centre: Array) -> Array:
+def _about(matrix: Floats, centre: Floats) -> Floats:
     """c - R c, the translation of a turn about c."""
     return np.asarray(centre - (matrix @ centre[..., None])[..., 0])

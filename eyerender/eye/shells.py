@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..arrays import FloatLike, Floats
 from ..geometry.surfaces import Surface
-from ..geometry.transforms import Array
-from ..optics.interface import Number
 from .model import EyeModel
 
 SHELLS = 21
@@ -19,22 +18,22 @@ SHELLS = 21
 class Layers(NamedTuple):
     """Sizes of shells from outside in, and how far the index inside each has gone from edge to core; (k,) each."""
 
-    sizes: Array
-    index_shares: Array
+    sizes: Floats
+    index_shares: Floats
 
 
 class Shells(NamedTuple):
     """Surfaces outside in, front shells and then back shells; the index behind each; their rims."""
 
     surfaces: tuple[Surface, ...]
-    indices: tuple[Number, ...]
-    rims_mm: tuple[Number, ...]
+    indices: tuple[FloatLike, ...]
+    rims_mm: tuple[FloatLike, ...]
 
 
 def lens_shells(
     front: Surface,
     back: Surface,
-    centre_mm: Array,
+    centre_mm: Floats,
     indices: tuple[float, float, float],
     rim_mm: float,
     layers: Layers,

@@ -19,7 +19,7 @@ from ..rig.rig import RigGeometry
 from .estimate import GazePoints, GazeRays
 from .guestrin import GuestrinEizenman
 from .parameters import MEAN_EYE, EyeParameters
-from .recalibration import Kind, Recalibration
+from .recalibration import Recalibration, RecalibrationKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Hennessey:
     """
 
     parameters: EyeParameters = MEAN_EYE
-    recalibration: Kind = "angle"
+    recalibration: RecalibrationKind = "angle"
     lights: tuple[int, ...] | None = None
     correction: Recalibration | None = field(default=None, repr=False)
 

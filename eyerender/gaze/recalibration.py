@@ -21,7 +21,7 @@ from ..rig.rig import RigGeometry
 from .estimate import GazePoints, GazeRays, gaze_points
 from .rays import screen_of
 
-Kind = Literal["none", "screen", "angle"]
+RecalibrationKind = Literal["none", "screen", "angle"]
 TERMS = 6
 
 
@@ -29,7 +29,7 @@ TERMS = 6
 class Recalibration:
     """A correction of gaze rays by eye; `coefficients` (2, 6) by eye, empty before the calibration."""
 
-    kind: Kind = "angle"
+    kind: RecalibrationKind = "angle"
     coefficients: Mapping[int, Floats] = field(default_factory=dict)
 
     def fit(self, observations: Observations, rays: GazeRays, targets_mm: Floats, rig: RigGeometry) -> Recalibration:

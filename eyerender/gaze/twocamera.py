@@ -21,7 +21,7 @@ from ..rig.rig import RigGeometry
 from .cornea import line_to_centre
 from .estimate import GazePoints, GazeRays
 from .rays import FeatureRays, feature_rays, unit
-from .recalibration import Kind, Recalibration
+from .recalibration import Recalibration, RecalibrationKind
 
 # Below this sine two lines or planes count as parallel: rounding alone would decide where they meet.
 _PARALLEL = 1e-7
@@ -39,7 +39,7 @@ class ShihWuLiu:
         lights: which lights' glints to use; None: all of the rig's.
     """
 
-    recalibration: Kind = "angle"
+    recalibration: RecalibrationKind = "angle"
     cameras: tuple[int, int] = (0, 1)
     lights: tuple[int, ...] | None = None
     correction: Recalibration | None = field(default=None, repr=False)

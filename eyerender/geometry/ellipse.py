@@ -15,11 +15,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Bools, Floats
 from ..errors import InputError
-
-Array = NDArray[np.float64]
 
 # Points handled at once: a chunk's temporaries (about 20 arrays) then stay in a core's second-level cache.
 _CHUNK_POINTS = 16384
@@ -34,8 +33,8 @@ class Ellipse:
     not positive or a number that is not finite.
     """
 
-    centre_px: Array
-    semi_axes_px: Array
+    centre_px: Floats
+    semi_axes_px: Floats
     angle_rad: float
 
     def __post_init__(self) -> None:
@@ -83,15 +82,15 @@ class Ellipse:
         """b / a, in (0, 1]."""
         return float(self.semi_axes_px[1] / self.semi_axes_px[0])
 
-    def conic(self) -> Array:
+    def conic(self) -> Floats:
         """(6,) conic coefficients; see `conic_from_parameters`."""
         return conic_from_parameters(self.centre_px, self.semi_axes_px, self.angle_rad)
 
-    def points(self, count: int) -> Array:
+    def points(self, count: int) -> Floats:
         """(count, 2) boundary points at equal steps of the parameter t."""
         return points_on_ellipse(self.centre_px, self.semi_axes_px, self.angle_rad, count)
 
-    def points_at(self, cos_t: Array, sin_t: Array) -> Array:
+    def points_at(self, cos_t: Floats, sin_t: Floats) -> Floats:
         """(n, 2) boundary points at parameters given by their cosines and sines (n,)."""
         a, b = self.semi_axes_px
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
@@ -115,18 +114,18 @@ class EllipseFit(NamedTuple):
     finite) the residual is infinite and the parameters are NaN; `ok` tells them apart.
     """
 
-    centre_px: Array
-    semi_axes_px: Array
-    angle_rad: Array
-    residual_px: Array
+    centre_px: Floats
+    semi_axes_px: Floats
+    angle_rad: Floats
+    residual_px: Floats
 
     @property
-    def ok(self) -> NDArray[np.bool_]:
+    def ok(self) -> Bools:
         """(...) whether there is an ellipse."""
         return np.isfinite(self.residual_px)
 
 
-def wrap_angle(angle_rad: ArrayLike) -> Array:
+def wrap_angle(angle_rad: ArrayLike) -> Floats:
     """angle mod pi, in [0, pi): the orientation of an undirected axis."""
     wrapped = np.mod(np.asarray(angle_rad, dtype=np.float64), np.pi)
     # np.mod rounds a tiny negative angle up to pi itself.
@@ -159,7 +158,7 @@ def fit_ellipse_direct(points: ArrayLike) -> EllipseFit:
     return EllipseFit(out[..., 0:2], out[..., 2:4], out[..., 4], out[..., 5])
 
 
-def _fit_chunk(points: Array) -> Array:
+def _fit_chunk(points: Floats) -> Floats:
     """(n, k, 2) points -> (n, 6) rows of cx, cy, a, b, angle, residual."""
     x = np.ascontiguousarray(points[..., 0])
     y = np.ascontiguousarray(points[..., 1])
@@ -214,12 +213,12 @@ def _fit_chunk(points: Array) -> Array:
     return rows
 
 
-def _dot(first: Array, second: Array) -> Array:
-    product: Array = np.einsum("nk,nk->n", first, second)
+def _dot(first: Floats, second: Floats) -> Floats:
+    product: Floats = np.einsum("nk,nk->n", first, second)
     return product
 
 
-def _positive_eigenvector(m: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+def _positive_eigenvector(m: tuple[Floats, ...]) -> tuple[Floats, Floats, Floats]:
     """The w of M w = lambda diag(1, -1, -1) w for the largest lambda; M symmetric (pp, pq, pr, qq, qr, rr)."""
     pp, pq, pr, qq, qr, rr = m
     # Eigenvalues of diag(1, -1, -1) M, whose characteristic polynomial is x^3 - t x^2 + s x - det = 0.
@@ -242,7 +241,7 @@ def _positive_eigenvector(m: tuple[Array, ...]) -> tuple[Array, Array, Array]:
     return w
 
 
-def _null_vector(m: tuple[Array, ...], value: Array) -> tuple[Array, Array, Array]:
+def _null_vector(m: tuple[Floats, ...], value: Floats) -> tuple[Floats, Floats, Floats]:
     """The null vector of M - value diag(1, -1, -1), normalised to w_p > 0.
 
     It is the first column of the adjugate: an ellipse has w_p^2 > w_q^2 + w_r^2, so no other column is longer.
@@ -255,13 +254,13 @@ def _null_vector(m: tuple[Array, ...], value: Array) -> tuple[Array, Array, Arra
 
 
 def _sampson_rms(
-    basis: tuple[Array, Array, Array],
-    w: tuple[Array, Array, Array],
-    quadratic: tuple[Array, Array, Array],
-    linear: tuple[Array, Array],
-    uv: tuple[Array, Array],
-    factor: tuple[Array, Array, Array],
-) -> Array:
+    basis: tuple[Floats, Floats, Floats],
+    w: tuple[Floats, Floats, Floats],
+    quadratic: tuple[Floats, Floats, Floats],
+    linear: tuple[Floats, Floats],
+    uv: tuple[Floats, Floats],
+    factor: tuple[Floats, Floats, Floats],
+) -> Floats:
     """sqrt(mean(F^2 / |grad F|^2)), px; the gradient is taken back to pixels by L^-T."""
     a2, h2, c2 = (term[:, None] for term in quadratic)
     d, e = (term[:, None] for term in linear)
@@ -271,11 +270,11 @@ def _sampson_rms(
     gu = 2.0 * (a2 * u + h2 * v) - d
     gv = (2.0 * (h2 * u + c2 * v) - e) / l22
     gx = (gu - l21 * gv) / l11
-    rms: Array = np.sqrt((value * value / (gx * gx + gv * gv)).mean(axis=1))
+    rms: Floats = np.sqrt((value * value / (gx * gx + gv * gv)).mean(axis=1))
     return rms
 
 
-def _axes_from_shape_matrix(g11: Array, g12: Array, g22: Array) -> tuple[Array, Array, Array]:
+def _axes_from_shape_matrix(g11: Floats, g12: Floats, g22: Floats) -> tuple[Floats, Floats, Floats]:
     """Semi-axes and angle of {x : x^T G^-1 x = 1}: the square roots of G's eigenvalues and its first eigenvector."""
     mean, half = 0.5 * (g11 + g22), 0.5 * (g11 - g22)
     radius = np.hypot(half, g12)
@@ -285,7 +284,7 @@ def _axes_from_shape_matrix(g11: Array, g12: Array, g22: Array) -> tuple[Array, 
     return np.sqrt(major), np.sqrt(minor), wrap_angle(0.5 * np.arctan2(g12, half))
 
 
-def points_on_ellipse(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: ArrayLike, count: int) -> Array:
+def points_on_ellipse(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: ArrayLike, count: int) -> Floats:
     """p(t_j), t_j = 2 pi j / count. centre (..., 2), semi-axes (..., 2), angle (...) -> (..., count, 2) px."""
     centre = np.asarray(centre_px, dtype=np.float64)
     axes = np.asarray(semi_axes_px, dtype=np.float64)
@@ -298,7 +297,7 @@ def points_on_ellipse(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: 
     )
 
 
-def conic_from_parameters(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: ArrayLike) -> Array:
+def conic_from_parameters(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: ArrayLike) -> Floats:
     """(..., 6) conic (A, B, C, D, E, F) with F(p) = |p'|^2 - 1, p' in units of the semi-axes.
 
     F is -1 at the centre, 0 on the boundary, positive outside. centre (..., 2), semi-axes (..., 2), angle (...).
@@ -318,7 +317,7 @@ def conic_from_parameters(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_r
     )
 
 
-def parameters_from_conic(conic: ArrayLike) -> tuple[Array, Array, Array]:
+def parameters_from_conic(conic: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """(centre (..., 2), semi-axes (..., 2), angle (...)) of (..., 6) conics; NaN where it is no real ellipse."""
     a, b, c, d, e, f = np.moveaxis(np.asarray(conic, dtype=np.float64), -1, 0)
     with np.errstate(all="ignore"):
@@ -346,7 +345,7 @@ def to_cv2(ellipse: Ellipse) -> tuple[tuple[float, float], tuple[float, float], 
     return (cx, cy), (2.0 * b, 2.0 * a), degrees
 
 
-def signed_distance(ellipse: Ellipse, points: ArrayLike) -> Array:
+def signed_distance(ellipse: Ellipse, points: ArrayLike) -> Floats:
     """First-order (Sampson) signed distance of (..., 2) points to the boundary, px: F / |grad F|, positive outside."""
     p = np.asarray(points, dtype=np.float64) - ellipse.centre_px
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
@@ -385,7 +384,7 @@ def _vertical_span(ellipse: Ellipse) -> tuple[float, float]:
     return float(ellipse.centre_px[1]) - half, float(ellipse.centre_px[1]) + half
 
 
-def _chord(ellipse: Ellipse, y: Array) -> tuple[Array, Array]:
+def _chord(ellipse: Ellipse, y: Floats) -> tuple[Floats, Floats]:
     """Ends of the horizontal chord at each y (equal where the line misses)."""
     a, b, c, d, e, f = ellipse.conic()
     linear = b * y + d
@@ -393,9 +392,9 @@ def _chord(ellipse: Ellipse, y: Array) -> tuple[Array, Array]:
     return (-linear - root) / (2.0 * a), (-linear + root) / (2.0 * a)
 
 
-def polygon_area(points: ArrayLike) -> Array:
+def polygon_area(points: ArrayLike) -> Floats:
     """Shoelace area of closed polygons (..., k, 2), px^2; positive when the turn is from +x toward +y."""
     p = np.asarray(points, dtype=np.float64)
     q = np.roll(p, -1, axis=-2)
-    area: Array = 0.5 * np.sum(p[..., 0] * q[..., 1] - q[..., 0] * p[..., 1], axis=-1)
+    area: Floats = 0.5 * np.sum(p[..., 0] * q[..., 1] - q[..., 0] * p[..., 1], axis=-1)
     return area

@@ -7,49 +7,47 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from ..arrays import FloatLike, Floats
 from .surfaces import Surface, fit
 from .surfaces_biconic import Biconic
 from .surfaces_quadric import Quadric
-from .transforms import Array
-
-Number = Array | float
 
 
 class Jet(NamedTuple):
     """h, its slopes and its second derivatives."""
 
-    x: Array
-    y: Array
-    z: Array
-    yy: Array
-    yz: Array
-    zz: Array
+    x: Floats
+    y: Floats
+    z: Floats
+    yy: Floats
+    yz: Floats
+    zz: Floats
 
 
 class Graph(Protocol):
     """A surface over the (y, z) plane of a working frame."""
 
-    def height(self, y: Array, z: Array) -> Array:
+    def height(self, y: Floats, z: Floats) -> Floats:
         """h(y, z)."""
 
-    def jet(self, y: Array, z: Array) -> Jet:
+    def jet(self, y: Floats, z: Floats) -> Jet:
         """h with its derivatives up to the second."""
 
 
 class AxialGraph(NamedTuple):
     """y^2 + z^2 + p x^2 + 2 b x + c = 0 on the sheet where p x + b > 0; u = p x + b = sqrt(b^2 - p (y^2 + z^2 + c))."""
 
-    p: Number
-    b: Number
-    c: Number
+    p: FloatLike
+    b: FloatLike
+    c: FloatLike
     ndim: int
 
-    def height(self, y: Array, z: Array) -> Array:
+    def height(self, y: Floats, z: Floats) -> Floats:
         b = fit(self.b, self.ndim)
         rest = y * y + z * z + fit(self.c, self.ndim)
         return np.asarray(-rest / (b + np.sqrt(b * b - fit(self.p, self.ndim) * rest)))
 
-    def jet(self, y: Array, z: Array) -> Jet:
+    def jet(self, y: Floats, z: Floats) -> Jet:
         p, b = fit(self.p, self.ndim), fit(self.b, self.ndim)
         rest = y * y + z * z + fit(self.c, self.ndim)
         u = np.sqrt(b * b - p * rest)
@@ -64,13 +62,13 @@ class AxialGraph(NamedTuple):
 class QuadricGraph(NamedTuple):
     """Any quadric: A_xx x^2 + 2 (A_xy y + A_xz z + b_x) x + F(0, y, z) = 0 on the sheet where g_x > 0."""
 
-    coefficients: tuple[Number, ...]
+    coefficients: tuple[FloatLike, ...]
     ndim: int
 
-    def height(self, y: Array, z: Array) -> Array:
+    def height(self, y: Floats, z: Floats) -> Floats:
         return self._root(y, z)[0]
 
-    def jet(self, y: Array, z: Array) -> Jet:
+    def jet(self, y: Floats, z: Floats) -> Jet:
         xx, yy, zz, xy, xz, yz, _, by, bz, _ = (fit(v, self.ndim) for v in self.coefficients)
         x, u = self._root(y, z)
         inverse = -1.0 / u
@@ -86,7 +84,7 @@ class QuadricGraph(NamedTuple):
             (az * hz + xz * hz + zz) * inverse,
         )
 
-    def _root(self, y: Array, z: Array) -> tuple[Array, Array]:
+    def _root(self, y: Floats, z: Floats) -> tuple[Floats, Floats]:
         xx, yy, zz, xy, xz, yz, bx, by, bz, c = (fit(v, self.ndim) for v in self.coefficients)
         half = xy * y + xz * z + bx
         rest = y * (yy * y + 2.0 * (yz * z + by)) + z * (zz * z + 2.0 * bz) + c
@@ -99,14 +97,14 @@ class BiconicGraph(NamedTuple):
 
     surface: Biconic
 
-    def height(self, y: Array, z: Array) -> Array:
+    def height(self, y: Floats, z: Floats) -> Floats:
         return self.surface.local_sag(y, z)
 
-    def jet(self, y: Array, z: Array) -> Jet:
+    def jet(self, y: Floats, z: Floats) -> Jet:
         return Jet(*self.surface.sag_derivatives(y, z)[:6])
 
 
-def graphs_of(surfaces: Sequence[Surface], ndim: int) -> tuple[list[Graph], Array, Array] | None:
+def graphs_of(surfaces: Sequence[Surface], ndim: int) -> tuple[list[Graph], Floats, Floats] | None:
     """(graphs, origin, rotation) in one working frame, or None where the surfaces have none in common.
 
     ndim : axes of the arrays that will be handed in. The frame is the eye's, or that of a biconic; two biconics in

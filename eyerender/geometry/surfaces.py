@@ -18,10 +18,9 @@ from typing import NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from .transforms import Array
+from ..arrays import Bools, Floats, Indices
 
-Mask = npt.NDArray[np.bool_]
-Xyz = tuple[Array, Array, Array]
+Xyz = tuple[Floats, Floats, Floats]
 
 
 class Hit(NamedTuple):
@@ -29,21 +28,21 @@ class Hit(NamedTuple):
     exists).
     """
 
-    distance: Array
+    distance: Floats
     point: Xyz
     gradient: Xyz
-    ok: Mask
+    ok: Bools
 
 
 class SymmetricMatrix(NamedTuple):
     """A symmetric 3 x 3 matrix as components, numbers or arrays: the derivative of the half gradient."""
 
-    xx: Array | float
-    yy: Array | float
-    zz: Array | float
-    xy: Array | float
-    xz: Array | float
-    yz: Array | float
+    xx: Floats | float
+    yy: Floats | float
+    zz: Floats | float
+    xy: Floats | float
+    xz: Floats | float
+    yz: Floats | float
 
     def times(self, vector: Xyz) -> Xyz:
         """The product with a vector; off-diagonal zeros cost nothing."""
@@ -66,8 +65,8 @@ class Surface(ABC):
 
     __slots__ = ()
 
-    origin_mm: Array
-    rotation: Array
+    origin_mm: Floats
+    rotation: Floats
 
     @property
     @abstractmethod
@@ -86,7 +85,7 @@ class Surface(ABC):
         """Where rays with unit `direction` cross the sheet, going in (d.g < 0) or out (d.g > 0)."""
 
     @abstractmethod
-    def value_at(self, point: Xyz) -> Array:
+    def value_at(self, point: Xyz) -> Floats:
         """The implicit function F."""
 
     @abstractmethod
@@ -98,15 +97,15 @@ class Surface(ABC):
         """H with dg = H dp."""
 
     @abstractmethod
-    def local_sag(self, y: Array, z: Array) -> Array:
+    def local_sag(self, y: Floats, z: Floats) -> Floats:
         """x of the sheet in the local frame over the local (y, z); NaN where the sheet does not reach."""
 
     @abstractmethod
-    def take(self, index: npt.NDArray[np.intp]) -> Self:
+    def take(self, index: Indices) -> Self:
         """The batch of surfaces at `index`; a single surface is returned as it is."""
 
     @abstractmethod
-    def scaled(self, centre_mm: Array, factor: float) -> Self:
+    def scaled(self, centre_mm: Floats, factor: float) -> Self:
         """The surface with all distances from `centre_mm` (3,) multiplied by `factor` > 0."""
 
     @abstractmethod
@@ -127,30 +126,30 @@ class Surface(ABC):
         return hash((type(self), *((a + 0.0).tobytes() for a in self._key())))
 
     @abstractmethod
-    def _key(self) -> tuple[Array, ...]:
+    def _key(self) -> tuple[Floats, ...]:
         """The arrays that make the surface what it is."""
 
     # -- points (..., 3) ----------------------------------------------------------------------------------------------
 
-    def implicit(self, points: npt.ArrayLike) -> Array:
+    def implicit(self, points: npt.ArrayLike) -> Floats:
         """F at points (..., 3); zero on the surface."""
         return self.value_at(components(points))
 
-    def gradient(self, points: npt.ArrayLike) -> Array:
+    def gradient(self, points: npt.ArrayLike) -> Floats:
         """grad F at points (..., 3)."""
         return 2.0 * join(self.gradient_at(components(points)))
 
-    def normal(self, points: npt.ArrayLike) -> Array:
+    def normal(self, points: npt.ArrayLike) -> Floats:
         """Unit normal g/|g| at points (..., 3), pointing to the air side (+x of the local frame)."""
         gradient = join(self.gradient_at(components(points)))
-        unit: Array = gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
+        unit: Floats = gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
         return unit
 
-    def sag(self, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike) -> Array:
+    def sag(self, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike) -> Floats:
         """x (mm, local frame) of the sheet over local y and z; NaN where it does not reach."""
         return self.local_sag(np.asarray(y_mm, dtype=np.float64), np.asarray(z_mm, dtype=np.float64))
 
-    def intersect(self, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Array, Mask]:
+    def intersect(self, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Floats, Bools]:
         """Distance (mm) to the nearest crossing ahead and whether there is one; shapes (..., 3) -> (...,).
 
         `directions` are unit vectors. Where nothing is met the distance is infinite.
@@ -161,15 +160,15 @@ class Surface(ABC):
         nearest = np.minimum(distances[0], distances[1])
         return nearest, np.isfinite(nearest)
 
-    def to_local(self, points: npt.ArrayLike) -> Array:
+    def to_local(self, points: npt.ArrayLike) -> Floats:
         """Points (..., 3) of the eye frame in the local frame."""
         return join(turn_back(self.rotation, shift(components(points), self.origin_mm, -1.0)))
 
-    def to_eye(self, points: npt.ArrayLike) -> Array:
+    def to_eye(self, points: npt.ArrayLike) -> Floats:
         """Points (..., 3) of the local frame in the eye frame."""
         return join(shift(turn(self.rotation, components(points)), self.origin_mm, 1.0))
 
-    def axis_distance(self, point: Xyz) -> Array:
+    def axis_distance(self, point: Xyz) -> Floats:
         """Distance (mm) of points from the local x axis."""
         local_x, local_y, local_z = shift(point, self.origin_mm, -1.0)
         axis_x, axis_y, axis_z = (fit(self.rotation[..., i, 0], point[0].ndim) for i in range(3))
@@ -183,12 +182,12 @@ def components(points: npt.ArrayLike) -> Xyz:
     return np.array(array[..., 0]), np.array(array[..., 1]), np.array(array[..., 2])
 
 
-def join(point: Xyz) -> Array:
+def join(point: Xyz) -> Floats:
     """Three arrays -> (..., 3)."""
     return np.stack(np.broadcast_arrays(*point), axis=-1)
 
 
-def fit(value: Array | float, ndim: int) -> Array | float:
+def fit(value: Floats | float, ndim: int) -> Floats | float:
     """A parameter () or (n,) made to broadcast with points that have `ndim` axes, the batch axis first."""
     if isinstance(value, float):
         return value
@@ -197,7 +196,7 @@ def fit(value: Array | float, ndim: int) -> Array | float:
     return value.reshape(value.shape + (1,) * (ndim - value.ndim))
 
 
-def shift(point: Xyz, offset: Array, sign: float) -> Xyz:
+def shift(point: Xyz, offset: Floats, sign: float) -> Xyz:
     """point + sign offset, offset (3,) or (n, 3)."""
     ndim = point[0].ndim
     return (
@@ -207,7 +206,7 @@ def shift(point: Xyz, offset: Array, sign: float) -> Xyz:
     )
 
 
-def turn(rotation: Array, vector: Xyz) -> Xyz:
+def turn(rotation: Floats, vector: Xyz) -> Xyz:
     """rotation vector, rotation (3, 3) or (n, 3, 3)."""
     ndim = vector[0].ndim
     rows = [[fit(rotation[..., i, j], ndim) for j in range(3)] for i in range(3)]
@@ -219,10 +218,10 @@ def turn(rotation: Array, vector: Xyz) -> Xyz:
     )
 
 
-def turn_back(rotation: Array, vector: Xyz) -> Xyz:
+def turn_back(rotation: Floats, vector: Xyz) -> Xyz:
     """rotation^T vector, rotation (3, 3) or (n, 3, 3)."""
     return turn(np.swapaxes(rotation, -1, -2), vector)
 
 
-def _is_zero(value: Array | float) -> bool:
+def _is_zero(value: Floats | float) -> bool:
     return isinstance(value, float) and value == 0.0

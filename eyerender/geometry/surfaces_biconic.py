@@ -6,22 +6,22 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
 
-from .surfaces import Hit, Mask, Surface, SymmetricMatrix, Xyz, fit, shift, turn, turn_back
-from .transforms import Array, flip_y, mirror_rotation, read_only
+from ..arrays import Bools, Floats, Indices
+from .surfaces import Hit, Surface, SymmetricMatrix, Xyz, fit, shift, turn, turn_back
+from .transforms import flip_y, mirror_rotation, read_only
 
 
 class _Sag(NamedTuple):
     """x(y, z) of the sheet, its first and its second derivatives; `inside` where the square root is real."""
 
-    x: Array
-    y: Array
-    z: Array
-    yy: Array
-    yz: Array
-    zz: Array
-    inside: Mask
+    x: Floats
+    y: Floats
+    z: Floats
+    yy: Floats
+    yz: Floats
+    zz: Floats
+    inside: Bools
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,10 +36,10 @@ class Biconic(Surface):
     optical instruments", biconic surface.)
     """
 
-    origin_mm: Array
-    rotation: Array
-    radii_mm: Array
-    conic_constants: Array
+    origin_mm: Floats
+    rotation: Floats
+    radii_mm: Floats
+    conic_constants: Floats
     _untilted: bool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -88,7 +88,7 @@ class Biconic(Surface):
         point = (origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2])
         return Hit(t, point, self._to_eye((np.ones_like(slope_y), -slope_y, -slope_z)), ok)
 
-    def value_at(self, point: Xyz) -> Array:
+    def value_at(self, point: Xyz) -> Floats:
         x, y, z = self._local_point(point)
         return 2.0 * (x - self._first_order(y, z)[0])
 
@@ -104,17 +104,17 @@ class Biconic(Surface):
             return SymmetricMatrix(0.0, -sag.yy, -sag.zz, 0.0, 0.0, -sag.yz)
         r = [[fit(self.rotation[..., i, j], y.ndim) for j in range(3)] for i in range(3)]
 
-        def entry(i: int, j: int) -> Array:
+        def entry(i: int, j: int) -> Floats:
             cross = r[i][1] * r[j][2] + r[i][2] * r[j][1]
             return np.asarray(-(r[i][1] * r[j][1] * sag.yy + r[i][2] * r[j][2] * sag.zz + cross * sag.yz))
 
         return SymmetricMatrix(entry(0, 0), entry(1, 1), entry(2, 2), entry(0, 1), entry(0, 2), entry(1, 2))
 
-    def local_sag(self, y: Array, z: Array) -> Array:
+    def local_sag(self, y: Floats, z: Floats) -> Floats:
         x, _, _, inside = self._first_order(y, z)
         return np.asarray(np.where(inside, x, np.nan))
 
-    def sag_derivatives(self, y: Array, z: Array) -> _Sag:
+    def sag_derivatives(self, y: Floats, z: Floats) -> _Sag:
         """x(y, z) in the local frame with its first and second derivatives.
 
         With N = c_y y^2 + c_z z^2 and W the square root, x = -N / (1 + W).
@@ -135,12 +135,12 @@ class Biconic(Surface):
         xyz = -d * (xy * wz + xz * wy + x * wyz)
         return _Sag(x, xy, xz, xyy, xyz, xzz, inside)
 
-    def take(self, index: npt.NDArray[np.intp]) -> Self:
+    def take(self, index: Indices) -> Self:
         if not self.batch_shape:
             return self
         return type(self)(*(part[index] for part in self._key()))
 
-    def scaled(self, centre_mm: Array, factor: float) -> Self:
+    def scaled(self, centre_mm: Floats, factor: float) -> Self:
         origin = centre_mm + factor * (self.origin_mm - centre_mm)
         return type(self)(origin, self.rotation, factor * self.radii_mm, self.conic_constants)
 
@@ -148,20 +148,20 @@ class Biconic(Surface):
         # The sag is even in y, so only the placement is mirrored.
         return type(self)(flip_y(self.origin_mm), mirror_rotation(self.rotation), self.radii_mm, self.conic_constants)
 
-    def _key(self) -> tuple[Array, ...]:
+    def _key(self) -> tuple[Floats, ...]:
         return self.origin_mm, self.rotation, self.radii_mm, self.conic_constants
 
     @classmethod
     def stack(cls, surfaces: tuple[Self, ...]) -> Self:
         return cls(*(np.stack(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
 
-    def _constants(self, ndim: int) -> tuple[Array | float, ...]:
+    def _constants(self, ndim: int) -> tuple[Floats | float, ...]:
         curvature = 1.0 / self.radii_mm
         shape = (1.0 + self.conic_constants) * curvature**2
         parts = (curvature[..., 0], curvature[..., 1], shape[..., 0], shape[..., 1])
         return tuple(fit(part, ndim) for part in parts)
 
-    def _first_order(self, y: Array, z: Array) -> tuple[Array, Array, Array, Mask]:
+    def _first_order(self, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats, Bools]:
         cy, cz, ky, kz = self._constants(max(y.ndim, z.ndim))
         y_square, z_square = y * y, z * z
         square = 1.0 - ky * y_square - kz * z_square

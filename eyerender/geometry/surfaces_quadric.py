@@ -8,8 +8,9 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from .surfaces import Hit, Mask, Surface, SymmetricMatrix, Xyz, fit
-from .transforms import MIRROR, Array, flip_y, mirror_rotation, read_only
+from ..arrays import Bools, Floats, Indices
+from .surfaces import Hit, Surface, SymmetricMatrix, Xyz, fit
+from .transforms import MIRROR, flip_y, mirror_rotation, read_only
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,12 +22,12 @@ class Quadric(Surface):
     constant : c (mm^2), (...,)
     """
 
-    origin_mm: Array
-    rotation: Array
-    matrix: Array
-    vector: Array
-    constant: Array
-    _eye: tuple[Array | float, ...] = field(init=False, repr=False)
+    origin_mm: Floats
+    rotation: Floats
+    matrix: Floats
+    vector: Floats
+    constant: Floats
+    _eye: tuple[Floats | float, ...] = field(init=False, repr=False)
     _axial: bool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -114,16 +115,16 @@ class Quadric(Surface):
         return "quadric"
 
     @property
-    def coefficients(self) -> tuple[Array | float, ...]:
+    def coefficients(self) -> tuple[Floats | float, ...]:
         """(A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c) in the eye frame, numbers or (n,) arrays."""
         return self._eye
 
     @property
-    def axial_coefficients(self) -> tuple[Array | float, Array | float, Array | float] | None:
+    def axial_coefficients(self) -> tuple[Floats | float, Floats | float, Floats | float] | None:
         """(A_xx, b_x, c) of y^2 + z^2 + A_xx x^2 + 2 b_x x + c = 0 in the eye frame, if the surface is of that form."""
         return (self._eye[0], self._eye[6], self._eye[9]) if self._axial else None
 
-    def seen_from(self, origin_mm: Array, rotation: Array) -> Quadric:
+    def seen_from(self, origin_mm: Floats, rotation: Floats) -> Quadric:
         """The same surface with another frame taken as the eye's: p = rotation p' + origin_mm."""
         back = np.swapaxes(rotation, -1, -2)
         moved = (back @ (self.origin_mm - origin_mm)[..., None])[..., 0]
@@ -154,7 +155,7 @@ class Quadric(Surface):
             ok = (square >= 0.0) & np.isfinite(t) & self.on_sheet(gradient)
         return Hit(t, point, gradient, ok)
 
-    def on_sheet(self, gradient: Xyz) -> Mask:
+    def on_sheet(self, gradient: Xyz) -> Bools:
         """Whether a half gradient in the eye frame points to local +x."""
         if self._axial:
             return np.asarray(gradient[0] > 0.0)
@@ -162,7 +163,7 @@ class Quadric(Surface):
         ax, ay, az = (fit(self.rotation[..., i, 0], ndim) for i in range(3))
         return np.asarray(ax * gradient[0] + ay * gradient[1] + az * gradient[2] > 0.0)
 
-    def value_at(self, point: Xyz) -> Array:
+    def value_at(self, point: Xyz) -> Floats:
         x, y, z = point
         gx, gy, gz = self.gradient_at(point)
         bx, by, bz, c = (fit(v, x.ndim) for v in self._eye[6:])
@@ -179,7 +180,7 @@ class Quadric(Surface):
     def hessian_at(self, point: Xyz) -> SymmetricMatrix:
         return SymmetricMatrix(*(fit(v, point[0].ndim) for v in self._eye[:6]))
 
-    def local_sag(self, y: Array, z: Array) -> Array:
+    def local_sag(self, y: Floats, z: Floats) -> Floats:
         """The root of A_xx x^2 + 2 (A_xy y + A_xz z + b_x) x + F(0, y, z) = 0 on the sheet."""
         m, v = self.matrix, self.vector
         ndim = max(y.ndim, z.ndim)
@@ -194,12 +195,12 @@ class Quadric(Surface):
             stable = half >= 0.0
             return np.asarray(np.where(stable, -rest / np.where(stable, half + root, 1.0), (root - half) / xx))
 
-    def take(self, index: npt.NDArray[np.intp]) -> Self:
+    def take(self, index: Indices) -> Self:
         if not self.batch_shape:
             return self
         return type(self)(*(part[index] for part in self._key()))
 
-    def scaled(self, centre_mm: Array, factor: float) -> Self:
+    def scaled(self, centre_mm: Floats, factor: float) -> Self:
         origin = centre_mm + factor * (self.origin_mm - centre_mm)
         return type(self)(origin, self.rotation, self.matrix, factor * self.vector, factor * factor * self.constant)
 
@@ -213,7 +214,7 @@ class Quadric(Surface):
             self.constant,
         )
 
-    def _key(self) -> tuple[Array, ...]:
+    def _key(self) -> tuple[Floats, ...]:
         return self.origin_mm, self.rotation, self.matrix, self.vector, self.constant
 
     @classmethod
@@ -221,7 +222,7 @@ class Quadric(Surface):
         return cls(*(np.stack(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
 
 
-def centre_of(quadric: Quadric) -> Array:
+def centre_of(quadric: Quadric) -> Floats:
     """Where the gradient vanishes, -A^-1 b, in the eye frame (..., 3); raises LinAlgError for a paraboloid or plane."""
     local = -np.linalg.solve(quadric.matrix, quadric.vector[..., None])[..., 0]
     return quadric.to_eye(local)

@@ -8,63 +8,63 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ..arrays import Floats
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 """Right eye <-> left eye: (x, y, z) -> (x, -y, z)."""
 MIRROR.setflags(write=False)
 
 
-def read_only(array: npt.ArrayLike) -> Array:
+def read_only(array: npt.ArrayLike) -> Floats:
     """A float64 copy that cannot be written to."""
     copy = np.array(array, dtype=np.float64)
     copy.setflags(write=False)
     return copy
 
 
-def rotation_x(angle_rad: npt.ArrayLike) -> Array:
+def rotation_x(angle_rad: npt.ArrayLike) -> Floats:
     """Rotation about x by `angle_rad`, shape (...,) -> (..., 3, 3)."""
     return _plane_rotation(angle_rad, 1, 2)
 
 
-def rotation_y(angle_rad: npt.ArrayLike) -> Array:
+def rotation_y(angle_rad: npt.ArrayLike) -> Floats:
     """Rotation about y by `angle_rad`, shape (...,) -> (..., 3, 3)."""
     return _plane_rotation(angle_rad, 2, 0)
 
 
-def rotation_z(angle_rad: npt.ArrayLike) -> Array:
+def rotation_z(angle_rad: npt.ArrayLike) -> Floats:
     """Rotation about z by `angle_rad`, shape (...,) -> (..., 3, 3)."""
     return _plane_rotation(angle_rad, 0, 1)
 
 
-def tilt_rotation(tilt_rad: npt.ArrayLike) -> Array:
+def tilt_rotation(tilt_rad: npt.ArrayLike) -> Floats:
     """Rz(t_z) Ry(t_y) Rx(t_x); `tilt_rad` about (x, y, z), shape (..., 3)."""
     tilt = np.asarray(tilt_rad, dtype=np.float64)
     about_x, about_y, about_z = rotation_x(tilt[..., 0]), rotation_y(tilt[..., 1]), rotation_z(tilt[..., 2])
-    whole: Array = about_z @ about_y @ about_x
+    whole: Floats = about_z @ about_y @ about_x
     return whole
 
 
-def flip_y(points: npt.ArrayLike) -> Array:
+def flip_y(points: npt.ArrayLike) -> Floats:
     """(x, y, z) -> (x, -y, z), shape (..., 3)."""
-    flipped: Array = np.asarray(points, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
+    flipped: Floats = np.asarray(points, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
     return flipped
 
 
-def mirror_rotation(rotation: npt.ArrayLike) -> Array:
+def mirror_rotation(rotation: npt.ArrayLike) -> Floats:
     """S R S with S the mirroring of y: the same rotation seen in the mirror; shape (..., 3, 3)."""
-    mirrored: Array = MIRROR @ np.asarray(rotation, dtype=np.float64) @ MIRROR
+    mirrored: Floats = MIRROR @ np.asarray(rotation, dtype=np.float64) @ MIRROR
     return mirrored
 
 
-def normalize(vectors: npt.ArrayLike) -> Array:
+def normalize(vectors: npt.ArrayLike) -> Floats:
     """v / |v| along the last axis."""
     array = np.asarray(vectors, dtype=np.float64)
-    unit: Array = array / np.linalg.norm(array, axis=-1, keepdims=True)
+    unit: Floats = array / np.linalg.norm(array, axis=-1, keepdims=True)
     return unit
 
 
-def _plane_rotation(angle_rad: npt.ArrayLike, first: int, second: int) -> Array:
+def _plane_rotation(angle_rad: npt.ArrayLike, first: int, second: int) -> Floats:
     angle = np.asarray(angle_rad, dtype=np.float64)
     cosine, sine = np.cos(angle), np.sin(angle)
     matrix = np.zeros((*angle.shape, 3, 3))

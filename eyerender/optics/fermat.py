@@ -22,10 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..arrays import FloatLike, Floats
 from ..geometry.graphs import Graph
 from ..geometry.surfaces import Xyz
-from ..geometry.transforms import Array
-from .interface import Number
 
 STEPS = 6
 SETTLED_MM = 2e-6
@@ -41,10 +40,10 @@ class Stationary(NamedTuple):
 
 def stationary_path(
     graphs: Sequence[Graph],
-    indices: Sequence[Number],
+    indices: Sequence[FloatLike],
     viewpoint: Xyz,
     target: Xyz,
-    start: Sequence[tuple[Array, Array]],
+    start: Sequence[tuple[Floats, Floats]],
 ) -> Stationary:
     """Newton on dS = 0 from `start` (y, z) on each surface; all in the frame of the graphs.
 
@@ -66,23 +65,28 @@ def stationary_path(
 class _Block(NamedTuple):
     """A symmetric 2 x 2 system: Hessian (yy, yz, zz) and gradient."""
 
-    yy: Array
-    yz: Array
-    zz: Array
-    y: Array
-    z: Array
+    yy: Floats
+    yz: Floats
+    zz: Floats
+    y: Floats
+    z: Floats
 
 
 def _newton(
-    graphs: Sequence[Graph], indices: Sequence[Number], viewpoint: Xyz, target: Xyz, ys: list[Array], zs: list[Array]
+    graphs: Sequence[Graph],
+    indices: Sequence[FloatLike],
+    viewpoint: Xyz,
+    target: Xyz,
+    ys: list[Floats],
+    zs: list[Floats],
 ) -> float:
     """One Newton step on all surfaces; updates `ys`, `zs` (lists of the caller) and returns the largest step."""
     jets = [graph.jet(y, z) for graph, y, z in zip(graphs, ys, zs, strict=True)]
     nodes: list[Xyz] = [viewpoint, *((jet.x, y, z) for jet, y, z in zip(jets, ys, zs, strict=True)), target]
     blocks: list[_Block] = []
-    couplings: list[tuple[Array, Array, Array, Array]] = []
+    couplings: list[tuple[Floats, Floats, Floats, Floats]] = []
     last = len(graphs)
-    carried: tuple[Array, ...] = ()
+    carried: tuple[Floats, ...] = ()
     for j, n in enumerate(indices):
         (x0, y0, z0), (x1, y1, z1) = nodes[j], nodes[j + 1]
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
@@ -126,11 +130,11 @@ def _newton(
 
 
 def _solve(
-    blocks: list[_Block], couplings: list[tuple[Array, Array, Array, Array]], ys: list[Array], zs: list[Array]
+    blocks: list[_Block], couplings: list[tuple[Floats, Floats, Floats, Floats]], ys: list[Floats], zs: list[Floats]
 ) -> float:
     """Block-tridiagonal elimination from the outermost surface inward, and back; applies the step."""
     reduced = [blocks[0]]
-    gains: list[tuple[Array, Array, Array, Array]] = []
+    gains: list[tuple[Floats, Floats, Floats, Floats]] = []
     for block, (yy, yz, zy, zz) in zip(blocks[1:], couplings, strict=True):
         before = reduced[-1]
         scale = 1.0 / (before.yy * before.zz - before.yz * before.yz)
@@ -148,8 +152,8 @@ def _solve(
             )
         )
     largest = 0.0
-    step_y: Array | None = None
-    step_z: Array | None = None
+    step_y: Floats | None = None
+    step_z: Floats | None = None
     for i in reversed(range(len(reduced))):
         b = reduced[i]
         scale = 1.0 / (b.yy * b.zz - b.yz * b.yz)

@@ -28,10 +28,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue
+from ..arrays import ArrayValue, Floats, Indices
 from ..geometry.surfaces import Hit, Surface, Xyz, fit
 from ..geometry.surfaces_quadric import Quadric
-from ..geometry.transforms import MIRROR, Array, flip_y, read_only
+from ..geometry.transforms import MIRROR, flip_y, read_only
 
 STEPS = 32
 """Steps in each half. Twice as many change the direction behind a human lens by less than 1e-5 deg for any ray through
@@ -51,7 +51,7 @@ class Passage(NamedTuple):
 
     hit: Hit
     way: Xyz
-    optical_path_mm: Array
+    optical_path_mm: Floats
     moves: list[Xyz]
     turns: list[Xyz]
 
@@ -64,18 +64,18 @@ class GradientMedium(ArrayValue):
     fall (...,): n_core and n_core - n_edge.
     """
 
-    centre_mm: Array
-    matrices: Array
-    vectors: Array
-    core: Array
-    fall: Array
+    centre_mm: Floats
+    matrices: Floats
+    vectors: Floats
+    core: Floats
+    fall: Floats
 
     def __post_init__(self) -> None:
         for name in ("centre_mm", "matrices", "vectors", "core", "fall"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @classmethod
-    def between(cls, front: Quadric, back: Quadric, centre_mm: Array, edge: float, core: float) -> GradientMedium:
+    def between(cls, front: Quadric, back: Quadric, centre_mm: Floats, edge: float, core: float) -> GradientMedium:
         """The medium between two single surfaces that have `centre_mm` (3,) between them."""
         matrices, vectors = [], []
         for surface in (front, back):
@@ -87,7 +87,7 @@ class GradientMedium(ArrayValue):
             vectors.append(-(matrix @ centre_mm + vector) / value)
         return cls(centre_mm, np.stack(matrices), np.stack(vectors), np.array(core), np.array(core - edge))
 
-    def index_at(self, points_mm: npt.ArrayLike) -> Array:
+    def index_at(self, points_mm: npt.ArrayLike) -> Floats:
         """n at points (..., 3) of the lens; for a batch of n media (n, ..., 3)."""
         points = np.moveaxis(np.asarray(points_mm, dtype=np.float64), -1, 0)
         front, back = self._halves(points.ndim - 1)
@@ -166,7 +166,7 @@ class GradientMedium(ArrayValue):
         )
         return front, back
 
-    def take(self, index: npt.NDArray[np.intp]) -> GradientMedium:
+    def take(self, index: Indices) -> GradientMedium:
         """The batch of media at `index`; a single medium is returned as it is."""
         return self if self.core.ndim == 0 else GradientMedium(*(part[index] for part in self._parts()))
 
@@ -181,27 +181,27 @@ class GradientMedium(ArrayValue):
         """Single media as one batch."""
         return cls(*(np.stack(parts) for parts in zip(*(m._parts() for m in media), strict=True)))
 
-    def _parts(self) -> tuple[Array, ...]:
+    def _parts(self) -> tuple[Floats, ...]:
         return self.centre_mm, self.matrices, self.vectors, self.core, self.fall
 
 
 class _Size(NamedTuple):
     """p, the root s and grad p at some points."""
 
-    size: Array
-    s: Array
-    slope: Array
+    size: Floats
+    s: Floats
+    slope: Floats
 
 
 class _Half(NamedTuple):
     """One half; vectors have their components first: (3, ...)."""
 
-    columns: tuple[Array, ...]
-    vector: Array
-    core: Array
-    fall: Array
+    columns: tuple[Floats, ...]
+    vector: Floats
+    core: Floats
+    fall: Floats
 
-    def at(self, q: Array) -> _Size:
+    def at(self, q: Floats) -> _Size:
         turned = self._turned(q)
         lead = _dot(self.vector, q)
         s = np.sqrt(lead * lead + _dot(q, turned))
@@ -209,14 +209,14 @@ class _Half(NamedTuple):
         size = lead + s
         return _Size(size, s, (turned + size * self.vector) / s)
 
-    def index_of(self, here: _Size) -> Array:
+    def index_of(self, here: _Size) -> Floats:
         return np.asarray(self.core - self.fall * (here.size * here.size))
 
-    def pull(self, here: _Size) -> Array:
+    def pull(self, here: _Size) -> Floats:
         """grad(n^2 / 2) = -2 n (n_core - n_edge) p grad p."""
         return np.asarray(-2.0 * self.fall * self.index_of(here) * here.size * here.slope)
 
-    def bend(self, here: _Size, move: Array) -> Array:
+    def bend(self, here: _Size, move: Floats) -> Floats:
         """The derivative of the pull along `move`."""
         index, slope = self.index_of(here), here.slope
         rise = _dot(slope, move)
@@ -225,7 +225,7 @@ class _Half(NamedTuple):
         by_size = 4.0 * self.fall * self.fall * here.size * here.size - 2.0 * self.fall * index
         return np.asarray(by_size * rise * slope - 2.0 * self.fall * index * here.size / here.s * curve)
 
-    def _turned(self, q: Array) -> Array:
+    def _turned(self, q: Floats) -> Floats:
         x, y, z = self.columns
         return np.asarray(x * q[0] + y * q[1] + z * q[2])
 
@@ -233,10 +233,10 @@ class _Half(NamedTuple):
 class _Rays(NamedTuple):
     """Places as seen from the centre, dr/dt, the optical path so far, and differentials of place and dr/dt."""
 
-    place: Array
-    speed: Array
-    optical_path_mm: Array
-    differentials: list[tuple[Array, Array]]
+    place: Floats
+    speed: Floats
+    optical_path_mm: Floats
+    differentials: list[tuple[Floats, Floats]]
 
 
 def _to_ridge(rays: _Rays, first: _Half, last: _Half, steps: int) -> _Rays:
@@ -258,26 +258,26 @@ def _to_ridge(rays: _Rays, first: _Half, last: _Half, steps: int) -> _Rays:
     return rays._replace(differentials=met)
 
 
-def _to_go(place: Array, speed: Array, first: _Half, last: _Half) -> Array:
+def _to_go(place: Floats, speed: Floats, first: _Half, last: _Half) -> Floats:
     """Newton's step in time to where p is the same in both halves."""
     a, b = first.at(place), last.at(place)
     return np.asarray((b.size - a.size) * _per_time(a.slope - b.slope, speed))
 
 
-def _per_time(slope: Array, speed: Array) -> Array:
+def _per_time(slope: Floats, speed: Floats) -> Floats:
     """1 / (slope . speed); 0 where both halves are the same sphere and any point will do as the ridge."""
     rate = _dot(slope, speed)
     return np.where(np.abs(rate) > 1e-9, 1.0 / rate, 0.0)
 
 
-def _march(rays: _Rays, half: _Half, time: Array, steps: int) -> _Rays:
+def _march(rays: _Rays, half: _Half, time: Floats, steps: int) -> _Rays:
     h = time / steps
     for _ in range(steps):
         rays = _step(rays, half, h)
     return rays
 
 
-def _step(rays: _Rays, half: _Half, h: Array) -> _Rays:
+def _step(rays: _Rays, half: _Half, h: Floats) -> _Rays:
     """One step of the scheme (A, B, C of the source are h times the pulls); the optical path by Simpson's rule."""
     place, speed = rays.place, rays.speed
     one = half.at(place)
@@ -301,21 +301,21 @@ def _step(rays: _Rays, half: _Half, h: Array) -> _Rays:
     )
 
 
-def _first(values: Array, ndim: int) -> Array:
+def _first(values: Floats, ndim: int) -> Floats:
     """Components (3,) or (n, 3) as (3, 1, ...) or (3, n, 1, ...)."""
     moved = np.moveaxis(values, -1, 0)
     return moved.reshape(moved.shape + (1,) * (ndim + 1 - moved.ndim))
 
 
-def _stacked(first: Xyz, second: Xyz) -> tuple[Array, Array]:
+def _stacked(first: Xyz, second: Xyz) -> tuple[Floats, Floats]:
     shape = np.broadcast_shapes(*(part.shape for part in (*first, *second)))
     one, two = (np.stack([np.broadcast_to(part, shape) for part in parts]) for parts in (first, second))
     return one, two
 
 
-def _xyz(vector: Array) -> Xyz:
+def _xyz(vector: Floats) -> Xyz:
     return vector[0], vector[1], vector[2]
 
 
-def _dot(a: Array, b: Array) -> Array:
+def _dot(a: Floats, b: Floats) -> Floats:
     return np.asarray((a * b).sum(axis=0))

@@ -10,10 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..geometry.surfaces import Mask, Xyz
-from ..geometry.transforms import Array
-
-Number = Array | float
+from ..arrays import Bools, FloatLike, Floats
+from ..geometry.surfaces import Xyz
 
 
 def reflect(direction: Xyz, normal: Xyz) -> Xyz:
@@ -26,7 +24,7 @@ def reflect(direction: Xyz, normal: Xyz) -> Xyz:
     )
 
 
-def refract(direction: Xyz, normal: Xyz, n_before: Number, n_after: Number) -> tuple[Xyz, Mask]:
+def refract(direction: Xyz, normal: Xyz, n_before: FloatLike, n_after: FloatLike) -> tuple[Xyz, Bools]:
     """Snell's law: w = eta d + (eta c - c2) N, eta = n_before / n_after, c = -d.N, c2 = sqrt(1 - eta^2 (1 - c^2)).
 
     N is taken against d whichever side it is given on. Returns w and where light passes (False: total reflection; w is
@@ -49,12 +47,12 @@ def refract(direction: Xyz, normal: Xyz, n_before: Number, n_after: Number) -> t
 class FresnelShares(NamedTuple):
     """Reflected shares of the energy: s and p polarized, and unpolarized; the rest is transmitted."""
 
-    s: Array
-    p: Array
-    unpolarized: Array
+    s: Floats
+    p: Floats
+    unpolarized: Floats
 
 
-def fresnel(cosine_incidence: npt.ArrayLike, n_before: Number, n_after: Number) -> FresnelShares:
+def fresnel(cosine_incidence: npt.ArrayLike, n_before: FloatLike, n_after: FloatLike) -> FresnelShares:
     """R_s = ((n1 c1 - n2 c2) / (n1 c1 + n2 c2))^2, R_p = ((n2 c1 - n1 c2) / (n2 c1 + n1 c2))^2; 1 at total reflection.
 
     Source: Born & Wolf 1999, Principles of Optics, 1.5.2 eq. (21) and (33).
@@ -69,6 +67,6 @@ def fresnel(cosine_incidence: npt.ArrayLike, n_before: Number, n_after: Number) 
     return FresnelShares(s, p, 0.5 * (s + p))
 
 
-def dot(a: Xyz, b: Xyz) -> Array:
+def dot(a: Xyz, b: Xyz) -> Floats:
     """a.b"""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

@@ -21,16 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue
-from ..geometry.surfaces import Mask, Surface, components, join
-from ..geometry.transforms import Array, normalize
+from ..arrays import ArrayValue, Bools, FloatLike, Floats, Indices, Statuses
+from ..geometry.surfaces import Surface, components, join
+from ..geometry.transforms import normalize
 from .gradient import GradientMedium
-from .interface import Number
 from .shooting import Corrected, correct, taken
 from .solve import apex_of
-from .trace import Crossing, RayStatus, Status, trace
-
-Rows = npt.NDArray[np.intp]
+from .trace import Crossing, RayStatus, trace
 
 FIRST_STEP = 0.125
 SHORTEST_STEP = 2.0**-14
@@ -50,18 +47,18 @@ class PurkinjePoints(ArrayValue):
     light came in; residual_mm, status (...,). NaN where there is no such ray.
     """
 
-    points_mm: Array
-    exit_points_mm: Array
-    directions: Array
-    course_mm: Array
-    residual_mm: Array
-    status: Status
+    points_mm: Floats
+    exit_points_mm: Floats
+    directions: Floats
+    course_mm: Floats
+    residual_mm: Floats
+    status: Statuses
 
 
 def purkinje_path(
     surfaces: Sequence[Surface],
-    indices: Sequence[Number],
-    rims_mm: Sequence[Number],
+    indices: Sequence[FloatLike],
+    rims_mm: Sequence[FloatLike],
     passing: Sequence[bool],
     gradient: GradientMedium | None = None,
     n_outside: float = 1.0,
@@ -73,7 +70,7 @@ def purkinje_path(
     innermost surface where it is not of one index.
     """
 
-    def crossing(k: int, n_after: Number, inward: bool) -> Crossing:
+    def crossing(k: int, n_after: FloatLike, inward: bool) -> Crossing:
         edge = RayStatus.OUTSIDE_LIMBUS if k == 0 else RayStatus.MISSED
         through = gradient if k == last - 1 and not inward else None
         return Crossing(surfaces[k], n_after, inward, False, rims_mm[k], None if passing[k] else edge, through)
@@ -89,8 +86,8 @@ def purkinje_path(
 
 def purkinje_points(
     surfaces: Sequence[Surface],
-    indices: Sequence[Number],
-    rims_mm: Sequence[Number],
+    indices: Sequence[FloatLike],
+    rims_mm: Sequence[FloatLike],
     passing: Sequence[bool],
     source_mm: npt.ArrayLike,
     viewpoint_mm: npt.ArrayLike,
@@ -131,18 +128,18 @@ class _Route:
     (m, 3).
     """
 
-    apex: Array
-    axis: Array
-    viewpoint: Array
-    source: Array
+    apex: Floats
+    axis: Floats
+    viewpoint: Floats
+    source: Floats
 
-    def at(self, t: Array, rows: Rows) -> tuple[Array, Array]:
+    def at(self, t: Floats, rows: Indices) -> tuple[Floats, Floats]:
         """(viewpoints, sources) of `rows` at t."""
         apex = np.broadcast_to(self.apex, self.source.shape)[rows]
         axis = np.broadcast_to(self.axis, self.source.shape)[rows]
         along, left = t[:, None], 1.0 - t[:, None]
 
-        def place(end: Array) -> Array:
+        def place(end: Floats) -> Floats:
             return np.asarray(apex + left * np.linalg.norm(end, axis=-1, keepdims=True) * axis + along * end)
 
         return place(self.viewpoint[rows]), place(self.source[rows])
@@ -157,12 +154,12 @@ def _followed(path: Sequence[Crossing], n_outside: float, route: _Route) -> Purk
     before = exits.copy()
     residual, tube, largest = np.zeros(count), np.zeros(count), np.zeros(count)
 
-    def sought(rows: Rows, to: Array, aim: Array) -> Corrected:
+    def sought(rows: Indices, to: Floats, aim: Floats) -> Corrected:
         viewpoint, source = route.at(to, rows)
         some = path if len(rows) == count else [taken(c, rows) for c in path]
         return correct(some, n_outside, components(viewpoint), components(source), components(aim))
 
-    def accept(rows: Rows, found: Corrected, good: Mask) -> None:
+    def accept(rows: Indices, found: Corrected, good: Bools) -> None:
         into = rows[good]
         before[into] = exits[into]
         point[into], exits[into], way[into] = (join(p)[good] for p in (found.turning, found.first, found.start))

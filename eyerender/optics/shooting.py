@@ -20,12 +20,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from ..geometry.surfaces import Mask, Xyz, fit
-from ..geometry.transforms import Array
-from .interface import Number, dot
-from .trace import BEHIND_MM, Crossing, RayStatus, Status, inside_rim, mark
+from ..arrays import Bools, FloatLike, Floats, Indices, Statuses
+from ..geometry.surfaces import Xyz, fit
+from .interface import dot
+from .trace import BEHIND_MM, Crossing, RayStatus, inside_rim, mark
 
 SETTLED_MM = 1e-12
 """Newton stops where a ray misses by no more than this and what one rounding of the direction makes at the target."""
@@ -60,9 +59,9 @@ class Connection:
     last: Xyz
     turning: Xyz
     end: Xyz
-    residual_mm: Array
-    tube_mm2_sr: Array
-    status: Status
+    residual_mm: Floats
+    tube_mm2_sr: Floats
+    status: Statuses
 
 
 class Corrected(NamedTuple):
@@ -72,9 +71,9 @@ class Corrected(NamedTuple):
     first: Xyz
     last: Xyz
     turning: Xyz
-    residual_mm: Array
-    determinant_mm2_sr: Array
-    status: Status
+    residual_mm: Floats
+    determinant_mm2_sr: Floats
+    status: Statuses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,15 +82,15 @@ class _Shot:
     last: Xyz
     turning: Xyz
     end: Xyz
-    along: Array
+    along: Floats
     miss: Xyz
-    residual_mm: Array
+    residual_mm: Floats
     tubes: tuple[Xyz, Xyz]
-    determinant: Array
-    status: Status
+    determinant: Floats
+    status: Statuses
 
 
-def connect(path: Sequence[Crossing], n_start: Number, source: Xyz, target: Xyz, aim: Xyz) -> Connection:
+def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz) -> Connection:
     """Find the rays from `source` through `path` to `target` (arrays that broadcast), first aimed at `aim`.
 
     Undamped Newton for all; what it leaves over goes through a guarded search (steps are halved until the miss
@@ -130,7 +129,7 @@ def connect(path: Sequence[Crossing], n_start: Number, source: Xyz, target: Xyz,
 
 
 def correct(
-    path: Sequence[Crossing], n_start: Number, source: Xyz, target: Xyz, aim: Xyz, steps: int = _FAST_STEPS
+    path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz, steps: int = _FAST_STEPS
 ) -> Corrected:
     """`connect` for rays (m,) whose aim is close already: at most `steps` undamped steps, and no other attempt.
 
@@ -155,18 +154,18 @@ class RayTube(NamedTuple):
     and target lie in media of the same index it is the same in both directions. end : the ray's unit direction there.
     """
 
-    cross_section_mm2_sr: Array
+    cross_section_mm2_sr: Floats
     end: Xyz
 
 
-def ray_tube(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xyz, target: Xyz) -> RayTube:
+def ray_tube(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction: Xyz, target: Xyz) -> RayTube:
     """The tube of rays that leave `source` along unit directions, where they pass `target` (see the module)."""
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *direction, *target)))
     shot = _shoot(path, n_start, _spread(source, shape), _spread(direction, shape), _spread(target, shape))
     return RayTube(np.abs(shot.determinant), shot.end)
 
 
-def _shoot(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xyz, target: Xyz) -> _Shot:
+def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction: Xyz, target: Xyz) -> _Shot:
     """Trace `direction` with its two differentials to the point of closest approach to `target`.
 
     Rims are not held against a ray here: the iteration may wander beyond them.
@@ -177,7 +176,7 @@ def _shoot(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xy
     moves: list[Xyz] = [(zero, zero, zero), (zero, zero, zero)]
     turns: list[Xyz] = [basis[0], basis[1]]
     status = np.zeros(way[0].shape, dtype=np.int8)
-    index: Number = n_start if isinstance(n_start, float) else fit(np.asarray(n_start), way[0].ndim)
+    index: FloatLike = n_start if isinstance(n_start, float) else fit(np.asarray(n_start), way[0].ndim)
     first: Xyz | None = None
     turning: Xyz | None = None
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -192,7 +191,7 @@ def _shoot(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xy
                 passage = crossing.through.cross(crossing.surface, crossing.inward, point, way, moves, turns)
                 hit, way, moves, turns = passage.hit, passage.way, passage.moves, passage.turns
                 step, met = hit.distance, hit.ok
-            skip: Mask | None = None
+            skip: Bools | None = None
             if crossing.beyond_rim is None:
                 skip = ~(met & inside_rim(crossing, hit.point))
             else:
@@ -201,7 +200,7 @@ def _shoot(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xy
             normal = (hit.gradient[0] * scale, hit.gradient[1] * scale, hit.gradient[2] * scale)
             cosine = -dot(way, normal)
             if crossing.reflects:
-                eta: Number = 1.0
+                eta: FloatLike = 1.0
                 factor, slope = 2.0 * cosine, 2.0 + zero
                 after = index
             else:
@@ -253,7 +252,7 @@ def _shoot(path: Sequence[Crossing], n_start: Number, source: Xyz, direction: Xy
     return _Shot(first or point, point, turning or point, way, along, miss, residual, (a1, a2), determinant, status)
 
 
-def _stepped(direction: Xyz, shot: _Shot, fraction: Array | float) -> Xyz:
+def _stepped(direction: Xyz, shot: _Shot, fraction: Floats | float) -> Xyz:
     """Newton's next direction, or a fraction of the way to it."""
     a1, a2 = shot.tubes
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -269,13 +268,13 @@ def _stepped(direction: Xyz, shot: _Shot, fraction: Array | float) -> Xyz:
 
 def _rescue(
     path: Sequence[Crossing],
-    n_start: Number,
+    n_start: FloatLike,
     source: Xyz,
     target: Xyz,
     aim: Xyz,
     direction: Xyz,
     shot: _Shot,
-    left: Mask,
+    left: Bools,
 ) -> tuple[Xyz, _Shot]:
     """Guarded Newton for the rays that the undamped one left over; the rest are handed on unchanged."""
     index = np.nonzero(left)
@@ -301,7 +300,7 @@ def _rescue(
 
 
 def _guarded(
-    path: Sequence[Crossing], n_start: Number, source: Xyz, target: Xyz, way: Xyz, shot: _Shot, done: Mask
+    path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, way: Xyz, shot: _Shot, done: Bools
 ) -> tuple[Xyz, _Shot]:
     """Newton with steps halved until the miss shrinks."""
     for _ in range(_GUARDED_STEPS):
@@ -324,23 +323,23 @@ def _guarded(
     return way, shot
 
 
-def _settled(shot: _Shot, slack: float) -> Mask:
+def _settled(shot: _Shot, slack: float) -> Bools:
     """Whether the miss is down to `slack` times what Newton can reach."""
     reach = SETTLED_MM + ROUNDING_RAD * np.sqrt(np.abs(shot.determinant)) * nearness(shot.along)
     return np.asarray(shot.residual_mm <= slack * reach)
 
 
-def _better(trial: _Shot, best: _Shot) -> Mask:
+def _better(trial: _Shot, best: _Shot) -> Bools:
     ok, held = trial.status == RayStatus.OK, best.status == RayStatus.OK
     return np.asarray((ok & ~held) | ((ok == held) & (trial.residual_mm < best.residual_mm)))
 
 
-def nearness(along_mm: Array) -> Array:
+def nearness(along_mm: Floats) -> Floats:
     """What a miss at the distance `along_mm` behind the last surface is multiplied by: FAR_MM / along_mm, at most 1."""
     return np.asarray(FAR_MM / np.maximum(along_mm, FAR_MM))
 
 
-def taken(crossing: Crossing, frame: npt.NDArray[np.intp]) -> Crossing:
+def taken(crossing: Crossing, frame: Indices) -> Crossing:
     """The crossing with its per-eye parameters gathered for single rays."""
     n_after, rim = crossing.n_after, crossing.rim_mm
     return Crossing(
@@ -354,7 +353,7 @@ def taken(crossing: Crossing, frame: npt.NDArray[np.intp]) -> Crossing:
     )
 
 
-def _merge(mask: Mask, new: _Shot, old: _Shot) -> _Shot:
+def _merge(mask: Bools, new: _Shot, old: _Shot) -> _Shot:
     def both(a: Xyz, b: Xyz) -> Xyz:
         return _choose(~mask, b, a)
 
@@ -372,8 +371,8 @@ def _merge(mask: Mask, new: _Shot, old: _Shot) -> _Shot:
     )
 
 
-def _merge_at(shot: _Shot, few: _Shot, index: tuple[npt.NDArray[np.intp], ...]) -> _Shot:
-    def place(old: Array, new: Array) -> Array:
+def _merge_at(shot: _Shot, few: _Shot, index: tuple[Indices, ...]) -> _Shot:
+    def place(old: Floats, new: Floats) -> Floats:
         out = np.array(old)
         out[index] = new
         return out
@@ -392,18 +391,18 @@ def _merge_at(shot: _Shot, few: _Shot, index: tuple[npt.NDArray[np.intp], ...]) 
     )
 
 
-def _put(old: Xyz, new: Xyz, index: tuple[npt.NDArray[np.intp], ...]) -> Xyz:
+def _put(old: Xyz, new: Xyz, index: tuple[Indices, ...]) -> Xyz:
     out = (np.array(old[0]), np.array(old[1]), np.array(old[2]))
     for whole, part in zip(out, new, strict=True):
         whole[index] = part
     return out
 
 
-def _pick(point: Xyz, index: tuple[npt.NDArray[np.intp], ...]) -> Xyz:
+def _pick(point: Xyz, index: tuple[Indices, ...]) -> Xyz:
     return point[0][index], point[1][index], point[2][index]
 
 
-def _choose(old_where: Mask, old: Xyz, new: Xyz) -> Xyz:
+def _choose(old_where: Bools, old: Xyz, new: Xyz) -> Xyz:
     return (
         np.where(old_where, old[0], new[0]),
         np.where(old_where, old[1], new[1]),
@@ -443,11 +442,11 @@ def _minus(a: Xyz, b: Xyz) -> Xyz:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-def _moved(point: Xyz, way: Xyz, distance: Array | float) -> Xyz:
+def _moved(point: Xyz, way: Xyz, distance: Floats | float) -> Xyz:
     return point[0] + distance * way[0], point[1] + distance * way[1], point[2] + distance * way[2]
 
 
-def _triple(a: Xyz, b: Xyz, c: Xyz) -> Array:
+def _triple(a: Xyz, b: Xyz, c: Xyz) -> Floats:
     """a.(b x c)"""
     return np.asarray(
         a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])

@@ -17,14 +17,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue
+from ..arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
 from ..geometry.graphs import Graph, graphs_of
-from ..geometry.surfaces import Mask, Surface, Xyz, components, fit, join, shift, turn, turn_back
-from ..geometry.transforms import Array
+from ..geometry.surfaces import Surface, Xyz, components, fit, join, shift, turn, turn_back
 from .fermat import stationary_path
-from .interface import Number, dot
+from .interface import dot
 from .shooting import RESIDUAL_LIMIT_MM, Connection, connect, nearness, taken
-from .trace import Crossing, RayStatus, Status, cross, inside_rim, mark, outward_path, trace
+from .trace import Crossing, RayStatus, cross, inside_rim, mark, outward_path, trace
 
 SURE_MM = 1e-11
 """A path that its traced ray confirms to this is taken as found; rounding stays well below."""
@@ -38,11 +37,11 @@ class ApparentPoints(ArrayValue):
     unit, from the object to the innermost surface; residual_mm (...,); status (...,).
     """
 
-    exit_points_mm: Array
-    directions: Array
-    inner_directions: Array
-    residual_mm: Array
-    status: Status
+    exit_points_mm: Floats
+    directions: Floats
+    inner_directions: Floats
+    residual_mm: Floats
+    status: Statuses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,10 +53,10 @@ class MirrorPoints(ArrayValue):
     (...,).
     """
 
-    points_mm: Array
-    directions: Array
-    residual_mm: Array
-    status: Status
+    points_mm: Floats
+    directions: Floats
+    residual_mm: Floats
+    status: Statuses
 
 
 class Rays(NamedTuple):
@@ -70,17 +69,17 @@ class Rays(NamedTuple):
     exit: Xyz
     way: Xyz
     end: Xyz
-    residual_mm: Array
-    status: Status
+    residual_mm: Floats
+    status: Statuses
 
 
 def apparent_points(
     surfaces: Sequence[Surface],
-    indices: Sequence[Number],
+    indices: Sequence[FloatLike],
     object_points_mm: npt.ArrayLike,
     viewpoint_mm: npt.ArrayLike,
     *,
-    rim_mm: Number = np.inf,
+    rim_mm: FloatLike = np.inf,
     n_outside: float = 1.0,
 ) -> ApparentPoints:
     """Refraction of object points (..., 3) to a viewpoint (..., 3), broadcast against each other.
@@ -94,7 +93,7 @@ def apparent_points(
 
 
 def mirror_points(
-    surface: Surface, source_mm: npt.ArrayLike, viewpoint_mm: npt.ArrayLike, *, rim_mm: Number = np.inf
+    surface: Surface, source_mm: npt.ArrayLike, viewpoint_mm: npt.ArrayLike, *, rim_mm: FloatLike = np.inf
 ) -> MirrorPoints:
     """Reflection of a source (..., 3) to a viewpoint (..., 3) at the outside of `surface`: the first Purkinje image."""
     rays = mirrored_rays(surface, components(source_mm), components(viewpoint_mm), rim_mm=rim_mm)
@@ -103,11 +102,11 @@ def mirror_points(
 
 def refracted_rays(
     surfaces: Sequence[Surface],
-    indices: Sequence[Number],
+    indices: Sequence[FloatLike],
     target: Xyz,
     viewpoint: Xyz,
     *,
-    rim_mm: Number = np.inf,
+    rim_mm: FloatLike = np.inf,
     n_outside: float = 1.0,
 ) -> Rays:
     """`apparent_points` on components."""
@@ -131,7 +130,7 @@ def refracted_rays(
     return _launched(path, n_outside, viewpoint, target, _confirmed(path, n_outside, viewpoint, target, first, target))
 
 
-def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Number = np.inf) -> Rays:
+def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: FloatLike = np.inf) -> Rays:
     """`mirror_points` on components."""
     path = (Crossing(surface, 1.0, reflects=True, rim_mm=rim_mm, beyond_rim=RayStatus.OUTSIDE_LIMBUS),)
     guess = mirror_start(surface, source, viewpoint)
@@ -145,7 +144,7 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Numb
     return _confirmed(path, 1.0, viewpoint, source, shift(turn(rotation, points[0]), origin, 1.0), guess, hopeless)
 
 
-def _far_beyond(crossing: Crossing, guess: Xyz) -> Mask:
+def _far_beyond(crossing: Crossing, guess: Xyz) -> Bools:
     """Where the first guess of a mirror point is so far outside the rim that the point cannot be on the surface."""
     surface, rim, ndim = crossing.surface, crossing.rim_mm, guess[0].ndim
     if isinstance(rim, float) and rim == np.inf:
@@ -158,12 +157,12 @@ def _far_beyond(crossing: Crossing, guess: Xyz) -> Mask:
 
 def _confirmed(
     path: Sequence[Crossing],
-    n_start: Number,
+    n_start: FloatLike,
     viewpoint: Xyz,
     target: Xyz,
     first: Xyz,
     aim: Xyz,
-    hopeless: Mask | None = None,
+    hopeless: Bools | None = None,
 ) -> Rays:
     """Trace from the viewpoint over the points `first` of the first surface; search again what misses the target.
 
@@ -185,7 +184,7 @@ def _confirmed(
         along = dot(gap, end)
         miss = (gap[0] - along * end[0], gap[1] - along * end[1], gap[2] - along * end[2])
         residual = np.sqrt(dot(miss, miss))
-        reach: Number = SURE_MM
+        reach: FloatLike = SURE_MM
         if path[0].reflects:
             residual = residual * nearness(along)
             # A distant source magnifies what Newton leaves of the mirror point.
@@ -237,7 +236,7 @@ def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target
     return _searched(path, n_outside, viewpoint, target, seen_at, rays, found.reshape(lost.shape))
 
 
-def _cone(count: int, reach_rad: float) -> Array:
+def _cone(count: int, reach_rad: float) -> Floats:
     """Unit directions (count, 3) spread evenly about +x, up to `reach_rad` from it."""
     step = np.arange(count) + 0.5
     angle, turn = reach_rad * np.sqrt(step / count), np.pi * (1.0 + np.sqrt(5.0)) * step
@@ -250,7 +249,7 @@ _LAUNCHED_AT_ONCE = 200
 
 
 def _searched(
-    path: Sequence[Crossing], n_start: Number, viewpoint: Xyz, target: Xyz, aim: Xyz, rays: Rays, left: Mask
+    path: Sequence[Crossing], n_start: FloatLike, viewpoint: Xyz, target: Xyz, aim: Xyz, rays: Rays, left: Bools
 ) -> Rays:
     """The rays with those at `left` found by shooting."""
     rows = np.nonzero(left) if left.ndim else (np.zeros(1, dtype=np.intp),)
@@ -264,7 +263,7 @@ def _searched(
     start = n_start if np.ndim(n_start) == 0 else np.asarray(n_start)[rows[0]]
     found = _from_connection(connect(few, start, pick(viewpoint), pick(target), pick(aim)))
 
-    def put(whole: Array, part: Array) -> Array:
+    def put(whole: Floats, part: Floats) -> Floats:
         out = np.array(np.broadcast_to(whole, shape))
         out[rows] = part
         return out.reshape(left.shape)
@@ -286,8 +285,8 @@ def _from_connection(found: Connection) -> Rays:
 
 
 def _paraxial_start(
-    graphs: Sequence[Graph], ladder: Sequence[Number], viewpoint: Xyz, target: Xyz
-) -> list[tuple[Array, Array]]:
+    graphs: Sequence[Graph], ladder: Sequence[FloatLike], viewpoint: Xyz, target: Xyz
+) -> list[tuple[Floats, Floats]]:
     """First guesses (y, z) on each surface, outside in.
 
     On the outermost one: the straight line's point, drawn away by m = 1 / (1 - d (n - 1) / (n R)) from the line that
@@ -347,13 +346,13 @@ def mirror_start(surface: Surface, source: Xyz, viewpoint: Xyz) -> Xyz:
     )
 
 
-def apex_of(surface: Surface) -> Array:
+def apex_of(surface: Surface) -> Floats:
     """The sheet's point on its local axis, (..., 3)."""
     zero = np.zeros(surface.batch_shape)
     return surface.to_eye(np.stack([surface.sag(zero, zero), zero, zero], axis=-1))
 
 
-def _spread_index(n: Number, ndim: int) -> Number:
+def _spread_index(n: FloatLike, ndim: int) -> FloatLike:
     return n if isinstance(n, float) else fit(np.asarray(n, dtype=np.float64), ndim)
 
 

@@ -9,13 +9,10 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue
-from ..geometry.surfaces import Mask, Surface, Xyz, components, fit, join
-from ..geometry.transforms import Array
+from ..arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
+from ..geometry.surfaces import Surface, Xyz, components, fit, join
 from .gradient import GradientMedium
-from .interface import Number, dot, reflect, refract
-
-Status = npt.NDArray[np.int8]
+from .interface import dot, reflect, refract
 
 
 class RayStatus(IntEnum):
@@ -61,10 +58,10 @@ class Crossing:
     """
 
     surface: Surface
-    n_after: Number
+    n_after: FloatLike
     inward: bool = True
     reflects: bool = False
-    rim_mm: Number = np.inf
+    rim_mm: FloatLike = np.inf
     beyond_rim: RayStatus | None = RayStatus.MISSED
     through: GradientMedium | None = None
 
@@ -77,26 +74,26 @@ class Traced(ArrayValue):
     from the start to the last crossing; status (...,). What follows a failed crossing is not meaningful.
     """
 
-    points_mm: Array
-    directions: Array
-    optical_path_mm: Array
-    status: Status
+    points_mm: Floats
+    directions: Floats
+    optical_path_mm: Floats
+    status: Statuses
 
 
-def inward_path(surfaces: Sequence[Surface], indices: Sequence[Number]) -> tuple[Crossing, ...]:
+def inward_path(surfaces: Sequence[Surface], indices: Sequence[FloatLike]) -> tuple[Crossing, ...]:
     """Refraction at `surfaces`, listed from outside in, with the index behind each."""
     return tuple(Crossing(surface, index) for surface, index in zip(surfaces, indices, strict=True))
 
 
 def outward_path(
-    surfaces: Sequence[Surface], indices: Sequence[Number], n_outside: Number = 1.0
+    surfaces: Sequence[Surface], indices: Sequence[FloatLike], n_outside: FloatLike = 1.0
 ) -> tuple[Crossing, ...]:
     """The same surfaces (listed from outside in) crossed on the way out."""
     behind = [n_outside, *indices[:-1]]
     return tuple(Crossing(s, n, inward=False) for s, n in zip(reversed(surfaces), reversed(behind), strict=True))
 
 
-def trace(path: Sequence[Crossing], n_start: Number, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> Traced:
+def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> Traced:
     """Trace rays (origins and unit directions (..., 3)) through `path`, starting in a medium of index `n_start`."""
     point, direction = components(origins_mm), components(directions)
     ndim = max(point[0].ndim, direction[0].ndim)
@@ -104,7 +101,7 @@ def trace(path: Sequence[Crossing], n_start: Number, origins_mm: npt.ArrayLike, 
     points, ways = [point], [direction]
     status = np.zeros(shape, dtype=np.int8)
     length = np.zeros(shape)
-    index: Number = n_start if isinstance(n_start, float) else fit(np.asarray(n_start, dtype=np.float64), ndim)
+    index: FloatLike = n_start if isinstance(n_start, float) else fit(np.asarray(n_start, dtype=np.float64), ndim)
     for crossing in path:
         if crossing.through is None:
             # A far origin loses digits in the quadratic; the foot of the perpendicular from the eye's origin does not.
@@ -145,7 +142,7 @@ def trace(path: Sequence[Crossing], n_start: Number, origins_mm: npt.ArrayLike, 
     )
 
 
-def cross(crossing: Crossing, gradient: Xyz, direction: Xyz, n_before: Number) -> tuple[Number, Xyz, Mask]:
+def cross(crossing: Crossing, gradient: Xyz, direction: Xyz, n_before: FloatLike) -> tuple[FloatLike, Xyz, Bools]:
     """(index after, direction after, light passes) at a point with half gradient `gradient`."""
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 1.0 / np.sqrt(dot(gradient, gradient))
@@ -159,7 +156,7 @@ def cross(crossing: Crossing, gradient: Xyz, direction: Xyz, n_before: Number) -
         return after, way, passes
 
 
-def inside_rim(crossing: Crossing, point: Xyz) -> Mask:
+def inside_rim(crossing: Crossing, point: Xyz) -> Bools:
     """Whether points of the surface lie within its rim."""
     rim = crossing.rim_mm
     if isinstance(rim, float) and rim == np.inf:
@@ -169,7 +166,7 @@ def inside_rim(crossing: Crossing, point: Xyz) -> Mask:
         return np.asarray(crossing.surface.axis_distance(point) <= limit)
 
 
-def mark(status: Status, where: Mask, value: RayStatus) -> None:
+def mark(status: Statuses, where: Bools, value: RayStatus) -> None:
     """Set `value` where nothing has gone wrong before (in place: `status` belongs to the caller)."""
     status[(status == RayStatus.OK) & where] = value
 

@@ -19,10 +19,9 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from PIL import Image
 
-from ..arrays import ArrayValue, Floats, Ints, frozen
+from ..arrays import ArrayValue, Floats, Ints, Singles, frozen
 from ..errors import InputError
 from ..files import opened, read_bytes, shown
 from ..spec import file_digest
@@ -146,7 +145,7 @@ def placed(head: HeadMesh, globe: Globe, texture: int = 0) -> RegionMesh:
     return RegionMesh(frozen(vertices), frozen(head.normals * mirror), layout, nothing, nothing, nothing, ())
 
 
-def head_map(spec: Region, head: HeadMesh) -> NDArray[np.float32]:
+def head_map(spec: Region, head: HeadMesh) -> Singles:
     """The map (rows, columns, 4) of a head: albedo, two slopes (0), gloss; the texture, then a band for each part.
 
     The texture's red channel counts, made linear and relative to its mean over the skin's vertices: the level is that

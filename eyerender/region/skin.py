@@ -14,10 +14,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..arrays import Floats, frozen
+from ..arrays import Floats, Singles, frozen
 from .anatomy import Region
 from .brow import brow_band
 from .contour import step
@@ -55,7 +54,7 @@ def _texels() -> Floats:
 
 
 @lru_cache(maxsize=4)
-def skin_map(spec: Region) -> NDArray[np.float32]:
+def skin_map(spec: Region) -> Singles:
     """The map (rows, columns, 4) of a subject; its blink does not matter."""
     reference = spec.model_copy(update={"blink": _REFERENCE_BLINK})
     rest = sheet(reference, Globe.sphere()).vertices

@@ -13,12 +13,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-Texture = NDArray[np.float32]
-_Array = NDArray[np.float64]
+from ..arrays import Floats, Singles
+
+Texture = Singles
 
 
 def _noise(
@@ -27,7 +27,7 @@ def _noise(
     rows: tuple[float, float],
     columns: tuple[float, float],
     periodic_rows: bool = False,
-) -> _Array:
+) -> Floats:
     """Gaussian noise of unit variance, band-passed: `rows`, `columns` are (low, high) cycles over the whole extent."""
     h, w = shape
     height = h if periodic_rows else 2 * h
@@ -36,8 +36,8 @@ def _noise(
     fy = np.abs(np.fft.fftfreq(height) * height)[:, None] / extent
     fx = np.abs(np.fft.rfftfreq(w) * w)[None, :]
 
-    def band(f: _Array, low: float, high: float) -> _Array:
-        keep: _Array = np.exp(-((f / high) ** 2))
+    def band(f: Floats, low: float, high: float) -> Floats:
+        keep: Floats = np.exp(-((f / high) ** 2))
         return keep * (1 - np.exp(-((f / low) ** 2))) if low > 0 else keep
 
     spectrum *= band(fy, *rows) * band(fx, *columns)
@@ -46,7 +46,7 @@ def _noise(
     return np.asarray(field / (field.std() + 1e-30))
 
 
-def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) -> _Array:
+def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) -> Floats:
     """Gaussian noise of unit variance on a periodic square, the same in all directions, `low` to `high` cycles."""
     f = np.hypot((np.fft.fftfreq(size) * size)[:, None], (np.fft.rfftfreq(size) * size)[None, :])
     keep = np.exp(-((f / high) ** 2))
@@ -57,7 +57,7 @@ def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) ->
     return np.asarray(field / field.std())
 
 
-def _sealed(texture: _Array) -> Texture:
+def _sealed(texture: Floats) -> Texture:
     out: Texture = texture.astype(np.float32)
     out.flags.writeable = False
     return out
@@ -90,7 +90,7 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     warp = 3.6 * _noise(rng, shape, (0, 2.2), (0, 14)) + 1.0 * _noise(rng, shape, (0, 6), (0, 60))
     rows, columns = np.meshgrid(np.arange(radial), np.arange(angular), indexing="ij")
 
-    def bent(field: _Array, strength: float) -> _Array:
+    def bent(field: Floats, strength: float) -> Floats:
         return np.asarray(ndimage.map_coordinates(field, [rows, columns + strength * warp], order=1, mode="grid-wrap"))
 
     coarse = bent(_noise(rng, shape, (0, 1.6), (22, 60)), 1.0)
@@ -121,7 +121,7 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     return _sealed(texture)
 
 
-def _furrows(rng: np.random.Generator, s: _Array, turn: _Array) -> _Array:
+def _furrows(rng: np.random.Generator, s: Floats, turn: Floats) -> Floats:
     """Concentric contraction furrows: dark arcs in the outer half, each over a part of the circle."""
     out = np.ones(np.broadcast_shapes(s.shape, turn.shape))
     for place in (0.60, 0.71, 0.82, 0.91):
@@ -134,7 +134,7 @@ def _furrows(rng: np.random.Generator, s: _Array, turn: _Array) -> _Array:
     return out
 
 
-def _crypts(rng: np.random.Generator, s: _Array, turn: _Array, collarette: _Array, warp: _Array) -> _Array:
+def _crypts(rng: np.random.Generator, s: Floats, turn: Floats, collarette: Floats, warp: Floats) -> Floats:
     """Fuchs' crypts: lens-shaped gaps in the front layer between trabeculae, a lattice along the collarette that is
     deep in some sectors and closed in others, with a few single ones towards the root.
     """

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Singles
 from ..errors import EyerenderError
 
 
@@ -28,7 +28,7 @@ def second_thread() -> Iterator[None]:
         dr.set_thread_count(count)
 
 
-def write_exr(path: Path, image: NDArray[np.float32]) -> None:
+def write_exr(path: Path, image: Singles) -> None:
     """Write (h, w) float32 as a one-channel EXR; raises `EyerenderError` where the disk refuses it."""
     import mitsuba as mi
 

@@ -16,12 +16,12 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import Bools, Floats
+from ..rig.camera import Window
 from .groups import Group, shade_group
 from .sampling import Sampler, Samples, camera_ray
 from .values import Lamp, Lights, Values
 from .view import Textures
 
-Window = tuple[int, int, int, int]
 _LANES = 2**24  # samples in flight; more are rendered in several passes
 _LARGEST_GROUP = 4
 _PACKET = 16

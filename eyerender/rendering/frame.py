@@ -16,7 +16,7 @@ from ..geometry.surfaces_quadric import Quadric
 from ..region.anatomy import Region
 from ..region.globe import Globe
 from ..region.look import Look
-from ..rig.camera import PinholeCamera
+from ..rig.camera import PinholeCamera, Window
 from ..rig.imaging import Ambient, Lens
 from ..rig.light import Lamp
 from ..rig.sensor import Sensor
@@ -50,7 +50,7 @@ class RenderJob(ArrayValue):
     M: Floats
     t: Floats
     camera: PinholeCamera
-    window: tuple[int, int, int, int]
+    window: Window
     lights: tuple[Lamp, ...]
     sensor: Sensor = _SENSOR
     look: Look = _LOOK

@@ -5,9 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Floats
+from ..arrays import Floats, Singles
 from ..errors import InputError
 from ..region.anatomy import Region
 from ..region.globe import Globe
@@ -56,7 +55,7 @@ class HeadScene(RegionScene):
         return self._still
 
     @staticmethod
-    def _look(spec: Region) -> NDArray[np.float32]:
+    def _look(spec: Region) -> Singles:
         return head_map(spec, load_head(_head(spec)))
 
     def _refuse_crossing(self, spec: Region, globe: Globe) -> None:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import ArrayValue, frozen
-from .film import Exposed, Window, pixels_of
+from ..arrays import ArrayValue, Bytes, Singles, frozen
+from ..rig.camera import Window
+from .film import Exposed, pixels_of
 from .sampling import camera_ray
 from .view import meet
 
@@ -26,9 +26,9 @@ class PartLabels(ArrayValue):
     fractions are of the part of the amodal pupil and iris that lies in the window, NaN where none does.
     """
 
-    part: NDArray[np.uint8]
-    amodal: NDArray[np.uint8]
-    depth_mm: NDArray[np.float32]
+    part: Bytes
+    amodal: Bytes
+    depth_mm: Singles
 
     def visible_fraction(self, part: int) -> float:
         """Share of the amodal pixels of a part that are visible."""

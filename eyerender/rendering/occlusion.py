@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Bytes, Floats
 from ..region.mesh import LidMargins, RegionMesh
 from ..rig.camera import PinholeCamera
 
@@ -36,7 +35,7 @@ def glint_reason(energy: Floats, open_: Bools, blockers: Sequence[str | None]) -
     return f"occluded by {by}" if not np.any(open_[there]) else f"partly occluded by {by}"
 
 
-def visible_arcs_deg(part: NDArray[np.uint8], pupil: int, points_px: Floats, origin_px: tuple[int, int],
+def visible_arcs_deg(part: Bytes, pupil: int, points_px: Floats, origin_px: tuple[int, int],
                      reach_px: float = 1.5) -> list[list[float]]:  # fmt: skip
     """Arcs [from, to] (degrees about the outline's centre, image x towards y) of the pupil's outline that are visible.
 

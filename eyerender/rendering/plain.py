@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..region.mesh import RegionMesh
-from ..rig.camera import PinholeCamera
+from ..rig.camera import PinholeCamera, Window
 
 _TILE_PX = 8
 _STEP_PX = 4.0  # between marked points of a curve
@@ -20,9 +20,7 @@ _HAIR_MM = 0.1  # no hair and no part of a rim is thicker
 _NEAREST_MM = 3.0  # with hairs nearer to the camera nothing is plain
 
 
-def plain_tiles(
-    region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: tuple[int, int, int, int]
-) -> tuple[Bools, int]:
+def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, int]:
     """Which tiles (rows, columns) of a window show nothing but skin, and the size of a tile in pixels.
 
     None does where the region's border is not known, and where hairs come too near to the camera.

@@ -14,9 +14,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, Singles
 from ..region.anatomy import Region
 from ..region.globe import Globe
 from ..region.head import file_states
@@ -90,7 +89,7 @@ class RegionScene:
         return region_mesh(spec, globe)
 
     @staticmethod
-    def _look(spec: Region) -> NDArray[np.float32]:
+    def _look(spec: Region) -> Singles:
         return skin_map(spec)
 
     def clear(self, a: Floats, b: Floats) -> Bools:

@@ -11,9 +11,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayValue, Floats, frozen
+from ..arrays import ArrayValue, Floats, Singles, frozen
 from ..errors import InputError
 from ..rig import defocus, exposure, psf
+from ..rig.camera import Window
 from .film import Exposed, mean_radiance
 from .frame import RenderJob
 from .glints import GlintTable
@@ -41,8 +42,8 @@ class RenderedWindow(ArrayValue):
     glint whether it is visible or what hides it; `lid_margins_px` holds landmarks along the lids where there are any.
     """
 
-    window: tuple[int, int, int, int]
-    irradiance: NDArray[np.float32]
+    window: Window
+    irradiance: Singles
     dn: NDArray[np.uint16]
     bit_depth: int
     labels: PartLabels | None

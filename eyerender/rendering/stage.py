@@ -10,9 +10,10 @@ import numpy as np
 
 from ..arrays import Bools, frozen
 from ..errors import InputError
+from ..rig.camera import Window
 from ..rig.imaging import Ambient
 from .environment import Ambience, Maps
-from .film import Exposed, Window
+from .film import Exposed
 from .frame import RenderJob, boundary_waves, globe_of, kinds, light_table, panel_table, parameters_of
 from .head import place_scene
 from .lidshade import LidShade

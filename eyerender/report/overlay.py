@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..arrays import Floats
+from ..arrays import Bytes, Floats
 from ..imagefile import preview
 from ..observation import Observations
 from .style import ANALYTIC_ON_DARK, IMAGE_ON_DARK
@@ -93,7 +93,7 @@ def _cross(at: Floats, size: float, *, diagonal: bool) -> str:
     return f'<path d="{path}" stroke-width=".5"/>'
 
 
-def _png(image: NDArray[np.uint8]) -> str:
+def _png(image: Bytes) -> str:
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="PNG", optimize=True)
     return base64.b64encode(buffer.getvalue()).decode()

@@ -21,6 +21,8 @@ from ..spec import Number, Positive, Spec, Vec2, Vec3
 Matrix3 = tuple[Vec3, Vec3, Vec3]
 Distortion = tuple[Number, Number, Number, Number, Number]
 Pixels = Annotated[int, Field(gt=0, le=65536)]
+Window = tuple[int, int, int, int]
+"""A part of a sensor: its first column and row, its width and its height (px)."""
 
 # Columns: the camera's right, down and forward axes at rest, in the world (x to the screen, y to the left, z up).
 _REST = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -16,6 +16,7 @@ from scipy import signal
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..rig.camera import Window
 from .camera import PinholeCamera
 from .imaging import Lens
 from .sensor import Sensor
@@ -61,7 +62,7 @@ def defocused(picture: Floats, kernel: Floats) -> Floats:
     return np.asarray(np.maximum(signal.fftconvolve(picture, kernel, mode="valid"), 0.0))
 
 
-def vignette(lens: Lens, camera: PinholeCamera, window: tuple[int, int, int, int]) -> Floats | float:
+def vignette(lens: Lens, camera: PinholeCamera, window: Window) -> Floats | float:
     """What of the light is left at each pixel of a window."""
     if lens.vignetting == 0:
         return 1.0

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import ndimage, special
 
 from ..arrays import Floats
+from ..rig.camera import Window
 
 
 def margin(sigma_px: float) -> int:
@@ -34,9 +35,7 @@ def blur(image: Floats, sigma_px: float) -> Floats:
     return np.asarray(out[m:-m, m:-m])
 
 
-def splat(
-    xy_px: Floats, energy: Floats, sigma_px: float, window: tuple[int, int, int, int]
-) -> tuple[Floats, slice, slice]:
+def splat(xy_px: Floats, energy: Floats, sigma_px: float, window: Window) -> tuple[Floats, slice, slice]:
     """Spots of given energies, the Gaussian integrated over each pixel, on the part of a window that they reach.
 
     Args:

@@ -11,22 +11,23 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from ..arrays import Ints, frozen
+from ..backends.choose import BackendChoice
 from ..errors import InputError
 from ..files import read_json
 from ..imagefolder import DATASET, METADATA, RUN, ImageEntry
 from ..jsonlines import JsonLines
 from ..observation import EYES, Observations
+from ..progress import Progress, Say
 from ..scene import Scene, SceneSpec
 
-Progress = Callable[[int, int, str], None]
 _SHARD_IMAGES = 27  # two or three seconds of work: what a kill costs at most
 _PATIENCE_S = 60.0  # an image, before a worker that says nothing is taken for dead
 
@@ -38,10 +39,10 @@ class ImageSettings:
     folder: Path
     spp: int | None = None
     workers: int | None = None
-    backend: Literal["auto", "cuda", "llvm"] = "auto"
+    backend: BackendChoice = "auto"
     threads: int | None = None
     progress: Progress | None = None
-    say: Callable[[str], None] | None = None
+    say: Say | None = None
 
 
 @dataclass(frozen=True, slots=True)

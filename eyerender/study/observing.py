@@ -26,7 +26,7 @@ from ..scene import Scene
 from .images import Shot, StudyImages, shots
 
 OUTLINE_POINTS = 64
-Kind = Literal["analytic", "image", "image-noiseless"]
+ObserverKind = Literal["analytic", "image", "image-noiseless"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Observing:
     Images are needed for the image observers alone.
     """
 
-    kind: Kind = "analytic"
+    kind: ObserverKind = "analytic"
     images: StudyImages | None = None
 
     def observe(self, scene: Scene, *, facing: bool = False) -> Observations:

@@ -12,22 +12,23 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
 
+from ..backends.choose import BackendChoice
 from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
 from ..files import read_json, write_json, write_text
 from ..lock import writer_lock
 from ..outfolder import clear, refuse_non_empty
+from ..progress import Progress, Say
 from ..scene import Scene
 from . import blignaut, guestrin, head_mounted, together
 from .conditions import conditions_part
 from .head_mounted import head_mounted_part
 from .images import ImageSettings, StudyImages, make_images
 from .literature import MODELS, VARIANTS
-from .observing import Kind, Observing
+from .observing import ObserverKind, Observing
 from .replicate import blignaut_part, facing, guestrin_part, scenes_of
 from .results import write_results
 
-Progress = Callable[[int, int, str], None]
 STUDIES = ("guestrin2006", "blignaut2014", "observers", "conditions")
 RUN_SCHEMA = "eyerender/study/1"
 MARKER, REPORT, IMAGES = "study.json", "report.html", "images"
@@ -50,11 +51,11 @@ def run_study(
     workers: int | None = 1,
     spp: int | None = None,
     noise: Literal["on", "off", "both"] = "both",
-    backend: Literal["auto", "cuda", "llvm"] = "auto",
+    backend: BackendChoice = "auto",
     threads: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
-    say: Callable[[str], None] | None = None,
+    say: Say | None = None,
 ) -> dict[str, Any]:
     """Run a study and write summary.json, findings.json, CSV of both and report.html into a folder.
 
@@ -123,9 +124,9 @@ def run_study(
         return summary
 
 
-def _kinds(observer: str, noise: str) -> list[Kind]:
+def _kinds(observer: str, noise: str) -> list[ObserverKind]:
     """The observers of a run."""
-    kinds: list[Kind] = []
+    kinds: list[ObserverKind] = []
     if observer != "image":
         kinds.append("analytic")
     if observer != "analytic":
@@ -141,7 +142,7 @@ def _noted(progress: Progress | None) -> Progress | None:
 
 
 def _images(
-    name: str, eyes: Sequence[str], protocols: Sequence[str], kinds: Sequence[Kind], settings: ImageSettings
+    name: str, eyes: Sequence[str], protocols: Sequence[str], kinds: Sequence[ObserverKind], settings: ImageSettings
 ) -> StudyImages:
     """The images of every scene of a study, made where they are missing."""
     module = _MODULES.get(name)
@@ -154,7 +155,7 @@ def _images(
     return make_images(name, [shot.scene for shot in shots], settings)
 
 
-def _observings(name: str, kinds: Sequence[Kind], images: StudyImages | None) -> list[tuple[Observing, ...]]:
+def _observings(name: str, kinds: Sequence[ObserverKind], images: StudyImages | None) -> list[tuple[Observing, ...]]:
     """The observers of each job: one by one, or all together where they are compared within it."""
     every = [Observing(kind, None if kind == "analytic" else images) for kind in kinds]
     return [tuple(every)] if name == "observers" else [(one,) for one in every]

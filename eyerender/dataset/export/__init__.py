@@ -16,6 +16,7 @@ from ...errors import InputError
 from ...files import write_json, write_text
 from ...imagefolder import DATASET, METADATA, ImageFolder
 from ...outfolder import staged
+from ...progress import Progress
 from ..assemble import verify_dataset
 from ..validation.problems import WRONG
 from . import coco, ellseg, openeds, table, teyed, webdataset
@@ -23,7 +24,6 @@ from .card import export_card
 from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain
 from .item import Item, Items
 
-Progress = Callable[[int, int, str], None]
 Writer = Callable[[Items, Path], None]
 
 SCHEMA = "eyerender/export/2"

@@ -13,8 +13,8 @@ from types import TracebackType
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Bools
 from ...geometry.ellipse import Ellipse
 from ...imagefile import write_png
 from .item import Items
@@ -92,7 +92,7 @@ def _append(file: IO[str], count: int, value: dict[str, Any]) -> int:
     return count + 1
 
 
-def run_lengths(inside: NDArray[np.bool_]) -> list[int]:
+def run_lengths(inside: Bools) -> list[int]:
     """COCO's uncompressed run lengths: down the columns, starting with zeros."""
     flat = inside.ravel(order="F")
     edges = np.flatnonzero(np.diff(flat)) + 1
@@ -100,7 +100,7 @@ def run_lengths(inside: NDArray[np.bool_]) -> list[int]:
     return [0, *runs] if flat[0] else runs
 
 
-def _instance(category: int, inside: NDArray[np.bool_], ellipse: Ellipse | None) -> dict[str, Any]:
+def _instance(category: int, inside: Bools, ellipse: Ellipse | None) -> dict[str, Any]:
     v, u = np.nonzero(inside)
     box = [int(u.min()), int(v.min()), int(u.max() - u.min() + 1), int(v.max() - v.min() + 1)]
     return {

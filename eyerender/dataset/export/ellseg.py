@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.io import savemat
 
+from ...arrays import Floats
 from ...errors import InputError
 from .item import Item, Items
 
@@ -65,7 +65,7 @@ def write(items: Items, out: Path) -> None:
             file.close()
 
 
-def fit_of(item: Item, part: str) -> NDArray[np.float64]:
+def fit_of(item: Item, part: str) -> Floats:
     """x, y, a, b, angle of the amodal outline, or -1 five times."""
     ellipse = item.ellipse(part)
     if ellipse is None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Ints
+from ...arrays import Bytes, Floats, Ints
 from ...errors import InputError
 from ...files import read_bytes
 from ...geometry.ellipse import Ellipse, signed_distance
@@ -87,13 +87,13 @@ class Item:
         return image
 
     @cached_property
-    def mask(self) -> NDArray[np.uint8]:
+    def mask(self) -> Bytes:
         """0 background or skin, 1 sclera, 2 iris, 3 pupil, (h, w)."""
         path = self.entry.mask_path
         return np.zeros(self.image.shape, np.uint8) if path is None else read_image(path)[0].astype(np.uint8)
 
     @cached_property
-    def amodal(self) -> NDArray[np.uint8]:
+    def amodal(self) -> Bytes:
         """The same as if nothing stood before the eye: the file, or the mask with both ellipses filled in."""
         path = self.entry.file("amodal_mask_file_name")
         if path is not None:
@@ -128,7 +128,7 @@ class Item:
             if g["xy_px"] is not None
         ]
 
-    def pixel_of(self, point_mm: Any) -> NDArray[np.float64]:
+    def pixel_of(self, point_mm: Any) -> Floats:
         """The pixel of a point of the camera's frame (no lens distortion)."""
         K = np.array(self.line["labels"]["camera"]["K"])
         x = K @ np.asarray(point_mm, dtype=float)

@@ -13,8 +13,9 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
+
+from ...arrays import Bytes
 
 _PNG = 0x6D
 _MATRIX = struct.pack(">9i", 0x10000, 0, 0, 0, 0x10000, 0, 0, 0, 0x40000000)
@@ -33,7 +34,7 @@ class PngVideo:
         self._start = self._file.tell()
         self._file.write(struct.pack(">I4sQ", 1, b"mdat", 0))  # 64-bit size, filled in at the end
 
-    def add(self, image: NDArray[np.uint8]) -> None:
+    def add(self, image: Bytes) -> None:
         """One more frame."""
         buffer = io.BytesIO()
         # Colour: decoders differ in whether they take greyscale PNG frames.

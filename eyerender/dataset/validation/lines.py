@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Ints
 from ...errors import InputError
 from ...files import shown
 from ...imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
@@ -108,7 +108,7 @@ class Lines:
         for k in self._moved():
             problems.add(f"{METADATA} line {k + 1}: subject {self._subjects[k]} is in two splits")
 
-    def _moved(self) -> NDArray[np.int64]:
+    def _moved(self) -> Ints:
         """The lines whose subject was in another split before."""
         order = np.argsort(self._subjects, kind="stable")
         subject, split = self._subjects[order], self._splits[order]

@@ -8,6 +8,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats
 from ...geometry.ellipse import points_on_ellipse
+from ...rig.camera import Window
 
 # A mask is traced in single precision, which moves an outline by .004 px at most (measured on the shipped eyes, seen at
 # up to 35 deg); the polygon of `_POINTS` chords lies within r pi^2 / (2 n^2) of the curve, 0.02 px at r = 500 px.
@@ -49,7 +50,7 @@ class Outline:
         """The outline where nothing but the ellipse that fits it best is known."""
         return cls(points_on_ellipse(centre_px, semi_axes_px, angle_rad, _POINTS), tolerance_px)
 
-    def inside(self, window: tuple[int, int, int, int]) -> Bools:
+    def inside(self, window: Window) -> Bools:
         """Whether each pixel's centre of a window (x0, y0, width, height) lies inside, (height, width)."""
         from skimage.draw import polygon2mask
 
@@ -57,7 +58,7 @@ class Outline:
         corners = (self.curve - np.array([x0, y0]))[:, ::-1]  # (row, column)
         return np.asarray(polygon2mask((height, width), corners))  # type: ignore[no-untyped-call]
 
-    def beyond(self, pixels: Bools, window: tuple[int, int, int, int]) -> Floats:
+    def beyond(self, pixels: Bools, window: Window) -> Floats:
         """How far from the outline those of a window's pixels are that lie farther from it than the tolerance, px."""
         v, u = np.nonzero(pixels)
         at = np.stack([u + window[0], v + window[1]], axis=1).astype(float)

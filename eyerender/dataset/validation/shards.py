@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Ints
 from ...errors import InputError
 from ...files import opened, parse_json, shown
 from ...imagefolder import METADATA
 from ...jsonlines import MAX_BYTES, MAX_LINE_BYTES
+from ...progress import Progress
 from ..assemble import damage
 from ..shard import LINES, SHARDS, finished, shard_name, verify
 from ..spec import MAX_COUNT
 from .problems import SHOWN, Problems, differences
 
 _EXACT_INTEGER = 2**53
-Numbers = NDArray[np.int64]
-Step = Callable[[int, int, str], None]
 
 
-def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: Problems, step: Step) -> None:
+def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: Problems, step: Progress) -> None:
     """Every shard that dataset.json asks for: there, of its plan, its files with their sizes and, unless `quick`, their
     checksums; and the files that were put together out of the shards."""
     # Without checksums of its own, as older versions wrote it, metadata.jsonl is left to `compare_lines`.
@@ -78,7 +78,7 @@ def compare_lines(folder: Path, problems: Problems) -> None:
         problems.count += max(len(alone) - SHOWN, 0)
 
 
-def _values(files: Sequence[Path], numbers: Numbers) -> NDArray[np.void]:
+def _values(files: Sequence[Path], numbers: Ints) -> NDArray[np.void]:
     """Some lines of a few files: their numbers, and hashes of their images' names and of their values."""
 
     def rows() -> Iterator[tuple[int, int, int]]:
@@ -90,7 +90,7 @@ def _values(files: Sequence[Path], numbers: Numbers) -> NDArray[np.void]:
     return np.fromiter(rows(), dtype=[("number", np.int64), ("name", np.uint64), ("value", np.uint64)])
 
 
-def _objects(files: Sequence[Path], numbers: Numbers) -> Iterator[tuple[int, dict[str, Any]]]:
+def _objects(files: Sequence[Path], numbers: Ints) -> Iterator[tuple[int, dict[str, Any]]]:
     """The lines of some numbers, in order, that hold objects; what is no object is found elsewhere."""
     if not len(numbers):
         return

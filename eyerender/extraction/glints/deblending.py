@@ -10,17 +10,16 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Bools, Floats
 from ..preprocessing import DN, Image
 from .fits import SpotFit, joined
 from .fitting import UNEXPLAINED, FittedSpots, fit_spots, report
 from .gaussian_model import STEPS, Limits, descend, slopes
 from .windows import Grid, window_radius
 
-Array = NDArray[np.float64]
-Background = Callable[[Array, Array], Array]
-Starts = tuple[Array, Array, Array]
+Background = Callable[[Floats, Floats], Floats]
+Starts = tuple[Floats, Floats, Floats]
 
 UNLIKE_BELL = 0.002  # share of the height that an extended LED and a non-Gaussian blur may leave
 # Largest residual, as a share of the height, that an edge beside a glint or a second glint can leave.
@@ -71,14 +70,14 @@ def give_edges(fitted: FittedSpots, blur_px: float, widest_px: float, limits: Li
     return fit.replaced(index[better], again.taken(better)) if better.size else fit
 
 
-def _unexplained(fit: SpotFit, noise_dn: float, most: float) -> NDArray[np.bool_]:
+def _unexplained(fit: SpotFit, noise_dn: float, most: float) -> Bools:
     """(n,) which spots have a residual that is too large for a single glint, but at most `most` of their height."""
     least = np.maximum(UNEXPLAINED * noise_dn, UNLIKE_BELL * fit.amplitude_dn)
     most_dn = most * np.minimum(fit.amplitude_dn, DN)
     return np.asarray(fit.converged & (fit.residual_dn > least) & (fit.residual_dn < most_dn))
 
 
-def _best_edge(fitted: FittedSpots, blur_px: float) -> tuple[Array, Array]:
+def _best_edge(fitted: FittedSpots, blur_px: float) -> tuple[Floats, Floats]:
     """The straight edge that explains most of each spot's residual, among 12 directions and 9 offsets.
 
     The part of an edge that the parameters of the spot and its background can explain is removed first.
@@ -176,7 +175,7 @@ def split_blends(
     return starts, fit
 
 
-def _long_axis(moments: Array) -> tuple[Array, float] | None:
+def _long_axis(moments: Floats) -> tuple[Floats, float] | None:
     """(2,) one standard deviation along a patch's longer axis, and the standard deviation across it; None if round.
 
     `moments` (2, 2) are the patch's second moments, px^2.

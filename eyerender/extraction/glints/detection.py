@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Bools, Floats, Indices, Singles
 from ...geometry.ellipse import Ellipse
 from ..preprocessing import Image, Prepared, as_image
 from ..settings import ExtractionSettings
 from .prescreening import bell_shaped
-
-Array = NDArray[np.float64]
 
 SMOOTH_PX = 0.7  # standard deviation of the Gaussian that the image is smoothed with first
 MAX_SIGMA_PX = 8.0  # widest spot
@@ -44,11 +42,11 @@ class Spots:
             pupil boundary leaves their pixels out.
     """
 
-    xy_px: Array
-    width_px: Array
-    height_dn: Array
-    patches_px: Array
-    clutter: tuple[Array, Array, Array]
+    xy_px: Floats
+    width_px: Floats
+    height_dn: Floats
+    patches_px: Floats
+    clutter: tuple[Floats, Floats, Floats]
 
 
 def detect_spots(
@@ -96,7 +94,7 @@ def detect_spots(
     )  # fmt: skip
 
 
-def _sampled(smooth: Image, xy: Array, x: Array, y: Array) -> NDArray[np.float32]:
+def _sampled(smooth: Image, xy: Floats, x: Floats, y: Floats) -> Singles:
     """(n, k) levels of the pixels nearest to the peaks xy (n, 2) plus the offsets x and y, (n, k) each."""
     height, width = smooth.shape
     column = np.rint(np.minimum(np.maximum(xy[:, :1] + x, 0.0), width - 1.0)).astype(np.intp)
@@ -104,7 +102,7 @@ def _sampled(smooth: Image, xy: Array, x: Array, y: Array) -> NDArray[np.float32
     return np.asarray(np.take(smooth, row * width + column), dtype=np.float32)
 
 
-def _above_ring(smooth: Image, xy: Array, width: Array) -> Array:
+def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
     """(n,) height of each peak above the brightest tenth of a ring around it. Pixels of other spots are left out.
 
     Skin, lashes and the gaps between lashes have many peaks, with equally bright ones beside them.
@@ -140,7 +138,7 @@ def optics_sigma(blur_px: float) -> float:
     return math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0))
 
 
-def _compact(smooth: Image, xy: Array, width: Array, height: Array) -> NDArray[np.bool_]:
+def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
     """Whether the level falls by at least a third of the height in 9 of 12 directions, 2.5 sigma from the peak.
 
     This rejects strips of sclera and the corners between lid and iris. A glint beside another one or on an edge passes.
@@ -151,7 +149,7 @@ def _compact(smooth: Image, xy: Array, width: Array, height: Array) -> NDArray[n
     return np.asarray(fallen.sum(axis=1) >= 9)
 
 
-def _parted(smooth: Image, xy: Array, size: int, dip: float) -> list[int]:
+def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> list[int]:
     """Indices of the maxima xy (n, 2) that are spots of their own, in the given order.
 
     Two maxima count as one spot unless the level between them falls by `dip` below the lower one, or they are farther
@@ -185,9 +183,7 @@ def _opening(half: Image, size: int) -> Image:
     return as_image(cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)))
 
 
-def _maxima(
-    smooth: Image, half: Image, opened: Image, threshold: float
-) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+def _maxima(smooth: Image, half: Image, opened: Image, threshold: float) -> tuple[Indices, Singles]:
     """Flat indices (n,) of local maxima that exceed the opened level by the threshold, and by how much they do (n,)."""
     blocks = np.flatnonzero(half - opened > LEAST_OF_BLOCK * threshold)
     width, columns = smooth.shape[1], half.shape[1]
@@ -203,7 +199,7 @@ def _maxima(
     return flat[high], (height - level)[high]
 
 
-def _widths(smooth: Image, opened: Image, xy: Array, height: Array, size: int) -> Array:
+def _widths(smooth: Image, opened: Image, xy: Floats, height: Floats, size: int) -> Floats:
     """sigma = sqrt(area above half height / (2 pi ln 2)), counted in a window of the opening's size."""
     step, (rows, columns) = np.arange(-(size // 2), size // 2 + 1), smooth.shape
     x, y = xy.astype(np.intp).T[:, :, None] + step
@@ -215,5 +211,5 @@ def _widths(smooth: Image, opened: Image, xy: Array, height: Array, size: int) -
     high = hat > (0.5 * height).astype(np.float32)[:, None, None]
     area = (high & inside).reshape(height.size, -1).sum(axis=1)
     out = np.sqrt(np.maximum(area, 1) / (2.0 * math.pi * math.log(2.0)))
-    sharp: Array = np.sqrt(np.maximum(out**2 - SMOOTH_PX**2, 0.3))
+    sharp: Floats = np.sqrt(np.maximum(out**2 - SMOOTH_PX**2, 0.3))
     return np.clip(sharp, 0.5, MAX_SIGMA_PX)

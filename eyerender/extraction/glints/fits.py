@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erf
 
-Array = NDArray[np.float64]
+from ...arrays import Bools, Floats, Indices
 
 _ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
 
@@ -31,21 +30,21 @@ class SpotFit:
         converged: (n,) whether the fit converged.
     """
 
-    xy_px: Array
-    covariance: Array
-    amplitude_dn: Array
-    sigma_px: Array
-    background_dn: Array
-    residual_dn: Array
-    moments_px2: Array
-    clipped: NDArray[np.intp]
-    converged: NDArray[np.bool_]
+    xy_px: Floats
+    covariance: Floats
+    amplitude_dn: Floats
+    sigma_px: Floats
+    background_dn: Floats
+    residual_dn: Floats
+    moments_px2: Floats
+    clipped: Indices
+    converged: Bools
 
-    def taken(self, index: NDArray[np.intp]) -> SpotFit:
+    def taken(self, index: Indices) -> SpotFit:
         """The spots with these indices."""
         return SpotFit(*(getattr(self, one.name)[index] for one in fields(self)))
 
-    def replaced(self, index: NDArray[np.intp], other: SpotFit) -> SpotFit:
+    def replaced(self, index: Indices, other: SpotFit) -> SpotFit:
         """A copy in which `other` replaces the spots with these indices."""
         parts = []
         for one in fields(self):
@@ -68,7 +67,7 @@ def no_spots() -> SpotFit:
     )  # fmt: skip
 
 
-def profile(x: Array, centre: float, sigma: float) -> Array:
+def profile(x: Floats, centre: float, sigma: float) -> Floats:
     """Mean over the pixel of exp(-(x - c)^2 / (2 s^2))."""
     scale = math.sqrt(0.5) / sigma
     low = (x - 0.5 - centre) * scale

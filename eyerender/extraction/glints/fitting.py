@@ -11,16 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from ...arrays import Bools, Floats
 from ..preprocessing import Image
 from .fits import SpotFit, no_spots
 from .gaussian_model import PARAMETERS, SAME_LIGHT, Descent, Limits, descend, lost, prior, promising
 from .windows import Others, SpotPixels, cut, window_radius
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Rounds of several steps each. A spot that still moves by WANDERING_PX after PATIENCE rounds is abandoned. The second
 # numbers are for spots whose fit is promising or whose misfit still falls.
@@ -37,16 +34,16 @@ class FittedSpots:
 
     fit: SpotFit
     pixels: SpotPixels
-    theta: Array
-    rest: Array
+    theta: Floats
+    rest: Floats
 
 
 def fit_spots(
     linear: Image,
-    known: Callable[[Array, Array], Array],
-    start_px: Array,
-    width_px: Array,
-    height_dn: Array,
+    known: Callable[[Floats, Floats], Floats],
+    start_px: Floats,
+    width_px: Floats,
+    height_dn: Floats,
     limits: Limits,
 ) -> FittedSpots:
     """Fit all spots.
@@ -107,15 +104,15 @@ def no_fit() -> FittedSpots:
     return FittedSpots(no_spots(), pixels, np.zeros((0, PARAMETERS)), none)
 
 
-def _distance(start: Array) -> Array:
+def _distance(start: Floats) -> Floats:
     """(n, n) distances between spots; infinite on the diagonal."""
     gap = start[:, None] - start
-    out: Array = np.sqrt((gap * gap).sum(axis=-1))
+    out: Floats = np.sqrt((gap * gap).sum(axis=-1))
     np.fill_diagonal(out, np.inf)
     return out
 
 
-def _start(pixels: SpotPixels, start: Array, width: Array, height: Array, touching: Mask) -> Array:
+def _start(pixels: SpotPixels, start: Floats, width: Floats, height: Floats, touching: Bools) -> Floats:
     """(n, PARAMETERS) start of the fit, without the background's level."""
     theta = np.zeros((width.size, PARAMETERS))
     theta[:, :2] = start
@@ -148,13 +145,13 @@ def _start(pixels: SpotPixels, start: Array, width: Array, height: Array, touchi
     return theta
 
 
-def _ring_level(pixels: SpotPixels, rest: Array) -> Array:
+def _ring_level(pixels: SpotPixels, rest: Floats) -> Floats:
     """(n,) mean level along the edges of the windows."""
     ring = pixels.dx * pixels.dx + pixels.dy * pixels.dy > ((pixels.radius - 1.0) ** 2)[pixels.spot]
     return pixels.total(rest * ring) / np.maximum(pixels.total(ring), 1.0)
 
 
-def report(pixels: SpotPixels, ended: Descent, rest: Array, limits: Limits, blur_px: float | None = None) -> SpotFit:
+def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blur_px: float | None = None) -> SpotFit:
     """The fit at the end of a descent; `rest` (P,) is the image minus B and the other spots' light."""
     theta, noise = ended.theta, limits.noise_dn
     k = theta.shape[1]
@@ -182,7 +179,7 @@ def report(pixels: SpotPixels, ended: Descent, rest: Array, limits: Limits, blur
     )
 
 
-def _moments(pixels: SpotPixels, rest: Array, level: Array, which: Mask, sigma: Array) -> Array:
+def _moments(pixels: SpotPixels, rest: Floats, level: Floats, which: Bools, sigma: Floats) -> Floats:
     """(n, 2, 2) second moments of the part above a third of the height, without the background `level` (n,). Spots
     outside `which` get the moments of their fit."""
     out = np.zeros((level.size, 2, 2))

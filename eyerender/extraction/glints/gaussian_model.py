@@ -12,13 +12,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from ...arrays import Bools, Floats
 from .windows import Grid, Others, SpotPixels
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; with an edge also h, p, o
 LOST_PX = 12.0  # a spot that becomes wider or moves farther is not a glint
@@ -67,28 +64,28 @@ class Descent:
         falling: (n,) whether the squared misfit halved during the second half of the steps.
     """
 
-    theta: Array
-    gram: Array
-    used: Array
-    settled: Mask
-    moved: Array
-    falling: Mask
+    theta: Floats
+    gram: Floats
+    used: Floats
+    settled: Bools
+    moved: Floats
+    falling: Bools
 
 
-def lost(theta: Array, start: Array) -> Mask:
+def lost(theta: Floats, start: Floats) -> Bools:
     """(n,) which spots have grown or moved more than a glint can."""
     wide = theta[:, 3:5].max(axis=1) > math.log(LOST_PX)
     away = theta[:, :2] - start
     return np.asarray(wide | ((away * away).sum(axis=1) > LOST_PX**2))
 
 
-def promising(theta: Array, gram: Array, used: Array, noise: float) -> Mask:
+def promising(theta: Floats, gram: Floats, used: Floats, noise: float) -> Bools:
     """(n,) which spots the fit explains roughly (see ROUGH and ROUGH_SHARE)."""
     misfit = noise * np.sqrt(gram[:, -1, -1] / np.maximum(used, 1.0))
     return np.asarray(misfit < np.maximum(ROUGH * noise, ROUGH_SHARE * np.exp(theta[:, 2])))
 
 
-def slopes(pixels: SpotPixels, grid: Grid, theta: Array, rest: Array, blur_px: float | None = None) -> Array:
+def slopes(pixels: SpotPixels, grid: Grid, theta: Floats, rest: Floats, blur_px: float | None = None) -> Floats:
     """(K + 1, P) derivatives of the model at every pixel and, in the last row, the residual.
 
     Args:
@@ -118,7 +115,7 @@ def slopes(pixels: SpotPixels, grid: Grid, theta: Array, rest: Array, blur_px: f
     return out
 
 
-def prior(limits: Limits, edge: bool) -> Array:
+def prior(limits: Limits, edge: bool) -> Floats:
     """(K, K) normal matrix of the priors, all with mean 0: a nearly round spot, a background that is flat to within its
     slope, and an edge of at most full scale within reach."""
     out = np.zeros((WITH_EDGE, WITH_EDGE))
@@ -129,7 +126,7 @@ def prior(limits: Limits, edge: bool) -> Array:
     return out if edge else out[:PARAMETERS, :PARAMETERS]
 
 
-def _gram(pixels: SpotPixels, rows: Array, theta: Array, noise: float, penalty: Array) -> tuple[Array, Array]:
+def _gram(pixels: SpotPixels, rows: Floats, theta: Floats, noise: float, penalty: Floats) -> tuple[Floats, Floats]:
     """Products of the `slopes`, summed over each spot's pixels, with the priors, in units of the noise.
 
     Returns:
@@ -154,7 +151,7 @@ def _gram(pixels: SpotPixels, rows: Array, theta: Array, noise: float, penalty: 
     return out, used
 
 
-def _dimmed(pixels: SpotPixels, rows: Array, gram: Array, light: Array, noise: float) -> None:
+def _dimmed(pixels: SpotPixels, rows: Floats, gram: Floats, light: Floats, noise: float) -> None:
     """Subtract more light (P,) of other spots from the residual; changes the products in place."""
     k = gram.shape[1] - 1
     for product, row, part in zip(gram, pixels.parts(rows), pixels.parts(light), strict=True):
@@ -166,8 +163,8 @@ def _dimmed(pixels: SpotPixels, rows: Array, gram: Array, light: Array, noise: f
 
 def descend(
     pixels: SpotPixels,
-    theta: Array,
-    rest: Array,
+    theta: Floats,
+    rest: Floats,
     others: Others | None,
     limits: Limits,
     blur_px: float | None = None,

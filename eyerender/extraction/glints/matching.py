@@ -11,12 +11,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 
+from ...arrays import Floats, Indices
 from ...errors import InputError
-
-Array = NDArray[np.float64]
 
 CORNEA_RADIUS_MM = 7.8
 # Of a typical adult eye: apex to centre of rotation, that to the entrance pupil and to the cornea's centre.
@@ -32,14 +31,14 @@ class Assignment:
     scale: of the layout that fitted.
     """
 
-    light: NDArray[np.intp]
+    light: Indices
     reasons: tuple[str | None, ...]
-    residual_px: Array
-    shift_px: Array
+    residual_px: Floats
+    shift_px: Floats
     scale: float
 
 
-def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLike, lights_mm: ArrayLike) -> Array:
+def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLike, lights_mm: ArrayLike) -> Floats:
     """(l, 3) points of a sphere that mirror the lights to the camera: normal = bisector of the two directions.
 
     Fixed-point iteration n <- (unit to camera + unit to light) / |...| from the point centre + radius n; it contracts
@@ -58,7 +57,7 @@ def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLik
     return np.asarray(centre + radius_mm * normal)
 
 
-def project(points_mm: ArrayLike, K: ArrayLike, R: ArrayLike, t_mm: ArrayLike) -> Array:
+def project(points_mm: ArrayLike, K: ArrayLike, R: ArrayLike, t_mm: ArrayLike) -> Floats:
     """(n, 2) px of world points (n, 3): K (R X + t), OpenCV's pinhole without distortion."""
     camera = np.asarray(points_mm, dtype=np.float64) @ np.asarray(R, dtype=np.float64).T + np.asarray(
         t_mm, dtype=np.float64
@@ -76,7 +75,7 @@ def predict_glints(
     eye_mm: ArrayLike,
     *,
     radius_mm: float = CORNEA_RADIUS_MM,
-) -> tuple[Array, float]:
+) -> tuple[Floats, float]:
     """((l, 2) expected glints, px; image scale at the eye, px per mm).
 
     pupil_px: (2,) centre of the pupil on the full sensor. K (3, 3), R (3, 3), t (3,): the camera. lights (l, 3).
@@ -137,7 +136,7 @@ def assign_lights(
         return Assignment(np.full(m, -1), (reason,) * m, np.zeros(m), np.zeros(2), 1.0)
     middle = lights.mean(axis=0)
     reach = tolerance_px + slack * np.hypot(*(lights - middle).T)
-    found: list[tuple[float, tuple[int, ...], Array, float]] = []
+    found: list[tuple[float, tuple[int, ...], Floats, float]] = []
     for shift, scale in _promising(glints, lights, middle, reach, scale_range, shift_sd_px):
         match = _match(glints, lights, middle, reach, shift, scale)
         shift, scale = _refitted(glints, lights, middle, match, shift, scale, scale_range)
@@ -183,17 +182,17 @@ def identify(
     return assign_lights(glints_px, predicted, shift_sd_px=max(position_sd_mm * scale, 2.0))
 
 
-def _unit(v: Array) -> Array:
+def _unit(v: Floats) -> Floats:
     return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
-def _placed(lights: Array, middle: Array, shift: Array, scale: float) -> Array:
+def _placed(lights: Floats, middle: Floats, shift: Floats, scale: float) -> Floats:
     return np.asarray(middle + shift + scale * (lights - middle))
 
 
 def _promising(
-    glints: Array, lights: Array, middle: Array, reach: Array, scale_range: tuple[float, float], sd: float
-) -> list[tuple[Array, float]]:
+    glints: Floats, lights: Floats, middle: Floats, reach: Floats, scale_range: tuple[float, float], sd: float
+) -> list[tuple[Floats, float]]:
     """The (shift, scale) worth a one-to-one match: of all that put one light on one glint, or two on two, those with
     the most glints near any light, and the shift of least surprise among equals."""
     m, count = glints.shape[0], lights.shape[0]
@@ -217,7 +216,7 @@ def _promising(
     return [(shift[i], float(scale[i])) for i in best]
 
 
-def _match(glints: Array, lights: Array, middle: Array, reach: Array, shift: Array, scale: float) -> NDArray[np.intp]:
+def _match(glints: Floats, lights: Floats, middle: Floats, reach: Floats, shift: Floats, scale: float) -> Indices:
     """(m,) light of every glint, one to one, least sum of squared misfits within reach; -1 where none is."""
     offset = glints[:, None, :] - _placed(lights, middle, shift, scale)[None]
     misfit = np.hypot(offset[..., 0], offset[..., 1]) / reach[None, :]
@@ -230,14 +229,14 @@ def _match(glints: Array, lights: Array, middle: Array, reach: Array, shift: Arr
 
 
 def _refitted(
-    glints: Array,
-    lights: Array,
-    middle: Array,
-    match: NDArray[np.intp],
-    shift: Array,
+    glints: Floats,
+    lights: Floats,
+    middle: Floats,
+    match: Indices,
+    shift: Floats,
     scale: float,
     span: tuple[float, float],
-) -> tuple[Array, float]:
+) -> tuple[Floats, float]:
     """Least-squares shift and scale of a match."""
     placed = match >= 0
     if not placed.any():
@@ -251,12 +250,12 @@ def _refitted(
 
 
 def _merit(
-    glints: Array,
-    lights: Array,
-    middle: Array,
-    reach: Array,
-    match: NDArray[np.intp],
-    shift: Array,
+    glints: Floats,
+    lights: Floats,
+    middle: Floats,
+    reach: Floats,
+    match: Indices,
+    shift: Floats,
     scale: float,
     sd: float,
 ) -> float:

@@ -6,13 +6,9 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Bools, Floats, Indices, Singles
 from ..preprocessing import DN, Image
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Index = NDArray[np.intp]
 
 # Largest misfit as a share of the height and of the scatter; smallest fitted peak as a share of the detected height.
 # Glints of the development images (rendered and ideal) reach 0.20 and 0.63, and 0.85.
@@ -25,7 +21,7 @@ EXPLAINED = 2.0  # a misfit below this many standard deviations of the noise is 
 LONGEST = 2.5  # largest elongation of the bright patch; glints, and two that touch, reach 2.0
 
 
-def about(xy: Array, reach: Array, shape: tuple[int, ...]) -> tuple[Index, NDArray[np.float32], Mask]:
+def about(xy: Floats, reach: Floats, shape: tuple[int, ...]) -> tuple[Indices, Singles, Bools]:
     """The pixels around n peak pixels xy (n, 2) up to `reach` (n,) px.
 
     Returns:
@@ -49,7 +45,7 @@ def about(xy: Array, reach: Array, shape: tuple[int, ...]) -> tuple[Index, NDArr
 
 
 @lru_cache(maxsize=32)
-def _disc(radius: int) -> tuple[Index, Index, Index, NDArray[np.float32]]:
+def _disc(radius: int) -> tuple[Indices, Indices, Indices, Singles]:
     """dx, dy, squared distance (k,) of the pixels within a radius, and (2, k) dx and dy."""
     step = np.arange(-radius, radius + 1)
     away2 = (step * step)[:, None] + step * step
@@ -59,8 +55,14 @@ def _disc(radius: int) -> tuple[Index, Index, Index, NDArray[np.float32]]:
 
 
 def bell_shaped(
-    linear: Image, xy: Array, width: Array, height: Array, noise_dn: float, clip_dn: float, which: Mask | None = None
-) -> Mask:
+    linear: Image,
+    xy: Floats,
+    width: Floats,
+    height: Floats,
+    noise_dn: float,
+    clip_dn: float,
+    which: Bools | None = None,
+) -> Bools:
     """(m,) whether the pixels around each spot form a bell. Skin, lashes and the gaps between lashes do not.
 
     Fits the level within 2.2 sigma + 1 px of the peak by linear least squares. Pixels nearer to another spot are left
@@ -120,7 +122,7 @@ def bell_shaped(
     return out
 
 
-def _elongation(patch: NDArray[np.float32], tall: Array, offset: NDArray[np.float32]) -> Array:
+def _elongation(patch: Singles, tall: Floats, offset: Singles) -> Floats:
     """(m,) standard deviation along over that across, of the part of each patch (m, k) above a third of the height."""
     weight = np.maximum(patch - (patch.max(axis=1) - 0.65 * tall).astype(np.float32)[:, None], np.float32(0.0))
     dx, dy = offset
@@ -133,7 +135,7 @@ def _elongation(patch: NDArray[np.float32], tall: Array, offset: NDArray[np.floa
     return np.asarray(np.sqrt((mean + gap) / np.maximum(mean - gap, 1e-3)))
 
 
-def _nearest(use: Mask, offset: NDArray[np.float32], own: Array, xy: Array, reach: Array) -> None:
+def _nearest(use: Bools, offset: Singles, own: Floats, xy: Floats, reach: Floats) -> None:
     """Clear in `use` (m, k) the pixels that lie nearer to another of the spots `xy` than to the patch's own."""
     gx, gy = (xy[None] - own[:, None]).transpose(2, 0, 1)
     apart2 = gx * gx + gy * gy

@@ -5,27 +5,24 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Bools
 from ...geometry.ellipse import Ellipse
 from ..preprocessing import Image, Prepared
 from .detection import Spots
 from .fits import SpotFit, profile
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # In noise standard deviations: the largest residual of a spot whose light is subtracted; the light above which a pixel
 # is left out even so; the faintest light that matters.
 WELL_FITTED, BRIGHT, FAINT = 3.0, 3.0, 0.2
 
 
-def well_fitted(prepared: Prepared, fit: SpotFit) -> Mask:
+def well_fitted(prepared: Prepared, fit: SpotFit) -> Bools:
     """(n,) which spots have a fit good enough to subtract their light."""
     return np.asarray(fit.converged & (fit.residual_dn < WELL_FITTED * prepared.noise_dn))
 
 
-def affected_pixels(prepared: Prepared, spots: Spots, which: Mask | None = None) -> Mask:
+def affected_pixels(prepared: Prepared, spots: Spots, which: Bools | None = None) -> Bools:
     """Mask (h, w) of pixels affected by spots (`which` of them, or all), clutter or saturation.
 
     The extent of a spot follows from its detected height and width.
@@ -42,7 +39,7 @@ def affected_pixels(prepared: Prepared, spots: Spots, which: Mask | None = None)
     return mask
 
 
-def subtract_spots(prepared: Prepared, fit: SpotFit, which: Mask, about: Ellipse) -> tuple[Image, Mask]:
+def subtract_spots(prepared: Prepared, fit: SpotFit, which: Bools, about: Ellipse) -> tuple[Image, Bools]:
     """Subtract the light of `which` spots from the image where it reaches the ellipse `about`.
 
     A fit describes the flanks of a spot far better than the circle of `affected_pixels`. It is not relied on where the

@@ -12,18 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from ...arrays import Bools, Floats, Indices
 from ..preprocessing import Image
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Index = NDArray[np.intp]
 _T = TypeVar("_T", bound=np.generic)
 
 _ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)
 LARGEST_PX = 20  # radius of a window at most
 
 
-def window_radius(width: Array) -> Array:
+def window_radius(width: Floats) -> Floats:
     """Radius, px, of the pixels that a spot of that sigma is fitted to."""
     return 2.7 * width + 1.2
 
@@ -37,29 +35,29 @@ class SpotPixels:
     data, known (P,): image and B. clip (P,): whether the sensor clipped the pixel; clipped: whether it did any.
     """
 
-    centre: Array
-    radius: Array
-    first: Index
-    spot: Index
-    middle_dn: Array
-    plane: Array
-    data: Array
-    known: Array
-    clip: Mask
+    centre: Floats
+    radius: Floats
+    first: Indices
+    spot: Indices
+    middle_dn: Floats
+    plane: Floats
+    data: Floats
+    known: Floats
+    clip: Bools
     clipped: bool
 
     @property
-    def count(self) -> Array:
+    def count(self) -> Floats:
         """(n,) of every spot's pixels."""
         return np.asarray(self.first[1:] - self.first[:-1], dtype=np.float64)
 
     @property
-    def dx(self) -> Array:
+    def dx(self) -> Floats:
         """(P,) from the window's middle."""
         return np.asarray(self.plane[1], dtype=np.float64)
 
     @property
-    def dy(self) -> Array:
+    def dy(self) -> Floats:
         """(P,) from the window's middle."""
         return np.asarray(self.plane[2], dtype=np.float64)
 
@@ -68,11 +66,11 @@ class SpotPixels:
         ends = self.first.tolist()
         return [values[..., begin:end] for begin, end in pairwise(ends)]
 
-    def rows(self, spots: Index) -> Index:
+    def rows(self, spots: Indices) -> Indices:
         """Which of the pixels are those spots', in the spots' order."""
         return _ranges(self.first[spots], self.first[spots + 1] - self.first[spots])
 
-    def taken(self, spots: Index) -> SpotPixels:
+    def taken(self, spots: Indices) -> SpotPixels:
         """The chosen spots'."""
         if spots.size == self.radius.size and bool((spots == np.arange(spots.size)).all()):
             return self
@@ -86,11 +84,11 @@ class SpotPixels:
             self.clipped and bool(clip.any()),
         )  # fmt: skip
 
-    def total(self, values: NDArray[np.generic]) -> Array:
+    def total(self, values: NDArray[np.generic]) -> Floats:
         """(n,) sum of a value (P,) over every spot's pixels."""
         return np.asarray(np.bincount(self.spot, weights=values, minlength=self.radius.size), dtype=np.float64)
 
-    def most(self, values: Array) -> Array:
+    def most(self, values: Floats) -> Floats:
         """(n,) largest value (P,), none below 0, in every spot's pixels."""
         out = np.zeros(self.radius.size)
         some = self.first[:-1] < self.first[1:]
@@ -99,21 +97,21 @@ class SpotPixels:
         return np.maximum(out, 0.0)
 
 
-def _starts(count: Index) -> Index:
+def _starts(count: Indices) -> Indices:
     """0, count[0], count[0] + count[1], ..., their sum."""
     out = np.zeros(count.size + 1, dtype=np.intp)
     np.cumsum(count, out=out[1:])
     return out
 
 
-def _ranges(first: Index, count: Index) -> Index:
+def _ranges(first: Indices, count: Indices) -> Indices:
     """first[0], first[0] + 1, ... (count[0] of them), first[1], ..."""
     start = _starts(count)
     return np.asarray(np.arange(start[-1]) + np.repeat(first - start[:-1], count), dtype=np.intp)
 
 
 def cut(
-    linear: Image, known: Callable[[Array, Array], Array], start: Array, width: Array, clip_dn: float
+    linear: Image, known: Callable[[Floats, Floats], Floats], start: Floats, width: Floats, clip_dn: float
 ) -> SpotPixels:
     """Round windows, each as wide as its spot needs: the less of the limbus and of other edges is in them.
 
@@ -150,14 +148,14 @@ class Grid:
     whose, the rows' owners counted on from n. column, row (P,): the edge before each pixel. split: E.
     """
 
-    edges: Array
-    owner: Index
-    column: Index
-    row: Index
+    edges: Floats
+    owner: Indices
+    column: Indices
+    row: Indices
     split: int
 
     @staticmethod
-    def of(radius: Array, spot: Index, dx: Array, dy: Array) -> Grid:
+    def of(radius: Floats, spot: Indices, dx: Floats, dy: Floats) -> Grid:
         """The windows' radius (n,); and of every pixel (P,) whose it is and its offset from the window's middle."""
         n, half = radius.size, np.ceil(radius + 0.5).astype(np.intp)
         size = np.tile(2 * half + 2, 2)
@@ -167,7 +165,7 @@ class Grid:
         column, row = middle[spot] + dx.astype(np.intp), middle[n + spot] + dy.astype(np.intp)
         return Grid(edges, owner, column, row, owner.size // 2)
 
-    def profiles(self, at: Array, sigma: Array, amplitude: Array) -> tuple[Array, Array]:
+    def profiles(self, at: Floats, sigma: Floats, amplitude: Floats) -> tuple[Floats, Floats]:
         """((3, P), (3, P)): the spots' profiles across the pixels' columns, times the amplitude, and along their rows.
 
         Of each the derivative by its centre, the value, the derivative by ln sigma. at (n, 2): the spots' centres from
@@ -180,7 +178,7 @@ class Grid:
         return across.take(self.column, axis=1), parts.take(self.row, axis=1)
 
 
-def profile(edges: Array, centre: Array | float, sigma: Array) -> Array:
+def profile(edges: Floats, centre: Floats | float, sigma: Floats) -> Floats:
     """(3, E - 1): of the mean of exp(-(x - c)^2 / (2 s^2)) between every edge and the next, 1 px on, the derivative by
     c, the value, the derivative by ln s.
 
@@ -206,14 +204,14 @@ class Others:
     """Pairs of spots of which one's light reaches into the other's window: `by` (m,) shines; rows (Q,): the pixels
     into which, pair after pair, pair (Q,) whose each is; grid: of the pairs' windows, centre (m, 2) their middles."""
 
-    by: Index
-    rows: Index
-    pair: Index
+    by: Indices
+    rows: Indices
+    pair: Indices
     grid: Grid
-    centre: Array
+    centre: Floats
 
     @staticmethod
-    def of(pixels: SpotPixels, theta: Array, pairs: Mask, noise_dn: float) -> Others | None:
+    def of(pixels: SpotPixels, theta: Floats, pairs: Bools, noise_dn: float) -> Others | None:
         """theta (n, 5 or more): x, y, ln A, ln sx, ln sy. pairs (n, n): whether the second may shine into the first's
         window. None where no light is more than far below the noise there."""
         to, by = np.nonzero(pairs)
@@ -228,7 +226,7 @@ class Others:
         grid = Grid.of(pixels.radius[to], pair, pixels.dx[rows], pixels.dy[rows])
         return Others(by, rows, pair, grid, pixels.centre[to])
 
-    def light(self, theta: Array, pixels: int, shining: Mask | None = None) -> Array:
+    def light(self, theta: Floats, pixels: int, shining: Bools | None = None) -> Floats:
         """(pixels,) the light of other spots, all or those `shining` (n,), in every spot's pixels."""
         own = theta[self.by]
         amplitude = np.exp(own[:, 2]) if shining is None else np.exp(own[:, 2]) * shining[self.by]

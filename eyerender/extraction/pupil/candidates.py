@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Floats
 from ...geometry.ellipse import Ellipse, points_on_ellipse
 from ..preprocessing import Image, Prepared, as_image
 from ..settings import ExtractionSettings
 from ..statistics import median, quantile
-
-Array = NDArray[np.float64]
 
 LEVELS = 20  # thresholds at even grey levels
 ANGLES = 48  # samples around a blob
@@ -85,7 +84,7 @@ def _reduced(linear: Image, factor: int, removal: int) -> Image:
     return as_image(cv2.morphologyEx(small, removal, kernel))
 
 
-def _levels(small: Image) -> Array:
+def _levels(small: Image) -> Floats:
     """Thresholds at even levels and at even areas, so that some separate the pupil even if its step is faint or the
     image has a small dark backdrop."""
     values = np.sort(small.ravel()[:: max(1, small.size // 8000)])
@@ -102,7 +101,7 @@ def _levels(small: Image) -> Array:
     return np.asarray(levels[keep], dtype=np.float64)
 
 
-def _sweep(small: Image, levels: Array, factor: int, settings: ExtractionSettings) -> Array:
+def _sweep(small: Image, levels: Floats, factor: int, settings: ExtractionSettings) -> Floats:
     """(n, 6) blobs that could be a pupil: ellipse (x, y, a, b, angle) in reduced pixels, and its filled share."""
     height, width = small.shape
     least = max(0.5 * settings.radius_min_px, settings.radius_min_px - 2.0 * factor) / factor
@@ -159,7 +158,7 @@ def _blob_ellipse(
     return m["m10"] / area, m["m01"] / area, a, b, 0.5 * math.atan2(2.0 * c12, c11 - c22), filled
 
 
-def _ranked(small: Image, noise: float, factor: int, blobs: Array, most: int) -> list[Candidate]:
+def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -> list[Candidate]:
     centre, axes, angle, filled = blobs[:, :2], blobs[:, 2:4], blobs[:, 4], blobs[:, 5]
     near_in = _sample(small, centre, axes * 0.65, angle)
     deep_in = _sample(small, centre, axes * 0.4, angle)
@@ -202,7 +201,7 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Array, most: int) ->
     ]  # fmt: skip
 
 
-def _sample(small: Image, centre: Array, axes: Array, angle: Array) -> Image:
+def _sample(small: Image, centre: Floats, axes: Floats, angle: Floats) -> Image:
     """(n, ANGLES) levels along n ellipses at the nearest pixels; outside the frame its border is repeated."""
     points = np.rint(points_on_ellipse(centre, axes, angle, ANGLES)).astype(np.intp)
     column = np.minimum(np.maximum(points[..., 0], 0), small.shape[1] - 1)

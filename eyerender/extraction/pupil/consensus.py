@@ -8,17 +8,14 @@ from itertools import islice
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse, EllipseFit, fit_ellipse_direct, from_cv2, signed_distance
 from ..settings import ExtractionSettings
 from ..statistics import median
 from .candidates import Candidate
 from .edges import EdgePoints
 from .stretches import Cuts, turn_of
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 SECTORS = 48  # of the outline, for support
 PIECES = 16  # arcs are cut at these sectors, so that a lid's margin parts from the boundary it joins
@@ -37,8 +34,8 @@ class BoundaryFit:
     """
 
     ellipse: Ellipse
-    inliers: Mask
-    points_px: Array
+    inliers: Bools
+    points_px: Floats
     support: float
     gap: float
     residual_px: float
@@ -141,7 +138,7 @@ def _random_fits(edges: EdgePoints, candidate: Candidate) -> EllipseFit:
     return fit_ellipse_direct(points[index])
 
 
-def _sane(fit: EllipseFit, candidate: Candidate, settings: ExtractionSettings) -> Array:
+def _sane(fit: EllipseFit, candidate: Candidate, settings: ExtractionSettings) -> Floats:
     """(m, 5) centre, semi-axes and angle of those fits whose size and shape may be the candidate's."""
     a, b = fit.semi_axes_px[:, 0], fit.semi_axes_px[:, 1]
     a0, b0 = candidate.ellipse.semi_axes_px
@@ -151,11 +148,11 @@ def _sane(fit: EllipseFit, candidate: Candidate, settings: ExtractionSettings) -
     return np.asarray(np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[sane])
 
 
-def _ellipse(row: Array) -> Ellipse:
+def _ellipse(row: Floats) -> Ellipse:
     return Ellipse(row[:2], row[2:4], float(row[4]))
 
 
-def _support(points: Array, normals: Array, fits: Array, tolerance: float) -> Array:
+def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) -> Floats:
     """(m,) score of every ellipse (m, 5): the points close by with an agreeing normal, weighted by closeness, per
     length."""
     cos, sin = np.cos(fits[:, 4:]), np.sin(fits[:, 4:])
@@ -169,11 +166,11 @@ def _support(points: Array, normals: Array, fits: Array, tolerance: float) -> Ar
     agree = (nx * cos - ny * sin) * normals[:, 0] + (nx * sin + ny * cos) * normals[:, 1] > 0.9 * slope
     closeness = np.maximum(1.0 - (distance / tolerance) ** 2, 0.0)
     # Per length of outline, so that a large loose ellipse does not win by points of other edges; total as well.
-    score: Array = np.einsum("mn,mn->m", closeness, agree) / np.sqrt(np.pi * (a + b)[:, 0])
+    score: Floats = np.einsum("mn,mn->m", closeness, agree) / np.sqrt(np.pi * (a + b)[:, 0])
     return score
 
 
-def _most(points: Array, fits: Array) -> Array:
+def _most(points: Floats, fits: Floats) -> Floats:
     """(m,) what `_support` would be if all points were on every ellipse."""
     return np.asarray(points.shape[0] / np.sqrt(np.pi * fits[:, 2:4].sum(axis=1)))
 
@@ -219,7 +216,7 @@ def _polished(
     return BoundaryFit(ellipse, inliers, points[inliers], support, gap, float(np.sqrt(np.mean(distance**2))))
 
 
-def ams_fit(points: Array) -> Ellipse | None:
+def ams_fit(points: Floats) -> Ellipse | None:
     """cv2.fitEllipseAMS about the points' mean and scale, because OpenCV computes in float32."""
     mean = points.mean(axis=0)
     scale = float(np.abs(points - mean).max())
@@ -236,7 +233,7 @@ def ams_fit(points: Array) -> Ellipse | None:
     return Ellipse(unit.centre_px * scale + mean, unit.semi_axes_px * scale, unit.angle_rad)
 
 
-def outline_support(ellipse: Ellipse, points: Array) -> tuple[float, float]:
+def outline_support(ellipse: Ellipse, points: Floats) -> tuple[float, float]:
     """Shares of the SECTORS of the outline (equal steps of the parameter) that hold a point, and in the longest row of
     sectors that do not."""
     sector = (turn_of(points, ellipse) * SECTORS).astype(np.intp) % SECTORS
@@ -247,7 +244,7 @@ def outline_support(ellipse: Ellipse, points: Array) -> tuple[float, float]:
     return held.size / SECTORS, float(rows.max()) / SECTORS
 
 
-def relative_to(ellipse: Ellipse, points: Array) -> tuple[Array, Array, Array]:
+def relative_to(ellipse: Ellipse, points: Floats) -> tuple[Floats, Floats, Floats]:
     """(signed distance (n,), outward normal (n, 2), the outline's curvature (n,)) about points near an ellipse."""
     a, b = ellipse.semi_axes_px.tolist()
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)

@@ -9,19 +9,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Floats
 from ...geometry.ellipse import Ellipse
 from .edge_model import SECTORS, Place, sector_of
-
-Array = NDArray[np.float64]
 
 SHAPE = 5  # number of parameters
 # Edge points are selected by their residual, so their scatter underestimates the noise; fitted on development images.
 SELECTION = 1.6
 
 
-def gram(slopes: Array) -> Array:
+def gram(slopes: Floats) -> Floats:
     """S S^T of (p, n), in blocks of columns: for the whole, BLAS would start threads and take several times as long."""
     columns = max(1, 200_000 // slopes.shape[0] ** 2)
     out = np.zeros((slopes.shape[0], slopes.shape[0]))
@@ -31,13 +29,13 @@ def gram(slopes: Array) -> Array:
     return out
 
 
-def project(slopes: Array, residual: Array) -> Array:
+def project(slopes: Floats, residual: Floats) -> Floats:
     """S r of (p, n), without BLAS for the same reason as in `gram`."""
-    out: Array = np.einsum("pn,n->p", slopes, residual)
+    out: Floats = np.einsum("pn,n->p", slopes, residual)
     return out
 
 
-def distance_slopes(ellipse: Ellipse, place: Place) -> Array:
+def distance_slopes(ellipse: Ellipse, place: Place) -> Floats:
     """(5, n) derivatives of the signed distance by cx, cy and the shape matrix (aa, bb, ab) in the ellipse's axes."""
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
     out = np.empty((SHAPE, place.nx.size))
@@ -51,7 +49,7 @@ def distance_slopes(ellipse: Ellipse, place: Place) -> Array:
     return out
 
 
-def sector_excess(plain: Array, inverse: Array, sums: Array) -> float:
+def sector_excess(plain: Floats, inverse: Floats, sums: Floats) -> float:
     """Factor by which correlated residuals increase the covariance: trace(plain^-1 S) / 5.
 
     S is the sum over k sectors of the outer product of `inverse` (5, p) times the sector's summed scores `sums` (p, k).
@@ -62,7 +60,7 @@ def sector_excess(plain: Array, inverse: Array, sums: Array) -> float:
     return float(np.trace(np.linalg.solve(plain, summed @ summed.T))) / SHAPE
 
 
-def edge_covariance(ellipse: Ellipse, points: Array, residual_px: float) -> Array:
+def edge_covariance(ellipse: Ellipse, points: Floats, residual_px: float) -> Floats:
     """(5, 5) covariance of (cx, cy, a, b, angle) of an ellipse fitted to edge points with this residual.
 
     Neighbouring edge points share noise (through the filter) and texture. `sector_excess` accounts for that.
@@ -82,7 +80,7 @@ def edge_covariance(ellipse: Ellipse, points: Array, residual_px: float) -> Arra
     return to_axes(plain * max(excess, 1.0) * SELECTION, ellipse)
 
 
-def boundary_deviation(ellipse: Ellipse, covariance: Array) -> float:
+def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
     """Root mean square, over the outline, of the boundary's standard deviation along its normal, px."""
     slopes = distance_slopes(ellipse, Place.middles(ellipse, 32))
     a, b = ellipse.semi_axes_px.tolist()
@@ -91,7 +89,7 @@ def boundary_deviation(ellipse: Ellipse, covariance: Array) -> float:
     return math.sqrt(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1])
 
 
-def to_axes(covariance: Array, ellipse: Ellipse) -> Array:
+def to_axes(covariance: Floats, ellipse: Ellipse) -> Floats:
     """Covariance of (cx, cy, a, b, angle) from that of the shape matrix: d angle = d ab / (a - b)."""
     a, b = ellipse.semi_axes_px
     jacobian = np.eye(SHAPE)

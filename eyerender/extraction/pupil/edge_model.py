@@ -20,12 +20,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse
-
-Array = NDArray[np.float64]
 
 SECTORS = 48  # equal steps of the ellipse's parameter u
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
@@ -40,26 +38,26 @@ class EdgeModel:
 
     ellipse: Ellipse
     inner_dn: float
-    outer: Array
+    outer: Floats
     sigma_px: float
     slope: float = 0.0
     kurtosis: float = 0.0
     lean: tuple[float, float] = (0.0, 0.0)
-    displaced: Array | None = None
+    displaced: Floats | None = None
 
     @property
     def step_dn(self) -> float:
         """Mean outer level less the inner one."""
         return float(self.outer[0]) - self.inner_dn
 
-    def level(self, x: Array, y: Array) -> Array:
+    def level(self, x: Floats, y: Floats) -> Floats:
         """Expected grey level at pixels (x, y) of any shape."""
         place = Place.of(self.ellipse, x.ravel(), y.ravel())
         if self.displaced is not None:
             place = replace(place, distance=place.distance + _between(self.displaced, place))
         return self.level_and_slope(place)[0].reshape(x.shape)
 
-    def level_and_slope(self, place: Place) -> tuple[Array, Array]:
+    def level_and_slope(self, place: Place) -> tuple[Floats, Floats]:
         """Expected grey level (n,) near the boundary of an exact ellipse, and its derivative by distance, DN per px."""
         profile = Profile.of(place.distance, place.curvature, self.sigma_px, self.kurtosis)
         inner = self.inner(place)
@@ -67,7 +65,7 @@ class EdgeModel:
         level = inner + step * profile.edge + self.slope * profile.ramp
         return level, step * profile.edge_by_distance + self.slope * profile.ramp_by_distance
 
-    def inner(self, place: Place) -> Array:
+    def inner(self, place: Place) -> Floats:
         """Inner level (n,) at places about the boundary."""
         return self.inner_dn + self.lean[0] * place.cos_u + self.lean[1] * place.sin_u
 
@@ -78,16 +76,16 @@ class Place:
     normal there in the ellipse's own axes (nx, ny), curvature, and the parameter counted from the image's x axis
     (cos u, sin u). All (n,)."""
 
-    distance: Array
-    cos_t: Array
-    sin_t: Array
-    nx: Array
-    ny: Array
-    curvature: Array
-    cos_u: Array
-    sin_u: Array
+    distance: Floats
+    cos_t: Floats
+    sin_t: Floats
+    nx: Floats
+    ny: Floats
+    curvature: Floats
+    cos_u: Floats
+    sin_u: Floats
 
-    def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Place:
+    def taken(self, which: Bools | Indices) -> Place:
         """The chosen points'."""
         parts = (self.distance, self.cos_t, self.sin_t, self.nx, self.ny, self.curvature, self.cos_u, self.sin_u)
         return Place(*(part[which] for part in parts))
@@ -99,7 +97,7 @@ class Place:
         return Place.on(ellipse, np.cos(t), np.sin(t))
 
     @staticmethod
-    def on(ellipse: Ellipse, cos_t: Array, sin_t: Array) -> Place:
+    def on(ellipse: Ellipse, cos_t: Floats, sin_t: Floats) -> Place:
         """On the ellipse."""
         a, b = ellipse.semi_axes_px.tolist()
         nx, ny = b * cos_t, a * sin_t
@@ -108,7 +106,7 @@ class Place:
         return Place(np.zeros_like(height), cos_t, sin_t, nx / height, ny / height, a * b / height**3, *turned)
 
     @staticmethod
-    def of(ellipse: Ellipse, x: Array, y: Array, steps: int = 3) -> Place:
+    def of(ellipse: Ellipse, x: Floats, y: Floats, steps: int = 3) -> Place:
         """By Newton's iteration on the nearest point's parameter, from the point's own direction.
 
         f(t) = (a^2 - b^2) cos t sin t - a p sin t + b q cos t = 0. Three steps reach 1e-6 px up to b / 2 away.
@@ -145,16 +143,16 @@ class Profile:
     """Across the boundary, all (n,): `edge` E from 0 inside to 1 outside and `ramp` max(d, 0) blurred, with their
     derivatives by the distance d (px), by sigma (px) and by the kurtosis."""
 
-    edge: Array
-    edge_by_distance: Array
-    edge_by_sigma: Array
-    edge_by_kurtosis: Array
-    ramp: Array
-    ramp_by_distance: Array
-    ramp_by_sigma: Array
+    edge: Floats
+    edge_by_distance: Floats
+    edge_by_sigma: Floats
+    edge_by_kurtosis: Floats
+    ramp: Floats
+    ramp_by_distance: Floats
+    ramp_by_sigma: Floats
 
     @staticmethod
-    def of(distance: Array, curvature: Array, sigma: float, kurtosis: float = 0.0) -> Profile:
+    def of(distance: Floats, curvature: Floats, sigma: float, kurtosis: float = 0.0) -> Profile:
         """distance, curvature: (n,) px and 1/px of the nearest point of the boundary. sigma: px."""
         z = distance / sigma
         z2 = z * z
@@ -175,19 +173,19 @@ class Profile:
         )
 
 
-def sector_of(place: Place) -> NDArray[np.intp]:
+def sector_of(place: Place) -> Indices:
     """(n,) which of the SECTORS equal steps of the ellipse's parameter u each point belongs to."""
     share = np.arctan2(place.sin_u, place.cos_u) / (2.0 * np.pi) + 0.5
     return (share * SECTORS).astype(np.intp) % SECTORS
 
 
-def _turned(cos_t: Array, sin_t: Array, angle: float) -> tuple[Array, Array]:
+def _turned(cos_t: Floats, sin_t: Floats, angle: float) -> tuple[Floats, Floats]:
     """Cosine and sine of t + angle."""
     cos, sin = math.cos(angle), math.sin(angle)
     return cos_t * cos - sin_t * sin, sin_t * cos + cos_t * sin
 
 
-def _between(values: Array, place: Place) -> Array:
+def _between(values: Floats, place: Place) -> Floats:
     """(n,) values of the SECTORS at places, linear between the sectors' middles."""
     share = np.arctan2(place.sin_u, place.cos_u) / (2.0 * np.pi) + 0.5
     at = share * SECTORS - 0.5
@@ -196,7 +194,7 @@ def _between(values: Array, place: Place) -> Array:
     return np.asarray(first + (at - low) * (second - first))
 
 
-def harmonics(cos_u: Array, sin_u: Array, order: int) -> Array:
+def harmonics(cos_u: Floats, sin_u: Floats, order: int) -> Floats:
     """(1 + 2 K, n): 1, cos u, sin u, ..., cos K u, sin K u."""
     out = np.empty((1 + 2 * order, cos_u.size))
     out[0] = 1.0

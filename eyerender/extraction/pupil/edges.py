@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Floats, Indices
 from ...geometry.ellipse import Ellipse
 from ..preprocessing import Image, as_image
 from ..statistics import median, quantile
 from .candidates import Candidate
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,10 +23,10 @@ class EdgePoints:
     filter_px: sigma of the filter alone.
     """
 
-    points_px: Array
-    normals: Array
-    strength: Array
-    arc: NDArray[np.intp]
+    points_px: Floats
+    normals: Floats
+    strength: Floats
+    arc: Indices
     sigma_px: float
     filter_px: float
 
@@ -134,7 +132,7 @@ def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
     )
 
 
-def _outward(ellipse: Ellipse, x: Array, y: Array) -> tuple[Array, Array, Array]:
+def _outward(ellipse: Ellipse, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
     """Unit outward normal of the concentric ellipses, and the radius in units of the semi-axes, at pixels (n,) from the
     centre."""
     a, b = ellipse.semi_axes_px.tolist()
@@ -150,13 +148,13 @@ def _typical(strength: Image) -> float:
     return quantile(strength, 0.9) if strength.size else 0.0
 
 
-def _nearest(image: Image, points: Array) -> Image:
+def _nearest(image: Image, points: Floats) -> Image:
     column = np.clip(np.rint(points[:, 0]).astype(np.intp), 0, image.shape[1] - 1)
     row = np.clip(np.rint(points[:, 1]).astype(np.intp), 0, image.shape[0] - 1)
     return image[row, column]
 
 
-def _arcs(shape: tuple[int, ...], row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[np.intp]:
+def _arcs(shape: tuple[int, ...], row: Indices, column: Indices) -> Indices:
     mask = np.zeros(shape[:2], np.uint8)
     mask[row, column] = 1
     _, labels = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)

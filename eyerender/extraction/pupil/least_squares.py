@@ -11,14 +11,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Floats, Indices
 from ...geometry.ellipse import Ellipse
 from .covariance import SHAPE, distance_slopes, gram, project
 from .edge_model import EdgeModel, Place, Profile, harmonics
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # Parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, lean (two), mean outer level.
 FIXED = SHAPE + 7
@@ -36,21 +33,21 @@ class Pixels:
     """n pixels in the order of their sectors, of which k have some: x, y, level (n,); index (n,): which of the k each
     is in; first (k,): where each begins; sector (k,): which of all it is."""
 
-    x: Array
-    y: Array
-    level: Array
-    index: Index
-    first: Index
-    sector: Index
+    x: Floats
+    y: Floats
+    level: Floats
+    index: Indices
+    first: Indices
+    sector: Indices
 
     @staticmethod
-    def of(x: Array, y: Array, level: Array, sector: Index) -> Pixels:
+    def of(x: Floats, y: Floats, level: Floats, sector: Indices) -> Pixels:
         """sector (n,): of every pixel, in order."""
         new = np.diff(sector, prepend=-1) > 0
         first = np.flatnonzero(new)
         return Pixels(x, y, level, np.cumsum(new) - 1, first, sector[first])
 
-    def sums(self, values: Array) -> Array:
+    def sums(self, values: Floats) -> Floats:
         """(..., k) sums of values (..., n) over every sector's pixels."""
         return np.asarray(np.add.reduceat(values, self.first, axis=-1), dtype=np.float64)
 
@@ -60,7 +57,7 @@ class Prior:
     """Weights, beside those of a pixel's residual, of the squares of slope, kurtosis, a lean, a harmonic (4,); and the
     standard deviation of a sector's displacement with the weight of its square (infinite where there is to be none)."""
 
-    weights: Array
+    weights: Floats
     uneven_px: float
     displacement: float
 
@@ -73,7 +70,7 @@ class Prior:
         weights = (noise_dn / np.array([slope, KURTOSIS_SD, LEAN_SD * step, HARMONIC_SD * step])) ** 2
         return Prior(weights, uneven_px, displacement)
 
-    def of_all(self, size: int) -> Array:
+    def of_all(self, size: int) -> Floats:
         """(size,) every parameter's, displacements apart."""
         out = np.zeros(size)
         out[7], out[8], out[9:11], out[FIXED:] = self.weights
@@ -84,12 +81,12 @@ class Prior:
 class Rows:
     """residual (n,); jacobian (p, n); slope (n,), the level's derivative by the distance."""
 
-    residual: Array
-    jacobian: Array
-    slope: Array
+    residual: Floats
+    jacobian: Floats
+    slope: Floats
 
     @staticmethod
-    def of(pixels: Pixels, model: EdgeModel, place: Place, displaced: Array) -> Rows:
+    def of(pixels: Pixels, model: EdgeModel, place: Place, displaced: Floats) -> Rows:
         """displaced (k,): how far every sector lies inside the ellipse, px."""
         at = replace(place, distance=place.distance + displaced[pixels.index]) if displaced.any() else place
         level, jacobian_, slope = jacobian(model, at)
@@ -102,19 +99,19 @@ class Normal:
     across (p, k) and along (k,), its displacement's products with the slopes and with the residual, priors included;
     inverse (k,), of its product with itself and the prior."""
 
-    matrix: Array
-    vector: Array
+    matrix: Floats
+    vector: Floats
     cost: float
-    across: Array
-    along: Array
-    inverse: Array
+    across: Floats
+    along: Floats
+    inverse: Floats
 
-    def displaced_by(self, step: Array) -> Array:
+    def displaced_by(self, step: Floats) -> Floats:
         """(k,) how the displacements change with a step of the parameters."""
         return np.asarray((self.along - step @ self.across) * self.inverse)
 
     @staticmethod
-    def of(pixels: Pixels, rows: Rows, displaced: Array, prior: Prior) -> Normal:
+    def of(pixels: Pixels, rows: Rows, displaced: Floats, prior: Prior) -> Normal:
         residual, slopes = rows.residual, rows.jacobian
         matrix, vector, cost = gram(slopes), project(slopes, residual), float(np.sum(residual * residual))
         if math.isinf(prior.displacement):
@@ -134,12 +131,12 @@ class Solution:
     step."""
 
     model: EdgeModel
-    displaced: Array
+    displaced: Floats
     rows: Rows
     place: Place
 
 
-def jacobian(model: EdgeModel, place: Place) -> tuple[Array, Array, Array]:
+def jacobian(model: EdgeModel, place: Place) -> tuple[Floats, Floats, Floats]:
     """Model levels (n,), their derivatives (FIXED + 2 K, n) by the parameters in the order of FIXED, and by the
     distance (n,)."""
     profile = Profile.of(place.distance, place.curvature, model.sigma_px, model.kurtosis)
@@ -159,12 +156,12 @@ def jacobian(model: EdgeModel, place: Place) -> tuple[Array, Array, Array]:
     return inner + step * profile.edge + model.slope * profile.ramp, out, by_distance
 
 
-def _values(model: EdgeModel) -> Array:
+def _values(model: EdgeModel) -> Floats:
     """The parameters that a prior may hold, at their places; the others are 0."""
     return np.concatenate([np.zeros(7), [model.slope, model.kurtosis, *model.lean, 0.0], model.outer[1:]])
 
 
-def moved(model: EdgeModel, step: Array) -> EdgeModel:
+def moved(model: EdgeModel, step: Floats) -> EdgeModel:
     """The model after a step of the parameters; the shape matrix's eigenvectors give the new axes."""
     x, y, aa, bb, ab, sigma, inner, slope, kurtosis, lean_x, lean_y = step[:11].tolist()
     cx, cy = model.ellipse.centre_px.tolist()
@@ -181,7 +178,7 @@ def moved(model: EdgeModel, step: Array) -> EdgeModel:
 
 
 def gauss_newton(
-    pixels: Pixels, model: EdgeModel, displaced: Array, place: Place, prior: Prior, steps: int
+    pixels: Pixels, model: EdgeModel, displaced: Floats, place: Place, prior: Prior, steps: int
 ) -> Solution:
     """The model after at most `steps` steps with Levenberg's damping; cost = sum r^2 + what the priors add.
 

@@ -6,14 +6,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Bools, Floats
 from ..statistics import median
 from .consensus import UNEVEN
 from .edge_model import SECTORS, EdgeModel, Place, sector_of
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 OUTLIER = 5.0  # pixels with a larger residual, in standard deviations, are left out
 LINEAR = 0.1  # a displacement below this share of the blur changes the levels linearly
@@ -31,20 +28,20 @@ class Visible:
         displaced: (SECTORS,) most likely displacements, px inward.
     """
 
-    use: Mask
-    explained: Mask
+    use: Bools
+    explained: Bools
     uneven_px: float
-    displaced: Array
+    displaced: Floats
 
 
 def visible_part(
     model: EdgeModel,
-    displaced: Array,
-    level: Array,
+    displaced: Floats,
+    level: Floats,
     place: Place,
-    use: Mask,
-    seen: Mask,
-    sectors: Mask,
+    use: Bools,
+    seen: Bools,
+    sectors: Bools,
     noise_dn: float,
 ) -> Visible:
     """Decide which pixels and sectors of the boundary the model explains.
@@ -98,7 +95,7 @@ def visible_part(
     )
 
 
-def clear_of_lids(seen: Mask, model: EdgeModel) -> Mask:
+def clear_of_lids(seen: Bools, model: EdgeModel) -> Bools:
     """Leave out the sectors beside each gap of two or more, as far as the blur of a lid margin reaches into them."""
     if seen.all():
         return seen

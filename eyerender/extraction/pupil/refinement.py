@@ -6,17 +6,14 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse, fit_ellipse_direct
 from ..preprocessing import Image
 from .covariance import SHAPE, distance_slopes, sector_excess, to_axes
 from .edge_model import SECTORS, EdgeModel, Place, sector_of
 from .least_squares import FIXED, NEAR, Normal, Pixels, Prior, Rows, Solution, gauss_newton
 from .occlusion import clear_of_lids, visible_part
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
 # side of the iris more, by a few hundredths of the step. Noise hides that from a test, but it shifts the centre.
@@ -43,16 +40,16 @@ class PixelFit:
 
     model: EdgeModel
     ellipse: Ellipse
-    covariance: Array
+    covariance: Floats
     reduced_chi2: float
     residual_dn: float
     pixels: int
-    sectors: Mask
+    sectors: Bools
     uneven_px: float
 
 
 def refine(
-    linear: Image, start: EdgeModel, sectors: Mask, masked: Mask, noise_dn: float, before: PixelFit | None = None
+    linear: Image, start: EdgeModel, sectors: Bools, masked: Bools, noise_dn: float, before: PixelFit | None = None
 ) -> PixelFit | str:
     """Fit the pixel model; returns the fit, or the reason why it failed.
 
@@ -109,7 +106,7 @@ def refine(
     return _report(pixels, found, prior, noise_dn, new_seen)
 
 
-def _band(linear: Image, model: EdgeModel, masked: Mask) -> tuple[Array, Array, Array]:
+def _band(linear: Image, model: EdgeModel, masked: Bools) -> tuple[Floats, Floats, Floats]:
     """(x, y, level) of the pixels near the boundary: up to 4 sigma + 1 px inside it and 3 sigma + 1 px outside it, but
     not beyond OUTWARD_PX.
 
@@ -136,7 +133,7 @@ def _band(linear: Image, model: EdgeModel, masked: Mask) -> tuple[Array, Array, 
     return (column + x0).astype(np.float64), (row + y0).astype(np.float64), level
 
 
-def _padded(outer: Array, order: int) -> Array:
+def _padded(outer: Floats, order: int) -> Floats:
     out = np.zeros(1 + 2 * order)
     kept = min(out.size, outer.size)
     out[:kept] = outer[:kept]
@@ -171,7 +168,7 @@ def _sane(model: EdgeModel, start: EdgeModel) -> bool:
     return moved < 0.25 * float(b) + 1.0 and bool((ratio > 0.7).all() and (ratio < 1.4).all()) and model.step_dn > 0.0
 
 
-def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen: Mask) -> PixelFit:
+def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen: Bools) -> PixelFit:
     model, rows = found.model, found.rows
     residual, slopes = rows.residual, rows.jacobian
     variance = float(np.sum(residual * residual)) / max(residual.size - slopes.shape[0], 1)
@@ -208,7 +205,7 @@ def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen
     )
 
 
-def _through(start: Ellipse, displaced: Array) -> tuple[Ellipse, Array]:
+def _through(start: Ellipse, displaced: Floats) -> tuple[Ellipse, Floats]:
     """The ellipse that fits an uneven boundary best, as a direct fit to the traced boundary would.
 
     Also returns the derivatives (5, SECTORS) of its centre and shape by the sectors' displacements from `start`.

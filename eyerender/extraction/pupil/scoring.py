@@ -13,9 +13,8 @@ import math
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import frozen
+from ...arrays import Floats, frozen
 from ...geometry.ellipse import Ellipse
 from ..preprocessing import DN
 from ..result import Goodness, PupilResult
@@ -25,15 +24,13 @@ from .covariance import boundary_deviation
 from .refinement import PixelFit
 from .search import Found
 
-Array = NDArray[np.float64]
-
 FEATURES = (
     "support", "gap", "explained", "ln contrast to noise", "ln contrast", "ln boundary sd / b", "ln residual / b",
     "ln b", "blur / b", "b / a", "unevenness", "spread", "ln chi2", "uneven / b", "refined",
 )  # fmt: skip
 
 
-def features(ellipse: Ellipse, goodness: Goodness) -> Array:
+def features(ellipse: Ellipse, goodness: Goodness) -> Floats:
     """(15,) what the confidence depends on, in the order of FEATURES."""
     g = goodness
     b = float(ellipse.semi_axes_px[1])
@@ -58,7 +55,7 @@ def features(ellipse: Ellipse, goodness: Goodness) -> Array:
     )
 
 
-def design(rows: Array, low: Array, high: Array) -> Array:
+def design(rows: Floats, low: Floats, high: Floats) -> Floats:
     """(n, 1 + 3 x 15) columns: 1, every feature scaled to 0..1 within its limits, the excess over 1/3, over 2/3."""
     scaled = (np.clip(rows, low, high) - low) / np.where(high > low, high - low, 1.0)
     bends = [np.maximum(scaled - knot, 0.0) for knot in (1.0 / 3.0, 2.0 / 3.0)]
@@ -73,7 +70,7 @@ def confidence(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "re
     return float(1.0 / (1.0 + np.exp(-np.clip(logit[0], -30.0, 30.0))))
 
 
-def calibrated(logit: Array, bend: Array) -> Array:
+def calibrated(logit: Floats, bend: Floats) -> Floats:
     """c0 + c1 logit + c2 min(logit, 1): what the logits of cross-validation were worth, doubtful ones apart."""
     return np.asarray(bend[0] + bend[1] * logit + bend[2] * np.minimum(logit, 1.0))
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Bools, Floats
 from ..preprocessing import Prepared
 from ..result import PupilResult
 from ..settings import ExtractionSettings
@@ -17,8 +17,6 @@ from .consensus import BoundaryFit, fit_boundary
 from .covariance import edge_covariance
 from .edge_model import SECTORS, EdgeModel, Place, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +41,7 @@ class Found:
         return EdgeModel(self.boundary.ellipse, candidate.inside_dn, outer, sigma)
 
     @cached_property
-    def covariance(self) -> Array:
+    def covariance(self) -> Floats:
         """(5, 5) covariance of centre, semi-axes and angle, from the scatter of the edge points."""
         return edge_covariance(self.boundary.ellipse, self.boundary.points_px, self.boundary.residual_px)
 
@@ -53,7 +51,7 @@ class Found:
         return inspect_interior(self.image.linear, self.boundary.ellipse, self.model.sigma_px, self.image.noise_dn)
 
     @cached_property
-    def sectors(self) -> NDArray[np.bool_]:
+    def sectors(self) -> Bools:
         """(SECTORS,) sectors with an edge point, and gaps of up to two sectors between them."""
         hit = np.bincount(sector_of(Place.of(self.boundary.ellipse, *self.edges.points_px[self.boundary.inliers].T)),
                           minlength=SECTORS) > 0  # fmt: skip

@@ -7,13 +7,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse, fit_ellipse_direct, iou, signed_distance
 from ..statistics import median
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 STARTS = 24  # positions around the outline at which a stretch begins
 CUT_POINTS = 40  # points that a fit uses of those that remain
@@ -32,15 +29,15 @@ class Cuts:
         points: (n, 2) all points, in the order of the outline.
     """
 
-    fits: Array
-    width: Array
-    residual_px: Array
-    first: NDArray[np.intp]
-    count: NDArray[np.intp]
-    points: Array
+    fits: Floats
+    width: Floats
+    residual_px: Floats
+    first: Indices
+    count: Indices
+    points: Floats
 
     @staticmethod
-    def of(points: Array, ellipse: Ellipse, least: int, shares: tuple[float, ...], largest: float) -> Cuts:
+    def of(points: Floats, ellipse: Ellipse, least: int, shares: tuple[float, ...], largest: float) -> Cuts:
         """Leave out each stretch of the given widths in turn.
 
         Args:
@@ -75,7 +72,7 @@ class Cuts:
         residual = np.sqrt(np.einsum("mn,mn->m", distance, distance) / CUT_POINTS)
         return Cuts(fits, widths[alike], residual, first[alike], count[alike], points)
 
-    def inside(self, which: Mask, depth_px: Callable[[float], float]) -> Iterator[Ellipse]:
+    def inside(self, which: Bools, depth_px: Callable[[float], float]) -> Iterator[Ellipse]:
         """Of `which`, different ones whose stretch lies inside, the median of its points by more than depth_px of the
         rest's residual; those first that the rest fits best."""
         given: list[Ellipse] = []
@@ -89,7 +86,7 @@ class Cuts:
                 yield ellipse
 
 
-def turn_of(points: Array, ellipse: Ellipse) -> Array:
+def turn_of(points: Floats, ellipse: Ellipse) -> Floats:
     """(n,) where along the outline points lie, 0..1 by the ellipse's parameter."""
     dx, dy = (points - ellipse.centre_px).T
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
@@ -97,7 +94,7 @@ def turn_of(points: Array, ellipse: Ellipse) -> Array:
     return np.asarray(np.arctan2((dy * cos - dx * sin) / b, (dx * cos + dy * sin) / a) / (2.0 * np.pi) + 0.5)
 
 
-def _distances(points: Array, fits: Array) -> Array:
+def _distances(points: Floats, fits: Floats) -> Floats:
     """(m, n) signed distances, as `signed_distance`, of points (m, n, 2) to an ellipse (m, 5) each."""
     cos, sin = np.cos(fits[:, 4:]), np.sin(fits[:, 4:])
     a, b = fits[:, 2:3], fits[:, 3:4]
