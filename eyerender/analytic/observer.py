@@ -34,10 +34,15 @@ def observe(scene: Scene, *, boundary_points: int = 30) -> Observations:
 def observe_in_detail(
     scene: Scene, *, boundary_points: int = 30, purkinje: Sequence[int] = (1,)
 ) -> tuple[Observations, Features]:
-    """The same with what a record has no place for: residuals, how far the pupil is from an ellipse, Purkinje images.
+    """Observe a scene and keep residuals, the pupil's deviation from an ellipse and Purkinje images too.
 
     Args:
-        purkinje: which images, from 1 (the glint) to 4; those the eye has no surface for are refused.
+        scene: the scene, whose frames are observed.
+        boundary_points: number of traced points of each pupil's boundary.
+        purkinje: which images, from 1 (the glint) to 4. Images for which the eye has no surface are refused.
+
+    Returns:
+        The observations, and the features that a record has no place for.
     """
     has = scene.eye("right").purkinje_orders
     if not set(purkinje) <= set(has):
@@ -117,12 +122,14 @@ def poses_of(scene: Scene, frames: Frames) -> PoseTruth:
 
 
 def pupil_features(seen: Features) -> PupilFeatures:
-    """The apparent pupils of a batch: missing where no boundary point has a ray, or no ellipse fits; partial where
-    some have one and others do not.
+    """Apparent pupils of a batch.
 
-    The arcs of a partial pupil run from the first to the last point of each run of points that are seen; the true ones
-    end less than one spacing of the points farther. An ellipse is fitted to these points where there are at least
-    `ARC_POINTS` and no stretch of more than `ARC_GAP_DEG` is hidden.
+    A pupil is missing where no boundary point has a ray or no ellipse fits. It is partial where only some points have a
+    ray.
+
+    The arcs of a partial pupil run from the first to the last point of each run of visible points. The true arcs extend
+    beyond these by less than one spacing of the points. An ellipse is fitted where there are at least `ARC_POINTS`
+    points and no stretch of more than `ARC_GAP_DEG` is hidden.
     """
     status, found = seen.pupil_status, seen.point_status == 0
     whole = status == 0

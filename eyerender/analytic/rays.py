@@ -50,11 +50,13 @@ def pupil_exits(eye: EyeModel, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats,
 
 
 def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
-    """Where the light of m lights (n, m) leaves the cornea for the camera, reflected at the surface of Purkinje's
-    `order`.
+    """Find where the light of lamps leaves the cornea for the camera.
 
-    Images 3 and 4 are seen through the pupil: BEHIND_IRIS where the iris is in the light's way in or out. Returns exit
-    points as three arrays (n, m), residuals, status.
+    The light is reflected at the surface of the given Purkinje image. Images 3 and 4 are seen through the pupil: their
+    status is BEHIND_IRIS where the iris blocks the light on its way in or out.
+
+    Returns:
+        Exit points as three arrays (n, m), residuals and status, for lights (n, m).
     """
     if order not in eye.purkinje_orders:
         nothing = np.full(lights_mm[0].shape, np.nan)

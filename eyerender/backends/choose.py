@@ -62,19 +62,14 @@ class BackendState:
 def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> Backend:
     """Make this process render with a backend that was seen to work.
 
-    Parameters
-    ----------
-    name
-        "auto" takes the GPU where one renders, else the processor.
-    threads
-        Threads of the processor to use, >= 1; None leaves Dr.Jit's choice, all of them.
+    Args:
+        name: "auto" takes the GPU where one renders, else the processor.
+        threads: threads of the processor to use, >= 1; None leaves Dr.Jit's choice, all of them.
 
-    Raises
-    ------
-    InputError
-        No such backend, or `threads` below 1.
-    BackendError
-        None renders, or mitsuba was imported earlier with a libLLVM that does not; the message says how to fix it.
+    Raises:
+        InputError: no such backend, or `threads` below 1.
+        BackendError: no backend renders, or mitsuba was imported earlier with a libLLVM that does not; the message says
+            how to fix it.
     """
     if name not in ("auto", "cuda", "llvm"):
         raise InputError(f"must be auto, cuda or llvm, not {name!r}", path="backend")

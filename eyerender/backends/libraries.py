@@ -38,12 +38,12 @@ def stored_folders() -> tuple[Path, ...]:
 
 
 def load_runtime(folders: Sequence[Path] = ()) -> None:
-    """Load what Dr.Jit is linked with, from the system or else from `folders` or what `setup_llvm` has unpacked.
+    """Load the libraries that Dr.Jit is linked with.
 
-    Raises
-    ------
-    OSError
-        It is nowhere; the message names the package.
+    The system is searched first, then `folders` or what `setup_llvm` has unpacked.
+
+    Raises:
+        OSError: a library is nowhere; the message names the package.
     """
     for name, (debian, fedora) in RUNTIME.items():
         try:
@@ -59,12 +59,10 @@ def load_library(library: Path, folders: Sequence[Path] = ()) -> None:
     """Load a shared library, and before it those of its dependencies that only `folders` hold.
 
     LD_LIBRARY_PATH is read when a process starts, so a library that was unpacked into a folder of ours does not find
-    what was unpacked beside it. What the system has goes first. The loader's message names the missing object.
+    what was unpacked beside it. The system's libraries have priority. The loader's message names the missing object.
 
-    Raises
-    ------
-    OSError
-        A dependency is nowhere, or the library does not fit this system.
+    Raises:
+        OSError: a dependency is nowhere, or the library does not fit this system.
     """
     for _ in range(64):
         try:

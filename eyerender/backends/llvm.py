@@ -78,12 +78,11 @@ def find_llvm(*, refresh: bool = False) -> LibLlvm | None:
 
 
 def ensure_llvm() -> LibLlvm:
-    """Have this process's Dr.Jit use a libLLVM that renders.
+    """Make this process's Dr.Jit use a libLLVM that renders.
 
-    Raises
-    ------
-    BackendError
-        There is none, or drjit was imported before and has loaded another, or none; the message says how to fix it.
+    Raises:
+        BackendError: there is none, or drjit was imported before and has loaded another, or none; the message says how
+            to fix it.
     """
     global _active
     if _active is None:

@@ -29,15 +29,11 @@ def _silent(line: str) -> None:
 def setup_llvm(*, say: Say = _silent) -> LibLlvm:
     """Find a libLLVM that renders, or fetch one.
 
-    Parameters
-    ----------
-    say
-        Receives one line for each step that takes time.
+    Args:
+        say: receives one line for each step that takes time.
 
-    Raises
-    ------
-    BackendError
-        None could be had; the message names the command that brings one.
+    Raises:
+        BackendError: no libLLVM could be had; the message names the command that brings one.
     """
     found = find_llvm(refresh=True)
     if found is not None:

@@ -27,8 +27,11 @@ class Failed(Exception):
 
 
 class _Tail:
-    """The end of what comes out of a pipe. A thread of its own reads it, so that the writer never waits; the rest is
-    dropped, so that a process may print without end."""
+    """The end of a pipe's output.
+
+    A thread of its own reads the pipe, so that the writer never waits. Only the end is kept, so that a process may
+    print without limit.
+    """
 
     def __init__(self, pipe: IO[bytes]) -> None:
         self._pipe = pipe

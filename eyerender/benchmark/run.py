@@ -46,6 +46,7 @@ class Run:
 
     @property
     def reports_glints(self) -> bool:
+        """Whether the extractor announced that it reports glints."""
         return self.greeting is not None and "glints" in self.greeting.reports
 
 
@@ -63,7 +64,14 @@ def bench_extractors(
     """Run extractors over a labelled folder and write report.html, results.json and results.csv.
 
     Args:
+        folder: the labelled images.
+        output: the folder that receives the results.
+        extractors: what to run, each under a name of its own.
+        timeout_s: longest time for an image.
+        start_timeout_s: longest time until an extractor greets.
+        overwrite: replace what `output` holds.
         absent: extractors that cannot be run here, and why; they are named in the results.
+        progress: called with (done, total, note).
 
     Returns:
         The content of results.json (schema eyerender/bench-extractors/1).

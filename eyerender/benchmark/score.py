@@ -22,8 +22,15 @@ MATCH_PX = 2.0
 
 @dataclass(frozen=True, slots=True)
 class GlintScore:
-    """true: shown by the image. reported: by the extractor. errors_px: (dx, dy) of every match within 2 px.
-    named: matches to which it gave a light. swapped: of those, matches given a wrong one."""
+    """Scores of an image's glints.
+
+    Attributes:
+        true: number of glints that the image shows.
+        reported: number of glints that the extractor reported.
+        errors_px: (dx, dy) of every match within 2 px.
+        named: number of matches for which the extractor named a light.
+        swapped: number of those for which it named the wrong light.
+    """
 
     true: int = 0
     reported: int = 0

@@ -95,8 +95,11 @@ def failures(scores: Sequence[Score], images: Sequence[LabelledImage]) -> list[d
 
 
 def bins(values: Sequence[float | None], name: str) -> list[tuple[float, float, list[int]]]:
-    """(low, high, members) of a factor: a bin each for up to six values, quarters of a pixel for a phase, else quarters
-    of the images. No bins where the factor hardly varies or is unknown for all."""
+    """Divide the values of a factor into bins, each as (low, high, members).
+
+    A factor with up to six values has one bin per value. A phase has quarters of a pixel, any other factor quarters of
+    the images. There are no bins where the factor hardly varies or is unknown for all images.
+    """
     known = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
     there = np.flatnonzero(np.isfinite(known))
     if not len(there):

@@ -208,10 +208,10 @@ def validate(
     deep: bool = False,
     json: Result = None,
 ) -> int:
-    """Check a folder of images and print its statistics: checksums, records and labels computed again from pose and
-    parameters, masks against the apparent outlines.
+    """Check a folder of images and print its statistics.
 
-    Exit code 1 where something is wrong.
+    Checks are made of checksums, of records and labels (computed again from pose and parameters), and of masks (against
+    the apparent outlines). Exit code 1 where something is wrong.
 
     Parameters
     ----------

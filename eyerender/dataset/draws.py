@@ -166,7 +166,7 @@ def parse_draw(node: dict[str, Any], *, source: str, path: str) -> Draw:
 
 
 def unit_number(seed: int, path: str, unit: str, number: int, attempt: int) -> float:
-    """u in (0, 1), see the module."""
+    """Draw a number u in (0, 1); see the module."""
     digest = hashlib.sha256(f"{seed}/{path}/{unit}/{number}/{attempt}".encode()).digest()
     return ((int.from_bytes(digest[:8], "big") >> 11) + 0.5) / 2.0**53
 

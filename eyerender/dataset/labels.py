@@ -134,8 +134,13 @@ def iris_outline(scene: Scene, view: EyeInWindow | WindowImage) -> dict[str, Any
 
 
 def limbus_px(scene: Scene, view: EyeInWindow | WindowImage, count: int) -> tuple[Floats, str | None]:
-    """The apparent limbus, (count, 2) full-sensor px: the circle of the front cornea at limbus radius - half the
-    limbus' width, projected. The second value says why it is not to be seen as a whole, None where it is."""
+    """Apparent limbus as points (count, 2) in full-sensor px.
+
+    The limbus is the circle of the front cornea whose radius is the limbus radius minus half the limbus' width.
+
+    Returns:
+        The projected circle, and the reason why it is not visible as a whole (None where it is).
+    """
     surface, camera = view.eye.front[0], scene.rig.cameras[view.camera]
     rho = float(view.eye.limbus_radius_mm) - 0.5 * scene.spec.look.limbus_width_mm
     angle = 2 * np.pi * np.arange(count) / count

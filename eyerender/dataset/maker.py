@@ -24,8 +24,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MadeImage:
-    """An image of a sample: its name without ending, its pictures by kind (`LabelsSpec.pictures`), its line of metadata
-    (without files), and whether it is saturated (`is_saturated`)."""
+    """An image of a sample.
+
+    Attributes:
+        name: file name without its ending.
+        pictures: pixels by kind (`LabelsSpec.pictures`).
+        line: line of metadata, without files.
+        saturated: whether the image is saturated (`is_saturated`).
+    """
 
     name: str
     pictures: dict[str, NDArray[Any]]

@@ -142,8 +142,11 @@ def _links(folder: Path) -> Iterator[str]:
 
 
 def _is_passing(name: str) -> bool:
-    """Whether a name is that of a lock, of a staged shard, of a file of ours that was not finished, or of the marker
-    that stands in a folder while it is cleared."""
+    """Whether a name is that of a temporary file.
+
+    These are locks, staged shards, files of ours that were not finished, and the marker that stands in a folder while
+    it is cleared.
+    """
     if name == MARKER or name.startswith((LOCK, STAGE)):
         return True
     return name.endswith(PART) and any(name.startswith(f".{own}.") for own in (*_OWN, MARKER))

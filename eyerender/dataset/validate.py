@@ -1,7 +1,9 @@
-"""Checks of a folder of images: files against checksums, lines against shards and plan, values against what is computed
-again from pose and parameters, masks against the apparent outlines.
+"""Checks of a folder of images.
 
-Memory does not grow with the folder, but for some tens of bytes an image.
+Files are compared with checksums, lines with shards and plan, values with what is computed again from pose and
+parameters, and masks with the apparent outlines.
+
+Memory does not grow with the folder, except for some tens of bytes an image.
 """
 
 from __future__ import annotations

@@ -19,8 +19,11 @@ from .shard import write_shard
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What every worker of a run is told: the plan and the folder of its files, frames a sample, the folder to write,
-    where and with how many threads. Folders are absolute, for a worker may be started in any."""
+    """What every worker of a run is told.
+
+    This is the plan and the folder of its files, the frames per sample, the folder to write, and the backend with its
+    threads. Folders are absolute because a worker may start in any working directory.
+    """
 
     plan: dict[str, Any]
     base: str
@@ -41,8 +44,11 @@ class Job:
 
 
 def work(pipe: Connection, job: Job) -> None:
-    """The worker's life. Messages out: ("ready", backend), ("sample", shard, samples, images), ("done", summary),
-    ("failed", kind, reason) with kind backend, input, disk or error. In: a shard's number, or None to end."""
+    """Run a worker until there is no more work.
+
+    The worker sends ("ready", backend), ("sample", shard, samples, images), ("done", summary) and ("failed", kind,
+    reason), where kind is backend, input, disk or error. It receives the number of a shard, or None to end.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     threading.Thread(target=_die_with_parent, daemon=True).start()
     try:

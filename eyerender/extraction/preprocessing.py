@@ -26,8 +26,13 @@ def as_image(array: NDArray[np.generic]) -> Image:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """linear: (h, w) float32 linear intensity, full scale 255. clip_dn: level at which the sensor saturates (infinite
-    for float images). noise_dn: standard deviation of a pixel's noise. inverted: whether this is a negative.
+    """An image made ready for extraction.
+
+    Attributes:
+        linear: (h, w) float32 linear intensity, full scale 255.
+        clip_dn: level at which the sensor saturates; infinite for float images.
+        noise_dn: standard deviation of a pixel's noise.
+        inverted: whether the image is a negative.
     """
 
     linear: Image
@@ -120,9 +125,12 @@ def _from_float(array: NDArray[np.generic], gamma: float) -> Image | str:
 
 
 def estimate_noise(linear: Image) -> float:
-    """sigma = 1.4826 median|d| / 2, d = I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1), on about 20,000 places.
+    """Estimate the noise at about 20,000 places.
 
-    The difference removes any plane; the median ignores edges. Source: Immerkaer (1996), with a median for the mean.
+    sigma = 1.4826 median|d| / 2, d = I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1)
+
+    The difference removes any plane, and the median ignores edges. Source: Immerkaer (1996), with a median for the
+    mean.
     """
     step = max(1, int(np.sqrt(linear.size / 20_000)))
     a, b = linear[:-1:step, :-1:step], linear[:-1:step, 1::step]

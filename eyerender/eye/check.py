@@ -109,7 +109,7 @@ def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:
 
 
 def _depth(surface: Surface, grid: Floats) -> Floats:
-    """x (mm, eye frame) of the surface over points (y, z), (m, 2) -> (m,); NaN where it is not met."""
+    """Depth x (mm, eye frame) of the surface over points (y, z), (m, 2) -> (m,); NaN where the line misses it."""
     start = np.column_stack([np.full(len(grid), _FAR_MM), grid])
     hit = surface.hit(components(start), components(np.broadcast_to([-1.0, 0.0, 0.0], start.shape)), inward=True)
     return np.where(hit.ok, _FAR_MM - hit.distance, np.nan)

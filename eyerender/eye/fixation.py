@@ -105,8 +105,9 @@ def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKi
 
 
 def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:
-    """Turn the fixed line p + s u through the target: e1.(q - p) = e2.(q - p) = 0, q the target seen by the turned
-    eye.
+    """Turn the fixed line p + s u through the target.
+
+    The equations are e1.(q - p) = e2.(q - p) = 0, where q is the target as the turned eye sees it.
     """
     point, direction = eye.chief_ray.point_mm, eye.chief_ray.direction
     azimuth, elevation, miss, ahead = _turn_line(eye, components(target_mm), _split(point), _split(direction))
@@ -155,8 +156,9 @@ def _turn_line(eye: EyeModel, target: Xyz, point: Xyz, direction: Xyz) -> tuple[
 
 
 def _seen(eye: EyeModel, target: Xyz, azimuth: Floats, elevation: Floats) -> tuple[Xyz, Xyz, Xyz]:
-    """The target as the turned eye has it, with its derivatives by azimuth and elevation (Listing's torsion
-    included).
+    """The target in the frame of the turned eye, with its derivatives by azimuth and elevation.
+
+    Listing's torsion is included.
     """
     rotation = eye.rotation
     ca, ce, ct = (
@@ -260,7 +262,7 @@ def _mean_ray(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Floats, Bool
 
 
 def _to_the_axis(point: Floats, way: Floats) -> Floats:
-    """t for which point - t way comes closest to the x axis, (n,)."""
+    """Parameter t (n,) for which point - t way comes closest to the x axis."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.sum(way[:, 1:] * point[:, 1:], axis=-1) / np.sum(way[:, 1:] ** 2, axis=-1))
 

@@ -42,10 +42,18 @@ def _through(eye: EyeModel, last: int) -> list[GradientMedium | None]:
 
 
 def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Floats, Floats]:
-    """The rays from objects (m, 3) that reach the retina parallel to themselves: directions (m, 3), retina points (m,
-    3).
+    """Rays from objects that reach the retina parallel to themselves.
 
-    Raises `InputError` where there is none.
+    Args:
+        eye: the eye.
+        objects_mm: (m, 3) objects.
+        guess_mm: starting point of the search.
+
+    Returns:
+        Directions (m, 3) and retina points (m, 3).
+
+    Raises:
+        InputError: an object has no such ray.
     """
     path = path_to_retina(eye)
     direction, error, retina = _parallel_rays(path, objects_mm, normalize(guess_mm - objects_mm))

@@ -23,12 +23,17 @@ def _no_contour() -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop(ArrayValue):
-    """The aperture stop (the anatomical pupil): an ellipse with semi-axes along local y and z of its frame, or a
-    contour about one.
+    """The aperture stop (the anatomical pupil): an ellipse, or a contour about one.
 
-    centre_mm (3,), rotation (3, 3) local -> eye, semi_axes_mm (2,), handed: +1 right eye, -1 left eye, contour (2, k):
-    c and s of the margin's relative radius r(f) = 1 + sum_k c_k cos(k f) + s_k sin(k f); k = 0: an ellipse. In a batch
-    all arrays have a leading axis, `handed` too.
+    In a batch all arrays have a leading axis, `handed` too.
+
+    Attributes:
+        centre_mm: (3,) centre.
+        rotation: (3, 3) local to eye frame.
+        semi_axes_mm: (2,) semi-axes along local y and z.
+        handed: +1 for a right eye, -1 for a left eye.
+        contour: (2, k) c and s of the margin's relative radius r(f) = 1 + sum_k c_k cos(k f) + s_k sin(k f); k = 0 for
+            an ellipse.
     """
 
     centre_mm: Floats
@@ -47,8 +52,12 @@ class Stop(ArrayValue):
         return np.asarray(self.rotation[..., :, 0])
 
     def relative_radius(self, angle_rad: npt.ArrayLike) -> Floats:
-        """r at the parameter f of the ellipse, from the first semi-axis of the right eye's stop towards up, mirrored
-        for a left one; angle () or (m,), or (n, ...) for a batch of n stops.
+        """Relative radius r at the parameter f of the ellipse.
+
+        f is counted from the first semi-axis of the right eye's stop towards up; it is mirrored for a left eye.
+
+        Args:
+            angle_rad: () or (m,); (n, ...) for a batch of n stops.
         """
         angle = np.asarray(angle_rad, dtype=np.float64)
         out = np.ones(angle.shape)
@@ -124,8 +133,11 @@ class RotationCentres(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineOfSight(ArrayValue):
-    """The chief ray to the fovea, in air: `point_mm` where it leaves the cornea, unit `direction` outward, (3,)
-    each.
+    """The chief ray to the fovea, in air.
+
+    Attributes:
+        point_mm: (3,) where it leaves the cornea.
+        direction: (3,) outward unit vector.
     """
 
     point_mm: Floats

@@ -52,7 +52,7 @@ class Poses(ArrayValue):
 
 
 def listing_torsion(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Floats:
-    """tau = -asin(sin az sin el / (1 + cos az cos el))."""
+    """Torsion tau = -asin(sin az sin el / (1 + cos az cos el))."""
     azimuth, elevation = np.asarray(azimuth_rad), np.asarray(elevation_rad)
     return np.asarray(-np.arcsin(np.sin(azimuth) * np.sin(elevation) / (1.0 + np.cos(azimuth) * np.cos(elevation))))
 
@@ -120,5 +120,5 @@ def _apply(matrix: Floats, vector: Floats) -> Floats:
 
 
 def _about(matrix: Floats, centre: Floats) -> Floats:
-    """c - R c, the translation of a turn about c."""
+    """Translation c - R c of a rotation about the point c."""
     return np.asarray(centre - (matrix @ centre[..., None])[..., 0])

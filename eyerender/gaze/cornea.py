@@ -48,7 +48,9 @@ def from_all_glints(
     is the same up to the factor m: sum_{i<j} |c_i - c_j|^2 = m sum_i |c_i - mean|^2.
 
     Args:
-        origin_mm: (..., 3) nodal points. glints: (..., m, 3) unit rays, m >= 2. light_mm: (m, 3).
+        origin_mm: (..., 3) nodal points.
+        glints: (..., m, 3) unit rays, m >= 2.
+        light_mm: (m, 3) lights.
         radius_mm: (...) corneal radius.
         start_mm: (..., m) distances to start from; default: the best of a coarse search.
     """
@@ -155,13 +157,17 @@ def optic_axis(
     w = unit(p - c)                                                               (Guestrin & Eizenman 2006, section II)
 
     Args:
-        origin_mm, pupil: (..., 3) nodal point and unit ray to the pupil centre. centre_mm: (..., 3).
-        radius_mm, distance_mm, index: (...) R, K and n.
+        origin_mm: (..., 3) nodal point.
+        pupil: (..., 3) unit ray to the pupil centre.
+        centre_mm: (..., 3) centre of the cornea, c.
+        radius_mm: (...) R.
+        distance_mm: (...) K.
+        index: (...) n.
 
     Returns:
         w; whether the ray meets the cornea (...); whether the refracted ray meets the sphere of radius K (...). Where
-        the ray misses the cornea w is that of the nearest point, where it misses the inner sphere that of its nearest
-        point, so that a search for parameters sees no step.
+        the ray misses the cornea, w is that of the nearest point; where it misses the inner sphere, it is that of its
+        nearest point, so that a search for parameters sees no step.
     """
     R, K, n = (np.asarray(v, dtype=float)[..., None] for v in (radius_mm, distance_mm, index))
     r, meets = _near_intersection(origin_mm, pupil, centre_mm, R)

@@ -31,7 +31,8 @@ def quality(samples_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> 
 
     Args:
         samples_mm: (s, n, 3) s >= 2 samples of n fixations, in time order.
-        target_mm: (n, 3). from_mm: (n, 3) or (3,) where the angles are seen from.
+        target_mm: (n, 3) targets.
+        from_mm: (n, 3) or (3,) point from which the angles are seen.
     """
     samples = np.asarray(samples_mm, dtype=float)
     if samples.ndim != 3 or len(samples) < 2:

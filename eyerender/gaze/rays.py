@@ -88,7 +88,7 @@ def screen_of(rig: RigGeometry) -> ScreenPlane:
 
 
 def unit(v: Floats) -> Floats:
-    """v / |v| along the last axis; NaN for a zero vector."""
+    """Unit vectors v / |v| along the last axis; NaN for a zero vector."""
     length = np.sqrt((v * v).sum(axis=-1, keepdims=True))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(v / np.where(length > 0, length, np.nan))

@@ -74,12 +74,12 @@ class Ellipse:
 
     @property
     def area_px2(self) -> float:
-        """pi a b."""
+        """Area pi a b."""
         return math.pi * float(self.semi_axes_px[0] * self.semi_axes_px[1])
 
     @property
     def aspect(self) -> float:
-        """b / a, in (0, 1]."""
+        """Aspect ratio b / a, in (0, 1]."""
         return float(self.semi_axes_px[1] / self.semi_axes_px[0])
 
     def conic(self) -> Floats:
@@ -126,7 +126,7 @@ class EllipseFit(NamedTuple):
 
 
 def wrap_angle(angle_rad: ArrayLike) -> Floats:
-    """angle mod pi, in [0, pi): the orientation of an undirected axis."""
+    """Wrap an angle to [0, pi): the orientation of an undirected axis."""
     wrapped = np.mod(np.asarray(angle_rad, dtype=np.float64), np.pi)
     # np.mod rounds a tiny negative angle up to pi itself.
     return np.where(wrapped >= np.pi, 0.0, wrapped)

@@ -28,10 +28,10 @@ class Graph(Protocol):
     """A surface over the (y, z) plane of a working frame."""
 
     def height(self, y: Floats, z: Floats) -> Floats:
-        """h(y, z)."""
+        """Height h(y, z)."""
 
     def jet(self, y: Floats, z: Floats) -> Jet:
-        """h with its derivatives up to the second."""
+        """Height h with its first and second derivatives."""
 
 
 class AxialGraph(NamedTuple):
@@ -43,11 +43,13 @@ class AxialGraph(NamedTuple):
     ndim: int
 
     def height(self, y: Floats, z: Floats) -> Floats:
+        """Height h(y, z) = -r / (b + sqrt(b^2 - p r)), r = y^2 + z^2 + c."""
         b = fit(self.b, self.ndim)
         rest = y * y + z * z + fit(self.c, self.ndim)
         return np.asarray(-rest / (b + np.sqrt(b * b - fit(self.p, self.ndim) * rest)))
 
     def jet(self, y: Floats, z: Floats) -> Jet:
+        """Height h with its first and second derivatives."""
         p, b = fit(self.p, self.ndim), fit(self.b, self.ndim)
         rest = y * y + z * z + fit(self.c, self.ndim)
         u = np.sqrt(b * b - p * rest)
@@ -66,9 +68,11 @@ class QuadricGraph(NamedTuple):
     ndim: int
 
     def height(self, y: Floats, z: Floats) -> Floats:
+        """Height h(y, z), the root of the quadric on the sheet."""
         return self._root(y, z)[0]
 
     def jet(self, y: Floats, z: Floats) -> Jet:
+        """Height h with its first and second derivatives."""
         xx, yy, zz, xy, xz, yz, _, by, bz, _ = (fit(v, self.ndim) for v in self.coefficients)
         x, u = self._root(y, z)
         inverse = -1.0 / u
@@ -98,9 +102,11 @@ class BiconicGraph(NamedTuple):
     surface: Biconic
 
     def height(self, y: Floats, z: Floats) -> Floats:
+        """Height h(y, z), the sag of the biconic."""
         return self.surface.local_sag(y, z)
 
     def jet(self, y: Floats, z: Floats) -> Jet:
+        """Height h with its first and second derivatives."""
         return Jet(*self.surface.sag_derivatives(y, z)[:6])
 
 

@@ -24,8 +24,13 @@ Xyz = tuple[Floats, Floats, Floats]
 
 
 class Hit(NamedTuple):
-    """Where rays meet a surface: `distance` along the unit direction (mm), `point`, half `gradient`, `ok` (it
-    exists).
+    """Where rays meet a surface.
+
+    Attributes:
+        distance: along the unit direction, mm.
+        point: the intersections.
+        gradient: half gradient there.
+        ok: whether the ray meets the surface.
     """
 
     distance: Floats
@@ -98,7 +103,7 @@ class Surface(ABC):
 
     @abstractmethod
     def local_sag(self, y: Floats, z: Floats) -> Floats:
-        """x of the sheet in the local frame over the local (y, z); NaN where the sheet does not reach."""
+        """Depth x of the sheet in the local frame over the local (y, z); NaN where the sheet does not reach."""
 
     @abstractmethod
     def take(self, index: Indices) -> Self:
@@ -136,7 +141,7 @@ class Surface(ABC):
         return self.value_at(components(points))
 
     def gradient(self, points: npt.ArrayLike) -> Floats:
-        """grad F at points (..., 3)."""
+        """Full gradient of F at points (..., 3), twice the half gradient."""
         return 2.0 * join(self.gradient_at(components(points)))
 
     def normal(self, points: npt.ArrayLike) -> Floats:
@@ -146,7 +151,7 @@ class Surface(ABC):
         return unit
 
     def sag(self, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike) -> Floats:
-        """x (mm, local frame) of the sheet over local y and z; NaN where it does not reach."""
+        """Depth x (mm, local frame) of the sheet over local y and z; NaN where it does not reach."""
         return self.local_sag(np.asarray(y_mm, dtype=np.float64), np.asarray(z_mm, dtype=np.float64))
 
     def intersect(self, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Floats, Bools]:
@@ -197,7 +202,7 @@ def fit(value: Floats | float, ndim: int) -> Floats | float:
 
 
 def shift(point: Xyz, offset: Floats, sign: float) -> Xyz:
-    """point + sign offset, offset (3,) or (n, 3)."""
+    """Add sign * offset to points; offset is (3,) or (n, 3)."""
     ndim = point[0].ndim
     return (
         point[0] + sign * fit(offset[..., 0], ndim),
@@ -207,7 +212,7 @@ def shift(point: Xyz, offset: Floats, sign: float) -> Xyz:
 
 
 def turn(rotation: Floats, vector: Xyz) -> Xyz:
-    """rotation vector, rotation (3, 3) or (n, 3, 3)."""
+    """Rotate vectors by a rotation (3, 3) or (n, 3, 3)."""
     ndim = vector[0].ndim
     rows = [[fit(rotation[..., i, j], ndim) for j in range(3)] for i in range(3)]
     x, y, z = vector
@@ -219,7 +224,7 @@ def turn(rotation: Floats, vector: Xyz) -> Xyz:
 
 
 def turn_back(rotation: Floats, vector: Xyz) -> Xyz:
-    """rotation^T vector, rotation (3, 3) or (n, 3, 3)."""
+    """Rotate vectors by the transpose of a rotation (3, 3) or (n, 3, 3)."""
     return turn(np.swapaxes(rotation, -1, -2), vector)
 
 

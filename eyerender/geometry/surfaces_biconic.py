@@ -26,14 +26,18 @@ class _Sag(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Biconic(Surface):
-    """x = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - (1 + Q_y) c_y^2 y^2 - (1 + Q_z) c_z^2 z^2)), c = 1/R, apex at the
-    origin.
+    """Biconic surface with its apex at the local origin.
 
-    radii_mm : (R_y, R_z) > 0: opens to -x; < 0: to +x, (..., 2)
-    conic_constants : (Q_y, Q_z), (..., 2)
+    x = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - (1 + Q_y) c_y^2 y^2 - (1 + Q_z) c_z^2 z^2)), c = 1/R
+    (Smith & Atchison 1997, "The eye and visual optical instruments", biconic surface.)
 
-    F = 2 (x - x(y, z)), so that the half gradient is (1, -dx/dy, -dx/dz). (Smith & Atchison 1997, "The eye and visual
-    optical instruments", biconic surface.)
+    F = 2 (x - x(y, z)), so that the half gradient is (1, -dx/dy, -dx/dz).
+
+    Attributes:
+        origin_mm: (..., 3) apex in the eye frame.
+        rotation: (..., 3, 3) local to eye frame.
+        radii_mm: (..., 2) apex radii (R_y, R_z); positive ones open to -x, negative ones to +x.
+        conic_constants: (..., 2) conic constants (Q_y, Q_z).
     """
 
     origin_mm: Floats
@@ -49,6 +53,7 @@ class Biconic(Surface):
 
     @property
     def kind(self) -> str:
+        """The word 'biconic'."""
         return "biconic"
 
     def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
@@ -89,15 +94,18 @@ class Biconic(Surface):
         return Hit(t, point, self._to_eye((np.ones_like(slope_y), -slope_y, -slope_z)), ok)
 
     def value_at(self, point: Xyz) -> Floats:
+        """Implicit function F = 2 (x - x(y, z))."""
         x, y, z = self._local_point(point)
         return 2.0 * (x - self._first_order(y, z)[0])
 
     def gradient_at(self, point: Xyz) -> Xyz:
+        """Half gradient (1, -dx/dy, -dx/dz) of the local frame, rotated to the eye frame."""
         _, y, z = self._local_point(point)
         _, slope_y, slope_z, _ = self._first_order(y, z)
         return self._to_eye((np.ones_like(slope_y), -slope_y, -slope_z))
 
     def hessian_at(self, point: Xyz) -> SymmetricMatrix:
+        """Derivative of the half gradient, H with dg = H dp."""
         _, y, z = self._local_point(point)
         sag = self.sag_derivatives(y, z)
         if self._untilted:
@@ -111,6 +119,7 @@ class Biconic(Surface):
         return SymmetricMatrix(entry(0, 0), entry(1, 1), entry(2, 2), entry(0, 1), entry(0, 2), entry(1, 2))
 
     def local_sag(self, y: Floats, z: Floats) -> Floats:
+        """Depth x of the sheet in the local frame over the local (y, z); NaN where the square root is not real."""
         x, _, _, inside = self._first_order(y, z)
         return np.asarray(np.where(inside, x, np.nan))
 
@@ -136,16 +145,19 @@ class Biconic(Surface):
         return _Sag(x, xy, xz, xyy, xyz, xzz, inside)
 
     def take(self, index: Indices) -> Self:
+        """Surfaces of the batch at `index`; a single surface is returned as it is."""
         if not self.batch_shape:
             return self
         return type(self)(*(part[index] for part in self._key()))
 
     def scaled(self, centre_mm: Floats, factor: float) -> Self:
+        """Multiply all distances from `centre_mm` (3,) by `factor` > 0; conic constants stay."""
         origin = centre_mm + factor * (self.origin_mm - centre_mm)
         return type(self)(origin, self.rotation, factor * self.radii_mm, self.conic_constants)
 
     def mirrored(self) -> Self:
         # The sag is even in y, so only the placement is mirrored.
+        """Mirror the surface, y -> -y."""
         return type(self)(flip_y(self.origin_mm), mirror_rotation(self.rotation), self.radii_mm, self.conic_constants)
 
     def _key(self) -> tuple[Floats, ...]:
@@ -153,6 +165,7 @@ class Biconic(Surface):
 
     @classmethod
     def stack(cls, surfaces: tuple[Self, ...]) -> Self:
+        """Combine single biconics into a batch."""
         return cls(*(np.stack(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
 
     def _constants(self, ndim: int) -> tuple[Floats | float, ...]:

@@ -17,9 +17,12 @@ from .transforms import MIRROR, flip_y, mirror_rotation, read_only
 class Quadric(Surface):
     """F(p) = p^T A p + 2 b.p + c = 0 in the local frame, on the sheet where g_x = (A p + b)_x > 0.
 
-    matrix : A, symmetric, (..., 3, 3)
-    vector : b (mm), (..., 3)
-    constant : c (mm^2), (...,)
+    Attributes:
+        origin_mm: (..., 3) origin of the local frame in the eye frame.
+        rotation: (..., 3, 3) local to eye frame.
+        matrix: (..., 3, 3) A, symmetric.
+        vector: (..., 3) b, mm.
+        constant: (...,) c, mm^2.
     """
 
     origin_mm: Floats
@@ -83,7 +86,7 @@ class Quadric(Surface):
 
     @classmethod
     def plane(cls, origin_mm: npt.ArrayLike, rotation: npt.ArrayLike | None = None) -> Quadric:
-        """x = 0 of the local frame."""
+        """Plane x = 0 of the local frame."""
         return cls.oriented(np.zeros((3, 3)), np.array([1.0, 0.0, 0.0]), np.array(0.0), 1.0, origin_mm, rotation)
 
     @classmethod
@@ -112,6 +115,7 @@ class Quadric(Surface):
 
     @property
     def kind(self) -> str:
+        """The word 'quadric'."""
         return "quadric"
 
     @property
@@ -164,12 +168,14 @@ class Quadric(Surface):
         return np.asarray(ax * gradient[0] + ay * gradient[1] + az * gradient[2] > 0.0)
 
     def value_at(self, point: Xyz) -> Floats:
+        """Implicit function F(p) = p^T A p + 2 b.p + c."""
         x, y, z = point
         gx, gy, gz = self.gradient_at(point)
         bx, by, bz, c = (fit(v, x.ndim) for v in self._eye[6:])
         return np.asarray((gx + bx) * x + (gy + by) * y + (gz + bz) * z + c)
 
     def gradient_at(self, point: Xyz) -> Xyz:
+        """Half gradient g = A p + b."""
         x, y, z = point
         if self._axial:
             return fit(self._eye[0], x.ndim) * x + fit(self._eye[6], x.ndim), y, z
@@ -178,6 +184,7 @@ class Quadric(Surface):
         return gx + bx, gy + by, gz + bz
 
     def hessian_at(self, point: Xyz) -> SymmetricMatrix:
+        """Derivative of the half gradient, the matrix A in the eye frame."""
         return SymmetricMatrix(*(fit(v, point[0].ndim) for v in self._eye[:6]))
 
     def local_sag(self, y: Floats, z: Floats) -> Floats:
@@ -196,16 +203,19 @@ class Quadric(Surface):
             return np.asarray(np.where(stable, -rest / np.where(stable, half + root, 1.0), (root - half) / xx))
 
     def take(self, index: Indices) -> Self:
+        """Surfaces of the batch at `index`; a single surface is returned as it is."""
         if not self.batch_shape:
             return self
         return type(self)(*(part[index] for part in self._key()))
 
     def scaled(self, centre_mm: Floats, factor: float) -> Self:
+        """Multiply all distances from `centre_mm` (3,) by `factor` > 0."""
         origin = centre_mm + factor * (self.origin_mm - centre_mm)
         return type(self)(origin, self.rotation, self.matrix, factor * self.vector, factor * factor * self.constant)
 
     def mirrored(self) -> Self:
         # In the mirrored local frame y changes sign too, so the local implicit function is mirrored with it.
+        """Mirror the surface, y -> -y."""
         return type(self)(
             flip_y(self.origin_mm),
             mirror_rotation(self.rotation),
@@ -219,6 +229,7 @@ class Quadric(Surface):
 
     @classmethod
     def stack(cls, surfaces: tuple[Self, ...]) -> Self:
+        """Combine single quadrics into a batch."""
         return cls(*(np.stack(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
 
 

@@ -58,7 +58,7 @@ def mirror_rotation(rotation: npt.ArrayLike) -> Floats:
 
 
 def normalize(vectors: npt.ArrayLike) -> Floats:
-    """v / |v| along the last axis."""
+    """Unit vectors v / |v| along the last axis."""
     array = np.asarray(vectors, dtype=np.float64)
     unit: Floats = array / np.linalg.norm(array, axis=-1, keepdims=True)
     return unit

@@ -88,7 +88,7 @@ class GradientMedium(ArrayValue):
         return cls(centre_mm, np.stack(matrices), np.stack(vectors), np.array(core), np.array(core - edge))
 
     def index_at(self, points_mm: npt.ArrayLike) -> Floats:
-        """n at points (..., 3) of the lens; for a batch of n media (n, ..., 3)."""
+        """Refractive index n at points (..., 3) of the lens; (n, ..., 3) for a batch of n media."""
         points = np.moveaxis(np.asarray(points_mm, dtype=np.float64), -1, 0)
         front, back = self._halves(points.ndim - 1)
         seen = points - _first(self.centre_mm, points.ndim - 1)

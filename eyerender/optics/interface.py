@@ -15,7 +15,7 @@ from ..geometry.surfaces import Xyz
 
 
 def reflect(direction: Xyz, normal: Xyz) -> Xyz:
-    """w = d - 2 (d.N) N."""
+    """Reflect directions: w = d - 2 (d.N) N."""
     double = 2.0 * dot(direction, normal)
     return (
         direction[0] - double * normal[0],
@@ -68,5 +68,5 @@ def fresnel(cosine_incidence: npt.ArrayLike, n_before: FloatLike, n_after: Float
 
 
 def dot(a: Xyz, b: Xyz) -> Floats:
-    """a.b"""
+    """Scalar product a.b."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

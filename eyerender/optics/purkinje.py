@@ -124,8 +124,9 @@ def purkinje_points(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Route:
-    """How viewpoints and sources (m, 3), given from the apex, go from the axis to their places; apex, axis (3,) or
-    (m, 3).
+    """Path along which viewpoints and sources move from the axis to their places.
+
+    Viewpoints and sources (m, 3) are given relative to the apex; apex and axis are (3,) or (m, 3).
     """
 
     apex: Floats

@@ -447,7 +447,7 @@ def _moved(point: Xyz, way: Xyz, distance: Floats | float) -> Xyz:
 
 
 def _triple(a: Xyz, b: Xyz, c: Xyz) -> Floats:
-    """a.(b x c)"""
+    """Triple product a.(b x c)."""
     return np.asarray(
         a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
     )

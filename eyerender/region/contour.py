@@ -30,11 +30,17 @@ _GAP_MM = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contour(ArrayValue):
-    """Per column: `angle` (n,), `along` a (n,), `upper` 1 or -1, the inner edge `point` (n, 3), the `normal` (n, 3) of
-    the globe or its continuation, the direction `away` (n, 3) from the fissure along it, and `along_lid` (n, 3),
-    towards the nose.
+    """Inner edge of the lids, per column.
 
-    `openness` is 1 for lids as wide as straight ahead, 0 for closed ones.
+    Attributes:
+        angle: (n,) angle of the column.
+        along: (n,) coordinate a along the fissure.
+        upper: 1 for the upper lid, -1 for the lower.
+        point: (n, 3) inner edge.
+        normal: (n, 3) normal of the globe or its continuation.
+        away: (n, 3) direction along the globe away from the fissure.
+        along_lid: (n, 3) direction towards the nose.
+        openness: 1 for lids as wide open as straight ahead, 0 for closed ones.
     """
 
     angle: Floats

@@ -41,7 +41,7 @@ _DEPTH = np.array([
 
 
 def face_depth(face: Face, y_mm: Floats, z_mm: Floats) -> Floats:
-    """x (mm) of the face over points (y, z) of the region's frame."""
+    """Depth x (mm) of the face over points (y, z) of the region's frame."""
     off = MIDDLE_MM - y_mm
     # Mirrored, and rounded where the halves meet: as far off as it was beyond a centimetre.
     folded = MIDDLE_MM - (np.sqrt(off * off + 5.5**2) - 5.5 * np.exp(-((off / 9.0) ** 2)))

@@ -67,7 +67,7 @@ class Globe(ArrayValue):
         return float(np.arcsin(np.clip(self.M[2, 0], -1, 1)))
 
     def radial(self, direction: Floats) -> Floats:
-        """r (n,) mm along unit directions (n, 3) from the centre."""
+        """Radius r (n,) mm along unit directions (n, 3) from the centre."""
         r = np.full(np.shape(direction)[:-1], self.radius_mm)
         if self.cornea is None:
             return r

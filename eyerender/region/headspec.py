@@ -1,5 +1,8 @@
-"""A user's own head mesh as a person writes it: which files, their unit and frame, what their parts are, where the eyes
-stand. It may stand in the scene, or in a manifest beside the mesh that the scene names (docs/formats.md)."""
+"""Specification of a user's own head mesh.
+
+It names the files, their unit and frame, what their parts are, and where the eyes are. It is part of the scene, or of a
+manifest beside the mesh that the scene names (docs/formats.md).
+"""
 
 from __future__ import annotations
 

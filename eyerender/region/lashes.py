@@ -32,8 +32,11 @@ _KINK = 0.45  # cosine of the sharpest bend between two pieces, sharper than any
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LashPlan(ArrayValue):
-    """What of the lashes does not move: column angle, place across the margin (0 to 1), length, fan, start, curl and
-    thickness (1 for a full-grown upper lash)."""
+    """Properties of the lashes that do not change with the pose.
+
+    Each lash has the angle of its column, its place across the margin (0 to 1), length, fan, start, curl and thickness
+    (1 for a full-grown upper lash).
+    """
 
     angle: Floats
     across: Floats
@@ -133,8 +136,9 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
 
 
 def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
-    """Whether the first pieces of curves (n, k, 3) cross the sheet about their roots, on either lid (n,): Moeller and
-    Trumbore's test.
+    """Whether the first pieces of curves (n, k, 3) cross the sheet near their roots (n,), on either lid.
+
+    The test is that of Moeller and Trumbore.
     """
     n = sheet.vertices.shape[1]
     across = np.rint(angle / (2 * np.pi) * n).astype(int)[:, None] + np.arange(-_NEAR_COLUMNS, _NEAR_COLUMNS + 1)

@@ -149,8 +149,10 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
 
 
 def _spread(c: Contour, y: Floats, z: Floats, y_line: float, nasal: bool) -> Floats:
-    """z (columns,) on a line across the corner of the fissure, evenly between where the lids cross it: near the
-    canthus, where the contour's own z crowd, their distances h from the canthus' go as the square root.
+    """Coordinate z (columns,) on a line across the corner of the fissure, evenly between the lids' crossings.
+
+    Near the canthus, where the contour's own z crowd, the distances h from the canthus grow as the square root of
+    theirs.
     """
     corner = 0 if nasal else len(z) // 2
     h = np.abs(z - z[corner])
@@ -196,7 +198,7 @@ def _spokes(c: Contour, crease: Floats, lash_line: Floats) -> tuple[Floats, Floa
 
 @lru_cache(maxsize=8)
 def _at_rest(spec: Region) -> tuple[Floats, Floats]:
-    """y and z (rows, columns) of the skin with the eye open and straight ahead."""
+    """Coordinates y and z (rows, columns) of the skin with the eye open and straight ahead."""
     globe = Globe.sphere()
     c = contour(spec, globe)
     _, lash_line = _margin(spec, globe, c)
@@ -269,7 +271,7 @@ def _fullness(spec: Region, c: Contour, y: Floats, z: Floats) -> Floats:
 
 
 def skin_depth(spec: Region, globe: Globe, y: Floats, z: Floats) -> Floats:
-    """x (mm) of the skin over (y, z) without margins and folds: the lids' shell and the face, joined smoothly."""
+    """Depth x (mm) of the skin over (y, z) without margins and folds: the lids' shell and the face, joined smoothly."""
     centre = 0.5 * (globe.centre + globe.rest)
     dy, dz = y - centre[1], z - centre[2]
     outer = globe.radius_mm + spec.lids.thickness_mm

@@ -29,8 +29,9 @@ def band(seed: int, size: int, across: tuple[float, float], up: tuple[float, flo
 
 @lru_cache(maxsize=8)
 def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Floats:
-    """Height 0 (furrow) to about 1 (plateau) over a periodic square of `cells` cells: the distance to the border
-    between the nearest two seeds. `stretch` > 1 draws cells out across.
+    """Height 0 (furrow) to about 1 (plateau) over a periodic square of `cells` cells.
+
+    The height is the distance to the border between the nearest two seeds. `stretch` > 1 draws cells out across.
     """
     rng = np.random.default_rng((0xF0, seed))
     # Distances count `stretch` times as much upwards.

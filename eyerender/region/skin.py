@@ -35,12 +35,12 @@ _REFERENCE_BLINK = 0.3  # in which the tissue is laid out: neither stretched nor
 
 
 def band_row(which: int) -> float:
-    """v of the middle of a constant band, 0 to 1 over the whole map."""
+    """Coordinate v of the middle of a constant band, 0 to 1 over the whole map."""
     return (SHEET_ROWS + BANDS * (which + 1) / 4) / (SHEET_ROWS + BANDS)
 
 
 def sheet_v(row: Floats) -> Floats:
-    """v of the sheet's rows, given as 0 (first) to 1 (last)."""
+    """Coordinate v of the sheet's rows, given as 0 (first) to 1 (last)."""
     return np.asarray((0.5 + np.interp(row * (ROWS - 1), np.arange(ROWS), _texels())) / (SHEET_ROWS + BANDS))
 
 
@@ -107,8 +107,9 @@ def _field(seed: int, y: Floats, z: Floats, across: tuple[float, float], up: tup
 
 
 def _cells(spec: Region, y: Floats, z: Floats, level: Floats, near: Floats) -> Floats:
-    """Plateaus (about 1) parted by furrows (0): wide fields, on the lids narrow ones drawn out across; both hold finer
-    ones.
+    """Plateaus (about 1) separated by furrows (0).
+
+    The fields are wide on the face, and narrow and drawn out across on the lids. Both contain finer ones.
     """
     coarse = sampled(furrows(spec.seed, _TILE, 1700), y, z, 0.72 * _TILE_MM)
     drawn = furrows(spec.seed + 7, _TILE, 1500, 0.6)
@@ -120,7 +121,7 @@ def _cells(spec: Region, y: Floats, z: Floats, level: Floats, near: Floats) -> F
 
 
 def _along_lids(y: Floats, z: Floats) -> Floats:
-    """z (mm) straightened so that lines along the lids are level."""
+    """Coordinate z (mm) straightened so that lines along the lids are level."""
     return np.asarray(z + 0.017 * np.minimum(y * y, 480.0) * np.tanh(z / 4.0))
 
 
@@ -147,8 +148,9 @@ def _from_line(rest: Floats) -> Floats:
 
 
 def _creases(spec: Region, y: Floats, out_mm: Floats, upper: Floats) -> Floats:
-    """Depth, 0 to about 1, of the lids' thin skin's creases, which run along the margin, begin and end, and branch:
-    fine ones all over the lid, wider ones where it folds.
+    """Depth, 0 to about 1, of the creases of the lids' thin skin.
+
+    The creases run along the margin, begin and end, and branch: fine ones all over the lid, wider ones where it folds.
     """
     reach = step(out_mm, 0.4, 2.0) * np.exp(-((np.maximum(out_mm - 7.0, 0) / 5.0) ** 2))
     reach = reach * step(np.abs(upper), 0.05, 0.5) * np.exp(-((y / 21.0) ** 6))

@@ -135,8 +135,10 @@ def _furrows(rng: np.random.Generator, s: Floats, turn: Floats) -> Floats:
 
 
 def _crypts(rng: np.random.Generator, s: Floats, turn: Floats, collarette: Floats, warp: Floats) -> Floats:
-    """Fuchs' crypts: lens-shaped gaps in the front layer between trabeculae, a lattice along the collarette that is
-    deep in some sectors and closed in others, with a few single ones towards the root.
+    """Fuchs' crypts: lens-shaped gaps in the front layer between trabeculae.
+
+    They form a lattice along the collarette that is deep in some sectors and closed in others, with a few single crypts
+    towards the root.
     """
     # Lattice in mm of an iris of 3.8 mm from margin to root, drawn out twofold along the radius.
     around, along = 2 * np.pi * 3.2, 3.8 / 2.0

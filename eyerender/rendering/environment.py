@@ -216,8 +216,15 @@ class Ambience:
         maps: Maps,
         lids: LidShade | None = None,
     ) -> None:
-        """`panels` (n, 13) as `frame.panel_table` has them; the map's rays are those of the world's axes; `lids` of a
-        scene with an eye region."""
+        """Prepare the light.
+
+        Args:
+            even_mw_mm2: irradiance of even light.
+            panels: (n, 13) as from `frame.panel_table`.
+            spec: the map, whose rays are in the world's axes; None for none.
+            maps: the maps that are kept.
+            lids: shading by the lids, for a scene with an eye region.
+        """
         self.lids = lids
         self._panels = Panels(panels)
         self._texture, made = maps.of(spec)
@@ -234,8 +241,10 @@ class Ambience:
         return mi.Vector3f(*(dr.dot(axis, v) for axis in self._axes))
 
     def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Radiance (mW/mm^2/sr) that rays of the scene's frame meet, even light left out; panels that overlap add up
-        and do not hide the map behind them."""
+        """Radiance (mW/mm^2/sr) along rays of the scene's frame, without the even light.
+
+        Overlapping panels add up, and they do not hide the map behind them.
+        """
         w = self._in_map(d)
         u = 0.5 - dr.atan2(w.y, w.x) * (0.5 * dr.inv_pi)
         v = dr.acos(dr.clip(w.z, -1, 1)) * dr.inv_pi

@@ -37,14 +37,16 @@ def export_scene(
     Args:
         job: what to show; its window becomes the film's crop.
         folder: an existing folder.
-        spp, max_depth: of the path integrator that the file asks for.
-        rings, sectors: of the meshes.
+        spp: samples per pixel of the path integrator that the file asks for.
+        max_depth: path depth of that integrator.
+        rings: rings of the meshes.
+        sectors: sectors of the meshes.
 
     Returns:
         The path of the XML file.
 
     Raises:
-        InputError: the camera's pixels are not square, which Mitsuba's perspective sensor does not know.
+        InputError: the camera's pixels are not square, which Mitsuba's perspective sensor does not support.
     """
     K = job.camera.K
     if abs(K[0, 0] - K[1, 1]) > 1e-6 * K[0, 0]:

@@ -36,8 +36,14 @@ Visibility = Callable[[Floats, Floats], Bools]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GlintTable(ArrayValue):
-    """One row a lamp: energy-weighted place (n, 2) in full-sensor pixels, energy (n,) in radiance times pixels
-    (mW/mm^2/sr px) that reaches the camera, the share (n,) of the lamp's image that is visible, and `visible` (n,)."""
+    """Visible glints, one row per lamp.
+
+    Attributes:
+        xy_px: (n, 2) energy-weighted place in full-sensor pixels.
+        energy: (n,) radiance times pixels (mW/mm^2/sr px) that reaches the camera.
+        share: (n,) share of the lamp's image that is visible.
+        visible: (n,) whether any of it is.
+    """
 
     xy_px: Floats
     energy: Floats
@@ -145,8 +151,11 @@ class GlintScene:
 
 
 def glint_table(scene: GlintScene, images: Sequence[Image]) -> tuple[GlintTable, list[Spots], list[Bools]]:
-    """The glints of all lamps as they are seen, the points that each is made of, and for all points of each whether
-    nothing stands in their ways."""
+    """Visible glints of all lamps.
+
+    Returns:
+        The table, the points that each glint is made of, and whether each of these points is unobstructed.
+    """
     sources, entries, exits = (
         np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm")
     )
@@ -203,7 +212,7 @@ def disc_points(light: Lamp, nodes: Nodes) -> Floats:
 
 
 def distortion_determinant(camera: PinholeCamera, x: Floats, y: Floats) -> Floats:
-    """det of d(distorted) / d(undistorted) normalised coordinates."""
+    """Determinant of d(distorted) / d(undistorted) normalised coordinates."""
     k1, k2, p1, p2, k3 = camera.distortion
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))

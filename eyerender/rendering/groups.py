@@ -195,8 +195,11 @@ class _GroupShading:
 
 @dataclass
 class Kept:
-    """The hit of a group's samples that stands for all on one kind of surface, its number, and what all weigh: those
-    without a ray of their own to the lamp (`shared`), and those of the others that see it (`clear`)."""
+    """The hit that represents all samples of a group on one kind of surface.
+
+    It holds the sample's number and two weights: that of the samples without a ray of their own to the lamp (`shared`),
+    and that of the other samples that see the lamp (`clear`).
+    """
 
     j: mi.UInt32 = None
     face: mi.UInt32 = None

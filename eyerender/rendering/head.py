@@ -59,8 +59,10 @@ class HeadScene(RegionScene):
         return head_map(spec, load_head(_head(spec)))
 
     def _refuse_crossing(self, spec: Region, globe: Globe) -> None:
-        """Raise where the mesh reaches deeper into the cornea than it may: seen along lines from the globe's centre
-        that are 0.15 mm apart on the cornea."""
+        """Raise an error where the mesh reaches too deep into the cornea.
+
+        The depth is measured along lines from the globe's centre that are 0.15 mm apart on the cornea.
+        """
         head = _head(spec)
         depth = cornea_depth_mm(self, globe)
         deepest = int(np.argmax(depth))

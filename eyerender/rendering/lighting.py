@@ -61,10 +61,16 @@ def _globe_blocks(
 
 
 def straight(lamp: Lamp, source: mi.Vector3f, view: View, back: mi.Vector3f | None = None) -> tuple[mi.Float, mi.Float]:
-    """What a lamp gives matte points in the air when nothing stands in the way: irradiance (mW/mm^2), and the radiance
-    of their sheen towards the unit direction `back` (eye frame), if it is given.
+    """Light that a lamp gives to matte points in air when nothing stands in the way.
 
-    `source` are points of the lamp.
+    Args:
+        lamp: the lamp.
+        source: points of the lamp.
+        view: the points that are lit.
+        back: unit direction of the viewer (eye frame), if their sheen is wanted.
+
+    Returns:
+        Irradiance (mW/mm^2), and the radiance of the sheen towards `back`.
     """
     to = source - view.point
     inv2 = dr.rcp(dr.squared_norm(to))
@@ -77,10 +83,22 @@ def straight(lamp: Lamp, source: mi.Vector3f, view: View, back: mi.Vector3f | No
 def light(
     values: Values, lights: Lights, scene: mi.Scene, view: View, back: mi.Vector3f, u: mi.Float, v: mi.Float
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.UInt32]:
-    """Irradiance (mW/mm^2) at the first surface where it is matte, the radiance of its sheen towards the unit direction
-    `back` (eye frame), the irradiance in the plane of the iris, and failed paths.
+    """Light on the eye.
 
-    u, v: place on each lamp's disc, [0, 1). The cornea is convex: where it faces a lamp it is not in its own way.
+    The cornea is convex: where it faces a lamp it does not shadow itself.
+
+    Args:
+        values: the scene's numbers.
+        lights: the lamps.
+        scene: what may stand in the way.
+        view: the points that are lit.
+        back: unit direction of the viewer (eye frame).
+        u: place on each lamp's disc, [0, 1).
+        v: the same, second coordinate.
+
+    Returns:
+        Irradiance (mW/mm^2) at the first surface where it is matte, the radiance of its sheen towards `back`, the
+        irradiance in the plane of the iris, and failed paths.
     """
     if values.structure.region:
         # Skin fills the picture and every lamp costs a ray through the region: each sample sees one lamp, for all.

@@ -56,6 +56,7 @@ def connect(
     """Paths from `lamp` to `x` through all `surfaces`, all points in the eye frame (mm).
 
     Args:
+        surfaces: refracting surfaces, from the front.
         lamp: points on the lamps.
         x: points behind the surfaces.
         normal: unit normals there, towards the light.
@@ -114,8 +115,11 @@ def connect(
 
 
 def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vector3f:
-    """Where the straight line to `aim` enters; where it does so under grazing incidence or misses, the point whose
-    normal halves the angle between the lamp and the axis, which any lamp in front of the eye lights well."""
+    """First guess of the entry point: where the straight line to `aim` enters.
+
+    Where that line misses the surface or enters at grazing incidence, the guess is the point whose normal halves the
+    angle between the lamp and the axis. Any lamp in front of the eye lights that point well.
+    """
     d = dr.normalize(aim - lamp)
     o = lamp + dr.maximum(-dr.dot(lamp, d) - _STANDOFF_MM, 0) * d
     ol, dl = front.point_in(o), front.vector_in(d)

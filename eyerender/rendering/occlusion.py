@@ -68,8 +68,11 @@ def visible_arcs_deg(part: Bytes, pupil: int, points_px: Floats, origin_px: tupl
 def lid_margins_px(
     region: RegionMesh | LidMargins, camera: PinholeCamera, anchor_mm: Floats
 ) -> dict[str, list[list[float]]] | None:
-    """Landmarks along the inner edges of both margins, canthus to canthus from temple to nose, full-sensor pixels; None
-    for a mesh of which none are known, and where one of them lies behind the camera."""
+    """Landmarks along the inner edges of both lid margins, in full-sensor pixels.
+
+    They run from canthus to canthus, from temple to nose. None for a mesh whose margins are unknown, and where a
+    landmark lies behind the camera.
+    """
     if len(region.upper_margin) == 0:
         return None
     out = {}

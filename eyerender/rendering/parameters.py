@@ -86,8 +86,11 @@ class PoseParameters:
 
 @dataclass(frozen=True, slots=True)
 class CameraParameters:
-    """Centre of projection (3,) mm, the axes right, down and forward (3,), focal lengths and principal point (px), and
-    the lens distortion (k1, k2, p1, p2, k3)."""
+    """Camera as the kernels use it.
+
+    It holds the centre of projection (3,) mm, the axes right, down and forward (3,), focal lengths and principal point
+    (px), and the lens distortion (k1, k2, p1, p2, k3).
+    """
 
     centre: mi.Vector3f
     right: mi.Vector3f

@@ -97,8 +97,10 @@ def indirect(
 def _mirrored(
     values: Values, textures: Textures, scene: mi.Scene, view: View, d: mi.Vector3f, clear: mi.Float
 ) -> mi.Float:
-    """Radiance of the ambient light that wet surfaces mirror to the camera: the front cornea where it is `clear`, the
-    film of tears elsewhere."""
+    """Radiance of the ambient light that wet surfaces mirror to the camera.
+
+    These are the front cornea where it is `clear`, and the film of tears elsewhere.
+    """
     back = -values.vector_to_eye(d)
     normal, share = view.normal, view.mirrored * clear
     wet = view.cornea

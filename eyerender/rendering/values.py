@@ -36,9 +36,12 @@ def aligned(values: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """What a kernel is compiled for: (biconic, tilted) of each surface, whether the camera's lens distorts, and whether
-    anything but the surround's plane, which hides no lamp before it, can stand in the way of light; whether the scene
-    is an eye region instead of a surround; whether there is other light than the lamps'."""
+    """What a kernel is compiled for.
+
+    It holds (biconic, tilted) of each surface, whether the camera's lens distorts, whether anything can stand in the
+    way of light (the surround's plane cannot: it hides no lamp before it), whether the scene is an eye region instead
+    of a surround, and whether there is other light than that of the lamps.
+    """
 
     surfaces: tuple[tuple[bool, bool], ...]
     distorted: bool = False
@@ -113,7 +116,7 @@ class PupilBoundary:
         self._buffer = mi.Float(table.ravel())
 
     def radius(self, x: mi.Float, y: mi.Float) -> mi.Float:
-        """r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
+        """Radius r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
         inv = dr.rsqrt(dr.maximum(x * x + y * y, 1e-12))
         c, s = x * inv, y * inv
 

@@ -29,13 +29,15 @@ def eye_picture(
     scale: int = 4,
     title: str = "",
 ) -> str:
-    """An <svg> of the eye, enlarged, with analytic (blue) and image-derived (orange) pupil and glints.
+    """Draw an enlarged <svg> of the eye with analytic (blue) and image-derived (orange) pupil and glints.
 
     Args:
         image: (h, w) linear counts of a window.
         origin_px: the window's first pixel on the full sensor.
         full_scale: the counts that become white.
-        truth, found: what the two observers report; `row` is this image's row in both.
+        truth: what the analytic observer reports.
+        found: what the image observer reports.
+        row: this image's row in both.
         crop_px: width and height that are shown, centred on the iris (or the window).
         scale: screen pixels per sensor pixel.
         title: text alternative.

@@ -16,8 +16,11 @@ _LIGHT, _SIGHT, _SCREEN = "#E69F00", "#CC79A7", "#777777"
 
 
 def scene_view(scene: Scene) -> Any:
-    """A matplotlib figure: eyes, screen with targets, cameras, lights; and for the first fixation of the first head
-    position the lines of sight, and the rays of glint and pupil centre to each camera."""
+    """Draw a scene as a matplotlib figure: eyes, screen with targets, cameras, lights.
+
+    For the first fixation of the first head position it adds the lines of sight, and the rays of glint and pupil centre
+    to each camera.
+    """
     with figure(9.5, 7.5, 1) as (fig, flat):
         flat.remove()
         ax = fig.add_subplot(projection="3d")

@@ -37,8 +37,11 @@ class Panel(Spec):
 
 
 class RadianceMap(Spec):
-    """A surrounding, infinitely far away, as a picture over all directions (latitude and longitude, twice as wide as
-    high): its upper edge is straight up, its middle the forward direction, and it runs on to the subject's right."""
+    """Surroundings infinitely far away, as a picture over all directions.
+
+    The picture's axes are latitude and longitude, and it is twice as wide as high. Its upper edge is straight up, its
+    middle the forward direction, and it continues to the subject's right.
+    """
 
     file: Annotated[str, Field(min_length=1)] = Field(
         description="a linear picture, .hdr, .exr, .pfm or .npy (relative to the scene)"

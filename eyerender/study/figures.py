@@ -62,8 +62,10 @@ def heads_figure(
     """Figure 4: errors at H1 and H2 by eye model, beside the paper's and the experiment's.
 
     Args:
-        own: label -> eye model -> head -> mean (deg). paper: eye model -> (H1, H2). measured: head -> participants
-        (deg). interval: head -> 95 % confidence interval of the participants' mean (deg).
+        own: label -> eye model -> head -> mean (deg).
+        paper: eye model -> (H1, H2).
+        measured: head -> participants (deg).
+        interval: head -> 95 % confidence interval of the participants' mean (deg).
     """
     models = list(dict.fromkeys(m for by_model in own.values() for m in by_model))
     styles = [

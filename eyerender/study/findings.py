@@ -41,10 +41,13 @@ def t_tests(means: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
 def guestrin(
     means: Mapping[str, Mapping[str, float]], errors: Mapping[str, Floats], protocol: str, observer: str
 ) -> list[Finding]:
-    """G1 to G3, and how near the paper's own figures are.
+    """Findings G1 to G3, and how close the paper's own figures are.
 
     Args:
-        means: mean (deg) by eye model and head. errors: H1's errors (n,) by eye model, of the same fixations.
+        means: mean (deg) by eye model and head.
+        errors: H1's errors (n,) by eye model, of the same fixations.
+        protocol: the reading of the paper.
+        observer: the observer whose features were used.
     """
     out = []
     for test in t_tests(means):

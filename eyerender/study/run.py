@@ -59,8 +59,8 @@ def run_study(
 ) -> dict[str, Any]:
     """Run a study and write summary.json, findings.json, CSV of both and report.html into a folder.
 
-    A folder of the same study is run again in place. Its images are a dataset in `images/`, which goes on where it was
-    stopped and is used again when it is finished.
+    A study may be run again in its own folder. Its images are a dataset in `images/`: a stopped run continues there,
+    and a finished one is used again.
 
     Args:
         name: guestrin2006, blignaut2014, observers (both observers on the head-mounted rig), or conditions (what lies
@@ -71,10 +71,13 @@ def run_study(
             choice it is, else analytic.
         eyes: eye models (catalogue names or files). With E5 and `published`, its two published variants come along.
         workers: processes; None: one a processor.
-        spp, backend, threads: of the images; threads are those of all workers together.
+        spp: samples per pixel of the images.
         noise: images with the sensor's noise, without it, or both.
+        backend: what renders the images.
+        threads: of all workers together.
         overwrite: replace what the folder holds.
-        progress: called with (done, total, note). say: called with what goes wrong on the way.
+        progress: called with (done, total, note).
+        say: called with what goes wrong on the way.
 
     Returns:
         The summary that was written.

@@ -1,6 +1,7 @@
 """WebDataset: tar files of at most 1000 images a split; NAME.png, NAME.mask.png and NAME.json make a sample.
 
-Where the dataset has amodal masks or noiseless images, NAME.amodal.png or NAME.noiseless.png too."""
+Where the dataset has amodal masks or noiseless images, NAME.amodal.png or NAME.noiseless.png too.
+"""
 
 from __future__ import annotations
 

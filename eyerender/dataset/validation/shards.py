@@ -28,8 +28,10 @@ _EXACT_INTEGER = 2**53
 
 
 def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: Problems, step: Progress) -> None:
-    """Every shard that dataset.json asks for: there, of its plan, its files with their sizes and, unless `quick`, their
-    checksums; and the files that were put together out of the shards."""
+    """Check every shard that dataset.json lists, and the files that were put together from the shards.
+
+    A shard must exist and belong to the plan. Its files must have the stated sizes and, unless `quick`, checksums.
+    """
     # Without checksums of its own, as older versions wrote it, metadata.jsonl is left to `compare_lines`.
     problems.extend(damage(folder, quick=quick or dataset.get("checksums") is None))
     there = sorted(finished(folder))

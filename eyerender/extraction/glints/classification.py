@@ -55,8 +55,11 @@ def classify_spots(
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """A fitted spot's looks: sigma across and along, height and residual in DN, distance from the bright pixel, and the
-    deviations of its bright patch across and along."""
+    """Appearance of a fitted spot.
+
+    It holds sigma across and along, height and residual in DN, the distance from the bright pixel, and the standard
+    deviations of the bright patch across and along.
+    """
 
     converged: bool
     narrow: float

@@ -200,7 +200,7 @@ def _maxima(smooth: Image, half: Image, opened: Image, threshold: float) -> tupl
 
 
 def _widths(smooth: Image, opened: Image, xy: Floats, height: Floats, size: int) -> Floats:
-    """sigma = sqrt(area above half height / (2 pi ln 2)), counted in a window of the opening's size."""
+    """Estimate sigma = sqrt(area above half height / (2 pi ln 2)) in a window of the opening's size."""
     step, (rows, columns) = np.arange(-(size // 2), size // 2 + 1), smooth.shape
     x, y = xy.astype(np.intp).T[:, :, None] + step
     column, row = np.minimum(np.maximum(x, 0), columns - 1), np.minimum(np.maximum(y, 0), rows - 1)

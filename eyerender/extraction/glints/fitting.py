@@ -180,8 +180,10 @@ def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blu
 
 
 def _moments(pixels: SpotPixels, rest: Floats, level: Floats, which: Bools, sigma: Floats) -> Floats:
-    """(n, 2, 2) second moments of the part above a third of the height, without the background `level` (n,). Spots
-    outside `which` get the moments of their fit."""
+    """Second moments (n, 2, 2) of the part of each spot above a third of its height.
+
+    The background `level` (n,) is subtracted first. Spots outside `which` get the moments of their fit.
+    """
     out = np.zeros((level.size, 2, 2))
     out[:, 0, 0], out[:, 1, 1] = (sigma * sigma).T
     index = np.flatnonzero(which)

@@ -116,8 +116,11 @@ def slopes(pixels: SpotPixels, grid: Grid, theta: Floats, rest: Floats, blur_px:
 
 
 def prior(limits: Limits, edge: bool) -> Floats:
-    """(K, K) normal matrix of the priors, all with mean 0: a nearly round spot, a background that is flat to within its
-    slope, and an edge of at most full scale within reach."""
+    """Normal matrix (K, K) of the priors, all with mean 0.
+
+    They favour a nearly round spot, a background that is flat to within its slope, and an edge of at most full scale
+    within reach.
+    """
     out = np.zeros((WITH_EDGE, WITH_EDGE))
     out[3, 3] = out[4, 4] = 1.0 / ROUND_SD**2
     out[3, 4] = out[4, 3] = -1.0 / ROUND_SD**2

@@ -26,9 +26,14 @@ ROTATION_TO_CORNEA_MM = 5.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assignment:
-    """light: (m,) index of every glint's light, -1 for none. reasons: why a glint has none (None for the others).
-    residual_px: (m,) distance to the place expected after shift and scale (0 where there is no light). shift_px: (2,),
-    scale: of the layout that fitted.
+    """Which light each glint belongs to.
+
+    Attributes:
+        light: (m,) index of every glint's light, -1 for none.
+        reasons: why a glint has no light; None for the others.
+        residual_px: (m,) distance to the place expected after shift and scale; 0 where there is no light.
+        shift_px: (2,) shift of the layout that fitted.
+        scale: scale of the layout that fitted.
     """
 
     light: Indices
@@ -193,8 +198,11 @@ def _placed(lights: Floats, middle: Floats, shift: Floats, scale: float) -> Floa
 def _promising(
     glints: Floats, lights: Floats, middle: Floats, reach: Floats, scale_range: tuple[float, float], sd: float
 ) -> list[tuple[Floats, float]]:
-    """The (shift, scale) worth a one-to-one match: of all that put one light on one glint, or two on two, those with
-    the most glints near any light, and the shift of least surprise among equals."""
+    """Find the (shift, scale) pairs for which a one-to-one match is worth trying.
+
+    Every pair puts one light on one glint, or two lights on two glints. Those with the most glints near any light are
+    kept; among equals the most likely shift wins.
+    """
     m, count = glints.shape[0], lights.shape[0]
     shift = (glints[:, None] - lights[None]).reshape(-1, 2)
     scale = np.ones(shift.shape[0])

@@ -179,10 +179,13 @@ class Grid:
 
 
 def profile(edges: Floats, centre: Floats | float, sigma: Floats) -> Floats:
-    """(3, E - 1): of the mean of exp(-(x - c)^2 / (2 s^2)) between every edge and the next, 1 px on, the derivative by
-    c, the value, the derivative by ln s.
+    """Pixel means of a Gaussian profile and their derivatives.
 
-    Where an edge is the last of a window, the next is another's and the value without meaning.
+    The mean of exp(-(x - c)^2 / (2 s^2)) is taken between every edge and the next, 1 px on. Where an edge is the last
+    of a window, the next belongs to another window and the value has no meaning.
+
+    Returns:
+        (3, E - 1): the derivative by c, the value, and the derivative by ln s.
     """
     u = (edges - centre) / sigma
     tail = np.exp(-0.5 * u * u)
@@ -201,8 +204,15 @@ def profile(edges: Floats, centre: Floats | float, sigma: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Others:
-    """Pairs of spots of which one's light reaches into the other's window: `by` (m,) shines; rows (Q,): the pixels
-    into which, pair after pair, pair (Q,) whose each is; grid: of the pairs' windows, centre (m, 2) their middles."""
+    """Pairs of spots in which one spot's light reaches into the other's window.
+
+    Attributes:
+        by: (m,) the spot that shines.
+        rows: (Q,) the pixels that it reaches, pair after pair.
+        pair: (Q,) the pair of each of these pixels.
+        grid: the windows of the pairs.
+        centre: (m, 2) the middles of these windows.
+    """
 
     by: Indices
     rows: Indices
@@ -212,8 +222,14 @@ class Others:
 
     @staticmethod
     def of(pixels: SpotPixels, theta: Floats, pairs: Bools, noise_dn: float) -> Others | None:
-        """theta (n, 5 or more): x, y, ln A, ln sx, ln sy. pairs (n, n): whether the second may shine into the first's
-        window. None where no light is more than far below the noise there."""
+        """Find the pairs, or None where no light rises above a small fraction of the noise.
+
+        Args:
+            pixels: the pixels of all windows.
+            theta: (n, 5 or more) x, y, ln A, ln sx, ln sy.
+            pairs: (n, n) whether the second spot may shine into the first's window.
+            noise_dn: standard deviation of the noise.
+        """
         to, by = np.nonzero(pairs)
         gap = np.hypot(*(pixels.centre[to] - theta[by, :2]).T) - pixels.radius[to] - 2.0
         wide2 = np.exp(2.0 * theta[by, 3:5].max(axis=1)) * 1.5 + 0.1  # room for what the fit may make of it

@@ -85,8 +85,10 @@ def _reduced(linear: Image, factor: int, removal: int) -> Image:
 
 
 def _levels(small: Image) -> Floats:
-    """Thresholds at even levels and at even areas, so that some separate the pupil even if its step is faint or the
-    image has a small dark backdrop."""
+    """Thresholds at even levels and at even areas.
+
+    Some of them separate the pupil even if its step is faint or the image has a small dark backdrop.
+    """
     values = np.sort(small.ravel()[:: max(1, small.size // 8000)])
     n = values.size
     low, high = float(values[0]), float(values[int(0.98 * n)])

@@ -153,8 +153,10 @@ def _ellipse(row: Floats) -> Ellipse:
 
 
 def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) -> Floats:
-    """(m,) score of every ellipse (m, 5): the points close by with an agreeing normal, weighted by closeness, per
-    length."""
+    """Score (m,) of every ellipse (m, 5).
+
+    The score counts nearby points with an agreeing normal, weighted by closeness, per length.
+    """
     cos, sin = np.cos(fits[:, 4:]), np.sin(fits[:, 4:])
     a, b = fits[:, 2:3], fits[:, 3:4]
     dx, dy = points[:, 0] - fits[:, :1], points[:, 1] - fits[:, 1:2]
@@ -234,8 +236,11 @@ def ams_fit(points: Floats) -> Ellipse | None:
 
 
 def outline_support(ellipse: Ellipse, points: Floats) -> tuple[float, float]:
-    """Shares of the SECTORS of the outline (equal steps of the parameter) that hold a point, and in the longest row of
-    sectors that do not."""
+    """Share of the outline that holds points, and share of the longest gap.
+
+    The outline is divided into SECTORS (equal steps of the parameter). The second value is the share of the longest run
+    of sectors without a point.
+    """
     sector = (turn_of(points, ellipse) * SECTORS).astype(np.intp) % SECTORS
     held = np.unique(sector)
     if held.size == 0:

@@ -31,9 +31,17 @@ _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeModel:
-    """ellipse; inner_dn; outer: (1 + 2 K,) Fourier coefficients (1, cos u, sin u, cos 2u, ...), DN; sigma_px; slope of
-    the outer level, DN per px; kurtosis of the blur beyond a Gaussian's 0; lean: the inner level's (cos u, sin u), DN;
-    displaced: (SECTORS,) how far the margin's sectors lie inside the ellipse, px.
+    """The pupil's edge as a blurred step across an ellipse.
+
+    Attributes:
+        ellipse: the pupil boundary.
+        inner_dn: inner level, DN.
+        outer: (1 + 2 K,) Fourier coefficients of the outer level (1, cos u, sin u, cos 2u, ...), DN.
+        sigma_px: width of the blur.
+        slope: slope of the outer level, DN per px.
+        kurtosis: kurtosis of the blur beyond a Gaussian's 0.
+        lean: (cos u, sin u) coefficients of the inner level, DN.
+        displaced: (SECTORS,) how far the boundary's sectors lie inside the ellipse, px.
     """
 
     ellipse: Ellipse
@@ -72,9 +80,11 @@ class EdgeModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """Where points lie relative to an ellipse: signed distance, nearest point's parameter (cos t, sin t), outward
-    normal there in the ellipse's own axes (nx, ny), curvature, and the parameter counted from the image's x axis
-    (cos u, sin u). All (n,)."""
+    """Where points (n,) lie relative to an ellipse.
+
+    It holds the signed distance, the nearest point's parameter (cos t, sin t), the outward normal there in the
+    ellipse's own axes (nx, ny), the curvature, and the parameter counted from the image's x axis (cos u, sin u).
+    """
 
     distance: Floats
     cos_t: Floats
@@ -140,8 +150,11 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profile:
-    """Across the boundary, all (n,): `edge` E from 0 inside to 1 outside and `ramp` max(d, 0) blurred, with their
-    derivatives by the distance d (px), by sigma (px) and by the kurtosis."""
+    """The blurred step and ramp across the boundary, all (n,).
+
+    `edge` E goes from 0 inside to 1 outside; `ramp` is max(d, 0) blurred. Both have their derivatives by the distance d
+    (px), by sigma (px) and by the kurtosis.
+    """
 
     edge: Floats
     edge_by_distance: Floats

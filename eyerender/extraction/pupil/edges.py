@@ -17,10 +17,15 @@ from .candidates import Candidate
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgePoints:
-    """points_px: (n, 2) ridge of the gradient, uncorrected for curvature. normals: (n, 2) unit, from dark to bright.
-    strength: (n,) gradient, DN per px. arc: (n,) label of the connected piece each point lies on. sigma_px: of the
-    whole smoothing (optics, pixel and filter) as the gradient's profile across the edge shows it.
-    filter_px: sigma of the filter alone.
+    """Edge points along a boundary.
+
+    Attributes:
+        points_px: (n, 2) ridge of the gradient, not corrected for curvature.
+        normals: (n, 2) unit normals, from dark to bright.
+        strength: (n,) gradient, DN per px.
+        arc: (n,) label of the connected piece that each point lies on.
+        sigma_px: width of the whole smoothing (optics, pixel and filter), measured across the edge.
+        filter_px: sigma of the filter alone.
     """
 
     points_px: Floats
@@ -133,8 +138,10 @@ def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
 
 
 def _outward(ellipse: Ellipse, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-    """Unit outward normal of the concentric ellipses, and the radius in units of the semi-axes, at pixels (n,) from the
-    centre."""
+    """Unit outward normal of the concentric ellipses at pixels (n,), and the radius in units of the semi-axes.
+
+    x and y are counted from the ellipse's centre.
+    """
     a, b = ellipse.semi_axes_px.tolist()
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
     p, q = (x * cos + y * sin) / a, (y * cos - x * sin) / b

@@ -30,8 +30,16 @@ STILL_PX = 1e-3  # a step smaller than that is the last one of a fit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pixels:
-    """n pixels in the order of their sectors, of which k have some: x, y, level (n,); index (n,): which of the k each
-    is in; first (k,): where each begins; sector (k,): which of all it is."""
+    """Pixels near the boundary, in the order of their sectors.
+
+    Attributes:
+        x: (n,) px.
+        y: (n,) px.
+        level: (n,) DN.
+        index: (n,) which of the k sectors that have pixels each pixel is in.
+        first: (k,) where each of these sectors begins.
+        sector: (k,) which of all sectors it is.
+    """
 
     x: Floats
     y: Floats
@@ -42,7 +50,7 @@ class Pixels:
 
     @staticmethod
     def of(x: Floats, y: Floats, level: Floats, sector: Indices) -> Pixels:
-        """sector (n,): of every pixel, in order."""
+        """Sort pixels by their sector; sector (n,) ascends."""
         new = np.diff(sector, prepend=-1) > 0
         first = np.flatnonzero(new)
         return Pixels(x, y, level, np.cumsum(new) - 1, first, sector[first])
@@ -54,8 +62,11 @@ class Pixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Weights, beside those of a pixel's residual, of the squares of slope, kurtosis, a lean, a harmonic (4,); and the
-    standard deviation of a sector's displacement with the weight of its square (infinite where there is to be none)."""
+    """Weights of the priors, beside the weight of a pixel's residual.
+
+    They are those of the squares of slope, kurtosis, a lean and a harmonic (4,), then the standard deviation of a
+    sector's displacement and the weight of its square (infinite where no displacement is allowed).
+    """
 
     weights: Floats
     uneven_px: float
@@ -87,7 +98,7 @@ class Rows:
 
     @staticmethod
     def of(pixels: Pixels, model: EdgeModel, place: Place, displaced: Floats) -> Rows:
-        """displaced (k,): how far every sector lies inside the ellipse, px."""
+        """Compute the residuals and slopes at sectors that lie `displaced` (k,) px inside the ellipse."""
         at = replace(place, distance=place.distance + displaced[pixels.index]) if displaced.any() else place
         level, jacobian_, slope = jacobian(model, at)
         return Rows(pixels.level - level, jacobian_, slope)
@@ -95,9 +106,16 @@ class Rows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
-    """Sums over the pixels, the sectors' displacements eliminated: matrix (p, p), vector (p,); cost. Of every sector:
-    across (p, k) and along (k,), its displacement's products with the slopes and with the residual, priors included;
-    inverse (k,), of its product with itself and the prior."""
+    """Normal equations with the sectors' displacements eliminated.
+
+    Attributes:
+        matrix: (p, p) sum of the slopes' products.
+        vector: (p,) sum of the slopes times the residual.
+        cost: sum of squares.
+        across: (p, k) products of each sector's displacement with the slopes, priors included.
+        along: (k,) its products with the residual, priors included.
+        inverse: (k,) inverse of its product with itself, prior included.
+    """
 
     matrix: Floats
     vector: Floats
@@ -112,6 +130,7 @@ class Normal:
 
     @staticmethod
     def of(pixels: Pixels, rows: Rows, displaced: Floats, prior: Prior) -> Normal:
+        """Sum over the pixels and eliminate the displacements (k,)."""
         residual, slopes = rows.residual, rows.jacobian
         matrix, vector, cost = gram(slopes), project(slopes, residual), float(np.sum(residual * residual))
         if math.isinf(prior.displacement):
@@ -127,8 +146,11 @@ class Normal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """model; displaced (k,) px; rows and place (n,), of which all but the residual lack the share of a last tiny
-    step."""
+    """Result of the fit.
+
+    It holds the model, the displacements (k,) px, and rows and place (n,). The rows and the place, except for the
+    residual, do not include the last tiny step.
+    """
 
     model: EdgeModel
     displaced: Floats
@@ -137,8 +159,12 @@ class Solution:
 
 
 def jacobian(model: EdgeModel, place: Place) -> tuple[Floats, Floats, Floats]:
-    """Model levels (n,), their derivatives (FIXED + 2 K, n) by the parameters in the order of FIXED, and by the
-    distance (n,)."""
+    """Model levels and their derivatives.
+
+    Returns:
+        The levels (n,), their derivatives (FIXED + 2 K, n) by the parameters in the order of FIXED, and their
+        derivative by the distance (n,).
+    """
     profile = Profile.of(place.distance, place.curvature, model.sigma_px, model.kurtosis)
     basis = harmonics(place.cos_u, place.sin_u, (model.outer.size - 1) // 2)
     inner = model.inner(place)

@@ -107,8 +107,9 @@ def refine(
 
 
 def _band(linear: Image, model: EdgeModel, masked: Bools) -> tuple[Floats, Floats, Floats]:
-    """(x, y, level) of the pixels near the boundary: up to 4 sigma + 1 px inside it and 3 sigma + 1 px outside it, but
-    not beyond OUTWARD_PX.
+    """Pixels near the boundary, as (x, y, level).
+
+    The band reaches 4 sigma + 1 px inside the boundary and 3 sigma + 1 px outside it, but not beyond OUTWARD_PX.
 
     Pixels farther out would determine the outer level better, but it changes with distance: 2 px more increase the
     error on a textured iris by half.

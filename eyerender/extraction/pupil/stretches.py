@@ -73,8 +73,11 @@ class Cuts:
         return Cuts(fits, widths[alike], residual, first[alike], count[alike], points)
 
     def inside(self, which: Bools, depth_px: Callable[[float], float]) -> Iterator[Ellipse]:
-        """Of `which`, different ones whose stretch lies inside, the median of its points by more than depth_px of the
-        rest's residual; those first that the rest fits best."""
+        """Yield different ellipses of `which` whose left-out stretch lies inside them.
+
+        The median of the stretch's points must lie deeper than depth_px of the other points' residual. The ellipses
+        that fit the other points best come first.
+        """
         given: list[Ellipse] = []
         for i in np.nonzero(which)[0][np.argsort(self.residual_px[which], kind="stable")]:
             hidden = (self.first[i] + np.arange(self.count[i])) % self.points.shape[0]
