@@ -10,14 +10,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from . import gaze
     from .capture import render_folder, render_windows
     from .comparison import Comparison, compare
     from .errors import BackendError, EyerenderError, InputError
     from .eye.catalogue import load_eye
     from .eye.model import EyeModel
     from .eye.spec import EyeSpec
-    from .gaze.regression import PupilGlintRegression
-    from .gaze.validation import GazeErrors, leave_one_target_out
     from .imagefolder import ImageFolder
     from .observation import Observations
     from .observers import AnalyticObserver, ImageObserver
@@ -32,17 +31,14 @@ _HOMES = {
     "EyeModel": "eye.model",
     "EyeSpec": "eye.spec",
     "EyerenderError": "errors",
-    "GazeErrors": "gaze.validation",
     "ImageFolder": "imagefolder",
     "ImageObserver": "observers",
     "InputError": "errors",
     "Observations": "observation",
-    "PupilGlintRegression": "gaze.regression",
     "RigGeometry": "rig.rig",
     "Scene": "scene",
     "SceneSpec": "scene",
     "compare": "comparison",
-    "leave_one_target_out": "gaze.validation",
     "load_eye": "eye.catalogue",
     "load_scene": "scene",
     "render_folder": "capture",
@@ -58,18 +54,16 @@ __all__ = [
     "EyeModel",
     "EyeSpec",
     "EyerenderError",
-    "GazeErrors",
     "ImageFolder",
     "ImageObserver",
     "InputError",
     "Observations",
-    "PupilGlintRegression",
     "RigGeometry",
     "Scene",
     "SceneSpec",
     "__version__",
     "compare",
-    "leave_one_target_out",
+    "gaze",
     "load_eye",
     "load_scene",
     "render_folder",
@@ -84,6 +78,8 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("eyerender")
+    if name == "gaze":
+        return import_module(".gaze", __name__)
     if name in _HOMES:
         return getattr(import_module(f".{_HOMES[name]}", __name__), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

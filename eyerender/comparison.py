@@ -9,10 +9,10 @@ import numpy as np
 
 from .arrays import ArrayValue, Bools, Floats, frozen
 from .errors import InputError
-from .gaze.estimate import Estimator
+from .gaze.estimate import GazeEstimator
 from .gaze.validation import GazeErrors, leave_one_target_out
 from .observation import Observations
-from .rig.rig import RigGeometry
+from .rig.rig import RigLike
 
 SCHEMA = "eyerender/compare/1"
 
@@ -102,7 +102,7 @@ def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
 
 
 def compare(
-    truth: Observations, found: Observations, rig: RigGeometry, estimator: Estimator, name: str = ""
+    truth: Observations, found: Observations, rig: RigLike, estimator: GazeEstimator, name: str = ""
 ) -> Comparison:
     """Compare two observers' reports of the same frames, in features and in gaze."""
     gaze: list[GazeErrors | None] = []

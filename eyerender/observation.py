@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, NoReturn
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .arrays import ArrayValue, Bools, Floats, Ints, Objects, frozen
 from .errors import InputError
@@ -152,6 +153,11 @@ class Observations(ArrayValue):
             return replace(group, **{f.name: frozen(v := getattr(group, f.name)[rows], v.dtype) for f in fields(group)})
 
         return Observations(part(self.index), part(self.pose), part(self.pupil), part(self.glints))
+
+    def with_targets(self, target_mm: ArrayLike) -> Observations:
+        """The same observations of other targets: (n, 3) or (3,) mm in the world, NaN where there is none."""
+        targets = np.broadcast_to(np.asarray(target_mm, dtype=float), (len(self), 3))
+        return replace(self, index=replace(self.index, target_mm=frozen(targets)))
 
     def records(self, version: int = RECORD) -> Iterator[dict[str, Any]]:
         """One record (docs/formats.md) an observation; every key always present, null where it does not apply.

@@ -9,7 +9,7 @@ from .backends.choose import BackendChoice
 from .capture import render_folder
 from .comparison import Comparison, compare
 from .errors import InputError, Warn
-from .gaze.regression import FUNCTIONS, PupilGlintRegression
+from .gaze.regression import FUNCTIONS, Regression
 from .imagefolder import ImageFolder, same_run
 from .observers import ImageObserver, scene_of
 from .plausibility import saturation_warnings
@@ -92,4 +92,4 @@ def _compare(scene: Scene, images: ImageFolder, function: str, progress: Progres
         raise InputError(f"{function!r} is no function of Table 2 (R1 to R12)", source="--function")
     truth = images.truth()
     found = ImageObserver().observe_entries(images.entries, truth.index, scene, progress=progress)
-    return compare(truth, found, scene.rig, PupilGlintRegression(function), f"regression {function}")
+    return compare(truth, found, scene.rig, Regression(function), f"regression {function}")

@@ -163,22 +163,37 @@ def test_a_type_alias_is_defined_once():
 
 def test_import_is_light():
     heavy = ("mitsuba", "drjit", "cv2", "skimage", "matplotlib")
-    code = f"import sys, eyerender; print([m for m in {heavy} if m in sys.modules])"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "[]"
+    uses = {"None": heavy, "eyerender.gaze": (*heavy, "scipy", "pydantic"), "eyerender.gaze.Regression": heavy}
+    for use, banned in uses.items():
+        code = f"import sys, eyerender; {use}; print([m for m in {banned} if m in sys.modules])"
+        out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert out.stdout.strip() == "[]"
 
 
 def test_public_names_are_pinned():
     assert eyerender.__all__ == [
-        "AnalyticObserver", "BackendError", "Comparison", "EyeModel", "EyeSpec", "EyerenderError", "GazeErrors",
-        "ImageFolder", "ImageObserver", "InputError", "Observations", "PupilGlintRegression", "RigGeometry", "Scene",
-        "SceneSpec", "__version__", "compare", "leave_one_target_out", "load_eye", "load_scene", "render_folder",
+        "AnalyticObserver", "BackendError", "Comparison", "EyeModel", "EyeSpec", "EyerenderError",
+        "ImageFolder", "ImageObserver", "InputError", "Observations", "RigGeometry", "Scene",
+        "SceneSpec", "__version__", "compare", "gaze", "load_eye", "load_scene", "render_folder",
         "render_windows", "shipped_scenes", "write_report",
     ]  # fmt: skip
     for name in eyerender.__all__:
         assert getattr(eyerender, name) is not None
 
 
+def test_gaze_names_are_pinned():
+    assert eyerender.gaze.__all__ == sorted(eyerender.gaze._HOMES)
+    assert eyerender.gaze.__all__ == [
+        "CrossRatio", "EyeParameters", "GazeErrors", "GazeEstimator", "GazePoints", "GazeRays", "GuestrinEizenman",
+        "Hennessey", "Homography", "ParameterBounds", "Recalibration", "Regression", "ShihWuLiu", "StoredEstimator",
+        "angular_error_deg", "binocular_average", "gaze_errors", "leave_one_target_out", "load_observations",
+    ]  # fmt: skip
+    for name in eyerender.gaze.__all__:
+        assert getattr(eyerender.gaze, name) is not None
+
+
 def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = eyerender.no_such_name
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = eyerender.gaze.no_such_name

@@ -14,13 +14,12 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..arrays import Floats
 from ..errors import InputError
 from ..observation import EYES, Observations
-from ..rig.rig import RigGeometry
-from .estimate import GazePoints, gaze_points
+from ..rig.rig import RigGeometry, RigLike
+from .estimate import GazePoints
 from .homography import glints_of, homography, transformed
 from .rays import chosen_lights, screen_of
 
@@ -41,13 +40,13 @@ class CrossRatio:
     tolerance: float = 0.05
     alphas: Mapping[int, Floats] = field(default_factory=dict)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
+    def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate alpha_i of each eye on its fixations of the four corner lights (averaged, where repeated).
 
         Raises:
             InputError: no usable observation of an eye looks at one of the corner lights.
         """
-        targets = np.asarray(targets_mm, dtype=float)
+        rig, targets = rig.build(), observations.index.target_mm
         corners = self._corners_mm(rig)
         glints, reason = glints_of(observations, (*self.corners, self.at_camera))
         p, u_c = observations.pupil.centre_px, glints[:, 4]
@@ -66,13 +65,13 @@ class CrossRatio:
             found[int(eye)] = alpha
         return replace(self, alphas=found)
 
-    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Gaze points on the screen's plane."""
         if not self.alphas:
             raise InputError("the estimator is not calibrated; call fit first")
+        rig = rig.build()
         screen = screen_of(rig)
-        corners = self._corners_mm(rig) - screen.centre_mm
-        flat = np.stack([corners @ screen.right, corners @ screen.up], axis=-1)
+        flat = screen.flat(self._corners_mm(rig))
         glints, reason = glints_of(observations, (*self.corners, self.at_camera))
         on_screen = np.full((len(observations), 2), np.nan)
         for eye in np.unique(observations.index.eye):
@@ -87,7 +86,7 @@ class CrossRatio:
             on_screen[rows], finite = transformed(H, observations.pupil.centre_px[rows])
             reason[rows[~finite]] = "the gaze point lies at infinity"
             reason[rows[~ok]] = "three of the glints lie on a line"
-        return gaze_points(screen.world(on_screen), reason)
+        return GazePoints.of(screen.world(on_screen), reason)
 
     def _corners_mm(self, rig: RigGeometry) -> Floats:
         if len(set(self.corners)) != 4 or self.at_camera in self.corners:

@@ -1,21 +1,23 @@
 """What every gaze estimator takes and gives.
 
-    fit(observations, targets_mm, rig) -> fitted estimator;   predict(observations, rig) -> GazePoints
+    fit(observations, rig) -> fitted copy;   predict(observations, rig) -> GazePoints
 
-Targets and gaze points are world points in mm, one row an observation.
+The targets of a calibration are those of the observations (`index.target_mm`). Targets and gaze points are world points
+in mm, one row an observation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import ArrayValue, Bools, Floats, Objects, frozen
 from ..observation import MISSING, OK, Observations
-from ..rig.rig import RigGeometry
+from ..rig.rig import RigLike
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,6 +27,19 @@ class GazePoints(ArrayValue):
     point_mm: Floats
     status: Objects
     reason: Objects
+
+    @classmethod
+    def of(cls, point_mm: ArrayLike, reason: Objects | None = None) -> GazePoints:
+        """Gaze points (n, 3) mm whose status follows from the reasons (n,), None where there is an estimate.
+
+        A point that is not finite is missing, whatever its reason.
+        """
+        points = np.asarray(point_mm, dtype=float)
+        reasons = np.full(len(points), None, dtype=object) if reason is None else reason.copy()
+        reasons[(reasons == None) & ~np.isfinite(points).all(axis=-1)] = "the estimate is not finite"  # noqa: E711
+        ok = np.array([r is None for r in reasons], dtype=bool)
+        status = np.where(ok, OK, MISSING).astype(object)
+        return cls(frozen(np.where(ok[:, None], points, np.nan)), frozen(status, object), frozen(reasons, object))
 
     def __len__(self) -> int:
         return len(self.status)
@@ -52,25 +67,48 @@ class GazeRays(ArrayValue):
         )
 
 
-class Estimator(Protocol):
-    """A gaze estimator; `fit` returns a fitted copy."""
+@runtime_checkable
+class GazeEstimator(Protocol):
+    """What a gaze estimator does. A user's own class that does it works wherever the package's own estimators do.
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
-        """Calibrate on observations of known targets (n, 3) mm; raises `InputError` where that is impossible."""
+    An estimator is a value: `fit` leaves it as it is and returns a fitted copy. The rig may be an authored `Rig` or a
+    computed `RigGeometry`; `rig.build()` gives the latter for both.
+    """
+
+    def fit(self, observations: Observations, rig: RigLike) -> Self:
+        """Calibrate each eye on the observations whose `index.target_mm` (n, 3) mm is finite.
+
+        Observations without the features that the estimator needs are left out.
+
+        Raises:
+            InputError: the observations or the rig do not determine the calibration.
+        """
         ...
 
-    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
-        """Gaze points of observations, one row each."""
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
+        """Gaze points of observations, one row each; where there is none the row has a reason.
+
+        Raises:
+            InputError: the estimator is not calibrated, or the rig lacks what it needs.
+        """
         ...
 
 
-def gaze_points(point_mm: Floats, reason: Objects) -> GazePoints:
-    """Gaze points whose status follows from the reason (None: ok); one that is not finite has none."""
-    reason = reason.copy()
-    reason[(reason == None) & ~np.isfinite(point_mm).all(axis=-1)] = "the estimate is not finite"  # noqa: E711
-    ok = np.array([r is None for r in reason], dtype=bool)
-    status = np.where(ok, OK, MISSING).astype(object)
-    return GazePoints(frozen(np.where(ok[:, None], point_mm, np.nan)), frozen(status, object), frozen(reason, object))
+@runtime_checkable
+class StoredEstimator(GazeEstimator, Protocol):
+    """A user's own estimator whose calibration can be written to a file and read back.
+
+    `from_mapping(to_mapping())` predicts the same.
+    """
+
+    def to_mapping(self) -> dict[str, Any]:
+        """What the calibration found, as JSON holds it: mappings, lists, texts, finite numbers, booleans and None."""
+        ...
+
+    @classmethod
+    def from_mapping(cls, data: Mapping[str, Any]) -> Self:
+        """The calibrated estimator; raises `InputError` or `ValueError` for data that it did not write."""
+        ...
 
 
 def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Observations, GazePoints]:
@@ -87,7 +125,7 @@ def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Obs
         reason[which[row]] = gaze.reason[row]
     points = np.zeros((len(frames), 3))
     np.add.at(points, which, gaze.point_mm)
-    return observations.take(first), gaze_points(points / count[:, None], reason)
+    return observations.take(first), GazePoints.of(points / count[:, None], reason)
 
 
 def angular_error_deg(point_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> Floats:

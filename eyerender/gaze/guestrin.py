@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike
 from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError
 from ..observation import EYES, Observations
-from ..rig.rig import RigGeometry
+from ..rig.rig import RigGeometry, RigLike
 from ..rig.screen import ScreenPlane
 from .cornea import CorneaCentres, from_all_glints, from_plane, optic_axis
-from .estimate import GazePoints, GazeRays, gaze_points
+from .estimate import GazePoints, GazeRays
 from .parameters import HUMAN_BOUNDS, MEAN_EYE, NAMES, Calibration, EyeParameters, ParameterBounds
 from .rays import FeatureRays, feature_rays, nasal_sign, screen_of
 from .search import Misses, calibrate
@@ -63,30 +63,31 @@ class GuestrinEizenman:
         known = {k: Calibration(p, p, 0.0, "given", 0, True, "given", ()) for k, p in parameters.items()}
         return replace(self, calibrations=known)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
+    def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate R, K, alpha, beta (and n) of each eye by bounded nonlinear least squares.
 
         Raises:
             InputError: fewer usable targets than determine the parameters.
         """
-        models = self._models(observations, targets_mm, rig)
+        models = self._models(observations, rig.build())
         return replace(self, calibrations={eye: model.calibrate(self.start) for eye, model in models.items()})
 
     def restarts(
-        self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry, starts: Sequence[EyeParameters]
+        self, observations: Observations, rig: RigLike, starts: Sequence[EyeParameters]
     ) -> dict[int, list[Calibration]]:
         """Calibrations of each eye from several starts, to see whether the search finds one minimum."""
-        models = self._models(observations, targets_mm, rig)
+        models = self._models(observations, rig.build())
         return {eye: [model.calibrate(start) for start in starts] for eye, model in models.items()}
 
-    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Gaze points on the screen's plane."""
+        rig = rig.build()
         screen = screen_of(rig)
         rays = self.visual_axes(observations, rig)
         on_screen, hits = screen.intersect(rays.origin_mm, rays.direction)
         reason = rays.reason.copy()
         reason[(reason == None) & ~hits] = "the visual axis does not meet the screen"  # noqa: E711
-        return gaze_points(screen.world(on_screen), reason)
+        return GazePoints.of(screen.world(on_screen), reason)
 
     def visual_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Visual axes: from the centre of corneal curvature, in the direction of gaze."""
@@ -143,9 +144,9 @@ class GuestrinEizenman:
         """Which of the five parameters are calibrated."""
         return np.array([self.free_index or name != "index" for name in NAMES])
 
-    def _models(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> dict[int, _Model]:
+    def _models(self, observations: Observations, rig: RigGeometry) -> dict[int, _Model]:
         screen = screen_of(rig)
-        targets = np.asarray(targets_mm, dtype=float)
+        targets = observations.index.target_mm
         rays = feature_rays(observations, rig, self.lights, least=2)
         usable = (rays.reason == None) & np.isfinite(targets).all(axis=1)  # noqa: E711
         count = int(self.free.sum())
@@ -176,9 +177,8 @@ class _Model:
     ) -> None:
         self.estimator, self.screen, self.sign = estimator, screen, sign
         self.origin, self.pupil = rays.origin_mm[rows], rays.pupil[rows]
-        to_target = targets_mm - screen.centre_mm
-        self.wanted = np.stack([to_target @ screen.right, to_target @ screen.up], axis=-1)
-        self.off_plane = -(to_target @ screen.normal)
+        self.wanted = screen.flat(targets_mm)
+        self.off_plane = -((targets_mm - screen.centre_mm) @ screen.normal)
         self.axes = np.stack([screen.right, screen.up, screen.normal], axis=-1)
         low, high = estimator.bounds.lower.cornea_radius_mm, estimator.bounds.upper.cornea_radius_mm
         # The centre depends on R alone, and smoothly: one batch of solutions serves every step of every search. Its

@@ -12,10 +12,9 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..observation import Observations
-from ..rig.rig import RigGeometry
+from ..rig.rig import RigGeometry, RigLike
 from .estimate import GazePoints, GazeRays
 from .guestrin import GuestrinEizenman
 from .parameters import MEAN_EYE, EyeParameters
@@ -37,14 +36,15 @@ class Hennessey:
     lights: tuple[int, ...] | None = None
     correction: Recalibration | None = field(default=None, repr=False)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
+    def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate the correction of each eye; raises `InputError` for fewer than six usable targets."""
+        rig = rig.build()
         rays = self.optic_axes(observations, rig)
-        targets = np.asarray(targets_mm, dtype=float)
-        return replace(self, correction=Recalibration(self.recalibration).fit(observations, rays, targets, rig))
+        return replace(self, correction=Recalibration(self.recalibration).fit(observations, rays, rig))
 
-    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Gaze points on the screen's plane."""
+        rig = rig.build()
         correction = self.correction or Recalibration(self.recalibration)
         return correction.apply(observations, self.optic_axes(observations, rig), rig)
 

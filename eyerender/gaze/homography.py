@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 from ..arrays import Bools, Floats, Objects
 from ..errors import InputError
 from ..observation import EYES, Observations
-from ..rig.rig import RigGeometry
-from .estimate import GazePoints, gaze_points
+from ..rig.rig import RigGeometry, RigLike
+from .estimate import GazePoints
 from .rays import chosen_lights, screen_of
 
 # The four lights' images: top left, top right, bottom right, bottom left of the square, u to the right and v up.
@@ -30,7 +30,7 @@ _DEGENERATE = 1e-10  # ratio of singular values below which points determine no 
 
 
 @dataclass(frozen=True, slots=True)
-class HomographyNormalisation:
+class Homography:
     """Pupil centre normalised by four glints, mapped to the screen.
 
     Args:
@@ -44,11 +44,10 @@ class HomographyNormalisation:
     conditioned: bool = True
     homographies: Mapping[int, Floats] = field(default_factory=dict)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
+    def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate H_c of each eye; raises `InputError` for fewer than four targets or collinear ones."""
-        screen = screen_of(rig)
-        targets = np.asarray(targets_mm, dtype=float) - screen.centre_mm
-        wanted = np.stack([targets @ screen.right, targets @ screen.up], axis=-1)
+        rig = rig.build()
+        wanted = screen_of(rig).flat(observations.index.target_mm)
         s, reason = self.normalised(observations, rig)
         usable = (reason == None) & np.isfinite(wanted).all(axis=1)  # noqa: E711
         found = {}
@@ -63,10 +62,11 @@ class HomographyNormalisation:
             found[int(eye)] = H
         return replace(self, homographies=found)
 
-    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Gaze points on the screen's plane."""
         if not self.homographies:
             raise InputError("the estimator is not calibrated; call fit first")
+        rig = rig.build()
         screen = screen_of(rig)
         s, reason = self.normalised(observations, rig)
         on_screen = np.full((len(observations), 2), np.nan)
@@ -80,7 +80,7 @@ class HomographyNormalisation:
             at_infinity = np.zeros(len(observations), dtype=bool)
             at_infinity[rows] = ~finite
             reason[at_infinity & (reason == None)] = "the gaze point lies at infinity"  # noqa: E711
-        return gaze_points(screen.world(on_screen), reason)
+        return GazePoints.of(screen.world(on_screen), reason)
 
     def normalised(self, observations: Observations, rig: RigGeometry) -> tuple[Floats, Objects]:
         """The pupil centre in the unit square of the glints (n, 2), and why there is none (n,)."""

@@ -17,8 +17,8 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..observation import EYES, Observations
-from ..rig.rig import RigGeometry
-from .estimate import GazePoints, GazeRays, gaze_points
+from ..rig.rig import RigLike
+from .estimate import GazePoints, GazeRays
 from .rays import screen_of
 
 RecalibrationKind = Literal["none", "screen", "angle"]
@@ -32,23 +32,22 @@ class Recalibration:
     kind: RecalibrationKind = "angle"
     coefficients: Mapping[int, Floats] = field(default_factory=dict)
 
-    def fit(self, observations: Observations, rays: GazeRays, targets_mm: Floats, rig: RigGeometry) -> Recalibration:
-        """Calibrate on rays (n) of observations (n) of targets (n, 3) mm.
+    def fit(self, observations: Observations, rays: GazeRays, rig: RigLike) -> Recalibration:
+        """Calibrate on the rays (n) of observations (n) with known targets.
 
         Raises:
             InputError: fewer than six usable targets, or targets that do not determine the polynomial.
         """
         if self.kind == "none":
             return self
-        screen = screen_of(rig)
+        screen, targets_mm = screen_of(rig.build()), observations.index.target_mm
         usable = np.array([r is None for r in rays.reason]) & np.isfinite(targets_mm).all(axis=1)
         if self.kind == "angle":
             measured, wanted = angles_of(rays.direction), angles_of(targets_mm - rays.origin_mm)
         else:
             measured, hits = screen.intersect(rays.origin_mm, rays.direction)
             usable &= hits
-            flat = targets_mm - screen.centre_mm
-            wanted = np.stack([flat @ screen.right, flat @ screen.up], axis=-1)
+            wanted = screen.flat(targets_mm)
         out = {}
         for eye in np.unique(observations.index.eye):
             rows = usable & (observations.index.eye == eye)
@@ -66,9 +65,9 @@ class Recalibration:
             out[int(eye)] = (solution / scale[:, None]).T
         return Recalibration(self.kind, out)
 
-    def apply(self, observations: Observations, rays: GazeRays, rig: RigGeometry) -> GazePoints:
+    def apply(self, observations: Observations, rays: GazeRays, rig: RigLike) -> GazePoints:
         """Corrected gaze points on the screen's plane."""
-        screen = screen_of(rig)
+        screen = screen_of(rig.build())
         reason = rays.reason.copy()
         direction, on_screen = rays.direction.copy(), np.full((len(observations), 2), np.nan)
         if self.kind != "none":
@@ -87,7 +86,7 @@ class Recalibration:
             for eye, A in self.coefficients.items():
                 rows = observations.index.eye == eye
                 on_screen[rows] = monomials(on_screen[rows]) @ A.T
-        return gaze_points(screen.world(on_screen), reason)
+        return GazePoints.of(screen.world(on_screen), reason)
 
 
 def angles_of(direction: Floats) -> Floats:

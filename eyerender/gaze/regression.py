@@ -13,13 +13,12 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError
 from ..observation import Observations
-from ..rig.rig import RigGeometry
-from .estimate import GazePoints, gaze_points
+from ..rig.rig import RigLike
+from .estimate import GazePoints
 from .rays import screen_of
 
 Terms = tuple[tuple[int, int], ...]  # exponents (i, j) of x^i y^j
@@ -78,7 +77,7 @@ class EyeFit:
 
 
 @dataclass(frozen=True, slots=True)
-class PupilGlintRegression:
+class Regression:
     """Polynomial regression on the pupil-glint vector of one light's glint.
 
     Args:
@@ -106,11 +105,9 @@ class PupilGlintRegression:
             x, y = self.function
         return _terms(x), _terms(y)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
+    def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate each eye; raises `InputError` for too few usable targets or targets that do not determine it."""
-        screen = screen_of(rig)
-        targets = np.asarray(targets_mm, dtype=float) - screen.centre_mm
-        wanted = np.stack([targets @ screen.right, targets @ screen.up], axis=-1)
+        wanted = screen_of(rig.build()).flat(observations.index.target_mm)
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
         usable = np.array([r is None for r in reason], dtype=bool) & np.isfinite(wanted).all(axis=1)
         fits = {}
@@ -138,11 +135,11 @@ class PupilGlintRegression:
         b = self._solve(monomials(u, y_terms), wanted[:, 1], name)
         return EyeFit(origin, scale, a, b)
 
-    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Gaze points on the screen's plane."""
         if not self.fits:
             raise InputError("the estimator is not calibrated; call fit first")
-        screen = screen_of(rig)
+        screen = screen_of(rig.build())
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
         reason = reason.copy()
         x_terms, y_terms = self.terms
@@ -155,7 +152,7 @@ class PupilGlintRegression:
                 continue
             u = (v[rows] - fit.origin) / fit.scale
             on_screen[rows] = np.stack([monomials(u, x_terms) @ fit.a, monomials(u, y_terms) @ fit.b], axis=-1)
-        return gaze_points(screen.world(on_screen), reason)
+        return GazePoints.of(screen.world(on_screen), reason)
 
     def _solve(self, design: Floats, wanted: Floats, eye: str) -> Floats:
         solution, _, rank, _ = np.linalg.lstsq(design, wanted, rcond=None)

@@ -18,14 +18,14 @@ from ..plausibility import target_warnings
 from ..rig.rig import RigGeometry
 from ..spec import Positive, Spec
 from .crossratio import CrossRatio
-from .estimate import Estimator, angular_error_deg, binocular_average
+from .estimate import GazeEstimator, angular_error_deg, binocular_average
 from .guestrin import GuestrinEizenman
 from .hennessey import Hennessey
-from .homography import HomographyNormalisation
+from .homography import Homography
 from .parameters import MEAN_EYE, Calibration, EyeParameters
 from .recalibration import Recalibration
 from .records import rig_from_mapping
-from .regression import EyeFit, PupilGlintRegression
+from .regression import EyeFit, Regression
 from .twocamera import ShihWuLiu
 
 CALIBRATION_SCHEMA = "eyerender/gaze-calibration/2"
@@ -46,15 +46,15 @@ class EstimatorSpec(Spec):
     index: float | None = Field(default=None, ge=1.0, le=2.0)
     recalibration: Literal["angle", "screen", "none"] = "angle"
 
-    def build(self) -> Estimator:
+    def build(self) -> GazeEstimator:
         """The estimator, not calibrated."""
         eye = MEAN_EYE if self.index is None else EyeParameters(index=self.index)
         if self.name == "regression":
-            regression = PupilGlintRegression(self.terms or self.function, normalised=self.normalised)
+            regression = Regression(self.terms or self.function, normalised=self.normalised)
             _ = regression.terms  # a bad function is an error now, not at the first fit
             return regression
         if self.name == "homography":
-            return HomographyNormalisation()
+            return Homography()
         if self.name == "cross-ratio":
             return CrossRatio()
         if self.name == "hennessey":
@@ -73,7 +73,7 @@ def fit_estimator(
     *,
     source: str = "",
     warn: Warn | None = None,
-) -> tuple[Estimator, dict[str, Any]]:
+) -> tuple[GazeEstimator, dict[str, Any]]:
     """A calibrated estimator and a summary (schema eyerender/gaze-fit/1).
 
     `warn` hears of targets off the screen before anything is calibrated; it may raise.
@@ -95,7 +95,7 @@ def fit_estimator(
         warn(target_warnings(used.index.target_mm, rig.screen, source))
     try:
         with np.errstate(all="ignore"):
-            fitted = spec.build().fit(used, used.index.target_mm, rig)
+            fitted = spec.build().fit(used, rig)
     except InputError as error:
         raise InputError(error.reason, source=error.source or source, path=error.path) from None
     except np.linalg.LinAlgError:
@@ -114,7 +114,7 @@ def fit_estimator(
     }
 
 
-def predictions(estimator: Estimator, observations: Observations, rig: RigGeometry) -> dict[str, Any]:
+def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGeometry) -> dict[str, Any]:
     """Gaze points of every observation and of every frame with two eyes (schema eyerender/gaze/1).
 
     Errors are angles at the eye's place, or at the mid-point of the eyes; null without a target or a place.
@@ -154,7 +154,9 @@ def predictions(estimator: Estimator, observations: Observations, rig: RigGeomet
     return {"schema": PREDICT_SCHEMA, "gaze": single, "binocular": binocular}
 
 
-def save_estimator(path: str | Path, spec: EstimatorSpec, estimator: Estimator, rig: RigGeometry | None = None) -> None:
+def save_estimator(
+    path: str | Path, spec: EstimatorSpec, estimator: GazeEstimator, rig: RigGeometry | None = None
+) -> None:
     """Write a calibration as JSON, with the rig that it was made on where that is known."""
     write_json(
         path,
@@ -167,12 +169,12 @@ def save_estimator(path: str | Path, spec: EstimatorSpec, estimator: Estimator, 
     )
 
 
-def load_estimator(path: str | Path) -> Estimator:
+def load_estimator(path: str | Path) -> GazeEstimator:
     """The estimator of a calibration; raises as `load_calibration` does."""
     return load_calibration(path)[0]
 
 
-def load_calibration(path: str | Path) -> tuple[Estimator, RigGeometry | None]:
+def load_calibration(path: str | Path) -> tuple[GazeEstimator, RigGeometry | None]:
     """Read a calibration back: the estimator, and the rig that it was made on (None where the file does not say).
 
     Raises:
@@ -244,15 +246,15 @@ class _ModelState(Spec):
     at_bound: Annotated[tuple[str, ...], Field(max_length=5)]
 
 
-def _checked(estimator: Estimator, state: object) -> Spec:
+def _checked(estimator: GazeEstimator, state: object) -> Spec:
     """One eye's part of a calibration's file; raises `InputError` with the key's path."""
-    if isinstance(estimator, PupilGlintRegression):
+    if isinstance(estimator, Regression):
         regression = _RegressionState.from_mapping(state)
         for key, values, terms in zip("ab", (regression.a, regression.b), estimator.terms, strict=True):
             if len(values) != len(terms):
                 raise InputError(f"must be {len(terms)} numbers, one for each term", path=key)
         return regression
-    if isinstance(estimator, HomographyNormalisation):
+    if isinstance(estimator, Homography):
         return _HomographyState.from_mapping(state)
     if isinstance(estimator, CrossRatio):
         return _CrossRatioState.from_mapping(state)
@@ -261,15 +263,15 @@ def _checked(estimator: Estimator, state: object) -> Spec:
     return _CorrectionState.from_mapping(state)
 
 
-def _state(estimator: Estimator) -> dict[str, Any]:
+def _state(estimator: GazeEstimator) -> dict[str, Any]:
     """What a calibration found, by eye."""
     found: dict[int, Any]
-    if isinstance(estimator, PupilGlintRegression):
+    if isinstance(estimator, Regression):
         found = {
             e: {"origin": f.origin.tolist(), "scale": f.scale.tolist(), "a": f.a.tolist(), "b": f.b.tolist()}
             for e, f in estimator.fits.items()
         }
-    elif isinstance(estimator, HomographyNormalisation):
+    elif isinstance(estimator, Homography):
         found = {e: {"homography": H.tolist()} for e, H in estimator.homographies.items()}
     elif isinstance(estimator, CrossRatio):
         found = {e: {"alpha": a.tolist()} for e, a in estimator.alphas.items()}
@@ -283,16 +285,16 @@ def _state(estimator: Estimator) -> dict[str, Any]:
     return {(EYES[e] if e >= 0 else "unknown"): v for e, v in found.items()}
 
 
-def _restored(estimator: Estimator, eyes: dict[int, Any]) -> Estimator:
+def _restored(estimator: GazeEstimator, eyes: dict[int, Any]) -> GazeEstimator:
     """An estimator with the calibrations that a file holds, by eye, as `_checked` gives them."""
 
     def arrays(key: str) -> dict[int, Floats]:
         return {e: frozen(getattr(state, key)) for e, state in eyes.items()}
 
-    if isinstance(estimator, PupilGlintRegression):
+    if isinstance(estimator, Regression):
         parts = [arrays(key) for key in ("origin", "scale", "a", "b")]
         return replace(estimator, fits={e: EyeFit(*(part[e] for part in parts)) for e in eyes})
-    if isinstance(estimator, HomographyNormalisation):
+    if isinstance(estimator, Homography):
         return replace(estimator, homographies=arrays("homography"))
     if isinstance(estimator, CrossRatio):
         return replace(estimator, alphas=arrays("alpha"))

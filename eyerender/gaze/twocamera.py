@@ -12,12 +12,11 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError
 from ..observation import Observations
-from ..rig.rig import RigGeometry
+from ..rig.rig import RigGeometry, RigLike
 from .cornea import line_to_centre
 from .estimate import GazePoints, GazeRays
 from .rays import FeatureRays, feature_rays, unit
@@ -44,19 +43,18 @@ class ShihWuLiu:
     lights: tuple[int, ...] | None = None
     correction: Recalibration | None = field(default=None, repr=False)
 
-    def fit(self, observations: Observations, targets_mm: ArrayLike, rig: RigGeometry) -> Self:
+    def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate the correction of each eye; raises `InputError` for fewer than six usable targets."""
+        rig = rig.build()
         rays = self.optic_axes(observations, rig)
         # One row of each pair, so that every fixation counts once.
         rows = np.flatnonzero(observations.index.camera == self.cameras[0])
         part = GazeRays.of(rays.origin_mm[rows], rays.direction[rows], rays.reason[rows].copy())
-        targets = np.asarray(targets_mm, dtype=float)[rows]
-        return replace(
-            self, correction=Recalibration(self.recalibration).fit(observations.take(rows), part, targets, rig)
-        )
+        return replace(self, correction=Recalibration(self.recalibration).fit(observations.take(rows), part, rig))
 
-    def predict(self, observations: Observations, rig: RigGeometry) -> GazePoints:
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Gaze points on the screen's plane."""
+        rig = rig.build()
         correction = self.correction or Recalibration(self.recalibration)
         return correction.apply(observations, self.optic_axes(observations, rig), rig)
 

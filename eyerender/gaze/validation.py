@@ -9,8 +9,8 @@ import numpy as np
 from ..arrays import ArrayValue, Bools, Floats, Objects
 from ..errors import InputError
 from ..observation import Observations
-from ..rig.rig import RigGeometry
-from .estimate import Estimator, GazePoints, angular_error_deg, binocular_average, gaze_points
+from ..rig.rig import RigLike
+from .estimate import GazeEstimator, GazePoints, angular_error_deg, binocular_average
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +42,7 @@ class GazeErrors(ArrayValue):
         return float(self.error_deg[self.ok].max()) if self.ok.any() else None
 
 
-def leave_one_target_out(estimator: Estimator, observations: Observations, rig: RigGeometry) -> GazeErrors:
+def leave_one_target_out(estimator: GazeEstimator, observations: Observations, rig: RigLike) -> GazeErrors:
     """Errors of each target estimated by a calibration on all the others.
 
     A residual at the calibration targets themselves would flatter every estimator with many terms.
@@ -50,7 +50,7 @@ def leave_one_target_out(estimator: Estimator, observations: Observations, rig: 
     Raises:
         InputError: there are no targets, or too few to calibrate on.
     """
-    targets = observations.index.target_mm
+    rig, targets = rig.build(), observations.index.target_mm
     if not np.isfinite(targets).all():
         raise InputError("there are no targets to compare the gaze with; use a scene with 'targets' instead of 'poses'")
     if len(np.unique(observations.index.fixation)) < 2:
@@ -62,11 +62,11 @@ def leave_one_target_out(estimator: Estimator, observations: Observations, rig: 
     reason = np.full(len(observations), None, dtype=object)
     for fixation in np.unique(observations.index.fixation):
         held_out = observations.index.fixation == fixation
-        fitted = estimator.fit(observations.take(~held_out), targets[~held_out], rig)
+        fitted = estimator.fit(observations.take(~held_out), rig)
         gaze = fitted.predict(observations.take(held_out), rig)
         points[held_out] = gaze.point_mm
         reason[held_out] = gaze.reason
-    return gaze_errors(observations, gaze_points(points, reason))
+    return gaze_errors(observations, GazePoints.of(points, reason))
 
 
 def gaze_errors(observations: Observations, gaze: GazePoints) -> GazeErrors:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Protocol, Self
 
 from pydantic import Field, model_validator
 
@@ -45,6 +45,14 @@ class Rig(Spec):
         return RigGeometry(cameras, lights, self.screen.build() if self.screen else None)
 
 
+class RigLike(Protocol):
+    """A rig as `Rig` authors it or as `RigGeometry` holds it; what takes one begins with `rig = rig.build()`."""
+
+    def build(self) -> RigGeometry:
+        """The numeric rig."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RigGeometry(ArrayValue):
     """Cameras, lights and, where there is one, the screen."""
@@ -52,6 +60,10 @@ class RigGeometry(ArrayValue):
     cameras: tuple[PinholeCamera, ...]
     lights: tuple[Lamp, ...]
     screen: ScreenPlane | None
+
+    def build(self) -> RigGeometry:
+        """This rig, which is numeric already."""
+        return self
 
     def to_mapping(self) -> dict[str, Any]:
         """The rig as `features --json` writes it (docs/formats.md)."""

@@ -50,6 +50,11 @@ class ScreenPlane(ArrayValue):
         p = np.asarray(on_screen_mm, dtype=float)
         return np.asarray(self.centre_mm + p[..., :1] * self.right + p[..., 1:] * self.up)
 
+    def flat(self, world_mm: ArrayLike) -> Floats:
+        """Screen points (..., 2) mm of world points (..., 3), by orthogonal projection; the inverse of `world`."""
+        p = np.asarray(world_mm, dtype=float) - self.centre_mm
+        return np.stack([p @ self.right, p @ self.up], axis=-1)
+
     def grid(self, columns: int, rows: int) -> Floats:
         """Targets (columns * rows, 3) out to the screen's edges, from the subject's left, each column from the top."""
         w, h = self.size_mm

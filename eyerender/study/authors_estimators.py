@@ -13,7 +13,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..gaze.guestrin import GuestrinEizenman
 from ..gaze.parameters import Calibration, EyeParameters
-from ..gaze.regression import EyeFit, PupilGlintRegression, monomials
+from ..gaze.regression import EyeFit, Regression, monomials
 from ..gaze.search import MOST_ITERATIONS, FreeParameters, Misses
 
 # A slots dataclass is a new class, which super() without arguments does not find: base classes are named instead.
@@ -66,7 +66,7 @@ class AuthorsGuestrinEizenman(GuestrinEizenman):
 
 
 @dataclass(frozen=True, slots=True)
-class MinimumNormRegression(PupilGlintRegression):
+class MinimumNormRegression(Regression):
     """Regression that takes the minimum-norm solution where the targets do not determine the coefficients."""
 
     def fit_eye(self, vectors: Floats, wanted: Floats, name: str) -> EyeFit:

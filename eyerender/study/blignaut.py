@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..gaze.estimate import angular_error_deg, binocular_average
-from ..gaze.regression import FUNCTIONS, PupilGlintRegression
+from ..gaze.regression import FUNCTIONS, Regression
 from ..observation import Observations
 from ..rig.rig import RigGeometry
 from ..scene import Scene, SceneSpec, load_scene
@@ -106,16 +106,16 @@ def terms(function: str, departures: Collection[str]) -> tuple[str, str]:
 def run(
     observations: Observations, rig: RigGeometry, departures: Collection[str], *, centred: bool = False
 ) -> list[Outcome]:
-    """Every function calibrated on every set, tested on all targets; `centred` as in `PupilGlintRegression`."""
+    """Every function calibrated on every set, tested on all targets; `centred` as in `Regression`."""
     out = []
     fixation = observations.index.fixation
     for name, targets in CALIBRATION_SETS.items():
         calibration = observations.take(np.isin(fixation, np.array(targets) - 1))
         for function in FUNCTIONS:
-            kind = MinimumNormRegression if "minimum_norm" in departures else PupilGlintRegression
+            kind = MinimumNormRegression if "minimum_norm" in departures else Regression
             regression = kind(terms(function, departures), centred=centred)
             try:
-                fitted = regression.fit(calibration, calibration.index.target_mm, rig)
+                fitted = regression.fit(calibration, rig)
             except InputError as error:
                 out.append(Outcome(function, name, np.zeros(0), str(error)))
                 continue

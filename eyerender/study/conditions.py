@@ -20,7 +20,7 @@ from ..eye.spec import EyeSpec
 from ..gaze.estimate import angular_error_deg, binocular_average
 from ..gaze.guestrin import GuestrinEizenman
 from ..gaze.quality import quality
-from ..gaze.regression import PupilGlintRegression
+from ..gaze.regression import Regression
 from ..observation import Observations
 from ..scene import Scene, SceneSpec
 from . import blignaut, guestrin
@@ -80,7 +80,7 @@ class _Tracker:
     """A calibrated tracker: errors of observations, one a target in the scene's order for each head position."""
 
     name: str
-    estimator: GuestrinEizenman | PupilGlintRegression
+    estimator: GuestrinEizenman | Regression
     scene: Scene
 
     def points(self, seen: Observations) -> tuple[Observations, Floats]:
@@ -170,10 +170,10 @@ def _calibrated(scene: Scene) -> tuple[_Tracker, Observations]:
     """The scene's tracker, calibrated in it, and what it was calibrated and tested on."""
     seen = observe(scene)
     if len(scene.rig.lights) > 1:
-        fitted = guestrin.estimator(guestrin.CORRECTED).fit(seen, seen.index.target_mm, scene.rig)
+        fitted = guestrin.estimator(guestrin.CORRECTED).fit(seen, scene.rig)
         return _Tracker("model-based", fitted, scene), seen
     some = seen.take(np.isin(seen.index.fixation, np.array(CALIBRATION_SETS[CALIBRATION]) - 1))
-    regression = PupilGlintRegression(FUNCTION).fit(some, some.index.target_mm, scene.rig)
+    regression = Regression(FUNCTION).fit(some, scene.rig)
     return _Tracker("interpolation", regression, scene), seen
 
 

@@ -175,7 +175,7 @@ def run(
     """Calibrate at H1 and estimate everywhere."""
     told = estimation_rig(rig, departures)
     central = observations.take(observations.index.head == 0)
-    fitted = estimator(departures, free_index=free_index).fit(central, central.index.target_mm, told)
+    fitted = estimator(departures, free_index=free_index).fit(central, told)
     gaze = fitted.predict(observations, told)
     return Outcome(observations, gaze, errors_deg(observations, gaze, departures), fitted)
 
@@ -248,7 +248,7 @@ def restarts(
         if not len(rows):
             continue
         first = replace(outcome.estimator, calibrations={})
-        found = first.restarts(rows, rows.index.target_mm, told, first.bounds.draw(starts, SEED))[eye]
+        found = first.restarts(rows, told, first.bounds.draw(starts, SEED))[eye]
         errors = []
         for calibration in found:
             gaze = replace(first, calibrations={eye: calibration}).predict(rows, told)

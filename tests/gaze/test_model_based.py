@@ -119,7 +119,7 @@ def test_centre_axis_and_gaze_point(scene, method, lights):
 @pytest.mark.parametrize("start", [EyeParameters(), EyeParameters(8.6, 5.0, 1.3375, -3.0, -4.0)])
 def test_calibration_recovers_the_eye_on_either_side(scene, start):
     seen, _, _ = one_camera(scene)
-    fitted = GuestrinEizenman(start=start).fit(seen, seen.index.target_mm, world())
+    fitted = GuestrinEizenman(start=start).fit(seen, world())
     for eye in (0, 1):  # alpha is towards the nose on both sides
         found = fitted.calibrations[eye]
         assert found.converged
@@ -131,7 +131,7 @@ def test_calibration_recovers_the_eye_on_either_side(scene, start):
 
 def test_free_index_is_nearly_unobservable_but_the_gaze_is_right(scene):
     seen, _, _ = one_camera(scene)
-    fitted = GuestrinEizenman(free_index=True, start=EyeParameters(index=1.38)).fit(seen, seen.index.target_mm, world())
+    fitted = GuestrinEizenman(free_index=True, start=EyeParameters(index=1.38)).fit(seen, world())
     gaze = fitted.predict(seen, world())
     assert np.linalg.norm(gaze.point_mm - seen.index.target_mm, axis=1).max() < 0.05
 
@@ -181,19 +181,18 @@ def test_a_gaze_away_from_the_screen_has_a_status(scene):
 
 def test_refusals(scene):
     seen, _, _ = one_camera(scene)
-    targets = seen.index.target_mm
     with pytest.raises(InputError, match="right eye: 1 usable calibration targets; 4 parameters need 2"):
-        GuestrinEizenman().fit(seen.take(np.arange(2)), targets[:2], world())
+        GuestrinEizenman().fit(seen.take(np.arange(2)), world())
     with pytest.raises(InputError, match="needs 2 lights, the rig has 1"):
-        GuestrinEizenman().fit(seen, targets, world(lights=1))
+        GuestrinEizenman().fit(seen, world(lights=1))
     with pytest.raises(InputError, match="not different lights"):
-        GuestrinEizenman(lights=(0, 7)).fit(seen, targets, world())
+        GuestrinEizenman(lights=(0, 7)).fit(seen, world())
     with pytest.raises(InputError, match="outside its bounds"):
-        GuestrinEizenman(start=EyeParameters(12.0)).fit(seen, targets, world())
+        GuestrinEizenman(start=EyeParameters(12.0)).fit(seen, world())
     with pytest.raises(InputError, match="call fit first"):
         GuestrinEizenman().predict(seen, world())
     with pytest.raises(InputError, match="needs a screen"):
-        GuestrinEizenman().fit(seen, targets, replace(world(), screen=None))
+        GuestrinEizenman().fit(seen, replace(world(), screen=None))
     with pytest.raises(InputError, match="less than its upper bound"):
         ParameterBounds(lower=EyeParameters(9.0), upper=EyeParameters(8.0))
 
@@ -204,7 +203,7 @@ def test_random_starts_end_at_one_minimum_and_are_seeded(scene):
     starts = estimator.bounds.draw(4, 7)
     assert starts == estimator.bounds.draw(4, 7)
     assert starts != estimator.bounds.draw(4, 8)
-    ends = estimator.restarts(seen, seen.index.target_mm, world(), starts)
+    ends = estimator.restarts(seen, world(), starts)
     for calibrations in ends.values():
         for c in calibrations:
             np.testing.assert_allclose(c.parameters.vector()[3:], EYE.vector()[3:], atol=2e-3)
@@ -227,7 +226,7 @@ def test_two_cameras_recalibrated(scene):
     seen, _, _ = scene
     rows = seen.index.eye == 0
     seen = seen.take(rows)
-    fitted = ShihWuLiu().fit(seen, seen.index.target_mm, world(cameras=2))
+    fitted = ShihWuLiu().fit(seen, world(cameras=2))
     gaze = fitted.predict(seen, world(cameras=2))
     assert gaze.ok.all()
     # The same estimate for the two cameras' observations of a fixation.
@@ -260,14 +259,14 @@ def test_hennessey_takes_up_a_wrong_eye(scene):
     wrong = Hennessey(EyeParameters(7.5, 4.6, 1.36))
     before = replace(wrong, recalibration="none").predict(seen, world()).point_mm - targets
     for kind in ("angle", "screen"):
-        fitted = replace(wrong, recalibration=kind).fit(seen, targets, world())
+        fitted = replace(wrong, recalibration=kind).fit(seen, world())
         after = fitted.predict(seen, world()).point_mm - targets
         assert np.linalg.norm(after, axis=1).mean() < 0.05 * np.linalg.norm(before, axis=1).mean()
     with pytest.raises(InputError, match="5 usable calibration targets"):
-        wrong.fit(seen.take(np.arange(10)), targets[:10], world())
+        wrong.fit(seen.take(np.arange(10)), world())
     row = seen.take(seen.index.fixation % 3 == 1)
     with pytest.raises(InputError, match="3 usable"):
-        wrong.fit(row, row.index.target_mm, world())
+        wrong.fit(row, world())
     with pytest.raises(InputError, match="call fit first"):
         wrong.predict(seen, world())
 

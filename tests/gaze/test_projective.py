@@ -8,7 +8,7 @@ from gaze_helpers import observations, rig
 
 from eyerender.errors import InputError
 from eyerender.gaze.crossratio import CrossRatio
-from eyerender.gaze.homography import HomographyNormalisation, homography, transformed
+from eyerender.gaze.homography import Homography, homography, transformed
 from eyerender.rig.camera import Camera
 
 CAMERA = Camera(
@@ -45,7 +45,7 @@ def data(n=16, seed=0, eyes=(0,)):
 @pytest.mark.parametrize("conditioned", [True, False])
 def test_projective_data_come_back_through_any_head_movement(conditioned):
     seen, held_out = data(seed=1), data(seed=1, n=40).take(np.arange(16, 40))
-    fitted = HomographyNormalisation(conditioned=conditioned).fit(seen, seen.index.target_mm, WORLD)
+    fitted = Homography(conditioned=conditioned).fit(seen, WORLD)
     gaze = fitted.predict(held_out, WORLD)
     assert gaze.ok.all()
     # Points 1000 px from the quadrangle's scale of 40 px lose three digits in the homography.
@@ -80,7 +80,7 @@ def test_a_batch_of_homographies_is_each_of_them():
 
 def test_statuses():
     seen = data()
-    fitted = HomographyNormalisation().fit(seen, seen.index.target_mm, WORLD)
+    fitted = Homography().fit(seen, WORLD)
     pupil, glints = seen.pupil.centre_px.copy(), seen.glints.xy_px.copy()
     pupil[0] = np.nan
     glints[1, 2] = np.nan
@@ -105,22 +105,22 @@ def test_a_gaze_point_at_infinity_is_a_status():
     pupil = seen.glints.xy_px.mean(axis=1)
     square = observations(pupil, np.array([[[0.0, 1], [1, 1], [1, 0], [0, 0]]] * len(seen)))
     square = observations(np.full((len(seen), 2), 0.5), square.glints.xy_px)
-    gaze = HomographyNormalisation(homographies={0: H}).predict(square, WORLD)
+    gaze = Homography(homographies={0: H}).predict(square, WORLD)
     assert set(gaze.reason) == {"the gaze point lies at infinity"}
 
 
 def test_refusals():
     seen = data()
     with pytest.raises(InputError, match="3 usable calibration targets, a homography needs 4"):
-        HomographyNormalisation().fit(seen.take(np.arange(3)), seen.index.target_mm[:3], WORLD)
+        Homography().fit(seen.take(np.arange(3)), WORLD)
     line = np.array(seen.index.target_mm)
     line[:, 2] = 0.0
     with pytest.raises(InputError, match="do not determine a homography"):
-        HomographyNormalisation().fit(seen, line, WORLD)
+        Homography().fit(seen.with_targets(line), WORLD)
     with pytest.raises(InputError, match="not different lights"):
-        HomographyNormalisation().fit(seen, seen.index.target_mm, rig([CAMERA], LIGHTS[:2], (650, 0, 0)))
+        Homography().fit(seen, rig([CAMERA], LIGHTS[:2], (650, 0, 0)))
     both = data(eyes=(0, 1))
-    only = HomographyNormalisation().fit(seen, seen.index.target_mm, WORLD).predict(both, WORLD)
+    only = Homography().fit(seen, WORLD).predict(both, WORLD)
     assert set(only.reason[both.index.eye == 1]) == {"this eye is not calibrated"}
 
 
@@ -145,7 +145,7 @@ def test_cross_ratio_recovers_alpha_and_gaze():
     alpha = [1.9, 2.0, 2.1, 2.05]
     seen = cross_ratio_data(alpha)
     corners = seen.take(np.arange(4))
-    fitted = CrossRatio().fit(corners, corners.index.target_mm, WORLD)
+    fitted = CrossRatio().fit(corners, WORLD)
     np.testing.assert_allclose(fitted.alphas[0], alpha, rtol=1e-12)
     gaze = fitted.predict(seen, WORLD)
     np.testing.assert_allclose(gaze.point_mm, seen.index.target_mm, atol=1e-8)
@@ -154,15 +154,15 @@ def test_cross_ratio_recovers_alpha_and_gaze():
 def test_cross_ratio_refusals_and_statuses():
     seen = cross_ratio_data([2, 2, 2, 2])
     with pytest.raises(InputError, match="no usable calibration target at the corner light 3"):
-        CrossRatio().fit(seen.take(np.arange(3)), seen.index.target_mm[:3], WORLD)
+        CrossRatio().fit(seen.take(np.arange(3)), WORLD)
     with pytest.raises(InputError, match="another one at the camera"):
-        CrossRatio(at_camera=2).fit(seen, seen.index.target_mm, WORLD)
+        CrossRatio(at_camera=2).fit(seen, WORLD)
     with pytest.raises(InputError, match="call fit first"):
         CrossRatio().predict(seen, WORLD)
     glints = seen.glints.xy_px.copy()
     glints[5, 4] = np.nan
     glints[6, 1] = (glints[6, 0] + glints[6, 2]) / 2
-    fitted = CrossRatio().fit(seen, seen.index.target_mm, WORLD)
+    fitted = CrossRatio().fit(seen, WORLD)
     gaze = fitted.predict(observations(seen.pupil.centre_px, glints), WORLD)
     assert gaze.reason[5] == "no glint of light 4"
     assert gaze.reason[6] == "three of the glints lie on a line"

@@ -11,10 +11,10 @@ from eyerender.gaze.cornea import from_all_glints, from_plane, line_to_centre
 from eyerender.gaze.crossratio import CrossRatio
 from eyerender.gaze.guestrin import GuestrinEizenman
 from eyerender.gaze.hennessey import Hennessey
-from eyerender.gaze.homography import HomographyNormalisation
+from eyerender.gaze.homography import Homography
 from eyerender.gaze.parameters import EyeParameters, ParameterBounds
 from eyerender.gaze.rays import feature_rays
-from eyerender.gaze.regression import PupilGlintRegression
+from eyerender.gaze.regression import Regression
 
 BIQUADRATIC = "x + y + xy + x2 + y2 + 1"
 
@@ -26,9 +26,9 @@ def hennessey_eye(data, **options):
 
 
 CASES = {
-    "interpolate_biquadratic": lambda d: PupilGlintRegression((BIQUADRATIC, BIQUADRATIC), normalised=False),
+    "interpolate_biquadratic": lambda d: Regression((BIQUADRATIC, BIQUADRATIC), normalised=False),
     # The vectors' transform is the plain algebraic least squares in metres.
-    "homography_glint4": lambda d: HomographyNormalisation(conditioned=False),
+    "homography_glint4": lambda d: Homography(conditioned=False),
     "hennessey_pupil_center_recalib_angle": hennessey_eye,
 }
 
@@ -38,7 +38,7 @@ def test_gaze_of_held_out_frames(name):
     data = load(f"estimator_{name}.json")
     world = ets_rig(data)
     calibration, frames = ets_observations(data["calibration"]), ets_observations(data["frames"])
-    fitted = CASES[name](data).fit(calibration, calibration.index.target_mm, world)
+    fitted = CASES[name](data).fit(calibration, world)
     gaze = fitted.predict(frames, world)
     assert gaze.ok.all()
     expected = on_plane([f["gaze"] for f in data["frames"]])
@@ -49,7 +49,7 @@ def test_gaze_of_held_out_frames(name):
 def test_homography_state():
     data = load("estimator_homography_glint4.json")
     calibration = ets_observations(data["calibration"])
-    fitted = HomographyNormalisation(conditioned=False).fit(calibration, calibration.index.target_mm, ets_rig(data))
+    fitted = Homography(conditioned=False).fit(calibration, ets_rig(data))
     # Screen coordinates run to the subject's right, the vectors' x to the left.
     H = np.diag([-1.0, 1.0, 1.0]) @ fitted.homographies[0]
     np.testing.assert_allclose(H * np.sign(H[2, 2]), data["state"]["H"], rtol=1e-9, atol=1e-10)
@@ -63,7 +63,7 @@ def test_cross_ratio():
     assert gaze.ok.all()
     np.testing.assert_allclose(gaze.point_mm, on_plane([f["gaze"] for f in data["frames"]]), rtol=1e-9, atol=4e-10)
     calibration = ets_observations(data["calibration"])
-    fitted = CrossRatio().fit(calibration, calibration.index.target_mm, world)
+    fitted = CrossRatio().fit(calibration, world)
     # The features given for the calibration frames are not to the last digit those that the given alpha came from: all
     # four ratios of lengths differ by 1.9e-5 to 2.3e-5. That is 3e-4 px; gaze on held-out frames is exact with their
     # alpha.
@@ -89,7 +89,7 @@ def test_hennessey_parts():
         plain.point_mm, on_plane([f["gaze_uncorrected"] for f in data["frames"]]), rtol=1e-9, atol=4e-10
     )
     for kind in ("angle", "screen"):
-        fitted = hennessey_eye(data, recalibration=kind).fit(calibration, calibration.index.target_mm, world)
+        fitted = hennessey_eye(data, recalibration=kind).fit(calibration, world)
         A = np.array(data["state"][f"recalib_{kind}"]["A"])
         if kind == "screen":
             # Screen x runs to the subject's right here: terms odd in x change sign, and so does the x row.
@@ -150,7 +150,7 @@ def test_guestrin_eizenman_calibrations(case):
     R, K, alpha, beta = record["x0"]
     start = EyeParameters(R, K, record["assumed_n"], -np.degrees(alpha), np.degrees(beta))
     wide = ParameterBounds(EyeParameters(3, 2, 1.3, -20, -20), EyeParameters(20, 15, 1.45, 20, 20))
-    fitted = GuestrinEizenman(start=start, bounds=wide).fit(seen, seen.index.target_mm, world)
+    fitted = GuestrinEizenman(start=start, bounds=wide).fit(seen, world)
     found = fitted.calibrations[0]
     assert found.converged
     assert found.at_bound == ()

@@ -8,7 +8,7 @@ import pytest
 from eyerender.arrays import frozen
 from eyerender.errors import InputError
 from eyerender.gaze.estimate import angular_error_deg, binocular_average
-from eyerender.gaze.regression import FUNCTIONS, PupilGlintRegression, pupil_glint_vectors
+from eyerender.gaze.regression import FUNCTIONS, Regression, pupil_glint_vectors
 from eyerender.gaze.validation import gaze_errors, leave_one_target_out
 from eyerender.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
 from eyerender.rig.rig import Rig
@@ -91,7 +91,7 @@ def test_a_polynomial_within_the_functions_terms_comes_back(name):
     # x + xy in x and y alone in y: terms that every one of these functions has.
     observations = synthetic(7, 6, lambda x, y: (9000 * x + 3000 * x * y + 5, 7000 * y - 2))
     targets = observations.index.target_mm
-    gaze = PupilGlintRegression(name).fit(observations, targets, RIG).predict(observations, RIG)
+    gaze = Regression(name).fit(observations, RIG).predict(observations, RIG)
     assert gaze.ok.all()
     # R12 has 12 terms up to the fifth power: condition number about 1e4 on scaled variables, times 300 mm and 1e-16.
     np.testing.assert_allclose(gaze.point_mm, targets, atol=1e-8)
@@ -99,14 +99,13 @@ def test_a_polynomial_within_the_functions_terms_comes_back(name):
 
 def test_user_terms_and_table_agree():
     observations = synthetic()
-    targets = observations.index.target_mm
-    a = PupilGlintRegression("R5").fit(observations, targets, RIG).predict(observations, RIG)
-    b = PupilGlintRegression(("1 + xy + y + x", "y2 + y + x + 1")).fit(observations, targets, RIG)
+    a = Regression("R5").fit(observations, RIG).predict(observations, RIG)
+    b = Regression(("1 + xy + y + x", "y2 + y + x + 1")).fit(observations, RIG)
     np.testing.assert_allclose(a.point_mm, b.predict(observations, RIG).point_mm, atol=1e-9)
 
 
 def test_table_2_has_the_published_numbers_of_terms():
-    counts = {name: tuple(len(t) for t in PupilGlintRegression(name).terms) for name in FUNCTIONS}
+    counts = {name: tuple(len(t) for t in Regression(name).terms) for name in FUNCTIONS}
     assert counts == {
         "R1": (2, 2), "R2": (4, 4), "R3": (6, 6), "R4": (7, 7), "R5": (4, 4), "R6": (4, 5), "R7": (5, 7),
         "R8": (8, 7), "R9": (8, 6), "R10": (8, 12), "R11": (10, 6), "R12": (10, 12),
@@ -114,16 +113,16 @@ def test_table_2_has_the_published_numbers_of_terms():
 
 
 def test_leave_one_out_is_zero_for_a_polynomial_and_not_for_another_function():
-    exact = leave_one_target_out(PupilGlintRegression("R3"), synthetic(), RIG)
+    exact = leave_one_target_out(Regression("R3"), synthetic(), RIG)
     assert exact.ok.all()
     assert exact.max_deg < 1e-9
     cubic = synthetic(polynomial=lambda x, y: (8000 * x + 3e6 * x**3, 7000 * y))
-    assert leave_one_target_out(PupilGlintRegression("R3"), cubic, RIG).mean_deg > 0.05
+    assert leave_one_target_out(Regression("R3"), cubic, RIG).mean_deg > 0.05
 
 
 def test_missing_glint_is_a_status_not_a_number():
     observations = without_glint(synthetic(), 4)
-    fitted = PupilGlintRegression("R2").fit(observations, observations.index.target_mm, RIG)
+    fitted = Regression("R2").fit(observations, RIG)
     gaze = fitted.predict(observations, RIG)
     assert gaze.status[4] == "missing"
     assert gaze.reason[4] == "no glint of light 0"
@@ -136,7 +135,7 @@ def test_missing_glint_is_a_status_not_a_number():
 
 def test_binocular_average_is_the_mean_of_both_eyes():
     observations = synthetic()
-    gaze = PupilGlintRegression("R1").fit(observations, observations.index.target_mm, RIG).predict(observations, RIG)
+    gaze = Regression("R1").fit(observations, RIG).predict(observations, RIG)
     _, both = binocular_average(observations, gaze)
     np.testing.assert_allclose(both.point_mm, (gaze.point_mm[::2] + gaze.point_mm[1::2]) / 2, atol=1e-12)
 
@@ -151,12 +150,12 @@ def test_binocular_average_is_the_mean_of_both_eyes():
 )
 def test_too_few_targets_are_refused(columns, rows, name, words):
     observations = synthetic(columns, rows)
-    estimator = PupilGlintRegression(name)
+    estimator = Regression(name)
     if name == "R12":
         observations = observations.take(np.arange(22))
         words = "11 usable calibration targets, but R12 has 12"
     with pytest.raises(InputError, match=words):
-        estimator.fit(observations, observations.index.target_mm, RIG)
+        estimator.fit(observations, RIG)
 
 
 def test_targets_that_determine_nothing_are_refused():
@@ -168,18 +167,18 @@ def test_targets_that_determine_nothing_are_refused():
 
     flat = replace(observations, pupil=replace(observations.pupil, centre_px=frozen(centre)))
     with pytest.raises(InputError, match="do not determine R2"):
-        PupilGlintRegression("R2").fit(flat, flat.index.target_mm, RIG)
+        Regression("R2").fit(flat, RIG)
 
 
 def test_prediction_before_calibration_is_refused():
     with pytest.raises(InputError, match="call fit first"):
-        PupilGlintRegression("R1").predict(synthetic(), RIG)
+        Regression("R1").predict(synthetic(), RIG)
 
 
 @pytest.mark.parametrize("text", ["x + z", "x12y", "x + x", "2x"])
 def test_bad_terms_are_refused(text):
     with pytest.raises(InputError):
-        _ = PupilGlintRegression((text, "y + 1")).terms
+        _ = Regression((text, "y + 1")).terms
 
 
 def test_angular_error_of_a_known_angle():

@@ -12,7 +12,7 @@ from eyerender.analytic.observer import observe
 from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.gaze.records import load_observations, rig_from_mapping
-from eyerender.gaze.regression import EyeFit, PupilGlintRegression
+from eyerender.gaze.regression import EyeFit, Regression
 from eyerender.gaze.store import (
     EstimatorSpec,
     fit_estimator,
@@ -340,7 +340,7 @@ def test_estimates_that_overflow_are_missing(guestrin):
     """Coefficients of 1e300 give no number; that is a reason, not an infinity in the output."""
     seen, rig = load_observations(guestrin)
     fit = EyeFit(np.zeros(2), np.full(2, 1e-100), np.full(6, 1e300), np.full(6, -1e300))
-    gaze = predictions(PupilGlintRegression(fits={0: fit, 1: fit}), seen, rig)
+    gaze = predictions(Regression(fits={0: fit, 1: fit}), seen, rig)
     assert {g["reason"] for g in gaze["gaze"]} == {"the estimate is not finite"}
     json.dumps(gaze, allow_nan=False)
 

@@ -13,7 +13,7 @@ from eyerender.arrays import frozen
 from eyerender.errors import InputError
 from eyerender.gaze.guestrin import GuestrinEizenman
 from eyerender.gaze.parameters import EyeParameters
-from eyerender.gaze.regression import PupilGlintRegression, monomials, pupil_glint_vectors
+from eyerender.gaze.regression import Regression, monomials, pupil_glint_vectors
 from eyerender.scene import load_scene
 from eyerender.study.authors_estimators import AuthorsGuestrinEizenman, MinimumNormRegression
 
@@ -49,7 +49,7 @@ def test_sum_of_errors_is_minimised(seen):
     rows = observations.take(observations.index.eye == 0)
     targets = rows.index.target_mm
     estimator = AuthorsGuestrinEizenman(visual_axis="angles")
-    found = estimator.fit(rows, targets, rig).calibrations[0]
+    found = estimator.fit(rows, rig).calibrations[0]
     assert found.objective == "sum_of_errors"
 
     def cost(v):
@@ -61,15 +61,14 @@ def test_sum_of_errors_is_minimised(seen):
     # An independent simplex search from there finds nothing lower.
     other = minimize(cost, best, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-10, "maxiter": 600})
     assert other.fun > found.cost * (1 - 1e-5)
-    squares = GuestrinEizenman().fit(rows, targets, rig).calibrations[0]
+    squares = GuestrinEizenman().fit(rows, rig).calibrations[0]
     assert found.cost < cost(squares.parameters.vector()[[0, 1, 3, 4]])
 
 
 def test_without_departures_they_are_the_estimators_of_the_package(seen):
     observations, rig = seen
-    targets = observations.index.target_mm
-    plain = GuestrinEizenman().fit(observations, targets, rig)
-    same = AuthorsGuestrinEizenman(visual_axis="angles", objective="least_squares").fit(observations, targets, rig)
+    plain = GuestrinEizenman().fit(observations, rig)
+    same = AuthorsGuestrinEizenman(visual_axis="angles", objective="least_squares").fit(observations, rig)
     assert same.calibrations == plain.calibrations
     np.testing.assert_array_equal(same.predict(observations, rig).point_mm, plain.predict(observations, rig).point_mm)
 
@@ -80,8 +79,8 @@ def test_the_minimum_norm_needs_no_more_targets_than_one():
     few = every.take(every.index.fixation < 3)
     targets = few.index.target_mm
     with pytest.raises(InputError, match="3 usable calibration targets, but R3 has"):
-        PupilGlintRegression("R3").fit(few, targets, scene.rig)
-    fitted = MinimumNormRegression("R3").fit(few, targets, scene.rig)
+        Regression("R3").fit(few, scene.rig)
+    fitted = MinimumNormRegression("R3").fit(few, scene.rig)
     np.testing.assert_allclose(fitted.predict(few, scene.rig).point_mm, targets, atol=1e-6)
     # The minimum-norm solution is the pseudo-inverse's.
     rows = few.index.eye == 0
@@ -90,4 +89,4 @@ def test_the_minimum_norm_needs_no_more_targets_than_one():
     coefficients = np.linalg.pinv(monomials(v[rows], fitted.terms[0])) @ wanted
     np.testing.assert_allclose(fitted.fits[0].a, coefficients, rtol=1e-6, atol=1e-6)
     with pytest.raises(InputError, match="no usable calibration targets"):
-        MinimumNormRegression("R3").fit(few, np.full_like(targets, np.nan), scene.rig)
+        MinimumNormRegression("R3").fit(few.with_targets([np.nan] * 3), scene.rig)

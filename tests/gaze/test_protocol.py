@@ -1,0 +1,96 @@
+"""Every estimator follows one protocol: an authored rig does as well as a computed one, and `fit` changes nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import eyerender as er
+from eyerender.analytic.observer import observe
+from eyerender.rig.rig import RigGeometry
+
+ONE_CAMERA = [
+    er.gaze.Regression("R3"),
+    er.gaze.Hennessey(),
+    er.gaze.GuestrinEizenman(),
+]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    spec = er.load_scene("guestrin2006").spec.to_mapping()
+    spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
+    return er.Scene.of(er.SceneSpec.from_mapping(spec))
+
+
+@pytest.fixture(scope="module")
+def five_lights():
+    """Four lights at the corners of the screen, one at the camera, and targets at the corners among others."""
+    spec = er.load_scene("guestrin2006").spec.to_mapping()
+    spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
+    screen, camera = spec["rig"]["screen"], spec["rig"]["cameras"][0]
+    (x, y, z), (w, h) = screen["centre_mm"], screen["size_mm"]
+    corners = [
+        [x, y + w / 2, z + h / 2],
+        [x, y - w / 2, z + h / 2],
+        [x, y - w / 2, z - h / 2],
+        [x, y + w / 2, z - h / 2],
+    ]
+    spec["rig"]["lights"] = [{"position_mm": p} for p in [*corners, camera["position_mm"]]]
+    return er.Scene.of(er.SceneSpec.from_mapping(spec))
+
+
+def check(estimator, seen, authored):
+    assert isinstance(estimator, er.gaze.GazeEstimator)
+    before = repr(estimator)
+    fitted = estimator.fit(seen, authored)
+    assert type(fitted) is type(estimator)
+    assert repr(estimator) == before
+    gaze = fitted.predict(seen, authored)
+    assert isinstance(gaze, er.gaze.GazePoints)
+    assert len(gaze) == len(seen)
+    assert gaze.ok.all()
+    computed = authored.build()
+    assert isinstance(computed, RigGeometry)
+    assert computed.build() is computed
+    np.testing.assert_array_equal(gaze.point_mm, estimator.fit(seen, computed).predict(seen, computed).point_mm)
+
+
+@pytest.mark.parametrize("estimator", ONE_CAMERA, ids=lambda e: type(e).__name__)
+def test_one_camera(scene, estimator):
+    check(estimator, observe(scene), scene.spec.rig)
+
+
+@pytest.mark.parametrize("estimator", [er.gaze.Homography(), er.gaze.CrossRatio()], ids=lambda e: type(e).__name__)
+def test_projective(five_lights, estimator):
+    check(estimator, observe(five_lights), five_lights.spec.rig)
+
+
+def test_two_cameras(scene):
+    spec = scene.spec.to_mapping()
+    spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})
+    two = er.Scene.of(er.SceneSpec.from_mapping(spec))
+    check(er.gaze.ShihWuLiu(), observe(two), two.spec.rig)
+
+
+def test_leave_one_target_out_takes_an_authored_rig(scene):
+    seen = observe(scene)
+    one = er.gaze.leave_one_target_out(er.gaze.Regression("R2"), seen, scene.spec.rig)
+    other = er.gaze.leave_one_target_out(er.gaze.Regression("R2"), seen, scene.rig)
+    assert isinstance(one, er.gaze.GazeErrors)
+    assert one == other
+
+
+def test_other_targets_make_another_calibration(scene):
+    seen, rig = observe(scene), scene.spec.rig
+    shifted = seen.with_targets(seen.index.target_mm + np.array([0.0, 10.0, 0.0]))
+    a, b = (er.gaze.Regression("R2").fit(s, rig).predict(seen, rig).point_mm for s in (seen, shifted))
+    np.testing.assert_allclose(b - a, np.broadcast_to([0.0, 10.0, 0.0], a.shape), atol=1e-9)
+    with pytest.raises(er.InputError, match="0 usable calibration targets"):
+        er.gaze.Regression("R2").fit(seen.with_targets([np.nan] * 3), rig)
+
+
+def test_points_without_a_finite_estimate_have_a_reason():
+    gaze = er.gaze.GazePoints.of([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0]])
+    assert gaze.status.tolist() == ["ok", "missing"]
+    assert gaze.reason.tolist() == [None, "the estimate is not finite"]
