@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from eyerender.optics.trace import RayStatus, inward_path, outward_path, trace
+from eyerender.optics.trace import inward_path, outward_path, trace
+from eyerender.status import Status
 
 WIDTH_MM = 6.6
 """Out to here the surfaces must not meet each other; exits beyond are not asked for."""
@@ -29,7 +30,7 @@ def misses(surfaces, indices, at, things, places):
     first = first / np.linalg.norm(first, axis=-1, keepdims=True)
     way = out.directions[-1]
     off = np.stack([np.sum(way * first, axis=-1), np.sum(way * np.cross(gap, first), axis=-1)], axis=-1)
-    ok = (out.status == RayStatus.OK) & (np.sum(way * gap, axis=-1) > 0.0)
+    ok = (out.status == Status.OK) & (np.sum(way * gap, axis=-1) > 0.0)
     return np.where(ok[:, None], off, np.nan), out.points_mm[-1]
 
 
@@ -79,7 +80,7 @@ def exhaustive(surfaces, indices, things, places, grid=61, tries=6, halvings=25)
     # The ray must be one on the way in, too: a sheet is crossed from its front.
     way = points - places
     back = trace(inward_path(surfaces, indices), 1.0, places, way / np.linalg.norm(way, axis=-1, keepdims=True))
-    good = (size_of(off) < 1e-11) & (back.status == RayStatus.OK)
+    good = (size_of(off) < 1e-11) & (back.status == Status.OK)
     good &= np.sum((things - back.points_mm[-1]) * back.directions[-1], axis=-1) > 0.0
     good &= np.hypot(points[:, 1], points[:, 2]) < WIDTH_MM
     points = np.where(good[:, None], points, np.nan).reshape(-1, tries, 3)

@@ -17,22 +17,20 @@ import numpy.typing as npt
 from ..arrays import ArrayValue, Bools, Floats, Indices, Statuses, frozen
 from ..errors import InputError
 from ..eye.batch import stack_eyes, structure_of, take_eyes
-from ..eye.fixation import Fixations, FixationStatus, LineOfSightKind, fixate
+from ..eye.fixation import Fixations, LineOfSightKind, fixate
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
 from ..geometry.ellipse import fit_ellipse_direct
 from ..geometry.surfaces import Xyz
 from ..observation import MAX_BOUNDARY_POINTS, MAX_POINTS
-from ..optics.trace import RayStatus
 from ..rig.camera import PinholeCamera, distort
+from ..status import Status
 from .rays import glint_exits, pupil_exits
 
 CHUNK_POINTS = 12000
 """Points refracted at once: fewer leave the time to the interpreter, more leave the cache (measured: 8,000 to
 20,000).
 """
-BEHIND_CAMERA = 100
-"""Status beside those of `RayStatus`: the point lies behind the camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,7 +189,7 @@ def features(
 
 def reason_of(status: int) -> str | None:
     """A point's status in words; None where nothing is wrong."""
-    return "behind the camera" if status == BEHIND_CAMERA else RayStatus(status).reason
+    return Status(status).reason
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,8 +235,8 @@ class _View:
         r, t = self.rotation[:, :, :, None], self.translation[:, :, None]
         x, y, z = points
         depth = r[:, 2, 0] * x + r[:, 2, 1] * y + r[:, 2, 2] * z + t[:, 2]
-        status = np.where((status == RayStatus.OK) & ~(depth > 0.0), np.int8(BEHIND_CAMERA), status)
-        inverse = 1.0 / np.where(status == RayStatus.OK, depth, np.nan)
+        status = np.where((status == Status.OK) & ~(depth > 0.0), np.int8(Status.BEHIND_CAMERA), status)
+        inverse = 1.0 / np.where(status == Status.OK, depth, np.nan)
         u = (r[:, 0, 0] * x + r[:, 0, 1] * y + r[:, 0, 2] * z + t[:, 0]) * inverse
         v = (r[:, 1, 0] * x + r[:, 1, 1] * y + r[:, 1, 2] * z + t[:, 1]) * inverse
         camera = self.camera
@@ -287,4 +285,4 @@ def _pose_rows(poses: Poses, rows: Indices) -> Poses:
 FEW_EYES = 4
 """Up to so many different eyes are traced one after the other with plain numbers; more are stacked."""
 
-__all__ = ["Features", "FixationStatus", "features", "fixations", "reason_of"]
+__all__ = ["Features", "features", "fixations", "reason_of"]

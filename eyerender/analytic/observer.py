@@ -10,11 +10,11 @@ import numpy as np
 
 from ..arrays import Bools, Floats, frozen
 from ..errors import InputError
-from ..eye.fixation import FixationStatus
 from ..eye.pose import Poses, listing_torsion
 from ..geometry.ellipse import fit_ellipse_direct
 from ..observation import EYES, MISSING, OK, PARTIAL, GlintFeatures, Observations, PoseTruth, PupilFeatures
 from ..scene import Frames, Scene
+from ..status import Status
 from .features import Features, features, fixations, reason_of
 
 ARC_POINTS = 6
@@ -107,7 +107,7 @@ def poses_of(scene: Scene, frames: Frames) -> PoseTruth:
             index.eye_position_mm[rows] + index.head_mm[rows],
             scene.spec.eye.line_of_sight,
         )
-        bad = np.flatnonzero(found.status != FixationStatus.OK)
+        bad = np.flatnonzero(found.status != Status.OK)
         if len(bad):
             row = rows[bad[0]]
             target = ", ".join(f"{v:g}" for v in index.target_mm[row])

@@ -10,7 +10,7 @@ from ..geometry.surfaces import Xyz, components, fit, join, shift, turn
 from ..optics.interface import dot
 from ..optics.purkinje import purkinje_points
 from ..optics.solve import mirrored_rays, refracted_rays
-from ..optics.trace import RayStatus, mark
+from ..status import Status, mark
 
 _AHEAD_MM = 500.0
 _ASIDE = 0.1
@@ -42,9 +42,9 @@ def pupil_exits(eye: EyeModel, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats,
     if aside.any():
         nx, ny, nz = (fit(eye.stop.normal[..., i], 2) for i in range(3))
         rises = nx * found.end[0] + ny * found.end[1] + nz * found.end[2] < 0.0
-        mark(status, aside[:, None] & ~rises, RayStatus.BEHIND_IRIS)
-        mark(status, aside[:, None] & _meets_sclera(eye, found.exit, found.way), RayStatus.BEHIND_SCLERA)
-    status[hidden] = RayStatus.BEHIND_IRIS
+        mark(status, aside[:, None] & ~rises, Status.BEHIND_IRIS)
+        mark(status, aside[:, None] & _meets_sclera(eye, found.exit, found.way), Status.BEHIND_SCLERA)
+    status[hidden] = Status.BEHIND_IRIS
     residual[hidden] = np.nan
     return found.exit, residual, status
 
@@ -60,7 +60,7 @@ def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tu
     """
     if order not in eye.purkinje_orders:
         nothing = np.full(lights_mm[0].shape, np.nan)
-        status = np.full(nothing.shape, RayStatus.MISSED, dtype=np.int8)
+        status = np.full(nothing.shape, Status.MISSED, dtype=np.int8)
         return (nothing, nothing, nothing), nothing, status
     if order == 1:
         place = (camera_mm[0][:, None], camera_mm[1][:, None], camera_mm[2][:, None])
@@ -79,9 +79,7 @@ def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tu
     )
     status = found.status
     if order > 2:
-        status = np.where(
-            (status == RayStatus.OK) & ~eye.stop.lets_through(found.course_mm), RayStatus.BEHIND_IRIS, status
-        )
+        status = np.where((status == Status.OK) & ~eye.stop.lets_through(found.course_mm), Status.BEHIND_IRIS, status)
     return components(found.exit_points_mm), found.residual_mm, status.astype(np.int8)
 
 

@@ -16,7 +16,6 @@ the fovea. (gkaModelEye's definition, Aguirre 2019, "A model of the entrance pup
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Literal
 
 import numpy as np
@@ -27,7 +26,8 @@ from ..errors import InputError
 from ..geometry.surfaces import Xyz, components, join
 from ..geometry.transforms import normalize
 from ..optics.solve import apparent_points
-from ..optics.trace import RayStatus, trace
+from ..optics.trace import trace
+from ..status import Status
 from .landmarks import path_to_retina
 from .model import EyeModel
 from .pose import Poses, Turning, into_eye
@@ -43,35 +43,12 @@ WINDOW_POINTS = 6
 _STEPS = 20
 
 
-class FixationStatus(IntEnum):
-    """Whether a target can be fixated."""
-
-    OK = 0
-    TARGET_TOO_NEAR = 1
-    OUT_OF_REACH = 2
-    NO_LINE_OF_SIGHT = 3
-    NOT_CONVERGED = 4
-
-    @property
-    def reason(self) -> str | None:
-        """The status in words; None where nothing is wrong."""
-        return _REASONS.get(self)
-
-
-_REASONS = {
-    FixationStatus.TARGET_TOO_NEAR: "the target lies inside the eye",
-    FixationStatus.OUT_OF_REACH: "the target is out of reach of the eye's rotation",
-    FixationStatus.NO_LINE_OF_SIGHT: "no line of sight joins the target and the fovea",
-    FixationStatus.NOT_CONVERGED: "the solver did not converge",
-}
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Fixations(ArrayValue):
     """A batch of fixations, leading axis n.
 
     poses; residual_mm (n,): by how much the line of sight misses (chief ray: the target; entrance window: the fovea);
-    status (n,) of `FixationStatus`; line_of_sight_mm (n, 3): the point of the unturned eye where the line of sight
+    status (n,): `Status`; line_of_sight_mm (n, 3): the point of the unturned eye where the line of sight
     meets the cornea; line_of_sight_direction (n, 3): unit, from there to the target, in the eye-fixed frame.
     """
 
@@ -83,7 +60,7 @@ class Fixations(ArrayValue):
 
     def reason(self, item: int) -> str | None:
         """Why fixation `item` failed; None if it did not."""
-        return FixationStatus(int(self.status[item])).reason
+        return Status(int(self.status[item])).reason
 
     def __len__(self) -> int:
         return len(self.residual_mm)
@@ -112,7 +89,7 @@ def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:
     point, direction = eye.chief_ray.point_mm, eye.chief_ray.direction
     azimuth, elevation, miss, ahead = _turn_line(eye, components(target_mm), _split(point), _split(direction))
     status = _status(target_mm, azimuth, elevation, miss)
-    status[(status == FixationStatus.OK) & ~(ahead > 0.0)] = FixationStatus.TARGET_TOO_NEAR
+    status[(status == Status.OK) & ~(ahead > 0.0)] = Status.TARGET_TOO_NEAR
     poses = Poses.listing(azimuth, elevation)
     return Fixations(
         poses,
@@ -191,7 +168,7 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
     """Broyden on the pose, started at the chief ray's; the error is the miss at the fovea across the line of sight."""
     start = _by_chief_ray(eye, target_mm)
     angles = np.stack([start.poses.azimuth_rad, start.poses.elevation_rad], axis=-1)
-    ok = start.status == FixationStatus.OK
+    ok = start.status == Status.OK
     angles = np.where(ok[:, None], angles, 0.0)
     miss, entry, way, lost = _window_miss(eye, target_mm, angles)
     slope = np.stack(
@@ -215,7 +192,7 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
         miss = new
     residual = np.linalg.norm(miss, axis=-1)
     status = np.where(ok, _status(target_mm, angles[:, 0], angles[:, 1], residual), start.status).astype(np.int8)
-    status[ok & lost] = FixationStatus.NO_LINE_OF_SIGHT
+    status[ok & lost] = Status.NO_LINE_OF_SIGHT
     return Fixations(Poses.listing(angles[:, 0], angles[:, 1]), residual, status, entry, way)
 
 
@@ -226,7 +203,7 @@ def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floa
     centre, lost = entrance_window_centre(eye, seen)
     direction = normalize(centre - seen)
     traced = trace(path_to_retina(eye), 1.0, seen, direction)
-    lost = lost | (traced.status != RayStatus.OK)
+    lost = lost | (traced.status != Status.OK)
     first, second = _tangents(_split(eye.chief_ray.direction))
     gap = traced.points_mm[-1] - eye.fovea_mm
     miss = np.stack([_dot(first, _split(gap)), _dot(second, _split(gap))], axis=-1)
@@ -257,7 +234,7 @@ def _mean_ray(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Floats, Bool
     """Mean exit point and mean direction (n, 3) of the rays from the stop's margin, and where one does not exist."""
     margin = eye.stop.boundary(WINDOW_POINTS)
     found = apparent_points(eye.front, eye.front_indices, margin, viewpoint_mm[:, None, :])
-    lost = (found.status != RayStatus.OK).any(axis=1)
+    lost = (found.status != Status.OK).any(axis=1)
     return np.mean(found.exit_points_mm, axis=1), np.mean(found.directions, axis=1), lost
 
 
@@ -268,11 +245,11 @@ def _to_the_axis(point: Floats, way: Floats) -> Floats:
 
 
 def _status(target_mm: Floats, azimuth: Floats, elevation: Floats, residual: Floats) -> Statuses:
-    status = np.full(residual.shape, int(FixationStatus.OK), dtype=np.int8)
-    status[~(residual <= RESIDUAL_LIMIT_MM)] = FixationStatus.NOT_CONVERGED
+    status = np.full(residual.shape, int(Status.OK), dtype=np.int8)
+    status[~(residual <= RESIDUAL_LIMIT_MM)] = Status.NOT_CONVERGED
     turned = ~((np.abs(azimuth) <= REACH_RAD) & (np.abs(elevation) <= REACH_RAD))
-    status[turned] = FixationStatus.OUT_OF_REACH
-    status[(target_mm[:, 0] < 0.0) & (status == FixationStatus.NOT_CONVERGED)] = FixationStatus.OUT_OF_REACH
+    status[turned] = Status.OUT_OF_REACH
+    status[(target_mm[:, 0] < 0.0) & (status == Status.NOT_CONVERGED)] = Status.OUT_OF_REACH
     return status
 
 

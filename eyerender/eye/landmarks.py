@@ -13,7 +13,8 @@ from ..geometry.surfaces import components, join
 from ..geometry.transforms import normalize, read_only
 from ..optics.gradient import GradientMedium
 from ..optics.shooting import connect
-from ..optics.trace import Crossing, RayStatus, Traced, outward_path, trace
+from ..optics.trace import Crossing, Traced, outward_path, trace
+from ..status import Status
 from .model import EyeModel, LineOfSight
 
 NODE_RING_DEG = 14.3
@@ -29,7 +30,7 @@ def path_to_retina(eye: EyeModel) -> tuple[Crossing, ...]:
     return (
         *(Crossing(s, n) for s, n in zip(eye.front, eye.front_indices, strict=True)),
         *(
-            Crossing(s, n, rim_mm=rim, beyond_rim=None if passing else RayStatus.MISSED, through=through)
+            Crossing(s, n, rim_mm=rim, beyond_rim=None if passing else Status.MISSED, through=through)
             for s, n, rim, passing, through in lens
         ),
         Crossing(eye.retina, last),
@@ -75,7 +76,7 @@ def _parallel_rays(path: Sequence[Crossing], objects_mm: Floats, direction: Floa
         traced = trace(path, 1.0, np.broadcast_to(objects_mm, bundle.shape), normalize(bundle))
         turn = traced.directions[-1] - traced.directions[0]
         error = np.stack([np.sum(turn * first, -1), np.sum(turn * second, -1)], axis=-1)
-        ok = (traced.status == RayStatus.OK).all(axis=0)
+        ok = (traced.status == Status.OK).all(axis=0)
         size = np.where(ok, np.linalg.norm(error[0], axis=-1), np.inf)
         retina = traced.points_mm[-1, 0]
         slope = np.stack([(error[1] - error[0]) / _STEP, (error[2] - error[0]) / _STEP], axis=-1)
@@ -91,9 +92,7 @@ def _parallel_rays(path: Sequence[Crossing], objects_mm: Floats, direction: Floa
 def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
     """The crossings that one traced ray (leading shape (1,)) really met, now without rims."""
     moved = np.linalg.norm(np.diff(traced.points_mm[:, 0], axis=0), axis=-1) > 0.0
-    return tuple(
-        replace(c, rim_mm=np.inf, beyond_rim=RayStatus.MISSED) for c, met in zip(path, moved, strict=True) if met
-    )
+    return tuple(replace(c, rim_mm=np.inf, beyond_rim=Status.MISSED) for c, met in zip(path, moved, strict=True) if met)
 
 
 def incident_node(eye: EyeModel) -> Floats:
@@ -139,7 +138,7 @@ def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
     if eye.back:
         path = [
             Crossing(
-                surface, n, inward=False, rim_mm=rim, beyond_rim=None if passing else RayStatus.MISSED, through=through
+                surface, n, inward=False, rim_mm=rim, beyond_rim=None if passing else Status.MISSED, through=through
             )
             for surface, n, rim, passing, through in zip(
                 reversed(eye.back),
@@ -152,16 +151,16 @@ def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
         ]
         start, target = components(fovea_mm[None]), components(centre[None])
         found = connect(path, eye.back_indices[-1], start, target, target)
-        if found.status[0] == RayStatus.NOT_CONVERGED and any(eye.back_passing):
+        if found.status[0] == Status.NOT_CONVERGED and any(eye.back_passing):
             met = crossed(path, trace(path, eye.back_indices[-1], fovea_mm[None], join(found.start)))
             found = connect(met, eye.back_indices[-1], start, target, target)
-        if found.status[0] != RayStatus.OK:
+        if found.status[0] != Status.OK:
             raise InputError("no ray joins the fovea and the centre of the stop", path="fovea")
         direction = join(found.end)[0]
     else:
         direction = normalize(centre - fovea_mm)
     traced = trace(outward_path(eye.front, eye.front_indices), eye.front_indices[-1], centre, direction)
-    if traced.status != RayStatus.OK:
+    if traced.status != Status.OK:
         raise InputError("the chief ray does not leave the eye", path="fovea")
     return LineOfSight(read_only(traced.points_mm[-1]), read_only(traced.directions[-1]))
 

@@ -24,10 +24,11 @@ import numpy.typing as npt
 from ..arrays import ArrayValue, Bools, FloatLike, Floats, Indices, Statuses
 from ..geometry.surfaces import Surface, components, join
 from ..geometry.transforms import normalize
+from ..status import Status
 from .gradient import GradientMedium
 from .shooting import Corrected, correct, taken
 from .solve import apex_of
-from .trace import Crossing, RayStatus, trace
+from .trace import Crossing, trace
 
 FIRST_STEP = 0.125
 SHORTEST_STEP = 2.0**-14
@@ -71,7 +72,7 @@ def purkinje_path(
     """
 
     def crossing(k: int, n_after: FloatLike, inward: bool) -> Crossing:
-        edge = RayStatus.OUTSIDE_LIMBUS if k == 0 else RayStatus.MISSED
+        edge = Status.OUTSIDE_LIMBUS if k == 0 else Status.MISSED
         through = gradient if k == last - 1 and not inward else None
         return Crossing(surfaces[k], n_after, inward, False, rims_mm[k], None if passing[k] else edge, through)
 
@@ -79,7 +80,7 @@ def purkinje_path(
     before = [n_outside, *indices]
     return (
         *(crossing(k, indices[k], True) for k in range(last)),
-        Crossing(surfaces[last], 1.0, True, True, rims_mm[last], RayStatus.NO_MIRROR_POINT, gradient),
+        Crossing(surfaces[last], 1.0, True, True, rims_mm[last], Status.NO_MIRROR_POINT, gradient),
         *(crossing(k, before[k], False) for k in reversed(range(last))),
     )
 
@@ -169,30 +170,30 @@ def _followed(path: Sequence[Crossing], n_outside: float, route: _Route) -> Purk
 
     everything = np.arange(count)
     found = sought(everything, t, exits)
-    good = found.status == RayStatus.OK
+    good = found.status == Status.OK
     accept(everything, found, good)
-    status = np.where(good, RayStatus.OK, RayStatus.NOT_CONVERGED).astype(np.int8)
-    while len(rows := np.flatnonzero((status == RayStatus.OK) & (t < 1.0))):
+    status = np.where(good, Status.OK, Status.NOT_CONVERGED).astype(np.int8)
+    while len(rows := np.flatnonzero((status == Status.OK) & (t < 1.0))):
         here, stride = t[rows], np.minimum(step[rows], 1.0 - t[rows])
         past = here - t_before[rows]
         slope = (exits[rows] - before[rows]) / np.where(past > 0.0, past, np.inf)[:, None]
         found = sought(rows, here + stride, exits[rows] + stride[:, None] * slope)
-        good = (found.status == RayStatus.OK) & (found.determinant_mm2_sr * tube[rows] > 0.0)
+        good = (found.status == Status.OK) & (found.determinant_mm2_sr * tube[rows] > 0.0)
         accept(rows, found, good)
         t_before[rows[good]], t[rows[good]] = here[good], (here + stride)[good]
         step[rows] = np.where(good, 2.0 * stride, 0.5 * stride)
         lost = ~good & (step[rows] < SHORTEST_STEP)
         folded = np.abs(tube[rows]) < FOLD * largest[rows]
-        ended = lost & (folded | (found.status == RayStatus.MISSED) | (found.status == RayStatus.TOTAL_REFLECTION))
-        status[rows[lost]] = RayStatus.NOT_CONVERGED
-        status[rows[ended]] = RayStatus.NO_MIRROR_POINT
-    ok = status == RayStatus.OK
+        ended = lost & (folded | (found.status == Status.MISSED) | (found.status == Status.TOTAL_REFLECTION))
+        status[rows[lost]] = Status.NOT_CONVERGED
+        status[rows[ended]] = Status.NO_MIRROR_POINT
+    ok = status == Status.OK
     # The rims count only for the ray that is left.
     traced = trace(
         path, n_outside, route.apex + route.viewpoint, np.where(ok[:, None], way, -normalize(route.viewpoint))
     )
     status = np.where(ok, traced.status, status)
-    none = (status != RayStatus.OK)[:, None]
+    none = (status != Status.OK)[:, None]
     point, exits, way = (np.where(none, np.nan, value) for value in (point, exits, -way))
     course = np.where(none, np.nan, traced.points_mm[1:])
     return PurkinjePoints(point, exits, way, course, np.where(none[:, 0], np.nan, residual), status)

@@ -23,8 +23,9 @@ import numpy as np
 
 from ..arrays import Bools, FloatLike, Floats, Indices, Statuses
 from ..geometry.surfaces import Xyz, fit
+from ..status import Status, mark
 from .interface import dot
-from .trace import BEHIND_MM, Crossing, RayStatus, inside_rim, mark
+from .trace import BEHIND_MM, Crossing, inside_rim
 
 SETTLED_MM = 1e-12
 """Newton stops where a ray misses by no more than this and what one rounding of the direction makes at the target."""
@@ -101,15 +102,15 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
     direction = _unit(_minus(_spread(aim, shape), source))
     shot = _shoot(path, n_start, source, direction, target)
     for _ in range(_FAST_STEPS):
-        if not ((shot.status == RayStatus.OK) & ~_settled(shot, 1.0)).any():
+        if not ((shot.status == Status.OK) & ~_settled(shot, 1.0)).any():
             break
         direction = _stepped(direction, shot, 1.0)
         shot = _shoot(path, n_start, source, direction, target)
-    settled = (shot.status == RayStatus.OK) & _settled(shot, 100.0)
+    settled = (shot.status == Status.OK) & _settled(shot, 100.0)
     if not settled.all():
         direction, shot = _rescue(path, n_start, source, target, _spread(aim, shape), direction, shot, ~settled)
     status = shot.status.copy()
-    mark(status, ~(shot.residual_mm <= RESIDUAL_LIMIT_MM), RayStatus.NOT_CONVERGED)
+    mark(status, ~(shot.residual_mm <= RESIDUAL_LIMIT_MM), Status.NOT_CONVERGED)
     for crossing, point in zip((path[0], path[-1]), (shot.first, shot.last), strict=True):
         if crossing.beyond_rim is not None:
             mark(status, ~inside_rim(crossing, point), crossing.beyond_rim)
@@ -138,12 +139,12 @@ def correct(
     direction = _unit(_minus(aim, source))
     shot = _shoot(path, n_start, source, direction, target)
     for _ in range(steps):
-        if not ((shot.status == RayStatus.OK) & ~_settled(shot, 1.0)).any():
+        if not ((shot.status == Status.OK) & ~_settled(shot, 1.0)).any():
             break
         direction = _stepped(direction, shot, 1.0)
         shot = _shoot(path, n_start, source, direction, target)
     settled = _settled(shot, 100.0) & (shot.residual_mm <= RESIDUAL_LIMIT_MM)
-    mark(shot.status, ~settled, RayStatus.NOT_CONVERGED)
+    mark(shot.status, ~settled, Status.NOT_CONVERGED)
     return Corrected(direction, shot.first, shot.last, shot.turning, shot.residual_mm, shot.determinant, shot.status)
 
 
@@ -195,7 +196,7 @@ def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction:
             if crossing.beyond_rim is None:
                 skip = ~(met & inside_rim(crossing, hit.point))
             else:
-                mark(status, ~met, RayStatus.MISSED)
+                mark(status, ~met, Status.MISSED)
             scale = 1.0 / np.sqrt(dot(hit.gradient, hit.gradient))
             normal = (hit.gradient[0] * scale, hit.gradient[1] * scale, hit.gradient[2] * scale)
             cosine = -dot(way, normal)
@@ -209,7 +210,7 @@ def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction:
                 eta = index / after
                 square = 1.0 - eta * eta * (1.0 - cosine * cosine)
                 blocked = ~(square > 0.0)
-                mark(status, blocked if skip is None else blocked & ~skip, RayStatus.TOTAL_REFLECTION)
+                mark(status, blocked if skip is None else blocked & ~skip, Status.TOTAL_REFLECTION)
                 root = np.copysign(np.sqrt(np.maximum(square, 0.0)), cosine)
                 factor = eta * cosine - root
                 slope = eta - eta * eta * cosine / root
@@ -246,9 +247,9 @@ def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction:
         a1, a2 = _moved(moves[0], turns[0], along), _moved(moves[1], turns[1], along)
         residual = np.sqrt(dot(miss, miss)) * nearness(along)
         determinant = _triple(way, a1, a2)
-    mark(status, ~np.isfinite(residual), RayStatus.MISSED)
+    mark(status, ~np.isfinite(residual), Status.MISSED)
     # The target lies ahead in the last medium, or the ray would have to run backwards to it.
-    mark(status, along < -BEHIND_MM, RayStatus.MISSED)
+    mark(status, along < -BEHIND_MM, Status.MISSED)
     return _Shot(first or point, point, turning or point, way, along, miss, residual, (a1, a2), determinant, status)
 
 
@@ -293,7 +294,7 @@ def _rescue(
         way, trial = _guarded(few_path, few_start, few_source, few_target, way, trial, done)
         better = ~done & _better(trial, best)
         best_way, best = _choose(~better, best_way, way), _merge(better, trial, best)
-        done = (best.status == RayStatus.OK) & _settled(best, 100.0)
+        done = (best.status == Status.OK) & _settled(best, 100.0)
         if done.all():
             break
     return _put(direction, best_way, index), _merge_at(shot, best, index)
@@ -304,7 +305,7 @@ def _guarded(
 ) -> tuple[Xyz, _Shot]:
     """Newton with steps halved until the miss shrinks."""
     for _ in range(_GUARDED_STEPS):
-        active = ~done & (shot.status == RayStatus.OK) & ~_settled(shot, 1.0)
+        active = ~done & (shot.status == Status.OK) & ~_settled(shot, 1.0)
         if not active.any():
             break
         fraction = np.ones(active.shape)
@@ -312,7 +313,7 @@ def _guarded(
         for _ in range(_RETREATS):
             trial_way = _stepped(way, shot, np.where(active & ~moved, fraction, 0.0))
             trial = _shoot(path, n_start, source, trial_way, target)
-            accept = active & ~moved & (trial.status == RayStatus.OK) & (trial.residual_mm < shot.residual_mm)
+            accept = active & ~moved & (trial.status == Status.OK) & (trial.residual_mm < shot.residual_mm)
             way, shot = _choose(~accept, way, trial_way), _merge(accept, trial, shot)
             moved |= accept
             if (moved | ~active).all():
@@ -330,7 +331,7 @@ def _settled(shot: _Shot, slack: float) -> Bools:
 
 
 def _better(trial: _Shot, best: _Shot) -> Bools:
-    ok, held = trial.status == RayStatus.OK, best.status == RayStatus.OK
+    ok, held = trial.status == Status.OK, best.status == Status.OK
     return np.asarray((ok & ~held) | ((ok == held) & (trial.residual_mm < best.residual_mm)))
 
 

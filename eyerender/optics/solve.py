@@ -20,10 +20,11 @@ import numpy.typing as npt
 from ..arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
 from ..geometry.graphs import Graph, graphs_of
 from ..geometry.surfaces import Surface, Xyz, components, fit, join, shift, turn, turn_back
+from ..status import Status, mark
 from .fermat import stationary_path
 from .interface import dot
 from .shooting import RESIDUAL_LIMIT_MM, Connection, connect, nearness, taken
-from .trace import Crossing, RayStatus, cross, inside_rim, mark, outward_path, trace
+from .trace import Crossing, cross, inside_rim, outward_path, trace
 
 SURE_MM = 1e-11
 """A path that its traced ray confirms to this is taken as found; rounding stays well below."""
@@ -111,7 +112,7 @@ def refracted_rays(
 ) -> Rays:
     """`apparent_points` on components."""
     path = [
-        Crossing(surface, index, rim_mm=rim_mm if k == 0 else np.inf, beyond_rim=RayStatus.OUTSIDE_LIMBUS)
+        Crossing(surface, index, rim_mm=rim_mm if k == 0 else np.inf, beyond_rim=Status.OUTSIDE_LIMBUS)
         for k, (surface, index) in enumerate(zip(surfaces, indices, strict=True))
     ]
     ndim = max(target[0].ndim, viewpoint[0].ndim)
@@ -132,7 +133,7 @@ def refracted_rays(
 
 def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: FloatLike = np.inf) -> Rays:
     """`mirror_points` on components."""
-    path = (Crossing(surface, 1.0, reflects=True, rim_mm=rim_mm, beyond_rim=RayStatus.OUTSIDE_LIMBUS),)
+    path = (Crossing(surface, 1.0, reflects=True, rim_mm=rim_mm, beyond_rim=Status.OUTSIDE_LIMBUS),)
     guess = mirror_start(surface, source, viewpoint)
     frame = graphs_of([surface], guess[0].ndim)
     if frame is None:
@@ -192,9 +193,9 @@ def _confirmed(
         found &= (residual <= reach) & (along > 0.0)
     status = np.zeros(residual.shape, dtype=np.int8)
     if hopeless is not None:
-        status[hopeless & ~found] = path[0].beyond_rim or RayStatus.MISSED
+        status[hopeless & ~found] = path[0].beyond_rim or Status.MISSED
         found |= hopeless
-    mark(status, ~inside_rim(path[0], first), path[0].beyond_rim or RayStatus.MISSED)
+    mark(status, ~inside_rim(path[0], first), path[0].beyond_rim or Status.MISSED)
     rays = Rays(first, way, end, residual, status)
     return rays if found.all() else _searched(path, n_start, viewpoint, target, aim, rays, ~found)
 
@@ -204,7 +205,7 @@ def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target
 
     A cone of rays is launched from it; those that leave closest to the viewpoint's direction start a search each.
     """
-    lost = (rays.status != RayStatus.OK) & (rays.status != RayStatus.OUTSIDE_LIMBUS)
+    lost = (rays.status != Status.OK) & (rays.status != Status.OUTSIDE_LIMBUS)
     if not lost.any():
         return rays
     shape = lost.shape or (1,)
@@ -220,12 +221,12 @@ def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target
         gap = places[part, None, :] - out.points_mm[-1]
         with np.errstate(all="ignore"):
             cosine = np.sum(gap * out.directions[-1], axis=-1) / np.linalg.norm(gap, axis=-1)
-        order = np.argsort(np.where(out.status == RayStatus.OK, -cosine, 2.0), axis=1)
+        order = np.argsort(np.where(out.status == Status.OK, -cosine, 2.0), axis=1)
         index = tuple(axis[part] for axis in rows)
         for best in order[:, :_TRIED].T:
             aim = ends[part] + _CONE[best]
             shot = connect(outward, indices[-1], components(ends[part]), components(places[part]), components(aim))
-            good = ~found[index] & (shot.status == RayStatus.OK)
+            good = ~found[index] & (shot.status == Status.OK)
             aims[index] = np.where(good[:, None], join(shot.last), aims[index])
             found[index] |= good
             if found[index].all():

@@ -4,44 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
 from ..geometry.surfaces import Surface, Xyz, components, fit, join
+from ..status import Status, mark
 from .gradient import GradientMedium
 from .interface import dot, reflect, refract
-
-
-class RayStatus(IntEnum):
-    """What became of a ray, or of the search for one."""
-
-    OK = 0
-    MISSED = 1
-    TOTAL_REFLECTION = 2
-    OUTSIDE_LIMBUS = 3
-    BEHIND_IRIS = 4
-    NOT_CONVERGED = 5
-    NO_MIRROR_POINT = 6
-    BEHIND_SCLERA = 7
-
-    @property
-    def reason(self) -> str | None:
-        """The status in words; None where nothing is wrong."""
-        return _REASONS.get(self)
-
-
-_REASONS = {
-    RayStatus.MISSED: "the ray misses a surface",
-    RayStatus.TOTAL_REFLECTION: "total reflection",
-    RayStatus.OUTSIDE_LIMBUS: "outside the limbus",
-    RayStatus.BEHIND_IRIS: "behind the iris",
-    RayStatus.NOT_CONVERGED: "the solver did not converge",
-    RayStatus.NO_MIRROR_POINT: "no point of the surface mirrors the light to the viewpoint",
-    RayStatus.BEHIND_SCLERA: "behind the sclera",
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +33,7 @@ class Crossing:
     inward: bool = True
     reflects: bool = False
     rim_mm: FloatLike = np.inf
-    beyond_rim: RayStatus | None = RayStatus.MISSED
+    beyond_rim: Status | None = Status.MISSED
     through: GradientMedium | None = None
 
 
@@ -125,9 +96,9 @@ def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLik
             after = np.where(within, after, index)
         else:
             moved, turned = hit.point, way
-            mark(status, ~met, RayStatus.MISSED)
+            mark(status, ~met, Status.MISSED)
             mark(status, met & ~within, crossing.beyond_rim)
-        mark(status, ~passes, RayStatus.TOTAL_REFLECTION)
+        mark(status, ~passes, Status.TOTAL_REFLECTION)
         length = length + index * step
         point, direction = (moved[0], moved[1], moved[2]), (turned[0], turned[1], turned[2])
         index = after
@@ -164,11 +135,6 @@ def inside_rim(crossing: Crossing, point: Xyz) -> Bools:
     limit = rim if isinstance(rim, float) else fit(np.asarray(rim), point[0].ndim)
     with np.errstate(invalid="ignore"):
         return np.asarray(crossing.surface.axis_distance(point) <= limit)
-
-
-def mark(status: Statuses, where: Bools, value: RayStatus) -> None:
-    """Set `value` where nothing has gone wrong before (in place: `status` belongs to the caller)."""
-    status[(status == RayStatus.OK) & where] = value
 
 
 BEHIND_MM = 1e-9

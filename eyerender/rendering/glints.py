@@ -26,9 +26,10 @@ from ..geometry.transforms import normalize
 from ..optics.interface import fresnel
 from ..optics.shooting import ray_tube
 from ..optics.solve import mirrored_rays
-from ..optics.trace import Crossing, RayStatus
+from ..optics.trace import Crossing
 from ..rig.camera import PinholeCamera
 from ..rig.light import Lamp
+from ..status import Status
 from .frame import ring_radius_mm
 
 Visibility = Callable[[Floats, Floats], Bools]
@@ -118,7 +119,7 @@ class GlintScene:
         sources = (points - self.t) @ self.M
         lamp_xyz, node_xyz = components(sources), components(np.broadcast_to(eyepoint, sources.shape))
         rays = mirrored_rays(self.surface, lamp_xyz, node_xyz, rim_mm=self.limbus_radius_mm)
-        found = np.asarray(rays.status == RayStatus.OK)
+        found = np.asarray(rays.status == Status.OK)
         mirror = (Crossing(self.surface, 1.0, reflects=True),)
         J = ray_tube(mirror, 1.0, node_xyz, rays.way, lamp_xyz).cross_section_mm2_sr
         # The solver's ray runs from the camera to the lamp, the light the other way.

@@ -16,9 +16,9 @@ from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses
 from eyerender.gaze.regression import pupil_glint_vectors
 from eyerender.observation import MISSING, OK, PARTIAL, Observations
-from eyerender.optics.trace import RayStatus
 from eyerender.rig.camera import PinholeCamera
 from eyerender.scene import Scene, SceneSpec
+from eyerender.status import Status
 
 
 def looking_at(place):
@@ -80,7 +80,7 @@ def test_beyond_90_degrees_is_seen_what_physics_lets_be_seen(name):
     )
     found = pupil_features(seen)
     expected = np.array([visible(eye, eye.stop.boundary(12), place) for place in places])
-    assert np.array_equal(seen.point_status == RayStatus.OK, expected)
+    assert np.array_equal(seen.point_status == Status.OK, expected)
     assert np.array_equal(found.status == OK, expected.all(axis=1))
     assert np.array_equal(found.status == MISSING, ~expected.any(axis=1))
     assert {OK, PARTIAL, MISSING} == set(found.status)
@@ -116,7 +116,7 @@ def test_the_ellipse_of_arcs_is_near_that_of_the_whole_outline():
     )
     for hidden, fitted in ((range(3, 12), True), (range(9), True), (range(10), False), (range(25), False)):
         status, points = seen.point_status.copy(), seen.points_px.copy()
-        status[0, list(hidden)], points[0, list(hidden)] = RayStatus.OUTSIDE_LIMBUS, np.nan
+        status[0, list(hidden)], points[0, list(hidden)] = Status.OUTSIDE_LIMBUS, np.nan
         part = pupil_features(replace(seen, point_status=status, points_px=points))
         assert part.status[0] == PARTIAL
         assert np.isfinite(part.arc_ellipse[0]).all() == fitted

@@ -14,7 +14,8 @@ from eyerender.errors import InputError
 from eyerender.eye.catalogue import FOLDER, catalogue_files, catalogue_names, load_eye
 from eyerender.eye.model import EyeSpec
 from eyerender.eye.shells import shelled
-from eyerender.optics.trace import RayStatus, trace
+from eyerender.optics.trace import trace
+from eyerender.status import Status
 
 NAMES = ("E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop")
 DATA = Path(__file__).resolve().parents[1] / "data"
@@ -149,7 +150,7 @@ def test_the_left_eye_is_the_mirror_image(name):
     way = (aim - start) / np.linalg.norm(aim - start, axis=1, keepdims=True)
     one = trace(path_to_retina(right), 1.0, start, way)
     other = trace(path_to_retina(left), 1.0, start * mirror, way * mirror)
-    assert (one.status == RayStatus.OK).all()
+    assert (one.status == Status.OK).all()
     assert np.allclose(other.points_mm, one.points_mm * mirror, atol=1e-11)
     for a, b in (
         (left.fovea_mm, right.fovea_mm),

@@ -12,12 +12,13 @@ from scipy.optimize import minimize_scalar
 from eyerender.errors import InputError
 from eyerender.eye.batch import stack_eyes
 from eyerender.eye.catalogue import catalogue_names, load_eye
-from eyerender.eye.fixation import RESIDUAL_LIMIT_MM, FixationStatus, entrance_window_centre, fixate
+from eyerender.eye.fixation import RESIDUAL_LIMIT_MM, entrance_window_centre, fixate
 from eyerender.eye.landmarks import field_direction, nodal_rays, path_to_retina
 from eyerender.eye.model import EyeSpec
 from eyerender.eye.pose import Poses, Turning, into_eye, rigid_motion
 from eyerender.geometry.surfaces import components, join
-from eyerender.optics.trace import RayStatus, trace
+from eyerender.optics.trace import trace
+from eyerender.status import Status
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 
@@ -119,7 +120,7 @@ def test_poses_by_entrance_window_agree_with_the_reference():
     expected = np.array([f["pose_azi_ele"] for f in data["fixations"]])
     torsion = np.array([f["pseudo_torsion"] for f in data["fixations"]])
     found = fixate(load_eye("E2").build(), [f["target_eye"] for f in data["fixations"]], "entrance_window")
-    assert (found.status == FixationStatus.OK).all()
+    assert (found.status == Status.OK).all()
     assert found.residual_mm.max() < 1e-9
     angles = np.degrees([found.poses.azimuth_rad, found.poses.elevation_rad]).T
     assert np.abs(angles - expected).max() < 1e-7
@@ -148,14 +149,14 @@ def test_the_chief_ray_runs_from_the_target_through_the_stops_centre_to_the_fove
     eye = load_eye(name).build(eye=side)
     goal = targets()
     found = fixate(eye, goal)
-    assert (found.status == FixationStatus.OK).all()
+    assert (found.status == Status.OK).all()
     assert found.residual_mm.max() < 1e-9
     # Traced afresh from the target, in the frame of the turned eye.
     start = join(into_eye(Turning.of(found.poses), eye, components(goal)))
     way = found.line_of_sight_mm - start
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     traced = trace(path_to_retina(eye), 1.0, start, way)
-    assert (traced.status == RayStatus.OK).all()
+    assert (traced.status == Status.OK).all()
     inside = traced.directions[len(eye.front)]
     gap = eye.stop.centre_mm - traced.points_mm[len(eye.front)]
     assert np.linalg.norm(np.cross(gap, inside), axis=1).max() < 1e-9
@@ -167,7 +168,7 @@ def test_the_entrance_window_reading_ends_on_the_fovea(name):
     eye = load_eye(name).build(eye="left")
     goal = targets(1, 40)
     found = fixate(eye, goal, "entrance_window")
-    assert (found.status == FixationStatus.OK).all()
+    assert (found.status == Status.OK).all()
     assert found.residual_mm.max() < RESIDUAL_LIMIT_MM
     start = join(into_eye(Turning.of(found.poses), eye, components(goal)))
     centre, _ = entrance_window_centre(eye, start)
@@ -212,11 +213,11 @@ def test_a_batch_of_eyes_fixates_as_its_members(e):
 def test_what_cannot_be_fixated_says_why(reading):
     eye = load_eye("E2").build()
     found = fixate(eye, [[600.0, 0.0, 0.0], [-600.0, 30.0, 10.0], [-8.0, 0.5, 0.0], [-13.5, 500.0, 0.0]], reading)
-    assert found.status[0] == FixationStatus.OK
+    assert found.status[0] == Status.OK
     assert found.reason(0) is None
-    assert (found.status[1:] != FixationStatus.OK).all()
+    assert (found.status[1:] != Status.OK).all()
     assert all(found.reason(k) for k in (1, 2, 3))
-    assert found.status[1] == FixationStatus.OUT_OF_REACH
+    assert found.status[1] == Status.OUT_OF_REACH
 
 
 def test_nonsense_is_refused():

@@ -10,7 +10,8 @@ from eyerender.geometry.surfaces_biconic import Biconic
 from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.geometry.transforms import tilt_rotation
 from eyerender.optics.solve import apparent_points
-from eyerender.optics.trace import RayStatus, inward_path, trace
+from eyerender.optics.trace import inward_path, trace
+from eyerender.status import Status
 
 
 def cornea(rng, biconics):
@@ -53,7 +54,7 @@ def check(biconics, seed, corneas, count=200):
         surfaces, indices = cornea(rng, biconics)
         things, places = scene(rng, count)
         found = apparent_points(surfaces, indices, things, places)
-        ok = found.status == RayStatus.OK
+        ok = found.status == Status.OK
         assert found.residual_mm[ok].max() < 1e-9
         # From near the surface: where a ray grazes it, the rounding of a far start moves the point where they meet.
         near = found.exit_points_mm[ok] + found.directions[ok]
@@ -61,7 +62,7 @@ def check(biconics, seed, corneas, count=200):
         sight = places[ok] - found.exit_points_mm[ok]
         sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
         assert np.linalg.norm(np.cross(sight, found.directions[ok]), axis=-1).max() < 1e-14
-        assert (traced.status == RayStatus.OK).all()
+        assert (traced.status == Status.OK).all()
         gap = things[ok] - traced.points_mm[-1]
         # A ray that grazes the surface meets it elsewhere at the least change of its height.
         cosine = np.sum(surfaces[0].normal(found.exit_points_mm[ok]) * found.directions[ok], axis=-1)
@@ -85,7 +86,7 @@ def test_a_ray_on_a_branch_of_its_own_is_found():
         surfaces, indices = cornea(rng, 3)
         things, places = scene(rng, 200)
     found = apparent_points(surfaces, indices, things[105], places[105])
-    assert found.status == RayStatus.OK
+    assert found.status == Status.OK
     assert np.abs(found.exit_points_mm - [-2.22377253, 5.64263656, 1.73530262]).max() < 1e-6
 
 
@@ -95,7 +96,7 @@ def test_the_exhaustive_search_finds_what_the_solver_finds():
     surfaces, indices = cornea(rng, 2)
     things, places = scene(rng, 40)
     found = apparent_points(surfaces, indices, things, places)
-    ok = found.status == RayStatus.OK
+    ok = found.status == Status.OK
     ok &= np.hypot(found.exit_points_mm[:, 1], found.exit_points_mm[:, 2]) < WIDTH_MM
     assert np.count_nonzero(ok) > 20
     points = exhaustive(surfaces, indices, things[ok], places[ok])

@@ -17,7 +17,8 @@ from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.geometry.transforms import normalize, rotation_z
 from eyerender.optics import gradient
 from eyerender.optics.gradient import GradientMedium
-from eyerender.optics.trace import RayStatus, trace
+from eyerender.optics.trace import trace
+from eyerender.status import Status
 
 
 @lru_cache
@@ -173,7 +174,7 @@ def test_shells_converge_to_the_gradient():
     ways = np.vstack([-line.direction, normalize(aim - start)])
     starts = np.broadcast_to(start, ways.shape)
     goal = trace(path_to_retina(eye), 1.0, starts, ways)
-    assert (goal.status == RayStatus.OK).all()
+    assert (goal.status == Status.OK).all()
     numbers = np.array([21, 84, 168, 336, 672, 1344])
     ends = [trace(path_to_retina(shelled(eye, int(n))), 1.0, starts, ways).points_mm[-1] for n in numbers]
     error = np.linalg.norm(np.array(ends) - goal.points_mm[-1], axis=-1).mean(axis=1)

@@ -9,7 +9,7 @@ import pytest
 
 from eyerender.eye.catalogue import load_eye
 from eyerender.optics.purkinje import purkinje_points
-from eyerender.optics.trace import RayStatus
+from eyerender.status import Status
 
 DISTANCE = 500.0
 # (radius, conic constant, apex) and the index behind, as the literature has them (Navarro 1985; Le Grand 1980).
@@ -111,7 +111,7 @@ def test_a_bundle_of_rays_finds_the_same_images_and_misses_the_same(name, order)
     view = away(np.zeros(len(tilts)), tilts, np.full(len(tilts), DISTANCE))
     light = away(np.zeros(len(tilts)), tilts + 4.0, np.full(len(tilts), 1.1 * DISTANCE))
     found = images(eye, order, light, view)
-    assert set(found.status) <= {RayStatus.OK, RayStatus.NO_MIRROR_POINT}
+    assert set(found.status) <= {Status.OK, Status.NO_MIRROR_POINT}
     count = 0
     for k in range(len(tilts)):
         place, lamp = view[k, [0, 2]], light[k, [0, 2]]
@@ -119,7 +119,7 @@ def test_a_bundle_of_rays_finds_the_same_images_and_misses_the_same(name, order)
         offset = np.linspace(-9.0, 9.0, 40001) / DISTANCE
         miss, height = plane.miss(place, lamp, straight + offset)
         change = np.flatnonzero((miss[:-1] * miss[1:] < 0) & (np.abs(np.diff(miss)) < 10))
-        assert (len(change) > 0) == (found.status[k] == RayStatus.OK), (tilts[k], found.status[k])
+        assert (len(change) > 0) == (found.status[k] == Status.OK), (tilts[k], found.status[k])
         if len(change):
             share = miss[change] / (miss[change] - miss[change + 1])
             roots = height[change] + share * (height[change + 1] - height[change])
@@ -137,7 +137,7 @@ def test_the_optical_length_is_stationary(name, order, kind):
     eye = built(name)
     source, view = rigs(kind, 60)
     found = images(eye, order, source, view, rim=eye.limbus_radius_mm)
-    rows = np.flatnonzero(found.status == RayStatus.OK)
+    rows = np.flatnonzero(found.status == Status.OK)
     assert len(rows) > 2
     depth = (len(found.course_mm) + 1) // 2
     surfaces = [*(eye.front + eye.back)[:depth], *(eye.front + eye.back)[: depth - 1][::-1]]
@@ -170,9 +170,9 @@ def test_every_rig_gets_an_answer_and_the_same_one_backwards(name, kind):
     source, view = rigs(kind, count, seed=1)
     for order in (2, 3, 4):
         found, back = (images(eye, order, *pair, rim=5.85) for pair in ((source, view), (view, source)))
-        assert not (found.status == RayStatus.NOT_CONVERGED).any()
+        assert not (found.status == Status.NOT_CONVERGED).any()
         assert np.array_equal(found.status, back.status)
-        ok = found.status == RayStatus.OK
+        ok = found.status == Status.OK
         assert ok.sum() > (count / 20 if order == 3 else count / 2)
         assert found.residual_mm[ok].max() < 1e-9
         apart = np.linalg.norm(found.points_mm - back.points_mm, axis=-1)[ok]

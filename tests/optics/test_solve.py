@@ -19,7 +19,8 @@ from eyerender.optics.fermat import stationary_path
 from eyerender.optics.purkinje import purkinje_points
 from eyerender.optics.shooting import connect
 from eyerender.optics.solve import apparent_points, mirror_points
-from eyerender.optics.trace import Crossing, RayStatus, inward_path, outward_path, trace
+from eyerender.optics.trace import Crossing, inward_path, outward_path, trace
+from eyerender.status import Status
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 
@@ -47,7 +48,7 @@ def test_exit_points_and_glints_agree_with_the_reference(name):
     for record, surfaces, indices, camera, lights, turning, eye in gka_scenes(name):
         found = apparent_points(surfaces, indices, record["stop_points_eye"], camera)
         expected = record["converged"]
-        assert (found.status == RayStatus.OK).all()
+        assert (found.status == Status.OK).all()
         assert found.residual_mm.max() < 1e-9
         assert np.abs(found.exit_points_mm - expected["pupil_exit_point_eye"]).max() < 1e-9
         seen = join(into_eye(turning, eye, components(lights)))
@@ -87,7 +88,7 @@ def test_single_sphere_scenes_agree_with_the_reference():
     count = 0
     for scene, cornea, into, project, camera in ets_scenes():
         found = apparent_points([cornea], [scene["eye"]["n_cornea"]], into(scene["pupil_boundary_world"]), camera)
-        assert (found.status == RayStatus.OK).all()
+        assert (found.status == Status.OK).all()
         assert np.abs(project(found.exit_points_mm) - scene["pupil_boundary_px_refracted"]).max() < 1e-8
         glints = mirror_points(cornea, into(scene["lights"]), camera)
         for place, glint in zip(project(glints.points_mm), scene["glints"], strict=True):
@@ -146,18 +147,18 @@ def test_every_start_a_rig_can_produce_converges(name):
         eye = spec.build(pupil_diameter_mm=diameter)
         margin = eye.stop.boundary(24)
         found = apparent_points(eye.front, eye.front_indices, margin, places[:, None, :])
-        assert (found.status == RayStatus.OK).all()
+        assert (found.status == Status.OK).all()
         assert found.residual_mm.max() < 1e-9
         # Independent of the solver's own check: out from the stop along the inner direction to the viewpoint.
         out = trace(outward_path(eye.front, eye.front_indices), eye.front_indices[-1], margin, found.inner_directions)
-        assert (out.status == RayStatus.OK).all()
+        assert (out.status == Status.OK).all()
         gap = places[:, None, :] - out.points_mm[-1]
         miss = np.linalg.norm(np.cross(gap, out.directions[-1]), axis=-1)
         # Near grazing, the rounding of a direction is magnified to some 1e-10 mm at 1500 mm.
         assert miss.max() < 1e-9
     light = places[::-1]
     glints = mirror_points(eye.front[0], light, places)
-    assert (glints.status == RayStatus.OK).all()
+    assert (glints.status == Status.OK).all()
     assert glints.residual_mm.max() < 1e-9
 
 
@@ -169,7 +170,7 @@ def test_the_two_solvers_agree(name):
     found = apparent_points(eye.front, eye.front_indices, eye.stop.boundary(12), places)
     target = components(np.broadcast_to(eye.stop.boundary(12), (len(places), 12, 3)))
     shot = connect(inward_path(eye.front, eye.front_indices), 1.0, components(places), target, target)
-    assert (shot.status == RayStatus.OK).all()
+    assert (shot.status == Status.OK).all()
     assert np.allclose(join(shot.first), found.exit_points_mm, atol=1e-10)
 
 
@@ -227,7 +228,7 @@ def test_glints_are_as_sure_for_distant_lights_as_for_near_ones(name):
     for distance in 10.0 ** np.arange(1, 13):
         lights = distance * ways
         found = mirror_points(eye.front[0], lights, places)
-        assert (found.status == RayStatus.OK).all()
+        assert (found.status == Status.OK).all()
         assert found.residual_mm.max() < 1e-9
         points[distance] = found.points_mm
         normal = eye.front[0].normal(found.points_mm)
@@ -250,7 +251,7 @@ def test_images_from_inside_the_eye_of_distant_lights_are_found(order):
         10.0 ** np.arange(3, 13)[:, None] * (np.array([12.0, 1.0, -2.0]) / np.sqrt(149.0)),
         [500.0, 60.0, 20.0],
     )
-    assert (found.status == RayStatus.OK).all()
+    assert (found.status == Status.OK).all()
     assert found.residual_mm.max() < 1e-9
     # The points of lights at 1e3 and 1e12 mm lie less than 0.1 mm apart, and the gap falls as 1 / distance.
     gap = np.abs(found.exit_points_mm - found.exit_points_mm[-1]).max(axis=-1)
@@ -275,18 +276,18 @@ def test_surfaces_without_a_common_graph_are_solved_too():
     found = apparent_points(
         [outer, inner], [1.376, 1.336], load_eye("E4").build().stop.boundary(8), [500.0, 50.0, -90.0]
     )
-    assert (found.status == RayStatus.OK).all()
+    assert (found.status == Status.OK).all()
     assert found.residual_mm.max() < 1e-9
 
 
 def test_what_has_no_ray_says_so():
     eye = load_eye("E2").build()
     outside = apparent_points(eye.front, eye.front_indices, [-3.6, -5.4, 0.0], [-40.0, -400.0, 0.0], rim_mm=5.85)
-    assert outside.status == RayStatus.OUTSIDE_LIMBUS
+    assert outside.status == Status.OUTSIDE_LIMBUS
     behind = apparent_points(eye.front, eye.front_indices, [-3.6, 2.0, 0.0], [-400.0, 0.0, 0.0])
-    assert behind.status not in (RayStatus.OK,)
+    assert behind.status not in (Status.OK,)
     far_side = mirror_points(eye.front[0], [-300.0, 10.0, 0.0], [500.0, 0.0, 0.0], rim_mm=5.85)
-    assert far_side.status != RayStatus.OK
+    assert far_side.status != Status.OK
 
 
 def test_a_solver_that_starts_astray_is_caught():
@@ -341,7 +342,7 @@ def test_purkinje_images_lie_where_paraxial_optics_puts_them(order):
         [distance, beside, 0.0],
         [distance, 0.0, 0.0],
     )
-    assert found.status == RayStatus.OK
+    assert found.status == Status.OK
     assert found.residual_mm < 1e-9
     # Heights of some microns: third-order terms are their cube.
     assert found.exit_points_mm[1] == pytest.approx(expected, rel=1e-5)

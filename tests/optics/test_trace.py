@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from eyerender.geometry.surfaces_quadric import Quadric
-from eyerender.optics.trace import Crossing, RayStatus, inward_path, outward_path, trace
+from eyerender.optics.trace import Crossing, inward_path, outward_path, trace
+from eyerender.status import Status
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 
@@ -36,7 +37,7 @@ def test_skew_rays_agree_with_the_reference(skew):
     way = np.array([ray["in_u"] for ray in data["rays"]])
     traced = trace(inward_path(surfaces, indices), 1.0, start, way)
     expected = np.array([ray["path"] for ray in data["rays"]]).transpose(1, 0, 2)
-    assert (traced.status == RayStatus.OK).all()
+    assert (traced.status == Status.OK).all()
     error = np.abs(traced.points_mm - expected).max(axis=-1)
     for k, surface in enumerate(surfaces):
         # The reference's points on its near-paraboloid lie up to 5e-9 mm off the surface it names.
@@ -55,7 +56,7 @@ def test_reversed_rays_return_to_their_start(skew):
     there = trace(inward_path(surfaces, indices), 1.0, start, way)
     deep = there.points_mm[-1] + 2.0 * there.directions[-1]
     back = trace(outward_path(surfaces, indices), indices[-1], deep, -there.directions[-1])
-    assert (back.status == RayStatus.OK).all()
+    assert (back.status == Status.OK).all()
     assert np.allclose(back.directions[-1], -way, atol=1e-12)
     assert np.allclose(back.points_mm[-1], there.points_mm[1], atol=1e-11)
     length = np.linalg.norm(there.points_mm[1] - start, axis=-1)
@@ -77,27 +78,27 @@ def test_the_optical_path_is_index_times_length(skew):
 def test_every_status_is_told_apart():
     cornea, stop = Quadric.conic(7.8, -0.25), Quadric.plane((-3.6, 0.0, 0.0))
     inward = (
-        Crossing(cornea, 1.3375, rim_mm=5.85, beyond_rim=RayStatus.OUTSIDE_LIMBUS),
-        Crossing(stop, 1.3375, rim_mm=2.0, beyond_rim=RayStatus.BEHIND_IRIS),
+        Crossing(cornea, 1.3375, rim_mm=5.85, beyond_rim=Status.OUTSIDE_LIMBUS),
+        Crossing(stop, 1.3375, rim_mm=2.0, beyond_rim=Status.BEHIND_IRIS),
     )
     start = np.array([[20.0, y, 0.0] for y in (0.5, 4.5, 6.5, 30.0)])
     traced = trace(inward, 1.0, start, np.broadcast_to([-1.0, 0.0, 0.0], start.shape))
     assert traced.status.tolist() == [
-        RayStatus.OK,
-        RayStatus.BEHIND_IRIS,
-        RayStatus.OUTSIDE_LIMBUS,
-        RayStatus.MISSED,
+        Status.OK,
+        Status.BEHIND_IRIS,
+        Status.OUTSIDE_LIMBUS,
+        Status.MISSED,
     ]
     # Across the cap from inside, the ray meets the cornea at 59 degrees; the critical angle is 48.4.
     steep = trace(outward_path([cornea], [1.3375]), 1.3375, [-1.2, -3.0, 0.0], [0.0, 1.0, 0.0])
-    assert steep.status == RayStatus.TOTAL_REFLECTION
-    assert all(status.reason or status == RayStatus.OK for status in RayStatus)
+    assert steep.status == Status.TOTAL_REFLECTION
+    assert all(status.reason or status == Status.OK for status in Status)
 
 
 def test_a_ray_passes_a_shell_that_it_does_not_reach():
     shell = Crossing(Quadric.conic(8.0), 1.5, rim_mm=1.0, beyond_rim=None)
     traced = trace([shell], 1.3, [[5.0, 0.5, 0.0], [5.0, 2.0, 0.0]], np.broadcast_to([-1.0, 0.0, 0.0], (2, 3)))
-    assert (traced.status == RayStatus.OK).all()
+    assert (traced.status == Status.OK).all()
     assert np.array_equal(traced.directions[1, 1], [-1.0, 0.0, 0.0])
     assert np.array_equal(traced.points_mm[1, 1], [5.0, 2.0, 0.0])
     assert not np.array_equal(traced.directions[1, 0], [-1.0, 0.0, 0.0])

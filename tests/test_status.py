@@ -1,0 +1,26 @@
+"""The one status type: small, complete and readable."""
+
+import numpy as np
+
+from eyerender.status import Status, mark
+
+
+def test_every_failure_has_a_reason_of_its_own():
+    assert Status.OK == 0
+    assert Status.OK.reason is None
+    reasons = [s.reason for s in Status if s != Status.OK]
+    assert all(reasons)
+    assert len(set(reasons)) == len(reasons)
+
+
+def test_statuses_fit_the_arrays_of_batches():
+    values = np.array(list(Status), dtype=np.int64)
+    assert np.array_equal(values.astype(np.int8), values)
+    assert [Status(v) for v in values.astype(np.int8)] == list(Status)
+
+
+def test_the_first_failure_stays():
+    status = np.array([Status.OK, Status.MISSED, Status.OK], dtype=np.int8)
+    mark(status, np.array([True, True, False]), Status.TOTAL_REFLECTION)
+    assert status.tolist() == [Status.TOTAL_REFLECTION, Status.MISSED, Status.OK]
+    assert status.dtype == np.int8
