@@ -1,4 +1,4 @@
-"""The layout's rules: imports point down, one room each for mitsuba and cv2, `import eyerender` is light."""
+"""The layout's rules: imports point down, few rooms for mitsuba and cv2, `import eyerender` is light."""
 
 from __future__ import annotations
 
@@ -125,11 +125,20 @@ def test_imports_point_down(path):
 
 @pytest.mark.parametrize(
     ("libraries", "homes"),
-    [(("mitsuba", "drjit"), {"rendering", "backends"}), (("cv2",), {"extraction"}), (("skimage",), {"dataset"})],
+    [
+        (("mitsuba", "drjit"), {"rendering", "backends"}),
+        (("cv2",), {"extraction", "dataset"}),
+        (("skimage",), {"dataset"}),
+    ],
 )
 def test_heavy_libraries_stay_in_their_packages(libraries, homes):
     users = {room(p) for p in modules() for name, _ in imports(p) if name.split(".")[0] in libraries}
     assert users == homes
+
+
+def test_datasets_use_opencv_for_nothing_but_videos():
+    users = [p.name for p in modules() if room(p) == "dataset" and "cv2" in {name for name, _ in imports(p)}]
+    assert users == ["video.py"]
 
 
 def test_what_reproduces_a_papers_software_stays_in_the_studies():

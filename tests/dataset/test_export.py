@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import resource
 import sys
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from eyerender.cli.app import run
 from eyerender.dataset.columns import type_first
 from eyerender.dataset.export import FORMATS, export
 from eyerender.dataset.export.coco import run_lengths
-from eyerender.dataset.export.mp4 import PngVideo
+from eyerender.dataset.export.video import LosslessVideo
 from eyerender.errors import InputError
 from eyerender.imagefile import read_image, write_png
 from eyerender.imagefolder import ImageFolder
@@ -221,16 +222,42 @@ def test_teyed_reads_it(tiny, exported, lines):
         assert not stream.read()[0]
 
 
-def test_videos_are_lossless(tmp_path):
-    frames = np.random.default_rng(0).integers(0, 256, (5, 46, 62), dtype=np.uint8)
-    with PngVideo(tmp_path / "v.mp4", 62, 46) as video:
+@pytest.mark.parametrize(("width", "height"), [(62, 46), (63, 46), (62, 47), (63, 47), (1, 1)])
+def test_videos_are_lossless(tmp_path, width, height):
+    frames = np.random.default_rng(0).integers(0, 256, (5, height, width), dtype=np.uint8)
+    with LosslessVideo(tmp_path / "v.mp4", width, height) as video:
         for frame in frames:
             video.add(frame)
     stream = cv2.VideoCapture(str(tmp_path / "v.mp4"))
     assert stream.get(cv2.CAP_PROP_FRAME_COUNT) == 5
     assert stream.get(cv2.CAP_PROP_FPS) == 25
-    for frame in frames:
-        np.testing.assert_array_equal(stream.read()[1][..., 1], frame)
+    for k, frame in enumerate(frames):
+        read, picture = stream.read()
+        assert read
+        assert stream.get(cv2.CAP_PROP_POS_MSEC) == pytest.approx(40 * k)
+        assert picture.shape == (height + height % 2, width + width % 2, 3)
+        np.testing.assert_array_equal(picture[:height, :width], np.repeat(frame[..., None], 3, axis=-1))
+        np.testing.assert_array_equal(picture[-1, -1], frame[-1, -1])
+
+
+def test_a_video_that_cannot_be_written_is_an_error(tmp_path):
+    with pytest.raises(OSError, match=r"OpenCV cannot write an FFV1 video of 62 x 46 pixels to v\.mp4"):
+        LosslessVideo(tmp_path / "missing" / "v.mp4", 62, 46)
+
+
+def test_a_video_cut_short_is_an_error(tmp_path):
+    """A limit on the size of files stands for a full disk."""
+    frame = np.random.default_rng(0).integers(0, 256, (200, 200), dtype=np.uint8)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    video = LosslessVideo(tmp_path / "v.mp4", 200, 200)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        for _ in range(10):
+            video.add(frame)
+        with pytest.raises(OSError, match="a video could not be written whole; the disk may be full"):
+            video.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_hugging_face_reads_the_folder_as_it_is(tiny, tmp_path, monkeypatch, lines):

@@ -8,8 +8,8 @@
     NAME.mp4validity_pupil.txt, iris, lid         FRAME;VALIDITY;
     NAME.mp4pupil_seg_2D.mp4, iris_seg_2D.mp4     white where visible
 
-Frames count from 1, -1 stands where there is nothing. Fuhl, Kasneci and Kasneci (2021), "TEyeD". The videos hold PNG
-frames (8 bits, lossless), which FFmpeg and OpenCV read.
+Frames count from 1, -1 stands where there is nothing. Fuhl, Kasneci and Kasneci (2021), "TEyeD". The videos are
+lossless (FFV1, 8 bits); a frame of odd width or height has its last column or row twice.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.ellipse import Ellipse
 from .item import Item, Items
-from .mp4 import PngVideo
+from .video import LosslessVideo
 
 _POINTS = 8
 _ELLIPSE = ("ANGLE", "CENTER X", "CENTER Y", "WIDTH", "HEIGHT")
@@ -83,7 +83,7 @@ class _Video:
             raise ValueError(f"the samples of subject {first.line['subject']} do not follow each other")
         with ExitStack() as stack:
             places = (out / "VIDEOS" / name, notes / f"{name}pupil_seg_2D.mp4", notes / f"{name}iris_seg_2D.mp4")
-            self._pictures = [stack.enter_context(PngVideo(place, w, h)) for place in places]
+            self._pictures = [stack.enter_context(LosslessVideo(place, w, h)) for place in places]
             self._texts: dict[str, IO[str]] = {}
             for kind, columns in _COLUMNS.items():
                 file = stack.enter_context(open(notes / f"{name}{kind}.txt", "w", encoding="utf-8"))

@@ -1,0 +1,60 @@
+"""Lossless videos: FFV1 (RFC 9043) in MP4, written by OpenCV's FFmpeg, which OpenCV and FFmpeg read.
+
+OpenCV is a dependency already, and its FFmpeg is under the LGPL; the wheels of PyAV and imageio-ffmpeg hold x264, which
+is under the GPL. OpenCV's writer has two habits that this module makes up for: it cuts the last column or row of frames
+whose width or height is odd, and it says nothing when a write fails.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+
+from ...arrays import Bytes
+
+FRAMES_PER_SECOND = 25
+
+
+class LosslessVideo:
+    """A file of grey frames (h, w) uint8 of one size.
+
+    Where a side is odd, its last column or row is repeated once, so that it becomes even.
+
+    Raises:
+        OSError: OpenCV cannot write the file; `close` finds out whether all frames are in it.
+    """
+
+    def __init__(self, path: Path, width: int, height: int) -> None:
+        self.size = (width, height)
+        self.frames = 0
+        self._path = str(path)
+        even = (width + width % 2, height + height % 2)
+        codec = cv2.VideoWriter.fourcc(*"FFV1")
+        self._writer = cv2.VideoWriter(self._path, cv2.CAP_FFMPEG, codec, FRAMES_PER_SECOND, even, isColor=False)
+        if not self._writer.isOpened():
+            raise OSError(f"OpenCV cannot write an FFV1 video of {width} x {height} pixels to {path.name}")
+
+    def add(self, image: Bytes) -> None:
+        """One more frame."""
+        height, width = image.shape
+        self._writer.write(np.pad(image, ((0, height % 2), (0, width % 2)), mode="edge"))
+        self.frames += 1
+
+    def close(self) -> None:
+        """Write the index, and read back how many frames it has."""
+        self._writer.release()
+        # FFmpeg writes nothing more after a write that failed, so that the index, which comes last, is missing then.
+        if int(cv2.VideoCapture(self._path, cv2.CAP_FFMPEG).get(cv2.CAP_PROP_FRAME_COUNT)) != self.frames:
+            raise OSError("a video could not be written whole; the disk may be full")
+
+    def __enter__(self) -> LosslessVideo:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self._writer.release()
