@@ -18,14 +18,14 @@ import time
 from dataclasses import dataclass, field
 from multiprocessing import Pool
 
-import bench_rendered_rows
 import cv2
-import make_ideal_images as ideal
 import numpy as np
-from _bench import Report, options_of, row
-from extraction_tally import CENTRE, Tally, compare
 from numpy.typing import NDArray
 
+import bench_rendered_rows
+import make_ideal_images as ideal
+from _bench import Report, options_of, row
+from extraction_tally import CENTRE, Tally, compare
 from eyerender.extraction import FAST, REFINED, ExtractionSettings, extract
 
 Array = NDArray[np.float64]

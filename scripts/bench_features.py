@@ -18,8 +18,8 @@ from collections.abc import Iterator
 from dataclasses import fields
 
 import numpy as np
-from _bench import Report, Row, options_of, row
 
+from _bench import Report, Row, options_of, row
 from eyerender.analytic.features import Features, features, fixations
 from eyerender.eye.catalogue import load_eye
 from eyerender.scene import load_scene

@@ -24,7 +24,7 @@ from _bench import Report, Row, options_of, resident_mib, row, single_threaded
 
 single_threaded()
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests" / "rendering"))
+sys.path.insert(0, str(ROOT / "tests"))
 
 import numpy as np  # noqa: E402
 
@@ -47,9 +47,8 @@ class Bench:
     """The measurements; `small` for --quick."""
 
     def __init__(self, backend: Any, small: bool) -> None:
-        import render_rigs
-
         from eyerender.rendering.renderer import Renderer
+        from support import render_rigs
 
         self.rigs, self.small = render_rigs, small
         self.renderer = Renderer(backend, spp=16)
@@ -71,7 +70,6 @@ class Bench:
         """
         import drjit as dr
         import mitsuba as mi
-        from render_oracles import RINGS_MM
 
         from eyerender.arrays import frozen
         from eyerender.rendering.film import pixels_of
@@ -79,6 +77,7 @@ class Bench:
         from eyerender.rendering.view import look
         from eyerender.rig.camera import Camera
         from eyerender.rig.light import Lamp
+        from support.render_oracles import RINGS_MM
 
         rigs, n = self.rigs, 72
         eye = rigs.eye_of("E2")
@@ -139,10 +138,9 @@ class Bench:
 
     def iris_against_light_tracer(self) -> Iterable[Row]:
         """Irradiance of the iris of E4 and E5 by a point lamp, against flux counted by a forward tracer in float64."""
-        from render_oracles import RINGS_MM, flux_on_rings, ring_points
-
         from eyerender.arrays import frozen
         from eyerender.rig.light import Lamp
+        from support.render_oracles import RINGS_MM, flux_on_rings, ring_points
 
         rigs = self.rigs
         for model in ("E4", "E5"):
@@ -187,7 +185,7 @@ class Bench:
 
     def glint_centroids(self) -> Iterable[Row]:
         """Centroids of rendered glints of point lamps against Fermat's principle in float64."""
-        from render_oracles import centroid, mirror_pixel
+        from support.render_oracles import centroid, mirror_pixel
 
         rigs = self.rigs
         poses = 10 if self.small else 200
@@ -214,7 +212,8 @@ class Bench:
     def large_disc(self) -> Iterable[Row]:
         """Flux and place of the glint of a large disc LED against stock path on the exported scene."""
         import mitsuba as mi
-        from render_oracles import centroid
+
+        from support.render_oracles import centroid
 
         rigs = self.rigs
         rig = rigs.head_rig(radius_mm=4.0, count=1)
@@ -248,7 +247,7 @@ class Bench:
 
     def pupil_outline(self) -> Iterable[Row]:
         """RMS of the smooth contour (12 harmonics) of rendered pupils at 64 spp against the refracted margin."""
-        from render_oracles import contour_error, outline
+        from support.render_oracles import contour_error, outline
 
         rigs = self.rigs
         dark = rigs.PLAIN.model_copy(update={"pupil_albedo": 0.0})

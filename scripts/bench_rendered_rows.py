@@ -15,11 +15,11 @@ from typing import Any, Protocol
 
 import cv2
 import numpy as np
+
 import rendered_eyes
 from extraction_tally import CENTRE, Tally, compare, merge
-from make_ideal_images import Drawing
-
 from eyerender.extraction import extract
+from make_ideal_images import Drawing
 
 COARSE_SPP = 16
 # Rows on rendered images: name -> noise DN, blur px, condition whose bars hold for the close rig, for the remote one.

@@ -21,7 +21,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from _bench import Report, Row, options_of, row
-
 from eyerender.study.literature import MODELS
 from eyerender.study.run import run_study
 

@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from make_ideal_images import Drawing
 
 from eyerender.arrays import Floats
 from eyerender.extraction import Extraction
 from eyerender.geometry.ellipse import Ellipse, iou
+from make_ideal_images import Drawing
 
 MATCH_PX = 2.0  # a glint within this of a true one is that one
 

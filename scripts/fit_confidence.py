@@ -16,11 +16,11 @@ from multiprocessing import Pool
 from typing import Any, Literal
 
 import cv2
-import make_ideal_images as ideal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+import make_ideal_images as ideal
 from eyerender.extraction import ExtractionSettings, extract
 from eyerender.extraction.pupil.scoring import TABLE, design, features
 from eyerender.geometry.ellipse import Ellipse, iou

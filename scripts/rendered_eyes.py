@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from make_ideal_images import Drawing
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
@@ -21,6 +20,7 @@ from eyerender.analytic.observer import observe
 from eyerender.capture import render_windows
 from eyerender.geometry.ellipse import Ellipse, signed_distance
 from eyerender.scene import Scene, SceneSpec
+from make_ideal_images import Drawing
 
 Array = NDArray[np.float64]
 

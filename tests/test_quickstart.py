@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +16,9 @@ from eyerender.cli.app import run
 from eyerender.imagefile import read_image
 from eyerender.imagefolder import ImageFolder
 from eyerender.scene import load_scene
+from support.paths import ROOT
 
 pytestmark = pytest.mark.render
-ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")

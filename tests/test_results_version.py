@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 
-import golden
 import numpy as np
 import pytest
 
+from support import golden
+
 CHANGED = (
     "what this package computes has changed. If that is intended, raise eyerender.imagefolder.RESULTS, say so in "
-    "CHANGELOG.md, and run: python tests/golden.py"
+    "CHANGELOG.md, and run: python tests/support/golden.py"
 )
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from support.paths import ROOT
+
 SCRIPTS = ("scripts/_setup.sh", "scripts/eyerender", "scripts/test", "scripts/prove-bare", ".ci/run")
 
 pytestmark = pytest.mark.skipif(not (ROOT / "scripts" / "_setup.sh").is_file(), reason="not a checkout")

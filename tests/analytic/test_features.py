@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -20,15 +17,15 @@ from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import inward_path, trace
 from eyerender.rig.camera import PinholeCamera, distort
 from eyerender.status import Status
+from support.paths import load
 
-DATA = Path(__file__).resolve().parents[1] / "data"
 # Reference world (X, Y, Z) = (y, z, x).
 AXES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 
 
 def gka_eye(name):
     """The reference's eye: its corneal quadrics as they stand in its file, on this package's globe and landmarks."""
-    data = json.loads((DATA / f"projection_{name}.json").read_text())
+    data = load(f"projection_{name}.json")
     mapping = load_eye(name).to_mapping()
     for k, row in enumerate(data["stopToMedium"][:0:-1]):
         coefficients = [v / row[1] for v in row[:10]]

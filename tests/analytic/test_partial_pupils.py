@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exhaustive import exhaustive
 
 from eyerender.analytic.features import features
 from eyerender.analytic.observer import observe, pupil_features, seen_arcs_deg
@@ -19,6 +18,7 @@ from eyerender.observation import MISSING, OK, PARTIAL, Observations
 from eyerender.rig.camera import PinholeCamera
 from eyerender.scene import Scene, SceneSpec
 from eyerender.status import Status
+from support.exhaustive import exhaustive
 
 
 def looking_at(place):

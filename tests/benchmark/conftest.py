@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import pytest
 
+import make_ideal_images as ideal
 from eyerender.capture import render_folder
 from eyerender.errors import BackendError
 from eyerender.scene import Scene, SceneSpec, shipped_scenes
 
 
 @pytest.fixture(scope="session")
-def ideal():
-    """The generator of ideal images, which lives with the scripts."""
-    path = Path(__file__).parents[2] / "scripts" / "make_ideal_images.py"
-    spec = importlib.util.spec_from_file_location("make_ideal_images", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["make_ideal_images"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="session")
-def drawn(ideal, tmp_path_factory):
+def drawn(tmp_path_factory):
     """Six ideal images of 200 x 160 px with noise between 1 and 4 DN."""
     conditions = ideal.CONDITIONS
     conditions["small"] = ideal.Condition(size=(200, 160), semi_axis=(14, 20), noise=(1, 4))

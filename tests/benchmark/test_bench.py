@@ -9,7 +9,6 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.extraction.baseline import contour_pupil
 from eyerender.imagefile import write_png
+from support.paths import SCRIPTS
 
 
 def test_the_shipped_extractors_are_installed():
@@ -172,7 +172,7 @@ def test_pupil_detectors_in_its_own_environment(drawn, tmp_path):
 
 
 def test_the_set_up_script_refuses_what_it_does_not_know(tmp_path):
-    script = Path(__file__).parents[2] / "scripts" / "setup_pupil_detectors.sh"
+    script = SCRIPTS / "setup_pupil_detectors.sh"
     env = {"PATH": os.environ["PATH"], "XDG_CACHE_HOME": str(tmp_path)}
     wrong = subprocess.run([script, "--farce"], env=env, capture_output=True, text=True)
     assert (wrong.returncode, wrong.stdout) == (2, "")

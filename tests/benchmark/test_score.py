@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+import make_ideal_images as ideal
 from eyerender.benchmark.bound import Edge, edge_of, measure_edge
 from eyerender.benchmark.folder import LabelledImage, TrueGlint, load_labelled
 from eyerender.benchmark.protocol import Reply
@@ -116,7 +117,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information(radius, blur, noise)
 
 
 @pytest.mark.parametrize(("blur", "noise", "a"), [(0.8, 1.0, 13.0), (1.0, 2.0, 30.0), (2.0, 4.0, 40.0)])
-def test_an_edge_is_measured_as_it_was_drawn(ideal, blur, noise, a):
+def test_an_edge_is_measured_as_it_was_drawn(blur, noise, a):
     condition = ideal.Condition(
         size=(240, 200), blur=(blur, blur), noise=(noise, noise), semi_axis=(a, a), glints="isolated"
     )
@@ -180,7 +181,7 @@ def test_an_ideal_folder_is_read_as_it_was_drawn(drawn):
         assert set(image.factors) == {"pupil_px", "aspect", "phase_x", "phase_y", "occlusion"}
 
 
-def test_a_lid_s_occlusion_is_what_it_covers(ideal):
+def test_a_lid_s_occlusion_is_what_it_covers():
     condition = ideal.Condition(size=(200, 160), semi_axis=(30, 30), lid=(0.2, 1.2), glints="none")
     for seed in range(10_000, 10_004):
         drawing = ideal.draw(condition, seed)

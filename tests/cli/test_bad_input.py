@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import stages
 import yaml
 from PIL import Image
 
@@ -21,6 +20,7 @@ from eyerender.dataset.spec import shipped_datasets
 from eyerender.eye.catalogue import load_eye
 from eyerender.imagefile import write_png
 from eyerender.scene import shipped_scenes
+from support import stages
 
 
 @pytest.fixture

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from dataset_specs import make, plan
-
 from eyerender.errors import BackendError
+from support.dataset_specs import make, plan
 
 
 @pytest.fixture(scope="session")

@@ -10,12 +10,12 @@ import time
 from pathlib import Path
 
 import pytest
-from dataset_specs import command, make, plan, tree, write
 
 from eyerender.dataset.cluster import RayEngine
 from eyerender.dataset.realise import frames_of
 from eyerender.dataset.shard import Staged
 from eyerender.dataset.worker import Job
+from support.dataset_specs import command, make, plan, tree, write
 
 pytestmark = [pytest.mark.render, pytest.mark.slow]
 

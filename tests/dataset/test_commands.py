@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dataset_specs import write
 from PIL import Image
 
 from eyerender.cli.app import run
 from eyerender.imagefolder import ImageFolder
 from eyerender.observers import scene_of
+from support.dataset_specs import write
 
 pytestmark = pytest.mark.render
 

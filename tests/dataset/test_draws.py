@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from dataset_specs import mapping, plan
 from scipy.stats import kstest, qmc, truncnorm, uniform
 
 from eyerender.dataset.draws import parse_draw, random_value, truncated_normal, unit_number
@@ -15,6 +14,7 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.dataset.template import Template, Turn, sobol_block
 from eyerender.errors import InputError
+from support.dataset_specs import mapping, plan
 
 
 def draw(node):

@@ -12,9 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import stages
 import trimesh
-from dataset_specs import command, make, mapping, tree, write
 
 from eyerender.cli.app import run
 from eyerender.dataset.cluster import ShardActor
@@ -28,6 +26,8 @@ from eyerender.dataset.worker import Job
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.imagefile import read_image
+from support import stages
+from support.dataset_specs import command, make, mapping, tree, write
 
 HEAD = {"unit": "mm", "licence": "CC0-1.0", "forward": [1, 0, 0], "up": [0, 0, 1], "right_eye": [0, 0, 0]}
 # A bar above the pupil: it stands before the iris, and lamps and maps light it.

@@ -10,7 +10,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import yaml
-from dataset_specs import plan, write
 
 from eyerender.dataset.draws import unit_number
 from eyerender.dataset.plan import RANKED_SUBJECTS, Plan
@@ -19,6 +18,7 @@ from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.scene import SceneSpec
+from support.dataset_specs import plan, write
 
 
 def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):

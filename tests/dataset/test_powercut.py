@@ -7,12 +7,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from dataset_specs import make, plan, tree, write
-from powercut import Disk, record
 
 from eyerender.dataset.assemble import verify_dataset
 from eyerender.dataset.shard import finished, verify
 from eyerender.files import read_json
+from support.dataset_specs import make, plan, tree, write
+from support.powercut import Disk, record
 
 pytestmark = [
     pytest.mark.render,

@@ -7,7 +7,6 @@ import shutil
 
 import numpy as np
 import pytest
-from dataset_specs import make
 
 from eyerender.dataset.export import export
 from eyerender.dataset.plan import Plan
@@ -16,6 +15,7 @@ from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
 from eyerender.imagefile import read_image, write_png
 from eyerender.imagefolder import ImageFolder
+from support.dataset_specs import make
 
 pytestmark = pytest.mark.render
 

@@ -6,7 +6,6 @@ import json
 import shutil
 
 import pytest
-from dataset_specs import make, plan, tree
 
 from eyerender.cli.app import run
 from eyerender.dataset.assemble import damage, verify_dataset
@@ -15,6 +14,7 @@ from eyerender.dataset.shard import verify
 from eyerender.errors import InputError
 from eyerender.files import write_json
 from eyerender.outfolder import MARKER
+from support.dataset_specs import make, plan, tree
 
 pytestmark = pytest.mark.render
 

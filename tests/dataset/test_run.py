@@ -13,8 +13,6 @@ import subprocess
 from pathlib import Path
 
 import pytest
-import stages
-from dataset_specs import command, make, plan, tree, write
 
 from eyerender.dataset.pool import LocalPool
 from eyerender.dataset.realise import frames_of
@@ -23,6 +21,8 @@ from eyerender.dataset.shard import finished
 from eyerender.dataset.worker import Job
 from eyerender.errors import EyerenderError, InputError
 from eyerender.lock import run_lock
+from support import stages
+from support.dataset_specs import command, make, plan, tree, write
 
 pytestmark = pytest.mark.render
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from dataset_specs import make
 
 from eyerender.capture import render_folder
 from eyerender.dataset.plan import Plan
@@ -11,6 +10,7 @@ from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
 from eyerender.scene import Scene, SceneSpec, load_scene, shipped_scenes
+from support.dataset_specs import make
 
 pytestmark = pytest.mark.render
 

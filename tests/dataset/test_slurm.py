@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import subprocess
-from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "slurm_generate.sh"
+from support.paths import SCRIPTS
+
+SCRIPT = SCRIPTS / "slurm_generate.sh"
 
 pytestmark = pytest.mark.skipif(not SCRIPT.is_file(), reason="not a checkout")
 

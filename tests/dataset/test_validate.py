@@ -7,7 +7,6 @@ import shutil
 
 import numpy as np
 import pytest
-from dataset_specs import mapping
 
 from eyerender.analytic.observer import observe
 from eyerender.dataset.export import export
@@ -17,6 +16,7 @@ from eyerender.dataset.validation.truth import SceneTruth
 from eyerender.errors import InputError
 from eyerender.imagefile import read_image, write_png
 from eyerender.scene import load_scene
+from support.dataset_specs import mapping
 
 pytestmark = pytest.mark.render
 

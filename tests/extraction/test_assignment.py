@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from eyerender.extraction.glints.matching import assign_lights, identify, mirror_in_sphere, predict_glints
+from support.paths import load
 
-DATA = Path(__file__).parents[1] / "data"
 # The reference's world axes (X, Y, Z) are this package's (y, z, x).
 AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def _records():
-    data = json.loads((DATA / "projection_E2.json").read_text())
+    data = load("projection_E2.json")
     scenes = {scene["name"]: scene for scene in data["scenes"]}
     for record in data["records"]:
         scene = scenes[record["scene"]]

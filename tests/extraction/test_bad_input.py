@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import make_ideal_images as ideal
 from eyerender.errors import InputError
 from eyerender.extraction import FAST, REFINED, Extraction, ExtractionSettings, extract
 
@@ -96,7 +97,7 @@ def test_settings_are_checked():
         ExtractionSettings.from_mapping({"radius": 3.0})
 
 
-def test_images_without_an_eye(ideal):
+def test_images_without_an_eye():
     """Letters can be ellipses; everything else is turned down, and hardly an answer is a sure one."""
     sure = found = 0
     for seed in range(20_000, 20_060):
@@ -107,7 +108,7 @@ def test_images_without_an_eye(ideal):
     assert sure <= 3
 
 
-def test_outside_the_sizes_looked_for(ideal):
+def test_outside_the_sizes_looked_for():
     image = ideal.draw("noise2-13px", 20_000).image
     wide = extract(image, settings=ExtractionSettings(radius_min_px=45.0)).pupil
     assert wide.status == "missing"
@@ -158,7 +159,7 @@ def _mutate(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, di
     return out, options
 
 
-def _fuzz(ideal, count: int, first: int) -> None:
+def _fuzz(count: int, first: int) -> None:
     conditions = ["noise2-13px", "mixed", "remote", "edge-glint"]
     sources = [ideal.draw(name, 20_100 + i).image for i, name in enumerate(conditions)]
     for seed in range(first, first + count):
@@ -175,11 +176,11 @@ def _fuzz(ideal, count: int, first: int) -> None:
 
 # The fits damp their steps against overflow themselves; a warning from numpy would be a number out of hand.
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_hundred_mutations(ideal):
-    _fuzz(ideal, 100, 0)
+def test_hundred_mutations():
+    _fuzz(100, 0)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_thousand_mutations(ideal):
-    _fuzz(ideal, 1000, 1000)
+def test_thousand_mutations():
+    _fuzz(1000, 1000)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import integrate, ndimage, optimize, special
 
+import make_ideal_images as ideal
 from eyerender.extraction import extract
 from eyerender.extraction.pupil.covariance import to_axes
 from eyerender.extraction.pupil.edge_model import EdgeModel, Place, Profile
@@ -91,7 +92,7 @@ def test_covariance_of_the_axes_follows_the_shape_matrix():
     np.testing.assert_allclose(sample.std(axis=0), stated, rtol=0.05)
 
 
-def test_refined_maximum_is_the_least_squares_one(ideal):
+def test_refined_maximum_is_the_least_squares_one():
     """The fitted ellipse against scipy's optimiser on the same pixels and model."""
     drawing = ideal.draw(ideal.Condition(noise=(4, 4), glints="none"), 20_003)
     found = extract(drawing.image).pupil
@@ -137,7 +138,7 @@ def test_tailed_blur_and_a_slope_leave_no_bias():
     assert np.abs(np.mean(errors, axis=0)).max() < 0.008
 
 
-def test_second_pass_on_a_textured_iris_with_glints(ideal):
+def test_second_pass_on_a_textured_iris_with_glints():
     """The glints' light taken away, the fit starts again from a model that already has harmonics."""
     condition = ideal.Condition(noise=(1, 1), texture=(6, 6), glints="edge", semi_axis=(20, 26), size=(240, 200))
     refined = 0

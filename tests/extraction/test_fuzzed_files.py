@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import make_ideal_images as ideal
 from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.geometry.ellipse import Ellipse, iou
@@ -121,7 +122,7 @@ def _huge(data: bytes, rng: np.random.Generator) -> bytes:
 MUTATIONS: tuple[Mutation, ...] = (_whole, _truncated, _flipped, _flipped, _header, _magic, _doubled, _huge)
 
 
-def _fuzz(ideal, tmp_path, capfd, count: int, first: int) -> None:
+def _fuzz(tmp_path, capfd, count: int, first: int) -> None:
     condition = ideal.Condition(size=(180, 140), semi_axis=(14, 20), noise=(2, 2), glints="edge")
     sources = []
     for drawing in (ideal.draw(condition, 20_300 + i) for i in range(3)):
@@ -176,14 +177,14 @@ def _only_record(text: str) -> dict:
     return record
 
 
-def test_sixty_damaged_files(ideal, tmp_path, capfd):
-    _fuzz(ideal, tmp_path, capfd, 60, 0)
+def test_sixty_damaged_files(tmp_path, capfd):
+    _fuzz(tmp_path, capfd, 60, 0)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_thousand_damaged_files(ideal, tmp_path, capfd):
-    _fuzz(ideal, tmp_path, capfd, 1000, 1000)
+def test_thousand_damaged_files(tmp_path, capfd):
+    _fuzz(tmp_path, capfd, 1000, 1000)
 
 
 def test_what_is_no_regular_file_is_not_opened(tmp_path):

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+import make_ideal_images as ideal
 from eyerender.extraction import extract
 from eyerender.extraction.glints import deblending, fits, fitting, gaussian_model, windows
 
 SEEDS = range(20_000, 20_008)
 
 
-def _errors(ideal, condition: str, which: slice) -> np.ndarray:
+def _errors(condition: str, which: slice) -> np.ndarray:
     errors = []
     for seed in SEEDS:
         drawing = ideal.draw(condition, seed)
@@ -32,11 +33,11 @@ def _errors(ideal, condition: str, which: slice) -> np.ndarray:
         ("edge-glint", slice(0, 1), 0.020),
     ],
 )
-def test_centre_error(ideal, condition, which, median):
-    assert np.median(_errors(ideal, condition, which)) <= median
+def test_centre_error(condition, which, median):
+    assert np.median(_errors(condition, which)) <= median
 
 
-def test_clipped_glints_say_so_and_keep_their_amplitude(ideal):
+def test_clipped_glints_say_so_and_keep_their_amplitude():
     drawing = ideal.draw("saturated-glint", SEEDS[0])
     for glint in extract(drawing.image).glints:
         assert glint.saturated
@@ -45,7 +46,7 @@ def test_clipped_glints_say_so_and_keep_their_amplitude(ideal):
     assert not any(g.saturated for g in extract(ideal.draw("noise2", SEEDS[0]).image).glints)
 
 
-def test_merged_pair_is_parted(ideal):
+def test_merged_pair_is_parted():
     """Two spots 3.5 px apart, sigma 1.2 px: one bright patch with a dent."""
     drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none", aspect=(0.95, 1.0)), SEEDS[0])
     centre = np.array(drawing.label["pupil"]["centre_px"]) + np.array([4.3, -2.6])
@@ -59,7 +60,7 @@ def test_merged_pair_is_parted(ideal):
         assert min(np.hypot(*(g.xy_px - xy)) for g in found.glints) < 0.06
 
 
-def test_elongated_reflection_is_rejected_with_the_reason(ideal):
+def test_elongated_reflection_is_rejected_with_the_reason():
     drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[1])
     x, y = drawing.label["pupil"]["centre_px"]
     y += 2.0 * drawing.label["pupil"]["semi_axes_px"][0]
@@ -72,7 +73,7 @@ def test_elongated_reflection_is_rejected_with_the_reason(ideal):
     assert all(g.status == "rejected" and ("strip" in g.reason or "elongated" in g.reason) for g in near)
 
 
-def test_pupil_does_not_feel_a_glint_on_its_edge(ideal):
+def test_pupil_does_not_feel_a_glint_on_its_edge():
     """The same noise with and without a spot on the boundary: the centre moves by less than the noise moves it."""
     plain = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[2])
     pupil = plain.label["pupil"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import make_ideal_images as ideal
 from eyerender.extraction import FAST, REFINED, ExtractionSettings, extract
 from eyerender.extraction.glints.prescreening import bell_shaped
 from eyerender.extraction.pupil.consensus import BoundaryFit, ams_fit, boundaries_without_stretch
@@ -20,7 +21,7 @@ def _truth(drawing) -> Ellipse:
 
 @pytest.mark.parametrize("settings", [FAST, REFINED], ids=["fast", "refined"])
 @pytest.mark.parametrize("seed", [137, 230])
-def test_a_refused_outline_is_searched_again(ideal, seed, settings):
+def test_a_refused_outline_is_searched_again(seed, settings):
     # A lid's margin in the outline (137), and a blur that leaves the first candidate's edges unlikely (230).
     drawing = ideal.draw("mixed", seed)
     found = extract(drawing.image, settings=settings).pupil
@@ -29,7 +30,7 @@ def test_a_refused_outline_is_searched_again(ideal, seed, settings):
 
 
 @pytest.mark.parametrize("seed", [13, 26, 30, 102, 120, 136, 158, 193, 237, 260])
-def test_the_fallback_does_not_take_the_iris(ideal, seed):
+def test_the_fallback_does_not_take_the_iris(seed):
     # Faint pupils in irises that stand out: what a second look reports is the pupil, and nothing reported is the iris.
     drawing = ideal.draw("mixed", seed)
     found, truth = extract(drawing.image).pupil, _truth(drawing)
@@ -37,7 +38,7 @@ def test_the_fallback_does_not_take_the_iris(ideal, seed):
     assert found.status == "missing" or np.prod(found.ellipse.semi_axes_px) < 1.5 * np.prod(truth.semi_axes_px)
 
 
-def test_no_fallback_finds_a_pupil_where_no_eye_is(ideal):
+def test_no_fallback_finds_a_pupil_where_no_eye_is():
     sure = [extract(ideal.draw_no_eye(seed)).pupil.confidence > 0.8 for seed in range(12)]
     assert not any(sure)
 

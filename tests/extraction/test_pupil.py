@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+import make_ideal_images as ideal
 from eyerender.extraction import FAST, REFINED, ExtractionSettings, extract
 from eyerender.geometry.ellipse import Ellipse, iou
 
@@ -18,7 +19,7 @@ def _truth(drawing) -> Ellipse:
     return Ellipse(pupil["centre_px"], pupil["semi_axes_px"], pupil["angle_rad"])
 
 
-def _errors(ideal, condition: str, settings: ExtractionSettings, seeds: range = SEEDS) -> tuple[np.ndarray, np.ndarray]:
+def _errors(condition: str, settings: ExtractionSettings, seeds: range = SEEDS) -> tuple[np.ndarray, np.ndarray]:
     centre, axes = [], []
     for seed in seeds:
         drawing = ideal.draw(condition, seed)
@@ -44,13 +45,13 @@ MORE = ("noise2-17px", "noise2-13px", "noise16")
         ("noise16", 0.09), ("blur4", 0.04), ("texture6", 0.04), ("edge-glint", 0.02),
     ],
 )  # fmt: skip
-def test_refined_centre_error(ideal, condition, median):
+def test_refined_centre_error(condition, median):
     seeds = range(20_000, 20_024) if condition in MORE else SEEDS
-    centre, _ = _errors(ideal, condition, REFINED, seeds)
+    centre, _ = _errors(condition, REFINED, seeds)
     assert np.median(centre) <= median
 
 
-def test_light_from_one_side_does_not_move_a_noisy_pupil(ideal):
+def test_light_from_one_side_does_not_move_a_noisy_pupil():
     """Lamps beside the camera make one side of the iris brighter by less than the noise lets anyone see.
 
     Five hundredths over a semi-axis each way move the fit of one outer level by 0.06 to 0.09 px, against images of
@@ -71,14 +72,14 @@ def test_light_from_one_side_does_not_move_a_noisy_pupil(ideal):
 
 
 @pytest.mark.parametrize(("condition", "median"), [("clean", 0.005), ("noise2", 0.03), ("noise2-13px", 0.04)])
-def test_fast_centre_error(ideal, condition, median):
+def test_fast_centre_error(condition, median):
     # The algebraic fit of edges reaches half the bound's efficiency: twice the refined bars.
-    centre, axes = _errors(ideal, condition, FAST)
+    centre, axes = _errors(condition, FAST)
     assert np.median(centre) <= median
     assert np.abs(axes.mean(axis=0)).max() < 0.05
 
 
-def test_lidded_pupils_are_found(ideal):
+def test_lidded_pupils_are_found():
     for seed in list(SEEDS)[:3]:
         drawing = ideal.draw("lid", seed)
         found = extract(drawing.image).pupil
@@ -86,7 +87,7 @@ def test_lidded_pupils_are_found(ideal):
         assert found.goodness.gap > 0.1
 
 
-def test_no_iris_lock_on_bare_globes(ideal):
+def test_no_iris_lock_on_bare_globes():
     for seed in SEEDS:
         drawing = ideal.draw("remote", seed)
         found = extract(drawing.image, bit_depth=16).pupil
@@ -94,7 +95,7 @@ def test_no_iris_lock_on_bare_globes(ideal):
         assert iou(found.ellipse, _truth(drawing)) > 0.97
 
 
-def test_bright_pupil_is_the_negative_of_a_dark_one(ideal):
+def test_bright_pupil_is_the_negative_of_a_dark_one():
     drawing = ideal.draw("bright-pupil", SEEDS[0])
     found = extract(drawing.image, settings=ExtractionSettings(polarity="bright")).pupil
     assert np.hypot(*(found.ellipse.centre_px - _truth(drawing).centre_px)) < 0.05
@@ -102,7 +103,7 @@ def test_bright_pupil_is_the_negative_of_a_dark_one(ideal):
     assert dark.status == "missing" or iou(dark.ellipse, _truth(drawing)) < 0.9
 
 
-def test_covariance_is_the_scatter(ideal):
+def test_covariance_is_the_scatter():
     """Forty noises on one scene: the centre's Mahalanobis distances are chi-squared."""
     clean = ideal.draw("clean", SEEDS[0])
     truth = _truth(clean)
@@ -120,7 +121,7 @@ def test_covariance_is_the_scatter(ideal):
     assert np.all(np.linalg.eigvalsh(pupil.covariance) > 0.0)
 
 
-def test_encodings_of_one_image_agree(ideal):
+def test_encodings_of_one_image_agree():
     """8, 10, 12 and 16 bits, floats of any scale and a stated gamma describe the same scene."""
     condition = ideal.Condition(noise=(2, 2), bit_depth=16, glints="none")
     drawing = ideal.draw(condition, SEEDS[1])
@@ -145,7 +146,7 @@ def test_encodings_of_one_image_agree(ideal):
     assert (truth.semi_axes_px - encoded.semi_axes_px).mean() > 0.1
 
 
-def test_result_moves_and_turns_with_the_image(ideal):
+def test_result_moves_and_turns_with_the_image():
     drawing = ideal.draw("noise2", SEEDS[2])
     base = extract(drawing.image)
     height, width = drawing.image.shape
@@ -163,7 +164,7 @@ def test_result_moves_and_turns_with_the_image(ideal):
     assert min(gap, math.pi - gap) < 0.01
 
 
-def test_same_image_same_answer(ideal):
+def test_same_image_same_answer():
     image = ideal.draw("noise8", SEEDS[0]).image
     first, second = extract(image), extract(image)
     assert first.pupil.ellipse == second.pupil.ellipse

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from eyerender.optics.trace import trace
 from eyerender.status import Status
 
 NAMES = ("E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop")
-DATA = Path(__file__).resolve().parents[1] / "data"
 
 
 def test_the_catalogue_is_complete():

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -19,8 +16,7 @@ from eyerender.eye.pose import Poses, Turning, into_eye, rigid_motion
 from eyerender.geometry.surfaces import components, join
 from eyerender.optics.trace import trace
 from eyerender.status import Status
-
-DATA = Path(__file__).resolve().parents[1] / "data"
+from support.paths import load
 
 
 def targets(seed=0, count=200):
@@ -30,7 +26,7 @@ def targets(seed=0, count=200):
 
 def test_landmarks_agree_with_the_reference():
     """The reference found its nodal rays by a search that ends near 1e-10 mm."""
-    data = json.loads((DATA / "landmarks_E2.json").read_text())
+    data = load("landmarks_E2.json")
     eye = load_eye("E2").build()
     assert np.abs(eye.incident_node_mm - data["incidentNode"]).max() < 1e-9
     assert np.abs(eye.fovea_mm - data["fovea"]).max() < 1e-9
@@ -80,7 +76,7 @@ def test_the_node_moves_with_a_decentred_eye():
 
 
 def test_entrance_windows_agree_with_the_reference():
-    data = json.loads((DATA / "landmarks_E2.json").read_text())
+    data = load("landmarks_E2.json")
     seen = data["entranceWindow_10_m5_r1p53"]
     eye = load_eye("E2").build(pupil_diameter_mm=2 * 1.53)
     centre, lost = entrance_window_centre(eye, np.array([seen["object"]]))
@@ -116,7 +112,7 @@ def test_an_eye_on_the_axis_does_not_disturb_the_others_of_its_batch():
 
 
 def test_poses_by_entrance_window_agree_with_the_reference():
-    data = json.loads((DATA / "fixation_E2.json").read_text())
+    data = load("fixation_E2.json")
     expected = np.array([f["pose_azi_ele"] for f in data["fixations"]])
     torsion = np.array([f["pseudo_torsion"] for f in data["fixations"]])
     found = fixate(load_eye("E2").build(), [f["target_eye"] for f in data["fixations"]], "entrance_window")
@@ -129,7 +125,7 @@ def test_poses_by_entrance_window_agree_with_the_reference():
 
 def test_the_two_readings_differ_by_a_thousandth_of_a_degree():
     """They cross the optic axis .014 mm apart, under some 5.6 degrees."""
-    data = json.loads((DATA / "fixation_E2.json").read_text())
+    data = load("fixation_E2.json")
     goal, eye = [f["target_eye"] for f in data["fixations"]], load_eye("E2").build()
     chief, window = fixate(eye, goal), fixate(eye, goal, "entrance_window")
     by_azimuth = np.degrees(chief.poses.azimuth_rad - window.poses.azimuth_rad)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -12,8 +9,7 @@ from eyerender.eye.batch import stack_eyes
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses, Turning, into_eye, listing_torsion, rigid_motion, rotation_matrices
 from eyerender.geometry.surfaces import components, join
-
-DATA = Path(__file__).resolve().parents[1] / "data"
+from support.paths import load
 
 
 def poses(seed=0, count=100):
@@ -36,7 +32,7 @@ def test_azimuth_turns_left_and_elevation_up():
 
 
 def test_torsions_agree_with_the_reference():
-    data = json.loads((DATA / "projection_E2.json").read_text())
+    data = load("projection_E2.json")
     for record in data["records"]:
         azimuth, elevation = np.radians(record["pose_azi_ele"])
         assert abs(np.degrees(listing_torsion(azimuth, elevation)) - record["pseudo_torsion"]) < 1e-12

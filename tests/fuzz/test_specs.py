@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import yaml
-from fuzz_helpers import CASES, budget, edited, garbled, proper, strict_json
 from hypothesis import given
 
 from eyerender.analytic.observer import observe
@@ -19,6 +18,7 @@ from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.eye.catalogue import FOLDER, catalogue_names, load_eye
 from eyerender.eye.spec import EyeSpec
 from eyerender.scene import Scene, SceneSpec, load_scene, shipped_scenes
+from support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
 FEW = 8  # observations: more cost time and show nothing new
 

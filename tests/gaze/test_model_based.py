@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gaze_helpers import observations, rig
 from scipy.optimize import minimize
 
 from eyerender.errors import InputError
@@ -17,6 +16,7 @@ from eyerender.gaze.parameters import EyeParameters, ParameterBounds
 from eyerender.gaze.rays import unit
 from eyerender.gaze.twocamera import ShihWuLiu
 from eyerender.rig.camera import Camera
+from support.gaze import observations, rig
 
 EYE = EyeParameters(7.9, 4.3, 1.3375, 5.2, 1.8)
 LIGHTS = np.array([[615.0, 208.5, 0.0], [615.0, -208.5, 0.0], [640.0, 30.0, 180.0], [600.0, -90.0, -190.0]])

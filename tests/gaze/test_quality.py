@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gaze_helpers import observations
-from test_regression import RIG, synthetic
 
 from eyerender.arrays import frozen
 from eyerender.errors import InputError
 from eyerender.gaze.estimate import GazePoints, binocular_average
 from eyerender.gaze.quality import quality
 from eyerender.gaze.regression import Regression, pupil_glint_vectors
+from support.gaze import observations
+from support.regression import RIG, synthetic
 
 
 def test_quality_of_known_noise():

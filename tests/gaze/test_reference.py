@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gaze_helpers import PLANE_TO_WORLD, camera_of, ets_observations, ets_rig, load, observations, on_plane, rig
 
 from eyerender.gaze.cornea import from_all_glints, from_plane, line_to_centre
 from eyerender.gaze.crossratio import CrossRatio
@@ -15,6 +14,8 @@ from eyerender.gaze.homography import Homography
 from eyerender.gaze.parameters import EyeParameters, ParameterBounds
 from eyerender.gaze.rays import feature_rays
 from eyerender.gaze.regression import Regression
+from support.gaze import PLANE_TO_WORLD, camera_of, ets_observations, ets_rig, observations, on_plane, rig
+from support.paths import load
 
 BIQUADRATIC = "x + y + xy + x2 + y2 + 1"
 

@@ -6,7 +6,6 @@ import json
 
 import numpy as np
 import pytest
-from gaze_helpers import ets_observations, ets_rig, load
 
 from eyerender.analytic.observer import observe
 from eyerender.cli.app import run
@@ -22,6 +21,8 @@ from eyerender.gaze.store import (
     save_estimator,
 )  # fmt: skip
 from eyerender.scene import load_scene
+from support.gaze import ets_observations, ets_rig
+from support.paths import load
 
 
 @pytest.fixture(scope="module")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 import pickle
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,8 +11,7 @@ import pytest
 
 from eyerender.errors import InputError
 from eyerender.geometry import ellipse as el
-
-DATA = Path(__file__).parents[1] / "data"
+from support.paths import load
 
 
 def _random(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -68,7 +65,7 @@ def test_noisy_points_agree_with_the_published_algorithm(arc):
 
 
 def test_reference_vectors_of_an_independent_ray_tracer():
-    records = json.loads((DATA / "projection_E2.json").read_text())["records"]
+    records = load("projection_E2.json")["records"]
     assert len(records) == 12
     for record in records:
         block = record["converged"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from exhaustive import WIDTH_MM, exhaustive
 
 from eyerender.geometry.surfaces_biconic import Biconic
 from eyerender.geometry.surfaces_quadric import Quadric
@@ -12,6 +11,7 @@ from eyerender.geometry.transforms import tilt_rotation
 from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import inward_path, trace
 from eyerender.status import Status
+from support.exhaustive import WIDTH_MM, exhaustive
 
 
 def cornea(rng, biconics):

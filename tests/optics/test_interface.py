@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,8 +9,7 @@ from eyerender.geometry.surfaces import components, join
 from eyerender.geometry.transforms import normalize
 from eyerender.optics.interface import fresnel, reflect, refract
 from eyerender.optics.media import CauchyMedium, ConstantMedium
-
-DATA = Path(__file__).resolve().parents[1] / "data"
+from support.paths import load
 
 
 def rays(seed=0, count=500):
@@ -73,7 +69,7 @@ def test_fresnel_at_normal_incidence_brewster_and_total_reflection():
 
 def test_indices_agree_with_the_reference():
     """To 1e-10, the reference's own digits being exact; rounding is near 1e-15."""
-    data = json.loads((DATA / "refractive_index.json").read_text())
+    data = load("refractive_index.json")
     count = 0
     for name, table in data["values"].items():
         if name not in data["coefficients"]:

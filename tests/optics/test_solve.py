@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
-from test_trace import quadric_of
 
 from eyerender.eye.catalogue import catalogue_names, load_eye
 from eyerender.eye.pose import Poses, Turning, into_eye
@@ -21,13 +17,13 @@ from eyerender.optics.shooting import connect
 from eyerender.optics.solve import apparent_points, mirror_points
 from eyerender.optics.trace import Crossing, inward_path, outward_path, trace
 from eyerender.status import Status
-
-DATA = Path(__file__).resolve().parents[1] / "data"
+from support.paths import load
+from support.surfaces import quadric_of
 
 
 def gka_scenes(name):
     """(record, surfaces outside in, indices, camera and lights in the eye frame) of each recorded pose."""
-    data = json.loads((DATA / f"projection_{name}.json").read_text())
+    data = load(f"projection_{name}.json")
     rows = data["stopToMedium"]
     surfaces = [quadric_of(row, 1) for row in rows[:0:-1]]
     indices = [row[18] for row in rows[-2::-1]]
@@ -61,7 +57,7 @@ def test_exit_points_and_glints_agree_with_the_reference(name):
 
 def ets_scenes():
     """Single-sphere scenes in metres: their eye frame has the axis along -z, x and y across."""
-    data = json.loads((DATA / "etsimul_features.json").read_text())
+    data = load("etsimul_features.json")
     for scene in data["scenes"]:
         eye = scene["eye"]
         pose = np.array(eye["trans"])
@@ -99,7 +95,7 @@ def test_single_sphere_scenes_agree_with_the_reference():
 
 
 def test_single_rays_agree_with_the_reference():
-    data = json.loads((DATA / "etsimul_features.json").read_text())
+    data = load("etsimul_features.json")
     for ray in data["rays"]:
         eye = ray["eye"]
         pose = np.array(eye["trans"])

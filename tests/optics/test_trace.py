@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.optics.trace import Crossing, inward_path, outward_path, trace
 from eyerender.status import Status
-
-DATA = Path(__file__).resolve().parents[1] / "data"
-
-
-def quadric_of(row, sign):
-    """A row [A B C D E F G H I K ...] of the reference: A x^2 + ... + 2 D xy + ... + 2 G x + ... + K."""
-    a, b, c, d, e, f, g, h, i, k = row[:10]
-    matrix = np.array([[a, d, e], [d, b, f], [e, f, c]]) / b
-    return Quadric.oriented(matrix, np.array([g, h, i]) / b, k / b, sign)
+from support.paths import load
+from support.surfaces import quadric_of
 
 
 @pytest.fixture(scope="module")
 def skew():
-    data = json.loads((DATA / "raytrace_E4.json").read_text())
+    data = load("raytrace_E4.json")
     rows = data["optical_system"][1:]
     # The lens' back and the retina open to the front.
     surfaces = [quadric_of(row, sign) for row, sign in zip(rows, (1, 1, 1, -1, -1), strict=True)]

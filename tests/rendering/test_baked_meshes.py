@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,9 @@ import trimesh
 
 from eyerender import load_eye
 from eyerender.rendering.export import bake_meshes
+from support.paths import ROOT
 
-MESHES = Path(__file__).resolve().parent.parent.parent / "meshes"
+MESHES = ROOT / "meshes"
 
 
 @pytest.mark.parametrize("name", ["E2", "E5"])

@@ -18,6 +18,7 @@ from eyerender.capture import make_renderer, render_job, render_windows
 from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.scene import Scene, SceneSpec, load_scene
+from support.paths import SCRIPTS
 
 pytestmark = pytest.mark.render
 
@@ -292,7 +293,7 @@ def test_the_own_region_as_a_head_hides_what_it_hides(renderer, tmp_path):
     import subprocess
     import sys
 
-    script = Path(__file__).resolve().parent.parent.parent / "scripts" / "describe_head.py"
+    script = SCRIPTS / "describe_head.py"
     subprocess.run([sys.executable, str(script), "--example", str(tmp_path)], check=True, capture_output=True)
     head = only(scene_of(tmp_path, {"file": "manifest.json"}), renderer)
     own = only(Scene.of(SceneSpec.from_mapping({**scene_data({}), "region": {}})), renderer)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from render_rigs import BLACK, eye_of, job_of, remote_rig
+
+from support.render_rigs import BLACK, eye_of, job_of, remote_rig
 
 
 @pytest.mark.parametrize("model", ["E2", "E5"])

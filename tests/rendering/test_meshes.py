@@ -8,10 +8,10 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from render_rigs import eye_of, job_of, remote_rig
 
 from eyerender.eye.meshes import crossing, eye_meshes
 from eyerender.rendering.export import bake_meshes, export_scene
+from support.render_rigs import eye_of, job_of, remote_rig
 
 EYES = ["E1", "E2", "E3", "E4", "E5", "E5-published"]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from matplotlib.path import Path
-from render_oracles import contour_error, outline
-from render_rigs import PLAIN, RIGS, eye_of, head_rig, job_of, remote_rig
 
 from eyerender.rendering.surround import Obstacle
+from support.render_oracles import contour_error, outline
+from support.render_rigs import PLAIN, RIGS, eye_of, head_rig, job_of, remote_rig
 
 
 @pytest.mark.parametrize("rig_name", RIGS)

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from render_oracles import centroid
-from render_rigs import BLACK, RIGS, eye_of, head_rig, job_of, remote_rig
 
 from eyerender.errors import InputError
 from eyerender.geometry.surfaces import components
 from eyerender.optics.purkinje import purkinje_path, purkinje_points
 from eyerender.optics.shooting import ray_tube
 from eyerender.rendering.purkinje import stack
+from support.render_oracles import centroid
+from support.render_rigs import BLACK, RIGS, eye_of, head_rig, job_of, remote_rig
 
 
 @pytest.mark.parametrize("model", ["E3", "E4", "E5"])

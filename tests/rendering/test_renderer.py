@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.path import Path as Outline
-from render_rigs import eye_of, head_rig, job_of, remote_rig
 
 from eyerender.rig.camera import PinholeCamera
 from eyerender.rig.sensor import Sensor
-
-
-def digest(window) -> str:
-    return hashlib.sha256(window.irradiance.tobytes() + window.dn.tobytes() + window.labels.part.tobytes()).hexdigest()
-
-
-def noisy_job():
-    rig = head_rig()
-    return job_of(eye_of("E4"), rig, (200, 150, 160, 120), (5.0, 3.0), sensor=Sensor(), seed=77)
+from support.paths import TESTS
+from support.render_rigs import digest, eye_of, head_rig, job_of, noisy_job, remote_rig
 
 
 def test_a_seed_gives_the_same_bytes_with_any_threads_and_after_other_frames(renderer):
@@ -43,12 +33,11 @@ def test_a_fresh_process_gives_the_same_bytes(renderer):
     code = (
         "from eyerender.backends.choose import choose_backend\n"
         "b = choose_backend('llvm', threads=2)\n"
-        "import test_renderer as t\n"
+        "from support.render_rigs import digest, noisy_job\n"
         "from eyerender.rendering.renderer import Renderer\n"
-        "print(t.digest(Renderer(b, spp=16).render(t.noisy_job())))\n"
+        "print(digest(Renderer(b, spp=16).render(noisy_job())))\n"
     )
-    here = Path(__file__).parent
-    done = subprocess.run([sys.executable, "-c", code], cwd=here, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=TESTS, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == digest(renderer.render(noisy_job()))
 
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of, remote_rig
 
 from eyerender.arrays import frozen
 from eyerender.rendering.export import export_scene
 from eyerender.rig.camera import Camera
 from eyerender.rig.light import Lamp
+from support.render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of, remote_rig
 
 MATTE = PLAIN.model_copy(
     update={

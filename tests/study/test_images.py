@@ -7,17 +7,14 @@ import random
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-import stages
 
 from eyerender.analytic.observer import observe
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.validate import validate
 from eyerender.imagefile import read_image
-from eyerender.scene import Scene, SceneSpec
 from eyerender.study import blignaut, guestrin
 from eyerender.study.images import (
     ImageSettings,
@@ -31,19 +28,9 @@ from eyerender.study.images import (
 from eyerender.study.observing import Observing
 from eyerender.study.replicate import facing, scenes_of
 from eyerender.study.run import run_study
-
-
-def small_scenes(eyes=("E1", "E2")):
-    """Three targets, both eyes, with and without noise: twelve windows a model."""
-    out = []
-    for eye in eyes:
-        data = guestrin.scene(eye, guestrin.CORRECTED).spec.to_mapping()
-        data["targets"] = {"grid": [3, 1]}
-        data["image"] = {"window_px": [160, 120], "spp": 4}
-        data["subject"]["head_positions_mm"] = [[0, 0, 0]]
-        scene = Scene.of(SceneSpec.from_mapping(data))
-        out += [s.scene for noise in (True, False) for s in shots(scene, noise=noise, facing=True)]
-    return out
+from support import stages
+from support.paths import TESTS
+from support.study_scenes import small_scenes
 
 
 @pytest.mark.parametrize("module", [guestrin, blignaut])
@@ -135,8 +122,9 @@ def test_images_are_made_once_and_a_part_of_them_serves_too(tmp_path):
 KILLED = """
 import sys
 from pathlib import Path
-sys.path[:0] = {tests!r}
-from test_images import ImageSettings, make_images, small_scenes
+sys.path.insert(0, {tests!r})
+from eyerender.study.images import ImageSettings, make_images
+from support.study_scenes import small_scenes
 make_images("small", small_scenes(), ImageSettings(Path({folder!r}), workers=1))
 """
 
@@ -144,7 +132,7 @@ make_images("small", small_scenes(), ImageSettings(Path({folder!r}), workers=1))
 @pytest.mark.render
 def test_a_killed_run_goes_on_where_it_was(tmp_path):
     folder = tmp_path / "killed"
-    script = KILLED.format(tests=[str(p) for p in Path(__file__).parents[:2]], folder=str(folder))
+    script = KILLED.format(tests=str(TESTS), folder=str(folder))
     # When its shards are finished and are about to be put together.
     hook = stages.environment(tmp_path, folder, match=r"/metadata\.jsonl$", at=1)
     process = subprocess.Popen([sys.executable, "-c", script], start_new_session=True, env=hook)

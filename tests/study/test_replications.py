@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import guestrin_by_hand
 import numpy as np
 import pytest
 
@@ -19,6 +18,7 @@ from eyerender.study import literature as lit
 from eyerender.study.findings import t_tests
 from eyerender.study.observing import Observing
 from eyerender.study.replicate import blignaut_part, guestrin_part
+from support import guestrin_by_hand
 
 
 def means(eye, departures, **options):

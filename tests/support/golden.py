@@ -1,6 +1,6 @@
 """Small results that stand for all: what `tests/test_results_version.py` compares with the stored ones.
 
-`python tests/golden.py` writes them for the version that `eyerender.imagefolder.RESULTS` says.
+`python tests/support/golden.py` writes them for the version that `eyerender.imagefolder.RESULTS` says.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from eyerender.dataset.realise import frames_of
 from eyerender.imagefolder import RESULTS
 from eyerender.scene import Scene, SceneSpec
 
-STORED = Path(__file__).parent / "data" / f"results_{RESULTS}.json"
+STORED = Path(__file__).parents[1] / "data" / f"results_{RESULTS}.json"
 BLOCK = 16  # px
 EYES = ("E1", "E2", "E3", "E4", "E5")
 SCENE = {

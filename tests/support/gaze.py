@@ -8,9 +8,6 @@ y down.
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 
 from eyerender.arrays import frozen
@@ -20,14 +17,9 @@ from eyerender.rig.light import Lamp
 from eyerender.rig.rig import RigGeometry
 from eyerender.rig.screen import ScreenPlane
 
-DATA = Path(__file__).parents[1] / "data"
 ETS_TO_WORLD = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 # (z away from the user, x to the user's right, y up), the user at z = +658: the one-camera vectors.
 PLANE_TO_WORLD = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-
-
-def load(name):
-    return json.loads((DATA / name).read_text(encoding="utf-8"))
 
 
 def observations(pupil, glints, targets=None, *, eye=None, camera=None, fixation=None, frame=None, head=None):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from eyerender.rig.sensor import Sensor
 
 if TYPE_CHECKING:
     from eyerender.rendering.frame import RenderJob
+    from eyerender.rendering.renderer import RenderedWindow
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
 BLACK = Look(
@@ -79,3 +81,13 @@ def job_of(
     M, t = rigid_motion(Poses.from_degrees([pose_deg[0]], [pose_deg[1]]), eye)
     job = RenderJob(eye, M[0], t[0], rig.camera, window, rig.lights, Sensor(noise=False), apex_mm=np.zeros(3), seed=1)
     return replace(job, **changes)
+
+
+def digest(window: RenderedWindow) -> str:
+    """A checksum of a window's pictures."""
+    return hashlib.sha256(window.irradiance.tobytes() + window.dn.tobytes() + window.labels.part.tobytes()).hexdigest()
+
+
+def noisy_job() -> RenderJob:
+    rig = head_rig()
+    return job_of(eye_of("E4"), rig, (200, 150, 160, 120), (5.0, 3.0), sensor=Sensor(), seed=77)
