@@ -20,11 +20,11 @@ _interrupted = threading.Event()
 app = App(
     name="eyerender",
     help="Near-infrared eye images rendered through refractive corneas, with exact labels.",
-    help_epilogue="Exit codes: 0 done, 1 the run failed, 2 bad input or usage, 3 no usable render backend, "
-    "130 interrupted. --debug shows a traceback.",
+    help_epilogue="Exit codes: 0 done, 1 the run failed, 2 bad input or usage, 3 no usable backend, 130 interrupted. "
+    "`--debug` shows a traceback.",
     result_action="return_value",
     suppress_keyboard_interrupt=False,
-    help_format="plaintext",
+    help_format="markdown",
     default_parameter=Parameter(negative=()),
 )
 

@@ -24,23 +24,18 @@ def bench_extractors(
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
-    """Run pupil and glint extractors over a folder of labelled images and measure each against the labels.
+    """Measure pupil and glint extractors against the labels of a folder of images.
 
-    Writes report.html, results.json and results.csv. Each extractor runs in a process of its own: one that crashes,
-    hangs or prints nonsense costs its own result only, which says why.
+    The output folder receives report.html, results.json and results.csv. Each extractor runs in its own process. If it
+    crashes, hangs or returns invalid answers, only its own result fails, with a reason.
 
-    Parameters
-    ----------
-    folder
-        A folder of labelled images: of quickstart, render or generate, or of ideal images.
-    output
-        The folder to write.
-    extractor
-        An installed extractor's name (own-fast, own-refined, opencv-contour, pupil-detectors, or a plug-in's), a Python
-        module:callable, or a command that speaks the protocol; NAME=... gives it a name. Repeat for several
-        (default: all that are installed).
-    timeout
-        Seconds an extractor may take for one image.
+    Args:
+        folder: A folder of labelled images written by quickstart, render or generate, or a folder of ideal images.
+        output: The folder to write.
+        extractor: The name of an installed extractor (own-fast, own-refined, opencv-contour, pupil-detectors, or a
+            plug-in), a Python module:callable, or a command that speaks the protocol. NAME=... names it in the report.
+            Repeat the option for several extractors (default: all installed ones).
+        timeout: Seconds that an extractor may take for one image.
     """
     from ..benchmark.registry import defaults, resolve
     from ..benchmark.run import REPORT, bench_extractors

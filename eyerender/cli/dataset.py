@@ -38,30 +38,22 @@ def generate(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Make a labelled dataset; started again on the same folder, it makes what is missing.
+    """Make a labelled dataset, or resume an interrupted one.
 
-    Parameters
-    ----------
-    spec
-        A dataset file, or the bare name of a shipped one.
-    folder
-        The folder to write.
-    workers
-        Worker processes (default: one a processor while memory lasts).
-    shard
-        K/N: make only every N-th shard, from the K-th on (1 <= K <= N), for array jobs on one folder.
-    engine
-        Processes of this machine, or actors of a Ray cluster.
-    address
-        The Ray cluster's address (default: one started on this machine).
-    dry_run
-        Only tell how long it would take and how much disk, by the last rate of this spec on this machine.
-    measure
-        With --dry-run: make a few samples to measure the rate.
-    count
-        Make the first COUNT samples of the spec's plan; more than it has plan a larger dataset.
-    timeout
-        Seconds without a sign of life after which a worker is ended and its shard tried again.
+    When started again on the same folder, the command makes only what is missing.
+
+    Args:
+        spec: A dataset file, or the name of a shipped one.
+        folder: The folder to write.
+        workers: Number of worker processes (default: one per processor, as far as memory allows).
+        shard: K/N: make only every N-th shard, starting with the K-th (1 <= K <= N). Use it for array jobs that write
+            to one folder.
+        engine: Processes on this machine (local), or actors on a Ray cluster (ray).
+        address: Address of the Ray cluster (default: start one on this machine).
+        dry_run: Only estimate the time and the disk space, from the last measured rate of this spec on this machine.
+        measure: With --dry-run, make a few samples to measure the rate.
+        count: Make the first COUNT samples of the spec's plan. A count above the spec's own plans a larger dataset.
+        timeout: Seconds without a sign of life after which a worker is ended and its shard is retried.
     """
     from ..dataset.plan import Plan
     from ..dataset.run import Options
@@ -88,7 +80,9 @@ def generate(
     if folder is None and not dry_run:
         raise InputError("give the folder to write", source="DIR")
     if overwrite and shard is not None:
-        raise InputError("cannot be given with --shard: other parts may be at work in the folder", source="--overwrite")
+        raise InputError(
+            "cannot be combined with --shard, because other jobs may be writing to the folder", source="--overwrite"
+        )
     heed = Heed(strict)
     heed(plan.warnings())
     if dry_run:
@@ -118,16 +112,12 @@ def sample(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Show sample I of a dataset: whose it is, what was drawn, and the scene and eye that come of it.
+    """Show the subject, the drawn values and the scene of one sample.
 
-    Parameters
-    ----------
-    spec
-        A dataset file, or the bare name of a shipped one.
-    index
-        The sample, from 0.
-    output
-        A folder for scene.yaml and eye.yaml, which the other commands read.
+    Args:
+        spec: A dataset file, or the name of a shipped one.
+        index: The index of the sample, counted from 0.
+        output: A folder for scene.yaml and eye.yaml, which other commands can read.
     """
     import yaml
 
@@ -138,12 +128,12 @@ def sample(
     if not 0 <= index < plan.spec.count:
         raise InputError(
             f"must be 0 to {plan.spec.count - 1}, not {index}: {spec} has {plan.spec.count} samples; "
-            "give one of them, or raise 'count' in the spec",
+            "choose one of them, or raise 'count' in the spec",
             source="I",
         )
     found = realise(plan, index)
     if found.sample is None or found.scene is None:
-        raise InputError(f"sample {index} is given up: {found.rejections[-1].reason}", source=plan.source)
+        raise InputError(f"sample {index} was given up: {found.rejections[-1].reason}", source=plan.source)
     heed = Heed(strict)
     heed(warning.at(plan.source) for warning in found.scene.warnings())
     data = {"schema": "eyerender/sample/1", **found.sample.to_mapping()}
@@ -167,14 +157,13 @@ def preview(
     threads: Threads = None,
     strict: Strict = False,
 ) -> int:
-    """Render a contact sheet of 16 images of a scene or a dataset; for people, never to measure in.
+    """Render a contact sheet of 16 images of a scene or a dataset.
 
-    Parameters
-    ----------
-    spec
-        A scene or a dataset: a file, or the bare name of a shipped one.
-    output
-        The picture to write.
+    The sheet is for looking at, not for measurements.
+
+    Args:
+        spec: A scene or dataset file, or the name of a shipped one.
+        output: The picture to write.
     """
     positive("--threads", threads)
     from ..dataset.plan import Plan
@@ -186,7 +175,7 @@ def preview(
         raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(output))
     what: Plan | Scene
     if spec not in shipped_files():
-        refuse_folder(Path(spec), "a scene or the spec of a dataset: a file, or the name of a shipped one")
+        refuse_folder(Path(spec), "a scene or dataset file, or the name of a shipped one")
     if spec in shipped_datasets() or is_dataset(Path(spec)):
         what = Plan.load(spec, eye=eye, seed=seed)
     else:
@@ -208,21 +197,17 @@ def validate(
     deep: bool = False,
     json: Result = None,
 ) -> int:
-    """Check a folder of images and print its statistics.
+    """Check a folder's files, labels and masks, and print statistics.
 
-    Checks are made of checksums, of records and labels (computed again from pose and parameters), and of masks (against
-    the apparent outlines). Exit code 1 where something is wrong.
+    The command compares files with their checksums, computes records and labels again from pose and parameters, and
+    compares masks with the apparent pupil outlines. The exit code is 1 if anything is wrong.
 
-    Parameters
-    ----------
-    folder
-        A folder that render, quickstart or generate wrote.
-    quick
-        Neither open nor hash pictures: a changed byte in one and a wrong mask are not found, only missing files and
-        other sizes.
-    deep
-        Compute every line again. By default 64 are, one at a hashed place in each 64th of the file, and all of a
-        folder that has no more.
+    Args:
+        folder: A folder written by render, quickstart or generate.
+        quick: Do not open or hash the pictures. This still finds missing files and wrong sizes, but no changed bytes or
+            wrong masks.
+        deep: Compute every line again. By default, 64 lines are computed again, one at a hashed position in each 64th
+            of the file; a folder with at most 64 lines is checked completely.
     """
     from ..dataset.validate import validate as check
 
@@ -245,22 +230,15 @@ def export_dataset(
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
-    """Write a generated dataset in a layout that existing training code reads.
+    """Convert a generated dataset to a layout that existing training code reads.
 
-    Parameters
-    ----------
-    folder
-        A folder that generate wrote.
-    out
-        The folder to write.
-    format
-        The layout.
-    bits
-        Of the images: 8, or 16 in webdataset, coco and csv.
-    encoding
-        Linear, or with a gamma of 2.2 (default: gamma for 8 bits, linear for 16).
-    gain
-        The exposure gain of all images (default: measured on a sample of them; 1 for 16 bits, linear).
+    Args:
+        folder: A folder written by generate.
+        out: The folder to write.
+        format: The layout.
+        bits: Bits per pixel of the images: 8, or 16 for webdataset, coco and csv.
+        encoding: Linear, or with a gamma of 2.2 (default: gamma for 8 bits, linear for 16 bits).
+        gain: Exposure gain of all images (default: measured on a sample of the images; 1 for 16-bit linear images).
     """
     from ..dataset.export import export
 
@@ -303,10 +281,10 @@ def _generate_text(done: dict[str, Any]) -> str:
         return "\n".join(lines)
     s = done["statistics"]
     splits = ", ".join(f"{name} {n}" for name, n in s["images_by_split"].items())
-    lines.append(f"{s['images']} images in {done['path']}: {splits}; {s['bytes_per_image']} bytes an image")
+    lines.append(f"{s['images']} images in {done['path']}: {splits}; {s['bytes_per_image']} bytes per image")
     if s["attempts_rejected"]:
         given = s["samples_given_up"]
-        lines.append(f"{s['attempts_rejected']} attempts drawn again, {given} samples given up (see failures.jsonl)")
+        lines.append(f"{s['attempts_rejected']} attempts redrawn, {given} samples given up (see failures.jsonl)")
     return "\n".join(lines)
 
 
@@ -314,7 +292,7 @@ def _estimate_text(found: dict[str, Any]) -> str:
     rate = found["rate"]
     text = f"{found['images']} images in {found['shards']} shards, {found['workers']} workers"
     if rate is None:
-        return f"{text}: time and disk unknown, no rate of this spec on this machine; --measure makes a few samples"
+        return f"{text}: time and disk space are unknown, because this spec was never measured on this machine; use --measure"
     how = "measured" if rate["how"] == "measured" else "of a run"
     return (
         f"{text} of {found['threads_per_worker']} threads on {rate['backend']}: about {_duration(found['seconds'])}, "

@@ -13,7 +13,10 @@ from .output import emit, say
 
 @app.command(name="doctor")
 def doctor(*, json: Result = None) -> int:
-    """Show which backends render here and how to fix the others; the exit code is 0 only where one renders."""
+    """Show which backends can render here and how to fix the others.
+
+    The exit code is 3 if none can render.
+    """
     from ..backends.doctor import doctor_report
 
     report = doctor_report()
@@ -23,7 +26,9 @@ def doctor(*, json: Result = None) -> int:
         if not state.ok:
             lines.append(f"      fix: {state.fix}")
     lines.append(
-        f"rendering uses {report.chosen}" if report.chosen else "nothing renders here; analysis and extraction do"
+        f"rendering uses {report.chosen}"
+        if report.chosen
+        else "no backend can render here; analysis and extraction work"
     )
     lines += [f"python   {report.python}", f"platform {report.platform}", f"cpu      {report.cpu}"]
     lines += [f"{name} {version}" for name, version in report.packages]
@@ -34,7 +39,10 @@ def doctor(*, json: Result = None) -> int:
 
 @app.command(name="setup-llvm")
 def setup_llvm() -> int:
-    """Fetch the libLLVM that rendering on the processor needs if none here works; needs no root."""
+    """Fetch the libLLVM that rendering on the CPU needs, unless one works already.
+
+    It needs no root rights.
+    """
     from ..backends.set_up import setup_llvm as bring
 
     found = bring(say=say)
@@ -44,12 +52,12 @@ def setup_llvm() -> int:
 
 @app.command(name="schema")
 def schema(name: Literal["scene", "eye", "dataset"] = "scene", /) -> int:
-    """Print the JSON Schema of a scene, an eye or a dataset file, for editors.
+    """Print the JSON Schema of a scene, eye or dataset file.
 
-    Parameters
-    ----------
-    name
-        Which kind of file.
+    Editors use it to complete and check the file.
+
+    Args:
+        name: The kind of file.
     """
     if name == "scene":
         from ..scene import SceneSpec

@@ -27,20 +27,14 @@ def export_scene(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Write one frame as PLY meshes and a Mitsuba XML that the stock `mitsuba` command renders as it is.
+    """Write one frame as PLY meshes and a Mitsuba XML file for the stock renderer.
 
-    Parameters
-    ----------
-    scene
-        A scene file, or the bare name of a shipped scene.
-    folder
-        The folder to write.
-    frame
-        Which frame of the scene.
-    side
-        Which eye, right or left; default: the first that the frame shows.
-    spp
-        Samples per pixel that the file asks for; the stock path integrator needs many.
+    Args:
+        scene: A scene file, or the name of a shipped scene.
+        folder: The folder to write.
+        frame: The frame of the scene, counted from 0.
+        side: The eye, right or left (default: the first one that the frame shows).
+        spp: Samples per pixel requested in the file; the stock path integrator needs many.
     """
     from ..analytic.observer import observe
     from ..capture import check_windows, render_job

@@ -20,10 +20,8 @@ _FORMATS = (".svg", ".pdf", ".png")
 def eyes(name: str | None = None, /, *, json: Result = None) -> int:
     """List the eye models of the catalogue, or print one as an eye file.
 
-    Parameters
-    ----------
-    name
-        A name of the catalogue, or an eye file.
+    Args:
+        name: The name of a catalogue model, or an eye file.
     """
     from ..eye.catalogue import catalogue_names, load_eye
 
@@ -52,18 +50,13 @@ def view(
     eye: str | None = None,
     strict: Strict = False,
 ) -> int:
-    """Draw an eye's section, or a scene's rig with its rays, as SVG, PDF or PNG.
+    """Draw an eye's section, or a scene's rig and rays, as SVG, PDF or PNG.
 
-    Parameters
-    ----------
-    what
-        An eye of the catalogue or an eye file; or a scene.
-    name
-        Its name or file.
-    output
-        The picture to write; its ending gives the format.
-    eye
-        Replace the scene's eye model.
+    Args:
+        what: What to draw.
+        name: For an eye, a catalogue name or an eye file; for a scene, a scene file or the name of a shipped one.
+        output: The picture to write; its suffix selects the format.
+        eye: Replace the scene's eye model.
     """
     if output.suffix.lower() not in _FORMATS:
         raise InputError(f"must end with one of {', '.join(_FORMATS)}", source=str(output))

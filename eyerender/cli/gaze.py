@@ -15,7 +15,7 @@ from .output import Heed, emit
 if TYPE_CHECKING:
     from ..scene import Scene
 
-gaze = App(name="gaze", help="Estimate gaze from records of features, those of real images too.")
+gaze = App(name="gaze", help="Estimate gaze from records of features, also from real images.")
 app.command(gaze)
 
 EstimatorName = Literal["regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman"]
@@ -41,38 +41,27 @@ def fit(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Calibrate a gaze estimator on records of known targets, and write the calibration.
+    """Calibrate a gaze estimator on records with known targets, and write the calibration.
 
-    Parameters
-    ----------
-    records
-        Records as `features` or `extract` write them (JSON), or one record a line (JSONL); each with its target_mm.
-    estimator
-        Which estimator: regression (polynomials of the pupil-glint vector; one light), homography (normalisation by
-        four lights), cross-ratio (four lights at the screen's corners, one at the camera), hennessey (one camera, two
-        lights), shih-wu-liu (two cameras, two lights), guestrin-eizenman (one camera, two lights).
-    output
-        The calibration file to write.
-    scene
-        A scene file or the name of a shipped one, for its rig; default: the rig in the records' file.
-    function
-        regression: R1 to R12.
-    terms_x
-        regression: terms of x instead, such as 'x + xy + 1'.
-    terms_y
-        regression: terms of y.
-    monocular
-        regression: the vector of one eye in pixels, not divided by the distance of both pupils.
-    method
-        guestrin-eizenman: centre of the cornea from all glints (A), or on the planes' common line (B).
-    free_index
-        guestrin-eizenman: calibrate the index of refraction too.
-    index
-        guestrin-eizenman, hennessey: the index assumed.
-    recalibration
-        hennessey, shih-wu-liu: what the correcting polynomial works on.
-    fixations
-        Calibrate on these fixations only, counted from 0: '0,4,8'.
+    Args:
+        records: Records as `features` or `extract` write them (JSON), or one record per line (JSONL). Each record needs
+            its target_mm.
+        estimator: regression (polynomials of the pupil-glint vector; one light), homography (normalisation by four
+            lights), cross-ratio (four lights at the screen's corners and one at the camera), hennessey (one camera, two
+            lights), shih-wu-liu (two cameras, two lights), or guestrin-eizenman (one camera, two lights).
+        output: The calibration file to write.
+        scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
+        function: regression: the function, R1 to R12.
+        terms_x: regression: your own terms of x instead of a function, such as 'x + xy + 1'.
+        terms_y: regression: your own terms of y.
+        monocular: regression: use the vector of one eye in pixels, without dividing it by the distance between the
+            pupils.
+        method: guestrin-eizenman: locate the corneal centre from all glints (A), or on the common line of the planes
+            (B).
+        free_index: guestrin-eizenman: also calibrate the refractive index.
+        index: guestrin-eizenman, hennessey: the assumed refractive index.
+        recalibration: hennessey, shih-wu-liu: the quantity that the correction polynomial acts on.
+        fixations: Calibrate on these fixations only, counted from 0, such as '0,4,8'.
     """
     from ..gaze.records import load_observations
     from ..gaze.store import EstimatorSpec, fit_estimator, save_estimator
@@ -115,16 +104,14 @@ def predict(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Estimate gaze points with a calibration that `gaze fit` wrote; where targets are known, their errors too.
+    """Estimate gaze points with a calibration written by `gaze fit`.
 
-    Parameters
-    ----------
-    records
-        Records as `features` or `extract` write them (JSON), or one record a line (JSONL).
-    calibration
-        The calibration file.
-    scene
-        A scene file or the name of a shipped one, for its rig; default: the rig in the records' file.
+    Where the targets are known, the errors are reported too.
+
+    Args:
+        records: Records as `features` or `extract` write them (JSON), or one record per line (JSONL).
+        calibration: The calibration file.
+        scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
     """
     from ..gaze.records import load_observations
     from ..gaze.store import load_calibration, predictions
@@ -156,7 +143,7 @@ def _chosen(text: str | None) -> list[int] | None:
     try:
         return [int(part) for part in text.split(",") if part.strip()]
     except ValueError:
-        raise InputError(f"{text!r} is no list of whole numbers", source="--fixations") from None
+        raise InputError(f"{text!r} is not a list of whole numbers", source="--fixations") from None
 
 
 def _gaze_table(data: dict[str, Any]) -> str:

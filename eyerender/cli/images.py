@@ -31,16 +31,11 @@ def render(
 ) -> int:
     """Render a scene into a folder of labelled near-infrared images.
 
-    Parameters
-    ----------
-    scene
-        A scene file, or the bare name of a shipped scene.
-    output
-        The folder to write.
-    spp
-        Replace the scene's samples per pixel.
-    exr
-        Also write the noise-free linear irradiance as EXR.
+    Args:
+        scene: A scene file, or the name of a shipped scene.
+        output: The folder to write.
+        spp: Replace the scene's samples per pixel.
+        exr: Also write the noise-free linear irradiance as EXR.
     """
     from ..capture import render_folder
     from ..scene import load_scene
@@ -69,12 +64,10 @@ def quickstart(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Do the main job: fixate, render, extract, calibrate, compare; and write a report to look at.
+    """Render a small scene, extract its features, estimate gaze, and write a report.
 
-    Parameters
-    ----------
-    folder
-        The folder to write.
+    Args:
+        folder: The folder to write.
     """
     from ..quickstart import run_quickstart
 

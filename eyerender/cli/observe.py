@@ -27,18 +27,15 @@ def features(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Compute the apparent pupil and the glints of a scene by ray optics; needs no renderer.
+    """Compute the apparent pupil and the glints of a scene by ray optics.
 
-    Parameters
-    ----------
-    scene
-        A scene file, or the bare name of a shipped scene.
-    points
-        Boundary points of the pupil.
-    record
-        Version of the records in the JSON, 1 or 2; in 1 a pupil of which only arcs are seen is missing.
-    purkinje
-        Also compute these Purkinje images (1 to 4) and how far the pupil is from an ellipse; in the JSON.
+    This needs no renderer.
+
+    Args:
+        scene: A scene file, or the name of a shipped scene.
+        points: Number of boundary points of the pupil.
+        record: Version of the records in the JSON, 1 or 2. Version 1 reports a partly visible pupil as missing.
+        purkinje: Add these Purkinje images (1 to 4) and the deviation of the pupil from an ellipse to the JSON.
     """
     # Not through `observers`, which would load OpenCV for nothing.
     from ..analytic.observer import observe_in_detail, purkinje_records
@@ -74,18 +71,15 @@ def extract(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Recover the pupil ellipse and the glints from images; a pupil that is not found is a result, not an error.
+    """Find the pupil ellipse and the glints in images.
 
-    Parameters
-    ----------
-    images
-        Greyscale images, or a folder of images that this package wrote.
-    scene
-        A scene whose rig identifies the glints by light.
-    gamma
-        Encoding gamma of the images' values; 1 is linear.
-    record
-        Version of the records in the JSON, 1 or 2.
+    An image without a detected pupil is a result with a reason, not an error.
+
+    Args:
+        images: Greyscale images, or one folder of images that this package wrote.
+        scene: A scene; its rig assigns the glints to lights.
+        gamma: Encoding gamma of the pixel values; 1 is linear.
+        record: Version of the records in the JSON, 1 or 2.
     """
     from ..observers import ImageObserver
     from ..scene import load_scene
@@ -114,14 +108,13 @@ def compare(
     function: str = "R3",
     json: Result = None,
 ) -> int:
-    """Extract the features of a folder of images and compare them with its analytic ones, in pixels and in gaze.
+    """Compare the features found in a folder's images with its analytic ones.
 
-    Parameters
-    ----------
-    folder
-        A folder that render, quickstart or generate wrote.
-    function
-        Regression function of the gaze estimator, R1 to R12.
+    The differences are given in pixels and in degrees of gaze.
+
+    Args:
+        folder: A folder written by render, quickstart or generate.
+        function: Regression function of the gaze estimator, R1 to R12.
     """
     from ..quickstart import compare_folder
 

@@ -9,15 +9,17 @@ from cyclopts import Parameter
 from ..backends.choose import BackendChoice
 from ..errors import InputError
 
-EyeModel = Annotated[str | None, Parameter(help="Replace the eye model: a name of the catalogue, or an eye file.")]
+EyeModel = Annotated[str | None, Parameter(help="Replace the eye model by a catalogue name or an eye file.")]
 Seed = Annotated[int | None, Parameter(help="Replace the seed.")]
-Backend = Annotated[BackendChoice, Parameter(help="Where to render.")]
-Threads = Annotated[int | None, Parameter(help="Processor threads in all (default: all there are).")]
-Overwrite = Annotated[bool, Parameter(help="Replace what the folder holds.")]
-Strict = Annotated[bool, Parameter(help="Treat warnings as errors: nothing is done, exit code 2.")]
+Backend = Annotated[BackendChoice, Parameter(help="The render backend.")]
+Threads = Annotated[int | None, Parameter(help="Total number of CPU threads (default: all).")]
+Overwrite = Annotated[bool, Parameter(help="Replace the contents of the folder.")]
+Strict = Annotated[bool, Parameter(help="Treat warnings as errors: do nothing and exit with code 2.")]
 Result = Annotated[
     str | None,
-    Parameter(name="--json", allow_leading_hyphen=True, help="Write the result as JSON to a file, or to stdout (-)."),
+    Parameter(
+        name="--json", allow_leading_hyphen=True, help="Write the result as JSON to a file, or to stdout with -."
+    ),
 ]
 
 

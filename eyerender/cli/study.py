@@ -29,33 +29,25 @@ def study(
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
-    """Replicate a published study of gaze estimation, test its findings on its own data, or compare the observers.
+    """Replicate a published gaze study, or compare observers or conditions.
 
-    Writes summary.json, findings.json, CSV of both and report.html. A folder of the same study is run again in place.
-    Rendered images are a dataset in images/: a run that was stopped goes on where it was, and what is finished is used
-    again.
+    The folder receives summary.json, findings.json, both as CSV, and report.html. A folder of the same study is
+    updated in place. Rendered images form a dataset in images/: an interrupted run resumes, and finished images are
+    reused.
 
-    Parameters
-    ----------
-    name
-        guestrin2006 (model-based), blignaut2014 (interpolation-based), observers (analytic against image-derived
-        features on the head-mounted rig), or conditions (errors over the screen, head positions, pupil sizes and eye
-        parameters; analytic).
-    output
-        The folder to write.
-    protocol
-        guestrin2006, blignaut2014: what the authors' software did (published), what the text says (corrected), or both.
-    observer
-        Features by ray optics (analytic), recovered from rendered images (image), or both, which compares them.
-        Default: analytic; both for observers.
-    eyes
-        Eye models, separated by commas: names of the catalogue, or eye files (default: E1 to E5).
-    workers
-        Processes (default: one a processor).
-    spp
-        Samples per pixel of the images (default: the scene's).
-    noise
-        Images with the sensor's noise (on), without it (off), or both.
+    Args:
+        name: guestrin2006 (model-based gaze), blignaut2014 (interpolation-based gaze), observers (analytic against
+            image-derived features on the head-mounted rig), or conditions (analytic errors over the screen, head
+            positions, pupil sizes and eye parameters).
+        output: The folder to write.
+        protocol: guestrin2006 and blignaut2014: what the authors' software computes (published), what the paper says
+            (corrected), or both.
+        observer: Features from ray optics (analytic), from rendered images (image), or both for comparison (default:
+            analytic; both for observers).
+        eyes: Eye models separated by commas, as catalogue names or eye files (default: E1 to E5).
+        workers: Number of worker processes (default: one per processor).
+        spp: Samples per pixel of the images (default: the scene's value).
+        noise: Images with sensor noise (on), without it (off), or both.
     """
     from ..study.literature import MODELS
     from ..study.run import REPORT, run_study

@@ -306,7 +306,7 @@ class _Run:
         left = (self.total - samples) * seconds / samples if samples else 0.0
         note = f"samples, {rate:.2f} images/s, {_clock(left)} left"
         if self.rejected:
-            note += f", {self.rejected} attempts drawn again, {self.given_up} samples given up"
+            note += f", {self.rejected} attempts redrawn, {self.given_up} samples given up"
         self.progress(samples, self.total, note)
 
     def _note_backends(self, done: set[int]) -> None:

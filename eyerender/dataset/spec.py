@@ -124,5 +124,5 @@ def find_dataset(spec: str | Path) -> Path:
             raise InputError(NOT_A_DATASET, source=str(spec))
         if path.suffix not in (".yaml", ".yml") and not os.path.exists(path):
             raise InputError(f"no such dataset file; shipped: {', '.join(shipped)}", source=str(spec))
-    refuse_folder(path, "the spec of a dataset: a file, or the name of a shipped one")
+    refuse_folder(path, "a dataset file, or the name of a shipped one")
     return path

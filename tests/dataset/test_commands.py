@@ -82,7 +82,9 @@ def test_a_dry_run_uses_the_last_rate_of_the_spec(spec, tmp_path, monkeypatch, c
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     text, found = dry_run(spec, capsys)
     assert "24 images in 8 shards" in text
-    assert "time and disk unknown, no rate of this spec on this machine; --measure makes a few samples" in text
+    assert (
+        "time and disk space are unknown, because this spec was never measured on this machine; use --measure" in text
+    )
     assert (found["seconds"], found["bytes"], found["rate"]) == (None, None, None)
     assert run(["generate", spec, "out", "--count", "6", "--workers", "1", "--threads", "1"]) == 0
     size = disk_of(tmp_path / "out")
@@ -101,13 +103,13 @@ def test_a_dry_run_uses_the_last_rate_of_the_spec(spec, tmp_path, monkeypatch, c
     )
     # Another spec, another backend, and a damaged cache: unknown.
     other = write(tmp_path / "other.yaml", scene__image__spp=3)
-    assert "time and disk unknown" in dry_run(str(other), capsys)[0]
-    assert "time and disk unknown" in dry_run(spec, capsys, "--backend", "cuda")[0]
+    assert "time and disk space are unknown" in dry_run(str(other), capsys)[0]
+    assert "time and disk space are unknown" in dry_run(spec, capsys, "--backend", "cuda")[0]
     (file,) = (tmp_path / "cache" / "eyerender" / "rates").iterdir()
     good = json.loads(file.read_text())
     for bad in ("", "[" * 10**5, "{}", json.dumps(good | {"seconds": -1}), json.dumps(good | {"bytes": 10**400})):
         file.write_text(bad)
-        assert "time and disk unknown" in dry_run(spec, capsys)[0]
+        assert "time and disk space are unknown" in dry_run(spec, capsys)[0]
 
 
 @pytest.mark.parametrize("what", ["dataset", "scene"])
