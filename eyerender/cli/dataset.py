@@ -292,7 +292,8 @@ def _estimate_text(found: dict[str, Any]) -> str:
     rate = found["rate"]
     text = f"{found['images']} images in {found['shards']} shards, {found['workers']} workers"
     if rate is None:
-        return f"{text}: time and disk space are unknown, because this spec was never measured on this machine; use --measure"
+        why = "this spec was never measured on this machine; use --measure"
+        return f"{text}: time and disk space are unknown, because {why}"
     how = "measured" if rate["how"] == "measured" else "of a run"
     return (
         f"{text} of {found['threads_per_worker']} threads on {rate['backend']}: about {_duration(found['seconds'])}, "
