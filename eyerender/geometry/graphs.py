@@ -14,7 +14,7 @@ from .surfaces_quadric import Quadric
 
 
 class Jet(NamedTuple):
-    """h, its slopes and its second derivatives."""
+    """Height h, its slopes and its second derivatives."""
 
     x: Floats
     y: Floats
@@ -111,10 +111,16 @@ class BiconicGraph(NamedTuple):
 
 
 def graphs_of(surfaces: Sequence[Surface], ndim: int) -> tuple[list[Graph], Floats, Floats] | None:
-    """(graphs, origin, rotation) in one working frame, or None where the surfaces have none in common.
+    """Express surfaces as graphs over one plane.
 
-    ndim : axes of the arrays that will be handed in. The frame is the eye's, or that of a biconic; two biconics in
-    different frames have none.
+    The working frame is the eye's, or that of the biconic if there is one. Two biconics have no frame in common.
+
+    Args:
+        surfaces: what to express.
+        ndim: number of axes of the arrays that the graphs will receive.
+
+    Returns:
+        (graphs, origin, rotation) of the working frame, or None where the surfaces have no common frame.
     """
     frame: Biconic | None = None
     for surface in surfaces:

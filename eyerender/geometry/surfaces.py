@@ -1,13 +1,12 @@
-"""Refracting and reflecting surfaces: the interface every kind of surface has, and points as components.
+"""Refracting and reflecting surfaces: their common interface, and points as components.
 
-A surface is the zero set of an implicit function F, oriented so that its half gradient g = grad F / 2 points to +x of
-the surface's local frame (the optic axis outward, towards the air) everywhere on the sheet that counts. A line
-parallel to the local x axis therefore meets the sheet at most once, and the sign of d.g tells a ray going into the eye
-(d.g < 0) from one coming out, which makes the choice of the root unambiguous for spheres, ellipsoids and hyperboloids
-alike.
+A surface is the zero set of an implicit function F. F is oriented so that its half gradient g = grad F / 2 points to +x
+of the surface's local frame (the optic axis outward, towards the air) everywhere on the sheet that is used. A line
+parallel to the local x axis therefore meets the sheet at most once. The sign of d.g distinguishes a ray going into the
+eye (d.g < 0) from one coming out, so the choice of the root is unambiguous for spheres, ellipsoids and hyperboloids.
 
-Points travel as one array per coordinate (`Xyz`): chunks of such arrays stay in the cache. Parameters of a surface are
-numbers, or arrays with one leading batch axis (one surface an eye); points then have that axis first.
+Points are passed as one array per coordinate (`Xyz`), because chunks of such arrays stay in the cache. Parameters of a
+surface are numbers, or arrays with one leading batch axis (one surface per eye); points then have that axis first.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class Hit(NamedTuple):
 
 
 class SymmetricMatrix(NamedTuple):
-    """A symmetric 3 x 3 matrix as components, numbers or arrays: the derivative of the half gradient."""
+    """Symmetric 3 x 3 matrix as components (numbers or arrays): the derivative of the half gradient."""
 
     xx: Floats | float
     yy: Floats | float
@@ -50,7 +49,7 @@ class SymmetricMatrix(NamedTuple):
     yz: Floats | float
 
     def times(self, vector: Xyz) -> Xyz:
-        """The product with a vector; off-diagonal zeros cost nothing."""
+        """Multiply with a vector; off-diagonal zeros cost nothing."""
         x, y, z = vector
         out_x, out_y, out_z = self.xx * x, self.yy * y, self.zz * z
         if not _is_zero(self.xy):
@@ -65,7 +64,11 @@ class SymmetricMatrix(NamedTuple):
 class Surface(ABC):
     """One sheet of a surface in the eye frame.
 
-    `origin_mm` (..., 3) and `rotation` (..., 3, 3) place the local frame: p_eye = rotation p_local + origin_mm.
+    The local frame is placed by p_eye = rotation p_local + origin_mm.
+
+    Attributes:
+        origin_mm: (..., 3) origin of the local frame.
+        rotation: (..., 3, 3) local to eye frame.
     """
 
     __slots__ = ()
@@ -76,30 +79,30 @@ class Surface(ABC):
     @property
     @abstractmethod
     def kind(self) -> str:
-        """'quadric' or 'biconic'."""
+        """Kind of the surface: 'quadric' or 'biconic'."""
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one surface, (n,) for one surface an eye."""
+        """Shape of the batch: () for one surface, (n,) for one surface per eye."""
         return self.origin_mm.shape[:-1]
 
     # -- one array per coordinate -------------------------------------------------------------------------------------
 
     @abstractmethod
     def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
-        """Where rays with unit `direction` cross the sheet, going in (d.g < 0) or out (d.g > 0)."""
+        """Intersect rays of unit `direction` with the sheet, going in (d.g < 0) or out (d.g > 0)."""
 
     @abstractmethod
     def value_at(self, point: Xyz) -> Floats:
-        """The implicit function F."""
+        """Implicit function F."""
 
     @abstractmethod
     def gradient_at(self, point: Xyz) -> Xyz:
-        """The half gradient g, not normalized."""
+        """Half gradient g, not normalized."""
 
     @abstractmethod
     def hessian_at(self, point: Xyz) -> SymmetricMatrix:
-        """H with dg = H dp."""
+        """Derivative of the half gradient, H with dg = H dp."""
 
     @abstractmethod
     def local_sag(self, y: Floats, z: Floats) -> Floats:
@@ -107,20 +110,20 @@ class Surface(ABC):
 
     @abstractmethod
     def take(self, index: Indices) -> Self:
-        """The batch of surfaces at `index`; a single surface is returned as it is."""
+        """Surfaces of the batch at `index`; a single surface is returned as it is."""
 
     @abstractmethod
     def scaled(self, centre_mm: Floats, factor: float) -> Self:
-        """The surface with all distances from `centre_mm` (3,) multiplied by `factor` > 0."""
+        """Multiply all distances from `centre_mm` (3,) by `factor` > 0."""
 
     @abstractmethod
     def mirrored(self) -> Self:
-        """The surface with y -> -y: that of the other eye."""
+        """Mirror the surface, y -> -y, for the other eye."""
 
     @classmethod
     @abstractmethod
     def stack(cls, surfaces: tuple[Self, ...]) -> Self:
-        """Single surfaces of this kind as one batch."""
+        """Combine single surfaces of this kind into a batch."""
 
     def __eq__(self, other: object) -> bool:
         return type(other) is type(self) and all(
@@ -132,12 +135,12 @@ class Surface(ABC):
 
     @abstractmethod
     def _key(self) -> tuple[Floats, ...]:
-        """The arrays that make the surface what it is."""
+        """Arrays that define the surface."""
 
     # -- points (..., 3) ----------------------------------------------------------------------------------------------
 
     def implicit(self, points: npt.ArrayLike) -> Floats:
-        """F at points (..., 3); zero on the surface."""
+        """Implicit function F at points (..., 3); zero on the surface."""
         return self.value_at(components(points))
 
     def gradient(self, points: npt.ArrayLike) -> Floats:
@@ -155,9 +158,14 @@ class Surface(ABC):
         return self.local_sag(np.asarray(y_mm, dtype=np.float64), np.asarray(z_mm, dtype=np.float64))
 
     def intersect(self, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Floats, Bools]:
-        """Distance (mm) to the nearest crossing ahead and whether there is one; shapes (..., 3) -> (...,).
+        """Find the nearest crossing ahead.
 
-        `directions` are unit vectors. Where nothing is met the distance is infinite.
+        Args:
+            origins_mm: (..., 3) origins.
+            directions: (..., 3) unit vectors.
+
+        Returns:
+            Distance (...,) in mm, infinite where the ray misses the surface, and whether there is a crossing (...,).
         """
         origin, direction = components(origins_mm), components(directions)
         hits = [self.hit(origin, direction, inward) for inward in (True, False)]
@@ -166,11 +174,11 @@ class Surface(ABC):
         return nearest, np.isfinite(nearest)
 
     def to_local(self, points: npt.ArrayLike) -> Floats:
-        """Points (..., 3) of the eye frame in the local frame."""
+        """Transform points (..., 3) from the eye frame to the local frame."""
         return join(turn_back(self.rotation, shift(components(points), self.origin_mm, -1.0)))
 
     def to_eye(self, points: npt.ArrayLike) -> Floats:
-        """Points (..., 3) of the local frame in the eye frame."""
+        """Transform points (..., 3) from the local frame to the eye frame."""
         return join(shift(turn(self.rotation, components(points)), self.origin_mm, 1.0))
 
     def axis_distance(self, point: Xyz) -> Floats:
@@ -182,18 +190,18 @@ class Surface(ABC):
 
 
 def components(points: npt.ArrayLike) -> Xyz:
-    """(..., 3) -> three contiguous arrays."""
+    """Split points (..., 3) into three contiguous arrays."""
     array = np.asarray(points, dtype=np.float64)
     return np.array(array[..., 0]), np.array(array[..., 1]), np.array(array[..., 2])
 
 
 def join(point: Xyz) -> Floats:
-    """Three arrays -> (..., 3)."""
+    """Join three arrays into points (..., 3)."""
     return np.stack(np.broadcast_arrays(*point), axis=-1)
 
 
 def fit(value: Floats | float, ndim: int) -> Floats | float:
-    """A parameter () or (n,) made to broadcast with points that have `ndim` axes, the batch axis first."""
+    """Reshape a parameter () or (n,) to broadcast with points that have `ndim` axes, the batch axis first."""
     if isinstance(value, float):
         return value
     if value.ndim == 0:

@@ -1,4 +1,4 @@
-"""The biconic: two apex radii and two conic constants, one pair a meridian."""
+"""The biconic: two apex radii and two conic constants, one pair per meridian."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .transforms import flip_y, mirror_rotation, read_only
 
 
 class _Sag(NamedTuple):
-    """x(y, z) of the sheet, its first and its second derivatives; `inside` where the square root is real."""
+    """Sag x(y, z) of the sheet, its first and second derivatives, and where the square root is real (`inside`)."""
 
     x: Floats
     y: Floats
@@ -57,7 +57,7 @@ class Biconic(Surface):
         return "biconic"
 
     def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
-        """Newton on x - x(y, z) = 0 along the ray, from the hit on the conic of mean curvature and mean 1 + Q.
+        """Solve x - x(y, z) = 0 along the ray by Newton, from the hit on the conic of mean curvature and mean 1 + Q.
 
         The gradient's local x component is 1 everywhere, so the sheet is the whole graph.
         """
@@ -86,7 +86,7 @@ class Biconic(Surface):
                     break
             y, z = oy + t * dy, oz + t * dz
             _, slope_y, slope_z, inside = self._first_order(y, z)
-            # Newton is quadratic: an error of 1e-7 before the last step leaves less than 1e-14 after it.
+            # Newton converges quadratically: an error of 1e-7 before the last step leaves less than 1e-14 after it.
             ok &= (np.abs(error) < _SETTLED_MM) & inside & np.isfinite(t)
             crossing = dx - slope_y * dy - slope_z * dz
             ok &= crossing < 0.0 if inward else crossing > 0.0
@@ -124,7 +124,7 @@ class Biconic(Surface):
         return np.asarray(np.where(inside, x, np.nan))
 
     def sag_derivatives(self, y: Floats, z: Floats) -> _Sag:
-        """x(y, z) in the local frame with its first and second derivatives.
+        """Sag x(y, z) in the local frame with its first and second derivatives.
 
         With N = c_y y^2 + c_z z^2 and W the square root, x = -N / (1 + W).
         """

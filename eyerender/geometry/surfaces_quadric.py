@@ -57,7 +57,7 @@ class Quadric(Surface):
         origin_mm: npt.ArrayLike = (0.0, 0.0, 0.0),
         rotation: npt.ArrayLike | None = None,
     ) -> Quadric:
-        """y^2 + z^2 + 2 R x + (1 + Q) x^2 = 0 with the apex at the local origin; R > 0 opens to -x, R < 0 to +x."""
+        """Conic y^2 + z^2 + 2 R x + (1 + Q) x^2 = 0, apex at the local origin; R > 0 opens to -x, R < 0 to +x."""
         radius = np.asarray(radius_mm, dtype=np.float64)
         shape = np.broadcast_shapes(radius.shape, np.shape(conic_constant), np.shape(origin_mm)[:-1])
         sign = np.broadcast_to(np.sign(radius), shape)
@@ -76,7 +76,7 @@ class Quadric(Surface):
         rotation: npt.ArrayLike | None = None,
         front: bool = True,
     ) -> Quadric:
-        """(x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about `centre_mm`: its half towards +x (`front`) or towards -x."""
+        """One half of the ellipsoid (x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about `centre_mm`: towards +x (`front`) or -x."""
         axes = np.asarray(semi_axes_mm, dtype=np.float64)
         matrix = np.zeros((*axes.shape[:-1], 3, 3))
         scale = axes[..., 1] * axes[..., 2]
@@ -99,7 +99,7 @@ class Quadric(Surface):
         origin_mm: npt.ArrayLike = (0.0, 0.0, 0.0),
         rotation: npt.ArrayLike | None = None,
     ) -> Quadric:
-        """F times `sign`: the sheet where the half gradient of F as given has the sign of `sign` along x."""
+        """Choose a sheet of F = 0: the one where the half gradient of F has the sign `sign` along x."""
         factor = np.asarray(sign, dtype=np.float64)
         full = factor[..., None, None] * np.asarray(matrix)
         shape = full.shape[:-2]
@@ -120,22 +120,22 @@ class Quadric(Surface):
 
     @property
     def coefficients(self) -> tuple[Floats | float, ...]:
-        """(A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c) in the eye frame, numbers or (n,) arrays."""
+        """Coefficients (A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c), eye frame; numbers or (n,) arrays."""
         return self._eye
 
     @property
     def axial_coefficients(self) -> tuple[Floats | float, Floats | float, Floats | float] | None:
-        """(A_xx, b_x, c) of y^2 + z^2 + A_xx x^2 + 2 b_x x + c = 0 in the eye frame, if the surface is of that form."""
+        """Coefficients (A_xx, b_x, c) of y^2 + z^2 + A_xx x^2 + 2 b_x x + c = 0 in the eye frame; None for others."""
         return (self._eye[0], self._eye[6], self._eye[9]) if self._axial else None
 
     def seen_from(self, origin_mm: Floats, rotation: Floats) -> Quadric:
-        """The same surface with another frame taken as the eye's: p = rotation p' + origin_mm."""
+        """Express the surface in another frame p', where p = rotation p' + origin_mm."""
         back = np.swapaxes(rotation, -1, -2)
         moved = (back @ (self.origin_mm - origin_mm)[..., None])[..., 0]
         return Quadric(moved, back @ self.rotation, self.matrix, self.vector, self.constant)
 
     def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
-        """Root of (d.Ad) t^2 + 2 (d.g(o)) t + F(o) = 0 with d.g of the wanted sign, as F / (-b -+ sqrt(b^2 - aF))."""
+        """Root of (d.Ad) t^2 + 2 (d.g(o)) t + F(o) = 0 with the required sign of d.g, as F / (-b -+ sqrt(b^2 - aF))."""
         ox, oy, oz = origin
         dx, dy, dz = direction
         xx, yy, zz, xy, xz, yz, bx, by, bz, c = (fit(v, max(ox.ndim, dx.ndim)) for v in self._eye)
@@ -188,7 +188,7 @@ class Quadric(Surface):
         return SymmetricMatrix(*(fit(v, point[0].ndim) for v in self._eye[:6]))
 
     def local_sag(self, y: Floats, z: Floats) -> Floats:
-        """The root of A_xx x^2 + 2 (A_xy y + A_xz z + b_x) x + F(0, y, z) = 0 on the sheet."""
+        """Root of A_xx x^2 + 2 (A_xy y + A_xz z + b_x) x + F(0, y, z) = 0 on the sheet."""
         m, v = self.matrix, self.vector
         ndim = max(y.ndim, z.ndim)
         xx, yy, zz, xy, xz, yz = (fit(m[..., i, j], ndim) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
@@ -234,6 +234,10 @@ class Quadric(Surface):
 
 
 def centre_of(quadric: Quadric) -> Floats:
-    """Where the gradient vanishes, -A^-1 b, in the eye frame (..., 3); raises LinAlgError for a paraboloid or plane."""
+    """Centre -A^-1 b, where the gradient vanishes, in the eye frame (..., 3).
+
+    Raises:
+        LinAlgError: a paraboloid or plane has no centre.
+    """
     local = -np.linalg.solve(quadric.matrix, quadric.vector[..., None])[..., 0]
     return quadric.to_eye(local)

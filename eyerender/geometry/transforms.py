@@ -23,22 +23,22 @@ def read_only(array: npt.ArrayLike) -> Floats:
 
 
 def rotation_x(angle_rad: npt.ArrayLike) -> Floats:
-    """Rotation about x by `angle_rad`, shape (...,) -> (..., 3, 3)."""
+    """Rotations about x by angles (...,), as (..., 3, 3)."""
     return _plane_rotation(angle_rad, 1, 2)
 
 
 def rotation_y(angle_rad: npt.ArrayLike) -> Floats:
-    """Rotation about y by `angle_rad`, shape (...,) -> (..., 3, 3)."""
+    """Rotations about y by angles (...,), as (..., 3, 3)."""
     return _plane_rotation(angle_rad, 2, 0)
 
 
 def rotation_z(angle_rad: npt.ArrayLike) -> Floats:
-    """Rotation about z by `angle_rad`, shape (...,) -> (..., 3, 3)."""
+    """Rotations about z by angles (...,), as (..., 3, 3)."""
     return _plane_rotation(angle_rad, 0, 1)
 
 
 def tilt_rotation(tilt_rad: npt.ArrayLike) -> Floats:
-    """Rz(t_z) Ry(t_y) Rx(t_x); `tilt_rad` about (x, y, z), shape (..., 3)."""
+    """Rotation Rz(t_z) Ry(t_y) Rx(t_x) for tilts (..., 3) about (x, y, z)."""
     tilt = np.asarray(tilt_rad, dtype=np.float64)
     about_x, about_y, about_z = rotation_x(tilt[..., 0]), rotation_y(tilt[..., 1]), rotation_z(tilt[..., 2])
     whole: Floats = about_z @ about_y @ about_x
@@ -46,13 +46,13 @@ def tilt_rotation(tilt_rad: npt.ArrayLike) -> Floats:
 
 
 def flip_y(points: npt.ArrayLike) -> Floats:
-    """(x, y, z) -> (x, -y, z), shape (..., 3)."""
+    """Mirror points (..., 3): (x, y, z) -> (x, -y, z)."""
     flipped: Floats = np.asarray(points, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
     return flipped
 
 
 def mirror_rotation(rotation: npt.ArrayLike) -> Floats:
-    """S R S with S the mirroring of y: the same rotation seen in the mirror; shape (..., 3, 3)."""
+    """Mirrored rotations S R S (..., 3, 3), where S mirrors y."""
     mirrored: Floats = MIRROR @ np.asarray(rotation, dtype=np.float64) @ MIRROR
     return mirrored
 

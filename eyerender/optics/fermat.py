@@ -11,8 +11,8 @@ e_j^T) n_j / L_j,
 
 (Born & Wolf 1999, 3.3.2; the Hessian is that of Walter et al. 2009, "Single scattering in refractive media with
 triangle mesh boundaries", eq. 6, for any number of surfaces.) Newton needs no intersections, so a biconic costs as
-much as a sphere. A mirror point is the same with m = 1, equal indices and the object outside. This is the fast way for
-the many; `shooting` is the sure one, and takes what is left over here.
+much as a sphere. A mirror point is the same problem with m = 1, equal indices and the object outside. This solver is
+fast and serves almost all rays; `shooting` is slower and more robust, and solves the rest.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SETTLED_MM = 2e-6
 
 
 class Stationary(NamedTuple):
-    """The points on the surfaces (in the working frame), and the size of Newton's last step (mm)."""
+    """Points on the surfaces (in the working frame), and the size of Newton's last step (mm)."""
 
     points: list[Xyz]
     last_step_mm: float
@@ -45,10 +45,16 @@ def stationary_path(
     target: Xyz,
     start: Sequence[tuple[Floats, Floats]],
 ) -> Stationary:
-    """Newton on dS = 0 from `start` (y, z) on each surface; all in the frame of the graphs.
+    """Solve dS = 0 by Newton from `start` (y, z) on each surface, all in the frame of the graphs.
 
-    indices : n_0 before the first surface, then the one behind each. Rays that go astray come out as nonsense: whoever
-    calls traces what comes back.
+    Rays that diverge have meaningless points, so the caller must trace the result.
+
+    Args:
+        graphs: the surfaces, from the viewpoint.
+        indices: n_0 before the first surface, then the index behind each.
+        viewpoint: where the rays end.
+        target: the objects.
+        start: first guesses (y, z) on each surface.
     """
     ys, zs = [s[0] for s in start], [s[1] for s in start]
     step = np.inf
@@ -63,7 +69,7 @@ def stationary_path(
 
 
 class _Block(NamedTuple):
-    """A symmetric 2 x 2 system: Hessian (yy, yz, zz) and gradient."""
+    """Symmetric 2 x 2 system: Hessian (yy, yz, zz) and gradient."""
 
     yy: Floats
     yz: Floats
@@ -80,7 +86,7 @@ def _newton(
     ys: list[Floats],
     zs: list[Floats],
 ) -> float:
-    """One Newton step on all surfaces; updates `ys`, `zs` (lists of the caller) and returns the largest step."""
+    """Take one Newton step on all surfaces; update the caller's `ys` and `zs` and return the largest step."""
     jets = [graph.jet(y, z) for graph, y, z in zip(graphs, ys, zs, strict=True)]
     nodes: list[Xyz] = [viewpoint, *((jet.x, y, z) for jet, y, z in zip(jets, ys, zs, strict=True)), target]
     blocks: list[_Block] = []
@@ -124,7 +130,7 @@ def _newton(
         if j < last:
             ty, tz = head
             wy, wz = weight * ty, weight * tz
-            # Parts of the next surface's block that belong to the segment before it.
+            # These parts of the next surface's block belong to the segment before it.
             carried = (n * ty, n * tz, n * dx, weight, wy * ty, wy * tz, wz * tz)
     return _solve(blocks, couplings, ys, zs)
 
@@ -132,13 +138,13 @@ def _newton(
 def _solve(
     blocks: list[_Block], couplings: list[tuple[Floats, Floats, Floats, Floats]], ys: list[Floats], zs: list[Floats]
 ) -> float:
-    """Block-tridiagonal elimination from the outermost surface inward, and back; applies the step."""
+    """Solve by block-tridiagonal elimination from the outermost surface inward and back, and apply the step."""
     reduced = [blocks[0]]
     gains: list[tuple[Floats, Floats, Floats, Floats]] = []
     for block, (yy, yz, zy, zz) in zip(blocks[1:], couplings, strict=True):
         before = reduced[-1]
         scale = 1.0 / (before.yy * before.zz - before.yz * before.yz)
-        # K = B^-1 C, C the coupling with rows of the surface before.
+        # K = B^-1 C, where C is the coupling with the rows of the surface before.
         k_yy, k_yz = (before.zz * yy - before.yz * zy) * scale, (before.zz * yz - before.yz * zz) * scale
         k_zy, k_zz = (before.yy * zy - before.yz * yy) * scale, (before.yy * zz - before.yz * yz) * scale
         gains.append((k_yy, k_yz, k_zy, k_zz))

@@ -1,22 +1,22 @@
-"""Rays through a medium whose index falls from a core to its edge, as in the lens of the eye.
+"""Rays through a medium whose index decreases from a core to its edge, as in the lens of the eye.
 
-The medium lies between a front and a back surface. Each of them, scaled by p about the centre, is a surface of one
+The medium lies between a front and a back surface. Each of them, scaled by p about the centre, is a surface of constant
 index (p = 1: the surface itself):
 
     n(p) = n_core - (n_core - n_edge) p^2
 
-With q the point as seen from the centre, a quadric scaled by p is p^2 = 2 p b.q + q.A q, so that
+With q the point relative to the centre, a quadric scaled by p is p^2 = 2 p b.q + q.A q, so that
 
     p = b.q + s,  s = sqrt((b.q)^2 + q.A q),    grad p = (p b + A q) / s,
     grad grad p = (A + b (grad p)^T + (grad p) b^T - (grad p)(grad p)^T) / s.
 
-A point belongs to the front half where the front's p is the larger one, else to the back half. The index is the same on
-both sides of the ridge where they meet; its gradient is not.
+A point belongs to the front half where the front's p is the larger one, else to the back half. The halves meet at a
+ridge. The index is continuous there; its gradient is not.
 
 The ray equation d^2 r / dt^2 = grad(n^2 / 2), dt = ds / n, is solved by a Runge-Kutta-Nystrom scheme of fourth order
-(Sharma, Kumar and Ghatak 1982, "Tracing rays through graded-index media: a new method", Appl. Opt. 21, 984-987): STEPS
-equal steps to the ridge and STEPS from there to the surface where the ray leaves, each half ended by short steps that
-land on the ridge and on the surface to rounding.
+(Sharma, Kumar and Ghatak 1982, "Tracing rays through graded-index media: a new method", Appl. Opt. 21, 984-987). It
+takes STEPS equal steps to the ridge and STEPS from there to the surface where the ray leaves. Each half ends with short
+steps that reach the ridge and the surface to rounding.
 """
 
 from __future__ import annotations
@@ -43,10 +43,14 @@ _OUTSIDE = 1e-9
 
 
 class Passage(NamedTuple):
-    """Rays (m,) that have crossed the medium: where they meet the far surface, and how they arrive there.
+    """Rays (m,) that have crossed the medium, where they meet the far surface.
 
-    hit : `distance` is 0; way : unit direction; optical_path_mm : the integral of n ds; moves, turns : the
-    differentials of point and direction on the surface, as many as were given.
+    Attributes:
+        hit: the intersection; its `distance` is 0.
+        way: unit direction on arrival.
+        optical_path_mm: the integral of n ds.
+        moves: differentials of the point on the surface, as many as were given.
+        turns: differentials of the direction, as many as were given.
     """
 
     hit: Hit
@@ -60,8 +64,12 @@ class Passage(NamedTuple):
 class GradientMedium(ArrayValue):
     """The medium between two quadrics; one, or a batch of n with a leading axis.
 
-    centre_mm (..., 3); matrices A (..., 2, 3, 3) and vectors b (..., 2, 3) of the front and the back; core (...,) and
-    fall (...,): n_core and n_core - n_edge.
+    Attributes:
+        centre_mm: (..., 3) centre.
+        matrices: (..., 2, 3, 3) A of the front and the back.
+        vectors: (..., 2, 3) b of the front and the back.
+        core: (...,) n_core.
+        fall: (...,) n_core - n_edge.
     """
 
     centre_mm: Floats
@@ -76,7 +84,7 @@ class GradientMedium(ArrayValue):
 
     @classmethod
     def between(cls, front: Quadric, back: Quadric, centre_mm: Floats, edge: float, core: float) -> GradientMedium:
-        """The medium between two single surfaces that have `centre_mm` (3,) between them."""
+        """Make the medium between two single surfaces on either side of `centre_mm` (3,)."""
         matrices, vectors = [], []
         for surface in (front, back):
             xx, yy, zz, xy, xz, yz, bx, by, bz, c = (float(v) for v in surface.coefficients)
@@ -105,11 +113,18 @@ class GradientMedium(ArrayValue):
         turns: Sequence[Xyz] = (),
         steps: int | None = None,
     ) -> Passage:
-        """Follow rays that start on one surface of the medium to `surface`, the other one.
+        """Follow rays from one surface of the medium to the other.
 
-        inward : from the front to the back. point, way : on the surface where they start, the direction behind it.
-        moves, turns : differentials of `point` (along the surface) and of `way` to be carried along. `hit.ok` is False
-        where a ray leaves the medium by the side where it came in. steps : in each half; None: STEPS.
+        `hit.ok` is False where a ray leaves the medium through the surface where it entered.
+
+        Args:
+            surface: the surface where the rays leave.
+            inward: whether the rays go from the front to the back.
+            point: where they start.
+            way: their direction behind the first surface.
+            moves: differentials of `point` (along the surface) to be carried along.
+            turns: differentials of `way` to be carried along.
+            steps: steps in each half; None: STEPS.
         """
         steps = STEPS if steps is None else steps
         place, speed = _stacked(point, way)
@@ -136,7 +151,7 @@ class GradientMedium(ArrayValue):
                 rays = _step(rays, last, (1.0 - here.size) / _dot(here.slope, rays.speed))
             here = last.at(rays.place)
             ok &= np.abs(here.size - 1.0) < _OUTSIDE
-            # The differentials are those at one time; on the surface they are where each ray meets it.
+            # These differentials are for a common time. On the surface they are for the point where each ray meets it.
             rate, pull = _dot(here.slope, rays.speed), last.pull(here)
             pace = np.sqrt(_dot(rays.speed, rays.speed))
             end = rays.speed / pace
@@ -153,7 +168,7 @@ class GradientMedium(ArrayValue):
         return Passage(hit, _xyz(end), rays.optical_path_mm, out_moves, out_turns)
 
     def _halves(self, ndim: int) -> tuple[_Half, _Half]:
-        """(front, back) with parameters that broadcast with components (3, ...) of `ndim` further axes."""
+        """Front and back with parameters that broadcast with components (3, ...) of `ndim` further axes."""
         core, fall = (np.asarray(fit(value, ndim)) for value in (self.core, self.fall))
         front, back = (
             _Half(
@@ -167,18 +182,18 @@ class GradientMedium(ArrayValue):
         return front, back
 
     def take(self, index: Indices) -> GradientMedium:
-        """The batch of media at `index`; a single medium is returned as it is."""
+        """Media of the batch at `index`; a single medium is returned as it is."""
         return self if self.core.ndim == 0 else GradientMedium(*(part[index] for part in self._parts()))
 
     def mirrored(self) -> GradientMedium:
-        """That of the other eye."""
+        """Mirror the medium, for the other eye."""
         return GradientMedium(
             flip_y(self.centre_mm), MIRROR @ self.matrices @ MIRROR, flip_y(self.vectors), self.core, self.fall
         )
 
     @classmethod
     def stack(cls, media: Sequence[GradientMedium]) -> GradientMedium:
-        """Single media as one batch."""
+        """Combine single media into a batch."""
         return cls(*(np.stack(parts) for parts in zip(*(m._parts() for m in media), strict=True)))
 
     def _parts(self) -> tuple[Floats, ...]:
@@ -186,7 +201,7 @@ class GradientMedium(ArrayValue):
 
 
 class _Size(NamedTuple):
-    """p, the root s and grad p at some points."""
+    """Scale p, the root s and grad p at some points."""
 
     size: Floats
     s: Floats
@@ -194,7 +209,7 @@ class _Size(NamedTuple):
 
 
 class _Half(NamedTuple):
-    """One half; vectors have their components first: (3, ...)."""
+    """One half of the medium; vectors have their components first: (3, ...)."""
 
     columns: tuple[Floats, ...]
     vector: Floats
@@ -205,7 +220,7 @@ class _Half(NamedTuple):
         turned = self._turned(q)
         lead = _dot(self.vector, q)
         s = np.sqrt(lead * lead + _dot(q, turned))
-        s = np.maximum(s, 1e-300)  # in the centre itself every product with p vanishes
+        s = np.maximum(s, 1e-300)  # at the centre itself, every product with p vanishes
         size = lead + s
         return _Size(size, s, (turned + size * self.vector) / s)
 
@@ -213,11 +228,11 @@ class _Half(NamedTuple):
         return np.asarray(self.core - self.fall * (here.size * here.size))
 
     def pull(self, here: _Size) -> Floats:
-        """grad(n^2 / 2) = -2 n (n_core - n_edge) p grad p."""
+        """Acceleration grad(n^2 / 2) = -2 n (n_core - n_edge) p grad p."""
         return np.asarray(-2.0 * self.fall * self.index_of(here) * here.size * here.slope)
 
     def bend(self, here: _Size, move: Floats) -> Floats:
-        """The derivative of the pull along `move`."""
+        """Derivative of the pull along `move`."""
         index, slope = self.index_of(here), here.slope
         rise = _dot(slope, move)
         # s times (grad grad p) move
@@ -231,7 +246,7 @@ class _Half(NamedTuple):
 
 
 class _Rays(NamedTuple):
-    """Places as seen from the centre, dr/dt, the optical path so far, and differentials of place and dr/dt."""
+    """Points relative to the centre, dr/dt, the optical path so far, and differentials of point and dr/dt."""
 
     place: Floats
     speed: Floats
@@ -240,8 +255,8 @@ class _Rays(NamedTuple):
 
 
 def _to_ridge(rays: _Rays, first: _Half, last: _Half, steps: int) -> _Rays:
-    """To where both halves have the same p."""
-    # Along the straight line, from where it passes the centre.
+    """Follow rays to the ridge, where both halves have the same p."""
+    # The straight line gives the time to its point closest to the centre.
     time = -_dot(rays.place, rays.speed) / _dot(rays.speed, rays.speed)
     for _ in range(_AIMS):
         time = time + _to_go(rays.place + time * rays.speed, rays.speed, first, last)
@@ -250,7 +265,7 @@ def _to_ridge(rays: _Rays, first: _Half, last: _Half, steps: int) -> _Rays:
         rays = _step(rays, first, _to_go(rays.place, rays.speed, first, last))
     if not rays.differentials:
         return rays
-    # Neighbours meet the ridge earlier or later, and the pull is another one behind it.
+    # Neighbouring rays meet the ridge earlier or later, and the pull behind it differs.
     before, after = first.at(rays.place), last.at(rays.place)
     slope, jump = before.slope - after.slope, first.pull(before) - last.pull(after)
     late = -_per_time(slope, rays.speed)
@@ -259,13 +274,13 @@ def _to_ridge(rays: _Rays, first: _Half, last: _Half, steps: int) -> _Rays:
 
 
 def _to_go(place: Floats, speed: Floats, first: _Half, last: _Half) -> Floats:
-    """Newton's step in time to where p is the same in both halves."""
+    """Newton's step in time to the ridge."""
     a, b = first.at(place), last.at(place)
     return np.asarray((b.size - a.size) * _per_time(a.slope - b.slope, speed))
 
 
 def _per_time(slope: Floats, speed: Floats) -> Floats:
-    """1 / (slope . speed); 0 where both halves are the same sphere and any point will do as the ridge."""
+    """Inverse rate 1 / (slope . speed), or 0 where both halves are the same sphere and any point may be the ridge."""
     rate = _dot(slope, speed)
     return np.where(np.abs(rate) > 1e-9, 1.0 / rate, 0.0)
 
@@ -278,7 +293,10 @@ def _march(rays: _Rays, half: _Half, time: Floats, steps: int) -> _Rays:
 
 
 def _step(rays: _Rays, half: _Half, h: Floats) -> _Rays:
-    """One step of the scheme (A, B, C of the source are h times the pulls); the optical path by Simpson's rule."""
+    """Take one step of the scheme.
+
+    A, B and C of the source are h times the pulls. The optical path uses Simpson's rule.
+    """
     place, speed = rays.place, rays.speed
     one = half.at(place)
     a = h * half.pull(one)
@@ -302,7 +320,7 @@ def _step(rays: _Rays, half: _Half, h: Floats) -> _Rays:
 
 
 def _first(values: Floats, ndim: int) -> Floats:
-    """Components (3,) or (n, 3) as (3, 1, ...) or (3, n, 1, ...)."""
+    """Reshape components (3,) or (n, 3) to (3, 1, ...) or (3, n, 1, ...)."""
     moved = np.moveaxis(values, -1, 0)
     return moved.reshape(moved.shape + (1,) * (ndim + 1 - moved.ndim))
 

@@ -1,4 +1,4 @@
-"""What happens to a ray at an interface: reflection, refraction, Fresnel's shares of the energy.
+"""Rays at an interface: reflection, refraction and Fresnel's shares of the energy.
 
 Vectors are `Xyz` (one array per coordinate). d is the unit direction of travel, N a unit normal on either side.
 """
@@ -27,8 +27,10 @@ def reflect(direction: Xyz, normal: Xyz) -> Xyz:
 def refract(direction: Xyz, normal: Xyz, n_before: FloatLike, n_after: FloatLike) -> tuple[Xyz, Bools]:
     """Snell's law: w = eta d + (eta c - c2) N, eta = n_before / n_after, c = -d.N, c2 = sqrt(1 - eta^2 (1 - c^2)).
 
-    N is taken against d whichever side it is given on. Returns w and where light passes (False: total reflection; w is
-    the grazing direction there).
+    N may point to either side; the side against d is used.
+
+    Returns:
+        w, and whether light passes. At total reflection it does not, and w is the grazing direction.
     """
     eta = n_before / n_after
     cosine = -dot(direction, normal)
@@ -45,7 +47,7 @@ def refract(direction: Xyz, normal: Xyz, n_before: FloatLike, n_after: FloatLike
 
 
 class FresnelShares(NamedTuple):
-    """Reflected shares of the energy: s and p polarized, and unpolarized; the rest is transmitted."""
+    """Reflected shares of the energy: s and p polarized, and unpolarized. The rest is transmitted."""
 
     s: Floats
     p: Floats
@@ -53,9 +55,9 @@ class FresnelShares(NamedTuple):
 
 
 def fresnel(cosine_incidence: npt.ArrayLike, n_before: FloatLike, n_after: FloatLike) -> FresnelShares:
-    """R_s = ((n1 c1 - n2 c2) / (n1 c1 + n2 c2))^2, R_p = ((n2 c1 - n1 c2) / (n2 c1 + n1 c2))^2; 1 at total reflection.
+    """Fresnel's R_s = ((n1 c1 - n2 c2) / (n1 c1 + n2 c2))^2, R_p = ((n2 c1 - n1 c2) / (n2 c1 + n1 c2))^2.
 
-    Source: Born & Wolf 1999, Principles of Optics, 1.5.2 eq. (21) and (33).
+    Both are 1 at total reflection. Source: Born & Wolf 1999, Principles of Optics, 1.5.2 eq. (21) and (33).
     """
     c1 = np.abs(np.asarray(cosine_incidence, dtype=np.float64))
     eta = n_before / n_after

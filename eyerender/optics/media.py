@@ -7,19 +7,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class ConstantMedium:
-    """n, the same at every wavelength (the source names none)."""
+    """A medium whose index n is the same at every wavelength, for sources that name no wavelength."""
 
     n: float
 
     def index(self, wavelength_nm: float) -> float:
-        """n; the wavelength does not matter."""
+        """Index n, whatever the wavelength."""
         del wavelength_nm
         return self.n
 
 
 @dataclass(frozen=True, slots=True)
 class CauchyMedium:
-    """n = c0 + c1 / l^2 + c2 / l^4 + c3 / l^6, l in nm (Atchison & Smith 2005, J. Opt. Soc. Am. A 22, 29-37, eq. 1)."""
+    """Cauchy's n = c0 + c1 / l^2 + c2 / l^4 + c3 / l^6, l in nm (Atchison & Smith 2005, JOSA A 22, 29-37, eq. 1)."""
 
     c0: float
     c1: float
@@ -27,7 +27,7 @@ class CauchyMedium:
     c3: float
 
     def index(self, wavelength_nm: float) -> float:
-        """The index at a vacuum wavelength (nm)."""
+        """Index at a vacuum wavelength (nm)."""
         inverse = 1.0 / (wavelength_nm * wavelength_nm)
         return self.c0 + inverse * (self.c1 + inverse * (self.c2 + inverse * self.c3))
 

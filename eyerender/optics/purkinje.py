@@ -1,13 +1,14 @@
-"""Purkinje images from inside the eye: light that goes in, is thrown back by a surface and comes out to a viewpoint.
+"""Purkinje images from inside the eye: light enters, is reflected by a surface and leaves to a viewpoint.
 
-Such a mirror point need not exist (the front of a lens that flattens outwards, a hyperboloid, faces no farther than its
-asymptotic cone), and where several do, one is the Purkinje image: the one that moves without a break from the axis,
-where paraxial optics has a single one. It is followed from there. With t from 0 to 1 source and viewpoint go along
+Such a mirror point need not exist: a hyperboloid, for example the front of a lens that flattens outwards, faces no
+farther than its asymptotic cone. Where several exist, one of them is the Purkinje image: the one that continues the
+single solution of paraxial optics on the axis. It is followed from there. With t from 0 to 1, source and viewpoint move
+along
 
     p(t) = o + (1 - t) |p - o| a + t (p - o)        (o, a: apex and axis of the outermost surface)
 
-The exit point is predicted along the secant of the two positions before, then corrected by Newton with ray
-differentials; the step in t is halved where that fails or where the ray tube's determinant has changed its sign
+The exit point is predicted along the secant of the two previous positions, then corrected by Newton with ray
+differentials. The step in t is halved where that fails or where the ray tube's determinant has changed its sign
 (another branch), and doubled where it succeeds (Allgower & Georg 1990, "Numerical continuation methods", chapter 2). A
 branch ends at a fold, where the determinant vanishes (the viewpoint lies on a caustic), at total reflection, or where a
 surface ends.
@@ -40,12 +41,18 @@ determinant falls as the square root of what is left of t: to about 0.01 at the 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PurkinjePoints(ArrayValue):
-    """Where light from a source is thrown back to a viewpoint inside the eye.
+    """Where light from a source is reflected to a viewpoint inside the eye.
 
-    points_mm (..., 3): the mirror point on the reflecting surface; exit_points_mm (..., 3): where the ray meets the
-    outermost surface on its way to the viewpoint; directions (..., 3): unit, from there to the viewpoint; course_mm
-    (2 k - 1, ..., 3): all points of the ray on k surfaces, from the exit point over the mirror point back to where the
-    light came in; residual_mm, status (...,). NaN where there is no such ray.
+    Values are NaN where there is no such ray.
+
+    Attributes:
+        points_mm: (..., 3) mirror point on the reflecting surface.
+        exit_points_mm: (..., 3) where the ray meets the outermost surface on its way to the viewpoint.
+        directions: (..., 3) unit vectors from there to the viewpoint.
+        course_mm: (2 k - 1, ..., 3) all points of the ray on k surfaces, from the exit point over the mirror point back
+            to where the light came in.
+        residual_mm: (...,) by how much the ray misses.
+        status: (...,).
     """
 
     points_mm: Floats
@@ -64,11 +71,15 @@ def purkinje_path(
     gradient: GradientMedium | None = None,
     n_outside: float = 1.0,
 ) -> tuple[Crossing, ...]:
-    """The crossings of a ray thrown back by the innermost of `surfaces`.
+    """Crossings of a ray that the innermost of `surfaces` reflects.
 
-    surfaces : outside in, the last one reflects; indices : the index behind each; rims_mm : where each ends; passing :
-    whether a ray that does not meet a surface passes on (shells of a gradient lens); gradient : the medium before the
-    innermost surface where it is not of one index.
+    Args:
+        surfaces: outside in; the last one reflects.
+        indices: the index behind each surface.
+        rims_mm: the rim radius of each surface.
+        passing: whether a ray that misses a surface continues (shells of a gradient lens).
+        gradient: the medium before the innermost surface where its index is not constant.
+        n_outside: index outside the eye.
     """
 
     def crossing(k: int, n_after: FloatLike, inward: bool) -> Crossing:
@@ -97,9 +108,18 @@ def purkinje_points(
 ) -> PurkinjePoints:
     """Reflection at the innermost of `surfaces`, refraction at the others on the way in and out.
 
-    The surfaces are those of `purkinje_path`; source_mm, viewpoint_mm (..., 3) broadcast against each other. Status
-    NO_MIRROR_POINT: the image, followed from the axis, ends before source and viewpoint are where they are, or lies
-    beyond the rim of the reflecting surface.
+    The status is NO_MIRROR_POINT where the image, followed from the axis, ends before source and viewpoint reach their
+    places, or where it lies beyond the rim of the reflecting surface.
+
+    Args:
+        surfaces: outside in; the last one reflects.
+        indices: the index behind each surface.
+        rims_mm: the rim radius of each surface.
+        passing: see `purkinje_path`.
+        source_mm: (..., 3) sources.
+        viewpoint_mm: (..., 3) viewpoints; they broadcast against the sources.
+        gradient: see `purkinje_path`.
+        n_outside: index outside the eye.
     """
     path = purkinje_path(surfaces, indices, rims_mm, passing, gradient, n_outside)
     viewpoint, source = np.broadcast_arrays(
@@ -107,7 +127,7 @@ def purkinje_points(
     )
     shape = source.shape[:-1]
     full = shape or (1,)
-    # One row a ray, so that those which are done drop out.
+    # One row per ray, so that finished rays are dropped.
     frame = np.repeat(np.arange(full[0]), int(np.prod(full[1:], dtype=np.intp)))
     outer = surfaces[0].take(frame)
     apex, axis = apex_of(outer), outer.rotation[..., :, 0]
@@ -136,7 +156,7 @@ class _Route:
     source: Floats
 
     def at(self, t: Floats, rows: Indices) -> tuple[Floats, Floats]:
-        """(viewpoints, sources) of `rows` at t."""
+        """Viewpoints and sources of `rows` at t."""
         apex = np.broadcast_to(self.apex, self.source.shape)[rows]
         axis = np.broadcast_to(self.axis, self.source.shape)[rows]
         along, left = t[:, None], 1.0 - t[:, None]
@@ -148,7 +168,7 @@ class _Route:
 
 
 def _followed(path: Sequence[Crossing], n_outside: float, route: _Route) -> PurkinjePoints:
-    """The images of a route's m rays."""
+    """Follow the images of a route's m rays."""
     count = len(route.source)
     t, t_before, step = np.zeros(count), np.zeros(count), np.full(count, FIRST_STEP)
     point, exits, way = (np.zeros((count, 3)) for _ in range(3))
@@ -188,7 +208,7 @@ def _followed(path: Sequence[Crossing], n_outside: float, route: _Route) -> Purk
         status[rows[lost]] = Status.NOT_CONVERGED
         status[rows[ended]] = Status.NO_MIRROR_POINT
     ok = status == Status.OK
-    # The rims count only for the ray that is left.
+    # Rims are checked only for the final ray.
     traced = trace(
         path, n_outside, route.apex + route.viewpoint, np.where(ok[:, None], way, -normalize(route.viewpoint))
     )

@@ -1,8 +1,8 @@
 """The two-point problem by shooting: the ray that leaves one point, passes a path of crossings and meets another point.
 
-Newton on the direction at the source with ray differentials. A unit direction d is varied along e1, e2 orthogonal to
-it; each crossing carries the differentials dy of the point and dw of the direction along (Igehy 1999, "Tracing ray
-differentials", eq. 8-19):
+It is solved by Newton on the direction at the source with ray differentials. A unit direction d is varied along e1, e2
+orthogonal to it. Each crossing carries along the differentials dy of the point and dw of the direction (Igehy 1999,
+"Tracing ray differentials", eq. 8-19):
 
     transfer    dt = -N.(dy + t dw) / (N.w),  dy <- dy + t dw + dt w,   dN = (H dy - N (N.H dy)) / |g|
     refraction  w = eta d + f N, f = eta c - c2:  dw = eta dd + df N + f dN,  df = (eta - eta^2 c / c2) dc
@@ -48,11 +48,16 @@ _RETREATS = 12
 class Connection:
     """The connecting rays, one array per coordinate.
 
-    start : unit direction at the source; first : the point on the first crossing; last : the point on the last one;
-    turning : the point where the ray was last reflected (the first one if it never was);
-    end : unit direction in the last medium; residual_mm : by how much the traced ray misses the target, for one
-    beyond `FAR_MM` of the last surface measured there;
-    tube_mm2_sr : |det|; status.
+    Attributes:
+        start: unit direction at the source.
+        first: the point on the first crossing.
+        last: the point on the last crossing.
+        turning: the point where the ray was last reflected; the first point if it never was.
+        end: unit direction in the last medium.
+        residual_mm: by how much the traced ray misses the target. For a target more than `FAR_MM` from the last surface
+            it is measured at `FAR_MM`.
+        tube_mm2_sr: |det|.
+        status: (...,).
     """
 
     start: Xyz
@@ -94,8 +99,8 @@ class _Shot:
 def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz) -> Connection:
     """Find the rays from `source` through `path` to `target` (arrays that broadcast), first aimed at `aim`.
 
-    Undamped Newton for all; what it leaves over goes through a guarded search (steps are halved until the miss
-    shrinks) from `aim`, and then from points between it and the target.
+    Undamped Newton is tried for all rays. The rays that it does not find go through a guarded search, in which steps
+    are halved until the miss shrinks. It starts from `aim`, and then from points between it and the target.
     """
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *target, *aim)))
     source, target = _spread(source, shape), _spread(target, shape)
@@ -132,9 +137,9 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
 def correct(
     path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz, steps: int = _FAST_STEPS
 ) -> Corrected:
-    """`connect` for rays (m,) whose aim is close already: at most `steps` undamped steps, and no other attempt.
+    """Refine rays (m,) whose aim is already close, with at most `steps` undamped steps and no other attempt.
 
-    Only the surfaces are held against a ray, not their rims.
+    The surfaces must be met, but their rims are not checked.
     """
     direction = _unit(_minus(aim, source))
     shot = _shoot(path, n_start, source, direction, target)
@@ -151,8 +156,10 @@ def correct(
 class RayTube(NamedTuple):
     """The tube of rays around a traced ray, arrays (...) and components.
 
-    cross_section_mm2_sr : its cross section at the target per solid angle at the source, |w . (a1 x a2)|. Where source
-    and target lie in media of the same index it is the same in both directions. end : the ray's unit direction there.
+    Attributes:
+        cross_section_mm2_sr: cross section at the target per solid angle at the source, |w . (a1 x a2)|. Where source
+            and target lie in media of the same index it is the same in both directions.
+        end: the ray's unit direction at the target.
     """
 
     cross_section_mm2_sr: Floats
@@ -160,7 +167,7 @@ class RayTube(NamedTuple):
 
 
 def ray_tube(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction: Xyz, target: Xyz) -> RayTube:
-    """The tube of rays that leave `source` along unit directions, where they pass `target` (see the module)."""
+    """Tube of rays that leave `source` along unit directions, where they pass `target` (see the module)."""
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *direction, *target)))
     shot = _shoot(path, n_start, _spread(source, shape), _spread(direction, shape), _spread(target, shape))
     return RayTube(np.abs(shot.determinant), shot.end)
@@ -169,7 +176,7 @@ def ray_tube(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, directio
 def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction: Xyz, target: Xyz) -> _Shot:
     """Trace `direction` with its two differentials to the point of closest approach to `target`.
 
-    Rims are not held against a ray here: the iteration may wander beyond them.
+    Rims are not checked here, because the iteration may move beyond them.
     """
     point, way = source, direction
     basis = _basis(direction)
@@ -248,7 +255,7 @@ def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction:
         residual = np.sqrt(dot(miss, miss)) * nearness(along)
         determinant = _triple(way, a1, a2)
     mark(status, ~np.isfinite(residual), Status.MISSED)
-    # The target lies ahead in the last medium, or the ray would have to run backwards to it.
+    # The target must lie ahead in the last medium, else the ray would have to run backwards to it.
     mark(status, along < -BEHIND_MM, Status.MISSED)
     return _Shot(first or point, point, turning or point, way, along, miss, residual, (a1, a2), determinant, status)
 
@@ -260,7 +267,7 @@ def _stepped(direction: Xyz, shot: _Shot, fraction: Floats | float) -> Xyz:
         scale = fraction / shot.determinant
         first = _triple(shot.end, shot.miss, a2) * scale
         second = _triple(shot.end, a1, shot.miss) * scale
-    # A singular tube or a failed ray stays where it is.
+    # Rays that have a singular tube or failed keep their direction.
     usable = np.isfinite(first) & np.isfinite(second)
     first, second = np.where(usable, first, 0.0), np.where(usable, second, 0.0)
     e1, e2 = _basis(direction)
@@ -277,7 +284,7 @@ def _rescue(
     shot: _Shot,
     left: Bools,
 ) -> tuple[Xyz, _Shot]:
-    """Guarded Newton for the rays that the undamped one left over; the rest are handed on unchanged."""
+    """Search the rays that undamped Newton did not find; the others are returned unchanged."""
     index = np.nonzero(left)
     frame = index[0] if left.ndim else np.zeros(1, dtype=np.intp)
     few_path = [taken(crossing, frame) for crossing in path]
@@ -286,7 +293,7 @@ def _rescue(
     best_way = _pick(direction, index)
     best = _shoot(few_path, few_start, few_source, best_way, few_target)
     done = np.zeros(frame.shape, dtype=bool)
-    # Aimed at the target itself, all blends are the same.
+    # For an aim at the target itself, all blends are the same.
     for blend in (0.0,) if all(map(np.array_equal, few_aim, few_target)) else (0.0, 0.5, -0.5, 1.0):
         aimed = _moved(few_aim, _minus(few_target, few_aim), np.full(frame.shape, blend))
         way = _unit(_minus(aimed, few_source))
@@ -303,7 +310,7 @@ def _rescue(
 def _guarded(
     path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, way: Xyz, shot: _Shot, done: Bools
 ) -> tuple[Xyz, _Shot]:
-    """Newton with steps halved until the miss shrinks."""
+    """Newton with steps that are halved until the miss shrinks."""
     for _ in range(_GUARDED_STEPS):
         active = ~done & (shot.status == Status.OK) & ~_settled(shot, 1.0)
         if not active.any():
@@ -325,7 +332,7 @@ def _guarded(
 
 
 def _settled(shot: _Shot, slack: float) -> Bools:
-    """Whether the miss is down to `slack` times what Newton can reach."""
+    """Whether the miss is at most `slack` times what Newton can reach."""
     reach = SETTLED_MM + ROUNDING_RAD * np.sqrt(np.abs(shot.determinant)) * nearness(shot.along)
     return np.asarray(shot.residual_mm <= slack * reach)
 
@@ -336,12 +343,12 @@ def _better(trial: _Shot, best: _Shot) -> Bools:
 
 
 def nearness(along_mm: Floats) -> Floats:
-    """What a miss at the distance `along_mm` behind the last surface is multiplied by: FAR_MM / along_mm, at most 1."""
+    """Factor by which a miss at `along_mm` behind the last surface is multiplied: FAR_MM / along_mm, at most 1."""
     return np.asarray(FAR_MM / np.maximum(along_mm, FAR_MM))
 
 
 def taken(crossing: Crossing, frame: Indices) -> Crossing:
-    """The crossing with its per-eye parameters gathered for single rays."""
+    """Gather the per-eye parameters of a crossing for single rays."""
     n_after, rim = crossing.n_after, crossing.rim_mm
     return Crossing(
         crossing.surface.take(frame),
@@ -412,7 +419,7 @@ def _choose(old_where: Bools, old: Xyz, new: Xyz) -> Xyz:
 
 
 def _spread(point: Xyz, shape: tuple[int, ...]) -> Xyz:
-    # One axis at least, so that rays can be picked out of the batch.
+    # There must be at least one axis, so that rays can be picked out of the batch.
     full = shape or (1,)
     return np.broadcast_to(point[0], full), np.broadcast_to(point[1], full), np.broadcast_to(point[2], full)
 
@@ -424,7 +431,7 @@ def _single(point: Xyz) -> Xyz:
 def _basis(direction: Xyz) -> tuple[Xyz, Xyz]:
     """Two unit vectors orthogonal to a unit direction and to each other (Duff et al. 2017, listing 3)."""
     x, y, z = direction
-    # The formula's singular direction is -z; it is turned here so that -sign(x) x is the pole.
+    # The formula is singular at -z. It is rotated here so that -sign(x) x is the pole.
     sign = np.copysign(1.0, x)
     a = -1.0 / (sign + x)
     b = y * z * a

@@ -1,11 +1,10 @@
 """Apparent points (refraction), mirror points (reflection) and Purkinje images: the rays that join two points.
 
-The many are found by Newton on the optical length (`fermat`), from a paraxial start. Every path found is then traced,
-from the viewpoint through the surfaces; what the traced ray misses the other point by is the residual. A path that
+Most rays are found by Newton on the optical length (`fermat`) from a paraxial start. Every path is then traced from the
+viewpoint through the surfaces; the distance by which the traced ray misses the other point is the residual. A path that
 misses by more than rounding is searched again by shooting with ray differentials and guarded steps (`shooting`), which
-also serves surfaces that have no common graph. A refracted ray that is still not found is looked for from
-the object's side: seen at a grazing angle, Newton from a straight line's guess may miss a ray that exists. Whatever the
-surfaces, these are tried in turn.
+also handles surfaces that have no common graph. A refracted ray that is still not found is searched from the object's
+side: at grazing angles, Newton from a straight line's guess may miss a ray that exists.
 """
 
 from __future__ import annotations
@@ -34,8 +33,12 @@ SURE_MM = 1e-11
 class ApparentPoints(ArrayValue):
     """Where the rays from object points to a viewpoint leave the outermost surface.
 
-    exit_points_mm (..., 3); directions (..., 3): unit, from the exit point to the viewpoint; inner_directions (..., 3):
-    unit, from the object to the innermost surface; residual_mm (...,); status (...,).
+    Attributes:
+        exit_points_mm: (..., 3) points on the outermost surface.
+        directions: (..., 3) unit vectors from the exit point to the viewpoint.
+        inner_directions: (..., 3) unit vectors from the object to the innermost surface.
+        residual_mm: (...,) by how much the traced ray misses.
+        status: (...,).
     """
 
     exit_points_mm: Floats
@@ -47,11 +50,14 @@ class ApparentPoints(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MirrorPoints(ArrayValue):
-    """Where light from a source is thrown back to a viewpoint.
+    """Where light from a source is reflected to a viewpoint.
 
-    points_mm (..., 3): on the surface; directions (..., 3): unit, from there to the viewpoint; residual_mm (...,): by
-    how much the traced ray misses the source, 1e-9 at most, measured at 1000 mm where the source is farther; status
-    (...,).
+    Attributes:
+        points_mm: (..., 3) points on the surface.
+        directions: (..., 3) unit vectors from there to the viewpoint.
+        residual_mm: (...,) by how much the traced ray misses the source, 1e-9 at most. It is measured at 1000 mm where
+            the source is farther away.
+        status: (...,).
     """
 
     points_mm: Floats
@@ -63,8 +69,12 @@ class MirrorPoints(ArrayValue):
 class Rays(NamedTuple):
     """Rays from a viewpoint to a point through surfaces, one array per coordinate.
 
-    exit : the point on the outermost surface; way : unit direction from the viewpoint to it; end : unit direction in
-    the last medium; residual_mm, status.
+    Attributes:
+        exit: the point on the outermost surface.
+        way: unit direction from the viewpoint to it.
+        end: unit direction in the last medium.
+        residual_mm: by how much the traced ray misses.
+        status: (...,).
     """
 
     exit: Xyz
@@ -83,9 +93,15 @@ def apparent_points(
     rim_mm: FloatLike = np.inf,
     n_outside: float = 1.0,
 ) -> ApparentPoints:
-    """Refraction of object points (..., 3) to a viewpoint (..., 3), broadcast against each other.
+    """Refraction of object points to a viewpoint.
 
-    surfaces : outside in; indices : the index behind each; rim_mm : where the outermost surface ends (the limbus).
+    Args:
+        surfaces: outside in.
+        indices: the index behind each surface.
+        object_points_mm: (..., 3) points behind the surfaces.
+        viewpoint_mm: (..., 3) viewpoints; they broadcast against the object points.
+        rim_mm: rim radius of the outermost surface (the limbus).
+        n_outside: index outside the eye.
     """
     rays = refracted_rays(
         surfaces, indices, components(object_points_mm), components(viewpoint_mm), rim_mm=rim_mm, n_outside=n_outside
@@ -110,7 +126,7 @@ def refracted_rays(
     rim_mm: FloatLike = np.inf,
     n_outside: float = 1.0,
 ) -> Rays:
-    """`apparent_points` on components."""
+    """Compute `apparent_points` on components."""
     path = [
         Crossing(surface, index, rim_mm=rim_mm if k == 0 else np.inf, beyond_rim=Status.OUTSIDE_LIMBUS)
         for k, (surface, index) in enumerate(zip(surfaces, indices, strict=True))
@@ -132,7 +148,7 @@ def refracted_rays(
 
 
 def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: FloatLike = np.inf) -> Rays:
-    """`mirror_points` on components."""
+    """Compute `mirror_points` on components."""
     path = (Crossing(surface, 1.0, reflects=True, rim_mm=rim_mm, beyond_rim=Status.OUTSIDE_LIMBUS),)
     guess = mirror_start(surface, source, viewpoint)
     frame = graphs_of([surface], guess[0].ndim)
@@ -146,7 +162,7 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Floa
 
 
 def _far_beyond(crossing: Crossing, guess: Xyz) -> Bools:
-    """Where the first guess of a mirror point is so far outside the rim that the point cannot be on the surface."""
+    """Whether the first guess of a mirror point is so far outside the rim that the point cannot be on the surface."""
     surface, rim, ndim = crossing.surface, crossing.rim_mm, guess[0].ndim
     if isinstance(rim, float) and rim == np.inf:
         return np.zeros(guess[0].shape, dtype=bool)
@@ -165,9 +181,9 @@ def _confirmed(
     aim: Xyz,
     hopeless: Bools | None = None,
 ) -> Rays:
-    """Trace from the viewpoint over the points `first` of the first surface; search again what misses the target.
+    """Trace from the viewpoint over the points `first` of the first surface, and search again what misses the target.
 
-    `hopeless` rays are not searched: they meet the surface beyond its rim, if at all.
+    `hopeless` rays are not searched: if they meet the surface at all, they meet it beyond its rim.
     """
     with np.errstate(all="ignore"):
         way = _unit((first[0] - viewpoint[0], first[1] - viewpoint[1], first[2] - viewpoint[2]))
@@ -188,7 +204,7 @@ def _confirmed(
         reach: FloatLike = SURE_MM
         if path[0].reflects:
             residual = residual * nearness(along)
-            # A distant source magnifies what Newton leaves of the mirror point.
+            # A distant source magnifies Newton's remaining error of the mirror point.
             reach = np.minimum(SURE_MM + 1e-15 * along * along, RESIDUAL_LIMIT_MM)
         found &= (residual <= reach) & (along > 0.0)
     status = np.zeros(residual.shape, dtype=np.int8)
@@ -201,9 +217,10 @@ def _confirmed(
 
 
 def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target: Xyz, rays: Rays) -> Rays:
-    """The refracted rays, with those that were not found searched from the object.
+    """Search from the object for the refracted rays that were not found.
 
-    A cone of rays is launched from it; those that leave closest to the viewpoint's direction start a search each.
+    A cone of rays is launched from the object. Those that leave closest to the viewpoint's direction each start a
+    search.
     """
     lost = (rays.status != Status.OK) & (rays.status != Status.OUTSIDE_LIMBUS)
     if not lost.any():
@@ -252,7 +269,7 @@ _LAUNCHED_AT_ONCE = 200
 def _searched(
     path: Sequence[Crossing], n_start: FloatLike, viewpoint: Xyz, target: Xyz, aim: Xyz, rays: Rays, left: Bools
 ) -> Rays:
-    """The rays with those at `left` found by shooting."""
+    """Find the rays at `left` by shooting, and keep the others."""
     rows = np.nonzero(left) if left.ndim else (np.zeros(1, dtype=np.intp),)
     shape = left.shape or (1,)
 
@@ -290,9 +307,9 @@ def _paraxial_start(
 ) -> list[tuple[Floats, Floats]]:
     """First guesses (y, z) on each surface, outside in.
 
-    On the outermost one: the straight line's point, drawn away by m = 1 / (1 - d (n - 1) / (n R)) from the line that
-    joins the viewpoint and the centre of curvature, which passes unbroken; d is the object's depth, n its index. On the
-    others: on the straight line from there to the object.
+    On the outermost surface the guess is the straight line's point, moved by m = 1 / (1 - d (n - 1) / (n R)) away from
+    the line through the viewpoint and the centre of curvature, which is not refracted; d is the object's depth, n its
+    index. On the other surfaces it is on the straight line from there to the object.
     """
     zero = np.zeros((1,) * target[0].ndim)
     with np.errstate(all="ignore"):
@@ -323,9 +340,9 @@ def _paraxial_start(
 
 
 def mirror_start(surface: Surface, source: Xyz, viewpoint: Xyz) -> Xyz:
-    """A first guess of a mirror point: where the bisector through the apex' centre of curvature meets the surface.
+    """First guess of a mirror point: where the bisector through the apex' centre of curvature meets the surface.
 
-    Exact on a sphere for source and viewpoint at infinity.
+    It is exact on a sphere for source and viewpoint at infinity.
     """
     ndim = max(source[0].ndim, viewpoint[0].ndim)
     shape = np.broadcast_shapes(source[0].shape, viewpoint[0].shape)
@@ -348,7 +365,7 @@ def mirror_start(surface: Surface, source: Xyz, viewpoint: Xyz) -> Xyz:
 
 
 def apex_of(surface: Surface) -> Floats:
-    """The sheet's point on its local axis, (..., 3)."""
+    """Point of the sheet on its local axis, (..., 3)."""
     zero = np.zeros(surface.batch_shape)
     return surface.to_eye(np.stack([surface.sag(zero, zero), zero, zero], axis=-1))
 

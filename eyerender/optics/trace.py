@@ -1,4 +1,4 @@
-"""Tracing rays through any number of surfaces, in sequence, with a status for each ray."""
+"""Sequential tracing of rays through any number of surfaces, with a status for each ray."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ from .interface import dot, reflect, refract
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crossing:
-    """A surface as a ray meets it.
+    """How a ray crosses a surface.
 
-    n_after : index behind the crossing; () or (n,), one an eye. Ignored where the ray is reflected.
-    inward : the ray goes into the eye (towards -x of the surface's frame).
-    reflects : the ray is thrown back instead of refracted.
-    rim_mm : the surface ends at this distance from its axis (infinite: it does not end).
-    beyond_rim : the status of a ray that meets the surface outside its rim; None: such a ray passes on undisturbed, as
-        does one that misses the surface (the inner shells of a gradient lens do not reach as far as the pupil).
-    through : the gradient medium before the crossing, where rays are bent on their way to it; None: they run straight.
+    Attributes:
+        surface: the surface.
+        n_after: index behind the crossing, () or (n,), one per eye. Ignored where the ray is reflected.
+        inward: whether the ray goes into the eye (towards -x of the surface's frame).
+        reflects: whether the ray is reflected instead of refracted.
+        rim_mm: distance from the axis at which the surface ends; infinite for one without an end.
+        beyond_rim: the status of a ray that meets the surface outside its rim. None: such a ray continues undisturbed,
+            as does one that misses the surface (the inner shells of a gradient lens do not reach as far as the pupil).
+        through: the gradient medium before the crossing; None: the ray runs straight.
     """
 
     surface: Surface
@@ -39,10 +41,16 @@ class Crossing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Traced(ArrayValue):
-    """The rays of a trace over S crossings; leading axis of the points: 0 the start, k the k-th crossing.
+    """The rays of a trace over S crossings.
 
-    points_mm (S + 1, ..., 3), directions (S + 1, ..., 3): the direction on leaving each point; optical_path_mm (...,)
-    from the start to the last crossing; status (...,). What follows a failed crossing is not meaningful.
+    The leading axis of the points is 0 for the start and k for the k-th crossing. Values after a failed crossing have
+    no meaning.
+
+    Attributes:
+        points_mm: (S + 1, ..., 3) points.
+        directions: (S + 1, ..., 3) unit directions on leaving each point.
+        optical_path_mm: (...,) from the start to the last crossing.
+        status: (...,).
     """
 
     points_mm: Floats
@@ -59,7 +67,7 @@ def inward_path(surfaces: Sequence[Surface], indices: Sequence[FloatLike]) -> tu
 def outward_path(
     surfaces: Sequence[Surface], indices: Sequence[FloatLike], n_outside: FloatLike = 1.0
 ) -> tuple[Crossing, ...]:
-    """The same surfaces (listed from outside in) crossed on the way out."""
+    """Refraction at the same surfaces (listed from outside in) on the way out."""
     behind = [n_outside, *indices[:-1]]
     return tuple(Crossing(s, n, inward=False) for s, n in zip(reversed(surfaces), reversed(behind), strict=True))
 
@@ -75,7 +83,8 @@ def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLik
     index: FloatLike = n_start if isinstance(n_start, float) else fit(np.asarray(n_start, dtype=np.float64), ndim)
     for crossing in path:
         if crossing.through is None:
-            # A far origin loses digits in the quadratic; the foot of the perpendicular from the eye's origin does not.
+            # A distant origin loses digits in the quadratic. The foot of the perpendicular from the eye's origin does
+            # not.
             lead = -dot(point, direction)
             near = (point[0] + lead * direction[0], point[1] + lead * direction[1], point[2] + lead * direction[2])
             hit = crossing.surface.hit(near, direction, crossing.inward)
@@ -114,7 +123,7 @@ def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLik
 
 
 def cross(crossing: Crossing, gradient: Xyz, direction: Xyz, n_before: FloatLike) -> tuple[FloatLike, Xyz, Bools]:
-    """(index after, direction after, light passes) at a point with half gradient `gradient`."""
+    """Index after, direction after, and whether light passes, at a point with half gradient `gradient`."""
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 1.0 / np.sqrt(dot(gradient, gradient))
         normal = (gradient[0] * scale, gradient[1] * scale, gradient[2] * scale)
