@@ -1,4 +1,4 @@
-"""Eyes with differing parameters as one eye whose numbers have a leading axis."""
+"""Batches of eyes: one eye model whose numbers have a leading axis."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ S = TypeVar("S", bound=Surface)
 
 
 def structure_of(eye: EyeModel) -> Structure:
-    """What must agree between eyes that are to be stacked: kinds and numbers of surfaces."""
+    """Structure that eyes must share to be stacked: kinds and numbers of surfaces."""
     front, back = (tuple(s.kind for s in surfaces) for surfaces in (eye.front, eye.back))
     return front, back, eye.back_passing, eye.lens_gradient is not None, eye.retina.kind
 
 
 def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
-    """A batch of n eyes of one structure; name and side are those of the first."""
+    """Stack n eyes of one structure into a batch; name and side are those of the first."""
     first = eyes[0]
     if any(structure_of(eye) != structure_of(first) for eye in eyes):
         raise ValueError("eyes of different structure cannot be stacked")
@@ -67,7 +67,7 @@ def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
 
 
 def take_eyes(eye: EyeModel, index: Indices) -> EyeModel:
-    """The eyes at `index` of a batch; a single eye is returned as it is."""
+    """Eyes of a batch at `index`; a single eye is returned as it is."""
     if eye.fovea_mm.ndim == 1:
         return eye
 
@@ -105,7 +105,7 @@ def _stack(surfaces: tuple[S, ...]) -> S:
 
 
 def _stop_parts(stop: Stop, waves: int) -> tuple[Floats, ...]:
-    """The stop's numbers, its contour continued by zeros to as many `waves`."""
+    """Numbers of the stop, with its contour padded by zeros to `waves`."""
     contour = np.zeros((*stop.contour.shape[:-1], waves))
     contour[..., : stop.contour.shape[-1]] = stop.contour
     return stop.centre_mm, stop.rotation, stop.semi_axes_mm, stop.handed, contour

@@ -1,4 +1,4 @@
-"""From an eye file to the numeric eye."""
+"""Build the numeric eye from an eye file."""
 
 from __future__ import annotations
 
@@ -39,7 +39,17 @@ from .spec import (
 
 
 def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm: float | None) -> EyeModel:
-    """The numeric eye; raises `InputError` for a pupil that does not fit or an index below 1 at this wavelength."""
+    """Build the numeric eye.
+
+    Args:
+        spec: the eye file.
+        side: right or left.
+        wavelength_nm: wavelength in vacuum.
+        pupil_diameter_mm: diameter of the pupil; None: the file's own.
+
+    Raises:
+        InputError: the pupil does not fit, or an index is below 1 at this wavelength.
+    """
     if not (np.isfinite(wavelength_nm) and wavelength_nm > 0.0):
         raise InputError("must be a positive number", path="wavelength_nm")
     diameter = spec.stop.diameter_mm if pupil_diameter_mm is None else float(pupil_diameter_mm)
@@ -50,7 +60,7 @@ def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm
     stop = stop_of(spec, diameter)
     if 2.0 * stop_reach_mm(stop) >= widest:
         raise InputError(f"the pupil is wider than the iris or the cornea ({widest:g} mm)", path=path)
-    # Behind a surface its implicit function is negative.
+    # The implicit function is negative behind a surface.
     if not (surface_of(spec.cornea[-1]).implicit(stop.boundary(32)) < 0.0).all():
         raise InputError("the pupil reaches beyond the cornea", path=path)
     x, y, z = (float(v) for v in stop.centre_mm)
@@ -59,7 +69,7 @@ def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm
 
 
 def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> EyeModel:
-    """The right eye without its landmarks (fovea, node, chief ray: zeros): enough to trace with."""
+    """The right eye without its landmarks (fovea, node and chief ray are zeros), which is enough for tracing."""
     front = tuple(surface_of(s) for s in spec.cornea)
     front_indices = tuple(index_at(s.medium, wavelength_nm, f"cornea.{k}.medium") for k, s in enumerate(spec.cornea))
     back: tuple[Surface, ...] = ()
@@ -105,7 +115,7 @@ def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> EyeModel:
 
 
 def surface_of(placed: PlacedSpec) -> Surface:
-    """A placed shape as a surface of the eye frame."""
+    """Build a placed shape as a surface of the eye frame."""
     shape = placed.shape
     rotation = tilt_rotation(np.radians(placed.tilt_deg))
     position = np.array(placed.position_mm)
@@ -125,7 +135,7 @@ def surface_of(placed: PlacedSpec) -> Surface:
 
 def _general_quadric(shape: QuadricSpec, position: Floats, rotation: Floats) -> Quadric:
     a, b, c, d, e, f, g, h, i, k = shape.coefficients
-    # Scaled so that distances, not the coefficients' own unit, set the size of rounding.
+    # The scale makes the size of rounding depend on distances, not on the unit of the coefficients.
     scale = max(abs(v) for v in (a, b, c, d, e, f)) or max(abs(v) for v in (g, h, i))
     if b == c and d == e == f == 0.0 and b != 0.0:
         scale = abs(b)
@@ -135,14 +145,18 @@ def _general_quadric(shape: QuadricSpec, position: Floats, rotation: Floats) -> 
 
 
 def medium_of(spec: MediumSpec) -> Medium:
-    """The medium a spec describes."""
+    """Build the medium that a spec describes."""
     if spec.cauchy is not None:
         return CauchyMedium(*spec.cauchy)
     return ConstantMedium(1.0 if spec.index is None else spec.index)
 
 
 def index_at(spec: MediumSpec, wavelength_nm: float, path: str) -> float:
-    """The index at a wavelength; raises `InputError` below 1."""
+    """Index at a wavelength.
+
+    Raises:
+        InputError: the index is below 1.
+    """
     index = medium_of(spec).index(wavelength_nm)
     if not 1.0 <= index <= LARGEST_INDEX:
         raise InputError(
@@ -152,11 +166,12 @@ def index_at(spec: MediumSpec, wavelength_nm: float, path: str) -> float:
 
 
 def stop_of(spec: EyeSpec, diameter_mm: float) -> Stop:
-    """The right eye's stop at a diameter."""
+    """Stop of the right eye at a diameter."""
     stop = spec.stop
     change = diameter_mm - stop.diameter_mm
     rotation = tilt_rotation(np.radians(stop.tilt_deg)) @ rotation_x(np.radians(stop.axis_deg))
-    # In the plane of the iris, which stays: a pupil that left it would sink into a lens that is tilted with it.
+    # The pupil moves within the plane of the iris, which is fixed. Otherwise it would sink into a lens that is tilted
+    # with it.
     depth = -float(rotation[1:, 0] @ stop.shift_mm_per_mm) / float(rotation[0, 0])
     centre = np.array(stop.position_mm) + np.array([depth, *stop.shift_mm_per_mm]) * change
     ratio = np.sqrt(1.0 - stop.ellipticity)
@@ -171,12 +186,12 @@ def stop_of(spec: EyeSpec, diameter_mm: float) -> Stop:
 
 
 def stop_reach_mm(stop: Stop) -> float:
-    """The largest distance of the margin from the stop's centre, within 0.1 %."""
+    """Largest distance of the margin from the stop's centre, within 0.1 %."""
     return float(np.max(np.linalg.norm(stop.boundary(360) - stop.centre_mm, axis=-1)))
 
 
 def sclera_of(spec: EyeSpec, cornea: Surface) -> Sphere:
-    """The sphere through the limbus circle, centre on the cornea's axis, unless the file gives the centre."""
+    """Sclera: the sphere through the limbus circle, centred on the cornea's axis unless the file gives the centre."""
     radius = spec.sclera.radius_mm
     if spec.sclera.centre_mm is not None:
         return Sphere(read_only(spec.sclera.centre_mm), radius)
@@ -188,7 +203,11 @@ def sclera_of(spec: EyeSpec, cornea: Surface) -> Sphere:
 
 
 def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Floats]:
-    """(front, back, centre (3,)) of a gradient lens; raises `InputError` for what cannot be one."""
+    """Geometry of a gradient lens: (front, back, centre (3,)).
+
+    Raises:
+        InputError: the surfaces cannot be those of a gradient lens.
+    """
     for name, shape in (("front", lens.front.shape), ("back", lens.back.shape)):
         if not isinstance(shape, SphereSpec | ConicSpec | BiconicSpec):
             raise InputError("a gradient lens is made of spheres, conics or biconics", path=f"lens.{name}.shape")
@@ -212,7 +231,7 @@ def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Floats]
 def gradient_lens(
     lens: GradientLensSpec, wavelength_nm: float
 ) -> tuple[tuple[Surface, ...], tuple[FloatLike, ...], tuple[FloatLike, ...], GradientMedium | None]:
-    """(surfaces outside in, the index behind each, rims, the medium between the two if they are no shells)."""
+    """Surfaces of a gradient lens outside in, the index behind each, their rims, and the medium (None for shells)."""
     front, back, centre = gradient_geometry(lens)
     edge, core, vitreous = (
         index_at(medium, wavelength_nm, f"lens.{name}")
@@ -230,7 +249,7 @@ def gradient_lens(
 
 
 def _equator_radius(front: Surface, back: Surface) -> float:
-    """Where the outer front and back surfaces meet (mm from the axis); infinite if they do not."""
+    """Distance from the axis (mm) where the outer front and back surfaces meet; infinite if they do not."""
     thickness = float(np.linalg.norm(front.origin_mm - back.origin_mm))
 
     def gap(r: float) -> float:
@@ -244,7 +263,7 @@ def _equator_radius(front: Surface, back: Surface) -> float:
 
 
 def mirrored_eye(eye: EyeModel) -> EyeModel:
-    """The other eye: every point (x, y, z) -> (x, -y, z)."""
+    """Mirror an eye to the other side: every point (x, y, z) -> (x, -y, z)."""
     side: Literal["right", "left"] = "left" if eye.side == "right" else "right"
     return EyeModel(
         name=eye.name,
@@ -280,7 +299,7 @@ def mirrored_eye(eye: EyeModel) -> EyeModel:
 
 
 class _Key:
-    """A spec that hashes by its digest, so that landmarks are computed once for an eye."""
+    """A spec that hashes by its digest, so that landmarks are computed once per eye."""
 
     __slots__ = ("digest", "spec")
 
@@ -296,7 +315,7 @@ class _Key:
 
 @lru_cache(maxsize=256)
 def _compiled(key: _Key, wavelength_nm: float, stop_centre_mm: tuple[float, float, float]) -> EyeModel:
-    """The right eye with its landmarks, which depend on the stop by its centre alone."""
+    """The right eye with its landmarks, which depend on the stop only through its centre."""
     spec = key.spec
     nominal = stop_of(spec, spec.stop.diameter_mm)
     bare = bare_eye(spec, wavelength_nm, replace(nominal, centre_mm=np.array(stop_centre_mm)))

@@ -1,4 +1,4 @@
-"""What pydantic cannot see in an eye file: whether the geometry it describes can be an eye."""
+"""Checks of an eye file that pydantic cannot make: whether the geometry can be an eye."""
 
 from __future__ import annotations
 
@@ -27,7 +27,11 @@ _FAR_MM = 60.0
 
 
 def check_eye(spec: EyeSpec, *, source: str = "") -> None:
-    """Raise `InputError` with the path of the first key that cannot stand."""
+    """Check the geometry of an eye file.
+
+    Raises:
+        InputError: with the path of the first wrong key.
+    """
     from .build import gradient_geometry, stop_of, stop_reach_mm
 
     def refuse(path: str, reason: str) -> None:
@@ -63,7 +67,7 @@ def check_eye(spec: EyeSpec, *, source: str = "") -> None:
 
 
 def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:
-    """Surfaces lie one behind the other within the aperture: cornea, stop, lens, retina."""
+    """Check that surfaces follow each other within the aperture: cornea, stop, lens, retina."""
     from .build import stop_of, surface_of
 
     def refuse(path: str, reason: str) -> None:
@@ -80,7 +84,7 @@ def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:
         refuse("limbus_radius_mm", f"the front cornea ends {reach:.3g} mm from the axis")
     for (path_before, before), (path, surface) in pairwise(cornea):
         ahead, depth = _depth(before, wide), _depth(surface, wide)
-        # Behind the plane of the iris the inner cornea is not there any more.
+        # The inner cornea ends at the plane of the iris.
         counts = np.isfinite(ahead) & np.isfinite(depth) & (ahead > depth_wide)
         crossing = counts & (depth > ahead - _TOUCH_MM)
         if crossing.any():
@@ -100,7 +104,7 @@ def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:
         depth = _depth(surface, narrow)
         if not np.isfinite(depth).all():
             refuse(f"{path}.shape", "does not reach as far as the pupil")
-        # A lens may touch the stop, and a decentred one may bulge through its plane by a little.
+        # A lens may touch the stop, and a decentred one may bulge slightly through its plane.
         slack = _BULGE_MM if path_before == "stop" else -_TOUCH_MM
         crossing = depth > ahead + slack
         if crossing.any():

@@ -1,14 +1,14 @@
 """Fixation: the pose in which the line of sight of an eye runs from a target to the fovea.
 
-Two readings of the line of sight:
+There are two definitions of the line of sight:
 
-`chief_ray` : the ray from the target that passes the centre of the stop and ends on the fovea. Its course in the eye
-does not depend on the target, so outside it is one line fixed in the eye, and the pose is the one that turns this line
-through the target: two equations in azimuth and elevation, solved by Newton with exact derivatives.
+`chief_ray`: the ray from the target that passes the centre of the stop and ends on the fovea. Its course in the eye
+does not depend on the target, so outside the eye it is one line fixed to the eye. The pose turns this line through the
+target. That gives two equations in azimuth and elevation, which Newton solves with exact derivatives.
 
-`entrance_window` : six points evenly spaced on the stop's margin are each joined to the target by a refracted ray; the
-six exit rays, run backwards, are cut at one common length, chosen so that the mean of the six points comes closest to
-the optic axis. That mean is the window's centre; the line of sight starts from the target towards it and must end on
+`entrance_window`: six points evenly spaced on the stop's margin are each joined to the target by a refracted ray. The
+six exit rays are extended backwards by one common length, chosen so that the mean of the six end points comes closest
+to the optic axis. That mean is the window's centre. The line of sight runs from the target towards it and must end on
 the fovea. (gkaModelEye's definition, Aguirre 2019, "A model of the entrance pupil of the human eye", Sci. Rep. 9,
 9360.)
 """
@@ -47,9 +47,12 @@ _STEPS = 20
 class Fixations(ArrayValue):
     """A batch of fixations, leading axis n.
 
-    poses; residual_mm (n,): by how much the line of sight misses (chief ray: the target; entrance window: the fovea);
-    status (n,): `Status`; line_of_sight_mm (n, 3): the point of the unturned eye where the line of sight
-    meets the cornea; line_of_sight_direction (n, 3): unit, from there to the target, in the eye-fixed frame.
+    Attributes:
+        poses: poses of the eye.
+        residual_mm: (n,) by how much the line of sight misses (chief ray: the target; entrance window: the fovea).
+        status: (n,) of `Status`.
+        line_of_sight_mm: (n, 3) point of the unturned eye where the line of sight meets the cornea.
+        line_of_sight_direction: (n, 3) unit vectors from there to the target, in the eye-fixed frame.
     """
 
     poses: Poses
@@ -59,7 +62,7 @@ class Fixations(ArrayValue):
     line_of_sight_direction: Floats
 
     def reason(self, item: int) -> str | None:
-        """Why fixation `item` failed; None if it did not."""
+        """Reason why fixation `item` failed; None if it did not."""
         return Status(int(self.status[item])).reason
 
     def __len__(self) -> int:
@@ -67,9 +70,15 @@ class Fixations(ArrayValue):
 
 
 def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKind = "chief_ray") -> Fixations:
-    """The poses of `eye` (one, or a batch of n) that fixate targets (n, 3).
+    """Find the poses that fixate targets.
 
-    target_mm : in the eye frame, i.e. the world's target minus the eye's position minus the head's.
+    Args:
+        eye: one eye, or a batch of n.
+        target_mm: (n, 3) in the eye frame, i.e. the world's target minus the eye's position minus the head's.
+        line_of_sight: its definition, see the module.
+
+    Raises:
+        InputError: a target is not a finite point, or the definition is unknown.
     """
     target = np.atleast_2d(np.asarray(target_mm, dtype=np.float64))
     if target.ndim != 2 or target.shape[1] != 3 or not np.isfinite(target).all():
@@ -101,7 +110,7 @@ def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:
 
 
 def _turn_line(eye: EyeModel, target: Xyz, point: Xyz, direction: Xyz) -> tuple[Floats, Floats, Floats, Floats]:
-    """(azimuth, elevation, distance of the target from the line, its distance along the line), Newton with Listing."""
+    """Turn the line by Newton with Listing's law: azimuth, elevation, the target's distance from and along the line."""
     e1, e2 = _tangents(direction)
     centre = eye.rotation.azimuth_centre_mm
     x, y = target[0] - centre[..., 0], target[1] - centre[..., 1]
@@ -120,11 +129,11 @@ def _turn_line(eye: EyeModel, target: Xyz, point: Xyz, direction: Xyz) -> tuple[
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = 1.0 / (a * d - b * c)
             turn, lift = (d * r1 - b * r2) * scale, (a * r2 - c * r1) * scale
-        # Far from the solution a full step can leave the hemisphere, where Listing's law has no meaning.
+        # Far from the solution a full step can leave the hemisphere in which Listing's law is defined.
         turn, lift = np.clip(np.nan_to_num(turn), -0.5, 0.5), np.clip(np.nan_to_num(lift), -0.5, 0.5)
         azimuth, elevation = azimuth - turn, elevation - lift
         if max(np.max(np.abs(turn)), np.max(np.abs(lift))) < 1e-9:
-            # Newton is quadratic: what is left is below rounding; measure it.
+            # Newton converges quadratically, so the remaining error is below rounding. It is measured here.
             seen, _, _ = _seen(eye, target, azimuth, elevation)
             gap = (seen[0] - point[0], seen[1] - point[1], seen[2] - point[2])
             r1, r2 = _dot(e1, gap), _dot(e2, gap)
@@ -165,7 +174,10 @@ def _seen(eye: EyeModel, target: Xyz, azimuth: Floats, elevation: Floats) -> tup
 
 
 def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
-    """Broyden on the pose, started at the chief ray's; the error is the miss at the fovea across the line of sight."""
+    """Solve for the pose by Broyden from the chief ray's pose.
+
+    The error is the miss at the fovea, across the line of sight.
+    """
     start = _by_chief_ray(eye, target_mm)
     angles = np.stack([start.poses.azimuth_rad, start.poses.elevation_rad], axis=-1)
     ok = start.status == Status.OK
@@ -186,7 +198,7 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
         new, entry, way, lost = _window_miss(eye, target_mm, angles)
         square = np.maximum(np.sum(step * step, -1), 1e-300)
         surprise = new - miss - np.einsum("nij,nj->ni", slope, step)
-        # Tiny steps carry only rounding; they would spoil the slope.
+        # Tiny steps contain only rounding and would spoil the slope.
         learn = (square > 1e-22)[:, None, None]
         slope = slope + np.where(learn, surprise[:, :, None] * step[:, None, :] / square[:, None, None], 0.0)
         miss = new
@@ -197,7 +209,7 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
 
 
 def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floats, Floats, Floats, Bools]:
-    """(miss at the fovea (n, 2), point on the cornea, direction to the target, whether there is no such ray)."""
+    """Miss at the fovea (n, 2), point on the cornea, direction to the target, and whether there is no such ray."""
     poses = Poses.listing(angles[:, 0], angles[:, 1])
     seen = join(into_eye(Turning.of(poses), eye, components(target_mm)))
     centre, lost = entrance_window_centre(eye, seen)
@@ -211,11 +223,15 @@ def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floa
 
 
 def entrance_window_centre(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Bools]:
-    """The centre of the entrance window seen from viewpoints (n, 3) of the eye frame (mm), and where there is none.
+    """Centre of the entrance window seen from viewpoints, and where there is none.
 
-    c = mean(p_i) - t mean(u_i) with exit points p_i and directions u_i; t makes c come closest to the optic axis.
-    Where the mean ray runs along the optic axis every t does. The window then lies where it lies for a viewpoint
-    1e-4 rad off the axis on the same side; t changes with the square of that angle, by some 1e-9 mm.
+    c = mean(p_i) - t mean(u_i) with exit points p_i and directions u_i, where t makes c come closest to the optic axis.
+    Where the mean ray runs along the optic axis, t is not determined. The window is then that of a viewpoint 1e-4 rad
+    off the axis on the same side; t changes with the square of that angle, by some 1e-9 mm.
+
+    Args:
+        eye: the eye.
+        viewpoint_mm: (n, 3) in the eye frame.
     """
     point, way, lost = _mean_ray(eye, viewpoint_mm)
     length = _to_the_axis(point, way)
@@ -231,7 +247,7 @@ def entrance_window_centre(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats,
 
 
 def _mean_ray(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Floats, Bools]:
-    """Mean exit point and mean direction (n, 3) of the rays from the stop's margin, and where one does not exist."""
+    """Mean exit point and mean direction (n, 3) of the rays from the stop's margin, and where a ray does not exist."""
     margin = eye.stop.boundary(WINDOW_POINTS)
     found = apparent_points(eye.front, eye.front_indices, margin, viewpoint_mm[:, None, :])
     lost = (found.status != Status.OK).any(axis=1)
@@ -254,7 +270,7 @@ def _status(target_mm: Floats, azimuth: Floats, elevation: Floats, residual: Flo
 
 
 def _tangents(direction: Xyz) -> tuple[Xyz, Xyz]:
-    """Two unit vectors across a direction that points roughly along +x."""
+    """Two unit vectors orthogonal to a direction that points roughly along +x."""
     x, y, z = direction
     scale = 1.0 / np.sqrt(x * x + y * y)
     e1 = (-y * scale, x * scale, 0.0 * x)

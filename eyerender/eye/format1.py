@@ -1,4 +1,4 @@
-"""Eye files of format 1, which had keys that format 2 writes otherwise.
+"""Eye files of format 1, whose keys format 2 replaces.
 
 | format 1 | format 2 |
 |---|---|
@@ -24,12 +24,12 @@ from ..spec import LARGEST
 
 
 def upgraded(data: Mapping[str, Any], *, source: str = "") -> dict[str, Any]:
-    """The mapping of an eye file of format 1 as one of format 2.
+    """Convert the mapping of an eye file of format 1 to format 2.
 
-    Values that are not what they should be stay as they are: the check of format 2 names them.
+    Wrong values are left as they are, and the check of format 2 names them.
 
     Raises:
-        InputError: naming one of the three keys, where its value is none that format 1 had or does not fit.
+        InputError: one of the three keys has a value that format 1 did not have, or that does not fit.
     """
     try:
         return _eye(data)
@@ -54,7 +54,7 @@ def _eye(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _placed(value: Any, path: str) -> Any:
-    """A placed surface by its apex, its tilt as Rz Ry Rx."""
+    """Convert a placed surface: its apex, and its tilt as Rz Ry Rx."""
     if not isinstance(value, Mapping):
         return value
     out = {**value}
@@ -76,7 +76,7 @@ def _placed(value: Any, path: str) -> Any:
 
 
 def _apex_from_centre(shape: Any, path: str) -> float | None:
-    """How far along the axis the apex lies from the centre (mm); None where the shape itself is wrong."""
+    """Distance of the apex from the centre along the axis (mm); None where the shape itself is wrong."""
     kind = shape.get("kind") if isinstance(shape, Mapping) else None
     if kind == "ellipsoid":
         semi_axes = _numbers(shape.get("semi_axes_mm"), 3)
@@ -94,19 +94,19 @@ def _apex_from_centre(shape: Any, path: str) -> float | None:
 
 
 def _tilt_deg(rotation: Floats) -> Floats:
-    """The angles (deg) about x, y, z of a rotation (3, 3) as Rz Ry Rx."""
+    """Angles (deg) about x, y, z of a rotation (3, 3) as Rz Ry Rx."""
     about_y = np.arctan2(-rotation[2, 0], np.hypot(rotation[2, 1], rotation[2, 2]))
     about_z = np.arctan2(rotation[1, 0], rotation[0, 0])
-    # What is left after these two is the rotation about x, also where x and z turn about one axis.
+    # The remaining rotation is the one about x, also where x and z turn about one axis.
     left = rotation_y(-about_y) @ rotation_z(-about_z) @ rotation
     return np.degrees([np.arctan2(left[2, 1], left[1, 1]), about_y, about_z])
 
 
 def _count_layers(lens: dict[str, Any]) -> None:
-    """In place: the index at twice the shells' rate as the layers that it stood for.
+    """Replace, in place, the doubled rate of the index by the layers that it stood for.
 
-    Shell k stood at k / (2 shells) of the way from edge to core and had (k + 1) / shells inside; the lens' own surfaces
-    lay on the first shell.
+    Shell k stood at k / (2 shells) of the way from edge to core and had (k + 1) / shells inside. The lens' own surfaces
+    were the first shell.
     """
     rate = _choice(lens, "index_rate", (1, 2), "lens")
     if rate != 2:
@@ -122,7 +122,7 @@ def _count_layers(lens: dict[str, Any]) -> None:
 
 
 def _choice(data: dict[str, Any], key: str, known: tuple[Any, Any], path: str) -> Any:
-    """Take a removed key out; its default is the first of the two values that it had."""
+    """Remove a key of format 1; its default is the first of its two values."""
     value = data.pop(key, known[0])
     if isinstance(value, bool) or not isinstance(value, type(known[0])) or value not in known:
         raise InputError(f"must be {known[0]!r} or {known[1]!r}, not {shown(value)}", path=f"{path}.{key}")
@@ -130,7 +130,7 @@ def _choice(data: dict[str, Any], key: str, known: tuple[Any, Any], path: str) -
 
 
 def _numbers(value: Any, count: int) -> Floats | None:
-    """A list of finite numbers within the limits of a spec, as an array; None where it is none."""
+    """Read a list of finite numbers within the limits of a spec as an array; None for anything else."""
     if not isinstance(value, list | tuple) or len(value) != count:
         return None
     if any(isinstance(v, bool) or not isinstance(v, int | float) or not abs(v) <= LARGEST for v in value):

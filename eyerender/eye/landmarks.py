@@ -24,7 +24,7 @@ NODE_DISTANCE_MM = 1500.0
 
 
 def path_to_retina(eye: EyeModel) -> tuple[Crossing, ...]:
-    """All crossings from air to the retina; light ends there, so the last one does not bend it."""
+    """All crossings from air to the retina; the last one does not bend the light, which ends there."""
     last = eye.back_indices[-1] if eye.back else eye.front_indices[-1]
     lens = zip(eye.back, eye.back_indices, eye.back_rims_mm, eye.back_passing, _through(eye, 1), strict=True)
     return (
@@ -38,7 +38,7 @@ def path_to_retina(eye: EyeModel) -> tuple[Crossing, ...]:
 
 
 def _through(eye: EyeModel, last: int) -> list[GradientMedium | None]:
-    """What lies before each surface of the lens on a way on which a gradient lens ends with its surface `last`."""
+    """Medium before each surface of the lens, on a path that leaves a gradient lens at its surface `last`."""
     return [eye.lens_gradient if k == last else None for k in range(len(eye.back))]
 
 
@@ -60,7 +60,8 @@ def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Flo
     direction, error, retina = _parallel_rays(path, objects_mm, normalize(guess_mm - objects_mm))
     for k in np.flatnonzero(~(error < _PARALLEL)):
         row = slice(k, k + 1)
-        # The ray stands on the edge of a shell, where the index jumps: solve with the shells met next to the edge.
+        # The ray meets the edge of a shell, where the index jumps. It is solved with the shells that it meets next to
+        # the edge.
         met = crossed(path, trace(path, 1.0, objects_mm[row], direction[row]))
         direction[row], error[row], retina[row] = _parallel_rays(met, objects_mm[row], direction[row])
     if not (error < _PARALLEL).all():
@@ -90,18 +91,19 @@ def _parallel_rays(path: Sequence[Crossing], objects_mm: Floats, direction: Floa
 
 
 def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
-    """The crossings that one traced ray (leading shape (1,)) really met, now without rims."""
+    """Crossings that one traced ray (leading shape (1,)) really met, without their rims."""
     moved = np.linalg.norm(np.diff(traced.points_mm[:, 0], axis=0), axis=-1) > 0.0
     return tuple(replace(c, rim_mm=np.inf, beyond_rim=Status.MISSED) for c, met in zip(path, moved, strict=True) if met)
 
 
 def incident_node(eye: EyeModel) -> Floats:
-    """The waist of a ring of nodal rays (3,).
+    """Incident node (3,): the waist of a ring of nodal rays.
 
-    16 nodal rays from (h, v) = 14.3 deg (sin f, cos f), objects 1500 mm from the apex; the node is the mean of the
-    points of closest approach of all pairs. It lies on the optic axis where the eye is centred about it, and off the
-    axis where surfaces are tilted or decentred. (Harris 2010, "Nodes and nodal points and lines in eyes and other
-    optical systems", Ophthalmic Physiol. Opt. 30, 24-42: an aspheric or tilted eye has no nodal point, but a waist.)
+    The ring has 16 nodal rays from (h, v) = 14.3 deg (sin f, cos f), from objects 1500 mm from the apex. The node is
+    the mean of the points of closest approach of all pairs. It lies on the optic axis where the eye is centred about
+    it, and off the axis where surfaces are tilted or decentred. (Harris 2010, "Nodes and nodal points and lines in eyes
+    and other optical systems", Ophthalmic Physiol. Opt. 30, 24-42: an aspheric or tilted eye has no nodal point, but a
+    waist.)
     """
     angle = 2.0 * np.pi * np.arange(NODE_RAYS) / NODE_RAYS
     ring = np.radians(NODE_RING_DEG) * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
@@ -118,7 +120,7 @@ def incident_node(eye: EyeModel) -> Floats:
 
 
 def fovea_by_nodal_ray(eye: EyeModel, node_mm: Floats, field_rad: Floats, distance_mm: float) -> Floats:
-    """Where the nodal ray from the field direction (h nasal, v up) meets the retina, (3,).
+    """Fovea (3,): where the nodal ray from the field direction (h nasal, v up) meets the retina.
 
     The object lies in the direction (1, tan h, tan v) from the incident node, `distance_mm` from the corneal apex.
     """
@@ -130,9 +132,12 @@ def fovea_by_nodal_ray(eye: EyeModel, node_mm: Floats, field_rad: Floats, distan
 
 
 def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
-    """The ray that leaves the fovea, passes the stop's centre and goes out into the air.
+    """Ray that leaves the fovea, passes the stop's centre and goes out into the air.
 
-    It is fixed in the eye, so that fixation by chief ray only has to turn the eye until it meets the target.
+    It is fixed in the eye, so fixation by chief ray only has to turn the eye until it meets the target.
+
+    Raises:
+        InputError: there is no such ray.
     """
     centre = eye.stop.centre_mm
     if eye.back:
@@ -166,7 +171,7 @@ def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
 
 
 def field_direction(field_rad: Floats) -> Floats:
-    """(1, tan h, tan v), normalized; field angles (..., 2) -> (..., 3)."""
+    """Unit vectors along (1, tan h, tan v); field angles (..., 2) -> (..., 3)."""
     field = np.asarray(field_rad, dtype=np.float64)
     return normalize(np.stack([np.ones(field.shape[:-1]), np.tan(field[..., 0]), np.tan(field[..., 1])], axis=-1))
 

@@ -1,15 +1,16 @@
-"""A pupil margin for any eye model: not quite round, and moving as the pupil changes size.
+"""A pupil margin for any eye model: slightly irregular, and moving as the pupil changes size.
 
-r(f) = 1 + sum_k A_k cos(k (f - F_k)), k = 2 .. 6, is the margin's radius over its mean; its noncircularity is the rms
+r(f) = 1 + sum_k A_k cos(k (f - F_k)), k = 2 .. 6, is the margin's radius over its mean. Its noncircularity is the rms
 of r - 1, sqrt(sum_k A_k^2 / 2). In a drawn margin A_k cos(k F_k) and A_k sin(k F_k) are independent normal numbers
-whose standard deviation falls as k^-2, scaled together to the noncircularity that is asked for. (k = 1 would only move
-the pupil.)
+whose standard deviation falls as k^-2, scaled together to the requested noncircularity. (k = 1 would only move the
+pupil.)
 
 Sources: Wyatt (1995), "The form of the human pupil", Vision Res. 35, 2021-2036: noncircularity 0.0166 on average,
 mostly in the first 4 or 5 harmonics, about half of it (47.7 % in light, 59.6 % in the dark) an ellipse's; here 46 % go
 with k = 2. Yang, Thompson and Burns (2002), "Pupil location under mesopic, photopic, and pharmacologically dilated
 conditions", Invest. Ophthalmol. Vis. Sci. 43, 2508-2512: .133 mm towards the temple from 4.1 to 6.3 mm.
-Chosen: the law of the fall, one outline at every diameter, no shift up or down, two eyes that are mirror images.
+Chosen without a source: the power law, one outline at every diameter, no vertical shift, and two eyes that are mirror
+images.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ Shift = Annotated[float, Field(ge=-0.5, le=0.5)]
 
 
 class PupilMargin(Spec):
-    """The margin of the pupil and its shift, in place of those of the eye file; a left eye has the mirror image.
+    """Margin of the pupil and its shift, in place of those of the eye file; a left eye has the mirror image.
 
     With a `seed` or a `contour` the outline is that about a circle, else it stays the eye file's.
     """
@@ -70,13 +71,13 @@ class PupilMargin(Spec):
         return self
 
     def outline(self) -> ContourSpec | None:
-        """The outline that is drawn or given; None where the eye file's stays."""
+        """Outline that is drawn or given; None where that of the eye file is kept."""
         if self.seed is None:
             return self.contour
         return drawn_contour(self.seed, NONCIRCULARITY if self.noncircularity is None else self.noncircularity)
 
     def applied(self, eye: EyeSpec) -> EyeSpec:
-        """The eye with this margin in its stop."""
+        """Eye file with this margin in its stop."""
         changes: dict[str, object] = {"shift_mm_per_mm": self.shift_mm_per_mm}
         outline = self.outline()
         if outline is not None:
@@ -85,10 +86,10 @@ class PupilMargin(Spec):
 
 
 def drawn_contour(seed: int, noncircularity: float) -> ContourSpec:
-    """The outline of a seed: the same directions and shares of its harmonics whatever its noncircularity."""
+    """Draw the outline of a seed; the directions and shares of its harmonics do not depend on its noncircularity."""
     order = np.array(HARMONICS, dtype=np.float64)
     u, v = np.random.default_rng((0x9099, seed)).random((2, len(order)))
-    # Box and Muller's transform: with the phase two normal numbers, from nothing but uniform ones.
+    # Box and Muller's transform: with the phase this gives two normal numbers from uniform ones.
     amplitude = order**_FALL * np.sqrt(-2.0 * np.log1p(-u))
     amplitude *= noncircularity / np.sqrt(np.sum(amplitude**2) / 2.0)
     waves = np.zeros((2, max(HARMONICS)))

@@ -1,8 +1,8 @@
-"""Eyes as triangle meshes: every surface a patch, and the closed bodies that the patches make up.
+"""Eyes as triangle meshes: every surface is a patch, and patches form closed bodies.
 
-Vertices lie exactly on the surfaces of the model, normals are analytic, faces turn their outside outwards (towards the
-air). A patch between two transparent media carries both indices; an opaque one carries none. Bodies share the vertices
-of their patches, so they close without gaps:
+Vertices lie exactly on the surfaces of the model, normals are analytic, and faces point outwards (towards the air). A
+patch between two transparent media has both indices; an opaque one has none. Bodies share the vertices of their
+patches, so they close without gaps:
 
     cornea     front, rim, back                        (models with a posterior cornea)
     aqueous    cornea's back, chamber wall, hyaloid, lens
@@ -11,9 +11,10 @@ of their patches, so they close without gaps:
     interior   cornea's front, chamber wall, retinal wall      (models of one medium)
     globe      cornea's front, sclera
 
-What the models leave open is closed thus: the posterior cornea ends where it meets the plane of the iris or at the
-limbus; a lens without a rim of its own ends at 4.5 mm or where its surfaces meet; the retinal wall is a sphere 1 mm
-inside the sclera. The renderer itself meets the surfaces in closed form; these meshes serve other integrators.
+Where a model leaves a gap, it is closed as follows: the posterior cornea ends where it meets the plane of the iris or
+at the limbus; a lens without a rim of its own ends at 4.5 mm or where its surfaces meet; the retinal wall is a sphere 1
+mm inside the sclera. The renderer itself intersects the surfaces in closed form; these meshes are for other
+integrators.
 """
 
 from __future__ import annotations
@@ -37,9 +38,15 @@ _WALL_MM = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A piece of surface: vertices (n, 3) mm, unit normals (n, 3), faces (m, 3).
+    """A piece of surface.
 
-    `exterior`, `interior` are the indices of refraction on the side of the normal and behind; None where opaque.
+    Attributes:
+        name: what it is.
+        vertices: (n, 3) mm.
+        normals: (n, 3) unit normals.
+        faces: (m, 3) indices of vertices.
+        exterior: index of refraction on the side of the normal; None where opaque.
+        interior: index of refraction behind; None where opaque.
     """
 
     name: str
@@ -51,20 +58,20 @@ class Patch:
 
     @property
     def mesh(self) -> Any:
-        """As a trimesh."""
+        """Convert to a trimesh."""
         return trimesh.Trimesh(self.vertices, self.faces, vertex_normals=self.normals, process=False)
 
 
 @dataclass(frozen=True, slots=True)
 class EyeMeshes:
-    """The patches of an eye by name, and its closed bodies as trimeshes, each facing outwards."""
+    """Patches of an eye by name, and its closed bodies as trimeshes, each facing outwards."""
 
     patches: dict[str, Patch]
     bodies: dict[str, Any] = field(default_factory=dict)
 
 
 def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
-    """All meshes of an eye, in the eye frame (mm); a gradient lens is made of shells."""
+    """Make all meshes of an eye, in the eye frame (mm); a gradient lens is made of shells."""
     eye = shelled(eye)
     angle = 2 * np.pi * np.arange(sectors) / sectors
     limbus = np.full(sectors, float(eye.limbus_radius_mm))
@@ -113,7 +120,7 @@ def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
 
 def _cap(name: str, surface: Surface, rho: Floats, rings: int, exterior: float, interior: float,
          inward: bool = False) -> Patch:  # fmt: skip
-    """The part of a surface within radius rho (sectors,) of its axis; faces towards +x, or -x if `inward`."""
+    """Part of a surface within radius rho (sectors,) of its axis; faces towards +x, or -x if `inward`."""
     sectors = len(rho)
     angle = 2 * np.pi * np.arange(sectors) / sectors
     share = np.arange(1, rings + 1) / rings
@@ -134,7 +141,7 @@ def _fan(sectors: int) -> Ints:
 
 
 def _strips(first: int, rings: int, sectors: int) -> Ints:
-    """Quads between consecutive rings of `sectors` vertices, the innermost starting at vertex `first`."""
+    """Quads between consecutive rings of `sectors` vertices; the innermost ring starts at vertex `first`."""
     i, j = np.meshgrid(np.arange(rings - 1), np.arange(sectors), indexing="ij")
     a, k = first + i * sectors, (j + 1) % sectors
     upper = np.stack([a + j, a + sectors + j, a + sectors + k], axis=-1)
@@ -143,14 +150,14 @@ def _strips(first: int, rings: int, sectors: int) -> Ints:
 
 
 def _rim(patch: Patch, sectors: int) -> Floats:
-    """The last ring of a patch."""
+    """Last ring of a patch."""
     return patch.vertices[-sectors:]
 
 
 def _band(
     name: str, inner: Floats, outer: Floats, exterior: float | None = None, interior: float | None = None
 ) -> Patch:
-    """The strip between two rings, oriented as a cap that goes on from `inner` to `outer`."""
+    """Strip between two rings, oriented like a cap that continues from `inner` to `outer`."""
     sectors = len(inner)
     vertices = np.concatenate([inner, outer])
     faces = _strips(0, 2, sectors)
@@ -159,7 +166,7 @@ def _band(
 
 
 def _chamber_rim(eye: EyeModel, surface: Surface, angle: Floats) -> Floats:
-    """Radius (sectors,) at which the posterior cornea meets the plane of the iris, at most the limbus'."""
+    """Radius (sectors,) at which the posterior cornea meets the plane of the iris, at most that of the limbus."""
     low, high = np.zeros_like(angle), np.full_like(angle, float(eye.limbus_radius_mm) * 0.995)
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -171,7 +178,7 @@ def _chamber_rim(eye: EyeModel, surface: Surface, angle: Floats) -> Floats:
 
 
 def _lenses(eye: EyeModel, outside: float, rings: int, sectors: int, angle: Floats) -> list[tuple[Patch, Patch, Patch]]:
-    """(front, equator, back) of the lens and of every shell inside it; all facing out of the lens."""
+    """Front, equator and back of the lens and of every shell inside it; all face out of the lens."""
     found = []
     count = len(eye.back) // 2
     before = [outside, *(float(n) for n in eye.back_indices)]
@@ -190,7 +197,7 @@ def _lenses(eye: EyeModel, outside: float, rings: int, sectors: int, angle: Floa
 
 
 def _meeting(front: Surface, back: Surface, rim: float, angle: Floats) -> float:
-    """The largest radius, at most `rim`, at which the front still lies before the back by a hundredth of a mm."""
+    """Largest radius, at most `rim`, at which the front is at least a hundredth of a mm before the back."""
     low, high = 0.0, rim
     for _ in range(50):
         middle = 0.5 * (low + high) if high != rim or low > 0 else rim
@@ -209,7 +216,7 @@ def _meeting(front: Surface, back: Surface, rim: float, angle: Floats) -> float:
 
 
 def _retinal_wall(eye: EyeModel, depth: float, rings: int, sectors: int, angle: Floats) -> tuple[Patch, Floats]:
-    """The sphere 1 mm inside the sclera from the plane x = depth to its back pole, and its first ring."""
+    """Sphere 1 mm inside the sclera from the plane x = depth to its back pole, and its first ring."""
     centre, radius = np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm) - _WALL_MM
     start = np.arccos(np.clip((depth - centre[0]) / radius, -1, 1))
     polar = start + (np.pi - start) * np.arange(rings) / rings
@@ -218,7 +225,7 @@ def _retinal_wall(eye: EyeModel, depth: float, rings: int, sectors: int, angle: 
 
 
 def _sclera(eye: EyeModel, rim: Floats, rings: int) -> Patch:
-    """The sclera's sphere from the cornea's rim to its back pole; its first ring is that rim."""
+    """Sphere of the sclera from the cornea's rim to its back pole; its first ring is that rim."""
     centre, radius = np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm)
     r = rim - centre
     start = np.arctan2(np.hypot(r[:, 1], r[:, 2]), r[:, 0])
@@ -230,7 +237,7 @@ def _sclera(eye: EyeModel, rim: Floats, rings: int) -> Patch:
 
 
 def _polar(name: str, centre: Floats, radius: float, polar: Floats, angle: Floats) -> Patch:
-    """A sphere's part by rings of polar angle (rings, sectors) from +x, closed at its back pole."""
+    """Part of a sphere by rings of polar angle (rings, sectors) from +x, closed at its back pole."""
     rings, sectors = polar.shape
     n = np.stack(
         [np.cos(polar), np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle)], axis=-1
@@ -243,7 +250,7 @@ def _polar(name: str, centre: Floats, radius: float, polar: Floats, angle: Float
 
 
 def _iris(eye: EyeModel, sectors: int) -> Patch:
-    """The annulus in the stop's plane from the pupil's margin to the root, facing the cornea."""
+    """Annulus in the stop's plane from the pupil's margin to the root, facing the cornea."""
     inner = eye.stop.boundary(sectors)
     if float(eye.stop.handed) < 0:
         inner = np.roll(inner[::-1], 1, axis=0)
@@ -256,7 +263,7 @@ def _iris(eye: EyeModel, sectors: int) -> Patch:
 
 
 def _closed(*parts: tuple[Patch, int]) -> Any:
-    """One body of several patches (sign -1: turned around), their common rims merged."""
+    """Join patches (sign -1: turned around) into one body with their common rims merged."""
     vertices, faces, count = [], [], 0
     for patch, sign in parts:
         vertices.append(patch.vertices)
@@ -268,7 +275,7 @@ def _closed(*parts: tuple[Patch, int]) -> Any:
 
 
 def crossing(eye: EyeModel, meshes: EyeMeshes, tolerance_mm: float = 1e-6) -> Sequence[str]:
-    """Names of refracting patches that poke through the next surface outside them; empty for a sound eye."""
+    """Names of refracting patches that intersect the next surface outside them; empty for a valid eye."""
     eye = shelled(eye)
     order: list[tuple[str, Surface]] = [("cornea_front", eye.front[0])]
     if len(eye.front) > 1:

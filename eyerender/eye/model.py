@@ -1,4 +1,4 @@
-"""The eye as numbers: surfaces, stop, landmarks, in the eye frame."""
+"""The numeric eye: surfaces, stop and landmarks in the eye frame."""
 
 from __future__ import annotations
 
@@ -68,9 +68,9 @@ class Stop(ArrayValue):
         return out
 
     def boundary(self, count: int) -> Floats:
-        """`count` points of the margin evenly spaced in the ellipse's parameter, (..., count, 3).
+        """Points of the margin, evenly spaced in the ellipse's parameter, (..., count, 3).
 
-        The first lies on the first semi-axis (nasal where it is not turned), the next follow towards up; those of a
+        The first lies on the first semi-axis (nasal where it is not turned), and the next follow towards up. Those of a
         left eye are the mirror images of the right eye's.
         """
         angle = 2.0 * np.pi * np.arange(count) / count
@@ -83,7 +83,7 @@ class Stop(ArrayValue):
         return np.asarray(c + first[..., None] * r[..., :, 1] + second[..., None] * r[..., :, 2])
 
     def contains(self, points_mm: npt.ArrayLike) -> Bools:
-        """Whether points (..., 3) of the plane lie inside the margin; for a batch of stops (n, ..., 3)."""
+        """Whether points (..., 3) of the plane lie inside the margin; (n, ..., 3) for a batch of stops."""
         point = components(points_mm)
         ndim = point[0].ndim
         _, y, z = turn_back(self.rotation, shift(point, self.centre_mm, -1.0))
@@ -102,7 +102,8 @@ class Stop(ArrayValue):
     def lets_through(self, course_mm: npt.ArrayLike) -> Bools:
         """Whether rays pass inside the margin wherever they cross the stop's plane.
 
-        course_mm : their points (k, ..., 3) in order, inside the eye; (k, n, ..., 3) for a batch of n stops.
+        Args:
+            course_mm: (k, ..., 3) points of the rays in order, inside the eye; (k, n, ..., 3) for a batch of n stops.
         """
         course = np.asarray(course_mm, dtype=np.float64)
         passes = np.ones(course.shape[1:-1], dtype=bool)
@@ -116,7 +117,7 @@ class Stop(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sphere(ArrayValue):
-    """centre_mm (3,), radius_mm."""
+    """A sphere: centre_mm (3,) and radius_mm."""
 
     centre_mm: Floats
     radius_mm: FloatLike
@@ -124,7 +125,7 @@ class Sphere(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RotationCentres(ArrayValue):
-    """Where the eye turns: azimuth about z, elevation about y, torsion about x; (3,) each."""
+    """Centres of rotation: azimuth about z, elevation about y, torsion about x; (3,) each."""
 
     azimuth_centre_mm: Floats
     elevation_centre_mm: Floats
@@ -148,11 +149,29 @@ class LineOfSight(ArrayValue):
 class EyeModel(ArrayValue):
     """An eye in the eye frame, at one wavelength and with one pupil.
 
-    front, front_indices : refracting surfaces between air and the stop, outside in; the index behind each.
-    back, back_indices : the lens' surfaces, likewise; empty without a lens. A gradient lens has two, with the index of
-        its edge behind the front and `lens_gradient` between them, or many shells.
-    back_rims_mm, back_passing : where each ends, and whether a ray that does not meet it passes on.
-    fovea_mm, incident_node_mm (3,); chief_ray : the fixed ray in air that the fovea sees through the stop's centre.
+    A gradient lens has two surfaces, with the index of its edge behind the front and `lens_gradient` between them, or
+    many shells.
+
+    Attributes:
+        name: name of the model.
+        side: right or left.
+        wavelength_nm: wavelength in vacuum.
+        front: refracting surfaces between air and the stop, outside in.
+        front_indices: the index behind each.
+        back: surfaces of the lens, outside in; empty without a lens.
+        back_indices: the index behind each.
+        back_rims_mm: the rim radius of each.
+        back_passing: whether a ray that misses the surface continues.
+        retina: surface of the retina.
+        stop: the anatomical pupil.
+        limbus_radius_mm: radius of the limbus.
+        iris_root_radius_mm: radius of the iris' root.
+        sclera: sphere of the sclera.
+        rotation: centres of rotation.
+        fovea_mm: (3,).
+        incident_node_mm: (3,).
+        chief_ray: the fixed ray in air that reaches the fovea through the stop's centre.
+        lens_gradient: medium of a gradient lens that is not made of shells.
     """
 
     name: str
@@ -177,7 +196,7 @@ class EyeModel(ArrayValue):
 
     @property
     def purkinje_orders(self) -> tuple[int, ...]:
-        """The Purkinje images this eye has: 1 front cornea, 2 back cornea, 3 lens front, 4 lens back."""
+        """Purkinje images of this eye: 1 front cornea, 2 back cornea, 3 lens front, 4 lens back."""
         orders = [1]
         if len(self.front) > 1:
             orders.append(2)

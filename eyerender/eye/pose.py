@@ -1,4 +1,4 @@
-"""Pose: how an eye stands, and how its points move with it.
+"""Pose: the orientation of an eye, and how its points move with it.
 
 M = Rz(azimuth) Ry(-elevation) Rx(torsion), right-handed; azimuth > 0 turns to the subject's left for both eyes,
 elevation > 0 up. Listing's law sets the torsion:
@@ -25,7 +25,7 @@ from .model import EyeModel
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses(ArrayValue):
-    """A batch of poses, (n,) each, in radians."""
+    """A batch of poses: three angles (n,) in radians."""
 
     azimuth_rad: Floats
     elevation_rad: Floats
@@ -37,14 +37,14 @@ class Poses(ArrayValue):
 
     @classmethod
     def listing(cls, azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Poses:
-        """Poses whose torsion follows Listing's law."""
+        """Make poses whose torsion follows Listing's law."""
         azimuth = np.asarray(azimuth_rad, dtype=np.float64)
         elevation = np.asarray(elevation_rad, dtype=np.float64)
         return cls(azimuth, elevation, listing_torsion(azimuth, elevation))
 
     @classmethod
     def from_degrees(cls, azimuth_deg: npt.ArrayLike, elevation_deg: npt.ArrayLike) -> Poses:
-        """The same, in degrees."""
+        """Make poses by Listing's law from degrees."""
         return cls.listing(np.radians(azimuth_deg), np.radians(elevation_deg))
 
     def __len__(self) -> int:
@@ -58,14 +58,21 @@ def listing_torsion(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) ->
 
 
 def rotation_matrices(poses: Poses) -> Floats:
-    """M, (n, 3, 3)."""
+    """Rotation matrices M, (n, 3, 3)."""
     return np.asarray(rotation_z(poses.azimuth_rad) @ rotation_y(-poses.elevation_rad) @ rotation_x(poses.torsion_rad))
 
 
 def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Floats, Floats]:
-    """(M (n, 3, 3), t (n, 3)): x_turned = M x + t in the eye frame.
+    """Rigid motion of the eye: x_turned = M x + t in the eye frame.
 
-    The world's point is x_turned + the eye's position + the head's position. `eye` may be a batch of n.
+    The world's point is x_turned + the eye's position + the head's position.
+
+    Args:
+        poses: n poses.
+        eye: one eye, or a batch of n.
+
+    Returns:
+        M (n, 3, 3) and t (n, 3).
     """
     centres = eye.rotation
     azimuth, elevation = rotation_z(poses.azimuth_rad), rotation_y(-poses.elevation_rad)
@@ -77,7 +84,7 @@ def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Floats, Floats]:
 
 
 class Turning(NamedTuple):
-    """Sines and cosines of poses, one array an angle: what moves points in and out of the turned eye cheaply."""
+    """Sines and cosines of poses, one array per angle, to transform points into the turned eye cheaply."""
 
     azimuth: tuple[Floats, Floats]
     elevation: tuple[Floats, Floats]
@@ -85,7 +92,7 @@ class Turning(NamedTuple):
 
     @classmethod
     def of(cls, poses: Poses) -> Turning:
-        """From poses."""
+        """Compute them from poses."""
         return cls(
             (np.cos(poses.azimuth_rad), np.sin(poses.azimuth_rad)),
             (np.cos(poses.elevation_rad), np.sin(poses.elevation_rad)),
@@ -94,7 +101,7 @@ class Turning(NamedTuple):
 
 
 def into_eye(turning: Turning, eye: EyeModel, point: Xyz) -> Xyz:
-    """Where points (n,) of the space around the eye lie for the turned eye: the inverse of the rigid motion."""
+    """Transform points (n,) around the eye into the frame of the turned eye: the inverse of the rigid motion."""
     ca, ce, ct = (_split(c) for c in _centres(eye))
     (cos_a, sin_a), (cos_e, sin_e), (cos_t, sin_t) = turning
     x, y, z = point[0] - ca[0], point[1] - ca[1], point[2] - ca[2]

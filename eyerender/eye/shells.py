@@ -16,14 +16,19 @@ SHELLS = 21
 
 
 class Layers(NamedTuple):
-    """Sizes of shells from outside in, and how far the index inside each has gone from edge to core; (k,) each."""
+    """Layers of a lens from outside in, (k,) each.
+
+    Attributes:
+        sizes: size of each shell.
+        index_shares: how far the index inside each shell has changed from edge to core.
+    """
 
     sizes: Floats
     index_shares: Floats
 
 
 class Shells(NamedTuple):
-    """Surfaces outside in, front shells and then back shells; the index behind each; their rims."""
+    """Surfaces outside in (front shells, then back shells), the index behind each, and their rims."""
 
     surfaces: tuple[Surface, ...]
     indices: tuple[FloatLike, ...]
@@ -38,7 +43,16 @@ def lens_shells(
     rim_mm: float,
     layers: Layers,
 ) -> Shells:
-    """The shells of the lens between two single surfaces; indices: of its edge, of its core, behind it."""
+    """Make the shells of the lens between two single surfaces.
+
+    Args:
+        front: front of the lens.
+        back: back of the lens.
+        centre_mm: (3,) centre of the scaling.
+        indices: index of the edge, of the core, and behind the lens.
+        rim_mm: rim radius of the outermost shell.
+        layers: sizes and indices of the shells.
+    """
     edge, core, behind = indices
     size, inside = layers.sizes, edge + (core - edge) * layers.index_shares
     fronts = tuple(front.scaled(centre_mm, float(p)) for p in size)
@@ -50,13 +64,13 @@ def lens_shells(
 
 
 def even_layers(count: int) -> Layers:
-    """Layers of equal steps of the index, which is taken in the middle of each; `count` as in `GradientLensSpec`."""
+    """Layers with equal steps of the index, which is taken in the middle of each; `count` as in `GradientLensSpec`."""
     steps = np.arange(count)
     return Layers(np.sqrt(1.0 - steps / count), (steps + 0.5) / count)
 
 
 def shelled(eye: EyeModel, count: int = SHELLS) -> EyeModel:
-    """A single eye with its gradient lens made of shells; any other eye as it is."""
+    """Replace the gradient lens of a single eye by shells; any other eye is returned as it is."""
     gradient = eye.lens_gradient
     if gradient is None:
         return eye
@@ -80,5 +94,5 @@ def shelled(eye: EyeModel, count: int = SHELLS) -> EyeModel:
 
 
 def passing_shells(count: int) -> tuple[bool, ...]:
-    """Rays may pass by all surfaces of a lens of shells but the outermost."""
+    """Whether a ray may miss each surface of a lens of shells: true for all but the outermost."""
     return tuple(k not in (0, count - 1) for k in range(count))

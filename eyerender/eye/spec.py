@@ -1,4 +1,4 @@
-"""The eye file: what a person writes about a right eye.
+"""The eye file: a right eye as the user writes it.
 
 Eye frame (mm): origin at the front corneal apex of the unrotated eye, +x outward along the optic axis, +y nasal, +z
 up. A left eye is the mirror image y -> -y. Lists of surfaces run from outside in; a medium is the one BEHIND its
@@ -17,9 +17,9 @@ from ..spec import FileSpec, Number, Positive, Spec, Vec2, Vec3
 if TYPE_CHECKING:
     from .model import EyeModel
 
-# As many surfaces as the finest lens of shells has.
+# This is the number of surfaces of the finest lens of shells.
 MAX_SURFACES = 400
-# Germanium's, of all that is transparent somewhere in the infrared the highest, is 4.
+# Germanium has the highest index of all materials that are transparent somewhere in the infrared: 4.
 LARGEST_INDEX = 5.0
 # Cauchy's coefficients grow with the sixth power of nanometres.
 Coefficient = Annotated[float, Field(ge=-1e20, le=1e20)]
@@ -29,14 +29,14 @@ Facing = Literal["front", "back"]
 
 
 class SphereSpec(Spec):
-    """y^2 + z^2 + 2 R s + s^2 = 0 from the apex; R > 0 opens to -x (cornea), R < 0 to +x (lens back, retina)."""
+    """Sphere y^2 + z^2 + 2 R s + s^2 = 0 from the apex; R > 0 opens to -x (cornea), R < 0 to +x (lens back, retina)."""
 
     kind: Literal["sphere"]
     radius_mm: Number
 
 
 class ConicSpec(Spec):
-    """y^2 + z^2 + 2 R s + (1 + Q) s^2 = 0 from the apex, on the sheet that holds the apex."""
+    """Conic y^2 + z^2 + 2 R s + (1 + Q) s^2 = 0 from the apex, on the sheet through the apex."""
 
     kind: Literal["conic"]
     radius_mm: Number
@@ -44,7 +44,7 @@ class ConicSpec(Spec):
 
 
 class BiconicSpec(Spec):
-    """Two apex radii and conic constants, for the meridians of y and z."""
+    """Biconic: two apex radii and conic constants, for the meridians of y and z."""
 
     kind: Literal["biconic"]
     radii_mm: Vec2
@@ -52,7 +52,7 @@ class BiconicSpec(Spec):
 
 
 class EllipsoidSpec(Spec):
-    """(x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about its centre; the half towards +x ('front') or -x ('back')."""
+    """Ellipsoid (x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about its centre; the half towards +x ('front') or -x ('back')."""
 
     kind: Literal["ellipsoid"]
     semi_axes_mm: tuple[Positive, Positive, Positive]
@@ -60,9 +60,9 @@ class EllipsoidSpec(Spec):
 
 
 class QuadricSpec(Spec):
-    """A x^2 + B y^2 + C z^2 + 2 D xy + 2 E xz + 2 F yz + 2 G x + 2 H y + 2 I z + K = 0 about its position.
+    """Quadric A x^2 + B y^2 + C z^2 + 2 D xy + 2 E xz + 2 F yz + 2 G x + 2 H y + 2 I z + K = 0 about its position.
 
-    The sheet is where dF/dx > 0 ('front') or < 0 ('back') with the coefficients as they stand.
+    The sheet is where dF/dx > 0 ('front') or < 0 ('back') with the coefficients as given.
     """
 
     kind: Literal["quadric"]
@@ -71,7 +71,7 @@ class QuadricSpec(Spec):
 
 
 class PlaneSpec(Spec):
-    """x = 0 of its frame."""
+    """Plane x = 0 of its frame."""
 
     kind: Literal["plane"]
 
@@ -131,7 +131,7 @@ class SurfaceLensSpec(Spec):
 class LayerSpec(Spec):
     """A shell of a lens and the medium inside it.
 
-    The shell is the lens' outer surface scaled by `size` about the lens' centre; inside it the index has gone
+    The shell is the lens' outer surface scaled by `size` about the lens' centre. Inside it the index has changed by
     `index_share` of the way from edge to core.
     """
 
@@ -142,12 +142,11 @@ class LayerSpec(Spec):
 class GradientLensSpec(Spec):
     """A gradient-index lens.
 
-    Its surfaces of one index are the outer surfaces scaled by p in (0, 1] about the lens' centre, which lies at
-    `centre_mm`, or on the line between the two apexes at `centre_fraction` of it, counted from the front;
-    n(p) = n_core - (n_core - n_edge) p^2. Rays are traced through the gradient itself, or through as many `shells` a
-    half as are given: shell k stands where n has gone k / shells of the way from edge to core, and the medium inside it
-    has the index half a step farther. `layers` in place of `shells` gives each shell a size and an index of its own,
-    from outside in.
+    Its surfaces of constant index are the outer surfaces scaled by p in (0, 1] about the lens' centre: n(p) = n_core -
+    (n_core - n_edge) p^2. The centre is at `centre_mm`, or on the line between the two apexes at `centre_fraction` of
+    it, counted from the front. Rays are traced through the gradient itself, or through the given number of `shells` in
+    each half: shell k is where n has changed by k / shells from edge to core, and the medium inside it has the index
+    half a step farther. `layers` in place of `shells` gives each shell a size and an index of its own, from outside in.
     """
 
     kind: Literal["gradient"]
@@ -178,11 +177,11 @@ Lens = Annotated[
 
 
 class ContourSpec(Spec):
-    """A margin that is not an ellipse: r(f) = 1 + sum_k c_k cos(k f) + s_k sin(k f), k from 1, times the ellipse.
+    """A margin that is not an ellipse: the ellipse times r(f) = 1 + sum_k c_k cos(k f) + s_k sin(k f), k from 1.
 
-    f is the ellipse's parameter from its first semi-axis (nasal where it is not turned) towards up, and
-    r (a cos f, b sin f) the margin: c_k and s_k are the Fourier coefficients of a measured pupil's radius over its mean
-    (Wyatt 1995, "The form of the human pupil", Vision Res. 35, 2021-2036). The shorter list is continued by zeros.
+    f is the ellipse's parameter from its first semi-axis (nasal where it is not turned) towards up, and r (a cos f, b
+    sin f) is the margin. c_k and s_k are the Fourier coefficients of a measured pupil's radius over its mean (Wyatt
+    1995, "The form of the human pupil", Vision Res. 35, 2021-2036). The shorter list is padded with zeros.
     """
 
     cosines: tuple[Number, ...] = Field(default=(), max_length=32)
@@ -194,7 +193,7 @@ class StopSpec(Spec):
 
     `ellipticity` = 1 - b/a at the area of the circle of `diameter_mm`; the long axis lies `axis_deg` from nasal
     towards up. A pupil of another diameter d is centred at position_mm + (s_x, s_y, s_z) (d - diameter_mm), (s_y, s_z)
-    = `shift_mm_per_mm`, s_x so that it stays in its plane.
+    = `shift_mm_per_mm`. s_x follows from the condition that the pupil stays in its plane.
     """
 
     diameter_mm: Positive
@@ -213,7 +212,7 @@ class IrisSpec(Spec):
 
 
 class ScleraSpec(Spec):
-    """A sphere; without a centre, the one through the limbus circle with its centre on the cornea's axis."""
+    """A sphere. Without a centre, it is the one through the limbus circle with its centre on the cornea's axis."""
 
     radius_mm: Positive
     centre_mm: Vec3 | None = None
@@ -228,7 +227,7 @@ class RotationSpec(Spec):
 
 
 class FoveaSpec(Spec):
-    """Where the fovea lies: at `position_mm`, or where a nodal ray meets the retina.
+    """Place of the fovea: `position_mm`, or the point where a nodal ray meets the retina.
 
     The nodal ray comes from the field direction (1, tan h, tan v), (h, v) = `field_deg` nasal and up, seen from the
     incident node, from an object `distance_mm` from the corneal apex.
@@ -240,7 +239,7 @@ class FoveaSpec(Spec):
 
 
 class EyeSpec(FileSpec):
-    """A right eye. `sources` says where values come from: dotted path (or the beginning of one) -> text."""
+    """A right eye; `sources` maps a dotted path (or the beginning of one) to the source of its values."""
 
     FORMATS: ClassVar[tuple[int, ...]] = (1, 2)
 
@@ -262,9 +261,12 @@ class EyeSpec(FileSpec):
 
     @classmethod
     def from_mapping(cls, data: object, *, source: str = "") -> Self:
-        """Validate a plain mapping and the geometry it describes; raises `InputError` with the path of the bad key.
+        """Validate a plain mapping and the geometry it describes.
 
         A mapping of format 1 gives the same eye in format 2.
+
+        Raises:
+            InputError: with the path of the wrong key.
         """
         from .check import check_eye
         from .format1 import upgraded
@@ -278,7 +280,7 @@ class EyeSpec(FileSpec):
     def build(
         self, *, eye: Side = "right", wavelength_nm: float = 850.0, pupil_diameter_mm: float | None = None
     ) -> EyeModel:
-        """The numeric model at a wavelength (nm) with a pupil (mm; the file's own if None)."""
+        """Build the numeric model at a wavelength (nm) with a pupil (mm; the file's own if None)."""
         from .build import build_eye
 
         return build_eye(self, eye, wavelength_nm, pupil_diameter_mm)

@@ -24,12 +24,12 @@ Pixels = Annotated[int, Field(gt=0, le=65536)]
 Window = tuple[int, int, int, int]
 """A part of a sensor: its first column and row, its width and its height (px)."""
 
-# Columns: the camera's right, down and forward axes at rest, in the world (x to the screen, y to the left, z up).
+# The columns are the camera's right, down and forward axes at rest, in the world (x to the screen, y left, z up).
 _REST = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 class CameraCalibration(Spec):
-    """A camera as OpenCV calibrates it: x_cam = R x_world + t."""
+    """OpenCV's calibration of a camera: x_cam = R x_world + t."""
 
     K: Matrix3 = Field(description="camera matrix, px")
     R: Matrix3 = Field(description="rotation, world to camera")
@@ -50,7 +50,7 @@ class CameraCalibration(Spec):
 
 
 class Camera(Spec):
-    """A camera: by place, direction and focal length, or by `calibration`."""
+    """A camera, given by place, direction and focal length, or by `calibration`."""
 
     name: str = "camera"
     resolution_px: tuple[Pixels, Pixels] = Field(description="sensor width and height")
@@ -99,7 +99,7 @@ class Camera(Spec):
         return self
 
     def build(self) -> PinholeCamera:
-        """The numeric camera."""
+        """Build the numeric camera."""
         if self.calibration is not None:
             c = self.calibration
             return PinholeCamera.of(c.K, c.R, c.t_mm, self.resolution_px, c.distortion, self.name)
@@ -126,7 +126,16 @@ class Camera(Spec):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PinholeCamera(ArrayValue):
-    """A pinhole camera: K (3, 3) px, R (3, 3), t (3,) mm, distortion (k1, k2, p1, p2, k3), resolution (w, h) px."""
+    """A pinhole camera with lens distortion.
+
+    Attributes:
+        K: (3, 3) camera matrix, px.
+        R: (3, 3) rotation, world to camera.
+        t: (3,) translation, world to camera, mm.
+        distortion: (k1, k2, p1, p2, k3).
+        resolution_px: (w, h).
+        name: name of the camera.
+    """
 
     K: Floats
     R: Floats
@@ -145,27 +154,27 @@ class PinholeCamera(ArrayValue):
         distortion: ArrayLike = (0, 0, 0, 0, 0),
         name: str = "camera",
     ) -> PinholeCamera:
-        """A camera from anything array-like."""
+        """Make a camera from array-like values."""
         return cls(frozen(K), frozen(R), frozen(t), frozen(distortion), resolution_px, name)
 
     @property
     def nodal_point_mm(self) -> Floats:
-        """The centre of projection in the world, (3,) mm: -R^T t."""
+        """Centre of projection in the world, (3,) mm: -R^T t."""
         return np.asarray(-self.R.T @ self.t)
 
     @property
     def axis(self) -> Floats:
-        """The optical axis, a unit vector (3,) in the world."""
+        """Optical axis, a unit vector (3,) in the world."""
         return np.array(self.R[2], dtype=np.float64)
 
     def project(self, points_mm: ArrayLike) -> tuple[Floats, Bools]:
-        """Image points of world points.
+        """Project world points into the image.
 
         Args:
             points_mm: (..., 3) mm, world.
 
         Returns:
-            pixels (..., 2), NaN behind the camera; and whether the point lies in front of it (...).
+            Pixels (..., 2), NaN behind the camera, and whether the point is in front of it (...).
         """
         cam = np.asarray(points_mm, dtype=float) @ self.R.T + self.t
         front = cam[..., 2] > 0
@@ -184,7 +193,7 @@ class PinholeCamera(ArrayValue):
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1])) / distance
 
     def rays(self, pixels: ArrayLike) -> Floats:
-        """Unit directions (..., 3) in the world in which the camera sees the pixels (..., 2)."""
+        """Unit directions (..., 3) in the world along which the camera sees the pixels (..., 2)."""
         p = np.asarray(pixels, dtype=float)
         x = (p[..., 0] - self.K[0, 2]) / self.K[0, 0]
         y = (p[..., 1] - self.K[1, 2]) / self.K[1, 1]
@@ -194,7 +203,7 @@ class PinholeCamera(ArrayValue):
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
     def ideal(self, pixels: ArrayLike) -> Floats:
-        """Where pixels (..., 2) would lie without lens distortion."""
+        """Pixels (..., 2) with the lens distortion removed."""
         p = np.asarray(pixels, dtype=float)
         if not np.any(self.distortion):
             return p
@@ -203,14 +212,14 @@ class PinholeCamera(ArrayValue):
         return np.stack([fx * x + cx, fy * y + cy], axis=-1)
 
     def in_image(self, pixels: ArrayLike) -> Bools:
-        """Whether pixels (..., 2) lie on the sensor, whose outer pixels' far edges are at -0.5 and W - 0.5."""
+        """Whether pixels (..., 2) lie on the sensor; the far edges of its outer pixels are at -0.5 and W - 0.5."""
         p = np.asarray(pixels, dtype=float)
         w, h = self.resolution_px
         return np.asarray((p[..., 0] >= -0.5) & (p[..., 0] <= w - 0.5) & (p[..., 1] >= -0.5) & (p[..., 1] <= h - 0.5))
 
 
 def distort(x: Floats, y: Floats, k: Floats) -> tuple[Floats, Floats]:
-    """Brown & Conrady's distortion as OpenCV writes it, in float64.
+    """Distort by Brown & Conrady's model as OpenCV defines it, in float64.
 
     x'' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and alike for y
     """
@@ -224,7 +233,7 @@ def distort(x: Floats, y: Floats, k: Floats) -> tuple[Floats, Floats]:
 
 
 def undistort(xd: Floats, yd: Floats, k: Floats, iterations: int = 50) -> tuple[Floats, Floats]:
-    """The inverse of `distort` by Newton's method on its exact Jacobian; NaN where it does not converge."""
+    """Invert `distort` by Newton's method on its exact Jacobian; NaN where it does not converge."""
     k1, k2, p1, p2, k3 = k
     x, y = xd.copy(), yd.copy()
     for _ in range(iterations):
@@ -250,13 +259,13 @@ def _turned(pan: float, tilt: float) -> Floats:
     """Camera axes as columns: tilted up about its right axis, then panned about the world's vertical."""
     ct, st, cp, sp = np.cos(tilt), np.sin(tilt), np.cos(pan), np.sin(pan)
     about_right = np.array([[1.0, 0, 0], [0, ct, -st], [0, st, ct]])
-    # The rest direction is -x; to the subject's left (+y) of it is a negative turn about +z.
+    # The rest direction is -x, so a pan to the subject's left (+y) is a negative turn about +z.
     about_up = np.array([[cp, sp, 0], [-sp, cp, 0], [0, 0, 1.0]])
     return np.asarray(about_up @ _REST @ about_right)
 
 
 def _facing(direction: Floats) -> Floats:
-    """Camera axes as columns, looking along `direction` with the world's z upright (the world's y, looking along z)."""
+    """Camera axes as columns, looking along `direction` with the world's z upright (or its y, when looking along z)."""
     forward = direction / np.linalg.norm(direction)
     up = np.array([0.0, 0, 1.0]) if abs(forward[2]) < 1 - 1e-9 else np.array([0.0, 1.0, 0.0])
     right = np.cross(forward, up)

@@ -1,12 +1,12 @@
-"""Defocus and vignetting, applied to the finished picture, glints included.
+"""Defocus and vignetting, applied to the finished image, including the glints.
 
-Defocus is one kernel for a window, that of the depth z of the unrotated eye's apex: the thin lens' circle of confusion,
+Defocus uses one kernel per window, for the depth z of the unrotated eye's apex. The thin lens' circle of confusion is
 
     c = (f / N) |z - s| / z * f / (s - f),
 
-f the focal length, N the f-number, s the distance in focus (Born & Wolf, section 6.1), a disc integrated over the
-pixels. A symmetric kernel leaves every centroid where it is, so labels need no change. Vignetting multiplies by
-1 - v (r / r_corner)^2.
+where f is the focal length, N the f-number and s the distance in focus (Born & Wolf, section 6.1). The kernel is a disc
+integrated over the pixels. A symmetric kernel does not move centroids, so labels need no change. Vignetting multiplies
+by 1 - v (r / r_corner)^2.
 """
 
 from __future__ import annotations
@@ -22,12 +22,16 @@ from .imaging import Lens
 from .sensor import Sensor
 
 _FINE = 9
-# Nothing of an eye is left in a picture that is blurred over more, and the kernel grows with the square.
+# No eye can be recognised in an image with more blur, and the cost of the kernel grows with the square.
 MAX_CONFUSION_PX = 400
 
 
 def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: float) -> float:
-    """Diameter (px) of the circle of confusion of a point at a depth along the axis; `InputError` beyond 400 px."""
+    """Diameter (px) of the circle of confusion of a point at a depth along the axis.
+
+    Raises:
+        InputError: it exceeds 400 px.
+    """
     if lens.focus_mm is None:
         return 0.0
     pitch_mm = sensor.pixel_pitch_um * 1e-3
@@ -44,7 +48,7 @@ def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: fl
 
 
 def disc(diameter_px: float) -> Floats:
-    """The disc's share of each pixel, odd and square, sum 1; a single 1 where it is smaller than a tenth of a pixel."""
+    """Share of each pixel in the disc, odd and square, sum 1; a single 1 below a tenth of a pixel."""
     if diameter_px < 0.1:
         return np.ones((1, 1))
     reach = int(np.ceil(diameter_px / 2 - 0.5 + 1e-9))
@@ -56,14 +60,14 @@ def disc(diameter_px: float) -> Floats:
 
 
 def defocused(picture: Floats, kernel: Floats) -> Floats:
-    """The picture convolved with an odd kernel, smaller by its reach on every side."""
+    """Convolve the image with an odd kernel; the result is smaller by the kernel's reach on every side."""
     if kernel.shape == (1, 1):
         return picture
     return np.asarray(np.maximum(signal.fftconvolve(picture, kernel, mode="valid"), 0.0))
 
 
 def vignette(lens: Lens, camera: PinholeCamera, window: Window) -> Floats | float:
-    """What of the light is left at each pixel of a window."""
+    """Factor by which vignetting reduces the light at each pixel of a window."""
     if lens.vignetting == 0:
         return 1.0
     x0, y0, width, height = window

@@ -1,4 +1,4 @@
-"""From the irradiance of the sensor to digital numbers (EMVA 1288, release 4.0, equations 3-8)."""
+"""Conversion of the sensor's irradiance to digital numbers (EMVA 1288, release 4.0, equations 3-8)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .sensor import Sensor
 
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0
-_FEW = 12.0  # below this mean the expansion of a Poisson quantile is not good enough, and probabilities are summed
+_FEW = 12.0  # below this mean the expansion of a Poisson quantile is too inaccurate, and probabilities are summed
 
 
 def radiance_to_irradiance(sensor: Sensor) -> float:
@@ -30,16 +30,17 @@ def electrons(sensor: Sensor, irradiance: Floats, wavelength_nm: float) -> Float
 
 
 def expose(sensor: Sensor, irradiance: Floats, wavelength_nm: float, seed: int) -> NDArray[np.uint16]:
-    """Digital numbers of an exposure; the noise of a pixel is a pure function of `seed`, its place and its mean.
+    """Digital numbers of an exposure.
 
-    Scenes that differ little so have the same noise where they agree, and rounding in the last digit of an irradiance,
-    which differs between processors, moves no other pixel's noise.
+    The noise of a pixel is a pure function of `seed`, its place and its mean. Scenes that differ little therefore have
+    the same noise where they agree. A rounding difference in the last digit of an irradiance, as between processors,
+    does not change the noise of other pixels.
     """
     mean = electrons(sensor, irradiance, wavelength_nm)
     if sensor.noise:
         rng = np.random.default_rng((0x5E75, seed))
         shot, read = rng.standard_normal(mean.shape), rng.standard_normal(mean.shape)
-        # Beyond a few wells a pixel is clipped whatever its noise.
+        # Above a few wells a pixel is clipped whatever its noise.
         counts = photon_counts(np.minimum(mean, 4 * sensor.full_well_e + 1e4), shot)
         signal = np.minimum(counts, sensor.full_well_e) + sensor.read_noise_e * read
     else:
@@ -49,10 +50,10 @@ def expose(sensor: Sensor, irradiance: Floats, wavelength_nm: float, seed: int) 
 
 
 def photon_counts(mean: Floats, normal: Floats) -> Floats:
-    """Poisson variates of the given means from standard normal ones of the same shape: the quantile at Phi(normal).
+    """Convert standard normal variates to Poisson variates of the given means: the quantile at Phi(normal).
 
-    The normal asymptotic expansion of the Poisson distribution's inverse (Giles 2016, Algorithm 955, ACM TOMS 42:7);
-    where few electrons are expected, by summing probabilities.
+    The quantile is the normal asymptotic expansion of the Poisson distribution's inverse (Giles 2016, Algorithm 955,
+    ACM TOMS 42:7). Where few electrons are expected, probabilities are summed instead.
     """
     root = np.sqrt(np.maximum(mean, _FEW))
     w = normal
@@ -63,19 +64,19 @@ def photon_counts(mean: Floats, normal: Floats) -> Floats:
     few = np.flatnonzero(mean < _FEW)
     if few.size:
         count.flat[few] = 0
-        few = few[mean.flat[few] > 0]  # much of a picture may be quite dark
+        few = few[mean.flat[few] > 0]  # large parts of an image may be dark
         count.flat[few] = _few_counts(mean.flat[few], special.ndtr(normal.flat[few]))
     return np.asarray(np.maximum(count, 0, out=count))
 
 
 def _few_counts(mean: Floats, probability: Floats) -> Floats:
-    """The smallest k whose cumulative probability reaches that asked for."""
+    """Smallest k whose cumulative probability reaches the given one."""
     count = np.zeros_like(mean)
     term = np.exp(-mean)
     reached = term.copy()
     k = 0
     left = np.flatnonzero(probability > reached)
-    while left.size and k < 10 * _FEW:  # the sum's rounding can keep it from 1
+    while left.size and k < 10 * _FEW:  # rounding can keep the sum below 1
         k += 1
         count[left] = k
         term[left] *= mean[left] / k

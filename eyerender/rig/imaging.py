@@ -1,4 +1,4 @@
-"""What goes wrong between the eye and the sensor, as a person writes it: focus, vignetting, motion, ambient light."""
+"""Specification of effects between the eye and the sensor: focus, vignetting, motion, ambient light."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..spec import NonNegative, Positive, Spec, Vec2, Vec3
 
 
 class Lens(Spec):
-    """A thin lens out of focus, and the shade towards the picture's corners beyond cos^4."""
+    """A thin lens out of focus, and vignetting beyond cos^4."""
 
     focus_mm: Positive | None = Field(
         default=None, description="distance of the plane in focus from the nodal point; default: the eye is in focus"
@@ -21,7 +21,7 @@ class Lens(Spec):
 
 
 class Motion(Spec):
-    """What moves during the exposure, evenly about its middle."""
+    """Motion during the exposure, at constant speed and centred on its middle."""
 
     eye_deg_s: Vec2 = Field(default=(0.0, 0.0), description="turn of the eye: azimuth and elevation per second")
     head_mm_s: Vec3 = Field(default=(0.0, 0.0, 0.0), description="velocity of the head in the world")
@@ -29,7 +29,7 @@ class Motion(Spec):
 
 
 class Panel(Spec):
-    """A rectangle that emits evenly to its front, as a screen or a window does; seen mirrored in the cornea."""
+    """A rectangle that emits evenly to its front, like a screen or a window; the cornea reflects it."""
 
     centre_mm: Vec3
     size_mm: tuple[Positive, Positive] = Field(description="width (level) and height")
@@ -65,7 +65,7 @@ class RadianceMap(Spec):
 
 
 class Ambient(Spec):
-    """Light that does not come from the lamps: even from all sides, a surrounding, and panels that face the head."""
+    """Light other than that of the lamps: even light from all sides, surroundings, and panels that face the head."""
 
     irradiance_w_m2: NonNegative = Field(default=0.0, description="on a matte surface, within the camera's filter")
     panels: Annotated[tuple[Panel, ...], Field(max_length=16)] = ()

@@ -1,4 +1,4 @@
-"""Infrared LEDs: where they stand, how large they are and how they radiate.
+"""Infrared LEDs: their places, sizes and radiation.
 
 Radiant intensity in direction w: I(w) = I0 max(0, cos(angle to the axis))^m (m = 0: the same everywhere).
 """
@@ -15,7 +15,8 @@ from ..arrays import ArrayValue, Floats, frozen
 from ..spec import NonNegative, Number, Positive, Spec, Vec3
 from .camera import PinholeCamera
 
-# Of a rig, those of rings counted one by one: each has a glint in every frame, with a status and a reason.
+# Largest number of LEDs of a rig, including each LED of a ring: each has a glint with a status and a reason in every
+# frame.
 MAX_LIGHTS = 1000
 
 
@@ -29,7 +30,7 @@ class LedRing(Spec):
 
 
 class Led(Spec):
-    """One LED at `position_mm`, or a `ring` of equal ones."""
+    """One LED at `position_mm`, or a `ring` of equal LEDs."""
 
     position_mm: Vec3 | None = None
     ring: LedRing | None = None
@@ -50,7 +51,7 @@ class Led(Spec):
         return self
 
     def build(self, cameras: tuple[PinholeCamera, ...]) -> tuple[Lamp, ...]:
-        """The numeric lights of this entry."""
+        """Build the numeric lights of this entry."""
         if self.position_mm is not None:
             places = [np.array(self.position_mm, dtype=float)]
         else:
@@ -77,7 +78,16 @@ class Led(Spec):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lamp(ArrayValue):
-    """An LED: position (3,) mm and axis (3,), a unit vector, in the world."""
+    """An LED in the world.
+
+    Attributes:
+        position_mm: (3,) mm.
+        axis: (3,) unit vector.
+        radius_mm: radius of the emitting disc; 0 for a point.
+        intensity_mw_sr: radiant intensity on the axis.
+        lobe_exponent: m of cos^m.
+        inner_radius_mm: radius of the hole of a ring-shaped emitter.
+    """
 
     position_mm: Floats
     axis: Floats

@@ -1,8 +1,8 @@
-"""The point-spread function: a Gaussian, on the grid of pixels and integrated over them.
+"""The point-spread function: a Gaussian, on the pixel grid and integrated over pixels.
 
 On the grid the kernel is the discrete Gaussian T(n) = exp(-s^2) I_n(s^2) (Lindeberg 1990), whose variance is exactly
-s^2: sampled Gaussians fall short of it below one pixel, and glints (integrated exactly) and edges (blurred on
-the grid) would see two different lenses.
+s^2. A sampled Gaussian has a smaller variance below one pixel. Glints (integrated exactly) and edges (blurred on the
+grid) would then have different lenses.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from ..rig.camera import Window
 
 
 def margin(sigma_px: float) -> int:
-    """Pixels that must be rendered beyond a window's border so that the blur inside is right."""
+    """Number of pixels that must be rendered beyond a window's border so that the blur inside is right."""
     return 0 if sigma_px == 0 else int(np.ceil(4 * sigma_px)) + 2
 
 
 def kernel(sigma_px: float) -> Floats:
-    """The discrete Gaussian of variance `sigma_px`^2 over -margin..margin, sum 1."""
+    """Discrete Gaussian of variance `sigma_px`^2 over -margin..margin, sum 1."""
     n = np.arange(-margin(sigma_px), margin(sigma_px) + 1)
     weights = special.ive(np.abs(n), sigma_px**2)
     return np.asarray(weights / weights.sum())
 
 
 def blur(image: Floats, sigma_px: float) -> Floats:
-    """`image` with its border of `margin` pixels consumed: the convolution, smaller by the margin on every side."""
+    """Convolve `image`; the result is smaller by `margin` pixels on every side."""
     if sigma_px == 0:
         return image
     m, k = margin(sigma_px), kernel(sigma_px)
@@ -36,7 +36,7 @@ def blur(image: Floats, sigma_px: float) -> Floats:
 
 
 def splat(xy_px: Floats, energy: Floats, sigma_px: float, window: Window) -> tuple[Floats, slice, slice]:
-    """Spots of given energies, the Gaussian integrated over each pixel, on the part of a window that they reach.
+    """Draw spots of given energies, the Gaussian integrated over each pixel, on the part of a window that they reach.
 
     Args:
         xy_px: (n, 2) places in full-sensor pixels, centres at integers.
@@ -45,7 +45,7 @@ def splat(xy_px: Floats, energy: Floats, sigma_px: float, window: Window) -> tup
         window: x0, y0, width, height in full-sensor pixels.
 
     Returns:
-        The patch and its rows and columns in the window (empty where nothing falls on it).
+        The patch and its rows and columns in the window (empty where no spot reaches it).
     """
     x0, y0, width, height = window
     reach = 7 * sigma_px + 1
@@ -61,7 +61,7 @@ def splat(xy_px: Floats, energy: Floats, sigma_px: float, window: Window) -> tup
 
 
 def _integrals(pixels: Floats, centres: Floats, sigma: float) -> Floats:
-    """(n, k): the share of each Gaussian that falls into each pixel [k - 1/2, k + 1/2]."""
+    """Share (n, k) of each Gaussian that falls into each pixel [k - 1/2, k + 1/2]."""
     edges = np.append(pixels - 0.5, pixels[-1] + 0.5)[None, :] - centres[:, None]
     cumulative = (edges >= 0).astype(float) if sigma == 0 else special.ndtr(edges / sigma)
     return np.asarray(np.diff(cumulative, axis=1))

@@ -13,12 +13,12 @@ from .camera import Camera, PinholeCamera
 from .light import MAX_LIGHTS, Lamp, Led
 from .screen import Screen, ScreenPlane
 
-# Each has frames of its own for every target and head position.
+# Every camera has its own frame for every target and head position.
 MAX_CAMERAS = 100
 
 
 class Rig(Spec):
-    """What stands before the subject; it does not move with the head."""
+    """The hardware in front of the subject; it does not move with the head."""
 
     cameras: Annotated[tuple[Camera, ...], Field(min_length=1, max_length=MAX_CAMERAS)]
     lights: Annotated[tuple[Led, ...], Field(min_length=1, max_length=MAX_LIGHTS)]
@@ -35,11 +35,11 @@ class Rig(Spec):
 
     @property
     def light_count(self) -> int:
-        """How many lights there are, those of rings counted one by one."""
+        """Number of lights, counting each LED of a ring."""
         return sum(1 if light.ring is None else light.ring.count for light in self.lights)
 
     def build(self) -> RigGeometry:
-        """The numeric rig."""
+        """Build the numeric rig."""
         cameras = tuple(camera.build() for camera in self.cameras)
         lights = tuple(light for spec in self.lights for light in spec.build(cameras))
         return RigGeometry(cameras, lights, self.screen.build() if self.screen else None)
@@ -55,7 +55,7 @@ class RigLike(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigGeometry(ArrayValue):
-    """Cameras, lights and, where there is one, the screen."""
+    """Cameras, lights and the screen, if there is one."""
 
     cameras: tuple[PinholeCamera, ...]
     lights: tuple[Lamp, ...]
@@ -66,7 +66,7 @@ class RigGeometry(ArrayValue):
         return self
 
     def to_mapping(self) -> dict[str, Any]:
-        """The rig as `features --json` writes it (docs/formats.md)."""
+        """Convert to the mapping that `features --json` writes (docs/formats.md)."""
         screen = self.screen
         return {
             "cameras": [

@@ -1,4 +1,4 @@
-"""The screen the subject looks at: a rectangle facing the subject."""
+"""The screen that the subject looks at: a rectangle facing the subject."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ..spec import Positive, Spec, Vec3
 
 
 class Screen(Spec):
-    """A screen by its centre and size."""
+    """A screen, given by its centre and size."""
 
     centre_mm: Vec3
     size_mm: tuple[Positive, Positive] = Field(description="width and height")
     tilt_deg: float = Field(default=0.0, gt=-90, lt=90, description="its face turned upwards from facing -x")
 
     def build(self) -> ScreenPlane:
-        """The numeric screen."""
+        """Build the numeric screen."""
         a = np.radians(self.tilt_deg)
         return ScreenPlane(
             frozen(self.centre_mm),
-            # As the subject sees it: +y is to the left, so the screen's right is -y.
+            # For the subject, +y is to the left, so the screen's right is -y.
             frozen([0.0, -1.0, 0.0]),
             frozen([np.sin(a), 0.0, np.cos(a)]),
             self.size_mm,
@@ -33,7 +33,14 @@ class Screen(Spec):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScreenPlane(ArrayValue):
-    """Centre (3,) mm, unit vectors to the subject's right and up along the screen, size (w, h) mm."""
+    """A screen in the world.
+
+    Attributes:
+        centre_mm: (3,) mm.
+        right: (3,) unit vector along the screen, to the subject's right.
+        up: (3,) unit vector along the screen, up.
+        size_mm: (w, h).
+    """
 
     centre_mm: Floats
     right: Floats
@@ -46,7 +53,7 @@ class ScreenPlane(ArrayValue):
         return np.cross(self.up, self.right) * -1.0
 
     def world(self, on_screen_mm: ArrayLike) -> Floats:
-        """World points (..., 3) of screen points (..., 2): mm to the subject's right of and above the centre."""
+        """World points (..., 3) of screen points (..., 2), in mm to the subject's right of the centre and above it."""
         p = np.asarray(on_screen_mm, dtype=float)
         return np.asarray(self.centre_mm + p[..., :1] * self.right + p[..., 1:] * self.up)
 
@@ -56,14 +63,14 @@ class ScreenPlane(ArrayValue):
         return np.stack([p @ self.right, p @ self.up], axis=-1)
 
     def grid(self, columns: int, rows: int) -> Floats:
-        """Targets (columns * rows, 3) out to the screen's edges, from the subject's left, each column from the top."""
+        """Targets (columns * rows, 3) up to the screen's edges, from the subject's left, each column from the top."""
         w, h = self.size_mm
         u = np.linspace(-w / 2, w / 2, columns) if columns > 1 else np.zeros(1)
         v = np.linspace(h / 2, -h / 2, rows) if rows > 1 else np.zeros(1)
         return self.world(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
 
     def intersect(self, origin_mm: ArrayLike, direction: ArrayLike) -> tuple[Floats, Bools]:
-        """Where rays meet the screen's plane: screen points (..., 2) mm, and whether they do so forwards (...)."""
+        """Where rays meet the screen's plane: screen points (..., 2) mm, and whether the plane is ahead (...)."""
         o, d = np.asarray(origin_mm, dtype=float), np.asarray(direction, dtype=float)
         along = d @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):

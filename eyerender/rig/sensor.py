@@ -16,7 +16,8 @@ from pydantic import Field
 
 from ..spec import NonNegative, Positive, Spec
 
-# Converters end a little below the well: pixels that saturate then all read full scale, instead of a noisy plateau.
+# Converters reach full scale slightly below the full well, so saturated pixels all read full scale instead of a noisy
+# level.
 _WELL_AT_FULL_SCALE = 0.98
 
 
@@ -46,22 +47,22 @@ class Sensor(Spec):
 
     @property
     def full_scale_dn(self) -> int:
-        """The largest number of the bit depth: 2^bits - 1."""
+        """Largest number of the bit depth: 2^bits - 1."""
         return int(2**self.bit_depth - 1)
 
     @property
     def black_dn(self) -> float:
-        """The black level in DN, with its default filled in."""
+        """Black level in DN, with its default filled in."""
         return self.full_scale_dn / 256 if self.black_level_dn is None else self.black_level_dn
 
     @property
     def saturation_dn(self) -> float:
-        """From which number on a pixel counts as saturated: full scale, or a full well less three read noises."""
+        """Level from which a pixel counts as saturated: full scale, or the full well minus three read noises."""
         return min(self.full_scale_dn, self.black_dn + self.gain * (self.full_well_e - 3 * self.read_noise_e))
 
     @property
     def gain(self) -> float:
-        """The system gain K in DN per electron, with its default filled in."""
+        """System gain K in DN per electron, with its default filled in."""
         if self.gain_dn_per_e is not None:
             return self.gain_dn_per_e
         return (self.full_scale_dn - self.black_dn) / (_WELL_AT_FULL_SCALE * self.full_well_e)
