@@ -24,7 +24,7 @@ from _bench import Report, Row, options_of, resident_mib, row, single_threaded
 
 single_threaded()
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT))
 
 import numpy as np  # noqa: E402
 
@@ -48,7 +48,7 @@ class Bench:
 
     def __init__(self, backend: Any, small: bool) -> None:
         from eyerender.rendering.renderer import Renderer
-        from support import render_rigs
+        from tests.support import render_rigs
 
         self.rigs, self.small = render_rigs, small
         self.renderer = Renderer(backend, spp=16)
@@ -77,7 +77,7 @@ class Bench:
         from eyerender.rendering.view import look
         from eyerender.rig.camera import Camera
         from eyerender.rig.light import Lamp
-        from support.render_oracles import RINGS_MM
+        from tests.support.render_oracles import RINGS_MM
 
         rigs, n = self.rigs, 72
         eye = rigs.eye_of("E2")
@@ -140,7 +140,7 @@ class Bench:
         """Irradiance of the iris of E4 and E5 by a point lamp, against flux counted by a forward tracer in float64."""
         from eyerender.arrays import frozen
         from eyerender.rig.light import Lamp
-        from support.render_oracles import RINGS_MM, flux_on_rings, ring_points
+        from tests.support.render_oracles import RINGS_MM, flux_on_rings, ring_points
 
         rigs = self.rigs
         for model in ("E4", "E5"):
@@ -185,7 +185,7 @@ class Bench:
 
     def glint_centroids(self) -> Iterable[Row]:
         """Centroids of rendered glints of point lamps against Fermat's principle in float64."""
-        from support.render_oracles import centroid, mirror_pixel
+        from tests.support.render_oracles import centroid, mirror_pixel
 
         rigs = self.rigs
         poses = 10 if self.small else 200
@@ -213,7 +213,7 @@ class Bench:
         """Flux and place of the glint of a large disc LED against stock path on the exported scene."""
         import mitsuba as mi
 
-        from support.render_oracles import centroid
+        from tests.support.render_oracles import centroid
 
         rigs = self.rigs
         rig = rigs.head_rig(radius_mm=4.0, count=1)
@@ -247,7 +247,7 @@ class Bench:
 
     def pupil_outline(self) -> Iterable[Row]:
         """RMS of the smooth contour (12 harmonics) of rendered pupils at 64 spp against the refracted margin."""
-        from support.render_oracles import contour_error, outline
+        from tests.support.render_oracles import contour_error, outline
 
         rigs = self.rigs
         dark = rigs.PLAIN.model_copy(update={"pupil_albedo": 0.0})

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from support.paths import SCRIPTS
+from tests.support.paths import SCRIPTS
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from eyerender.cli.app import run
 from eyerender.imagefile import read_image
 from eyerender.imagefolder import ImageFolder
 from eyerender.scene import load_scene
-from support.paths import ROOT
+from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.render
 

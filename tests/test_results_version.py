@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from support import golden
+from tests.support import golden
 
 CHANGED = (
     "what this package computes has changed. If that is intended, raise eyerender.imagefolder.RESULTS, say so in "
-    "CHANGELOG.md, and run: python tests/support/golden.py"
+    "CHANGELOG.md, and run: python -m tests.support.golden"
 )
 
 

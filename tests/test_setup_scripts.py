@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from support.paths import ROOT
+from tests.support.paths import ROOT
 
 SCRIPTS = ("scripts/_setup.sh", "scripts/eyerender", "scripts/test", "scripts/prove-bare", ".ci/run")
 

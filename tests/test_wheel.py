@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from support.paths import ROOT
+from tests.support.paths import ROOT
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import inward_path, trace
 from eyerender.rig.camera import PinholeCamera, distort
 from eyerender.status import Status
-from support.paths import load
+from tests.support.paths import load
 
 # Reference world (X, Y, Z) = (y, z, x).
 AXES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])

@@ -18,7 +18,7 @@ from eyerender.observation import MISSING, OK, PARTIAL, Observations
 from eyerender.rig.camera import PinholeCamera
 from eyerender.scene import Scene, SceneSpec
 from eyerender.status import Status
-from support.exhaustive import exhaustive
+from tests.support.exhaustive import exhaustive
 
 
 def looking_at(place):

@@ -20,7 +20,7 @@ from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.extraction.baseline import contour_pupil
 from eyerender.imagefile import write_png
-from support.paths import SCRIPTS
+from tests.support.paths import SCRIPTS
 
 
 def test_the_shipped_extractors_are_installed():

@@ -20,7 +20,7 @@ from eyerender.dataset.spec import shipped_datasets
 from eyerender.eye.catalogue import load_eye
 from eyerender.imagefile import write_png
 from eyerender.scene import shipped_scenes
-from support import stages
+from tests.support import stages
 
 
 @pytest.fixture

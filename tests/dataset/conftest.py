@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from eyerender.errors import BackendError
-from support.dataset_specs import make, plan
+from tests.support.dataset_specs import make, plan
 
 
 @pytest.fixture(scope="session")

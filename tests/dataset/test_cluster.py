@@ -15,7 +15,7 @@ from eyerender.dataset.cluster import RayEngine
 from eyerender.dataset.realise import frames_of
 from eyerender.dataset.shard import Staged
 from eyerender.dataset.worker import Job
-from support.dataset_specs import command, make, plan, tree, write
+from tests.support.dataset_specs import command, make, plan, tree, write
 
 pytestmark = [pytest.mark.render, pytest.mark.slow]
 

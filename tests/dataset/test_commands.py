@@ -12,7 +12,7 @@ from PIL import Image
 from eyerender.cli.app import run
 from eyerender.imagefolder import ImageFolder
 from eyerender.observers import scene_of
-from support.dataset_specs import write
+from tests.support.dataset_specs import write
 
 pytestmark = pytest.mark.render
 

@@ -14,7 +14,7 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.dataset.template import Template, Turn, sobol_block
 from eyerender.errors import InputError
-from support.dataset_specs import mapping, plan
+from tests.support.dataset_specs import mapping, plan
 
 
 def draw(node):

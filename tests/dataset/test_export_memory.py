@@ -12,7 +12,7 @@ import pytest
 from eyerender.dataset.export import FORMATS, export
 from eyerender.dataset.shard import sum_of
 from eyerender.errors import InputError
-from support.fabricated import fabricate, peak_bytes
+from tests.support.fabricated import fabricate, peak_bytes
 
 pytestmark = pytest.mark.render
 BAR_BYTES, ROWS = 300 * 2**20, 200_000  # what so many images may take above the base process

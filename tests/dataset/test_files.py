@@ -26,8 +26,8 @@ from eyerender.dataset.worker import Job
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.imagefile import read_image
-from support import stages
-from support.dataset_specs import command, make, mapping, tree, write
+from tests.support import stages
+from tests.support.dataset_specs import command, make, mapping, tree, write
 
 HEAD = {"unit": "mm", "licence": "CC0-1.0", "forward": [1, 0, 0], "up": [0, 0, 1], "right_eye": [0, 0, 0]}
 # A bar above the pupil: it stands before the iris, and lamps and maps light it.

@@ -26,8 +26,8 @@ from eyerender.imagefile import read_image
 from eyerender.imagefolder import ImageFolder
 from eyerender.observers import scene_of
 from eyerender.quickstart import compare_folder
-from support.dataset_specs import make, plan
-from support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
+from tests.support.dataset_specs import make, plan
+from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
 SECRET = b"the secret of another folder"
 JSON = ("dataset.json", "run.json", "shards/00000/done.json")

@@ -13,7 +13,7 @@ from eyerender.dataset.export import export
 from eyerender.dataset.validate import validate
 from eyerender.imagefile import read_image, write_png
 from eyerender.imagefolder import ImageFolder
-from support.dataset_specs import make, plan
+from tests.support.dataset_specs import make, plan
 
 pytestmark = pytest.mark.render
 SMALL = {"count": 4, "subjects": 2, "shard_size": 2, "splits": {"train": 1.0}}

@@ -18,7 +18,7 @@ from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.scene import SceneSpec
-from support.dataset_specs import plan, write
+from tests.support.dataset_specs import plan, write
 
 
 def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):

@@ -11,8 +11,8 @@ import pytest
 from eyerender.dataset.assemble import verify_dataset
 from eyerender.dataset.shard import finished, verify
 from eyerender.files import read_json
-from support.dataset_specs import make, plan, tree, write
-from support.powercut import Disk, record
+from tests.support.dataset_specs import make, plan, tree, write
+from tests.support.powercut import Disk, record
 
 pytestmark = [
     pytest.mark.render,

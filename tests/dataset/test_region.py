@@ -15,7 +15,7 @@ from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
 from eyerender.imagefile import read_image, write_png
 from eyerender.imagefolder import ImageFolder
-from support.dataset_specs import make
+from tests.support.dataset_specs import make
 
 pytestmark = pytest.mark.render
 

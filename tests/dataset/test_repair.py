@@ -14,7 +14,7 @@ from eyerender.dataset.shard import verify
 from eyerender.errors import InputError
 from eyerender.files import write_json
 from eyerender.outfolder import MARKER
-from support.dataset_specs import make, plan, tree
+from tests.support.dataset_specs import make, plan, tree
 
 pytestmark = pytest.mark.render
 

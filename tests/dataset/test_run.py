@@ -21,8 +21,8 @@ from eyerender.dataset.shard import finished
 from eyerender.dataset.worker import Job
 from eyerender.errors import EyerenderError, InputError
 from eyerender.lock import run_lock
-from support import stages
-from support.dataset_specs import command, make, plan, tree, write
+from tests.support import stages
+from tests.support.dataset_specs import command, make, plan, tree, write
 
 pytestmark = pytest.mark.render
 

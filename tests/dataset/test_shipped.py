@@ -10,7 +10,7 @@ from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
 from eyerender.scene import Scene, SceneSpec, load_scene, shipped_scenes
-from support.dataset_specs import make
+from tests.support.dataset_specs import make
 
 pytestmark = pytest.mark.render
 

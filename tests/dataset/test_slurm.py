@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from support.paths import SCRIPTS
+from tests.support.paths import SCRIPTS
 
 SCRIPT = SCRIPTS / "slurm_generate.sh"
 

@@ -16,7 +16,7 @@ from eyerender.dataset.validation.truth import SceneTruth
 from eyerender.errors import InputError
 from eyerender.imagefile import read_image, write_png
 from eyerender.scene import load_scene
-from support.dataset_specs import mapping
+from tests.support.dataset_specs import mapping
 
 pytestmark = pytest.mark.render
 

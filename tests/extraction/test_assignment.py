@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eyerender.extraction.glints.matching import assign_lights, identify, mirror_in_sphere, predict_glints
-from support.paths import load
+from tests.support.paths import load
 
 # The reference's world axes (X, Y, Z) are this package's (y, z, x).
 AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -16,7 +16,7 @@ from eyerender.eye.pose import Poses, Turning, into_eye, rigid_motion
 from eyerender.geometry.surfaces import components, join
 from eyerender.optics.trace import trace
 from eyerender.status import Status
-from support.paths import load
+from tests.support.paths import load
 
 
 def targets(seed=0, count=200):

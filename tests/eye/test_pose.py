@@ -9,7 +9,7 @@ from eyerender.eye.batch import stack_eyes
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses, Turning, into_eye, listing_torsion, rigid_motion, rotation_matrices
 from eyerender.geometry.surfaces import components, join
-from support.paths import load
+from tests.support.paths import load
 
 
 def poses(seed=0, count=100):

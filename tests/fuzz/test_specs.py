@@ -18,7 +18,7 @@ from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.eye.catalogue import FOLDER, catalogue_names, load_eye
 from eyerender.eye.spec import EyeSpec
 from eyerender.scene import Scene, SceneSpec, load_scene, shipped_scenes
-from support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
+from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
 FEW = 8  # observations: more cost time and show nothing new
 

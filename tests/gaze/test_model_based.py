@@ -16,7 +16,7 @@ from eyerender.gaze.parameters import EyeParameters, ParameterBounds
 from eyerender.gaze.rays import unit
 from eyerender.gaze.twocamera import ShihWuLiu
 from eyerender.rig.camera import Camera
-from support.gaze import observations, rig
+from tests.support.gaze import observations, rig
 
 EYE = EyeParameters(7.9, 4.3, 1.3375, 5.2, 1.8)
 LIGHTS = np.array([[615.0, 208.5, 0.0], [615.0, -208.5, 0.0], [640.0, 30.0, 180.0], [600.0, -90.0, -190.0]])

@@ -9,7 +9,7 @@ from eyerender.errors import InputError
 from eyerender.gaze.crossratio import CrossRatio
 from eyerender.gaze.homography import Homography, homography, transformed
 from eyerender.rig.camera import Camera
-from support.gaze import observations, rig
+from tests.support.gaze import observations, rig
 
 CAMERA = Camera(
     position_mm=(600, 0, -100), look_at_mm=(0, 0, 0), focal_length_px=3000, resolution_px=(640, 480)

@@ -10,8 +10,8 @@ from eyerender.errors import InputError
 from eyerender.gaze.estimate import GazePoints, binocular_average
 from eyerender.gaze.quality import quality
 from eyerender.gaze.regression import Regression, pupil_glint_vectors
-from support.gaze import observations
-from support.regression import RIG, synthetic
+from tests.support.gaze import observations
+from tests.support.regression import RIG, synthetic
 
 
 def test_quality_of_known_noise():

@@ -14,8 +14,8 @@ from eyerender.gaze.homography import Homography
 from eyerender.gaze.parameters import EyeParameters, ParameterBounds
 from eyerender.gaze.rays import feature_rays
 from eyerender.gaze.regression import Regression
-from support.gaze import PLANE_TO_WORLD, camera_of, ets_observations, ets_rig, observations, on_plane, rig
-from support.paths import load
+from tests.support.gaze import PLANE_TO_WORLD, camera_of, ets_observations, ets_rig, observations, on_plane, rig
+from tests.support.paths import load
 
 BIQUADRATIC = "x + y + xy + x2 + y2 + 1"
 

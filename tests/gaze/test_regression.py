@@ -11,7 +11,7 @@ from eyerender.gaze.estimate import angular_error_deg, binocular_average
 from eyerender.gaze.regression import FUNCTIONS, Regression, pupil_glint_vectors
 from eyerender.gaze.validation import gaze_errors, leave_one_target_out
 from eyerender.observation import GlintFeatures, Observations
-from support.regression import RIG, synthetic
+from tests.support.regression import RIG, synthetic
 
 
 def without_glint(observations, row):

@@ -21,8 +21,8 @@ from eyerender.gaze.store import (
     save_estimator,
 )  # fmt: skip
 from eyerender.scene import load_scene
-from support.gaze import ets_observations, ets_rig
-from support.paths import load
+from tests.support.gaze import ets_observations, ets_rig
+from tests.support.paths import load
 
 
 @pytest.fixture(scope="module")

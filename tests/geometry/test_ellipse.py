@@ -11,7 +11,7 @@ import pytest
 
 from eyerender.errors import InputError
 from eyerender.geometry import ellipse as el
-from support.paths import load
+from tests.support.paths import load
 
 
 def _random(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from eyerender.geometry.transforms import tilt_rotation
 from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import inward_path, trace
 from eyerender.status import Status
-from support.exhaustive import WIDTH_MM, exhaustive
+from tests.support.exhaustive import WIDTH_MM, exhaustive
 
 
 def cornea(rng, biconics):

@@ -9,7 +9,7 @@ from eyerender.geometry.surfaces import components, join
 from eyerender.geometry.transforms import normalize
 from eyerender.optics.interface import fresnel, reflect, refract
 from eyerender.optics.media import CauchyMedium, ConstantMedium
-from support.paths import load
+from tests.support.paths import load
 
 
 def rays(seed=0, count=500):

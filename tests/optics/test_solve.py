@@ -17,8 +17,8 @@ from eyerender.optics.shooting import connect
 from eyerender.optics.solve import apparent_points, mirror_points
 from eyerender.optics.trace import Crossing, inward_path, outward_path, trace
 from eyerender.status import Status
-from support.paths import load
-from support.surfaces import quadric_of
+from tests.support.paths import load
+from tests.support.surfaces import quadric_of
 
 
 def gka_scenes(name):

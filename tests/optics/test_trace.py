@@ -8,8 +8,8 @@ import pytest
 from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.optics.trace import Crossing, inward_path, outward_path, trace
 from eyerender.status import Status
-from support.paths import load
-from support.surfaces import quadric_of
+from tests.support.paths import load
+from tests.support.surfaces import quadric_of
 
 
 @pytest.fixture(scope="module")

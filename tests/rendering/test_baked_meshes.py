@@ -11,7 +11,7 @@ import trimesh
 
 from eyerender import load_eye
 from eyerender.rendering.export import bake_meshes
-from support.paths import ROOT
+from tests.support.paths import ROOT
 
 MESHES = ROOT / "meshes"
 

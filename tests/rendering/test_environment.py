@@ -13,8 +13,8 @@ from scipy import ndimage
 from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.rig.imaging import Ambient, Panel, RadianceMap
-from support.render_oracles import mirror_pixel
-from support.render_rigs import BLACK, LampRig, eye_of, job_of, remote_rig
+from tests.support.render_oracles import mirror_pixel
+from tests.support.render_rigs import BLACK, LampRig, eye_of, job_of, remote_rig
 
 WINDOW = (120, 120)
 

@@ -9,8 +9,8 @@ import pytest
 
 from eyerender.rendering.surround import Obstacle
 from eyerender.rig.sensor import Sensor
-from support.render_oracles import centroid, mirror_pixel
-from support.render_rigs import BLACK, MODELS, RIGS, eye_of, head_rig, job_of, remote_rig
+from tests.support.render_oracles import centroid, mirror_pixel
+from tests.support.render_rigs import BLACK, MODELS, RIGS, eye_of, head_rig, job_of, remote_rig
 
 
 @pytest.mark.parametrize("rig_name", RIGS)

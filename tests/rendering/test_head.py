@@ -18,7 +18,7 @@ from eyerender.capture import make_renderer, render_job, render_windows
 from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.scene import Scene, SceneSpec, load_scene
-from support.paths import SCRIPTS
+from tests.support.paths import SCRIPTS
 
 pytestmark = pytest.mark.render
 

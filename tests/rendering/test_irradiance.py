@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 
 from eyerender.arrays import frozen
 from eyerender.rig.light import Lamp
-from support.render_oracles import RINGS_MM, flux_on_rings, ring_points
-from support.render_rigs import MODELS, PLAIN, LampRig, eye_of, job_of, remote_rig
+from tests.support.render_oracles import RINGS_MM, flux_on_rings, ring_points
+from tests.support.render_rigs import MODELS, PLAIN, LampRig, eye_of, job_of, remote_rig
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from support.render_rigs import BLACK, eye_of, job_of, remote_rig
+from tests.support.render_rigs import BLACK, eye_of, job_of, remote_rig
 
 
 @pytest.mark.parametrize("model", ["E2", "E5"])

@@ -11,8 +11,8 @@ from matplotlib.path import Path
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.spec import ContourSpec
 from eyerender.rendering.frame import boundary_waves
-from support.render_oracles import contour_error, outline
-from support.render_rigs import PLAIN, RIGS, head_rig, job_of, remote_rig
+from tests.support.render_oracles import contour_error, outline
+from tests.support.render_rigs import PLAIN, RIGS, head_rig, job_of, remote_rig
 
 # About the size that Wyatt (1995) found: the second harmonic a few per cent of the radius, higher ones fewer.
 CONTOUR = ContourSpec(cosines=(0.0, 0.025, -0.012, 0.006), sines=(0.0, -0.018, 0.014, 0.0, 0.004))

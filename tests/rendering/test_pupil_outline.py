@@ -7,8 +7,8 @@ import pytest
 from matplotlib.path import Path
 
 from eyerender.rendering.surround import Obstacle
-from support.render_oracles import contour_error, outline
-from support.render_rigs import PLAIN, RIGS, eye_of, head_rig, job_of, remote_rig
+from tests.support.render_oracles import contour_error, outline
+from tests.support.render_rigs import PLAIN, RIGS, eye_of, head_rig, job_of, remote_rig
 
 
 @pytest.mark.parametrize("rig_name", RIGS)

@@ -12,8 +12,8 @@ from eyerender.geometry.surfaces import components
 from eyerender.optics.purkinje import purkinje_path, purkinje_points
 from eyerender.optics.shooting import ray_tube
 from eyerender.rendering.purkinje import stack
-from support.render_oracles import centroid
-from support.render_rigs import BLACK, RIGS, eye_of, head_rig, job_of, remote_rig
+from tests.support.render_oracles import centroid
+from tests.support.render_rigs import BLACK, RIGS, eye_of, head_rig, job_of, remote_rig
 
 
 @pytest.mark.parametrize("model", ["E3", "E4", "E5"])

@@ -12,8 +12,8 @@ from matplotlib.path import Path as Outline
 
 from eyerender.rig.camera import PinholeCamera
 from eyerender.rig.sensor import Sensor
-from support.paths import TESTS
-from support.render_rigs import digest, eye_of, head_rig, job_of, noisy_job, remote_rig
+from tests.support.paths import ROOT
+from tests.support.render_rigs import digest, eye_of, head_rig, job_of, noisy_job, remote_rig
 
 
 def test_a_seed_gives_the_same_bytes_with_any_threads_and_after_other_frames(renderer):
@@ -33,11 +33,11 @@ def test_a_fresh_process_gives_the_same_bytes(renderer):
     code = (
         "from eyerender.backends.choose import choose_backend\n"
         "b = choose_backend('llvm', threads=2)\n"
-        "from support.render_rigs import digest, noisy_job\n"
+        "from tests.support.render_rigs import digest, noisy_job\n"
         "from eyerender.rendering.renderer import Renderer\n"
         "print(digest(Renderer(b, spp=16).render(noisy_job())))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=TESTS, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == digest(renderer.render(noisy_job()))
 
 

@@ -11,7 +11,7 @@ from eyerender.arrays import frozen
 from eyerender.rendering.export import export_scene
 from eyerender.rig.camera import Camera
 from eyerender.rig.light import Lamp
-from support.render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of, remote_rig
+from tests.support.render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of, remote_rig
 
 MATTE = PLAIN.model_copy(
     update={

@@ -28,9 +28,9 @@ from eyerender.study.images import (
 from eyerender.study.observing import Observing
 from eyerender.study.replicate import facing, scenes_of
 from eyerender.study.run import run_study
-from support import stages
-from support.paths import TESTS
-from support.study_scenes import small_scenes
+from tests.support import stages
+from tests.support.paths import ROOT
+from tests.support.study_scenes import small_scenes
 
 
 @pytest.mark.parametrize("module", [guestrin, blignaut])
@@ -122,9 +122,9 @@ def test_images_are_made_once_and_a_part_of_them_serves_too(tmp_path):
 KILLED = """
 import sys
 from pathlib import Path
-sys.path.insert(0, {tests!r})
+sys.path.insert(0, {root!r})
 from eyerender.study.images import ImageSettings, make_images
-from support.study_scenes import small_scenes
+from tests.support.study_scenes import small_scenes
 make_images("small", small_scenes(), ImageSettings(Path({folder!r}), workers=1))
 """
 
@@ -132,7 +132,7 @@ make_images("small", small_scenes(), ImageSettings(Path({folder!r}), workers=1))
 @pytest.mark.render
 def test_a_killed_run_goes_on_where_it_was(tmp_path):
     folder = tmp_path / "killed"
-    script = KILLED.format(tests=str(TESTS), folder=str(folder))
+    script = KILLED.format(root=str(ROOT), folder=str(folder))
     # When its shards are finished and are about to be put together.
     hook = stages.environment(tmp_path, folder, match=r"/metadata\.jsonl$", at=1)
     process = subprocess.Popen([sys.executable, "-c", script], start_new_session=True, env=hook)

@@ -18,7 +18,7 @@ from eyerender.study import literature as lit
 from eyerender.study.findings import t_tests
 from eyerender.study.observing import Observing
 from eyerender.study.replicate import blignaut_part, guestrin_part
-from support import guestrin_by_hand
+from tests.support import guestrin_by_hand
 
 
 def means(eye, departures, **options):

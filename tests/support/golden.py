@@ -1,12 +1,11 @@
 """Small results that stand for all: what `tests/test_results_version.py` compares with the stored ones.
 
-`python tests/support/golden.py` writes them for the version that `eyerender.imagefolder.RESULTS` says.
+`python -m tests.support.golden` writes them for the version that `eyerender.imagefolder.RESULTS` says.
 """
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,9 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
 from eyerender.imagefolder import RESULTS
 from eyerender.scene import Scene, SceneSpec
+from tests.support.paths import DATA
 
-STORED = Path(__file__).parents[1] / "data" / f"results_{RESULTS}.json"
+STORED = DATA / f"results_{RESULTS}.json"
 BLOCK = 16  # px
 EYES = ("E1", "E2", "E3", "E4", "E5")
 SCENE = {

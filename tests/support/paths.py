@@ -6,10 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-TESTS = Path(__file__).resolve().parents[1]
-ROOT = TESTS.parent
+ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "scripts"
-DATA = TESTS / "data"
+DATA = ROOT / "tests" / "data"
 
 
 def load(name: str) -> Any:
