@@ -239,7 +239,7 @@ def _lights(
     """The light of each glint (-1: none) and why it has none, from the rig and a rough position of the eye."""
     if not found.glints or found.pupil.ellipse is None:
         return [-1] * len(found.glints), ["no pupil to place the reflections by"] * len(found.glints)
-    spots = np.array([g.xy_px if g.xy_px is not None else [np.nan, np.nan] for g in found.glints]) + corner
+    spots = np.array([g.xy_px for g in found.glints]) + corner
     pupil = np.asarray(found.pupil.ellipse.centre_px) + corner
     places = np.array([light.position_mm for light in scene.rig.lights])
     predicted, px_per_mm = predict_glints(camera.ideal(pupil), camera.K, camera.R, camera.t, places, eye_mm)
@@ -259,17 +259,16 @@ def _observation(
         axes = np.asarray(pupil.ellipse.semi_axes_px, dtype=float)[None]
         angle = np.array([pupil.ellipse.angle_rad])
     covariance = np.full((1, 5, 5), np.nan) if pupil.covariance is None else pupil.covariance[None]
-    ok = pupil.status == OK
+    ok = pupil.ok
     m = len(glints)
     xy = np.full((1, m, 2), np.nan)
     spread = np.full((1, m, 2, 2), np.nan)
     for j, glint in enumerate(glints):
-        if glint.xy_px is not None:
-            xy[0, j] = glint.xy_px + corner
+        xy[0, j] = glint.xy_px + corner
         if glint.covariance is not None:
             spread[0, j] = glint.covariance
     # What was measured in an image lies in the image.
-    seen = np.array([[g.status == OK for g in glints]], dtype=bool).reshape(1, m)
+    seen = np.array([[g.ok for g in glints]], dtype=bool).reshape(1, m)
     return Observations(
         index,
         PoseTruth(nan, nan, nan, nan),
@@ -286,7 +285,7 @@ def _observation(
         ),
         GlintFeatures(
             frozen(np.array(lights, dtype=np.int64).reshape(1, m), np.int64),
-            frozen(_texts([OK if g.status == OK else MISSING for g in glints]).reshape(1, m), object),
+            frozen(_texts([OK if g.ok else MISSING for g in glints]).reshape(1, m), object),
             frozen(_texts([g.reason or r for g, r in zip(glints, reasons, strict=True)]).reshape(1, m), object),
             frozen(seen, bool),
             frozen(xy),

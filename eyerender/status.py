@@ -31,6 +31,9 @@ class Status(IntEnum):
     TARGET_TOO_NEAR = 9
     OUT_OF_REACH = 10
     NO_LINE_OF_SIGHT = 11
+    # Features in an image.
+    NOT_FOUND = 12
+    REJECTED = 13
 
     @property
     def reason(self) -> str | None:
@@ -50,6 +53,8 @@ _REASONS = {
     Status.TARGET_TOO_NEAR: "the target lies inside the eye",
     Status.OUT_OF_REACH: "the target is out of reach of the eye's rotation",
     Status.NO_LINE_OF_SIGHT: "no line of sight joins the target and the fovea",
+    Status.NOT_FOUND: "not found",
+    Status.REJECTED: "a reflection, but no glint of the cornea",
 }
 
 

@@ -82,7 +82,11 @@ def _own(settings: ExtractionSettings, image: NDArray[Any], request: Mapping[str
     depth = None if image.dtype.kind == "f" else request["bit_depth"]
     found = extract(image, bit_depth=depth, gamma=hints["gamma"], settings=settings.model_copy(update=changes))
     pupil, lights = found.pupil, _lights(found, hints["rig"])
-    out: dict[str, Any] = {"status": pupil.status, "reason": pupil.reason, "confidence": pupil.confidence}
+    out: dict[str, Any] = {
+        "status": "ok" if pupil.ok else "missing",
+        "reason": pupil.reason,
+        "confidence": pupil.confidence,
+    }
     if pupil.ellipse is not None:
         out |= {
             "centre_px": pupil.ellipse.centre_px.tolist(),
@@ -93,7 +97,6 @@ def _own(settings: ExtractionSettings, image: NDArray[Any], request: Mapping[str
     glints = [
         {"status": "ok", "light": light, "xy_px": glint.xy_px.tolist()}
         for glint, light in zip(found.glints, lights, strict=True)
-        if glint.status == "ok" and glint.xy_px is not None
     ]
     return {"pupil": out, "glints": glints}
 
@@ -103,7 +106,7 @@ def _lights(found: Extraction, rig: Mapping[str, Any] | None) -> list[int | None
     if rig is None or not found.glints or found.pupil.ellipse is None:
         return [None] * len(found.glints)
     camera = PinholeCamera.of(rig["K"], rig["R"], rig["t_mm"], (1, 1), rig["distortion"])
-    spots = np.array([g.xy_px if g.xy_px is not None else [np.nan, np.nan] for g in found.glints])
+    spots = np.array([g.xy_px for g in found.glints])
     assigned = identify(
         camera.ideal(spots),
         camera.ideal(found.pupil.ellipse.centre_px),

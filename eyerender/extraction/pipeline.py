@@ -58,7 +58,7 @@ def extract(
     if isinstance(found, PupilResult):
         return Extraction(found, (), (), noise, size)
     first = _explained(prepared, found, settings)
-    if first.pupil.status == "ok" or work.inverted:
+    if first.pupil.ok or work.inverted:
         return first
     other = fallback_search(work, found, settings)
     again = None if other is None else _explained(prepared, other, settings)
@@ -72,7 +72,7 @@ def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -
     model = found.model
     refined = settings.method == "refined"
     pupil = None if refined else pupil_of(found, None, settings)  # no glint moves a fast one
-    if pupil is not None and pupil.status == "missing":
+    if pupil is not None and not pupil.ok:
         return Extraction(pupil, (), (), noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     spots, fit = _fit_spots(prepared, found, spots)
@@ -80,7 +80,7 @@ def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -
         pixel_fit, fit = _refined(prepared, found, spots, fit)
         model = model if pixel_fit is None else pixel_fit.model
         pupil = pupil_of(found, pixel_fit, settings)
-    if pupil.status == "missing":
+    if not pupil.ok:
         return Extraction(pupil, (), (), noise, size)
     accepted, rejected = classify_spots(spots, fit, prepared, abs(model.step_dn), model.sigma_px, settings)
     return Extraction(pupil, accepted, rejected, noise, size)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from ..arrays import Floats, frozen
 from ..geometry.ellipse import Ellipse
+from ..status import Status
 
 Stage = Literal["input", "coarse search", "edges", "fit", "refinement"]
 
@@ -48,47 +49,56 @@ class Goodness:
     refined: bool
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PupilResult:
     """The pupil, or why there is none.
 
     covariance: (5, 5) of (cx, cy, a, b, angle), px and rad. confidence: probability that the ellipse overlaps the true
-    one with IoU > 0.9. contour_px: (n, 2) the edge points the fit rests on. Where status is "missing", `stage` and
+    one with IoU > 0.9. contour_px: (n, 2) the edge points the fit rests on. Where the status is NOT_FOUND, `stage` and
     `reason` say what failed, confidence is 0 and the rest is None or empty.
     """
 
-    status: Literal["ok", "missing"]
-    stage: Stage | None
-    reason: str | None
-    ellipse: Ellipse | None
-    covariance: Floats | None
-    confidence: float
-    goodness: Goodness | None
-    contour_px: Floats
+    status: Status
+    stage: Stage | None = None
+    reason: str | None = None
+    ellipse: Ellipse | None = None
+    covariance: Floats | None = None
+    confidence: float = 0.0
+    goodness: Goodness | None = None
+    contour_px: Floats = field(default_factory=lambda: frozen(np.zeros((0, 2))))
+
+    @property
+    def ok(self) -> bool:
+        """Whether the pupil was found."""
+        return self.status == Status.OK
 
     @staticmethod
     def missing(stage: Stage, reason: str) -> PupilResult:
         """No pupil: the stage that failed and why."""
-        return PupilResult("missing", stage, f"{stage}: {reason}", None, None, 0.0, None, frozen(np.zeros((0, 2))))
+        return PupilResult(status=Status.NOT_FOUND, stage=stage, reason=f"{stage}: {reason}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class GlintResult:
     """One bright spot.
 
     xy_px: (2,). covariance: (2, 2) px^2. amplitude: peak over the background as a share of full scale (the fitted one:
-    above 1 for a clipped spot). sigma_px: of the spot. status "rejected" is a reflection that is no glint of the
-    cornea, with the reason; light: index of the light, None until assigned.
+    above 1 for a clipped spot). sigma_px: of the spot. status: OK, or REJECTED for a reflection that is no glint of the
+    cornea, with the reason.
     """
 
-    status: Literal["ok", "missing", "rejected"]
-    reason: str | None
-    xy_px: Floats | None
-    covariance: Floats | None
-    amplitude: float
-    sigma_px: float
-    saturated: bool
-    light: int | None = None
+    status: Status
+    reason: str | None = None
+    xy_px: Floats
+    covariance: Floats | None = None
+    amplitude: float = 0.0
+    sigma_px: float = 0.0
+    saturated: bool = False
+
+    @property
+    def ok(self) -> bool:
+        """Whether the spot was accepted as a glint."""
+        return self.status == Status.OK
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,13 +8,14 @@ import pytest
 import make_ideal_images as ideal
 from eyerender.errors import InputError
 from eyerender.extraction import FAST, REFINED, Extraction, ExtractionSettings, extract
+from eyerender.status import Status
 
 
 def _check(found: Extraction) -> None:
     """Every result is complete and consistent."""
     pupil = found.pupil
     assert 0.0 <= pupil.confidence <= 1.0
-    if pupil.status == "missing":
+    if not pupil.ok:
         assert pupil.ellipse is None
         assert pupil.covariance is None
         assert pupil.reason is not None
@@ -33,7 +34,7 @@ def _check(found: Extraction) -> None:
     for value in pupil.goodness.__dataclass_fields__:
         assert np.isfinite(float(getattr(pupil.goodness, value)))
     for glint in found.glints:
-        assert glint.status == "ok"
+        assert glint.ok
         assert np.isfinite(glint.xy_px).all()
         assert np.linalg.eigvalsh(glint.covariance).min() > 0.0
         assert glint.amplitude > 0.0
@@ -60,7 +61,7 @@ def _check(found: Extraction) -> None:
 )
 def test_images_without_content_are_missing_with_the_reason(image, reason):
     found = extract(image)
-    assert found.pupil.status == "missing"
+    assert found.pupil.status == Status.NOT_FOUND
     assert reason in found.pupil.reason
     _check(found)
 
@@ -102,7 +103,7 @@ def test_images_without_an_eye():
     sure = found = 0
     for seed in range(20_000, 20_060):
         pupil = extract(ideal.draw_no_eye(seed)).pupil
-        found += pupil.status == "ok"
+        found += pupil.ok
         sure += pupil.confidence > 0.9
     assert found <= 15
     assert sure <= 3
@@ -111,7 +112,7 @@ def test_images_without_an_eye():
 def test_outside_the_sizes_looked_for():
     image = ideal.draw("noise2-13px", 20_000).image
     wide = extract(image, settings=ExtractionSettings(radius_min_px=45.0)).pupil
-    assert wide.status == "missing"
+    assert not wide.ok
 
 
 def _mutate(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, dict]:

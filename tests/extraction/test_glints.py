@@ -9,6 +9,7 @@ from scipy.special import ndtr
 import make_ideal_images as ideal
 from eyerender.extraction import extract
 from eyerender.extraction.glints import deblending, fits, fitting, gaussian_model, windows
+from eyerender.status import Status
 
 SEEDS = range(20_000, 20_008)
 
@@ -70,7 +71,7 @@ def test_elongated_reflection_is_rejected_with_the_reason():
     assert not found.glints
     near = [g for g in found.rejected if np.hypot(*(g.xy_px - [x, y])) < 6.0]
     assert near
-    assert all(g.status == "rejected" and ("strip" in g.reason or "elongated" in g.reason) for g in near)
+    assert all(g.status == Status.REJECTED and ("strip" in g.reason or "elongated" in g.reason) for g in near)
 
 
 def test_pupil_does_not_feel_a_glint_on_its_edge():

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...arrays import frozen
+from ...status import Status
 from ..preprocessing import DN, Prepared
 from ..result import GlintResult
 from ..settings import ExtractionSettings
@@ -33,7 +34,7 @@ def classify_spots(
         look = looks[i]
         reason = _objection(look, fit, i, prepared, step_dn, blur_px)
         result = GlintResult(
-            status="ok" if reason is None else "rejected",
+            status=Status.OK if reason is None else Status.REJECTED,
             reason=reason,
             xy_px=frozen(fit.xy_px[i]) if look.converged else frozen(spots.xy_px[i]),
             covariance=frozen(fit.covariance[i]) if look.converged else None,
@@ -43,13 +44,11 @@ def classify_spots(
         )
         (accepted if reason is None else rejected).append(result)
     reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
-    surplus = [replace(glint, status="rejected", reason=reason) for glint in accepted[settings.max_glints :]]
+    surplus = [replace(glint, status=Status.REJECTED, reason=reason) for glint in accepted[settings.max_glints :]]
     strip = "a strip or a broad patch, as reflections off the sclera and wet lid margins are"
     places = np.array([glint.xy_px for glint in accepted]).reshape(-1, 2)
     far = (((spots.patches_px[:, None] - places) ** 2).sum(axis=-1) > 4.0**2).all(axis=1)
-    patches = [
-        GlintResult("rejected", strip, frozen(xy), None, 0.0, 0.0, saturated=False) for xy in spots.patches_px[far]
-    ]
+    patches = [GlintResult(status=Status.REJECTED, reason=strip, xy_px=frozen(xy)) for xy in spots.patches_px[far]]
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from ...arrays import Floats, frozen
 from ...geometry.ellipse import Ellipse
+from ...status import Status
 from ..preprocessing import DN
 from ..result import Goodness, PupilResult
 from ..settings import ExtractionSettings
@@ -102,7 +103,14 @@ def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -
     if sure < settings.min_confidence:
         return PupilResult.missing("fit", f"the ellipse found is the pupil with a probability of only {sure:.2f}")
     contour = frozen(found.edges.points_px[boundary.inliers])
-    return PupilResult("ok", None, None, ellipse, frozen(covariance), sure, goodness, contour)
+    return PupilResult(
+        status=Status.OK,
+        ellipse=ellipse,
+        covariance=frozen(covariance),
+        confidence=sure,
+        goodness=goodness,
+        contour_px=contour,
+    )
 
 
 # Lower limits, upper limits, weights, calibration; printed by scripts/fit_confidence.py.
