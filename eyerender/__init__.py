@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from . import gaze
+    from .benchmark.protocol import Extractor
     from .capture import render_folder, render_windows
     from .comparison import Comparison, compare
     from .errors import BackendError, EyerenderError, InputError
@@ -28,6 +29,7 @@ _HOMES = {
     "AnalyticObserver": "observers",
     "BackendError": "errors",
     "Comparison": "comparison",
+    "Extractor": "benchmark.protocol",
     "EyeModel": "eye.model",
     "EyeSpec": "eye.spec",
     "EyerenderError": "errors",
@@ -51,6 +53,7 @@ __all__ = [
     "AnalyticObserver",
     "BackendError",
     "Comparison",
+    "Extractor",
     "EyeModel",
     "EyeSpec",
     "EyerenderError",

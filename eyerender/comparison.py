@@ -10,6 +10,7 @@ import numpy as np
 from .arrays import ArrayValue, Bools, Floats, frozen
 from .errors import InputError
 from .gaze.estimate import GazeEstimator
+from .gaze.regression import Regression
 from .gaze.validation import GazeErrors, leave_one_target_out
 from .observation import Observations
 from .rig.rig import RigLike
@@ -104,7 +105,20 @@ def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
 def compare(
     truth: Observations, found: Observations, rig: RigLike, estimator: GazeEstimator, name: str = ""
 ) -> Comparison:
-    """Compare two observers' reports of the same frames, in features and in gaze."""
+    """Compare two observers' reports of the same frames, in features and in gaze.
+
+    Args:
+        truth: what is compared with, such as the analytic observer's report.
+        found: of the same frames and eyes, row by row, such as the image observer's report.
+        rig: the rig of both.
+        estimator: how gaze is estimated from each; every target in turn by a calibration on the others.
+        name: of the estimator, for the result; default: its class, and a regression's function.
+
+    Raises:
+        InputError: the two are not of the same frames and eyes. Where gaze cannot be estimated the result says why.
+    """
+    if not name:
+        name = f"regression {estimator.function}" if isinstance(estimator, Regression) else type(estimator).__name__
     gaze: list[GazeErrors | None] = []
     reason = None
     for observations in (truth, found):

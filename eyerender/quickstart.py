@@ -8,8 +8,9 @@ from pathlib import Path
 from .backends.choose import BackendChoice
 from .capture import render_folder
 from .comparison import Comparison, compare
-from .errors import InputError, Warn
-from .gaze.regression import FUNCTIONS, Regression
+from .errors import Warn
+from .gaze.estimate import GazeEstimator
+from .gaze.regression import Regression
 from .imagefolder import ImageFolder, same_run
 from .observers import ImageObserver, scene_of
 from .plausibility import saturation_warnings
@@ -25,7 +26,6 @@ def run_quickstart(
     *,
     scene: str = "quickstart",
     eye: str | None = None,
-    function: str = "R3",
     backend: BackendChoice = "auto",
     threads: int | None = None,
     overwrite: bool = False,
@@ -73,7 +73,7 @@ def run_quickstart(
     if warn is not None:
         saturated = images.dataset.get("statistics", {}).get("images_saturated", 0)
         warn(saturation_warnings(saturated, len(images.entries), loaded.source))
-    result = _compare(loaded, images, function, step(count, "extracting"))
+    result = _compared(images, loaded, Regression(), "", step(count, "extracting"))
     timings.append(Timing("extracting and calibrating", time.monotonic() - start))
     write_report(folder / REPORT, loaded, result, images.entries, timings)
     if progress is not None:
@@ -81,15 +81,31 @@ def run_quickstart(
     return result
 
 
-def compare_folder(folder: str | Path, *, function: str = "R3", progress: Progress | None = None) -> Comparison:
-    """Extract the features of a folder's images and compare them with its analytic ones."""
-    images = ImageFolder.load(folder)
-    return _compare(scene_of(images), images, function, progress)
+def compare_folder(
+    path: str | Path,
+    *,
+    estimator: GazeEstimator | None = None,
+    name: str = "",
+    progress: Progress | None = None,
+) -> Comparison:
+    """Extract the features of a folder's images and compare them with its analytic ones, in pixels and in gaze.
+
+    Args:
+        path: a folder that `render`, `quickstart` or `generate` wrote.
+        estimator: how gaze is estimated from both; default: `er.gaze.Regression("R3")`.
+        name: of the estimator, for the result; default: as `compare` has it.
+        progress: called with images done, images in all and "".
+
+    Raises:
+        InputError: it is no such folder, or holds an image or a record that cannot be read.
+    """
+    images = ImageFolder.load(path)
+    return _compared(images, scene_of(images), estimator or Regression(), name, progress)
 
 
-def _compare(scene: Scene, images: ImageFolder, function: str, progress: Progress | None) -> Comparison:
-    if function not in FUNCTIONS:
-        raise InputError(f"{function!r} is no function of Table 2 (R1 to R12)", source="--function")
+def _compared(
+    images: ImageFolder, scene: Scene, estimator: GazeEstimator, name: str, progress: Progress | None
+) -> Comparison:
     truth = images.truth()
     found = ImageObserver().observe_entries(images.entries, truth.index, scene, progress=progress)
-    return compare(truth, found, scene.rig, Regression(function), f"regression {function}")
+    return compare(truth, found, scene.rig, estimator, name)

@@ -20,6 +20,7 @@ FLOORS = {
     "arrays": 0,
     "files": 0,
     "jsonlines": 0,
+    "references": 0,
     "lock": 0,
     "progress": 0,
     "status": 0,
@@ -60,6 +61,7 @@ ORDER = [
     "status",
     "files",
     "jsonlines",
+    "references",
     "lock",
     "spec",
     "observation",
@@ -183,7 +185,7 @@ def test_import_is_light():
 
 def test_public_names_are_pinned():
     assert eyerender.__all__ == [
-        "AnalyticObserver", "BackendError", "Comparison", "EyeModel", "EyeSpec", "EyerenderError",
+        "AnalyticObserver", "BackendError", "Comparison", "Extractor", "EyeModel", "EyeSpec", "EyerenderError",
         "ImageFolder", "ImageObserver", "InputError", "Observations", "RigGeometry", "Scene",
         "SceneSpec", "__version__", "compare", "gaze", "load_eye", "load_scene", "render_folder",
         "render_windows", "shipped_scenes", "write_report",

@@ -16,7 +16,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError, one_line
 from ..files import shown
@@ -26,6 +29,24 @@ from .conventions import Conventions, number, pair
 SCHEMA = "eyerender/extractor/1"
 FEATURES = ("pupil", "glints")
 _MOST_GLINTS = 1000
+Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
+
+
+class Extractor(Protocol):
+    """What an extractor in Python does: a function of an image, with no state.
+
+    Two attributes of the function may say more: `conventions`, what the numbers of its records mean (the keys of
+    `Conventions`; without it this package's own), and `reports`, the features that it looks for at all (`FEATURES`).
+    """
+
+    def __call__(self, image: Image, request: Mapping[str, Any], /) -> Mapping[str, Any]:
+        """The record of an image: `{"pupil": {..}, "glints": [..]}`, as in the protocol above.
+
+        Args:
+            image: (h, w) numbers as the file stores them.
+            request: the request above; `bit_depth` and `hints` are of use.
+        """
+        ...
 
 
 @dataclass(frozen=True, slots=True)

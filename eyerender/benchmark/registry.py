@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..references import is_reference
 
 GROUP = "eyerender.extractors"
-_CALLABLE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 WORKER = "eyerender.benchmark.worker"
 
 
@@ -27,7 +27,7 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
-class Extractor:
+class ExtractorCommand:
     """An extractor to be run: its label, what was asked for, and the command that runs it."""
 
     name: str
@@ -40,7 +40,7 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(_installed()))
 
 
-def resolve(given: str) -> Extractor:
+def resolve(given: str) -> ExtractorCommand:
     """A name of the entry-point group, `module:callable`, or a command line, each perhaps after `LABEL=`.
 
     Raises:
@@ -52,9 +52,9 @@ def resolve(given: str) -> Extractor:
     installed = _installed()
     if spec in installed:
         return _of_entry_point(name or spec, given, installed[spec])
-    if _CALLABLE.fullmatch(spec):
+    if is_reference(spec):
         title = name or spec
-        return Extractor(title, given, (sys.executable, "-m", WORKER, spec, title))
+        return ExtractorCommand(title, given, (sys.executable, "-m", WORKER, spec, title))
     try:
         argv = shlex.split(spec)
     except ValueError as error:
@@ -62,10 +62,10 @@ def resolve(given: str) -> Extractor:
     if not argv or shutil.which(argv[0]) is None:
         known = ", ".join(sorted(installed))
         raise InputError(f"{given!r} is no extractor ({known}), module:callable or command", source="--extractor")
-    return Extractor(name or Path(argv[0]).name, given, tuple(argv))
+    return ExtractorCommand(name or Path(argv[0]).name, given, tuple(argv))
 
 
-def defaults() -> tuple[list[Extractor], dict[str, str]]:
+def defaults() -> tuple[list[ExtractorCommand], dict[str, str]]:
     """Every installed extractor that can be run here; and why the others cannot."""
     ready, absent = [], {}
     for name, entry in sorted(_installed().items(), key=lambda item: item[0]):
@@ -80,7 +80,7 @@ def _installed() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
-def _of_entry_point(name: str, given: str, entry: EntryPoint) -> Extractor:
+def _of_entry_point(name: str, given: str, entry: EntryPoint) -> ExtractorCommand:
     argv: tuple[str, ...] = (sys.executable, "-m", WORKER, entry.value, name)
     # Another package's code is only ever loaded in the worker, which alone it can harm.
     if entry.value.startswith("eyerender."):
@@ -89,4 +89,4 @@ def _of_entry_point(name: str, given: str, entry: EntryPoint) -> Extractor:
             if found.argv is None:
                 raise InputError(found.missing, source=f"--extractor {entry.name}")
             argv = found.argv
-    return Extractor(name, given, argv)
+    return ExtractorCommand(name, given, argv)

@@ -25,7 +25,7 @@ from .bound import Edge, edge_of
 from .folder import LabelledImage, load_labelled
 from .process import ExtractorProcess, Failed
 from .protocol import Greeting, Request
-from .registry import Extractor
+from .registry import ExtractorCommand
 from .score import Score, failed, score
 from .summary import FACTORS, breakdown, failures, summarise
 
@@ -40,7 +40,7 @@ START_S = 60.0
 class Run:
     """What one extractor gave: its greeting (None when it never came), a score an image."""
 
-    extractor: Extractor
+    extractor: ExtractorCommand
     greeting: Greeting | None
     scores: tuple[Score, ...]
 
@@ -53,7 +53,7 @@ class Run:
 def bench_extractors(
     folder: str | Path,
     output: str | Path,
-    extractors: Sequence[Extractor],
+    extractors: Sequence[ExtractorCommand],
     *,
     timeout_s: float = 30.0,
     start_timeout_s: float = START_S,
@@ -120,7 +120,7 @@ def bench_extractors(
 
 
 def run_extractor(
-    extractor: Extractor,
+    extractor: ExtractorCommand,
     images: Sequence[LabelledImage],
     *,
     timeout_s: float,

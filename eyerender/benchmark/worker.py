@@ -1,29 +1,25 @@
 """A Python callable behind the protocol: `python -m eyerender.benchmark.worker module:callable [NAME]`.
 
-The callable takes (image, request): the image as (h, w) numbers as stored, the request as the mapping that was sent. It
-returns the record, {"pupil": {..}, "glints": [..]}. Its attributes `conventions` and `reports`, where it has them, are
-those of the greeting. What it prints goes to stderr. In place of a callable a `registry.Command` may
-stand, which is then run instead.
+The callable follows `protocol.Extractor`. What it prints goes to stderr. A `registry.Command` may stand in place of a
+callable; it is then run instead.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
 from typing import Any, TextIO
 
 import numpy as np
 
+from ..errors import InputError
 from ..imagefile import read_image
+from ..references import load_reference
 from .conventions import Conventions
-from .protocol import FEATURES, SCHEMA
+from .protocol import FEATURES, SCHEMA, Extractor
 from .registry import Command
-
-ExtractorCallable = Callable[[Any, Mapping[str, Any]], Mapping[str, Any]]
 
 
 def main(argv: list[str]) -> int:
@@ -32,12 +28,18 @@ def main(argv: list[str]) -> int:
     # Nothing that a library or the callable prints may mix with the answers.
     os.dup2(2, 1)
     sys.stdout = sys.stderr
-    extractor = load(argv[0])
-    if isinstance(extractor, Command):
-        if extractor.argv is None:
-            raise SystemExit(extractor.missing)
+    try:
+        found = load_reference(argv[0])
+    except InputError as error:
+        raise SystemExit(str(error)) from None
+    if isinstance(found, Command):
+        if found.argv is None:
+            raise SystemExit(found.missing)
         os.dup2(stdout, 1)
-        os.execvp(extractor.argv[0], extractor.argv)
+        os.execvp(found.argv[0], found.argv)
+    if not callable(found):
+        raise SystemExit(f"{argv[0]} is neither a callable nor a Command")
+    extractor: Extractor = found
     answers = os.fdopen(stdout, "w", encoding="utf-8")
     greeting = {
         "schema": SCHEMA,
@@ -62,17 +64,6 @@ def main(argv: list[str]) -> int:
             text = json.dumps({"id": request["id"], "error": f"{type(error).__name__}: {error}"})
         _send(answers, text)
     return 0
-
-
-def load(name: str) -> ExtractorCallable | Command:
-    """The object behind `module:attribute.attribute`."""
-    module, _, path = name.partition(":")
-    found: Any = importlib.import_module(module)
-    for part in path.split("."):
-        found = getattr(found, part)
-    if not (callable(found) or isinstance(found, Command)):
-        raise TypeError(f"{name} is neither a callable nor a Command")
-    return found  # type: ignore[no-any-return]
 
 
 def _send(stream: TextIO, line: str) -> None:

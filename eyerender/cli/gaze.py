@@ -18,15 +18,13 @@ if TYPE_CHECKING:
 gaze = App(name="gaze", help="Estimate gaze from records of features, also from real images.")
 app.command(gaze)
 
-EstimatorName = Literal["regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman"]
-
 
 @gaze.command(name="fit")
 def fit(
     records: Path,
     /,
     *,
-    estimator: EstimatorName,
+    estimator: Annotated[str, Parameter(name="--estimator")],
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     scene: str | None = None,
     function: str = "R3",
@@ -48,7 +46,8 @@ def fit(
             its target_mm.
         estimator: regression (polynomials of the pupil-glint vector; one light), homography (normalisation by four
             lights), cross-ratio (four lights at the screen's corners and one at the camera), hennessey (one camera, two
-            lights), shih-wu-liu (two cameras, two lights), or guestrin-eizenman (one camera, two lights).
+            lights), shih-wu-liu (two cameras, two lights), or guestrin-eizenman (one camera, two lights);
+            or module:Class, a class of your own that can be made without arguments.
         output: The calibration file to write.
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
         function: regression: the function, R1 to R12.
@@ -64,25 +63,23 @@ def fit(
         fixations: Calibrate on these fixations only, counted from 0, such as '0,4,8'.
     """
     from ..gaze.records import load_observations
-    from ..gaze.store import EstimatorSpec, fit_estimator, save_estimator
+    from ..gaze.store import choose_estimator, fit_estimator, save_estimator
 
     if (terms_x is None) != (terms_y is None):
         raise InputError("give both --terms-x and --terms-y", source="--terms-x")
+    spec = choose_estimator(
+        estimator,
+        function=function,
+        terms=[terms_x, terms_y] if terms_x is not None else None,
+        normalised=not monocular,
+        method=method,
+        free_index=free_index,
+        index=index,
+        recalibration=recalibration,
+    )
+    chosen = _chosen(fixations)
     heed = Heed(strict)
     observations, rig = load_observations(records, _scene(scene, heed))
-    chosen = _chosen(fixations)
-    spec = EstimatorSpec.from_mapping(
-        {
-            "name": estimator,
-            "function": function,
-            "terms": [terms_x, terms_y] if terms_x is not None else None,
-            "normalised": not monocular,
-            "method": method,
-            "free_index": free_index,
-            "index": index,
-            "recalibration": recalibration,
-        }
-    )
     fitted, summary = fit_estimator(spec, observations, rig, chosen, source=str(records), warn=heed)
     save_estimator(output, spec, fitted, rig)
     summary = {**summary, "path": str(output)}
@@ -100,6 +97,7 @@ def predict(
     /,
     *,
     calibration: Annotated[Path, Parameter(name=["--calibration", "-c"])],
+    estimator: str | None = None,
     scene: str | None = None,
     strict: Strict = False,
     json: Result = None,
@@ -111,6 +109,7 @@ def predict(
     Args:
         records: Records as `features` or `extract` write them (JSON), or one record per line (JSONL).
         calibration: The calibration file.
+        estimator: Your own class, module:Class, if the calibration is one of it. Reading a file imports no code.
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
     """
     from ..gaze.records import load_observations
@@ -118,11 +117,11 @@ def predict(
     from ..plausibility import rig_warnings
 
     heed = Heed(strict)
+    fitted, calibrated = load_calibration(calibration, estimator)
     observations, rig = load_observations(records, _scene(scene, heed))
-    estimator, calibrated = load_calibration(calibration)
     if calibrated is not None:
         heed(rig_warnings(rig, calibrated, scene or str(records)))
-    data = predictions(estimator, observations, rig)
+    data = predictions(fitted, observations, rig)
     emit(data, _gaze_table(data), json, heed)
     return 0
 

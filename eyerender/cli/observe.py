@@ -105,6 +105,7 @@ def compare(
     folder: Annotated[Path, Parameter(name="DIR")],
     /,
     *,
+    estimator: str = "regression",
     function: str = "R3",
     json: Result = None,
 ) -> int:
@@ -114,12 +115,16 @@ def compare(
 
     Args:
         folder: A folder written by render, quickstart or generate.
-        function: Regression function of the gaze estimator, R1 to R12.
+        estimator: The gaze estimator: a name as in `gaze fit`, or module:Class, a class of your own.
+        function: regression: the function, R1 to R12.
     """
+    from ..gaze.store import choose_estimator
     from ..quickstart import compare_folder
 
+    chosen = choose_estimator(estimator, function=function).build()
+    name = f"regression {function}" if estimator == "regression" else estimator
     with progress("extracting") as steps:
-        result = compare_folder(folder, function=function, progress=steps)
+        result = compare_folder(folder, estimator=chosen, name=name, progress=steps)
     emit(result.to_mapping(), comparison_text(result.to_mapping()), json)
     return 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -15,6 +15,7 @@ from ..errors import InputError, Warn
 from ..files import read_json, shown, write_json
 from ..observation import EYES, Observations
 from ..plausibility import target_warnings
+from ..references import is_reference
 from ..rig.rig import RigGeometry
 from ..spec import Positive, Spec
 from .crossratio import CrossRatio
@@ -22,22 +23,28 @@ from .estimate import GazeEstimator, angular_error_deg, binocular_average
 from .guestrin import GuestrinEizenman
 from .hennessey import Hennessey
 from .homography import Homography
+from .own import OwnEstimator
 from .parameters import MEAN_EYE, Calibration, EyeParameters
 from .recalibration import Recalibration
 from .records import rig_from_mapping
 from .regression import EyeFit, Regression
 from .twocamera import ShihWuLiu
 
-CALIBRATION_SCHEMA = "eyerender/gaze-calibration/2"
-_WITHOUT_RIG = "eyerender/gaze-calibration/1"  # still read
+CALIBRATION_SCHEMA = "eyerender/gaze-calibration/3"
+# Still read: 1 has no rig, neither has a user's own estimators.
+_SCHEMAS = (CALIBRATION_SCHEMA, "eyerender/gaze-calibration/2", "eyerender/gaze-calibration/1")
 FIT_SCHEMA = "eyerender/gaze-fit/1"
 PREDICT_SCHEMA = "eyerender/gaze/1"
+
+
+Name = Literal["regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman"]
+NAMES: tuple[str, ...] = get_args(Name)
 
 
 class EstimatorSpec(Spec):
     """Which estimator, and its options; those of other estimators are not looked at."""
 
-    name: Literal["regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman"]
+    name: Name
     function: str = "R3"
     terms: tuple[str, str] | None = Field(default=None, description="terms of x and y, in place of `function`")
     normalised: bool = True
@@ -65,8 +72,21 @@ class EstimatorSpec(Spec):
         return GuestrinEizenman(centre=centre, start=eye, free_index=self.free_index)
 
 
+def choose_estimator(given: str, *, source: str = "--estimator", **options: Any) -> EstimatorSpec | OwnEstimator:
+    """The estimator of a name (see `NAMES`) with its options, or a user's own class by `module:Class`.
+
+    Raises:
+        InputError: there is no such estimator, or an option is wrong.
+    """
+    if is_reference(given):
+        return OwnEstimator.load(given, source=source)
+    if given not in NAMES:
+        raise InputError(f"must be one of {', '.join(NAMES)}, or module:Class, not {shown(given)}", source=source)
+    return EstimatorSpec.from_mapping({"name": given, **options})
+
+
 def fit_estimator(
-    spec: EstimatorSpec,
+    spec: EstimatorSpec | OwnEstimator,
     observations: Observations,
     rig: RigGeometry,
     fixations: Sequence[int] | None = None,
@@ -90,6 +110,8 @@ def fit_estimator(
         rows &= np.isin(index.fixation, fixations)
     if not rows.any():
         raise InputError("a calibration needs records with target_mm", source=source)
+    if isinstance(spec, OwnEstimator):
+        spec.check_storable()
     used = observations.take(rows)
     if warn is not None:
         warn(target_warnings(used.index.target_mm, rig.screen, source))
@@ -155,7 +177,7 @@ def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGe
 
 
 def save_estimator(
-    path: str | Path, spec: EstimatorSpec, estimator: GazeEstimator, rig: RigGeometry | None = None
+    path: str | Path, spec: EstimatorSpec | OwnEstimator, estimator: GazeEstimator, rig: RigGeometry | None = None
 ) -> None:
     """Write a calibration as JSON, with the rig that it was made on where that is known."""
     write_json(
@@ -164,30 +186,37 @@ def save_estimator(
             "schema": CALIBRATION_SCHEMA,
             "estimator": spec.to_mapping(),
             "rig": None if rig is None else rig.to_mapping(),
-            "eyes": _state(estimator),
+            **({"state": estimator.state()} if isinstance(estimator, OwnEstimator) else {"eyes": _state(estimator)}),
         },
     )
 
 
-def load_estimator(path: str | Path) -> GazeEstimator:
-    """The estimator of a calibration; raises as `load_calibration` does."""
-    return load_calibration(path)[0]
+def load_estimator(path: str | Path, own: str | None = None) -> GazeEstimator:
+    """The estimator of a calibration; as `load_calibration`."""
+    return load_calibration(path, own)[0]
 
 
-def load_calibration(path: str | Path) -> tuple[GazeEstimator, RigGeometry | None]:
+def load_calibration(path: str | Path, own: str | None = None) -> tuple[GazeEstimator, RigGeometry | None]:
     """Read a calibration back: the estimator, and the rig that it was made on (None where the file does not say).
+
+    The calibration of a user's own class is read only where `own` names that class again, as `module:Class`: a file
+    never has code loaded.
 
     Raises:
         InputError: naming the file and the key.
     """
     source = str(path)
     data = read_json(path)
-    if data.get("schema") not in (CALIBRATION_SCHEMA, _WITHOUT_RIG):
+    if data.get("schema") not in _SCHEMAS:
         found = shown(data.get("schema"))
         raise InputError(f"is {found}; this version reads {CALIBRATION_SCHEMA!r}", source=source, path="schema")
     rig = None if data.get("rig") is None else rig_from_mapping(data["rig"], source=source)
+    said = data.get("estimator")
+    reference = said.get("reference") if isinstance(said, dict) else None
+    if reference is not None or own is not None:
+        return _own_calibration(data, reference, own, source), rig
     try:
-        spec = EstimatorSpec.from_mapping(data.get("estimator"))
+        spec = EstimatorSpec.from_mapping(said)
         estimator = spec.build()
     except InputError as error:
         path_of = ".".join(part for part in ("estimator", error.path) if part)
@@ -203,6 +232,21 @@ def load_calibration(path: str | Path) -> tuple[GazeEstimator, RigGeometry | Non
             path_of = ".".join(part for part in ("eyes", name, error.path) if part)
             raise InputError(error.reason, source=source, path=path_of) from None
     return _restored(estimator, found_eyes), rig
+
+
+def _own_calibration(data: dict[str, Any], reference: object, own: str | None, source: str) -> OwnEstimator:
+    """The calibration of a user's own class; raises `InputError` unless `own` is the class that the file names."""
+    at = "estimator.reference"
+    if own is None:
+        made_by = f"was made by {shown(reference)}, which no file can have loaded"
+        raise InputError(f"{made_by}; name the class again with --estimator", source=source, path=at)
+    if reference != own:
+        raise InputError(f"is {shown(reference)}, not {own}", source=source, path=at)
+    estimator = OwnEstimator.load(own, source="--estimator")
+    try:
+        return estimator.restored(data.get("state"))
+    except InputError as error:
+        raise InputError(error.reason, source=source, path=error.path) from error
 
 
 class _RegressionState(Spec):

@@ -13,7 +13,7 @@ import pytest
 from eyerender.benchmark.folder import load_labelled
 from eyerender.benchmark.process import ExtractorProcess, Failed
 from eyerender.benchmark.protocol import Request
-from eyerender.benchmark.registry import Extractor, resolve
+from eyerender.benchmark.registry import ExtractorCommand, resolve
 from eyerender.benchmark.run import run_extractor
 
 HEAD = """
@@ -33,7 +33,7 @@ def program(tmp_path):
     def make(body):
         path = tmp_path / "extractor.py"
         path.write_text(HEAD + textwrap.dedent(body))
-        return Extractor("test", "test", (sys.executable, str(path)))
+        return ExtractorCommand("test", "test", (sys.executable, str(path)))
 
     return make
 
@@ -202,7 +202,7 @@ def test_a_python_callable_is_an_extractor(images, tmp_path, monkeypatch):
     deep = run_extractor(resolve("mine:Deep.quiet"), images[:1], timeout_s=20)
     assert deep.scores[0].reason == "gave no reason"
     nothing = run_extractor(resolve("mine:nothing"), images[:1], timeout_s=20)
-    assert "AttributeError" in nothing.scores[0].reason
+    assert nothing.scores[0].reason == "ended with exit code 1: mine has no nothing"
 
 
 def test_an_installed_plug_in_is_found_by_its_name(images, tmp_path, monkeypatch):

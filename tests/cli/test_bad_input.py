@@ -27,6 +27,8 @@ from tests.support import stages
 def place(tmp_path, monkeypatch):
     """A folder with one of each bad thing, as the current folder."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     data = yaml.safe_load(shipped_scenes()["quickstart"].read_text(encoding="utf-8"))
 
     def scene(name, path, value):
@@ -52,6 +54,12 @@ def place(tmp_path, monkeypatch):
     scene("focal.yaml", "rig.cameras.0.focal_length_mm", 1e300)
     scene("grid.yaml", "targets", {"grid": [10**9, 1]})
     os.mkfifo("pipe.yaml")
+    Path("broken.py").write_text("def", encoding="utf-8")
+    Path("exits.py").write_text("raise SystemExit(3)", encoding="utf-8")
+    records = {"records": [], "rig": None}
+    Path("f.json").write_text(json.dumps(records), encoding="utf-8")
+    own = {"schema": "eyerender/gaze-calibration/3", "estimator": {"reference": "exits:Mine"}, "rig": None, "state": {}}
+    Path("own.json").write_text(json.dumps(own), encoding="utf-8")
     Path("empty.png").write_bytes(b"")
     Path("noise.png").write_bytes(np.random.default_rng(0).bytes(400))
     colour = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
@@ -109,6 +117,39 @@ TABLE = [
     (["extract", "pipe.yaml"], 2, "pipe.yaml: is a pipe, not a file"),
     (["generate", "pipe.yaml", "out"], 2, "pipe.yaml: is a pipe, not a file"),
     (["gaze", "predict", "pipe.yaml", "-c", "pipe.yaml"], 2, "pipe.yaml: is a pipe, not a file"),
+    (
+        ["gaze", "fit", "f.json", "--estimator", "magic", "-o", "c.json"],
+        2,
+        "--estimator: must be one of regression, homog",
+    ),
+    (["gaze", "fit", "f.json", "--estimator", "a:b:c", "-o", "c.json"], 2, "or module:Class, not 'a:b:c'"),
+    (
+        ["gaze", "fit", "f.json", "--estimator", "no_such.x:C", "-o", "c.json"],
+        2,
+        "--estimator: there is no module 'no_",
+    ),
+    (["gaze", "fit", "f.json", "--estimator", "json:Nothing", "-o", "c.json"], 2, "--estimator: json has no Nothing"),
+    (["gaze", "fit", "f.json", "--estimator", "json:loads", "-o", "c.json"], 2, "--estimator: json:loads is no class"),
+    (
+        ["gaze", "fit", "f.json", "--estimator", "json:JSONDecoder", "-o", "c.json"],
+        2,
+        "json:JSONDecoder has no method fit",
+    ),
+    (
+        ["gaze", "fit", "f.json", "--estimator", "broken:Mine", "-o", "c.json"],
+        2,
+        "broken cannot be imported (SyntaxError",
+    ),
+    (["gaze", "fit", "f.json", "--estimator", "exits:Mine", "-o", "c.json"], 2, "exits cannot be imported (SystemExit"),
+    (["gaze", "predict", "f.json", "-c", "own.json"], 2, "own.json: estimator.reference: was made by 'exits:Mine'"),
+    (
+        ["gaze", "predict", "f.json", "-c", "own.json", "--estimator", "json:X"],
+        2,
+        "own.json: estimator.reference: is 'e",
+    ),
+    (["compare", "hollow", "--estimator", "magic"], 2, "--estimator: must be one of regression"),
+    (["compare", "hollow", "--estimator", "json:JSONDecoder"], 2, "--estimator: json:JSONDecoder has no method fit"),
+    (["compare", "hollow", "--function", "R13"], 2, "'R13' is no function of Table 2"),
     (["features", "date.yaml"], 2, "date.yaml: line 2: not valid YAML: is no timestamp (month must be in 1..12)"),
     (["features", "focal.yaml"], 2, "focal.yaml: rig.cameras.0.focal_length_mm: must be <= 1e+09"),
     (["features", "grid.yaml"], 2, "grid.yaml: targets.grid.0: must be <= 1000"),

@@ -1,0 +1,122 @@
+"""A user's own estimator class behind `module:Class`, with its mistakes told in one line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+from ..errors import EyerenderError, InputError
+from ..observation import Observations
+from ..references import load_reference
+from ..rig.rig import RigLike
+from .estimate import GazeEstimator, GazePoints, StoredEstimator
+
+
+@dataclass(frozen=True, slots=True)
+class OwnEstimator:
+    """An estimator of a user's own class, which follows `GazeEstimator`.
+
+    Whatever its methods raise becomes an `InputError` that names the class; their results are checked.
+    """
+
+    reference: str
+    estimator: GazeEstimator
+
+    @classmethod
+    def load(cls, reference: str, *, source: str = "") -> Self:
+        """Import `module:Class` and make one without arguments.
+
+        Raises:
+            InputError: there is no such class, it needs arguments, or it has no `fit` and `predict`.
+        """
+        return cls(reference, _instance(_class(reference, source), reference))
+
+    def build(self) -> Self:
+        """The estimator, as of `EstimatorSpec`."""
+        return self
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Which class it is, as the files of calibrations say it."""
+        return {"reference": self.reference}
+
+    def fit(self, observations: Observations, rig: RigLike) -> Self:
+        """As of `GazeEstimator`."""
+        with _calling(self.reference, "fit"):
+            fitted = self.estimator.fit(observations, rig)
+        if not isinstance(fitted, GazeEstimator):
+            raise InputError(f"fit returned a {type(fitted).__name__}, not the fitted estimator", source=self.reference)
+        return replace(self, estimator=fitted)
+
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
+        """As of `GazeEstimator`."""
+        with _calling(self.reference, "predict"):
+            gaze = self.estimator.predict(observations, rig)
+        if not isinstance(gaze, GazePoints):
+            raise InputError(f"predict returned a {type(gaze).__name__}, not GazePoints", source=self.reference)
+        if gaze.point_mm.shape != (len(observations), 3):
+            shape = f"{gaze.point_mm.shape} for {len(observations)} observations"
+            raise InputError(f"predict returned points of shape {shape}", source=self.reference)
+        return gaze
+
+    def check_storable(self) -> None:
+        """Raise `InputError` where a calibration cannot be written, before there is one."""
+        if not isinstance(self.estimator, StoredEstimator):
+            reason = (
+                "has no to_mapping and from_mapping, so its calibration cannot be stored (see er.gaze.StoredEstimator)"
+            )
+            raise InputError(reason, source=self.reference)
+
+    def state(self) -> dict[str, Any]:
+        """What the calibration found, as JSON holds it; raises `InputError` where it cannot be stored."""
+        self.check_storable()
+        assert isinstance(self.estimator, StoredEstimator)
+        with _calling(self.reference, "to_mapping"):
+            state = self.estimator.to_mapping()
+            if not isinstance(state, dict):
+                raise TypeError(f"must be a dict, not a {type(state).__name__}")
+            json.dumps(state, allow_nan=False)
+        return state
+
+    def restored(self, state: Any) -> Self:
+        """The estimator with the calibration that a file holds; raises `InputError`."""
+        self.check_storable()
+        assert isinstance(self.estimator, StoredEstimator)
+        if not isinstance(state, dict):
+            raise InputError("must hold what to_mapping gave", path="state")
+        try:
+            with _calling(self.reference, "from_mapping"):
+                estimator = type(self.estimator).from_mapping(state)
+        except InputError as error:
+            raise InputError(str(error), path="state") from error
+        return replace(self, estimator=estimator)
+
+
+def _class(reference: str, source: str) -> type[Any]:
+    found = load_reference(reference, source=source)
+    if not isinstance(found, type):
+        raise InputError(f"{reference} is no class", source=source)
+    missing = [name for name in ("fit", "predict") if not callable(getattr(found, name, None))]
+    if missing:
+        reason = f"{reference} has no method {' and no method '.join(missing)} (see er.gaze.GazeEstimator)"
+        raise InputError(reason, source=source)
+    return found
+
+
+def _instance(kind: type[Any], reference: str) -> GazeEstimator:
+    with _calling(reference, "making one without arguments"):
+        made: GazeEstimator = kind()
+    return made
+
+
+@contextmanager
+def _calling(reference: str, what: str) -> Iterator[None]:
+    """Run a user's code; whatever it raises becomes one line."""
+    try:
+        yield
+    except EyerenderError:
+        raise
+    except Exception as error:
+        raise InputError(f"{what} failed ({type(error).__name__}: {error})", source=reference) from error

@@ -1,0 +1,213 @@
+"""A user's own estimator: by `module:Class`, through fit, file and predict; a file never has code loaded."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import eyerender as er
+from eyerender.cli.app import run
+from eyerender.gaze.own import OwnEstimator
+from eyerender.gaze.store import choose_estimator, load_calibration, predictions
+
+OWN = '''
+import numpy as np
+
+import eyerender as er
+
+
+class Mean:
+    """Every gaze point is the mean of the targets of its eye."""
+
+    def __init__(self, means=None):
+        self.means = means or {}
+
+    def fit(self, observations, rig):
+        eye, target = observations.index.eye, observations.index.target_mm
+        return type(self)({int(e): target[eye == e].mean(axis=0).tolist() for e in np.unique(eye)})
+
+    def predict(self, observations, rig):
+        points = np.array([self.means[int(e)] for e in observations.index.eye])
+        assert rig.build().screen is not None
+        return er.gaze.GazePoints.of(points, np.where(observations.pupil.ok, None, "no pupil"))
+
+    def to_mapping(self):
+        return {"means": {str(e): m for e, m in self.means.items()}}
+
+    @classmethod
+    def from_mapping(cls, data):
+        return cls({int(e): m for e, m in data["means"].items()})
+
+
+class Unstored:
+    def fit(self, observations, rig):
+        return self
+
+    def predict(self, observations, rig):
+        return er.gaze.GazePoints.of(np.zeros((len(observations), 3)))
+
+
+class Unfitted(Mean):
+    def fit(self, observations, rig):
+        return None
+
+
+class Loose(Unstored):
+    to_mapping = Mean.to_mapping
+    from_mapping = Mean.from_mapping
+
+    def predict(self, observations, rig):
+        return np.zeros((len(observations), 3))
+
+
+class Short(Loose):
+    def predict(self, observations, rig):
+        return er.gaze.GazePoints.of(np.zeros((1, 3)))
+
+
+class Raises(Mean):
+    def fit(self, observations, rig):
+        raise KeyError("glint")
+
+
+class Refuses(Mean):
+    def fit(self, observations, rig):
+        raise er.InputError("needs more targets")
+
+
+class Infinite(Mean):
+    def to_mapping(self):
+        return {"means": float("inf")}
+
+
+class Listed(Mean):
+    def to_mapping(self):
+        return []
+
+
+class Demanding(Mean):
+    def __init__(self, order):
+        pass
+
+
+class Predictor:
+    def predict(self, observations, rig):
+        pass
+
+
+def function():
+    pass
+'''
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch, features):
+    """A current folder with a module of estimators, `mine_<unique>`, and a file of records; gives the module's name."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    name = f"mine_{abs(hash(str(tmp_path)))}"
+    (tmp_path / f"{name}.py").write_text(OWN)
+    (tmp_path / "features.json").write_text(features)
+    yield name
+    sys.modules.pop(name, None)
+
+
+@pytest.fixture(scope="module")
+def features(tmp_path_factory):
+    path = tmp_path_factory.mktemp("records") / "features.json"
+    assert run(["features", "blignaut2014", "--json", str(path)]) == 0
+    return path.read_text()
+
+
+def fit(name, *more):
+    return ["gaze", "fit", "features.json", "--estimator", name, "-o", "c.json", *more]
+
+
+def predict(*more):
+    return ["gaze", "predict", "features.json", "-c", "c.json", *more]
+
+
+def test_it_is_fitted_stored_and_loaded_again(place, tmp_path, capsys):
+    reference = f"{place}:Mean"
+    assert run(fit(reference)) == 0
+    assert f"{reference}: calibrated on" in capsys.readouterr().out
+    data = json.loads((tmp_path / "c.json").read_text())
+    assert data["schema"] == "eyerender/gaze-calibration/3"
+    assert data["estimator"] == {"reference": reference}
+    assert set(data["state"]["means"]) == {"0", "1"}
+    assert run(predict("--estimator", reference, "--json", "gaze.json")) == 0
+    gaze = json.loads((tmp_path / "gaze.json").read_text())["gaze"]
+    assert gaze[0]["point_mm"] == data["state"]["means"]["0"]
+    fitted, rig = load_calibration("c.json", reference)
+    assert isinstance(fitted, OwnEstimator)
+    seen, _ = er.gaze.load_observations("features.json")
+    assert predictions(fitted, seen, rig)["gaze"] == gaze
+
+
+def test_a_file_never_has_its_module_imported(place, tmp_path, capsys):
+    assert run(fit(f"{place}:Mean")) == 0
+    del sys.modules[place]
+    (tmp_path / f"{place}.py").write_text("open('ran', 'w').close()\n")
+    other = f"{place}:Other"
+    for more in ([], ["--estimator", "json:JSONDecoder"], ["--estimator", other], ["--estimator", "regression"]):
+        capsys.readouterr()
+        assert run(predict(*more)) == 2
+        err = capsys.readouterr().err
+        assert err.startswith("error: c.json: estimator.reference: ")
+        assert len(err.splitlines()) == 1
+        assert not (tmp_path / "ran").exists()
+        assert place not in sys.modules
+    # Nor is a class imported for the calibration of another estimator.
+    assert run(fit("regression")) == 0
+    assert run(predict("--estimator", f"{place}:Mean")) == 2
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Unstored", "{0}:Unstored: has no to_mapping and from_mapping, so its calibration cannot be stored"),
+        ("Unfitted", "{0}:Unfitted: fit returned a NoneType, not the fitted estimator"),
+        ("Loose", "{0}:Loose: predict returned a ndarray, not GazePoints"),
+        ("Short", "{0}:Short: predict returned points of shape (1, 3) for "),
+        ("Raises", "{0}:Raises: fit failed (KeyError: 'glint')"),
+        ("Refuses", "features.json: needs more targets"),
+        ("Infinite", "{0}:Infinite: to_mapping failed (ValueError: "),
+        ("Listed", "{0}:Listed: to_mapping failed (TypeError: must be a dict, not a list)"),
+        ("Demanding", "{0}:Demanding: making one without arguments failed (TypeError: "),
+        ("Predictor", "--estimator: {0}:Predictor has no method fit (see er.gaze.GazeEstimator)"),
+        ("function", "--estimator: {0}:function is no class"),
+        ("Nothing", "--estimator: {0} has no Nothing"),
+    ],
+)
+def test_a_class_that_does_not_follow_the_protocol_gets_one_line(place, tmp_path, capsys, name, words):
+    assert run(fit(f"{place}:{name}")) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    assert err.startswith(f"error: {words.format(place)}")
+    assert not (tmp_path / "c.json").exists()
+
+
+@pytest.mark.parametrize("state", [3, {}, {"means": {"x": 1}}])
+def test_a_state_that_the_class_cannot_read_gets_one_line(place, tmp_path, capsys, state):
+    reference = f"{place}:Mean"
+    assert run(fit(reference)) == 0
+    data = json.loads((tmp_path / "c.json").read_text())
+    (tmp_path / "c.json").write_text(json.dumps({**data, "state": state}))
+    capsys.readouterr()
+    assert run(predict("--estimator", reference)) == 2
+    err = capsys.readouterr().err
+    assert len(err.splitlines()) == 1
+    assert err.startswith("error: c.json: state: ")
+
+
+def test_the_api_takes_it_as_it_is(place):
+    """Without the command line a class needs no wrapper: any object that follows the protocol will do."""
+    chosen = choose_estimator(f"{place}:Unstored")
+    seen, rig = er.gaze.load_observations("features.json")
+    errors = er.gaze.leave_one_target_out(chosen.estimator, seen, rig)
+    np.testing.assert_array_equal(errors.point_mm, np.zeros_like(errors.point_mm))
