@@ -11,22 +11,25 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from . import gaze
+    from .analytic.observer import AnalyticObserver
     from .benchmark.protocol import Extractor
-    from .capture import render_folder, render_windows
+    from .capture import render_windows
     from .comparison import Comparison, compare
     from .errors import BackendError, EyerenderError, InputError
     from .eye.catalogue import load_eye
     from .eye.model import EyeModel
     from .eye.spec import EyeSpec
     from .imagefolder import ImageFolder
+    from .imageobserver import ImageObserver
     from .observation import Observations
-    from .observers import AnalyticObserver, ImageObserver
+    from .renderedfolder import render_folder
     from .report.comparison import write_report
     from .rig.rig import RigGeometry
-    from .scene import Scene, SceneSpec, load_scene, shipped_scenes
+    from .scene import Scene, load_scene, shipped_scenes
+    from .scenespec import SceneSpec
 
 _HOMES = {
-    "AnalyticObserver": "observers",
+    "AnalyticObserver": "analytic.observer",
     "BackendError": "errors",
     "Comparison": "comparison",
     "Extractor": "benchmark.protocol",
@@ -34,16 +37,16 @@ _HOMES = {
     "EyeSpec": "eye.spec",
     "EyerenderError": "errors",
     "ImageFolder": "imagefolder",
-    "ImageObserver": "observers",
+    "ImageObserver": "imageobserver",
     "InputError": "errors",
     "Observations": "observation",
     "RigGeometry": "rig.rig",
     "Scene": "scene",
-    "SceneSpec": "scene",
+    "SceneSpec": "scenespec",
     "compare": "comparison",
     "load_eye": "eye.catalogue",
     "load_scene": "scene",
-    "render_folder": "capture",
+    "render_folder": "renderedfolder",
     "render_windows": "capture",
     "shipped_scenes": "scene",
     "write_report": "report.comparison",

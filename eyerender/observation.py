@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,6 +30,15 @@ MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
 MAX_GLINTS = 5_000_000
 # In a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
 _MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
+
+
+T = TypeVar("T", "Index", "PoseTruth", "PupilFeatures", "GlintFeatures")
+
+
+def taken(part: T, rows: Any) -> T:
+    """Some rows (indices, a slice or a mask) of a batch's part."""
+    arrays = {f.name: getattr(part, f.name)[rows] for f in fields(part)}
+    return replace(part, **{name: frozen(array, array.dtype) for name, array in arrays.items()})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,11 +157,8 @@ class Observations(ArrayValue):
 
     def take(self, rows: Any) -> Observations:
         """The observations of some rows (indices, a slice or a mask)."""
-
-        def part(group: Any) -> Any:
-            return replace(group, **{f.name: frozen(v := getattr(group, f.name)[rows], v.dtype) for f in fields(group)})
-
-        return Observations(part(self.index), part(self.pose), part(self.pupil), part(self.glints))
+        index, pose = taken(self.index, rows), taken(self.pose, rows)
+        return Observations(index, pose, taken(self.pupil, rows), taken(self.glints, rows))
 
     def with_targets(self, target_mm: ArrayLike) -> Observations:
         """The same observations of other targets: (n, 3) or (3,) mm in the world, NaN where there is none."""

@@ -6,15 +6,15 @@ import time
 from pathlib import Path
 
 from .backends.choose import BackendChoice
-from .capture import render_folder
 from .comparison import Comparison, compare
 from .errors import Warn
 from .gaze.estimate import GazeEstimator
 from .gaze.regression import Regression
 from .imagefolder import ImageFolder, same_run
-from .observers import ImageObserver, scene_of
+from .imageobserver import ImageObserver, scene_of
 from .plausibility import saturation_warnings
 from .progress import Progress
+from .renderedfolder import render_folder
 from .report.comparison import Timing, write_report
 from .scene import Scene, load_scene
 
@@ -46,7 +46,7 @@ def run_quickstart(
     loaded = load_scene(scene, eye=eye)
     if warn is not None:
         warn(loaded.warnings())
-    count = len(loaded.frames())
+    count = len(loaded.index())
 
     def step(offset: int, what: str) -> Progress:
         def show(done: int, _total: int, _note: str) -> None:

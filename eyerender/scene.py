@@ -1,4 +1,4 @@
-"""A scene: one subject, one rig, what is looked at; and the frames that come of it.
+"""A scene: one subject, one rig, what is looked at; and the frames with poses that come of it.
 
 Frames are ordered by head position, then fixation, then camera; within a frame the right eye comes first.
 """
@@ -7,183 +7,65 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from .arrays import ArrayValue, Floats, frozen
 from .errors import InputError, InputWarning
 from .eye.catalogue import load_eye
+from .eye.fixation import fixations
 from .eye.margin import PupilMargin
 from .eye.model import EyeModel
+from .eye.pose import listing_torsion
 from .eye.spec import EyeSpec
-from .observation import EYES, MAX_GLINTS, Index
+from .observation import EYES, Index, PoseTruth, taken
 from .plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
 from .region.anatomy import Region
-from .region.look import Look
 from .rig.camera import Window
-from .rig.imaging import Ambient, Lens, Motion
-from .rig.rig import Rig, RigGeometry
-from .rig.sensor import Sensor
-from .spec import FileSpec, Positive, Spec, Vec2, Vec3, file_digest, read_yaml
-
-DATASET_KIND = "dataset"
-Count = Annotated[int, Field(ge=1, le=1000)]
-# An observation is one eye in one frame. Analysing this many takes about 1 GB of memory, their records some 2 GB.
-MAX_OBSERVATIONS = 200_000
-
-
-class Eye(Spec):
-    """Which eye looks, and how."""
-
-    model: str = Field(default="E2", description="a name of the catalogue, or an eye file (relative to the scene)")
-    pupil_diameter_mm: Positive | None = Field(default=None, description="of the anatomical pupil; default: the eye's")
-    line_of_sight: Literal["chief_ray", "entrance_window"] = "chief_ray"
-    margin: PupilMargin | None = Field(default=None, description="of the pupil; default: the eye's")
-
-
-class Subject(Spec):
-    """Which eyes are there, how far apart, and where the head stands."""
-
-    eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = ("right", "left")
-    ipd_mm: Positive = Field(default=63.0, description="interpupillary distance")
-    head_positions_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] = ((0.0, 0.0, 0.0),)
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if len(set(self.eyes)) != len(self.eyes):
-            raise ValueError("eyes: each eye once")
-        return self
-
-
-class Targets(Spec):
-    """What is fixated: a grid out to the screen's edges, points on the screen, or points in the world."""
-
-    grid: tuple[Count, Count] | None = Field(default=None, description="columns and rows")
-    screen_mm: Annotated[tuple[Vec2, ...], Field(min_length=1)] | None = Field(
-        default=None, description="points to the subject's right of and above the screen's centre"
-    )
-    world_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if sum(v is not None for v in (self.grid, self.screen_mm, self.world_mm)) != 1:
-            raise ValueError("give exactly one of grid, screen_mm, world_mm")
-        return self
-
-
-class EyeDirection(Spec):
-    """An eye's direction without a target: of the optic axis; torsion follows Listing's law."""
-
-    azimuth_deg: Annotated[float, Field(gt=-90, lt=90)]
-    elevation_deg: Annotated[float, Field(gt=-90, lt=90)]
-
-
-class Picture(Spec):
-    """What part of the sensor is rendered, and how finely."""
-
-    window_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = Field(
-        default=None, description="width and height of one window per eye, centred on it; default: the whole sensor"
-    )
-    spp: Annotated[int, Field(ge=1, le=65536)] = Field(default=16, description="samples per pixel")
-
-
-NOT_A_SCENE = (
-    "is the spec of a dataset, not a scene; 'eyerender generate SPEC DIR' makes its images, "
-    "'eyerender sample SPEC 0 -o DIR' writes one of its scenes"
-)
-NOT_A_DATASET = (
-    "is a scene, not a dataset; 'eyerender render SCENE -o DIR' makes its images; the spec of a dataset says "
-    "'kind: dataset' and holds a scene under 'scene'"
-)
-
-
-class SceneSpec(FileSpec):
-    """A scene file."""
-
-    name: Annotated[str, Field(min_length=1)]
-    description: str = ""
-    eye: Eye = Eye()
-    subject: Subject = Subject()
-    rig: Rig
-    targets: Targets | None = None
-    poses: Annotated[tuple[EyeDirection, ...], Field(min_length=1)] | None = None
-    wavelength_nm: Annotated[float, Field(ge=350, le=1100)] = 850.0
-    image: Picture = Picture()
-    sensor: Sensor = Sensor()
-    look: Look = Look()
-    region: Region | None = None
-    lens: Lens = Lens()
-    motion: Motion | None = None
-    ambient: Ambient = Ambient()
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if (self.targets is None) == (self.poses is None):
-            raise ValueError("give either targets or poses")
-        if self.targets is not None and self.targets.world_mm is None and self.rig.screen is None:
-            raise ValueError("targets on a screen need rig.screen")
-        self._check_size()
-        if self.image.window_px is not None:
-            for i, camera in enumerate(self.rig.cameras):
-                if any(w > r for w, r in zip(self.image.window_px, camera.resolution_px, strict=True)):
-                    raise ValueError(f"image.window_px: is larger than the sensor of rig.cameras.{i}")
-        return self
-
-    @classmethod
-    def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
-        """Raise `InputError` where a mapping is a dataset's or an eye's, and say what to do with it."""
-        if data.get("kind") == DATASET_KIND:
-            raise InputError(NOT_A_SCENE, source=source)
-        if "cornea" in data:
-            raise InputError(
-                "is an eye file, not a scene; give it with --eye, or as 'eye.model' of a scene", source=source
-            )
-
-    def _check_size(self) -> None:
-        targets = self.targets
-        if targets is None:
-            fixations = len(self.poses or ())
-        elif targets.grid is not None:
-            fixations = targets.grid[0] * targets.grid[1]
-        else:
-            fixations = len(targets.screen_mm or targets.world_mm or ())
-        heads, cameras, eyes = len(self.subject.head_positions_mm), len(self.rig.cameras), len(self.subject.eyes)
-        count = fixations * heads * cameras * eyes
-        if count > MAX_OBSERVATIONS:
-            raise ValueError(
-                f"{fixations} fixations, {heads} head positions, {cameras} cameras and {eyes} eyes make {count} "
-                f"observations; a scene may have {MAX_OBSERVATIONS}"
-            )
-        lights = self.rig.light_count
-        if count * lights > MAX_GLINTS:
-            raise ValueError(
-                f"{count} observations of {lights} lights make {count * lights} glints; a scene may have {MAX_GLINTS}"
-            )
-
-    def with_spp(self, spp: int) -> Self:
-        """A copy with other samples per pixel; raises an `InputError` that names the option --spp."""
-        return self.replaced("--spp", {"image": {**self.to_mapping()["image"], "spp": spp}})
+from .rig.imaging import Ambient
+from .rig.rig import RigGeometry, RigLike
+from .scenespec import DATASET_KIND, NOT_A_SCENE, SceneSpec
+from .spec import file_digest, read_yaml
+from .status import Status
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames(ArrayValue):
-    """The observations that a scene asks for: `index` (n), and the wanted poses where there are no targets.
+    """The frames of a scene with the pose of each eye: what every observer starts from.
 
-    `direction_rad` (n, 2): azimuth and elevation of the optic axis, NaN where a target is fixated.
+    A row is one eye in one frame (an exposure of one camera). `index` (n) says which eye, camera and target it is and
+    `pose` (n) how the eye stands.
     """
 
+    scene: Scene
     index: Index
-    direction_rad: Floats
+    pose: PoseTruth
 
     def __len__(self) -> int:
         return len(self.index)
+
+    def take(self, rows: Any) -> Frames:
+        """Some of the rows (indices, a slice or a mask)."""
+        return Frames(self.scene, taken(self.index, rows), taken(self.pose, rows))
+
+    def seen_by(self, rig: RigLike | None) -> Frames:
+        """The same eyes before another rig, which has the same number of cameras; None changes nothing.
+
+        Raises:
+            InputError: the rig has another number of cameras.
+        """
+        if rig is None or (built := rig.build()) == self.scene.rig:
+            return self
+        if len(built.cameras) != len(self.scene.rig.cameras):
+            raise InputError(
+                f"are {len(built.cameras)}, but the frames were made for {len(self.scene.rig.cameras)}",
+                path="rig.cameras",
+            )
+        return replace(self, scene=replace(self.scene, rig=built))
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,8 +211,8 @@ class Scene:
             return screen.grid(*targets.grid)
         return screen.world(np.array(targets.screen_mm, dtype=float))
 
-    def frames(self) -> Frames:
-        """Every (frame, eye) of the scene."""
+    def index(self) -> Index:
+        """Which (frame, eye) the scene has, in order; n rows."""
         spec = self.spec
         targets = self.targets_mm
         fixations = len(targets) if targets is not None else len(spec.poses or ())
@@ -345,13 +227,9 @@ class Scene:
         )
         n = len(head)
         eye = sides[side]
-        directions = np.full((n, 2), np.nan)
-        if targets is None:
-            wanted = np.radians([[p.azimuth_deg, p.elevation_deg] for p in spec.poses or ()])
-            directions = wanted[fixation]
         model = np.empty(n, dtype=object)
         model[:] = self.eye_spec.name
-        index = Index(
+        return Index(
             frozen((head * fixations + fixation) * cameras + camera, np.int64),
             frozen(fixation, np.int64),
             frozen(camera, np.int64),
@@ -362,7 +240,46 @@ class Scene:
             frozen(heads[head]),
             frozen(np.stack([self.eye_position_mm(EYES[e]) for e in (0, 1)])[eye]),
         )
-        return Frames(index, frozen(directions))
+
+    def frames(self) -> Frames:
+        """Every (frame, eye) of the scene with its pose: the one given, or the one that fixates the target.
+
+        Raises:
+            InputError: a target that no pose of an eye fixates; the message says which, and why.
+        """
+        index = self.index()
+        if self.spec.poses is None:
+            return Frames(self, index, self._fixating(index))
+        wanted = np.radians([[p.azimuth_deg, p.elevation_deg] for p in self.spec.poses])
+        azimuth, elevation = wanted[index.fixation].T
+        torsion = listing_torsion(azimuth, elevation)
+        return Frames(
+            self, index, PoseTruth(frozen(azimuth), frozen(elevation), frozen(torsion), frozen(np.zeros(len(index))))
+        )
+
+    def _fixating(self, index: Index) -> PoseTruth:
+        # Cameras see the same pose: solve once for each head position, fixation and eye.
+        keys = np.stack([index.head, index.fixation, index.eye], axis=-1)
+        _, rows, back = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        found = fixations(
+            [self.eye(side) for side in EYES],
+            index.eye[rows],
+            index.target_mm[rows],
+            index.eye_position_mm[rows] + index.head_mm[rows],
+            self.spec.eye.line_of_sight,
+        )
+        bad = np.flatnonzero(found.status != Status.OK)
+        if len(bad):
+            row = rows[bad[0]]
+            target = ", ".join(f"{v:g}" for v in index.target_mm[row])
+            raise InputError(
+                f"the {EYES[index.eye[row]]} eye cannot fixate ({target}) mm: {found.reason(int(bad[0]))}",
+                path=f"targets.{index.fixation[row]}",
+            )
+        back = back.reshape(-1)
+        azimuth, elevation = found.poses.azimuth_rad[back], found.poses.elevation_rad[back]
+        torsion = listing_torsion(azimuth, elevation)
+        return PoseTruth(frozen(azimuth), frozen(elevation), frozen(torsion), frozen(found.residual_mm[back]))
 
     def windows(self) -> dict[tuple[int, int, int], Window]:
         """The rendered window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.

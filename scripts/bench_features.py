@@ -20,8 +20,9 @@ from dataclasses import fields
 import numpy as np
 
 from _bench import Report, Row, options_of, row
-from eyerender.analytic.features import Features, features, fixations
+from eyerender.analytic.features import Features, features
 from eyerender.eye.catalogue import load_eye
+from eyerender.eye.fixation import fixations
 from eyerender.scene import load_scene
 
 EYES = ("E2", "E4", "E5")

@@ -321,11 +321,11 @@ class Bench:
         """CPU time of an eye in its lids over that of the bare eye, 640 x 480, 16 spp, in turns; what a move costs."""
         import yaml
 
-        from eyerender.analytic.observer import observe
         from eyerender.capture import render_job
         from eyerender.eye.pose import Poses, rigid_motion
         from eyerender.region.anatomy import Region
-        from eyerender.scene import Scene, SceneSpec
+        from eyerender.scene import Scene
+        from eyerender.scenespec import SceneSpec
 
         rigs, region = self.rigs, Region(seed=11)
         rig = rigs.remote_rig()
@@ -334,7 +334,7 @@ class Bench:
         spec = yaml.safe_load((ROOT / "scenes" / "headset.yaml").read_text(encoding="utf-8"))
         spec["rig"]["lights"][0]["ring"]["count"] = 6
         scene = Scene.of(SceneSpec.from_mapping(spec))
-        headset = replace(render_job(scene, observe(scene), 4), labels=False)
+        headset = replace(render_job(scene.frames(), 4), labels=False)
         for name, job in (("2 lamps", remote), ("headset", headset)):
             jobs = [replace(job, region=r) for r in (None, region)]
             cpu: list[list[float]] = [[], []]

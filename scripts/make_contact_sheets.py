@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from eyerender.analytic.observer import observe
 from eyerender.capture import make_renderer, render_windows
 from eyerender.region.anatomy import Region
-from eyerender.scene import Scene, SceneSpec, load_scene
+from eyerender.scene import Scene, load_scene
+from eyerender.scenespec import SceneSpec
 
 PRESETS = ("desktop_tracker", "headset", "webcam", "stress")
 CELL = (400, 300)
@@ -86,7 +86,7 @@ def sheet(name: str, renderer: Any, spp: int, gamma: float, quick: bool) -> Imag
         line = []
         for caption, mapping in cells:
             scene = Scene.of(SceneSpec.from_mapping(mapping, source=f"{name}: {title}"))
-            (shot,) = render_windows(scene, observe(scene), renderer=renderer)
+            (shot,) = render_windows(scene.frames(), renderer=renderer)
             cell = Image.new("L", (CELL[0], CELL[1] + 16), 255)
             cell.paste(picture(shot.irradiance, gamma), (0, 16))
             ImageDraw.Draw(cell).text((3, 2), caption, fill=0)

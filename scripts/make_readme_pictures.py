@@ -53,13 +53,13 @@ def draw(image, origin, white, truth, found, row, crop, path):
 
 
 def picture(scene, fixation, eye, crop, white, path):
-    truth = er.AnalyticObserver().observe(scene)
-    row = int(np.flatnonzero((truth.index.fixation == fixation) & (truth.index.eye == eye))[0])
-    one = truth.take([row])
-    (image,) = render_windows(scene, one)
-    found = er.ImageObserver().observe(scene, only=[row])
+    frames = scene.frames()
+    one = frames.take((frames.index.fixation == fixation) & (frames.index.eye == eye))
+    truth = er.AnalyticObserver().observe(one)
+    (image,) = render_windows(one)
+    found = er.ImageObserver().observe_images([image])
     full = scene.spec.sensor.full_scale_dn
-    draw(image.dn, image.window[:2], white * full, one, found, 0, crop, path)
+    draw(image.counts, image.window[:2], white * full, truth, found, 0, crop, path)
     print(path)
 
 

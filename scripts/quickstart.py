@@ -8,7 +8,7 @@ import eyerender as er
 out = Path(sys.argv[1])
 scene = er.load_scene("quickstart")  # eyes, rig, targets: a YAML file; try eye="E1"
 
-truth = er.AnalyticObserver().observe(scene)  # ray optics: apparent pupil and glints
+truth = er.AnalyticObserver().observe(scene.frames())  # ray optics: apparent pupil and glints
 er.render_folder(scene, out)  # near-infrared images with labels
 folder = er.ImageFolder.load(out)
 found = er.ImageObserver().observe_folder(folder, scene)  # the same features from the pixels

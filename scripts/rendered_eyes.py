@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.capture import render_windows
 from eyerender.geometry.ellipse import Ellipse, signed_distance
-from eyerender.scene import Scene, SceneSpec
+from eyerender.scene import Scene
+from eyerender.scenespec import SceneSpec
 from make_ideal_images import Drawing
 
 Array = NDArray[np.float64]
@@ -101,7 +102,7 @@ def with_edge_glint(scene: Scene, seed: int) -> Scene:
 
     def off(places: list[Array]) -> Array:
         """Signed distance of each lamp's glint from the apparent pupil's outline, px."""
-        seen = observe(lamps(places))
+        seen = trace(lamps(places))
         pupil = Ellipse(seen.pupil.centre_px[0], seen.pupil.semi_axes_px[0], float(seen.pupil.angle_rad[0]))
         out = np.full(len(places), np.nan)
         for k in range(len(places)):
@@ -126,13 +127,16 @@ def with_edge_glint(scene: Scene, seed: int) -> Scene:
 
 def photograph(renderer: Any, scene: Scene) -> Photograph:
     """Render a scene's one window, exposed for the step at the pupil's outline."""
-    truth = observe(scene)
-    (shot,) = render_windows(scene, truth, renderer=renderer)
+    frames = scene.frames()
+    truth = trace(frames)
+    (shot,) = render_windows(frames, renderer=renderer)
     corner = np.array(shot.window[:2])
     pupil = truth.pupil
     ellipse = Ellipse(pupil.centre_px[0] - corner, pupil.semi_axes_px[0], float(pupil.angle_rad[0]))
     irradiance = shot.irradiance.astype(np.float64)
-    inside, outside = (_median_near(irradiance, ellipse, shot.mask, part, away) for part, away in ((3, -4.0), (2, 4.0)))
+    inside, outside = (
+        _median_near(irradiance, ellipse, shot.parts, part, away) for part, away in ((3, -4.0), (2, 4.0))
+    )
     places = [
         (xy - corner).tolist() if ok else None for xy, ok in zip(truth.glints.xy_px[0], truth.glints.ok[0], strict=True)
     ]

@@ -33,6 +33,7 @@ FLOORS = {
     "rig": 3,
     "plausibility": 4,
     "scene": 4,
+    "scenespec": 4,
     "observation": 4,
     "imagefile": 4,
     "imagefolder": 4,
@@ -42,7 +43,9 @@ FLOORS = {
     "extraction": 5,
     "gaze": 5,
     "capture": 6,
-    "observers": 6,
+    "imageobserver": 6,
+    "labels": 6,
+    "renderedfolder": 6,
     "comparison": 6,
     "report": 7,
     "dataset": 7,
@@ -69,10 +72,13 @@ ORDER = [
     "imagefolder",
     "outfolder",
     "plausibility",
+    "scenespec",
     "scene",
     "comparison",
     "capture",
-    "observers",
+    "imageobserver",
+    "labels",
+    "renderedfolder",
 ]
 
 
@@ -141,6 +147,21 @@ def test_heavy_libraries_stay_in_their_packages(libraries, homes):
 def test_datasets_use_opencv_for_nothing_but_videos():
     users = [p.name for p in modules() if room(p) == "dataset" and "cv2" in {name for name, _ in imports(p)}]
     assert users == ["video.py"]
+
+
+@pytest.mark.parametrize("observer", ["analytic", "image"])
+def test_observers_are_siblings(observer):
+    """Neither observer uses the other; what composes both stands above them."""
+    image = {"rendering", "extraction", "capture", "imageobserver"}
+    own, other = ({"analytic"}, image) if observer == "analytic" else (image, {"analytic"})
+    used = {
+        name.split(".")[1]
+        for p in modules()
+        if room(p) in own
+        for name, _ in imports(p)
+        if name.startswith("eyerender.")
+    }
+    assert not used & other
 
 
 def test_what_reproduces_a_papers_software_stays_in_the_studies():

@@ -10,14 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.geometry.ellipse import Ellipse, signed_distance
 from eyerender.imagefile import write_png
 from eyerender.imagefolder import write_dataset
 from eyerender.outfolder import staged
-from eyerender.scene import Scene, SceneSpec
+from eyerender.scene import Scene
+from eyerender.scenespec import SceneSpec
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="tells peaks of memory in /proc only")
 WIDTH, HEIGHT = 96, 72
@@ -72,7 +73,7 @@ def folder_of(path, count):
     with staged(path) as stage:
         (stage / "images").mkdir()
         write_png(stage / "images" / "even.png", np.full((HEIGHT, WIDTH), 90, np.uint8))
-        for k, record in enumerate(observe(Scene.of(spec)).records()):
+        for k, record in enumerate(trace(Scene.of(spec)).records()):
             x, y = (round(v) for v in record["pupil"]["centre_px"])
             window = {"x0": x - WIDTH // 2, "y0": y - HEIGHT // 2, "width": WIDTH, "height": HEIGHT}
             write_png(stage / "images" / f"{k}.png", drawn(record, window))
@@ -122,7 +123,7 @@ def dataset_of(path, count, size):
     spec = {"format": 1, "kind": "dataset", "name": "many", "count": count, "shard_size": size, "subjects": count // 10}
     spec |= {"scene": scene | {"subject": {"eyes": ["right"]}}, "splits": {"train": 0.8, "test": 0.2}}
     plan = Plan.of(DatasetSpec.from_mapping(spec))
-    (record,) = observe(plan.draw(0).build(), boundary_points=6).records()
+    (record,) = trace(plan.draw(0).build(), boundary_points=6).records()
     sums = {"bytes": 1, "sha256": ""}
     done = {"schema": "eyerender/shard/1", "digest": plan.digest, "versions": {}, "cpu": "", "rejections": []}
     done |= {"backend": {"name": "", "device": ""}, "given_up": []}

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from eyerender import lock
-from eyerender.capture import render_folder
 from eyerender.dataset import assemble, croissant, run, shard
 from eyerender.errors import EyerenderError, InputError
 from eyerender.imagefile import write_png
 from eyerender.imagefolder import write_dataset
 from eyerender.lock import LOCK, run_lock, writer_lock
 from eyerender.outfolder import MARKER, clear, refuse_non_empty, staged
+from eyerender.renderedfolder import render_folder
 from eyerender.scene import load_scene
 from eyerender.study import run as study
 

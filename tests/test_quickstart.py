@@ -11,7 +11,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.cli.app import run
 from eyerender.imagefile import read_image
 from eyerender.imagefolder import ImageFolder
@@ -40,7 +40,7 @@ def test_folder_is_what_the_contract_says(folder):
         assert entry.window[2:] == (320, 240)
         assert set(np.unique(mask)) == {0, 1, 2, 3}
         assert entry.line["labels"]["failed_paths"] == 0
-    fresh = observe(load_scene("quickstart"))
+    fresh = trace(load_scene("quickstart"))
     np.testing.assert_array_equal(images.truth().pupil.centre_px, fresh.pupil.centre_px)
     np.testing.assert_array_equal(images.truth().glints.xy_px, fresh.glints.xy_px)
 

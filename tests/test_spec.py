@@ -12,7 +12,8 @@ import yaml
 from eyerender.dataset.spec import DatasetSpec, find_dataset
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
-from eyerender.scene import SceneSpec, load_scene, shipped_scenes
+from eyerender.scene import load_scene, shipped_scenes
+from eyerender.scenespec import SceneSpec
 from eyerender.spec import file_digest, read_yaml
 
 

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, Floats, Indices, Statuses, frozen
+from ..arrays import ArrayValue, Bools, Floats, Statuses
 from ..errors import InputError
-from ..eye.batch import stack_eyes, structure_of, take_eyes
-from ..eye.fixation import Fixations, LineOfSightKind, fixate
+from ..eye.batch import CHUNK_POINTS, chunks, groups, slices, take_eyes
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
 from ..geometry.ellipse import fit_ellipse_direct
@@ -26,11 +24,6 @@ from ..observation import MAX_BOUNDARY_POINTS, MAX_POINTS
 from ..rig.camera import PinholeCamera, distort
 from ..status import Status
 from .rays import glint_exits, pupil_exits
-
-CHUNK_POINTS = 12000
-"""Points refracted at once: fewer leave the time to the interpreter, more leave the cache (measured: 8,000 to
-20,000).
-"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,31 +72,6 @@ class Features(ArrayValue):
         return len(self.centre_px)
 
 
-def fixations(
-    eyes: Sequence[EyeModel],
-    eye_index: npt.ArrayLike,
-    target_mm: npt.ArrayLike,
-    position_mm: npt.ArrayLike,
-    line_of_sight: LineOfSightKind = "chief_ray",
-) -> Fixations:
-    """Poses of n eyes (`eyes[eye_index]`, apexes at `position_mm` in the world, head included) that fixate targets."""
-    which = np.asarray(eye_index, dtype=np.intp)
-    seen = np.asarray(target_mm, dtype=np.float64) - np.asarray(position_mm, dtype=np.float64)
-    n = len(which)
-    angles = np.zeros((n, 3))
-    residual, status = np.zeros(n), np.zeros(n, dtype=np.int8)
-    point, way = np.zeros((n, 3)), np.zeros((n, 3))
-    for group, rows in _groups(eyes, which):
-        size = max(1, CHUNK_POINTS // 6) if line_of_sight == "entrance_window" else CHUNK_POINTS
-        for part, local in _chunks(group, rows, size):
-            found = fixate(local, seen[part], line_of_sight)
-            poses = found.poses
-            angles[part] = np.stack([poses.azimuth_rad, poses.elevation_rad, poses.torsion_rad], axis=-1)
-            residual[part], status[part] = found.residual_mm, found.status
-            point[part], way[part] = found.line_of_sight_mm, found.line_of_sight_direction
-    return Fixations(Poses(*angles.T), frozen(residual), frozen(status, np.int8), frozen(point), frozen(way))
-
-
 def features(
     eyes: Sequence[EyeModel],
     eye_index: npt.ArrayLike,
@@ -145,17 +113,17 @@ def features(
     ellipse, in_image = np.full((n, 6), np.nan), np.zeros((n, boundary_points), dtype=bool)
     glints, glint_residual = np.full((n, m, p, 2), np.nan), np.full((n, m, p), np.nan)
     glint_status, glint_in_image = np.zeros((n, m, p), dtype=np.int8), np.zeros((n, m, p), dtype=bool)
-    for group, rows in _groups(eyes, which):
+    for group, rows in groups(eyes, which):
         for number in np.unique(cams[rows]):
             camera = cameras[number]
-            for block, turned in _chunks(group, rows[cams[rows] == number], max(1, CHUNK_POINTS // max(m, 4))):
+            for block, turned in chunks(group, rows[cams[rows] == number], max(1, CHUNK_POINTS // max(m, 4))):
                 view = _View.of(turned, _pose_rows(poses, block), position[block], camera)
                 for j, order in enumerate(purkinje if m else ()):
                     exits, residual, status = glint_exits(turned, order, view.into_eye(lights), view.camera_mm)
                     pixels, status = view.project(exits, status)
                     glints[block, :, j], glint_status[block, :, j] = pixels, status
                     glint_residual[block, :, j], glint_in_image[block, :, j] = residual, camera.in_image(pixels)
-                for inner in _slices(len(block), max(1, CHUNK_POINTS // boundary_points)):
+                for inner in slices(len(block), max(1, CHUNK_POINTS // boundary_points)):
                     part, eye, near = block[inner], take_eyes(turned, np.arange(len(block))[inner]), view.rows(inner)
                     # The last point is the stop's centre.
                     exits, residual, status = pupil_exits(eye, boundary_points, near.camera_mm)
@@ -248,41 +216,5 @@ class _View:
         return pixels, status
 
 
-def _groups(eyes: Sequence[EyeModel], which: Indices) -> list[tuple[tuple[EyeModel, Indices | None], Indices]]:
-    """Rows whose eyes can be traced together: ((eye or stacked eyes, row -> eye of the stack), rows)."""
-    kinds: dict[object, list[int]] = {}
-    for k in np.unique(which):
-        kinds.setdefault(structure_of(eyes[k]), []).append(int(k))
-    out: list[tuple[tuple[EyeModel, Indices | None], Indices]] = []
-    for members in kinds.values():
-        if len(members) <= FEW_EYES:
-            out += [((eyes[k], None), np.flatnonzero(which == k)) for k in members]
-        else:
-            place = np.full(len(eyes), -1, dtype=np.intp)
-            place[members] = np.arange(len(members))
-            rows = np.flatnonzero(place[which] >= 0)
-            out.append(((stack_eyes([eyes[k] for k in members]), place[which]), rows))
-    return out
-
-
-def _chunks(group: tuple[EyeModel, Indices | None], rows: Indices, size: int) -> list[tuple[Indices, EyeModel]]:
-    eye, place = group
-    parts = [rows[part] for part in _slices(len(rows), size)]
-    return [(part, eye if place is None else take_eyes(eye, place[part])) for part in parts]
-
-
-def _slices(count: int, size: int) -> list[slice]:
-    """Equal pieces of at most `size`: a short rest would cost the interpreter as much as a full piece."""
-    pieces = max(1, -(-count // size))
-    edges = [count * k // pieces for k in range(pieces + 1)]
-    return [slice(low, high) for low, high in pairwise(edges)]
-
-
-def _pose_rows(poses: Poses, rows: Indices) -> Poses:
+def _pose_rows(poses: Poses, rows: npt.NDArray[np.intp]) -> Poses:
     return Poses(poses.azimuth_rad[rows], poses.elevation_rad[rows], poses.torsion_rad[rows])
-
-
-FEW_EYES = 4
-"""Up to so many different eyes are traced one after the other with plain numbers; more are stacked."""
-
-__all__ = ["Features", "features", "fixations", "reason_of"]

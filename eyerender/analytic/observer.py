@@ -1,8 +1,9 @@
-"""A scene observed by ray optics."""
+"""The analytic observer: frames traced by ray optics."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -10,62 +11,80 @@ import numpy as np
 
 from ..arrays import Bools, Floats, frozen
 from ..errors import InputError
-from ..eye.pose import Poses, listing_torsion
+from ..eye.pose import Poses
 from ..geometry.ellipse import fit_ellipse_direct
-from ..observation import EYES, MISSING, OK, PARTIAL, GlintFeatures, Observations, PoseTruth, PupilFeatures
+from ..observation import EYES, MISSING, OK, PARTIAL, GlintFeatures, Observations, PupilFeatures
+from ..rig.rig import RigLike
 from ..scene import Frames, Scene
-from ..status import Status
-from .features import Features, features, fixations, reason_of
+from .features import Features, features, reason_of
 
 ARC_POINTS = 6
 ARC_GAP_DEG = 120.0
 """What an ellipse of a partial pupil needs: as many points that are seen, and no longer stretch between two of them."""
 
 
-def observe(scene: Scene, *, boundary_points: int = 30) -> Observations:
-    """Every (frame, eye) of a scene, in the scene's order.
-
-    Raises:
-        InputError: a target that no pose of an eye fixates; the message says which, and why.
-    """
-    return observe_in_detail(scene, boundary_points=boundary_points)[0]
-
-
-def observe_in_detail(
-    scene: Scene, *, boundary_points: int = 30, purkinje: Sequence[int] = (1,)
-) -> tuple[Observations, Features]:
-    """Observe a scene and keep residuals, the pupil's deviation from an ellipse and Purkinje images too.
+@dataclass(frozen=True, slots=True)
+class AnalyticObserver:
+    """Ray optics: the apparent pupil and the glints as they exactly are.
 
     Args:
-        scene: the scene, whose frames are observed.
-        boundary_points: number of traced points of each pupil's boundary.
-        purkinje: which images, from 1 (the glint) to 4. Images for which the eye has no surface are refused.
-
-    Returns:
-        The observations, and the features that a record has no place for.
+        boundary_points: how many points of the pupil boundary are traced.
     """
-    has = scene.eye("right").purkinje_orders
-    if not set(purkinje) <= set(has):
-        raise InputError(
-            f"must be among {', '.join(map(str, has))}: {scene.eye_spec.name} has no other Purkinje images",
-            path="purkinje",
+
+    boundary_points: int = 30
+
+    def observe(self, frames: Frames, rig: RigLike | None = None) -> Observations:
+        """Trace every (frame, eye); `rig` replaces the one that the frames were made for."""
+        return self.observe_in_detail(frames, rig)[0]
+
+    def observe_in_detail(
+        self, frames: Frames, rig: RigLike | None = None, *, purkinje: Sequence[int] = (1,)
+    ) -> tuple[Observations, Features]:
+        """Trace with all details: residuals, how far the pupil is from an ellipse, Purkinje images.
+
+        Args:
+            frames: n of them.
+            rig: replaces the one that the frames were made for.
+            purkinje: which images, from 1 (the glint) to 4.
+
+        Raises:
+            InputError: the eye has no surface for one of the Purkinje images.
+        """
+        frames = frames.seen_by(rig)
+        scene, index, pose = frames.scene, frames.index, frames.pose
+        has = scene.eye("right").purkinje_orders
+        if not set(purkinje) <= set(has):
+            raise InputError(
+                f"must be among {', '.join(map(str, has))}: {scene.eye_spec.name} has no other Purkinje images",
+                path="purkinje",
+            )
+        seen = features(
+            [scene.eye(side) for side in EYES],
+            index.eye,
+            Poses(pose.azimuth_rad, pose.elevation_rad, pose.torsion_rad),
+            index.eye_position_mm + index.head_mm,
+            scene.rig.cameras,
+            index.camera,
+            np.array([light.position_mm for light in scene.rig.lights]),
+            boundary_points=self.boundary_points,
+            purkinje=(1, *sorted(set(purkinje) - {1})),
         )
-    orders = (1, *sorted(set(purkinje) - {1}))
-    frames = scene.frames()
-    pose = poses_of(scene, frames)
-    index = frames.index
-    seen = features(
-        [scene.eye(side) for side in EYES],
-        index.eye,
-        Poses(pose.azimuth_rad, pose.elevation_rad, pose.torsion_rad),
-        index.eye_position_mm + index.head_mm,
-        scene.rig.cameras,
-        index.camera,
-        np.array([light.position_mm for light in scene.rig.lights]),
-        boundary_points=boundary_points,
-        purkinje=orders,
-    )
-    return Observations(index, pose, pupil_features(seen), glint_features(seen)), seen
+        return Observations(index, pose, pupil_features(seen), glint_features(seen)), seen
+
+
+def trace(frames: Frames | Scene, rig: RigLike | None = None, *, boundary_points: int = 30) -> Observations:
+    """The apparent pupils and glints of frames, or of all frames of a scene, by ray optics.
+
+    Args:
+        frames: what to observe.
+        rig: replaces the one that the frames were made for.
+        boundary_points: how many points of each pupil boundary are traced.
+
+    Raises:
+        InputError: a target of the scene that no pose of an eye fixates; the message says which, and why.
+    """
+    frames = frames.frames() if isinstance(frames, Scene) else frames
+    return AnalyticObserver(boundary_points).observe(frames, rig)
 
 
 def purkinje_records(observed: Observations, seen: Features, orders: Sequence[int]) -> list[dict[str, Any]]:
@@ -87,38 +106,6 @@ def purkinje_records(observed: Observations, seen: Features, orders: Sequence[in
             }
         )
     return out
-
-
-def poses_of(scene: Scene, frames: Frames) -> PoseTruth:
-    """The pose of each observation: given, or the one that fixates its target."""
-    index = frames.index
-    azimuth, elevation = frames.direction_rad[:, 0].copy(), frames.direction_rad[:, 1].copy()
-    residual = np.where(np.isnan(azimuth), np.nan, 0.0)
-    aimed = np.flatnonzero(np.isnan(azimuth))
-    if len(aimed):
-        # Cameras see the same pose: solve once for each head position, fixation and eye.
-        keys = np.stack([index.head[aimed], index.fixation[aimed], index.eye[aimed]], axis=-1)
-        _, first, back = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        rows = aimed[first]
-        found = fixations(
-            [scene.eye(side) for side in EYES],
-            index.eye[rows],
-            index.target_mm[rows],
-            index.eye_position_mm[rows] + index.head_mm[rows],
-            scene.spec.eye.line_of_sight,
-        )
-        bad = np.flatnonzero(found.status != Status.OK)
-        if len(bad):
-            row = rows[bad[0]]
-            target = ", ".join(f"{v:g}" for v in index.target_mm[row])
-            raise InputError(
-                f"the {EYES[index.eye[row]]} eye cannot fixate ({target}) mm: {found.reason(int(bad[0]))}",
-                path=f"targets.{index.fixation[row]}",
-            )
-        back = back.reshape(-1)
-        azimuth[aimed], elevation[aimed] = found.poses.azimuth_rad[back], found.poses.elevation_rad[back]
-        residual[aimed] = found.residual_mm[back]
-    return PoseTruth(frozen(azimuth), frozen(elevation), frozen(listing_torsion(azimuth, elevation)), frozen(residual))
 
 
 def pupil_features(seen: Features) -> PupilFeatures:

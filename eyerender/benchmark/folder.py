@@ -23,7 +23,8 @@ from ..jsonlines import JsonLines
 from ..observation import OK, Observations
 from ..rig.camera import PinholeCamera
 from ..rig.rig import RigGeometry
-from ..scene import Scene, SceneSpec
+from ..scene import Scene
+from ..scenespec import SceneSpec
 
 IDEAL_SCHEMA = "eyerender/ideal-images/1"
 # Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens.

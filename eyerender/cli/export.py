@@ -36,7 +36,6 @@ def export_scene(
         side: The eye, right or left (default: the first one that the frame shows).
         spp: Samples per pixel requested in the file; the stock path integrator needs many.
     """
-    from ..analytic.observer import observe
     from ..capture import check_windows, render_job
     from ..observation import EYES
     from ..outfolder import MARKER, staged
@@ -48,16 +47,16 @@ def export_scene(
     loaded = load_scene(scene, eye=eye)
     heed(loaded.warnings())
     check_windows(loaded)
-    observed = observe(loaded)
+    frames = loaded.frames()
     if side is not None and side not in EYES:
         raise InputError("must be right or left", source="--side")
-    index = observed.index
-    rows = [r for r in range(len(observed)) if index.frame[r] == frame and side in (None, EYES[index.eye[r]])]
+    index = frames.index
+    rows = [r for r in range(len(frames)) if index.frame[r] == frame and side in (None, EYES[index.eye[r]])]
     if not rows:
         shown = " and ".join(loaded.spec.subject.eyes)
         raise InputError(f"the scene has frames 0 to {int(index.frame.max())}, eyes {shown}", source="--frame")
     with staged(folder, overwrite=overwrite) as stage:
-        written = write_scene(render_job(loaded, observed, rows[0]), stage, spp=spp)
+        written = write_scene(render_job(frames, rows[0]), stage, spp=spp)
         name = written.name
     files = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file() and p.name != MARKER)
     data = {"schema": "eyerender/export-scene/1", "path": str(folder), "scene": name, "files": files}

@@ -37,7 +37,7 @@ def render(
         spp: Replace the scene's samples per pixel.
         exr: Also write the noise-free linear irradiance as EXR.
     """
-    from ..capture import render_folder
+    from ..renderedfolder import render_folder
     from ..scene import load_scene
 
     positive("--threads", threads)

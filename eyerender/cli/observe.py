@@ -38,7 +38,7 @@ def features(
         purkinje: Add these Purkinje images (1 to 4) and the deviation of the pupil from an ellipse to the JSON.
     """
     # Not through `observers`, which would load OpenCV for nothing.
-    from ..analytic.observer import observe_in_detail, purkinje_records
+    from ..analytic.observer import AnalyticObserver, purkinje_records
     from ..scene import load_scene
 
     if points < 6:
@@ -49,7 +49,7 @@ def features(
     heed = Heed(strict)
     loaded = load_scene(scene, eye=eye)
     heed(loaded.warnings())
-    observed, seen = observe_in_detail(loaded, boundary_points=points, purkinje=purkinje or (1,))
+    observed, seen = AnalyticObserver(points).observe_in_detail(loaded.frames(), purkinje=purkinje or (1,))
     data: dict[str, Any] = {
         "schema": "eyerender/features/1",
         "rig": loaded.rig_mapping(),
@@ -81,7 +81,7 @@ def extract(
         gamma: Encoding gamma of the pixel values; 1 is linear.
         record: Version of the records in the JSON, 1 or 2.
     """
-    from ..observers import ImageObserver
+    from ..imageobserver import ImageObserver
     from ..scene import load_scene
 
     if not images:

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from ..arrays import Bytes
 from ..backends.choose import BackendChoice
-from ..capture import WindowImage, make_renderer, noiseless, render_windows
+from ..capture import EyeImage, make_renderer, noiseless, render_windows
+from ..labels import image_labels
 from ..plausibility import is_saturated
-from ..scene import Scene
-from .labels import image_labels
 from .line import image_line
 from .plan import Plan
 from .realise import Realised, Rejection, realise
@@ -68,26 +67,25 @@ class Maker:
         return MadeSample(index, tuple(self._images(found)), found.rejections)
 
     def _images(self, found: Realised) -> Iterator[MadeImage]:
-        scene, observations = found.scene, found.observations
-        if found.sample is None or scene is None or observations is None:
+        if found.frames is None or found.observations is None:
             return
-        for image in render_windows(scene, observations, renderer=self.renderer):
-            labels = image_labels(scene, observations, image)
+        for image in render_windows(found.frames, renderer=self.renderer):
+            labels = image_labels(image, found.observations)
             name, line = image_line(found, image.row, self.frames, image.window, labels)
             kinds = self.plan.spec.labels.pictures
-            pictures = {kind: _PICTURES[kind](scene, image) for kind in kinds}
-            yield MadeImage(name, pictures, line, is_saturated(image.dn, scene.spec.sensor))
+            pictures = {kind: _PICTURES[kind](image) for kind in kinds}
+            yield MadeImage(name, pictures, line, is_saturated(image.counts, image.scene.spec.sensor))
 
 
-def _amodal(scene: Scene, image: WindowImage) -> Bytes:
+def _amodal(image: EyeImage) -> Bytes:
     labels = image.rendered.labels
     assert labels is not None
     return labels.amodal
 
 
-_PICTURES: dict[str, Callable[[Scene, WindowImage], NDArray[Any]]] = {
-    "images": lambda _, image: image.dn,
-    "masks": lambda _, image: image.mask,
+_PICTURES: dict[str, Callable[[EyeImage], NDArray[Any]]] = {
+    "images": lambda image: image.counts,
+    "masks": lambda image: image.parts,
     "amodal_masks": _amodal,
     "noiseless": noiseless,
 }

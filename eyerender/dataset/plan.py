@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from ..errors import InputError, InputWarning
 from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
-from ..scene import Scene, SceneSpec
+from ..scene import Scene
+from ..scenespec import SceneSpec
 from .draws import is_draw, unit_number
 from .files import check_files, sum_of_file, sums_of_files
 from .spec import DatasetSpec, find_dataset

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..analytic.observer import observe
+from ..analytic.observer import trace
 from ..arrays import Bools, Floats
 from ..capture import check_windows
 from ..errors import InputError
 from ..observation import Observations
 from ..rig.camera import Window
-from ..scene import Scene
+from ..scene import Frames, Scene
 from .plan import Plan, Sample
 
 
@@ -37,9 +37,14 @@ class Realised:
 
     index: int
     sample: Sample | None
-    scene: Scene | None
+    frames: Frames | None
     observations: Observations | None
     rejections: tuple[Rejection, ...]
+
+    @property
+    def scene(self) -> Scene | None:
+        """The sample's scene."""
+        return None if self.frames is None else self.frames.scene
 
 
 def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
@@ -62,7 +67,8 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
         try:
             scene = sample.build()
             check_windows(scene)
-            found = observe(scene, boundary_points=spec.labels.boundary_points)
+            posed = scene.frames()
+            found = trace(posed, boundary_points=spec.labels.boundary_points)
             count = int(found.index.frame.max()) + 1
             if frames is not None and count != frames:
                 raise InputError(f"has {count} frames, sample 0 has {frames}")
@@ -72,7 +78,7 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
             reason = f"{error.path}: {error.reason}" if error.path else error.reason
             rejections.append(Rejection(index, attempt, reason))
             continue
-        return Realised(index, sample, scene, found, tuple(rejections))
+        return Realised(index, sample, posed, found, tuple(rejections))
     return Realised(index, None, None, None, tuple(rejections))
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from ..analytic.observer import observe
 from ..arrays import Bytes
 from ..backends.choose import BackendChoice
 from ..capture import make_renderer, render_windows
@@ -103,13 +102,13 @@ def _of_plan(plan: Plan, backend: BackendChoice, threads: int | None) -> Iterato
 
 
 def _of_scene(scene: Scene, backend: BackendChoice, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:
-    observed = observe(scene)
-    count = min(TILES, len(observed))
-    rows = np.array([k * len(observed) // count for k in range(count)])
+    frames = scene.frames()
+    count = min(TILES, len(frames))
+    rows = np.array([k * len(frames) // count for k in range(count)])
     renderer = make_renderer(backend, threads)
-    for image in render_windows(scene, observed.take(rows), renderer=renderer):
-        tile = _tile(image.dn, scene.spec.sensor.bit_depth, image.name)
-        yield count, tile, is_saturated(image.dn, scene.spec.sensor)
+    for image in render_windows(frames.take(rows), renderer=renderer):
+        tile = _tile(image.counts, scene.spec.sensor.bit_depth, image.name)
+        yield count, tile, is_saturated(image.counts, scene.spec.sensor)
 
 
 def _tile(dn: Any, bit_depth: int, caption: str) -> Tile:

@@ -11,7 +11,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from ..errors import InputError
-from ..scene import DATASET_KIND, NOT_A_DATASET, is_shipped_dataset, refuse_folder, shipped_files
+from ..scene import is_shipped_dataset, refuse_folder, shipped_files
+from ..scenespec import DATASET_KIND, NOT_A_DATASET
 from ..spec import FileSpec, Positive, Spec
 
 # Samples of a run; a Sobol sequence has no more points.

@@ -15,19 +15,21 @@ the fovea. (gkaModelEye's definition, Aguirre 2019, "A model of the entrance pup
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, Floats, Statuses
+from ..arrays import ArrayValue, Bools, Floats, Statuses, frozen
 from ..errors import InputError
 from ..geometry.surfaces import Xyz, components, join
 from ..geometry.transforms import normalize
 from ..optics.solve import apparent_points
 from ..optics.trace import trace
 from ..status import Status
+from .batch import CHUNK_POINTS, chunks, groups
 from .landmarks import path_to_retina
 from .model import EyeModel
 from .pose import Poses, Turning, into_eye
@@ -67,6 +69,31 @@ class Fixations(ArrayValue):
 
     def __len__(self) -> int:
         return len(self.residual_mm)
+
+
+def fixations(
+    eyes: Sequence[EyeModel],
+    eye_index: npt.ArrayLike,
+    target_mm: npt.ArrayLike,
+    position_mm: npt.ArrayLike,
+    line_of_sight: LineOfSightKind = "chief_ray",
+) -> Fixations:
+    """Poses of n eyes (`eyes[eye_index]`, apexes at `position_mm` in the world, head included) that fixate targets."""
+    which = np.asarray(eye_index, dtype=np.intp)
+    seen = np.asarray(target_mm, dtype=np.float64) - np.asarray(position_mm, dtype=np.float64)
+    n = len(which)
+    angles = np.zeros((n, 3))
+    residual, status = np.zeros(n), np.zeros(n, dtype=np.int8)
+    point, way = np.zeros((n, 3)), np.zeros((n, 3))
+    for group, rows in groups(eyes, which):
+        size = max(1, CHUNK_POINTS // 6) if line_of_sight == "entrance_window" else CHUNK_POINTS
+        for part, local in chunks(group, rows, size):
+            found = fixate(local, seen[part], line_of_sight)
+            poses = found.poses
+            angles[part] = np.stack([poses.azimuth_rad, poses.elevation_rad, poses.torsion_rad], axis=-1)
+            residual[part], status[part] = found.residual_mm, found.status
+            point[part], way[part] = found.line_of_sight_mm, found.line_of_sight_direction
+    return Fixations(Poses(*angles.T), frozen(residual), frozen(status, np.int8), frozen(point), frozen(way))
 
 
 def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKind = "chief_ray") -> Fixations:

@@ -1,13 +1,12 @@
-"""What an eye region hides, in words and numbers for the labels: glints, the pupil's outline, the lids' margins."""
+"""What an eye region hides of the glints, in words and numbers for the labels, and where the lid margins are."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import ndimage
 
-from ..arrays import Bools, Bytes, Floats
+from ..arrays import Bools, Floats
 from ..region.mesh import LidMargins, RegionMesh
 from ..rig.camera import PinholeCamera
 
@@ -33,36 +32,6 @@ def glint_reason(energy: Floats, open_: Bools, blockers: Sequence[str | None]) -
     ]
     by = max(sorted(set(names)), key=names.count) if names else "head"
     return f"occluded by {by}" if not np.any(open_[there]) else f"partly occluded by {by}"
-
-
-def visible_arcs_deg(part: Bytes, pupil: int, points_px: Floats, origin_px: tuple[int, int],
-                     reach_px: float = 1.5) -> list[list[float]]:  # fmt: skip
-    """Arcs [from, to] (degrees about the outline's centre, image x towards y) of the pupil's outline that are visible.
-
-    A point of the outline (k, 2) counts as visible where a pixel of the pupil lies within `reach_px` of it; points off
-    the window do not. A whole outline is [[0, 360]].
-    """
-    height, width = part.shape
-    x, y = points_px[:, 0] - origin_px[0], points_px[:, 1] - origin_px[1]
-    k = int(reach_px)
-    ball = np.hypot(*np.mgrid[-k : k + 1, -k : k + 1]) <= reach_px
-    near = ndimage.binary_dilation(part == pupil, structure=ball)
-    column, row = np.rint(x).astype(int), np.rint(y).astype(int)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    seen = np.zeros(len(x), dtype=bool)
-    seen[inside] = near[row[inside], column[inside]]
-    centre = points_px.mean(axis=0)
-    angle = np.degrees(np.arctan2(points_px[:, 1] - centre[1], points_px[:, 0] - centre[0])) % 360
-    order = np.argsort(angle)
-    angle, seen = angle[order], seen[order]
-    if np.all(seen):
-        return [[0.0, 360.0]]
-    if not np.any(seen):
-        return []
-    first = int(np.flatnonzero(~seen)[0])
-    angle, seen = np.roll(angle, -first), np.roll(seen, -first)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(int), [0]])))
-    return [[float(angle[a]), float(angle[b - 1])] for a, b in edges.reshape(-1, 2)]
 
 
 def lid_margins_px(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..analytic.observer import observe
+from ..analytic.observer import trace
 from ..arrays import Floats
 from ..observation import EYES, Observations
 from ..scene import Scene
@@ -24,7 +24,7 @@ def scene_view(scene: Scene) -> Any:
     with figure(9.5, 7.5, 1) as (fig, flat):
         flat.remove()
         ax = fig.add_subplot(projection="3d")
-        seen = observe(scene)
+        seen = trace(scene)
         rows = np.flatnonzero((seen.index.head == 0) & (seen.index.fixation == seen.index.fixation[0]))
         _screen(ax, scene)
         for k, camera in enumerate(scene.rig.cameras):

@@ -14,7 +14,8 @@ from ..gaze.estimate import angular_error_deg, binocular_average
 from ..gaze.regression import FUNCTIONS, Regression
 from ..observation import Observations
 from ..rig.rig import RigGeometry
-from ..scene import Scene, SceneSpec, load_scene
+from ..scene import Scene, load_scene
+from ..scenespec import SceneSpec
 from .authors_estimators import MinimumNormRegression
 from .literature import CALIBRATION_SETS
 from .results import Departure, Row, mean_row

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..analytic.observer import observe
+from ..analytic.observer import trace
 from ..arrays import Floats, frozen
 from ..errors import InputError
 from ..eye.spec import EyeSpec
@@ -22,7 +22,8 @@ from ..gaze.guestrin import GuestrinEizenman
 from ..gaze.quality import quality
 from ..gaze.regression import Regression
 from ..observation import Observations
-from ..scene import Scene, SceneSpec
+from ..scene import Scene
+from ..scenespec import SceneSpec
 from . import blignaut, guestrin
 from .literature import CALIBRATION_SETS
 from .results import Row, mean_row
@@ -112,7 +113,7 @@ def conditions_part(eye: str) -> ConditionsPart:
         keys |= {"eye": "right"} if name == "model-based" else both
         columns, rows = GRID if name == "model-based" else (15, 9)
         wide = _changed(tracker.scene, {"targets": {"grid": [columns, rows]}})
-        over = tracker.errors_deg(observe(wide))
+        over = tracker.errors_deg(trace(wide))
         out.screen_maps[name] = over.reshape(columns, rows).T
         out.rows.append(mean_row(errors, variant=f"{name}, as calibrated", **keys))
         out.rows.append(mean_row(over, variant=f"{name}, {columns} x {rows} targets", **keys))
@@ -121,7 +122,7 @@ def conditions_part(eye: str) -> ConditionsPart:
         out.diameters[name] = []
         for diameter in DIAMETERS_MM:
             row = mean_row(
-                tracker.errors_deg(observe(_changed(tracker.scene, {"eye": {"pupil_diameter_mm": diameter}}))),
+                tracker.errors_deg(trace(_changed(tracker.scene, {"eye": {"pupil_diameter_mm": diameter}}))),
                 variant=f"{name}, pupil {diameter:g} mm",
                 **keys,
             )
@@ -168,7 +169,7 @@ def _changed(scene: Scene, changes: dict[str, dict[str, Any]]) -> Scene:
 
 def _calibrated(scene: Scene) -> tuple[_Tracker, Observations]:
     """The scene's tracker, calibrated in it, and what it was calibrated and tested on."""
-    seen = observe(scene)
+    seen = trace(scene)
     if len(scene.rig.lights) > 1:
         fitted = guestrin.estimator(guestrin.CORRECTED).fit(seen, scene.rig)
         return _Tracker("model-based", fitted, scene), seen
@@ -187,7 +188,7 @@ def _over_heads(tracker: _Tracker, keys: dict[str, Any]) -> tuple[Floats, list[R
     """Mean errors (depth, sideways) of nine targets over head positions."""
     places = [[x, y, 0.0] for x in HEAD_MM for y in HEAD_MM]
     scene = _changed(tracker.scene, {"targets": {"grid": [3, 3]}, "subject": {"head_positions_mm": places}})
-    errors = tracker.errors_deg(observe(scene)).reshape(len(places), -1)
+    errors = tracker.errors_deg(trace(scene)).reshape(len(places), -1)
     rows = [
         mean_row(e, variant=f"{tracker.name}, head at ({p[0]:g}, {p[1]:g}, 0) mm", **keys)
         for p, e in zip(places, errors, strict=True)

@@ -16,7 +16,8 @@ from ..gaze.estimate import GazePoints, angular_error_deg
 from ..gaze.parameters import Calibration, EyeParameters, ParameterBounds
 from ..observation import EYES, Observations
 from ..rig.rig import RigGeometry
-from ..scene import Scene, SceneSpec, load_scene
+from ..scene import Scene, load_scene
+from ..scenespec import SceneSpec
 from .authors_estimators import AuthorsGuestrinEizenman
 from .results import Departure, Row, mean_row
 

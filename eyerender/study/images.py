@@ -26,7 +26,8 @@ from ..imagefolder import DATASET, METADATA, RUN, ImageEntry
 from ..jsonlines import JsonLines
 from ..observation import EYES, Observations
 from ..progress import Progress, Say
-from ..scene import Scene, SceneSpec
+from ..scene import Scene
+from ..scenespec import SceneSpec
 
 _SHARD_IMAGES = 27  # two or three seconds of work: what a kill costs at most
 _PATIENCE_S = 60.0  # an image, before a worker that says nothing is taken for dead
@@ -67,22 +68,22 @@ class StudyImages:
     def holds(self, scene: Scene) -> bool:
         """Whether every image of a shot's scene is there."""
         found = self.of(scene)
-        return len(found) == len(scene.frames()) and all(entry.path.is_file() for entry in found)
+        return len(found) == len(scene.index()) and all(entry.path.is_file() for entry in found)
 
     def observe(self, scene: Scene) -> Observations:
         """The features of a shot's images; raises `InputError` where they are not there."""
-        from ..observers import ImageObserver
+        from ..imageobserver import ImageObserver
 
         if not self.holds(scene):
             raise InputError("its images are not in the study's dataset", source=scene.name)
-        return ImageObserver().observe_entries(self.of(scene), scene.frames().index, scene)
+        return ImageObserver().observe_entries(self.of(scene), scene.index(), scene)
 
 
 def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[Shot]:
     """One shot an eye; with `facing` one an eye and head position, the cameras turned to the eye."""
     data = (scene.spec if spp is None else scene.spec.with_spp(spp)).to_mapping()
     data["sensor"]["noise"] = noise
-    index, out = scene.frames().index, []
+    index, out = scene.index(), []
     heads = scene.spec.subject.head_positions_mm
     for head in range(len(heads)) if facing else (None,):
         for side in sorted(scene.spec.subject.eyes, key=EYES.index):
@@ -132,7 +133,7 @@ def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) ->
             workers=settings.workers,
             backend=settings.backend,
             threads=settings.threads,
-            timeout_s=600.0 + _PATIENCE_S * len(scenes[0].frames()),
+            timeout_s=600.0 + _PATIENCE_S * len(scenes[0].index()),
             overwrite=not _begun(settings.folder, plan),
         )
         generate(
@@ -176,7 +177,7 @@ def dataset_spec(study: str, scenes: Sequence[Scene]) -> Any:
             "one head position, all its fixations.",
             "count": len(scenes),
             "subjects": len(by_model),
-            "shard_size": max(1, _SHARD_IMAGES // len(scenes[0].frames())),
+            "shard_size": max(1, _SHARD_IMAGES // len(scenes[0].index())),
             "splits": {"study": 1.0},
             "require": "nothing",
             "attempts": 1,

@@ -11,16 +11,16 @@ centre: through a camera without distortion it becomes another ellipse exactly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from ..analytic.observer import observe
+from ..analytic.observer import trace
 from ..arrays import Floats, Ints, frozen
 from ..errors import InputError
 from ..geometry.ellipse import fit_ellipse_direct, points_on_ellipse
-from ..observation import Observations, concatenate
+from ..observation import Observations, concatenate, taken
 from ..rig.camera import PinholeCamera
 from ..scene import Scene
 from .images import Shot, StudyImages, shots
@@ -46,7 +46,7 @@ class Observing:
             InputError: a target that no pose of an eye fixates, or images that are not there.
         """
         if self.kind == "analytic":
-            return observe(scene)
+            return trace(scene)
         if self.images is None:
             raise InputError("the image observer needs images")
         parts, order = [], []
@@ -99,6 +99,4 @@ def moved(observations: Observations, seen_by: PinholeCamera, told: PinholeCamer
 
 def with_index_of(observations: Observations, scene: Scene, rows: Ints) -> Observations:
     """The observations as rows of a scene's own index."""
-    index = scene.frames().index
-    part = replace(index, **{f.name: frozen(v := getattr(index, f.name)[rows], v.dtype) for f in fields(index)})
-    return replace(observations, index=part)
+    return replace(observations, index=taken(scene.index(), rows))

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.analytic.features import features, fixations
+from eyerender.analytic.features import features
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
+from eyerender.eye.fixation import fixations
 from eyerender.eye.model import EyeSpec
 from eyerender.eye.pose import Poses, Turning, into_eye, rigid_motion
 from eyerender.geometry.surfaces import components, join

@@ -7,16 +7,18 @@ import json
 import numpy as np
 import pytest
 
-from eyerender.analytic.features import features, fixations
-from eyerender.analytic.observer import observe
+from eyerender.analytic.features import features
+from eyerender.analytic.observer import trace
 from eyerender.errors import InputError
-from eyerender.scene import Scene, SceneSpec, load_scene, shipped_scenes
+from eyerender.eye.fixation import fixations
+from eyerender.scene import Scene, load_scene, shipped_scenes
+from eyerender.scenespec import SceneSpec
 
 
 @pytest.mark.parametrize("name", sorted(shipped_scenes()))
 def test_every_shipped_scene_is_observed(name):
     scene = load_scene(name)
-    seen = observe(scene)
+    seen = trace(scene)
     assert len(seen) == len(scene.frames())
     assert seen.pupil.ok.all()
     assert np.nanmax(seen.pose.residual_mm) < 1e-6
@@ -31,7 +33,7 @@ def test_every_shipped_scene_is_observed(name):
 def test_rows_are_what_their_index_says():
     """Each row computed again alone, from its target, head, eye and camera."""
     scene = load_scene("guestrin2006", eye="E4")
-    seen = observe(scene)
+    seen = trace(scene)
     lights = np.array([light.position_mm for light in scene.rig.lights])
     for k in np.random.default_rng(0).choice(len(seen), 12, replace=False):
         at = seen.index
@@ -48,14 +50,14 @@ def test_a_target_out_of_reach_is_refused_by_its_place():
     data["targets"] = {"world_mm": [[800.0, 0.0, 0.0], [-500.0, 0.0, 0.0]]}
     scene = Scene.of(SceneSpec.from_mapping(data))
     with pytest.raises(InputError, match=r"targets\.1: the right eye cannot fixate \(-500, 0, 0\) mm"):
-        observe(scene)
+        trace(scene)
 
 
 def test_given_poses_are_taken_as_they_are():
     data = load_scene("quickstart").spec.to_mapping()
     del data["targets"]
     data["poses"] = [{"azimuth_deg": 5.0, "elevation_deg": -12.0}]
-    seen = observe(Scene.of(SceneSpec.from_mapping(data)))
+    seen = trace(Scene.of(SceneSpec.from_mapping(data)))
     assert np.allclose(np.degrees(seen.pose.azimuth_rad), 5.0, atol=1e-13)
     assert np.allclose(np.degrees(seen.pose.elevation_rad), -12.0, atol=1e-13)
     assert seen.pupil.ok.all()
@@ -65,6 +67,6 @@ def test_the_reading_of_the_line_of_sight_is_the_scenes():
     scene = load_scene("blignaut2014")
     data = scene.spec.to_mapping()
     data["eye"]["line_of_sight"] = "entrance_window"
-    other = observe(Scene.of(SceneSpec.from_mapping(data)))
-    gap = np.abs(np.degrees(other.pose.azimuth_rad - observe(scene).pose.azimuth_rad))
+    other = trace(Scene.of(SceneSpec.from_mapping(data)))
+    gap = np.abs(np.degrees(other.pose.azimuth_rad - trace(scene).pose.azimuth_rad))
     assert 1e-4 < gap.max() < 0.02

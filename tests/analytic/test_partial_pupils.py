@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.features import features
-from eyerender.analytic.observer import observe, pupil_features, seen_arcs_deg
+from eyerender.analytic.observer import pupil_features, seen_arcs_deg, trace
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses
 from eyerender.gaze.regression import pupil_glint_vectors
 from eyerender.observation import MISSING, OK, PARTIAL, Observations
 from eyerender.rig.camera import PinholeCamera
-from eyerender.scene import Scene, SceneSpec
+from eyerender.scene import Scene
+from eyerender.scenespec import SceneSpec
 from eyerender.status import Status
 from tests.support.exhaustive import exhaustive
 
@@ -88,7 +89,7 @@ def test_beyond_90_degrees_is_seen_what_physics_lets_be_seen(name):
 
 
 def test_a_partial_pupil_tells_its_arcs():
-    found = observe(scene(95.0)).pupil
+    found = trace(scene(95.0)).pupil
     assert found.status[0] == PARTIAL
     assert found.reason[0].startswith("outside the limbus (")
     (arc,) = found.arcs_deg[0]
@@ -104,7 +105,7 @@ def test_a_partial_pupil_tells_its_arcs():
 def test_the_ellipse_of_arcs_is_near_that_of_the_whole_outline():
     """The whole pupil is seen at 80 degrees; two thirds of it must tell nearly the same ellipse."""
     view = scene(80.0)
-    whole = observe(view).pupil
+    whole = trace(view).pupil
     seen = features(
         [view.eye("right")],
         [0],
@@ -143,14 +144,14 @@ def test_arcs_run_from_the_first_to_the_last_point_that_is_seen(hidden, arcs):
 
 
 def test_a_camera_behind_the_head_sees_the_back_of_the_iris():
-    found = observe(scene(170.0)).pupil
+    found = trace(scene(170.0)).pupil
     assert found.status[0] == MISSING
     assert found.reason[0] == "behind the iris (30 of 30 boundary points)"
-    assert next(observe(scene(170.0)).records())["pupil"]["arcs_deg"] is None
+    assert next(trace(scene(170.0)).records())["pupil"]["arcs_deg"] is None
 
 
 def test_version_1_of_the_record_has_no_partial_pupils():
-    observed = observe(scene(95.0))
+    observed = trace(scene(95.0))
     (new,), (old,) = observed.records(), observed.records(1)
     assert (new["schema"], old["schema"]) == ("eyerender/record/2", "eyerender/record/1")
     assert (new["pupil"]["status"], old["pupil"]["status"]) == (PARTIAL, MISSING)
@@ -161,7 +162,7 @@ def test_version_1_of_the_record_has_no_partial_pupils():
 
 
 def test_both_versions_are_read_together():
-    partial, whole = observe(scene(95.0)), observe(scene(40.0))
+    partial, whole = trace(scene(95.0)), trace(scene(40.0))
     lines = [*partial.records(), *whole.records(1), *whole.records()]
     both = Observations.from_records(json.loads(json.dumps(lines)))
     assert list(both.pupil.status) == [PARTIAL, OK, OK]
@@ -171,7 +172,7 @@ def test_both_versions_are_read_together():
 
 
 def test_a_damaged_partial_record_is_refused_by_name():
-    (line,) = observe(scene(90.0)).records()
+    (line,) = trace(scene(90.0)).records()
     for key, value in (
         ("arcs_deg", [[1, 2, 3]]),
         ("arcs_deg", 7),
@@ -186,7 +187,7 @@ def test_a_damaged_partial_record_is_refused_by_name():
 
 
 def test_estimators_take_no_partial_pupil():
-    observed = observe(scene(90.0))
+    observed = trace(scene(90.0))
     assert np.isfinite(observed.pupil.arc_ellipse).all()
     vectors, reason = pupil_glint_vectors(observed, normalised=False)
     assert reason[0] == "no pupil"

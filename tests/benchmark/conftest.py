@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 
 import make_ideal_images as ideal
-from eyerender.capture import render_folder
 from eyerender.errors import BackendError
-from eyerender.scene import Scene, SceneSpec, shipped_scenes
+from eyerender.renderedfolder import render_folder
+from eyerender.scene import Scene, shipped_scenes
+from eyerender.scenespec import SceneSpec
 
 
 @pytest.fixture(scope="session")

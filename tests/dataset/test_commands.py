@@ -11,7 +11,7 @@ from PIL import Image
 
 from eyerender.cli.app import run
 from eyerender.imagefolder import ImageFolder
-from eyerender.observers import scene_of
+from eyerender.imageobserver import scene_of
 from tests.support.dataset_specs import write
 
 pytestmark = pytest.mark.render

@@ -24,7 +24,7 @@ from eyerender.errors import BackendError
 from eyerender.gaze.records import load_observations
 from eyerender.imagefile import read_image
 from eyerender.imagefolder import ImageFolder
-from eyerender.observers import scene_of
+from eyerender.imageobserver import scene_of
 from eyerender.quickstart import compare_folder
 from tests.support.dataset_specs import make, plan
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json

@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from eyerender.dataset.labels import moments_ellipse
 from eyerender.eye.spec import EyeSpec
 from eyerender.geometry.ellipse import Ellipse, points_on_ellipse, signed_distance
 from eyerender.imagefile import read_image
 from eyerender.imagefolder import ImageFolder
-from eyerender.scene import SceneSpec
+from eyerender.labels import moments_ellipse
+from eyerender.scenespec import SceneSpec
 
 pytestmark = pytest.mark.render
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from eyerender.capture import render_folder
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
-from eyerender.scene import Scene, SceneSpec, load_scene, shipped_scenes
+from eyerender.renderedfolder import render_folder
+from eyerender.scene import Scene, load_scene, shipped_scenes
+from eyerender.scenespec import SceneSpec
 from tests.support.dataset_specs import make
 
 pytestmark = pytest.mark.render

@@ -9,10 +9,11 @@ import shutil
 import numpy as np
 import pytest
 
-from eyerender.capture import render_folder
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.validate import SAMPLE, sampled, validate
-from eyerender.scene import Scene, SceneSpec
+from eyerender.renderedfolder import render_folder
+from eyerender.scene import Scene
+from eyerender.scenespec import SceneSpec
 
 pytestmark = pytest.mark.render
 

@@ -8,13 +8,13 @@ import shutil
 import numpy as np
 import pytest
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.dataset.export import export
-from eyerender.dataset.labels import EyeInWindow
 from eyerender.dataset.validate import validate
 from eyerender.dataset.validation.truth import SceneTruth
 from eyerender.errors import InputError
 from eyerender.imagefile import read_image, write_png
+from eyerender.labels import EyeInWindow
 from eyerender.scene import load_scene
 from tests.support.dataset_specs import mapping
 
@@ -123,9 +123,9 @@ def test_what_is_no_finished_dataset_is_refused(copy, tmp_path):
 @pytest.mark.parametrize("version", [1, 2])
 def test_lines_of_either_version_of_the_record_are_computed_again(version):
     scene = load_scene("guestrin2006")
-    observed = observe(scene)
-    truth = SceneTruth(scene, observed)
-    view = EyeInWindow.of(scene, observed, 0)
+    observed = trace(scene)
+    truth = SceneTruth(scene.frames(), observed)
+    view = EyeInWindow.of(scene.frames(), 0)
     line = {
         "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
         "bit_depth": scene.spec.sensor.bit_depth,

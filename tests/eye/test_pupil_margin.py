@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.margin import HARMONICS, PupilMargin, drawn_contour
 from eyerender.eye.spec import EyeSpec
-from eyerender.scene import Scene, SceneSpec, load_scene
+from eyerender.scene import Scene, load_scene
+from eyerender.scenespec import SceneSpec
 
 PRESETS = ("desktop_tracker", "headset", "webcam", "stress")
 BARE = ("guestrin2006", "blignaut2014", "head_mounted", "quickstart")
@@ -107,7 +108,7 @@ def test_the_shift_is_seen_in_the_picture():
     for diameter in (4.0, 6.0):
         data["eye"] = {"model": "E2", "pupil_diameter_mm": diameter, "margin": {}}
         scene = Scene.of(SceneSpec.from_mapping(data))
-        centres.append(observe(scene).pupil)
+        centres.append(trace(scene).pupil)
     (surface,), (n,) = scene.eye_spec.cornea, scene.eye("right").front_indices
     depth, radius = 3.6, surface.shape.radius_mm
     seen = depth / (n - depth * (n - 1) / radius)

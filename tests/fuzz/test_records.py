@@ -12,11 +12,12 @@ from typing import Any
 import pytest
 from hypothesis import given
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.gaze.records import load_observations, rig_from_mapping
 from eyerender.gaze.store import EstimatorSpec, fit_estimator, load_estimator, predictions, save_estimator
 from eyerender.observation import Observations
-from eyerender.scene import Scene, SceneSpec, load_scene
+from eyerender.scene import Scene, load_scene
+from eyerender.scenespec import SceneSpec
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
 NAMES = ("regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman")
@@ -40,7 +41,7 @@ def features(name: str = "regression") -> dict[str, Any]:
         places = [[x, *corner] for corner in corners] + [camera["position_mm"]]
         data["rig"]["lights"] = [{**light, "position_mm": place} for place in places]
     scene = Scene.of(SceneSpec.from_mapping(data))
-    found = observe(scene, boundary_points=8)
+    found = trace(scene, boundary_points=8)
     return {"schema": "eyerender/features/1", "rig": scene.rig_mapping(), "records": list(found.records())}
 
 

@@ -11,13 +11,14 @@ import pytest
 import yaml
 from hypothesis import given
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.capture import check_windows
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.eye.catalogue import FOLDER, catalogue_names, load_eye
 from eyerender.eye.spec import EyeSpec
-from eyerender.scene import Scene, SceneSpec, load_scene, shipped_scenes
+from eyerender.scene import Scene, load_scene, shipped_scenes
+from eyerender.scenespec import SceneSpec
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
 FEW = 8  # observations: more cost time and show nothing new
@@ -50,7 +51,7 @@ def use_scene(scene: Scene) -> None:
     """All that a scene is asked for before anything is rendered."""
     if len(scene.frames()) > FEW:
         return
-    found = observe(scene, boundary_points=12)
+    found = trace(scene, boundary_points=12)
     strict_json([list(found.records()), scene.rig_mapping()])
     for x0, y0, width, height in scene.windows().values():
         assert min(x0, y0) >= 0

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.gaze.records import load_observations, rig_from_mapping
@@ -96,10 +96,11 @@ def test_calibrations_survive_their_file(tmp_path, name, vectors):
             spec = scene.spec.to_mapping()
             spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})
             spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
-            from eyerender.scene import Scene, SceneSpec
+            from eyerender.scene import Scene
+            from eyerender.scenespec import SceneSpec
 
             scene = Scene.of(SceneSpec.from_mapping(spec))
-        seen, rig = observe(scene), scene.rig
+        seen, rig = trace(scene), scene.rig
     fitted, _ = fit_estimator(EstimatorSpec.from_mapping({"name": name}), seen, rig)
     save_estimator(tmp_path / "c.json", EstimatorSpec.from_mapping({"name": name}), fitted)
     again = load_estimator(tmp_path / "c.json")
@@ -108,13 +109,14 @@ def test_calibrations_survive_their_file(tmp_path, name, vectors):
 
 def test_two_cameras_on_an_aspheric_eye(tmp_path):
     """Two cameras need no eye parameters, but a spherical cornea: E1 comes out to some thousandths of a degree."""
-    from eyerender.scene import Scene, SceneSpec
+    from eyerender.scene import Scene
+    from eyerender.scenespec import SceneSpec
 
     spec = load_scene("guestrin2006", eye="E1").spec.to_mapping()
     spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})
     spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
     scene = Scene.of(SceneSpec.from_mapping(spec), eye="E1")
-    seen = observe(scene)
+    seen = trace(scene)
     _, summary = fit_estimator(EstimatorSpec.from_mapping({"name": "shih-wu-liu"}), seen, scene.rig)
     assert summary["calibration_error_deg"]["n"] == 36
     assert summary["calibration_error_deg"]["mean_deg"] < 0.05

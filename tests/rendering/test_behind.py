@@ -16,7 +16,8 @@ from eyerender.imagefolder import ImageFolder
 from eyerender.region.globe import Globe
 from eyerender.region.mesh import region_mesh
 from eyerender.rendering.occlusion import lid_margins_px
-from eyerender.scene import Scene, SceneSpec, shipped_scenes
+from eyerender.scene import Scene, shipped_scenes
+from eyerender.scenespec import SceneSpec
 
 
 def quickstart(**changes):

@@ -13,11 +13,13 @@ import trimesh
 import yaml
 from scipy import ndimage
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.capture import make_renderer, render_job, render_windows
 from eyerender.cli.app import run
 from eyerender.errors import InputError
-from eyerender.scene import Scene, SceneSpec, load_scene
+from eyerender.scene import Scene, load_scene
+from eyerender.scenespec import SceneSpec
+from tests.support.labels import labels_of
 from tests.support.paths import SCRIPTS
 
 pytestmark = pytest.mark.render
@@ -117,13 +119,13 @@ def folder(tmp_path):
 
 
 def only(scene, renderer):
-    (image,) = render_windows(scene, observe(scene), renderer=renderer)
+    (image,) = render_windows(scene.frames(), renderer=renderer)
     return image
 
 
 def projected(scene, row: int, points: np.ndarray, side: int = 1) -> np.ndarray:
     """Pixels of points of the eye frame (of a right eye; -1: mirrored)."""
-    apex = observe(scene).index.eye_position_mm[row]
+    apex = trace(scene).index.eye_position_mm[row]
     return scene.rig.cameras[0].project(points * np.array([1, side, 1]) + apex)[0]
 
 
@@ -135,7 +137,7 @@ def test_the_opening_is_where_its_edge_projects(renderer, folder, side):
     image = only(scene, renderer)
     edge = np.column_stack([np.full(len(almond()), X_MM), almond()])
     outline = Outline(projected(scene, 0, edge, 1 if side == "right" else -1))
-    v, u = np.mgrid[: image.mask.shape[0], : image.mask.shape[1]]
+    v, u = np.mgrid[: image.parts.shape[0], : image.parts.shape[1]]
     inside = outline.contains_points(np.column_stack([u.ravel(), v.ravel()]) + image.window[:2]).reshape(u.shape)
     amodal, part = image.rendered.labels.amodal, image.rendered.labels.part
     expected = np.where(inside, amodal, 0)
@@ -146,15 +148,16 @@ def test_the_opening_is_where_its_edge_projects(renderer, folder, side):
     assert 0 < (part == 3).sum() == ((amodal == 3) & inside & (part == 3)).sum()
     # The depth of the skin is that of its plane.
     skin = ~ndimage.binary_dilation(inside)
-    camera, apex = scene.rig.cameras[0], observe(scene).index.eye_position_mm[0]
+    camera, apex = scene.rig.cameras[0], trace(scene).index.eye_position_mm[0]
     pixels = np.column_stack([u[skin], v[skin]]) + image.window[:2]
     rays, node = camera.rays(pixels.astype(float)), camera.nodal_point_mm - apex
     distance = (X_MM - node[0]) / rays[:, 0]
     np.testing.assert_allclose(image.rendered.labels.depth_mm[skin], distance, rtol=1e-5)
     # The second lamp's glint lies high on the cornea, under the upper lid; the first stands free.
-    assert [g["reason"] for g in image.labels["glints"]] == ["visible", "occluded by lid"]
-    assert image.labels["lid_margins_px"] is None
-    assert 0.5 < image.labels["iris_visible_fraction"] < 1
+    labels = labels_of(image)
+    assert [g["reason"] for g in labels["glints"]] == ["visible", "occluded by lid"]
+    assert labels["lid_margins_px"] is None
+    assert 0.5 < labels["iris_visible_fraction"] < 1
     assert image.irradiance[skin].min() > 0
 
 
@@ -163,7 +166,7 @@ def test_reasons_name_the_part(renderer, folder, part, word):
     scene = scene_of(folder, head_of(parts={"skin": ["face"], part: ["bar"]}))
     free = only(scene_of(folder, head_of(parts={"skin": ["face"]})), renderer)
     barred = only(scene, renderer)
-    first = barred.labels["glints"][0]
+    first = labels_of(barred)["glints"][0]
     assert first["reason"] == f"occluded by {word}"
     assert first["visible_share"] == 0
     # The bar, 1 mm high before the pupil of 4 mm or so, takes its band out of it.
@@ -172,9 +175,9 @@ def test_reasons_name_the_part(renderer, folder, part, word):
     xy = projected(scene, 0, corners) - barred.window[:2]
     rows = slice(int(np.ceil(xy[:, 1].min())) + 1, int(xy[:, 1].max()))
     columns = slice(int(np.ceil(xy[:, 0].min())) + 1, int(xy[:, 0].max()) - 1)
-    assert free.mask[rows, columns].min() > 0
-    assert barred.mask[rows, columns].max() == 0
-    lost = free.labels["pupil_visible_fraction"] - barred.labels["pupil_visible_fraction"]
+    assert free.parts[rows, columns].min() > 0
+    assert barred.parts[rows, columns].max() == 0
+    lost = labels_of(free)["pupil_visible_fraction"] - labels_of(barred)["pupil_visible_fraction"]
     assert 0.05 < lost < 0.4
 
 
@@ -182,7 +185,7 @@ def test_the_head_shades_the_iris(renderer, folder):
     # A lamp above the lid: the upper iris lies in the lid's shadow, the lower does not.
     bare = SceneSpec.from_mapping({**scene_data({}), "region": None})
     open_, hidden = (only(s, renderer) for s in (Scene.of(bare), scene_of(folder, head_of(parts={"skin": ["face"]}))))
-    iris = (hidden.mask == 2) & (open_.mask == 2)
+    iris = (hidden.parts == 2) & (open_.parts == 2)
     iris = ndimage.binary_erosion(iris, iterations=2)
     ratio = hidden.irradiance[iris] / open_.irradiance[iris]
     assert ratio.max() < 1.02
@@ -222,8 +225,8 @@ def test_ply_files_and_a_manifest_give_the_same_picture(renderer, folder, monkey
     (folder / "mine" / "manifest.json").write_text(json.dumps(manifest))
     written = scene_of(folder, {"file": "mine/manifest.json"})
     c = only(written, renderer)
-    assert np.array_equal(b.dn, c.dn)
-    assert np.array_equal(a.mask, b.mask)  # PLY keeps single precision
+    assert np.array_equal(b.counts, c.counts)
+    assert np.array_equal(a.parts, b.parts)  # PLY keeps single precision
     # What a folder of images stores can be read again, and other bytes make another scene.
     again = SceneSpec.from_mapping(written.spec.to_mapping())
     assert again == written.spec
@@ -251,7 +254,7 @@ def test_a_head_compiles_nothing_beside_the_procedural_region(renderer, folder):
         only(scene_of(folder, head_of(parts={"skin": ["face", "bar"]})), renderer)
         known = kernels()
         scene = scene_of(folder, head_of(parts={"skin": ["face"]}))
-        job = render_job(scene, observe(scene), 0)
+        job = render_job(scene.frames(), 0)
         renderer.radiance(job)
         renderer.labels(job)
         used = kernels()
@@ -264,7 +267,7 @@ def test_kernels_do_not_depend_on_where_memory_lies(renderer, folder):
     import drjit as dr
 
     scene = scene_of(folder, head_of(parts={"skin": ["face"]}))
-    job = render_job(scene, observe(scene), 0)
+    job = render_job(scene.frames(), 0)
     _, place = renderer.bind(job)
     found, taken = set(), []
     for k in range(12):
@@ -297,9 +300,9 @@ def test_the_own_region_as_a_head_hides_what_it_hides(renderer, tmp_path):
     subprocess.run([sys.executable, str(script), "--example", str(tmp_path)], check=True, capture_output=True)
     head = only(scene_of(tmp_path, {"file": "manifest.json"}), renderer)
     own = only(Scene.of(SceneSpec.from_mapping({**scene_data({}), "region": {}})), renderer)
-    assert np.mean(head.mask != own.mask) < 1e-4  # the file keeps five digits
-    assert [g["reason"] for g in head.labels["glints"]] == [g["reason"] for g in own.labels["glints"]]
-    assert head.labels["iris_visible_fraction"] == pytest.approx(own.labels["iris_visible_fraction"], abs=1e-3)
+    assert np.mean(head.parts != own.parts) < 1e-4  # the file keeps five digits
+    assert [g["reason"] for g in labels_of(head)["glints"]] == [g["reason"] for g in labels_of(own)["glints"]]
+    assert labels_of(head)["iris_visible_fraction"] == pytest.approx(labels_of(own)["iris_visible_fraction"], abs=1e-3)
 
 
 def test_a_mesh_in_the_cornea_is_refused_with_its_depth(renderer, folder):
@@ -314,7 +317,7 @@ def test_a_mesh_in_the_cornea_is_refused_with_its_depth(renderer, folder):
     plate.apply_translation([0.9, 0, 0])
     write_obj(folder / "head.obj", {"face": plate})
     at_rest = only(scene_of(folder, head_of(tolerance_mm=0.3)), renderer)
-    assert at_rest.mask.max() == 3
+    assert at_rest.parts.max() == 3
 
 
 REFUSED = [

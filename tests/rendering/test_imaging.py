@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.analytic.observer import observe
 from eyerender.capture import make_renderer, render_windows
 from eyerender.errors import InputError
 from eyerender.rig.defocus import confusion_px, defocused, disc, vignette
 from eyerender.rig.imaging import Lens
 from eyerender.rig.sensor import Sensor
-from eyerender.scene import Scene, SceneSpec
+from eyerender.scene import Scene
+from eyerender.scenespec import SceneSpec
 
 pytestmark = pytest.mark.render
 
@@ -42,7 +42,7 @@ def shot(renderer, **more):
             }
         )
     )  # fmt: skip
-    (image,) = render_windows(scene, observe(scene), renderer=renderer)
+    (image,) = render_windows(scene.frames(), renderer=renderer)
     return image
 
 
@@ -92,7 +92,7 @@ def test_defocus_keeps_energy_and_centroids(renderer):
     sharp, soft = shot(renderer), shot(renderer, lens={"focus_mm": 660})
     assert soft.irradiance.max() < 0.7 * sharp.irradiance.max()
     assert soft.irradiance[30:-30, 30:-30].mean() == pytest.approx(sharp.irradiance[30:-30, 30:-30].mean(), rel=5e-3)
-    assert np.array_equal(sharp.mask, soft.mask)
+    assert np.array_equal(sharp.parts, soft.parts)
     spot = np.zeros((81, 81))
     spot[40, 40], spot[40, 41] = 0.3, 0.7
     out = defocused(spot, disc(7.3))
@@ -116,7 +116,7 @@ def test_a_moving_head_smears_the_glint_about_its_place(renderer):
     # Even over 12.5 px: 12.5 / sqrt(12) = 3.6 px.
     assert wide == pytest.approx(12.5 / np.sqrt(12), abs=0.5)
     assert narrow < 1.5
-    assert np.array_equal(still.mask, moved.mask)
+    assert np.array_equal(still.parts, moved.parts)
 
 
 def test_a_panel_is_mirrored_where_a_lamp_at_its_middle_is(renderer):
@@ -141,4 +141,4 @@ def test_even_light_adds_its_share_everywhere(renderer):
     extra = bright.irradiance - dark.irradiance
     assert extra.min() > 0
     # The sclera mirrors nothing: its gain over its albedo is the surround's over its own.
-    assert np.median(extra[dark.mask == 3]) < 0.3 * np.median(extra[dark.mask == 2])
+    assert np.median(extra[dark.parts == 3]) < 0.3 * np.median(extra[dark.parts == 2])

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from eyerender.analytic.observer import observe
 from eyerender.capture import make_renderer, render_windows
-from eyerender.scene import Scene, SceneSpec
+from eyerender.scene import Scene
+from eyerender.scenespec import SceneSpec
 
 pytestmark = pytest.mark.render
 
@@ -70,7 +70,7 @@ def test_lids_take_ambient_light_from_the_globe_most_at_their_margins(renderer):
                 }
             )
         )  # fmt: skip
-        (image,) = render_windows(scene, observe(scene), renderer=renderer)
+        (image,) = render_windows(scene.frames(), renderer=renderer)
         return image
 
     lids = {"region": {"lashes": {"upper_count": 0, "lower_count": 0}}}

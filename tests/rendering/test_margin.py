@@ -96,7 +96,8 @@ def test_other_margins_compile_nothing(renderer):
 
 def drawn_scene(rig_name, side, seed, pupil_mm=4.0):
     """A study's scene of one eye with a drawn margin: a single direction, noise-free, the iris even."""
-    from eyerender.scene import Scene, SceneSpec, load_scene
+    from eyerender.scene import Scene, load_scene
+    from eyerender.scenespec import SceneSpec
 
     data = load_scene(rig_name).spec.to_mapping()
     data["eye"] = {"model": "E2", "pupil_diameter_mm": pupil_mm, "margin": {"seed": seed}}
@@ -111,13 +112,13 @@ def drawn_scene(rig_name, side, seed, pupil_mm=4.0):
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_both_observers_have_the_margin_of_a_scene(renderer, side):
-    from eyerender.analytic.observer import observe
+    from eyerender.analytic.observer import trace
     from eyerender.capture import render_job
 
     # The margin of the picture, as above, but with what a scene's key gives both observers.
     scene = drawn_scene("blignaut2014", side, 5, 5.0)
-    polygon = observe(scene, boundary_points=720).pupil.points_px[0]
-    job = render_job(scene, observe(scene), 0)
+    polygon = trace(scene, boundary_points=720).pupil.points_px[0]
+    job = render_job(scene.frames(), 0)
     black, grey = (
         renderer.radiance(replace(job, look=PLAIN.model_copy(update={"pupil_albedo": albedo})), spp=64)
         for albedo in (0.0, PLAIN.iris_albedo)
@@ -125,7 +126,7 @@ def test_both_observers_have_the_margin_of_a_scene(renderer, side):
     share = 1 - black / grey
     assert contour_error(share, polygon, job.window) < 0.02
     bare = scene.spec.model_copy(update={"eye": scene.spec.eye.model_copy(update={"margin": None})})
-    plain = observe(replace(scene, spec=bare), boundary_points=720).pupil.points_px[0]
+    plain = trace(replace(scene, spec=bare), boundary_points=720).pupil.points_px[0]
     assert contour_error(share, plain, job.window) > 0.2
 
 
@@ -135,11 +136,11 @@ def test_the_ellipse_of_the_picture_is_that_of_the_analytic_observer(renderer, r
     import cv2
     from skimage.measure import find_contours
 
-    from eyerender.analytic.observer import observe
+    from eyerender.analytic.observer import trace
     from eyerender.capture import render_job
 
     scene = drawn_scene(rig_name, "right", seed)
-    truth = observe(scene)
+    truth = trace(scene)
     job = render_job(scene, truth, 0)
     black, grey = (
         renderer.radiance(replace(job, look=PLAIN.model_copy(update={"pupil_albedo": albedo})), spp=64)

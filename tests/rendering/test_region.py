@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from eyerender.analytic.observer import observe
 from eyerender.capture import make_renderer, render_windows
+from eyerender.labels import visible_arcs_deg
 from eyerender.region.anatomy import Region
-from eyerender.rendering.occlusion import glint_reason, visible_arcs_deg
-from eyerender.scene import Scene, SceneSpec
+from eyerender.rendering.occlusion import glint_reason
+from eyerender.scene import Scene
+from eyerender.scenespec import SceneSpec
+from tests.support.labels import labels_of
 
 pytestmark = pytest.mark.render
 
@@ -47,7 +49,7 @@ def scene(eyes=("right",), poses=((0.0, 0.0),), look=None, region=None, spp=4):
 
 def images(renderer, *args, **kwargs):
     s = scene(*args, **kwargs)
-    return list(render_windows(s, observe(s), renderer=renderer))
+    return list(render_windows(s.frames(), renderer=renderer))
 
 
 def test_the_eye_between_open_lids_is_the_bare_eye(renderer):
@@ -63,25 +65,25 @@ def test_the_eye_between_open_lids_is_the_bare_eye(renderer):
     ratio = whole.irradiance[clear] / bare.irradiance[clear]
     assert np.median(ratio) == pytest.approx(1.0, abs=2e-3)
     assert np.percentile(ratio, 99) < 1.01
-    assert whole.labels["pupil_visible_fraction"] == 1.0
-    assert 0.7 < whole.labels["iris_visible_fraction"] < 1.0
+    assert labels_of(whole)["pupil_visible_fraction"] == 1.0
+    assert 0.7 < labels_of(whole)["iris_visible_fraction"] < 1.0
 
 
 def test_a_shut_lid_hides_pupil_and_glint_and_says_so(renderer):
     open_, half, shut = (
         images(renderer, region={"blink": b, "lashes": {"upper_count": 0}})[0] for b in (0.0, 0.5, 1.0)
     )
-    shares = [i.labels["pupil_visible_fraction"] for i in (open_, half, shut)]
+    shares = [labels_of(i)["pupil_visible_fraction"] for i in (open_, half, shut)]
     assert shares[0] == 1.0
     assert 0.0 < shares[1] < 1.0
     assert shares[2] == 0.0
-    assert [i.labels["glints"][0]["reason"] for i in (open_, shut)] == ["visible", "occluded by lid"]
+    assert [labels_of(i)["glints"][0]["reason"] for i in (open_, shut)] == ["visible", "occluded by lid"]
     assert not shut.rendered.glints.visible.any()
     assert open_.rendered.glints.visible.all()
-    assert open_.labels["pupil_visible_arcs_deg"] == [[0.0, 360.0]]
-    assert shut.labels["pupil_visible_arcs_deg"] == []
+    assert labels_of(open_)["pupil_visible_arcs_deg"] == [[0.0, 360.0]]
+    assert labels_of(shut)["pupil_visible_arcs_deg"] == []
     # What is left of a half hidden pupil is its lower part: image y runs down, so angles from 0 to 180.
-    ((start, end),) = half.labels["pupil_visible_arcs_deg"]
+    ((start, end),) = labels_of(half)["pupil_visible_arcs_deg"]
     middle = (start + ((end - start) % 360) / 2) % 360
     assert abs(middle - 90) < 25
 
@@ -99,7 +101,7 @@ def test_left_is_the_mirror_image_of_right(renderer):
 
 
 def test_lid_margins_follow_the_blink(renderer):
-    open_, shut = (images(renderer, region={"blink": b})[0].labels["lid_margins_px"] for b in (0.0, 1.0))
+    open_, shut = (labels_of(images(renderer, region={"blink": b})[0])["lid_margins_px"] for b in (0.0, 1.0))
     height = [np.array(m["lower"])[8, 1] - np.array(m["upper"])[8, 1] for m in (open_, shut)]
     assert height[0] > 8 * 4000 / 612 * 0.8  # about 9 mm at 6.5 px/mm
     assert abs(height[1]) < 1.0
@@ -120,8 +122,8 @@ def test_moving_lids_compile_nothing_new(renderer):
 
 def test_two_runs_are_the_same(renderer):
     a, b = (images(renderer, region={})[0] for _ in range(2))
-    assert np.array_equal(a.dn, b.dn)
-    assert a.labels == b.labels
+    assert np.array_equal(a.counts, b.counts)
+    assert labels_of(a) == labels_of(b)
 
 
 @pytest.mark.parametrize("place", [(600.0, 0.0, -120.0), (42.0, -38.0, -16.0)])
@@ -144,7 +146,7 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin(renderer, monkeypatch, pla
     data["rig"]["lights"] = [{**lamp, "position_mm": [500, 60.0 * k, -60]} for k in (-1, 0, 1)]
     s = Scene.of(SceneSpec.from_mapping(data))
     camera = s.rig.cameras[0]
-    job = replace(render_job(s, observe(s), 0), window=(0, 0, *camera.resolution_px))
+    job = replace(render_job(s.frames(), 0), window=(0, 0, *camera.resolution_px))
     shown, _ = renderer.bind(job)
     tiles, size = shown.plain(job.window)
     width, height = job.window[2:]
@@ -174,7 +176,7 @@ def test_plain_tiles_leave_no_seam_where_fine_shadows_begin(renderer, monkeypatc
     lamp = data["rig"]["lights"][0]
     data["rig"]["lights"] = [{**lamp, "position_mm": [600, 40.0 * k, -60]} for k in range(lamps)]
     s = Scene.of(SceneSpec.from_mapping(data))
-    job = replace(render_job(s, observe(s), 0), window=(0, 0, 640, 320))
+    job = replace(render_job(s.frames(), 0), window=(0, 0, 640, 320))
     quick = renderer.radiance(job)
     monkeypatch.setattr("eyerender.rendering.stage.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000))
     slow = renderer.radiance(job)

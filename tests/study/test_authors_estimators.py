@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.arrays import frozen
 from eyerender.errors import InputError
 from eyerender.gaze.guestrin import GuestrinEizenman
@@ -24,7 +24,7 @@ EYE = EyeParameters(7.9, 4.3, 1.3375, 5.2, 1.8)
 def seen():
     """The nine targets of guestrin2006 at the central head position, with noise; and the rig."""
     scene = load_scene("guestrin2006")
-    every = observe(scene)
+    every = trace(scene)
     central = every.take(every.index.head == 0)
     noise = np.random.default_rng(2).normal(0.0, 0.2, central.pupil.centre_px.shape)
     return replace(central, pupil=replace(central.pupil, centre_px=frozen(central.pupil.centre_px + noise))), scene.rig
@@ -75,7 +75,7 @@ def test_without_departures_they_are_the_estimators_of_the_package(seen):
 
 def test_the_minimum_norm_needs_no_more_targets_than_one():
     scene = load_scene("blignaut2014")
-    every = observe(scene)
+    every = trace(scene)
     few = every.take(every.index.fixation < 3)
     targets = few.index.target_mm
     with pytest.raises(InputError, match="3 usable calibration targets, but R3 has"):

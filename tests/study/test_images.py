@@ -11,7 +11,7 @@ import sys
 import numpy as np
 import pytest
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.validate import validate
 from eyerender.imagefile import read_image
@@ -105,7 +105,7 @@ def test_images_are_made_once_and_a_part_of_them_serves_too(tmp_path):
     assert read_images(tmp_path / "images") == made
     # An image is the one that its scene says: pupil and glints lie where ray optics has them.
     for scene in scenes[:4]:
-        truth, seen = observe(scene), made.observe(scene)
+        truth, seen = trace(scene), made.observe(scene)
         np.testing.assert_allclose(seen.pupil.centre_px, truth.pupil.centre_px, atol=0.5)
     # Noise is all that tells the two exposures apart: the same places within what single pixels vary by.
     noisy, quiet = (read_image(made.of(scene)[0].path)[0] / 257 for scene in scenes[0:3:2])

@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace as observe
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.landmarks import field_direction, path_to_retina
 from eyerender.eye.model import EyeSpec
 from eyerender.gaze.regression import FUNCTIONS
 from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import trace
-from eyerender.scene import Scene, SceneSpec
+from eyerender.scene import Scene
+from eyerender.scenespec import SceneSpec
 from eyerender.study import blignaut, guestrin
 from eyerender.study import literature as lit
 from eyerender.study.findings import t_tests

@@ -9,7 +9,7 @@ import re
 import numpy as np
 import pytest
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.scene import load_scene
@@ -135,13 +135,13 @@ def test_bad_input(tmp_path, monkeypatch, capsys, argv, code, words):
 
 def test_a_turned_camera_changes_no_ray():
     scene = guestrin.scene("E2", guestrin.CORRECTED)
-    direct = observe(scene)
+    direct = trace(scene)
     index = direct.index
     outside = 0
     for head, place in enumerate(scene.spec.subject.head_positions_mm):
         rows = np.flatnonzero((index.head == head) & (index.eye == 1))
         turned = facing_scene(scene, place, "left")
-        seen = observe(turned)
+        seen = trace(turned)
         assert (seen.pupil.in_image & seen.glints.in_image.all(axis=1)).all()
         outside += int((~direct.glints.in_image[rows].all(axis=1)).sum())
         back = with_index_of(moved(seen, turned.rig.cameras[0], scene.rig.cameras[0]), scene, rows)
@@ -157,9 +157,9 @@ def test_a_turned_camera_changes_no_ray():
 def test_turned_frames_come_back_in_the_scenes_order(monkeypatch):
     scene = guestrin.scene("E1", guestrin.CORRECTED)
     # The image part alone is replaced by the analytic one: what is tested is the order and the index.
-    monkeypatch.setattr(StudyImages, "observe", lambda self, s: observe(s))
+    monkeypatch.setattr(StudyImages, "observe", lambda self, s: trace(s))
     seen = Observing("image", StudyImages({})).observe(scene, facing=True)
-    direct = observe(scene)
+    direct = trace(scene)
     for name in ("frame", "fixation", "head", "eye", "target_mm"):
         np.testing.assert_array_equal(getattr(seen.index, name), getattr(direct.index, name))
     np.testing.assert_allclose(seen.glints.xy_px, direct.glints.xy_px, atol=1e-8)
@@ -179,7 +179,7 @@ def test_known_feature_errors_and_paired_differences():
     from eyerender.arrays import frozen
 
     scene = guestrin.scene("E2", {"eyes"})
-    truth = observe(scene)
+    truth = trace(scene)
     shift = np.array([0.3, -0.1])
     found = replace(truth, pupil=replace(truth.pupil, centre_px=frozen(truth.pupil.centre_px + shift)))
     rows = {f.feature: f for f in observers_compared.features(truth, found, scene.rig, "c", "image", "E2")}
@@ -251,7 +251,7 @@ def test_observers_on_the_head_mounted_rig(tmp_path):
 
 def test_directions_of_the_head_mounted_rig():
     scene = head_mounted.scene("E2")
-    seen = observe(scene)
+    seen = trace(scene)
     np.testing.assert_allclose(
         np.degrees([seen.pose.azimuth_rad, seen.pose.elevation_rad]).T, head_mounted.directions_deg(), atol=1e-9
     )

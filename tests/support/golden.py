@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.dataset.maker import Maker
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
 from eyerender.imagefolder import RESULTS
-from eyerender.scene import Scene, SceneSpec
+from eyerender.scene import Scene
+from eyerender.scenespec import SceneSpec
 from tests.support.paths import DATA
 
 STORED = DATA / f"results_{RESULTS}.json"
@@ -38,7 +39,7 @@ def analytic() -> dict[str, Any]:
     """Pupil centre, semi-axes, glints and pose of both eyes for each eye model: numbers in px and rad."""
     found = {}
     for name in EYES:
-        seen = observe(Scene.of(SceneSpec.from_mapping({**SCENE, "eye": {"model": name}})))
+        seen = trace(Scene.of(SceneSpec.from_mapping({**SCENE, "eye": {"model": name}})))
         numbers = [seen.pupil.centre_px, seen.pupil.semi_axes_px, seen.glints.xy_px.reshape(len(seen), -1)]
         numbers += [seen.pose.azimuth_rad[:, None], seen.pose.elevation_rad[:, None]]
         found[name] = np.concatenate(numbers, axis=1).tolist()

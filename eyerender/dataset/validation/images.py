@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ...arrays import Bools, Floats
 from ...imagefile import read_image
 from ...imagefolder import ImageEntry
+from ...labels import IRIS, PUPIL, moments_ellipse
 from ...observation import OK
 from ...rig.camera import Window
-from ..labels import IRIS, PUPIL, moments_ellipse
 from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
 
 SKIN, SCLERA = 0, 1

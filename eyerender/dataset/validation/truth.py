@@ -15,18 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from ...analytic.observer import observe
+from ...analytic.observer import trace
 from ...arrays import Bools, Floats
 from ...errors import InputError
 from ...files import parse_json, shown
 from ...imagefolder import DATASET, RESULTS, ImageFolder, versions
+from ...labels import EyeInWindow, known_labels, limbus_px
 from ...observation import EYES, Observations, version_of
 from ...region.mesh import lid_margins
 from ...rendering.frame import globe_of
 from ...rendering.glints import GlintScene
 from ...rendering.occlusion import lid_margins_px
-from ...scene import Scene, SceneSpec
-from ..labels import EyeInWindow, known_labels, limbus_px
+from ...scene import Frames, Scene
+from ...scenespec import SceneSpec
 from ..line import image_line, image_name
 from ..plan import Plan
 from ..realise import Realised, frames_of, realise
@@ -98,13 +99,13 @@ class DatasetTruth:
         if self._last is None or self._last.index != number:
             self._last = realise(self.plan, number, self.frames)
         found = self._last
-        scene, observations = found.scene, found.observations
-        if scene is None or observations is None:
+        frames, observations = found.frames, found.observations
+        if frames is None or observations is None:
             return Again((f"sample {number} is given up by the plan",))
         row = _row(observations, record["frame"] - number * self.frames, record["eye"])
         if row is None:
             return Again((f"sample {number} has no such image",))
-        view = EyeInWindow.of(scene, observations, row)
+        scene, view = frames.scene, EyeInWindow.of(frames, row)
         _, expected = image_line(
             found, row, self.frames, view.window, known_labels(scene, observations, view), version_of(record)
         )
@@ -118,7 +119,7 @@ class DatasetTruth:
 class SceneTruth:
     """Lines of a folder that one scene was rendered into."""
 
-    scene: Scene
+    frames: Frames
     observations: Observations
     stale: None = None
 
@@ -137,7 +138,7 @@ class SceneTruth:
         try:
             scene = Scene.of(SceneSpec.from_mapping(dataset["spec"], source=DATASET))
             digest = scene.digest()
-            found = observe(scene)
+            frames = scene.frames()
         except InputError as error:
             raise NoTruth(str(error)) from None
         if digest != dataset.get("digest"):
@@ -146,7 +147,7 @@ class SceneTruth:
             if isinstance(made_by, dict) and made_by.get("eyerender") != versions()["eyerender"]:
                 raise NoTruth("another version of the package made it")
             problems.add(f"{DATASET}: its digest is not that of its scene, its eye and its files")
-        return cls(scene, found)
+        return cls(frames, trace(frames))
 
     def whose(self, line: dict[str, Any]) -> dict[str, Any]:
         """File names that a line must have; raises one of `WRONG`."""
@@ -155,12 +156,12 @@ class SceneTruth:
 
     def again(self, line: dict[str, Any]) -> Again:
         """A line computed again; raises one of `WRONG` where it is no line of a rendered folder."""
-        scene, found = self.scene, self.observations
+        scene, found = self.frames.scene, self.observations
         record = line["records"][0]
         row = _row(found, record["frame"], record["eye"])
         if row is None:
             return Again(("the scene has no such image",))
-        view = EyeInWindow.of(scene, found, row)
+        view = EyeInWindow.of(self.frames, row)
         expected = {
             "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
             "bit_depth": scene.spec.sensor.bit_depth,

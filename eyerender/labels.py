@@ -1,4 +1,6 @@
-"""The labels of one rendered window: ellipses, glints, points and lines in space, matrices.
+"""The labels of an image: what ray optics knows, and what the picture shows.
+
+They hold ellipses, glints, points and lines in space, and matrices.
 
 `amodal` ellipses are those of the outline as if nothing stood before the eye: the pupil's seen through the cornea, the
 iris' at the circle of the limbus where the cornea is half clear. A `visible` ellipse has the second moments of the
@@ -11,15 +13,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
-from ..analytic.features import fixations
-from ..arrays import Bools, Floats
-from ..capture import WindowImage, eye_motion
-from ..eye.model import EyeModel
-from ..geometry.ellipse import fit_ellipse_direct
-from ..observation import EYES, MISSING, OK, Observations
-from ..rig.camera import PinholeCamera, Window
-from ..scene import Scene
+from .arrays import Bools, Bytes, Floats
+from .capture import EyeImage, eye_motion
+from .eye.fixation import fixations
+from .eye.model import EyeModel
+from .geometry.ellipse import fit_ellipse_direct
+from .observation import EYES, MISSING, OK, Observations
+from .rig.camera import PinholeCamera, Window
+from .scene import Frames, Scene
 
 _OUTLINE_POINTS = 60
 _SAG_STEP_MM = 0.05
@@ -28,9 +31,9 @@ IRIS, PUPIL = 2, 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyeInWindow:
-    """An eye as a window shows it: observation `row` of a scene, its `camera` and `window` (x0, y0, width, height).
+    """An eye as a window shows it, without the picture: row `row` of frames, its `camera` and `window`.
 
-    The eye's frame lies in the world by x_world = M x + t.
+    The window is (x0, y0, width, height) in full-sensor pixels. The eye's frame lies in the world by x_world = M x + t.
     """
 
     row: int
@@ -41,40 +44,65 @@ class EyeInWindow:
     t: Floats
 
     @classmethod
-    def of(cls, scene: Scene, observations: Observations, row: int) -> EyeInWindow:
-        """Observation `row` of a scene in its window."""
-        index = observations.index
+    def of(cls, frames: Frames, row: int) -> EyeInWindow:
+        """Row `row` of frames in its window."""
+        index, scene = frames.index, frames.scene
         camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
-        eye = scene.eye(EYES[side])
-        M, t = eye_motion(eye, observations, row)
-        apex = index.eye_position_mm[row] + index.head_mm[row]
-        return cls(row, camera, scene.windows()[camera, head, side], eye, M, t + apex)
+        M, t = eye_motion(frames, row)
+        return cls(row, camera, scene.windows()[camera, head, side], scene.eye(EYES[side]), M, t)
 
 
-def image_labels(scene: Scene, observations: Observations, image: WindowImage) -> dict[str, Any]:
-    """The labels of a window; the same keys for every image."""
-    part, window = image.mask, image.window
-    known = known_labels(scene, observations, image)
+def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
+    """What the picture shows of pupil, iris, glints and lids: the labels of a rendered folder.
+
+    Args:
+        image: a rendered image, row `image.row` of `truth`.
+        truth: what the analytic observer sees in the frames that were rendered.
+    """
+    done, row = image.rendered, image.row
+    assert done.labels is not None
+    points = truth.pupil.points_px[row]
+    whole = bool(truth.pupil.ok[row]) and len(points) > 2
+    return {
+        "pupil_visible_fraction": _share(done.labels.visible_fraction(PUPIL)),
+        "iris_visible_fraction": _share(done.labels.visible_fraction(IRIS)),
+        "failed_paths": done.failed_paths,
+        "pupil_visible_arcs_deg": visible_arcs_deg(image.parts, PUPIL, points, image.window[:2]) if whole else None,
+        "glints": [
+            {"light": i, "reason": reason, "visible_share": float(share)}
+            for i, (reason, share) in enumerate(zip(done.glint_reasons, done.glints.share, strict=True))
+        ],
+        "lid_margins_px": done.lid_margins_px,
+    }
+
+
+def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
+    """All labels of an image, the same keys for every image; the arguments are those of `seen_labels`."""
+    part, window, seen = image.parts, image.window, seen_labels(image, truth)
+    known = known_labels(image.scene, truth, image)
     return {
         "pupil": {
             **known["pupil"],
             "visible": moments_ellipse(part == PUPIL, window),
-            "visible_fraction": image.labels["pupil_visible_fraction"],
-            "visible_arcs_deg": image.labels["pupil_visible_arcs_deg"],
+            "visible_fraction": seen["pupil_visible_fraction"],
+            "visible_arcs_deg": seen["pupil_visible_arcs_deg"],
         },
         "iris": {
             **known["iris"],
             "visible": moments_ellipse((part == PUPIL) | (part == IRIS), window),
-            "visible_fraction": image.labels["iris_visible_fraction"],
+            "visible_fraction": seen["iris_visible_fraction"],
         },
-        "glints": [known["glints"][k] | _seen_glint(image, k, known["glints"][k]) for k in range(len(known["glints"]))],
-        "lid_margins_px": image.labels["lid_margins_px"],
+        "glints": [
+            glint | _seen_glint(image, k, glint["in_window"], seen["glints"][k]["reason"])
+            for k, glint in enumerate(known["glints"])
+        ],
+        "lid_margins_px": seen["lid_margins_px"],
         **{key: known[key] for key in ("space", "globe_radius_mm", "pose", "camera", "lights_mm")},
-        "failed_paths": int(image.labels["failed_paths"]),
+        "failed_paths": int(seen["failed_paths"]),
     }
 
 
-def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | WindowImage) -> dict[str, Any]:
+def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> dict[str, Any]:
     """The labels that follow from pose and parameters alone, without a picture: a part of `image_labels`."""
     camera = scene.rig.cameras[view.camera]
     return {
@@ -115,7 +143,38 @@ def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:
     return out | {"centre_px": [x + window[0], y + window[1]], "semi_axes_px": axes, "angle_rad": angle}
 
 
-def iris_outline(scene: Scene, view: EyeInWindow | WindowImage) -> dict[str, Any]:
+def visible_arcs_deg(
+    part: Bytes, pupil: int, points_px: Floats, origin_px: tuple[int, int], reach_px: float = 1.5
+) -> list[list[float]]:
+    """Arcs [from, to] (degrees about the outline's centre, image x towards y) of the pupil's outline that are visible.
+
+    A point of the outline (k, 2) counts as visible where a pixel of the pupil lies within `reach_px` of it; points off
+    the window do not. A whole outline is [[0, 360]].
+    """
+    height, width = part.shape
+    x, y = points_px[:, 0] - origin_px[0], points_px[:, 1] - origin_px[1]
+    k = int(reach_px)
+    ball = np.hypot(*np.mgrid[-k : k + 1, -k : k + 1]) <= reach_px
+    near = ndimage.binary_dilation(part == pupil, structure=ball)
+    column, row = np.rint(x).astype(int), np.rint(y).astype(int)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    seen = np.zeros(len(x), dtype=bool)
+    seen[inside] = near[row[inside], column[inside]]
+    centre = points_px.mean(axis=0)
+    angle = np.degrees(np.arctan2(points_px[:, 1] - centre[1], points_px[:, 0] - centre[0])) % 360
+    order = np.argsort(angle)
+    angle, seen = angle[order], seen[order]
+    if np.all(seen):
+        return [[0.0, 360.0]]
+    if not np.any(seen):
+        return []
+    first = int(np.flatnonzero(~seen)[0])
+    angle, seen = np.roll(angle, -first), np.roll(seen, -first)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(int), [0]])))
+    return [[float(angle[a]), float(angle[b - 1])] for a, b in edges.reshape(-1, 2)]
+
+
+def iris_outline(scene: Scene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
     """The ellipse of the apparent limbus (`limbus_px`), with a status and a reason where there is none."""
     nothing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
     pixels, reason = limbus_px(scene, view, _OUTLINE_POINTS)
@@ -133,7 +192,7 @@ def iris_outline(scene: Scene, view: EyeInWindow | WindowImage) -> dict[str, Any
     }
 
 
-def limbus_px(scene: Scene, view: EyeInWindow | WindowImage, count: int) -> tuple[Floats, str | None]:
+def limbus_px(scene: Scene, view: EyeInWindow | EyeImage, count: int) -> tuple[Floats, str | None]:
     """Apparent limbus as points (count, 2) in full-sensor px.
 
     The limbus is the circle of the front cornea whose radius is the limbus radius minus half the limbus' width.
@@ -179,7 +238,7 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
     }
 
 
-def _glints(scene: Scene, observations: Observations, view: EyeInWindow | WindowImage) -> list[dict[str, Any]]:
+def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> list[dict[str, Any]]:
     """Where ray optics puts the centre of each lamp's glint."""
     glints, row = observations.glints, view.row
     x0, y0, w, h = view.window
@@ -202,20 +261,24 @@ def _glints(scene: Scene, observations: Observations, view: EyeInWindow | Window
     return out
 
 
-def _seen_glint(image: WindowImage, k: int, known: dict[str, Any]) -> dict[str, Any]:
+def _seen_glint(image: EyeImage, k: int, in_window: bool, hidden_by: str | None) -> dict[str, Any]:
     """What of a lamp's glint the camera gets."""
     table = image.rendered.glints
     lit = np.isfinite(table.xy_px[k]).all()
     return {
-        "visible": bool(table.visible[k]) and known["in_window"],
-        "hidden_by": image.labels["glints"][k]["reason"],
+        "visible": bool(table.visible[k]) and in_window,
+        "hidden_by": hidden_by,
         "visible_share": float(table.share[k]),
         "spot_xy_px": table.xy_px[k].tolist() if lit else None,
     }
 
 
+def _share(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
 def _space(
-    scene: Scene, observations: Observations, view: EyeInWindow | WindowImage, camera: PinholeCamera
+    scene: Scene, observations: Observations, view: EyeInWindow | EyeImage, camera: PinholeCamera
 ) -> dict[str, Any]:
     """Points (mm) and lines in the world and in the camera's frame."""
     eye, M, t, row = view.eye, view.M, view.t, view.row
@@ -241,7 +304,7 @@ def _space(
     }
 
 
-def _line_of_sight(scene: Scene, observations: Observations, view: EyeInWindow | WindowImage) -> tuple[Floats, Floats]:
+def _line_of_sight(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> tuple[Floats, Floats]:
     """The line of sight of the unturned eye: the fixed chief ray, or the one that the entrance window gives."""
     index, row = observations.index, view.row
     if scene.spec.eye.line_of_sight == "entrance_window" and np.isfinite(index.target_mm[row]).all():

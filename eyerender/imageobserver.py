@@ -1,10 +1,10 @@
-"""The two observers of a scene. Both report `Observations`; swapping one for the other is the whole comparison."""
+"""The image observer: features recovered from pixels, reported as the analytic observer reports its own."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .analytic.observer import observe
 from .arrays import Floats, Ints, Objects, frozen
 from .backends.choose import BackendChoice
-from .capture import render_windows
+from .capture import EyeImage, render_windows
 from .errors import InputError
 from .extraction import Extraction, ExtractionSettings, extract
 from .extraction.glints.matching import assign_lights, predict_glints
@@ -26,26 +25,13 @@ from .imagefolder import DATASET, ImageEntry, ImageFolder
 from .observation import MISSING, OK, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
 from .progress import Progress
 from .rig.camera import PinholeCamera
-from .scene import Scene, SceneSpec
+from .rig.rig import RigLike
+from .scene import Frames, Scene
+from .scenespec import SceneSpec
 
 # How far the reflections of a real eye lie from those of a typical one that is placed by its pupil.
 _PLACE_MM = 1.5
 _BATCH = 256
-
-
-@dataclass(frozen=True, slots=True)
-class AnalyticObserver:
-    """Ray optics: the apparent pupil and the glints as they exactly are."""
-
-    boundary_points: int = 30
-
-    def observe(self, scene: Scene) -> Observations:
-        """Every (frame, eye) of the scene.
-
-        Raises:
-            InputError: a target that no pose of the eye fixates.
-        """
-        return observe(scene, boundary_points=self.boundary_points)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,32 +41,37 @@ class ImageObserver:
     Args:
         settings: of the extraction; the range of pupil sizes is narrowed where the rig is known.
         gamma: encoding gamma of the images; 1 is linear.
+        backend: what renders the frames.
+        threads: how many processor threads render; None takes all.
+        progress: hears (done, all, "") after each image.
     """
 
     settings: ExtractionSettings = field(default_factory=ExtractionSettings)
     gamma: float = 1.0
+    backend: BackendChoice = "auto"
+    threads: int | None = None
+    progress: Progress | None = None
 
-    def observe(
-        self,
-        scene: Scene,
-        *,
-        backend: BackendChoice = "auto",
-        threads: int | None = None,
-        only: Sequence[int] | None = None,
-        progress: Progress | None = None,
-    ) -> Observations:
-        """Render a scene's windows in memory and extract their features; `only` some of its observations."""
-        truth = observe(scene)
-        if only is not None:
-            truth = truth.take(np.asarray(only))
-        images = render_windows(scene, truth, backend=backend, threads=threads, progress=progress)
-        parts = [
-            self._observe_rows(
-                image.dn, scene.spec.sensor.bit_depth, image.window[:2], truth.index, np.array([image.row]), scene
-            )
-            for image in images
-        ]
-        return concatenate(parts)
+    def observe(self, frames: Frames, rig: RigLike | None = None) -> Observations:
+        """Render every (frame, eye) and extract its features; `rig` replaces the one the frames were made for."""
+        images = render_windows(frames.seen_by(rig), backend=self.backend, threads=self.threads, progress=self.progress)
+        return self.observe_images(images)
+
+    def observe_images(self, images: Iterable[EyeImage]) -> Observations:
+        """Extract the features of rendered images, one row for each."""
+        return concatenate(
+            [
+                self._observe_rows(
+                    image.counts,
+                    image.scene.spec.sensor.bit_depth,
+                    image.window[:2],
+                    image.frame.index,
+                    np.array([0]),
+                    image.scene,
+                )
+                for image in images
+            ]
+        )
 
     def observe_folder(self, folder: ImageFolder, scene: Scene, *, progress: Progress | None = None) -> Observations:
         """Extract the features of a folder's images, row by row as its records."""

@@ -1,0 +1,157 @@
+"""What a scene file says: the eye, the subject, the rig, what is looked at, and how pictures are taken."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from .errors import InputError
+from .eye.margin import PupilMargin
+from .observation import MAX_GLINTS
+from .region.anatomy import Region
+from .region.look import Look
+from .rig.imaging import Ambient, Lens, Motion
+from .rig.rig import Rig
+from .rig.sensor import Sensor
+from .spec import FileSpec, Positive, Spec, Vec2, Vec3
+
+DATASET_KIND = "dataset"
+Count = Annotated[int, Field(ge=1, le=1000)]
+# An observation is one eye in one frame. Analysing this many takes about 1 GB of memory, their records some 2 GB.
+MAX_OBSERVATIONS = 200_000
+
+
+class Eye(Spec):
+    """Which eye looks, and how."""
+
+    model: str = Field(default="E2", description="a name of the catalogue, or an eye file (relative to the scene)")
+    pupil_diameter_mm: Positive | None = Field(default=None, description="of the anatomical pupil; default: the eye's")
+    line_of_sight: Literal["chief_ray", "entrance_window"] = "chief_ray"
+    margin: PupilMargin | None = Field(default=None, description="of the pupil; default: the eye's")
+
+
+class Subject(Spec):
+    """Which eyes are there, how far apart, and where the head stands."""
+
+    eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = ("right", "left")
+    ipd_mm: Positive = Field(default=63.0, description="interpupillary distance")
+    head_positions_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] = ((0.0, 0.0, 0.0),)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(set(self.eyes)) != len(self.eyes):
+            raise ValueError("eyes: each eye once")
+        return self
+
+
+class Targets(Spec):
+    """What is fixated: a grid out to the screen's edges, points on the screen, or points in the world."""
+
+    grid: tuple[Count, Count] | None = Field(default=None, description="columns and rows")
+    screen_mm: Annotated[tuple[Vec2, ...], Field(min_length=1)] | None = Field(
+        default=None, description="points to the subject's right of and above the screen's centre"
+    )
+    world_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if sum(v is not None for v in (self.grid, self.screen_mm, self.world_mm)) != 1:
+            raise ValueError("give exactly one of grid, screen_mm, world_mm")
+        return self
+
+
+class EyeDirection(Spec):
+    """An eye's direction without a target: of the optic axis; torsion follows Listing's law."""
+
+    azimuth_deg: Annotated[float, Field(gt=-90, lt=90)]
+    elevation_deg: Annotated[float, Field(gt=-90, lt=90)]
+
+
+class Picture(Spec):
+    """What part of the sensor is rendered, and how finely."""
+
+    window_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = Field(
+        default=None, description="width and height of one window per eye, centred on it; default: the whole sensor"
+    )
+    spp: Annotated[int, Field(ge=1, le=65536)] = Field(default=16, description="samples per pixel")
+
+
+NOT_A_SCENE = (
+    "is the spec of a dataset, not a scene; 'eyerender generate SPEC DIR' makes its images, "
+    "'eyerender sample SPEC 0 -o DIR' writes one of its scenes"
+)
+NOT_A_DATASET = (
+    "is a scene, not a dataset; 'eyerender render SCENE -o DIR' makes its images; the spec of a dataset says "
+    "'kind: dataset' and holds a scene under 'scene'"
+)
+
+
+class SceneSpec(FileSpec):
+    """A scene file."""
+
+    name: Annotated[str, Field(min_length=1)]
+    description: str = ""
+    eye: Eye = Eye()
+    subject: Subject = Subject()
+    rig: Rig
+    targets: Targets | None = None
+    poses: Annotated[tuple[EyeDirection, ...], Field(min_length=1)] | None = None
+    wavelength_nm: Annotated[float, Field(ge=350, le=1100)] = 850.0
+    image: Picture = Picture()
+    sensor: Sensor = Sensor()
+    look: Look = Look()
+    region: Region | None = None
+    lens: Lens = Lens()
+    motion: Motion | None = None
+    ambient: Ambient = Ambient()
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.targets is None) == (self.poses is None):
+            raise ValueError("give either targets or poses")
+        if self.targets is not None and self.targets.world_mm is None and self.rig.screen is None:
+            raise ValueError("targets on a screen need rig.screen")
+        self._check_size()
+        if self.image.window_px is not None:
+            for i, camera in enumerate(self.rig.cameras):
+                if any(w > r for w, r in zip(self.image.window_px, camera.resolution_px, strict=True)):
+                    raise ValueError(f"image.window_px: is larger than the sensor of rig.cameras.{i}")
+        return self
+
+    @classmethod
+    def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
+        """Raise `InputError` where a mapping is a dataset's or an eye's, and say what to do with it."""
+        if data.get("kind") == DATASET_KIND:
+            raise InputError(NOT_A_SCENE, source=source)
+        if "cornea" in data:
+            raise InputError(
+                "is an eye file, not a scene; give it with --eye, or as 'eye.model' of a scene", source=source
+            )
+
+    def _check_size(self) -> None:
+        targets = self.targets
+        if targets is None:
+            fixations = len(self.poses or ())
+        elif targets.grid is not None:
+            fixations = targets.grid[0] * targets.grid[1]
+        else:
+            fixations = len(targets.screen_mm or targets.world_mm or ())
+        heads, cameras, eyes = len(self.subject.head_positions_mm), len(self.rig.cameras), len(self.subject.eyes)
+        count = fixations * heads * cameras * eyes
+        if count > MAX_OBSERVATIONS:
+            raise ValueError(
+                f"{fixations} fixations, {heads} head positions, {cameras} cameras and {eyes} eyes make {count} "
+                f"observations; a scene may have {MAX_OBSERVATIONS}"
+            )
+        lights = self.rig.light_count
+        if count * lights > MAX_GLINTS:
+            raise ValueError(
+                f"{count} observations of {lights} lights make {count * lights} glints; a scene may have {MAX_GLINTS}"
+            )
+
+    def with_spp(self, spp: int) -> Self:
+        """A copy with other samples per pixel; raises an `InputError` that names the option --spp."""
+        return self.replaced("--spp", {"image": {**self.to_mapping()["image"], "spp": spp}})
