@@ -11,8 +11,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeGuard, overload
 
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import Bytes
 from .errors import InputError
 from .files import inside, is_plain, read_json, shown, write_json
+from .imagefile import read_image
 from .jsonlines import JsonLines
 from .observation import EYES, Observations, concatenate, count_heads
 from .rig.camera import Window
@@ -85,10 +90,71 @@ class ImageEntry:
         w = self.line["window_px"]
         return w["x0"], w["y0"], w["width"], w["height"]
 
+    def image(self) -> NDArray[Any]:
+        """The sensor's counts, (h, w) uint8 or uint16, as `window` shows them; float32 where the file holds floats.
+
+        Raises:
+            InputError: as `file` does; the file is no greyscale image, or has another size than the window.
+        """
+        return self._picture(self.path)
+
+    def mask(self) -> Bytes | None:
+        """The part of the eye at each pixel, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil.
+
+        Returns:
+            None where the line names no mask.
+
+        Raises:
+            InputError: as `image` does; the file does not hold 8 bits.
+        """
+        return self._parts("mask_file_name")
+
+    def amodal_mask(self) -> Bytes | None:
+        """The mask as if nothing stood before the eye; as `mask`."""
+        return self._parts("amodal_mask_file_name")
+
+    def noiseless(self) -> NDArray[Any] | None:
+        """The counts without the sensor's noise, as `image`; None where the line names no such file."""
+        path = self.file("noiseless_file_name")
+        return None if path is None else self._picture(path)
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """The analytic observer's record of each eye in the image, as JSON has it; `truth` gives them as arrays."""
+        found: list[dict[str, Any]] = self.line["records"]
+        return found
+
+    @property
+    def labels(self) -> dict[str, Any]:
+        """The labels of the image (docs/formats.md), empty where it has none; raises `InputError` for no mapping."""
+        found = self.line.get("labels")
+        if found is None:
+            return {}
+        if not isinstance(found, dict):
+            raise InputError("must be a mapping", source=str(self.folder / METADATA), path=self._where("labels"))
+        return found
+
+    def _picture(self, path: Path) -> NDArray[Any]:
+        image = read_image(path)[0]
+        width, height = self.window[2:]
+        if image.shape != (height, width):
+            reason = f"is {image.shape[1]} x {image.shape[0]} px, its window is {width} x {height}"
+            raise InputError(reason, source=str(path))
+        return image
+
+    def _parts(self, key: str) -> Bytes | None:
+        path = self.file(key)
+        if path is None:
+            return None
+        mask = self._picture(path)
+        if mask.dtype != np.uint8:
+            raise InputError(f"holds {mask.dtype.name} values; a mask has 8 bits", source=str(path))
+        return mask
+
     def truth(self) -> Observations:
         """The analytic observer's records of this image; raises `InputError` naming line and key."""
         try:
-            return Observations.from_records(self.line["records"])
+            return Observations.from_records(self.records)
         except InputError as error:
             source, path = str(self.folder / METADATA), self._where(error.path or "records")
             raise InputError(error.reason, source=source, path=path) from None
@@ -133,7 +199,10 @@ class Entries(Sequence[ImageEntry]):
 
 @dataclass(frozen=True, slots=True)
 class ImageFolder:
-    """A complete folder of images. Its lines of metadata are read when `entries` are asked for, and never all held."""
+    """A complete folder of images; going through it gives an `ImageEntry` for each.
+
+    The lines of metadata are read when their entries are asked for, and never all held.
+    """
 
     path: Path
     dataset: dict[str, Any]
@@ -168,13 +237,19 @@ class ImageFolder:
         _ = entries[0]
         return cls(folder, dataset, entries)
 
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __iter__(self) -> Iterator[ImageEntry]:
+        return iter(self.entries)
+
     def truth(self) -> Observations:
         """The analytic observer's records of every image, in order; raises `InputError` for a wrong record."""
         parts = []
         for start in range(0, len(self.entries), _BATCH):
             batch = list(self.entries[start : start + _BATCH])
             try:
-                parts.append(Observations.from_records([r for entry in batch for r in entry.line["records"]]))
+                parts.append(Observations.from_records([r for entry in batch for r in entry.records]))
             except InputError:
                 for entry in batch:
                     entry.truth()  # says which line is wrong

@@ -85,13 +85,9 @@ class ImageObserver:
         few: list[Observations] = []  # observations of one row take ten times the memory of joined ones
         row = 0
         for k, entry in enumerate(entries):
-            image, stored = read_image(entry.path)
-            if image.shape != (entry.window[3], entry.window[2]):
-                raise InputError(
-                    f"is {image.shape[1]} x {image.shape[0]} px, its window is not", source=str(entry.path)
-                )
-            rows = np.arange(row, row + len(entry.line["records"]))
-            depth = int(entry.line.get("bit_depth") or stored)
+            image = entry.image()
+            rows = np.arange(row, row + len(entry.records))
+            depth = int(entry.line.get("bit_depth") or 8 * image.itemsize)
             few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene))
             if len(few) == _BATCH:
                 parts.append(concatenate(few))
@@ -170,7 +166,7 @@ def _scene_of_samples(folder: ImageFolder) -> Scene:
     """The scene of a generated dataset's first sample, whose cameras and places of lights all others must share."""
     first: Scene | None = None
     seen: set[str] = set()
-    for entry in folder.entries:
+    for entry in folder:
         source = str(folder.path / entry.name)
         try:
             text, eye = entry.line["parameters"]["scene_json"], entry.line["parameters"]["eye_json"]

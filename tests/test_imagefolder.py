@@ -270,3 +270,73 @@ def test_a_folder_that_changes_while_it_is_read_is_refused(folder):
     change(file_name="images/1.png", more=1)
     with pytest.raises(InputError, match=r"metadata\.jsonl: has changed while it was read"):
         entries[2]
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    """A folder of two images of 5 x 6 px, the first with a mask, an amodal mask, a noiseless image and labels."""
+    rng = np.random.default_rng(3)
+    image, quiet = rng.integers(0, 65536, (2, 6, 5), dtype=np.uint16)
+    mask, whole = rng.integers(0, 4, (2, 6, 5), dtype=np.uint8)
+    out = tmp_path / "out"
+    keys = {"mask_file_name": "m.png", "amodal_mask_file_name": "w.png", "noiseless_file_name": "q.png"}
+    with staged(out) as folder:
+        (folder / "images").mkdir()
+        for name, data in {
+            "images/a.png": image,
+            "images/b.png": mask,
+            "m.png": mask,
+            "w.png": whole,
+            "q.png": quiet,
+        }.items():
+            write_png(folder / name, data)
+        lines = [{**line("a"), **keys, "labels": {"failed_paths": 0}}, line("b")]
+        write_dataset(folder, lines, spec={}, digest="d")
+    return out, image, mask, whole, quiet
+
+
+def test_entries_read_their_own_pictures(pictures):
+    out, image, mask, whole, quiet = pictures
+    folder = ImageFolder.load(out)
+    assert len(folder) == 2
+    first, second = folder
+    for found, expected in (
+        (first.image(), image), (first.mask(), mask), (first.amodal_mask(), whole), (first.noiseless(), quiet),
+        (second.image(), mask),
+    ):  # fmt: skip
+        assert found.dtype == expected.dtype
+        np.testing.assert_array_equal(found, expected)
+    assert (second.mask(), second.amodal_mask(), second.noiseless()) == (None, None, None)
+    assert first.labels == {"failed_paths": 0}
+    assert second.labels == {}
+    assert first.records == []
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "read", "words"),
+    [
+        ("images/a.png", np.zeros((5, 6), np.uint16), "image", "a.png: is 6 x 5 px, its window is 5 x 6"),
+        ("m.png", np.zeros((5, 6), np.uint8), "mask", "m.png: is 6 x 5 px, its window is 5 x 6"),
+        ("m.png", np.zeros((6, 5), np.uint16), "mask", "m.png: holds uint16 values; a mask has 8 bits"),
+        ("w.png", np.zeros((6, 5), np.uint16), "amodal_mask", "w.png: holds uint16 values"),
+        ("q.png", None, "noiseless", "line 1.noiseless_file_name: 'q.png': no such file"),
+    ],
+)
+def test_pictures_of_another_shape_are_refused(pictures, name, data, read, words):
+    out = pictures[0]
+    if data is None:
+        (out / name).unlink()
+    else:
+        write_png(out / name, data)
+    entry = next(iter(ImageFolder.load(out)))
+    with pytest.raises(InputError, match=words):
+        getattr(entry, read)()
+
+
+def test_labels_that_are_no_mapping_are_refused(tmp_path):
+    out = tmp_path / "out"
+    with staged(out) as folder:
+        write_dataset(folder, [{**line(), "labels": [1]}], spec={}, digest="d")
+    (entry,) = ImageFolder.load(out)
+    with pytest.raises(InputError, match=r"line 1\.labels: must be a mapping"):
+        _ = entry.labels

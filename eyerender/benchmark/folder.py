@@ -74,8 +74,8 @@ def load_labelled(folder: str | Path) -> list[LabelledImage]:
     truth = images.truth()
     scene_rig = _rig_of(images)
     out = []
-    for k, entry in enumerate(images.entries):
-        count = len(entry.line["records"])
+    for k, entry in enumerate(images):
+        count = len(entry.records)
         if count != 1:
             raise InputError(
                 f"holds {count} eyes; the bench takes images of one", source=str(path / METADATA), path=f"line {k + 1}"
@@ -86,12 +86,10 @@ def load_labelled(folder: str | Path) -> list[LabelledImage]:
 
 
 def _rendered(entry: ImageEntry, truth: Observations, row: int, rig: RigGeometry | None) -> LabelledImage:
-    image, stored = read_image(entry.path)
+    image = entry.image()
     x0, y0, width, height = entry.window
-    if image.shape != (height, width):
-        raise InputError(f"is {image.shape[1]} x {image.shape[0]} px, its window is not", source=str(entry.path))
     corner = np.array([x0, y0], dtype=np.float64)
-    labels = entry.line.get("labels") or {}
+    labels = entry.labels
     pupil, glints = truth.pupil, truth.glints
     visible = _visible(labels)
     there = bool(pupil.ok[row] and pupil.in_image[row]) and visible != 0.0
@@ -116,7 +114,7 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int, rig: RigGeometry
     return LabelledImage(
         str(entry.line["file_name"]),
         entry.path,
-        int(entry.line.get("bit_depth") or stored),
+        int(entry.line.get("bit_depth") or 8 * image.itemsize),
         (width, height),
         ellipse,
         outline,

@@ -12,7 +12,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..comparison import Comparison
 from ..files import write_text
-from ..imagefile import read_image
 from ..imagefolder import ImageEntry, versions
 from ..observation import EYES
 from ..scene import Scene
@@ -116,7 +115,7 @@ def _pictures(scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry
     full = 0.7 * scene.spec.sensor.full_scale_dn
     truth, found = comparison.truth, comparison.found
     for row, entry in enumerate(entries):
-        image, _ = read_image(entry.path)
+        image = entry.image()
         side = EYES[int(truth.index.eye[row])]
         name = f"{side} eye, fixation {int(truth.index.fixation[row]) + 1}"
         # The iris of an adult is 12 mm wide at most; three pupils' widths around the pupil show it whole.

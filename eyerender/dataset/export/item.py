@@ -57,7 +57,7 @@ class Item:
     @cached_property
     def image(self) -> NDArray[Any]:
         """The sensor's counts, (h, w) uint8 or uint16; raises `InputError`."""
-        return self._counts(self.entry.path)
+        return _integers(self.entry.image(), self.entry.path)
 
     @property
     def encoded(self) -> NDArray[Any]:
@@ -69,7 +69,7 @@ class Item:
         if self.encoding.keeps(self.bit_depth):
             return read_bytes(path, follow=False)
         buffer = io.BytesIO()
-        encode_png(buffer, self.encoding.apply(self._counts(path), self.bit_depth))
+        encode_png(buffer, self.encoding.apply(_integers(read_image(path)[0], path), self.bit_depth))
         return buffer.getvalue()
 
     def exported_line(self) -> dict[str, Any]:
@@ -80,24 +80,18 @@ class Item:
     def _where(self, key: str) -> str:
         return f"line {self.entry.number}.{key}"
 
-    def _counts(self, path: Path) -> NDArray[Any]:
-        image = read_image(path)[0]
-        if image.dtype.kind != "u":
-            raise InputError("holds no integers", source=str(path))
-        return image
-
     @cached_property
     def mask(self) -> Bytes:
         """0 background or skin, 1 sclera, 2 iris, 3 pupil, (h, w)."""
-        path = self.entry.mask_path
-        return np.zeros(self.image.shape, np.uint8) if path is None else read_image(path)[0].astype(np.uint8)
+        mask = self.entry.mask()
+        return np.zeros(self.image.shape, np.uint8) if mask is None else mask
 
     @cached_property
     def amodal(self) -> Bytes:
         """The same as if nothing stood before the eye: the file, or the mask with both ellipses filled in."""
-        path = self.entry.file("amodal_mask_file_name")
-        if path is not None:
-            return read_image(path)[0].astype(np.uint8)
+        whole = self.entry.amodal_mask()
+        if whole is not None:
+            return whole
         out = self.mask.copy()
         v, u = np.mgrid[: out.shape[0], : out.shape[1]]
         for part, value in (("iris", IRIS), ("pupil", PUPIL)):
@@ -133,6 +127,12 @@ class Item:
         K = np.array(self.line["labels"]["camera"]["K"])
         x = K @ np.asarray(point_mm, dtype=float)
         return np.asarray(x[:2] / x[2] - self.entry.window[:2])
+
+
+def _integers(image: NDArray[Any], path: Path) -> NDArray[Any]:
+    if image.dtype.kind != "u":
+        raise InputError("holds no integers", source=str(path))
+    return image
 
 
 class Items:
