@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
+from typing import NoReturn
 
 # A message may quote a file that somebody else made. Longer parts lose their middle.
 MAX_MESSAGE, MAX_SOURCE, MAX_PATH, MAX_REASON = 2000, 600, 200, 400
@@ -40,6 +41,10 @@ class InputError(EyerenderError):
         self.path = one_line(path, MAX_PATH)
         shown = one_line(source, MAX_SOURCE)
         super().__init__(": ".join(part for part in (shown, self.path, self.reason) if part))
+
+
+Refuse = Callable[[str, str], NoReturn]
+"""Raises `InputError` for a path in some input, with a reason."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,13 +9,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeGuard, overload
+from typing import Any, NoReturn, TypeGuard, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import Bytes
-from .errors import InputError
+from .errors import InputError, Refuse
 from .files import inside, is_plain, read_json, shown, write_json
 from .imagefile import read_image
 from .jsonlines import JsonLines
@@ -262,40 +262,51 @@ class ImageFolder:
 def _check_line(line: dict[str, Any], source: str, where: str) -> None:
     """Raise `InputError` for a line whose files, names or window cannot be used; what else it holds is not checked."""
 
-    def refuse(reason: str, key: str) -> None:
+    def refuse(key: str, reason: str) -> NoReturn:
         raise InputError(reason, source=source, path=f"{where}.{key}")
 
     if line.get("schema") != IMAGE_SCHEMA:
-        refuse(f"is {shown(line.get('schema'))}, no image record of {IMAGE_SCHEMA!r}", "schema")
+        refuse("schema", f"is {shown(line.get('schema'))}, no image record of {IMAGE_SCHEMA!r}")
     for key in FILE_KEYS:
         name = line.get(key)
         if not is_plain(name) and (name is not None or key == "file_name"):
-            refuse(f"must be a path inside the folder, not {shown(name)}", key)
+            refuse(key, f"must be a path inside the folder, not {shown(name)}")
     window = line.get("window_px")
     for key in ("x0", "y0", "width", "height"):
         value = window.get(key) if isinstance(window, dict) else None
         if not _is_whole(value) or abs(value) > _MAX_PX or (value < 1 and key in ("width", "height")):
-            refuse("must be a whole number of pixels", f"window_px.{key}")
+            refuse(f"window_px.{key}", "must be a whole number of pixels")
     depth = line.get("bit_depth")
     if depth is not None and not (_is_whole(depth) and 1 <= depth <= 32):
-        refuse("must be 1 to 32", "bit_depth")
-    # These become parts of the names of exported files.
+        refuse("bit_depth", "must be 1 to 32")
+    _check_names(line, refuse)
+    _check_records(line.get("records"), refuse)
+
+
+def _check_names(line: dict[str, Any], refuse: Refuse) -> None:
+    """What becomes a part of the names of exported files."""
     for key in ("sample", "subject"):
-        if key in line and not (_is_whole(line[key]) and 0 <= line[key] < 2**63):
-            refuse("must be a whole number >= 0", key)
+        if key in line and not _is_count(line[key], 2**63):
+            refuse(key, "must be a whole number >= 0")
     if "split" in line and not (is_plain(line["split"]) and "/" not in line["split"] and len(line["split"]) <= 64):
-        refuse(f"must be a plain name, not {shown(line['split'])}", "split")
-    records = line.get("records")
+        refuse("split", f"must be a plain name, not {shown(line['split'])}")
+
+
+def _check_records(records: Any, refuse: Refuse) -> None:
     if not isinstance(records, list):
-        refuse("must be a list", "records")
-    for k, record in enumerate(line["records"]):
+        refuse("records", "must be a list")
+    for k, record in enumerate(records):
         if not isinstance(record, dict):
-            refuse("must be a record", f"records.{k}")
+            refuse(f"records.{k}", "must be a record")
         if record.get("eye") not in (None, *EYES):
-            refuse("must be 'right' or 'left'", f"records.{k}.eye")
+            refuse(f"records.{k}.eye", "must be 'right' or 'left'")
         camera = record.get("camera")
-        if camera is not None and not (_is_whole(camera) and 0 <= camera < 2**31):
-            refuse("must be a whole number >= 0", f"records.{k}.camera")
+        if camera is not None and not _is_count(camera, 2**31):
+            refuse(f"records.{k}.camera", "must be a whole number >= 0")
+
+
+def _is_count(value: object, end: int) -> bool:
+    return _is_whole(value) and 0 <= value < end
 
 
 def _is_whole(value: object) -> TypeGuard[int]:

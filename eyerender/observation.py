@@ -448,14 +448,15 @@ def _glint_problem(g: Any) -> str | None:
     for key in ("light", "status", "reason", "in_image", "xy_px", "covariance"):
         if key not in g:
             return f"{key} is missing"
-    if not (g["light"] is None or _is_count(g["light"])):
-        return "light must be a whole number or null"
-    if not (isinstance(g["status"], str) and 0 < len(g["status"]) <= _MAX_TEXT):
-        return f"status must be {OK!r} or {MISSING!r}"
-    if not (g["reason"] is None or (isinstance(g["reason"], str) and len(g["reason"]) <= _MAX_TEXT)):
-        return "reason must be null or a text"
-    if not (g["in_image"] is None or isinstance(g["in_image"], bool)):
-        return "in_image must be true, false or null"
+    light, status, reason, in_image = g["light"], g["status"], g["reason"], g["in_image"]
+    for fits, message in (
+        (light is None or _is_count(light), "light must be a whole number or null"),
+        (isinstance(status, str) and 0 < len(status) <= _MAX_TEXT, f"status must be {OK!r} or {MISSING!r}"),
+        (reason is None or (isinstance(reason, str) and len(reason) <= _MAX_TEXT), "reason must be null or a text"),
+        (in_image is None or isinstance(in_image, bool), "in_image must be true, false or null"),
+    ):
+        if not fits:
+            return message
     for key, shape in (("xy_px", (2,)), ("covariance", (2, 2))):
         if g[key] is not None and ((found := _array(g[key])) is None or found.shape != shape):
             return f"{key} must be null or {'x'.join(map(str, shape))} numbers"

@@ -177,14 +177,6 @@ def _made_here(folder: Path, listed: Set[str], *, strict: bool) -> Iterator[tupl
     With `strict` anything else raises `InputError`, otherwise it is left out.
     """
 
-    def ours(name: str, is_folder: bool) -> bool:
-        if is_folder:
-            return f"{name}/" in listed or _FOLDERS.fullmatch(name) is not None
-        part = _PARTS.fullmatch(name)
-        if part:
-            name = part["folder"] + (part["hidden"] or part["plain"])
-        return name in listed or _FILES.fullmatch(name) is not None
-
     def walk(prefix: str) -> Iterator[tuple[str, bool]]:
         with os.scandir(folder / prefix) as found:
             entries = list(found)  # they may be removed on the way
@@ -197,7 +189,7 @@ def _made_here(folder: Path, listed: Set[str], *, strict: bool) -> Iterator[tupl
                     yield name, False
             elif is_folder and _STAGES.fullmatch(entry.name):
                 continue
-            elif plain and ours(name, is_folder):
+            elif plain and _is_ours(name, is_folder, listed):
                 if is_folder:
                     yield from walk(f"{name}/")
                 yield name, is_folder
@@ -208,6 +200,16 @@ def _made_here(folder: Path, listed: Set[str], *, strict: bool) -> Iterator[tupl
                 )
 
     return walk("")
+
+
+def _is_ours(name: str, is_folder: bool, listed: Set[str]) -> bool:
+    """Whether a file or folder of a folder has a name that this package gives, or is listed as made by it."""
+    if is_folder:
+        return f"{name}/" in listed or _FOLDERS.fullmatch(name) is not None
+    part = _PARTS.fullmatch(name)
+    if part:
+        name = part["folder"] + (part["hidden"] or part["plain"])
+    return name in listed or _FILES.fullmatch(name) is not None
 
 
 def _refuse_others(folder: Path, listed: Set[str]) -> None:

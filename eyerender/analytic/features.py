@@ -90,18 +90,7 @@ def features(
     the head's displacement included. cameras, camera_index (n,). lights_mm (m, 3) in the world. boundary_points : >= 6.
     purkinje : orders of the images wanted of each light; one that an eye lacks has status MISSED.
     """
-    if boundary_points < 6:
-        raise InputError("must be >= 6", path="boundary_points")
-    if boundary_points > MAX_BOUNDARY_POINTS:
-        raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", path="boundary_points")
-    if len(np.atleast_1d(eye_index)) * boundary_points > MAX_POINTS:
-        raise InputError(
-            f"{len(np.atleast_1d(eye_index))} observations with {boundary_points} points each are more than "
-            f"{MAX_POINTS} points; ask for fewer",
-            path="boundary_points",
-        )
-    if not set(purkinje) <= {1, 2, 3, 4} or len(set(purkinje)) != len(purkinje):
-        raise InputError("must be different numbers from 1 to 4", path="purkinje")
+    _check_options(len(np.atleast_1d(eye_index)), boundary_points, purkinje)
     which = np.asarray(eye_index, dtype=np.intp)
     cams = np.asarray(camera_index, dtype=np.intp)
     position = np.broadcast_to(np.asarray(position_mm, dtype=np.float64), (len(which), 3))
@@ -153,6 +142,21 @@ def features(
         glint_residual,
         glint_in_image,
     )
+
+
+def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> None:
+    """Raise `InputError` for options that `features` of so many eyes cannot take."""
+    if boundary_points < 6:
+        raise InputError("must be >= 6", path="boundary_points")
+    if boundary_points > MAX_BOUNDARY_POINTS:
+        raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", path="boundary_points")
+    if rows * boundary_points > MAX_POINTS:
+        raise InputError(
+            f"{rows} observations with {boundary_points} points each are more than {MAX_POINTS} points; ask for fewer",
+            path="boundary_points",
+        )
+    if not set(purkinje) <= {1, 2, 3, 4} or len(set(purkinje)) != len(purkinje):
+        raise InputError("must be different numbers from 1 to 4", path="purkinje")
 
 
 def reason_of(status: int) -> str | None:

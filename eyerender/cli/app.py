@@ -67,41 +67,36 @@ def run(argv: Sequence[str] | None = None) -> int:
         code = app(tokens, exit_on_error=False, print_error=False)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
-    except CycloptsError as error:
-        if debug:
-            raise
-        return _fail(" ".join(str(error).split()), InputError.exit_code)
-    except EyerenderError as error:
-        if debug:
-            raise
-        return _fail(str(error), error.exit_code)
-    except KeyboardInterrupt:
-        if debug:
-            raise
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
     except BrokenPipeError:
         # The reader has gone (`| head`): nothing is wrong, and the interpreter must not complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except MemoryError:
-        if debug:
+    except (Exception, KeyboardInterrupt) as error:
+        code = None if debug else _reported(error)
+        if code is None:
             raise
-        return _fail("out of memory", 1)
-    except OSError as error:
-        if debug:
-            raise
-        name = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{name}{error.strerror or error}", 1)
-    except Exception:
-        # Libraries that call back into Python can turn the interrupt into an error of their own.
-        if debug or not _interrupted.is_set():
-            raise
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return code
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def _reported(error: BaseException) -> int | None:
+    """Print an expected error as one line; returns the exit code, None (and prints nothing) for any other error."""
+    if isinstance(error, CycloptsError):
+        return _fail(" ".join(str(error).split()), InputError.exit_code)
+    if isinstance(error, EyerenderError):
+        return _fail(str(error), error.exit_code)
+    if isinstance(error, MemoryError):
+        return _fail("out of memory", 1)
+    if isinstance(error, OSError):
+        name = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{name}{error.strerror or error}", 1)
+    # Libraries that call back into Python can turn the interrupt into an error of their own.
+    if isinstance(error, KeyboardInterrupt) or _interrupted.is_set():
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    return None
 
 
 def _fail(message: str, code: int) -> int:

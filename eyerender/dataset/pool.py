@@ -76,12 +76,8 @@ class LocalPool:
         pending, tries, lost = deque(shards), Counter[int](), dict[int, str]()
         self._made = 0
         try:
-            while pending or any(w.shard is not None for w in self._workers):
-                while pending and len(self._workers) < min(self.size, self._busy() + len(pending)):
-                    self._start()
-                for worker in self._workers:
-                    if worker.is_ready and worker.shard is None and pending:
-                        self._give(worker, pending.popleft())
+            while pending or self._busy():
+                self._hand_out(pending)
                 wait([w.pipe for w in self._workers] + [w.process.sentinel for w in self._workers], timeout=1.0)
                 for worker in list(self._workers):
                     made = self._made
@@ -92,20 +88,19 @@ class LocalPool:
                         if worker.shard is None and worker.images >= self.recycle_images:
                             self._end(worker)  # before what its libraries leak adds up
                         continue
-                    shard = worker.shard
                     self._end(worker)
-                    key = NO_SHARD if shard is None else shard
-                    tries[key] += 1
-                    if shard is None:
-                        if tries[key] >= TRIES:
-                            raise EyerenderError(f"workers do not start: {reason}")
-                    elif tries[key] >= TRIES:
+                    shard = NO_SHARD if worker.shard is None else worker.shard
+                    tries[shard] += 1
+                    if tries[shard] < TRIES:
+                        if shard != NO_SHARD:
+                            pending.appendleft(shard)
+                    elif shard == NO_SHARD:
+                        raise EyerenderError(f"workers do not start: {reason}")
+                    else:
                         lost[shard] = reason
                         if len(lost) >= HOPELESS and not self._made:
                             return lost
-                    else:
-                        pending.appendleft(shard)
-                    events.retry(key, reason, tries[key])
+                    events.retry(shard, reason, tries[shard])
             return lost
         finally:
             self.close()
@@ -120,6 +115,14 @@ class LocalPool:
 
     def _busy(self) -> int:
         return sum(w.shard is not None for w in self._workers)
+
+    def _hand_out(self, pending: deque[int]) -> None:
+        """Start as many workers as there is work for, and give a shard to each that is ready and idle."""
+        while pending and len(self._workers) < min(self.size, self._busy() + len(pending)):
+            self._start()
+        for worker in self._workers:
+            if worker.is_ready and worker.shard is None and pending:
+                self._give(worker, pending.popleft())
 
     def _start(self) -> None:
         ours, theirs = self._context.Pipe()

@@ -172,24 +172,10 @@ def sobol_block(seed: int, unit: str, dimensions: int, block: int) -> Floats:
 
 def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, prefix: str) -> None:
     if is_draw(node):
-        shown = _join(prefix, path)
-        draw = parse_draw(node, source=source, path=shown)
-        bare = _CHOSEN.sub("", path)  # a place means the same inside a choice
-        identity = _under(bare, IDENTITY) and not _under(bare, PASSING)
-        unit: Unit = draw.per or ("subject" if identity else "sample")
-        if unit == "sample" and _under(bare, FIXED_IDENTITY):
-            raise InputError("a subject's eye is drawn once a subject", source=source, path=f"{shown}.per")
-        if isinstance(draw, SequenceDraw) and unit == "subject":
-            raise InputError("a sequence runs over the frames of a subject", source=source, path=shown)
-        draws[path] = PlacedDraw(draw, unit)
+        placed = draws[path] = _placed(node, path, source, _join(prefix, path))
         if len(draws) > MAX_DRAWS:
             raise InputError(f"holds more than {MAX_DRAWS} draws", source=source, path=prefix)
-        inner: tuple[Any, ...] = ()
-        if isinstance(draw, FixedDraw):
-            inner = (draw.value,)
-        elif isinstance(draw, ChoiceDraw | SequenceDraw | GridDraw):
-            inner = draw.values or ()
-        for k, value in enumerate(inner):
+        for k, value in enumerate(_values_of(placed.draw)):
             _collect(value, f"{path}#{k}", draws, source, prefix)
     elif isinstance(node, Mapping):
         for key, value in node.items():
@@ -197,6 +183,28 @@ def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, pr
     elif isinstance(node, list | tuple):
         for k, value in enumerate(node):
             _collect(value, _join(path, k), draws, source, prefix)
+
+
+def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
+    """The draw at a path, which messages call `shown`."""
+    draw = parse_draw(node, source=source, path=shown)
+    bare = _CHOSEN.sub("", path)  # a place means the same inside a choice
+    identity = _under(bare, IDENTITY) and not _under(bare, PASSING)
+    unit: Unit = draw.per or ("subject" if identity else "sample")
+    if unit == "sample" and _under(bare, FIXED_IDENTITY):
+        raise InputError("a subject's eye is drawn once a subject", source=source, path=f"{shown}.per")
+    if isinstance(draw, SequenceDraw) and unit == "subject":
+        raise InputError("a sequence runs over the frames of a subject", source=source, path=shown)
+    return PlacedDraw(draw, unit)
+
+
+def _values_of(draw: Draw) -> tuple[Any, ...]:
+    """The values that a draw lists, in which there may be draws again."""
+    if isinstance(draw, FixedDraw):
+        return (draw.value,)
+    if isinstance(draw, ChoiceDraw | SequenceDraw | GridDraw):
+        return draw.values or ()
+    return ()
 
 
 def _under(path: str, places: tuple[str, ...]) -> bool:

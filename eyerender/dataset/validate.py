@@ -65,18 +65,14 @@ def validate(
         for k, (entry, wrong) in enumerate(zip(batch, records, strict=True), start):
             where = f"{METADATA} line {k + 1}"
             named = str(entry.line["file_name"])
+            used = truth if able and (deep or k in chosen) else None
             try:
                 problems.extend(f"{where}: {text}" for text in lines.take(k, entry))
                 problems.extend(f"{named}: {text}" for text in wrong)
-                again = Again(())
-                if truth is not None and able and (deep or k in chosen) and not wrong:
-                    again = truth.again(entry.line)
-                    problems.extend(f"{named}: {text}" for text in again.problems)
-                if quick:
-                    for key in FILE_KEYS:
-                        entry.file(key)  # says what is wrong with it
-                elif not wrong:
-                    problems.extend(f"{named}: {text}" for text in check_images(entry, again.limbus_px, tally))
+                if not wrong:
+                    problems.extend(f"{named}: {text}" for text in _check(entry, used, tally, quick=quick))
+                elif quick:
+                    _find_files(entry)
             except WRONG as error:
                 problems.add(f"{where}: has not the labels it should have ({type(error).__name__}: {error})")
             except InputError as error:
@@ -96,6 +92,22 @@ def validate(
         "problems_left_out": problems.count - len(problems.shown),
         "statistics": {**(statistics if isinstance(statistics, dict) else {}), **tally.to_mapping()},
     }
+
+
+def _check(entry: ImageEntry, truth: DatasetTruth | SceneTruth | None, tally: Tally, *, quick: bool) -> Iterator[str]:
+    """What is wrong with a line, as far as `truth` tells (None: it is not computed again), and with its pictures."""
+    again = Again(()) if truth is None else truth.again(entry.line)
+    yield from again.problems
+    if quick:
+        _find_files(entry)
+    else:
+        yield from check_images(entry, again.limbus_px, tally)
+
+
+def _find_files(entry: ImageEntry) -> None:
+    """Raise `InputError` for the first file of a line that is missing or lies outside the folder."""
+    for key in FILE_KEYS:
+        entry.file(key)
 
 
 def sampled(total: int, digest: str) -> list[int]:

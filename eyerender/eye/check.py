@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import NoReturn
 
 import numpy as np
 
 from ..arrays import Bools, Floats
-from ..errors import InputError
+from ..errors import InputError, Refuse
 from ..geometry.surfaces import Surface, components
+from .model import Stop
 from .spec import (
     BiconicSpec,
     ConicSpec,
@@ -34,7 +36,7 @@ def check_eye(spec: EyeSpec, *, source: str = "") -> None:
     """
     from .build import gradient_geometry, stop_of, stop_reach_mm
 
-    def refuse(path: str, reason: str) -> None:
+    def refuse(path: str, reason: str) -> NoReturn:
         raise InputError(reason, source=source, path=path)
 
     for path, placed in _placed(spec):
@@ -48,17 +50,11 @@ def check_eye(spec: EyeSpec, *, source: str = "") -> None:
     if not (stop.relative_radius(np.linspace(0.0, 2.0 * np.pi, 720)) > 0.0).all():
         refuse("stop.contour", "the margin's radius must be > 0 all around")
     radius = stop_reach_mm(stop)
-    if radius >= spec.limbus_radius_mm:
-        refuse("stop.diameter_mm", f"the pupil is wider than the cornea ({2 * spec.limbus_radius_mm:g} mm)")
-    if radius >= spec.iris.root_radius_mm:
-        refuse("stop.diameter_mm", f"the pupil is wider than the iris ({2 * spec.iris.root_radius_mm:g} mm)")
-    if spec.iris.root_radius_mm > spec.limbus_radius_mm:
-        refuse("iris.root_radius_mm", f"the iris is wider than the cornea ({spec.limbus_radius_mm:g} mm)")
-    if spec.sclera.radius_mm <= spec.limbus_radius_mm:
-        refuse("sclera.radius_mm", f"must be > limbus_radius_mm ({spec.limbus_radius_mm:g})")
+    _check_widths(spec, refuse, radius)
     if any(abs(angle) >= 60.0 for angle in spec.fovea.field_deg):
         refuse("fovea.field_deg", "must be within 60 degrees of the optic axis")
-    _check_order(spec, source, radius)
+    _check_cornea(spec, refuse, stop)
+    _check_inside(spec, refuse, stop, radius)
     if isinstance(spec.lens, GradientLensSpec):
         try:
             gradient_geometry(spec.lens)
@@ -66,17 +62,24 @@ def check_eye(spec: EyeSpec, *, source: str = "") -> None:
             refuse(error.path, error.reason)
 
 
-def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:
-    """Check that surfaces follow each other within the aperture: cornea, stop, lens, retina."""
-    from .build import stop_of, surface_of
+def _check_widths(spec: EyeSpec, refuse: Refuse, pupil_radius_mm: float) -> None:
+    """Check that the pupil lies within the iris, the iris within the cornea, and the cornea within the sclera."""
+    if pupil_radius_mm >= spec.limbus_radius_mm:
+        refuse("stop.diameter_mm", f"the pupil is wider than the cornea ({2 * spec.limbus_radius_mm:g} mm)")
+    if pupil_radius_mm >= spec.iris.root_radius_mm:
+        refuse("stop.diameter_mm", f"the pupil is wider than the iris ({2 * spec.iris.root_radius_mm:g} mm)")
+    if spec.iris.root_radius_mm > spec.limbus_radius_mm:
+        refuse("iris.root_radius_mm", f"the iris is wider than the cornea ({spec.limbus_radius_mm:g} mm)")
+    if spec.sclera.radius_mm <= spec.limbus_radius_mm:
+        refuse("sclera.radius_mm", f"must be > limbus_radius_mm ({spec.limbus_radius_mm:g})")
 
-    def refuse(path: str, reason: str) -> None:
-        raise InputError(reason, source=source, path=path)
+
+def _check_cornea(spec: EyeSpec, refuse: Refuse, stop: Stop) -> None:
+    """Check that the cornea's surfaces reach the limbus and follow each other, before the plane of the iris."""
+    from .build import surface_of
 
     cornea = [(f"cornea.{k}", surface_of(s)) for k, s in enumerate(spec.cornea)]
-    stop = stop_of(spec, spec.stop.diameter_mm)
     wide = _disc(spec.limbus_radius_mm, np.zeros(2))
-    narrow = _disc(pupil_radius_mm, stop.centre_mm[1:])
     depth_wide = _stop_depth(stop.centre_mm, stop.normal, wide)
     front = _depth(cornea[0][1], wide)
     if not np.isfinite(front).all():
@@ -89,10 +92,16 @@ def _check_order(spec: EyeSpec, source: str, pupil_radius_mm: float) -> None:
         crossing = counts & (depth > ahead - _TOUCH_MM)
         if crossing.any():
             refuse(f"{path}.position_mm", f"crosses {path_before} {_where(wide, crossing)}")
-    inner = cornea[-1]
-    depth = _depth(inner[1], narrow)
+
+
+def _check_inside(spec: EyeSpec, refuse: Refuse, stop: Stop, pupil_radius_mm: float) -> None:
+    """Check that inner cornea, stop, lens and retina follow each other within the pupil."""
+    from .build import surface_of
+
+    narrow = _disc(pupil_radius_mm, stop.centre_mm[1:])
+    depth = _depth(surface_of(spec.cornea[-1]), narrow)
     if not (depth > _stop_depth(stop.centre_mm, stop.normal, narrow)).all():
-        refuse("stop.position_mm", f"the stop is not behind {inner[0]} within the pupil")
+        refuse("stop.position_mm", f"the stop is not behind cornea.{len(spec.cornea) - 1} within the pupil")
     behind: list[tuple[str, Surface]] = []
     if isinstance(spec.lens, SurfaceLensSpec):
         behind = [(f"lens.surfaces.{k}", surface_of(s)) for k, s in enumerate(spec.lens.surfaces)]

@@ -19,6 +19,9 @@ from ..rig.screen import ScreenPlane
 from ..scene import Scene, load_scene
 from ..spec import LARGEST
 
+ReadArray = Callable[[Any, tuple[int, ...], str], Floats]
+"""Turns a value into an array of a shape; raises `InputError` with the path."""
+
 # Records of some 40,000 observations. All of them are held at once.
 MAX_RECORDS_BYTES = 128 * 2**20
 
@@ -80,33 +83,34 @@ def rig_from_mapping(data: Any, *, source: str = "") -> RigGeometry:
         raise InputError("must hold cameras", source=source, path="rig")
     if len(data["cameras"]) > MAX_CAMERAS:
         raise InputError(f"are more than {MAX_CAMERAS}", source=source, path="rig.cameras")
-    cameras = []
-    for k, c in enumerate(data["cameras"]):
-        at = f"rig.cameras.{k}"
-        if not isinstance(c, dict):
-            raise InputError("must be a camera", source=source, path=at)
-        size = array(c.get("resolution_px"), (2,), f"{at}.resolution_px")
-        if not ((size >= 1) & (size <= 65536) & (size == np.floor(size))).all():
-            raise InputError("must be whole numbers from 1 to 65536", source=source, path=f"{at}.resolution_px")
-        K, R, t = (array(c.get(key), (3, 3)[: 1 + (key != "t")], f"{at}.{key}") for key in ("K", "R", "t"))
-        distortion = array(c.get("distortion", [0.0] * 5), (5,), f"{at}.distortion")
-        # The same rules as those of a camera in a scene.
-        calibration = {"K": K.tolist(), "R": R.tolist(), "t_mm": t.tolist(), "distortion": distortion.tolist()}
-        try:
-            CameraCalibration.from_mapping(calibration)
-        except InputError as error:
-            raise InputError(error.reason, source=source, path=at) from None
-        cameras.append(PinholeCamera.of(K, R, t, (int(size[0]), int(size[1])), distortion))
+    cameras = tuple(_camera(c, array, source, f"rig.cameras.{k}") for k, c in enumerate(data["cameras"]))
     places = data.get("lights_mm") or []
     if not isinstance(places, list) or len(places) > MAX_LIGHTS:
         raise InputError(f"must be a list of at most {MAX_LIGHTS} points", source=source, path="rig.lights_mm")
     lights = tuple(
         Lamp(array(p, (3,), f"rig.lights_mm.{k}"), frozen([1.0, 0.0, 0.0]), 0.0, 1.0, 0.0) for k, p in enumerate(places)
     )
-    return RigGeometry(tuple(cameras), lights, _screen(data.get("screen"), array, source))
+    return RigGeometry(cameras, lights, _screen(data.get("screen"), array, source))
 
 
-def _screen(data: Any, array: Callable[[Any, tuple[int, ...], str], Floats], source: str) -> ScreenPlane | None:
+def _camera(data: Any, array: ReadArray, source: str, at: str) -> PinholeCamera:
+    if not isinstance(data, dict):
+        raise InputError("must be a camera", source=source, path=at)
+    size = array(data.get("resolution_px"), (2,), f"{at}.resolution_px")
+    if not ((size >= 1) & (size <= 65536) & (size == np.floor(size))).all():
+        raise InputError("must be whole numbers from 1 to 65536", source=source, path=f"{at}.resolution_px")
+    K, R, t = (array(data.get(key), (3, 3)[: 1 + (key != "t")], f"{at}.{key}") for key in ("K", "R", "t"))
+    distortion = array(data.get("distortion", [0.0] * 5), (5,), f"{at}.distortion")
+    # The same rules as those of a camera in a scene.
+    calibration = {"K": K.tolist(), "R": R.tolist(), "t_mm": t.tolist(), "distortion": distortion.tolist()}
+    try:
+        CameraCalibration.from_mapping(calibration)
+    except InputError as error:
+        raise InputError(error.reason, source=source, path=at) from None
+    return PinholeCamera.of(K, R, t, (int(size[0]), int(size[1])), distortion)
+
+
+def _screen(data: Any, array: ReadArray, source: str) -> ScreenPlane | None:
     if data is None:
         return None
     if not isinstance(data, dict):

@@ -82,10 +82,8 @@ def file_states(spec: Head) -> tuple[tuple[int, int], ...]:
     return tuple(states)
 
 
-@lru_cache(maxsize=4)
-def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
-    del states
-    source = spec.files[0]
+def _all_objects(spec: Head) -> dict[str, list[trimesh.Trimesh]]:
+    """The meshes of all files by their names; raises `InputError` where a check sum does not fit."""
     for file, wanted in zip(spec.files, spec.sums, strict=False):
         if file_digest(Path(file)) != wanted:
             raise InputError("is not the file that sha256 belongs to", source=file)
@@ -93,6 +91,14 @@ def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
     for file in spec.files:
         for name, mesh in _objects(Path(file)).items():
             objects.setdefault(name, []).append(mesh)
+    return objects
+
+
+@lru_cache(maxsize=4)
+def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
+    del states
+    source = spec.files[0]
+    objects = _all_objects(spec)
     scale, axes = _UNIT_MM[spec.unit or "mm"], _axes(spec, source)
     vertices, normals, faces, uv, vertex_ends, face_ends = [], [], [], [], [], []
     count = triangles = 0

@@ -19,6 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Floats, frozen
 from ..errors import InputError
@@ -86,20 +87,24 @@ def read_map(path: str | Path, channel: str = "red") -> Floats:
         raise InputError(f"is not a readable map ({detail})", source=source) from None
     if data.dtype.kind not in "fiu" or data.ndim not in (2, 3):
         raise InputError("must hold numbers (height, width) or (height, width, channels)", source=source)
-    if data.ndim == 3:
-        if data.shape[2] < 3:
-            data = data[..., 0]
-        elif channel == "luminance":
-            data = data[..., :3] @ _LUMINANCE
-        else:
-            data = data[..., ("red", "green", "blue").index(channel)]
-    values: Floats = np.asarray(data, dtype=np.float64)
+    values: Floats = np.asarray(_channel(data, channel), dtype=np.float64)
     height, width = values.shape
     if width != 2 * height or height < 4:
         raise InputError(f"is {width} x {height}; a map over all directions is twice as wide as high", source=source)
     if not np.all(np.isfinite(values)) or np.min(values) < 0:
         raise InputError("holds values that are negative or not finite", source=source)
     return values
+
+
+def _channel(data: NDArray[Any], channel: str) -> NDArray[Any]:
+    """One channel (h, w) of a map (h, w) or (h, w, channels); maps of fewer than three have only one that counts."""
+    if data.ndim == 2:
+        return data
+    if data.shape[2] < 3:
+        return data[..., 0]
+    if channel == "luminance":
+        return np.asarray(data[..., :3] @ _LUMINANCE)
+    return data[..., ("red", "green", "blue").index(channel)]
 
 
 def _size(kind: str, head: bytes) -> int | None:

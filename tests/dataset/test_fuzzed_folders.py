@@ -65,47 +65,54 @@ def harmed(folder: Path, rng: Random, secret: Path) -> None:
     """Do one or two things to a folder that a stranger or a bad disk may have done."""
     for _ in range(rng.choice((1, 1, 2))):
         what = rng.choice(HARMS)
-        name = rng.choice(JSON if what == "json" else LINES if what == "line" else FILES)
-        path = folder / name
-        if path.parent.is_symlink() or not path.parent.is_dir() or path.is_symlink():  # harmed before
-            continue
-        if path.is_dir() and not path.is_symlink():
-            inside = sorted(path.iterdir())
-            if not inside:
-                continue
-            path = inside[0]
-        if not path.is_file():
+        path = target(folder / rng.choice(JSON if what == "json" else LINES if what == "line" else FILES))
+        if path is None:
             continue
         if what == "json":
             data = parsed(path)
             if data is not None:
                 path.write_text(json.dumps(edited(data, rng)), encoding="utf-8")
         elif what == "line":
-            # The same change in the shard and in what is put together of it, as somebody who means it would do.
-            data = parsed(path, first=True)
-            if data is None:
-                continue
-            changed = json.dumps(edited(data, rng))
-            for other in LINES:
-                if (folder / other).is_file() and not (folder / other).is_symlink():
-                    lines = (folder / other).read_text(encoding="utf-8").splitlines()
-                    (folder / other).write_text("\n".join([changed, *lines[1:]]) + "\n", encoding="utf-8")
+            edit_line(folder, path, rng)
         elif what == "bytes":
             path.write_bytes(garbled(path.read_bytes(), rng))
         else:
-            path.unlink()
-            if what == "link":
-                path.symlink_to(secret)
-            elif what == "link up":
-                if path.parent == folder:
-                    path.symlink_to(secret)
-                else:
-                    shutil.rmtree(path.parent)
-                    path.parent.symlink_to(secret.parent)
-            elif what == "pipe":
-                os.mkfifo(path)
-            elif what == "folder":
-                path.mkdir()
+            replace(folder, path, what, secret)
+
+
+def target(path: Path) -> Path | None:
+    """The file at a path, or the first one in a folder there; None where an earlier harm has changed what is there."""
+    if path.parent.is_symlink() or not path.parent.is_dir() or path.is_symlink():
+        return None
+    if path.is_dir():
+        path = min(path.iterdir(), default=path)
+    return path if path.is_file() else None
+
+
+def edit_line(folder: Path, path: Path, rng: Random) -> None:
+    """The same change in the shard and in what is put together of it, as somebody who means it would do."""
+    data = parsed(path, first=True)
+    if data is None:
+        return
+    changed = json.dumps(edited(data, rng))
+    for other in LINES:
+        if (folder / other).is_file() and not (folder / other).is_symlink():
+            lines = (folder / other).read_text(encoding="utf-8").splitlines()
+            (folder / other).write_text("\n".join([changed, *lines[1:]]) + "\n", encoding="utf-8")
+
+
+def replace(folder: Path, path: Path, what: str, secret: Path) -> None:
+    """Put a link, a pipe, a folder or nothing in a file's place, or a link in its folder's."""
+    path.unlink()
+    if what == "link" or (what == "link up" and path.parent == folder):
+        path.symlink_to(secret)
+    elif what == "link up":
+        shutil.rmtree(path.parent)
+        path.parent.symlink_to(secret.parent)
+    elif what == "pipe":
+        os.mkfifo(path)
+    elif what == "folder":
+        path.mkdir()
 
 
 def signed(folder: Path) -> None:

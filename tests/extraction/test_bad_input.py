@@ -115,41 +115,46 @@ def test_outside_the_sizes_looked_for():
     assert not wide.ok
 
 
+def _cropped(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    y, x = (int(rng.integers(0, n)) for n in image.shape)
+    return image[y : y + int(rng.integers(1, 200)), x : x + int(rng.integers(1, 200))]
+
+
+def _painted(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    out = image.copy()
+    y, x = (int(rng.integers(0, n)) for n in out.shape)
+    out[y : y + 60, x : x + 90] = rng.integers(0, 255)
+    return out
+
+
+def _flipped(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    raw = bytearray(np.ascontiguousarray(image).tobytes())
+    for place in rng.integers(0, max(len(raw), 1), 200 if raw else 0):
+        raw[place] ^= int(rng.integers(1, 256))
+    return np.frombuffer(bytes(raw), image.dtype).reshape(image.shape)
+
+
+DAMAGES = (
+    _cropped,
+    lambda image, rng: np.iinfo(image.dtype).max - image if image.dtype.kind == "u" else -image,
+    _painted,
+    lambda image, rng: (image * rng.uniform(0.0, 1.0)).astype(image.dtype),
+    lambda image, rng: image.astype(np.float64) / 255.0 * 10.0 ** rng.integers(-6, 7),
+    lambda image, rng: image[:: int(rng.integers(1, 6)), :: int(rng.integers(1, 6))],
+    _flipped,
+    lambda image, rng: np.where(rng.random(image.shape) < 0.2, 0, image).astype(image.dtype),
+    lambda image, rng: np.roll(image, int(rng.integers(0, 300)), axis=int(rng.integers(0, 2))),
+    lambda image, rng: np.minimum(image, rng.integers(1, 60)).astype(image.dtype),
+    lambda image, rng: np.sort(image, axis=int(rng.integers(0, 2))),
+    lambda image, rng: np.repeat(np.repeat(image[:80, :80], 3, axis=0), 3, axis=1),
+)
+
+
 def _mutate(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, dict]:
     """One to three random damages, and sometimes a wrong description."""
     out = image
     for _ in range(rng.integers(1, 4)):
-        kind = rng.integers(0, 12)
-        if kind == 0:
-            y, x = (int(rng.integers(0, n)) for n in out.shape)
-            out = out[y : y + int(rng.integers(1, 200)), x : x + int(rng.integers(1, 200))]
-        elif kind == 1:
-            out = np.iinfo(out.dtype).max - out if out.dtype.kind == "u" else -out
-        elif kind == 2:
-            out = out.copy()
-            y, x = (int(rng.integers(0, n)) for n in out.shape)
-            out[y : y + 60, x : x + 90] = rng.integers(0, 255)
-        elif kind == 3:
-            out = (out * rng.uniform(0.0, 1.0)).astype(out.dtype)
-        elif kind == 4:
-            out = out.astype(np.float64) / 255.0 * 10.0 ** rng.integers(-6, 7)
-        elif kind == 5:
-            out = out[:: int(rng.integers(1, 6)), :: int(rng.integers(1, 6))]
-        elif kind == 6:
-            raw = bytearray(np.ascontiguousarray(out).tobytes())
-            for place in rng.integers(0, max(len(raw), 1), 200 if raw else 0):
-                raw[place] ^= int(rng.integers(1, 256))
-            out = np.frombuffer(bytes(raw), out.dtype).reshape(out.shape)
-        elif kind == 7:
-            out = np.where(rng.random(out.shape) < 0.2, 0, out).astype(out.dtype)
-        elif kind == 8:
-            out = np.roll(out, int(rng.integers(0, 300)), axis=int(rng.integers(0, 2)))
-        elif kind == 9:
-            out = np.minimum(out, rng.integers(1, 60)).astype(out.dtype)
-        elif kind == 10:
-            out = np.sort(out, axis=int(rng.integers(0, 2)))
-        else:
-            out = np.repeat(np.repeat(out[:80, :80], 3, axis=0), 3, axis=1)
+        out = DAMAGES[rng.integers(0, len(DAMAGES))](out, rng)
         if out.size == 0:
             return out, {}
     options: dict = {}

@@ -32,44 +32,32 @@ def _encoded(image: np.ndarray, kind: str) -> bytes:
         return out.getvalue()
     deep = (image.astype(np.uint16) * 257) if image.dtype == np.uint8 else image
     grey, colour = Image.fromarray(image), np.repeat(image[..., None], 3, axis=2)
-    match kind:
-        case "png":
-            grey.save(out, "PNG")
-        case "png16":
-            Image.fromarray(deep).save(out, "PNG")
-        case "pgm":
-            grey.save(out, "PPM")
-        case "jpeg":
-            grey.save(out, "JPEG", quality=95)
-        case "tiff":
-            grey.save(out, "TIFF")
-        case "tiff16":
-            Image.fromarray(deep).save(out, "TIFF", compression="tiff_lzw")
-        case "bmp":
-            grey.save(out, "BMP")
-        case "rgb":
-            Image.fromarray(colour).save(out, "PNG")
-        case "tinted":
-            colour[..., 0] //= 2
-            Image.fromarray(colour).save(out, "PNG")
-        case "alpha":
-            alpha = np.full((*image.shape, 4), 255, np.uint8)
-            alpha[..., :3] = colour
-            alpha[: image.shape[0] // 2, :, 3] = 0
-            Image.fromarray(alpha).save(out, "PNG")
-        case "palette":
-            grey.convert("P").save(out, "PNG")
-        case "animated":
-            grey.save(out, "GIF", save_all=True, append_images=[Image.fromarray(255 - image)])
-        case "one":
-            Image.fromarray(image[:1, :1]).save(out, "PNG")
+    tinted = colour // np.array([2, 1, 1], np.uint8)
+    alpha = np.dstack([colour, np.full(image.shape, 255, np.uint8)])
+    alpha[: image.shape[0] // 2, :, 3] = 0
+    pictures = {
+        "png16": Image.fromarray(deep),
+        "tiff16": Image.fromarray(deep),
+        "rgb": Image.fromarray(colour),
+        "tinted": Image.fromarray(tinted),
+        "alpha": Image.fromarray(alpha),
+        "palette": grey.convert("P"),
+        "one": Image.fromarray(image[:1, :1]),
+    }
+    options = {
+        "jpeg": {"quality": 95},
+        "tiff16": {"compression": "tiff_lzw"},
+        "animated": {"save_all": True, "append_images": [Image.fromarray(255 - image)]},
+    }
+    pictures.get(kind, grey).save(out, FORMATS[kind], **options.get(kind, {}))
     return out.getvalue()
 
 
-KINDS = (
-    "png", "png16", "pgm", "jpeg", "tiff", "tiff16", "bmp", "npy", "rgb", "tinted", "alpha", "palette", "animated",
-    "one",
-)  # fmt: skip
+FORMATS = {
+    "png": "PNG", "png16": "PNG", "pgm": "PPM", "jpeg": "JPEG", "tiff": "TIFF", "tiff16": "TIFF", "bmp": "BMP",
+    "rgb": "PNG", "tinted": "PNG", "alpha": "PNG", "palette": "PNG", "animated": "GIF", "one": "PNG",
+}  # fmt: skip
+KINDS = (*FORMATS, "npy")
 PIXELS_KEPT = ("png", "png16", "pgm", "jpeg", "tiff", "tiff16", "bmp", "rgb", "palette")  # one grey image, all of it
 
 

@@ -69,20 +69,25 @@ def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> I
         quiet, _ = read_image(quiet_path)
         if quiet.shape != image.shape or float(quiet.max()) > full:
             yield "its noiseless image has another shape or values above its range"
-    if mask_path is None:
-        return
-    mask = read_image(mask_path)[0]
-    whole = None if whole_path is None else read_image(whole_path)[0]
+    if mask_path is not None:
+        mask = read_image(mask_path)[0]
+        whole = None if whole_path is None else read_image(whole_path)[0]
+        yield from _masks(entry, mask, whole, limbus_px)
+
+
+def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats | None) -> Iterator[str]:
+    """The masks of visible parts and, where there is one, of whole parts."""
+    w, h = entry.window[2:]
     for name, picture in (("mask", mask), ("amodal mask", whole)):
         if picture is None:
             continue
-        if picture.shape != image.shape:
+        if picture.shape != (h, w):
             yield f"its {name} is {_size(picture)} px"
             return
         if int(picture.max()) > PUPIL:
             yield f"its {name} holds the value {int(picture.max())}"
-    yield from _visible(line, mask, entry.window)
-    yield from _outlines(line, mask, whole, limbus_px, entry.window)
+    yield from _visible(entry.line, mask, entry.window)
+    yield from _outlines(entry.line, mask, whole, limbus_px, entry.window)
 
 
 def _size(picture: NDArray[Any]) -> str:

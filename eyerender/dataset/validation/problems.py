@@ -39,29 +39,27 @@ def differences(expected: Any, found: Any, tolerance: float, path: str = "") -> 
     Numbers may differ by `tolerance` (1 + |expected|). What `found` has beyond the expected keys is not looked at. The
     angle of an ellipse counts as far as it moves the ellipse's edge: a circle has none.
     """
-    if isinstance(expected, dict):
-        if not isinstance(found, dict):
-            yield _differ(path, found, expected)
-            return
-        for key, value in expected.items():
-            where = f"{path}.{key}" if path else str(key)
-            if key not in found:
-                yield f"{where} is missing"
-            elif key == "angle_rad" and _same_angle(expected, found, tolerance):
-                continue
-            else:
-                yield from differences(value, found[key], tolerance, where)
-    elif isinstance(expected, list | tuple):
-        if not isinstance(found, list) or len(found) != len(expected):
-            yield _differ(path, found, expected)
-            return
+    if isinstance(expected, dict) and isinstance(found, dict):
+        yield from _differences_of_keys(expected, found, tolerance, path)
+    elif isinstance(expected, list | tuple) and isinstance(found, list) and len(found) == len(expected):
         for k, (a, b) in enumerate(zip(expected, found, strict=True)):
             yield from differences(a, b, tolerance, f"{path}.{k}")
+    elif isinstance(expected, dict | list | tuple):
+        yield _differ(path, found, expected)
     elif _is_number(expected) and _is_number(found):
         if not abs(found - expected) <= tolerance * (1 + abs(expected)):
             yield _differ(path, found, expected)
     elif expected != found or isinstance(expected, bool) != isinstance(found, bool):
         yield _differ(path, found, expected)
+
+
+def _differences_of_keys(expected: dict[str, Any], found: dict[str, Any], tolerance: float, path: str) -> Iterator[str]:
+    for key, value in expected.items():
+        where = f"{path}.{key}" if path else str(key)
+        if key not in found:
+            yield f"{where} is missing"
+        elif key != "angle_rad" or not _same_angle(expected, found, tolerance):
+            yield from differences(value, found[key], tolerance, where)
 
 
 def _same_angle(expected: dict[str, Any], found: dict[str, Any], tolerance: float) -> bool:
