@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -95,11 +96,11 @@ class Bench:
         black = rigs.BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
         rig = rigs.LampRig(camera, tuple(lights))
         job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
-        shown, place = self.renderer.bind(job)
+        shown, surround = self.renderer.bind(job)
         values = shown.values
         u, v = pixels_of(dr.arange(mi.UInt32, n * n), job.window)
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
-        view = look(values, place.scene, o, d, True)
+        view = look(values, surround.scene, o, d, True)
         inner = view.inner.numpy().T
         rho = np.hypot(inner[:, 1], inner[:, 2]).reshape(n, n)
         cornea = view.cornea.numpy().astype(bool).reshape(n, n)
@@ -241,9 +242,8 @@ class Bench:
         place = (centroid(image, zoomed.window) - 0.5 * (fine - 1)) / fine
         flux = image.sum()
         yield row("large disc: flux against path", 100 * abs(mine.irradiance.sum(dtype=float) / flux - 1), "%", 1.0)
-        yield row(
-            "large disc: centroid against path", np.linalg.norm(centroid(mine.irradiance, window) - place), "px", 0.02
-        )
+        away = float(np.linalg.norm(centroid(mine.irradiance, window) - place))
+        yield row("large disc: centroid against path", away, "px", 0.02)
 
     def pupil_outline(self) -> Iterable[Row]:
         """RMS of the smooth contour (12 harmonics) of rendered pupils at 64 spp against the refracted margin."""
@@ -282,7 +282,7 @@ class Bench:
         for model in ("E2", "E4", "E5"):
             job = rigs.job_of(rigs.eye_of(model), rig, rig.window(640, 480), lights=lamps, labels=False)
             self.renderer.render(job)
-            cpu[model], wall[model] = cpu_of(lambda job=job: self.renderer.render(job), runs)
+            cpu[model], wall[model] = cpu_of(partial(self.renderer.render, job), runs)
         job = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(640, 480), lights=lamps, labels=False)
         # Anything but the surround's plane in the scene makes every shadow ray one of Embree's.
         card = np.array([[40.0, y, z] for y, z in ((300, 300), (310, 300), (310, 310), (300, 310))])

@@ -109,7 +109,8 @@ def _add_row(table: Rows, name: str, tally: Tally, rig: str, row: str, *, barred
     """One row: errors of centre, semi-axes and glints. The bars are those of the ideal images."""
     condition = {TEXTURED: "texture6", EDGE: "edge-glint"}.get(row)
     if row in RENDERED:
-        condition = RENDERED[row][2 if rig == "close" else 3]
+        _, _, close, remote = RENDERED[row]
+        condition = close if rig == "close" else remote
     if rig == "remote" and condition == "edge-glint":
         condition = None  # that bar is for semi-axes of 28 px and more
     median, p95 = CENTRE[condition] if barred and condition is not None else (None, None)

@@ -108,7 +108,7 @@ def main() -> None:
         observed = pool.map(observe, seeds, chunksize=20)
     print("TABLE: dict[str, tuple[tuple[float, ...], ...]] = {")
     for i, method in enumerate(METHODS):
-        found = [item[i] for item in observed if item[i] is not None]
+        found = [one for item in observed if (one := item[i]) is not None]
         rows, right = np.array([row for row, _ in found]), np.array([float(ok) for _, ok in found])
         table = fit(rows, right)
         print(f'    "{method}": (')

@@ -133,7 +133,10 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
     name = condition if isinstance(condition, str) else "custom"
     c = CONDITIONS[condition] if isinstance(condition, str) else condition
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    pick = lambda span: float(rng.uniform(*span))  # noqa: E731
+
+    def pick(span: tuple[float, float]) -> float:
+        return float(rng.uniform(*span))
+
     width, height = c.size
     noise = c.noise[0] if c.noise[0] == c.noise[1] else float(np.exp(rng.uniform(*np.log(c.noise))))
     blur, step, texture = pick(c.blur), pick(c.step), pick(c.texture)
@@ -204,7 +207,10 @@ def draw_no_eye(seed: int, size: tuple[int, int] = (320, 240)) -> NDArray[np.uin
     kind = rng.choice(["field", "field", "rectangles", "letters", "lines", "checks", "noise", "ramp"])
     canvas = Image.new("L", size, int(rng.integers(90, 230)))
     pen = ImageDraw.Draw(canvas)
-    grey = lambda: int(rng.integers(0, 255))  # noqa: E731
+
+    def grey() -> int:
+        return int(rng.integers(0, 255))
+
     if kind == "field":
         power = np.fft.fftfreq(height)[:, None] ** 2 + np.fft.fftfreq(width)[None, :] ** 2
         power[0, 0] = 1.0
@@ -230,10 +236,9 @@ def draw_no_eye(seed: int, size: tuple[int, int] = (320, 240)) -> NDArray[np.uin
                 text = "".join(rng.choice(list("ABCDGOQSaegos0689"), 5))
                 pen.text((left, top), text, fill=grey(), font=ImageFont.load_default(size=int(rng.integers(12, 110))))
         image = np.asarray(canvas, dtype=np.float64)
-    image = ndimage.gaussian_filter(image, rng.uniform(0.5, 2.0)) + rng.normal(0.0, 1.0, image.shape) * rng.uniform(
-        0.5, 8.0
-    )
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    image = np.asarray(ndimage.gaussian_filter(image, rng.uniform(0.5, 2.0)))
+    image = image + rng.normal(0.0, 1.0, image.shape) * rng.uniform(0.5, 8.0)
+    return np.asarray(np.clip(np.rint(image), 0, 255), dtype=np.uint8)
 
 
 def _iris_texture(iris: _Conic, sigma: float, x: Array, y: Array, rng: np.random.Generator) -> Array | float:

@@ -22,7 +22,16 @@ ROOT = Path(__file__).resolve().parent.parent
 SIZE = (6.4, 4.8)
 
 
-def draw(image, origin, white, truth, found, row, crop, path):
+def draw(
+    image: np.ndarray,
+    origin: tuple[int, ...],
+    white: float,
+    truth: er.Observations,
+    found: er.Observations,
+    row: int,
+    crop: tuple[int, int],
+    path: Path,
+) -> None:
     """One picture: `crop` = (width, height) in px around the pupil, as large as the figure."""
     x0, y0 = truth.pupil.centre_px[row] - np.array(crop) / 2
     fig = Figure(figsize=SIZE)
@@ -52,7 +61,8 @@ def draw(image, origin, white, truth, found, row, crop, path):
     fig.savefig(path, dpi=100)
 
 
-def picture(scene, fixation, eye, crop, white, path):
+def picture(scene: er.Scene, fixation: int, eye: int, crop: tuple[int, int], white: float, path: Path) -> None:
+    """Render one eye at one fixation and draw both observers' features over it."""
     frames = scene.frames()
     one = frames.take((frames.index.fixation == fixation) & (frames.index.eye == eye))
     truth = er.AnalyticObserver().observe(one)

@@ -20,4 +20,5 @@ errors = result.features.summary()
 print(f"pupil centre, median error: {errors['pupil_centre_px']['median']:.3f} px")
 print(f"glint, median error:        {errors['glint_px']['median']:.3f} px")
 for name, gaze in (("analytic features", result.gaze_truth), ("image features", result.gaze_found)):
-    print(f"gaze error, {name}: {gaze.mean_deg:.3f} deg")
+    if gaze is not None:
+        print(f"gaze error, {name}: {gaze.mean_deg:.3f} deg")

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def folder_of(path, count):
     with open(path / "metadata.jsonl", "w", encoding="utf-8") as file:
         for k in range(count):
             frame, which = k // 2, k % len(lines)
-            line = {**lines[which], "file_name": f"images/{'even' if frame % 10 else which}.png"}
+            line: dict[str, Any] = {**lines[which], "file_name": f"images/{'even' if frame % 10 else which}.png"}
             line["records"][0]["frame"] = frame
             file.write(json.dumps({"schema": "eyerender/image/1", **line}) + "\n")
     return path
@@ -105,7 +106,12 @@ def drawn(record, window):
 def rows_of(path, count):
     """A folder of `count` lines of one template, none of whose images is there."""
     with staged(path) as stage:
-        line = {"file_name": "images/0000000.png", "mask_file_name": "masks/0000000.png", "records": [], "split": "a"}
+        line: dict[str, Any] = {
+            "file_name": "images/0000000.png",
+            "mask_file_name": "masks/0000000.png",
+            "records": [],
+            "split": "a",
+        }
         line["window_px"] = {"x0": 0, "y0": 0, "width": WIDTH, "height": HEIGHT}
         write_dataset(stage, [line], spec={}, digest="d")
     template = (path / "metadata.jsonl").read_text()
@@ -136,7 +142,7 @@ def dataset_of(path, count, size):
                 for sample in range(shard * size, (shard + 1) * size):
                     subject, sequence = plan.subject_of(sample)
                     name = f"{shard:05d}/{sample:08d}-right.png"
-                    line = {
+                    line: dict[str, Any] = {
                         "schema": "eyerender/image/1",
                         "file_name": f"images/{name}",
                         "mask_file_name": f"masks/{name}",

@@ -54,7 +54,12 @@ def observations(n: int = 4, seed: int = 0, points: int = 6, lights: int = 2) ->
             frozen(np.zeros((n, 3))),
             frozen(np.array([[0, -31.5, 0], [0, 31.5, 0]])[np.arange(n) % 2]),
         ),
-        PoseTruth(*(frozen(np.radians(rng.uniform(-20, 20, n))) for _ in range(3)), frozen(rng.random(n) * 1e-9)),
+        PoseTruth(
+            frozen(np.radians(rng.uniform(-20, 20, n))),
+            frozen(np.radians(rng.uniform(-20, 20, n))),
+            frozen(np.radians(rng.uniform(-20, 20, n))),
+            frozen(rng.random(n) * 1e-9),
+        ),
         PupilFeatures(
             frozen(status, object),
             frozen(reason, object),

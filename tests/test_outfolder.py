@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -11,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eyerender import lock
-from eyerender.dataset import assemble, croissant, run, shard
+from eyerender.dataset import assemble, croissant, runfile, shard
 from eyerender.errors import EyerenderError, InputError
 from eyerender.imagefile import write_png
 from eyerender.imagefolder import write_dataset
@@ -161,7 +161,7 @@ def test_what_the_rooms_write_can_be_replaced(tmp_path):
     """The names that the rooms above give their files are the known ones."""
     kinds = [f"{kind}/00000/s0.png" for kind in shard.KINDS]
     shards = [f"{shard.SHARDS}/00000/{name}" for name in (shard.LINES, shard.DONE)]
-    whole = [run.LOG, assemble.FAILURES, assemble.CARD, croissant.CROISSANT, "run.json", "metadata.jsonl"]
+    whole = [runfile.LOG, assemble.FAILURES, assemble.CARD, croissant.CROISSANT, "run.json", "metadata.jsonl"]
     dataset = [*kinds, *shards, *whole, f"{assemble.FAILURES}.part", f".{assemble.CARD}.0123abcd.part"]
     results = ["summary.json", "summary.csv", "findings.json", "findings.csv", "waterfall.csv", study.REPORT]
     for name in [*dataset, *(f"images/{name}" for name in dataset), *results, study.MARKER, f"images/{LOCK}"]:
@@ -267,7 +267,8 @@ def test_render_and_study_take_the_lock(tmp_path):
 
 def test_a_lock_whose_file_was_removed_holds_nobody(tmp_path, monkeypatch):
     """The first writer removes the lock's file just before the second, which has it open, locks it."""
-    flock, calls = lock.fcntl.flock, []
+    flock = fcntl.flock
+    calls: list[int] = []
 
     def late(file, how):
         if not calls:
@@ -275,7 +276,7 @@ def test_a_lock_whose_file_was_removed_holds_nobody(tmp_path, monkeypatch):
         calls.append(how)
         return flock(file, how)
 
-    monkeypatch.setattr(lock.fcntl, "flock", late)
+    monkeypatch.setattr(fcntl, "flock", late)
     with writer_lock(tmp_path):
         assert len(calls) == 2
         with pytest.raises(InputError, match="another run is at work"), writer_lock(tmp_path):

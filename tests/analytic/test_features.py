@@ -264,13 +264,15 @@ def test_the_iris_hides_images_of_the_lens_from_the_pupil_on_that_just_lets_them
         place = join(into_eye(turning, eye, components(-(camera.t @ camera.R)[None])))
         lamp = join(into_eye(turning, eye, components(lights[:1])))
         depth = {3: len(eye.front) + 1, 4: len(eye.front) + len(eye.back)}[order]
-        path = [
+        found = purkinje_points(
             (eye.front + eye.back)[:depth],
             (eye.front_indices + eye.back_indices)[:depth],
             ((eye.limbus_radius_mm,) * len(eye.front) + eye.back_rims_mm)[:depth],
             ((False,) * len(eye.front) + eye.back_passing)[:depth],
-        ]
-        found = purkinje_points(*path, lamp, place, eye.lens_gradient if order == 4 else None)
+            lamp,
+            place,
+            eye.lens_gradient if order == 4 else None,
+        )
         assert found.status[0] == Status.OK
         reach = []
         for start, target in ((place, found.exit_points_mm), (lamp, found.course_mm[-1])):

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,7 +135,9 @@ def test_the_contour_baseline_on_a_plain_disc():
     image = np.full((120, 160), 180, dtype=np.uint8)
     image[np.hypot(x - 80, y - 60) < 45] = 90
     image[np.hypot((x - 82.0) / 18, (y - 61.0) / 14) < 1] = 25
-    (cx, cy), axes, degrees = contour_pupil(image, bit_depth=8)
+    pupil = contour_pupil(image, bit_depth=8)
+    assert not isinstance(pupil, str), pupil
+    (cx, cy), axes, degrees = pupil
     assert (cx, cy) == pytest.approx((82, 61), abs=0.1)
     assert sorted(axes) == pytest.approx([2 * 14 - 1, 2 * 18 - 1], abs=0.8)
     assert degrees == pytest.approx(90, abs=2)  # the minor axis comes first
@@ -144,7 +147,7 @@ def test_the_contour_baseline_on_a_plain_disc():
 
 
 def test_the_detector_s_answer_is_passed_on_as_it_is():
-    found = {"ellipse": {"center": (3.0, 4.0), "axes": (10.0, 12.0), "angle": 30.0}, "confidence": 0.9}
+    found: dict[str, Any] = {"ellipse": {"center": (3.0, 4.0), "axes": (10.0, 12.0), "angle": 30.0}, "confidence": 0.9}
     assert pupil_of(found)["axes_px"] == [10.0, 12.0]
     assert pupil_of({**found, "confidence": 0.0})["status"] == "missing"
     assert pupil_of({**found, "ellipse": {**found["ellipse"], "axes": (0.0, 0.0)}})["status"] == "missing"

@@ -53,7 +53,7 @@ def test_every_convention_comes_back_as_the_same_outline(words):
 
 
 def test_opencv_s_rotated_rectangle_is_what_it_is_declared_to_be():
-    truth = Ellipse((61.3, 48.7), (30.0, 18.0), 0.7)
+    truth = Ellipse(np.array([61.3, 48.7]), np.array([30.0, 18.0]), 0.7)
     got = OPENCV.ellipse(*cv2.fitEllipse(truth.points(60).astype(np.float32)))
     assert got.centre_px == pytest.approx(truth.centre_px, abs=1e-3)  # it fits in float32
     assert got.semi_axes_px == pytest.approx(truth.semi_axes_px, abs=1e-3)

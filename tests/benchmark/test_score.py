@@ -22,7 +22,7 @@ from eyerender.errors import InputError
 from eyerender.geometry.ellipse import Ellipse, signed_distance
 from eyerender.imagefile import read_image
 
-PUPIL = Ellipse((50.0, 40.0), (20.0, 16.0), 0.4)
+PUPIL = Ellipse(np.array([50.0, 40.0]), np.array([20.0, 16.0]), 0.4)
 IMAGE = LabelledImage(
     "a.png", Path("a.png"), 8, (100, 80), PUPIL, PUPIL.points(120), 1.0,
     (TrueGlint(0, (45.0, 40.0)), TrueGlint(1, (55.0, 40.0)), TrueGlint(2, (50.0, 30.0))), {},
@@ -45,7 +45,9 @@ def test_outcomes():
 
 
 def test_errors_of_a_known_difference():
-    got = score(IMAGE, found(Ellipse((50.3, 39.6), (20.2, 15.9), 0.4 + math.pi - 0.01)), 0.1, ("pupil",))
+    got = score(
+        IMAGE, found(Ellipse(np.array([50.3, 39.6]), np.array([20.2, 15.9]), 0.4 + math.pi - 0.01)), 0.1, ("pupil",)
+    )
     assert got.offset_px == pytest.approx((0.3, -0.4))
     assert got.centre_px == pytest.approx(0.5)
     assert got.axes_px == pytest.approx((0.2, -0.1))
@@ -54,7 +56,7 @@ def test_errors_of_a_known_difference():
 
 
 def test_boundary_error_is_that_of_a_grown_circle():
-    circle = Ellipse((50.0, 40.0), (20.0, 20.0), 0.0)
+    circle = Ellipse(np.array([50.0, 40.0]), np.array([20.0, 20.0]), 0.0)
     image = replace(IMAGE, pupil=circle, outline_px=circle.points(100))
     got = score(image, found(circle.scaled(1.01)), 0.1, ("pupil",))
     assert got.boundary_px == pytest.approx(0.2)
@@ -112,7 +114,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information(radius, blur, noise)
 
     slope = (disc(x0 + 0.01) - disc(x0 - 0.01)) / 0.02
     exact = noise / math.sqrt(float(np.sum(slope**2)))
-    got = Edge(noise, step, sigma).centre_sigma_px(Ellipse((x0, y0), (radius, radius), 0.0))
+    got = Edge(noise, step, sigma).centre_sigma_px(Ellipse(np.array([x0, y0]), np.array([radius, radius]), 0.0))
     assert got == pytest.approx(exact, rel=0.01)  # the formula neglects (sigma / R)^2
 
 

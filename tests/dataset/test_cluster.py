@@ -29,7 +29,10 @@ def test_the_same_bytes_as_the_local_engine(tiny, tmp_path):
 def test_a_killed_actor_is_started_again_and_nothing_is_lost(tmp_path):
     pytest.importorskip("ray")
     made = plan(shard_size=6)
-    retries, shards, killed, workers = [], [], [], set()
+    retries: list = []
+    shards: list = []
+    killed: list[int] = []
+    workers: set[int] = set()
 
     class Listener:
         def ready(self, backend, worker):

@@ -193,7 +193,7 @@ def test_teyed_reads_it(tiny, exported, lines):
     with open(folder / "splits.csv", newline="") as file:
         videos = list(csv.DictReader(file))
     assert sum(int(v["frames"]) for v in videos) == 24
-    by_subject = {}
+    by_subject: dict[int, list] = {}
     for name in sorted(lines):
         by_subject.setdefault(lines[name]["subject"], []).append(lines[name])
     for video in videos:
@@ -310,7 +310,7 @@ def test_hugging_face_reads_a_reason_that_comes_late(tiny, tmp_path, monkeypatch
     assert last["records"][0]["glints"][1]["reason"] is None
     last["records"][0]["glints"][1]["reason"] = "behind the lid"
     lines[-1] = json.dumps(last) + "\n"
-    taken = []
+    taken: list[dict] = []
     (folder / "metadata.jsonl").write_text("".join(type_first(lambda: lines, taken.append)))
     assert [json.dumps(line) + "\n" for line in taken] == lines
     rows = datasets.load_dataset("imagefolder", data_dir=str(folder), cache_dir=str(tmp_path / "cache"))["train"]

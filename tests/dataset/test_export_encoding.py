@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -164,7 +165,7 @@ def test_the_cards_code_reads_sixteen_bits(tiny, tmp_path):
     entry = ImageFolder.load(tiny).entries[0]
     wanted = read_image(entry.path)[0]
     assert 'convert("L")' in (tiny / "README.md").read_text()
-    names = {"path": entry.path, "gain": 2.0}
+    names: dict[str, Any] = {"path": entry.path, "gain": 2.0}
     for code in blocks(tiny / "README.md"):
         for line in code.splitlines():
             exec(line, names)

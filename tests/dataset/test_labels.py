@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from eyerender.eye.spec import EyeSpec
+from eyerender.eye.spec import ConicSpec, EyeSpec
 from eyerender.geometry.ellipse import Ellipse, points_on_ellipse, signed_distance
 from eyerender.imagefile import read_image
 from eyerender.imagefolder import ImageFolder
@@ -96,7 +96,9 @@ def test_points_and_lines_hang_together(entries):
         near(axis, [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], 1e-12)
         eye = EyeSpec.from_mapping(json.loads(line["parameters"]["eye_json"]))
         radius = line["parameters"]["draws"]["eye_parameters.E2.cornea.0.shape.radius_mm"]
-        assert eye.cornea[0].shape.radius_mm == radius
+        shape = eye.cornea[0].shape
+        assert isinstance(shape, ConicSpec)
+        assert shape.radius_mm == radius
         # The paraxial radius from the sag at 0.05 mm: 1e-4 of it.
         near(world["cornea_centre_mm"], apex - radius * axis, 2e-3)
         near(world["pupil_centre_mm"], apex - 3.6 * axis)

@@ -178,13 +178,12 @@ def test_a_crashed_worker_is_replaced(tmp_path):
 
 
 def test_a_shard_that_cannot_be_put_in_place_ends_the_run(tmp_path):
-    def staged(_staged, _worker):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    class Full(Listener):
+        def staged(self, staged, worker):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    listener = Listener()
-    listener.staged = staged
     with pytest.raises(OSError, match="No space left on device"):
-        pool(tmp_path, timeout_s=60.0).run([0], listener)
+        pool(tmp_path, timeout_s=60.0).run([0], Full())
 
 
 @pytest.mark.slow
@@ -197,15 +196,13 @@ def test_a_hung_worker_is_ended_and_replaced(tmp_path):
 
 @pytest.mark.slow
 def test_a_shard_is_given_up_after_three_tries(tmp_path):
-    listener = Listener()
-    real = listener.sample
+    class Killer(Listener):
+        def sample(self, shard, samples, images):
+            super().sample(shard, samples, images)
+            if shard == 1:
+                os.kill(self.pids[-1], signal.SIGKILL)
 
-    def sample(shard, samples, images):
-        real(shard, samples, images)
-        if shard == 1:
-            os.kill(listener.pids[-1], signal.SIGKILL)
-
-    listener.sample = sample
+    listener = Killer()
     lost = pool(tmp_path).run([0, 1, 2], listener)
     assert lost == {1: "the worker was ended by SIGKILL"}
     assert sorted(listener.made) == [0, 2]

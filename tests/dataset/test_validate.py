@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
@@ -126,7 +127,7 @@ def test_lines_of_either_version_of_the_record_are_computed_again(version):
     observed = trace(scene)
     truth = SceneTruth(scene.frames(), observed)
     view = EyeInWindow.of(scene.frames(), 0)
-    line = {
+    line: dict[str, Any] = {
         "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
         "bit_depth": scene.spec.sensor.bit_depth,
         "records": list(observed.take([0]).records(version)),

@@ -34,7 +34,7 @@ def test_blurred_edge_of_a_disc():
 
 def test_level_of_a_blurred_ellipse():
     """Against an 8 x oversampled, Gaussian-blurred, pixel-averaged mask."""
-    ellipse, sigma, fine = Ellipse([31.3, 29.6], [19.0, 13.0], 0.6), 1.2, 8
+    ellipse, sigma, fine = Ellipse(np.array([31.3, 29.6]), np.array([19.0, 13.0]), 0.6), 1.2, 8
     axis = (np.arange(64 * fine) + 0.5) / fine - 0.5
     x, y = np.meshgrid(axis, axis)
     mask = (Place.of(ellipse, x.ravel(), y.ravel()).distance.reshape(x.shape) > 0.0).astype(float)
@@ -47,7 +47,7 @@ def test_level_of_a_blurred_ellipse():
 
 def test_distance_is_the_nearest_points():
     rng = np.random.default_rng(3)
-    ellipse = Ellipse([50.0, 40.0], [30.0, 18.0], 1.1)
+    ellipse = Ellipse(np.array([50.0, 40.0]), np.array([30.0, 18.0]), 1.1)
     points = ellipse.scaled(1.0).points(40) + rng.normal(0.0, 3.0, (40, 2))
     place = Place.of(ellipse, points[:, 0], points[:, 1])
     outline = ellipse.points(200_000)
@@ -61,8 +61,15 @@ def test_distance_is_the_nearest_points():
 def test_jacobian_is_the_models_slope(b):
     """Of a nearly round ellipse too, whose axes turn far with a small change of its shape."""
     outer = np.array([75.0, 6.0, -4.0, 3.0, 2.0])
+    ellipse = Ellipse(np.array([40.2, 38.7]), np.array([21.0, b]), 0.8)
     model = EdgeModel(
-        Ellipse([40.2, 38.7], [21.0, b], 0.8), 20.0, outer, 1.3, slope=-1.2, kurtosis=0.7, lean=(0.4, -0.9)
+        ellipse,
+        20.0,
+        outer,
+        1.3,
+        slope=-1.2,
+        kurtosis=0.7,
+        lean=(0.4, -0.9),
     )
     rng = np.random.default_rng(4)
     base = model.ellipse.points(300) + rng.normal(0.0, 1.0, (300, 2))
@@ -81,7 +88,7 @@ def test_jacobian_is_the_models_slope(b):
 
 def test_covariance_of_the_axes_follows_the_shape_matrix():
     """Draws of the shape matrix's changes, turned into axes and angle by eigenvectors, scatter as stated."""
-    ellipse = Ellipse([0.0, 0.0], [30.0, 22.0], 0.7)
+    ellipse = Ellipse(np.array([0.0, 0.0]), np.array([30.0, 22.0]), 0.7)
     covariance = np.diag([0.02, 0.03, 0.05, 0.04, 0.06]) ** 2
     rng = np.random.default_rng(6)
     draws = rng.multivariate_normal(np.zeros(5), covariance, 4000)
@@ -126,7 +133,9 @@ def test_tailed_blur_and_a_slope_leave_no_bias():
     errors = []
     for seed in range(4):
         rng = np.random.default_rng([seed, 9])
-        ellipse = Ellipse(np.array([47.0, 44.0]) + rng.uniform(-1.0, 1.0, 2), [20.0, 18.0], rng.uniform(0.0, 3.0))
+        ellipse = Ellipse(
+            np.array([47.0, 44.0]) + rng.uniform(-1.0, 1.0, 2), np.array([20.0, 18.0]), rng.uniform(0.0, 3.0)
+        )
         x, y = np.meshgrid(*((np.arange(n * fine) + 0.5) / fine - 0.5 for n in (width, height)))
         distance = Place.of(ellipse, x.ravel(), y.ravel()).distance.reshape(x.shape)
         sharp = np.where(distance < 0.0, 3000.0, 16000.0 * (1.0 - 0.006 * np.maximum(distance, 0.0)))
@@ -162,7 +171,9 @@ def test_uneven_margin_leaves_no_bias():
     distances, errors = [], []
     for seed in range(8):
         rng = np.random.default_rng([seed, 11])
-        ellipse = Ellipse(np.array([55.0, 51.0]) + rng.uniform(-1.0, 1.0, 2), [34.0, 30.0], rng.uniform(0.0, 3.0))
+        ellipse = Ellipse(
+            np.array([55.0, 51.0]) + rng.uniform(-1.0, 1.0, 2), np.array([34.0, 30.0]), rng.uniform(0.0, 3.0)
+        )
         phase, size = rng.uniform(0.0, 2.0 * np.pi, 6), rng.uniform(0.5, 1.0, 6)
         size *= 0.32 * np.sqrt(2.0) / np.hypot.reduce(size)
         place = Place.on(ellipse, np.cos(t), np.sin(t))

@@ -128,7 +128,7 @@ def test_encodings_of_one_image_agree():
     full = drawing.image.astype(np.float64) / 65535.0
     truth = _truth(drawing)
     reference = extract(drawing.image).pupil.ellipse
-    images = {
+    images: dict[str, tuple[np.ndarray, dict]] = {
         "8": (np.rint(full * 255).astype(np.uint8), {}),
         "10": (np.rint(full * 1023).astype(np.uint16), {"bit_depth": 10}),
         "12": (np.rint(full * 4095).astype(np.uint16), {"bit_depth": 12}),

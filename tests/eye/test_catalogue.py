@@ -13,6 +13,9 @@ from eyerender.errors import InputError
 from eyerender.eye.catalogue import FOLDER, catalogue_files, catalogue_names, load_eye
 from eyerender.eye.model import EyeSpec
 from eyerender.eye.shells import shelled
+from eyerender.eye.spec import GradientLensSpec
+from eyerender.geometry.surfaces_biconic import Biconic
+from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.optics.trace import trace
 from eyerender.status import Status
 
@@ -69,6 +72,7 @@ def test_the_table_of_indices_at_850_nm():
     assert eye.front_indices == pytest.approx((1.3701734173, 1.3302435786), abs=6e-11)
     assert eye.back_indices[-1] == pytest.approx(1.3304719540, abs=6e-11)
     lens = load_eye("E5").lens
+    assert isinstance(lens, GradientLensSpec)
     core, edge = (np.polyval(m.cauchy[::-1], 850.0**-2.0) for m in (lens.core, lens.edge))
     assert edge == pytest.approx(1.3639839821, abs=6e-11)
     assert core == pytest.approx(1.42185945, abs=6e-9)
@@ -85,6 +89,7 @@ def test_dispersion_and_constant_media():
 def test_the_shells_of_a_gradient_lens_follow_its_law():
     """n(p) = n_core - (n_core - n_edge) p^2 at the shells; inside each the mid index; p from the apexes' distances."""
     spec = load_eye("E5")
+    assert isinstance(spec.lens, GradientLensSpec)
     built = spec.model_copy(update={"lens": spec.lens.model_copy(update={"shells": 21})}).build()
     core, edge = (np.polyval(m.cauchy[::-1], 850.0**-2.0) for m in (spec.lens.core, spec.lens.edge))
     for eye in (built, shelled(spec.build())):
@@ -101,10 +106,12 @@ def test_the_shells_of_a_gradient_lens_follow_its_law():
             assert np.allclose(law, np.linspace(edge, core, 22)[:-1], atol=1e-14)
             nodes.append(law)
         middle = 0.5 * (np.append(nodes[0][1:], core) + nodes[0])
-        assert np.allclose(eye.back_indices[:21], middle, atol=1e-14)
-        assert np.allclose(eye.back_indices[21:41], middle[-2::-1], atol=1e-14)
+        indices = np.array([float(n) for n in eye.back_indices])
+        assert np.allclose(indices[:21], middle, atol=1e-14)
+        assert np.allclose(indices[21:41], middle[-2::-1], atol=1e-14)
         # Scaled with the shell: the radius, not the conic constant. The apex radius is the half gradient over A_yy.
         for s in front:
+            assert isinstance(s, Quadric)
             p = np.linalg.norm(s.origin_mm - centre) / np.linalg.norm(front[0].origin_mm - centre)
             assert s.vector[0] == pytest.approx(14.304 * p, rel=1e-13)
             assert s.matrix[0, 0] == pytest.approx(1.0 - 3.546, rel=1e-13)
@@ -128,7 +135,7 @@ def test_corneas_and_stops_stand_where_the_table_says():
         assert eye.stop.semi_axes_mm.tolist() == [2.0, 2.0]
     e5 = load_eye("E5").build()
     biconic = e5.front[0]
-    assert biconic.kind == "biconic"
+    assert isinstance(biconic, Biconic)
     assert biconic.radii_mm.tolist() == [7.76, 7.74]
     assert biconic.conic_constants.tolist() == [-0.272, -0.361]
     assert e5.rotation.azimuth_centre_mm.tolist() == [-14.7, 0.79, 0.0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from eyerender.eye.model import EyeSpec
 
 def changed(name, path, value):
     data = copy.deepcopy(load_eye(name).to_mapping())
-    place = data
+    place: Any = data
     *parents, last = path.split(".")
     for key in parents:
         place = place[int(key) if key.isdigit() else key]

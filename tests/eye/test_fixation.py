@@ -221,7 +221,7 @@ def test_nonsense_is_refused():
     with pytest.raises(InputError, match="target_mm"):
         fixate(eye, [[np.nan, 0.0, 0.0]])
     with pytest.raises(InputError, match="line_of_sight"):
-        fixate(eye, [[600.0, 0.0, 0.0]], "visual_axis")
+        fixate(eye, [[600.0, 0.0, 0.0]], "visual_axis")  # type: ignore[arg-type]  # what is tested
 
 
 def test_a_fovea_may_be_given():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import yaml
@@ -10,10 +12,11 @@ from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.format1 import upgraded
 from eyerender.eye.model import EyeSpec
-from eyerender.geometry.surfaces_quadric import centre_of
+from eyerender.eye.spec import GradientLensSpec
+from eyerender.geometry.surfaces_quadric import Quadric, centre_of
 from eyerender.geometry.transforms import rotation_x, rotation_y, rotation_z, tilt_rotation
 
-CENTRED = [
+CENTRED: list[tuple[dict[str, Any], list[float]]] = [
     ({"kind": "sphere", "radius_mm": 7.8}, [-7.8, 0.3, -0.2]),
     ({"kind": "conic", "radius_mm": 7.8, "conic_constant": -0.25}, [-10.4, 0.3, -0.2]),
     ({"kind": "ellipsoid", "semi_axes_mm": [10.4, 9.0, 9.1]}, [-10.4, 0.3, -0.2]),
@@ -37,6 +40,7 @@ def test_a_surface_placed_by_its_centre_still_turns_about_it(shape, centre, orde
     )
     turn = about_z @ about_y @ about_x if order == "zyx" else about_x @ about_y @ about_z
     np.testing.assert_allclose(surface.rotation, turn, atol=1e-15)
+    assert isinstance(surface, Quadric)
     np.testing.assert_allclose(centre_of(surface), centre, atol=1e-14)
 
 
@@ -52,6 +56,7 @@ def test_twice_the_shells_rate_gives_the_layers_that_it_stood_for():
     data = old("E5")
     data["lens"] |= {"shells": 4, "index_rate": 2}
     spec = EyeSpec.from_mapping(data)
+    assert isinstance(spec.lens, GradientLensSpec)
     assert spec.lens.shells is None
     assert [(layer.size, layer.index_share) for layer in spec.lens.layers] == [
         (1.0, 0.0), (1.0, 0.25), (np.sqrt(7 / 8), 0.5), (np.sqrt(6 / 8), 0.75), (np.sqrt(5 / 8), 1.0)

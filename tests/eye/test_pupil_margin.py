@@ -12,7 +12,7 @@ from eyerender.analytic.observer import trace
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.margin import HARMONICS, PupilMargin, drawn_contour
-from eyerender.eye.spec import EyeSpec
+from eyerender.eye.spec import ConicSpec, EyeSpec, Side
 from eyerender.scene import Scene, load_scene
 from eyerender.scenespec import SceneSpec
 
@@ -89,8 +89,10 @@ def test_the_left_eye_is_the_mirror_image(model):
 
 @pytest.mark.parametrize("model", ["E1", "E2", "E3", "E4", "E5"])
 def test_a_dilating_pupil_moves_to_the_temple(model):
+    # Signs of y, which runs to the subject's left.
+    sides: tuple[tuple[Side, float], ...] = (("right", -1.0), ("left", 1.0))
     # Yang, Thompson and Burns (2002): .133 mm from 4.1 to 6.3 mm; the slope is rounded to .06 mm per mm.
-    for side, temporal in (("right", -1.0), ("left", 1.0)):  # of y, which runs to the subject's left
+    for side, temporal in sides:
         small, own, large = (scene_with({"seed": 3}, d, model=model).eye(side).stop for d in (4.1, 4.0, 6.3))
         moved = large.centre_mm - small.centre_mm
         assert moved[1:] == pytest.approx([temporal * 0.133, 0.0], abs=0.002)
@@ -110,6 +112,7 @@ def test_the_shift_is_seen_in_the_picture():
         scene = Scene.of(SceneSpec.from_mapping(data))
         centres.append(trace(scene).pupil)
     (surface,), (n,) = scene.eye_spec.cornea, scene.eye("right").front_indices
+    assert isinstance(surface.shape, ConicSpec)
     depth, radius = 3.6, surface.shape.radius_mm
     seen = depth / (n - depth * (n - 1) / radius)
     scale = scene.rig.cameras[0].K[0, 0] / (60.0 + seen)

@@ -78,7 +78,9 @@ def scene():
     """Nine targets, right and left eye, both cameras, four lights; a slightly different eye place at each fixation."""
     rng = np.random.default_rng(5)
     targets = [[650.0, y, z] for y in (180.0, 0.0, -180.0) for z in (140.0, 0.0, -140.0)]
-    rows = {k: [] for k in ("pupil", "glints", "target", "eye", "camera", "fixation", "centre", "axis")}
+    rows: dict[str, list] = {
+        k: [] for k in ("pupil", "glints", "target", "eye", "camera", "fixation", "centre", "axis")
+    }
     for f, target in enumerate(targets):
         for eye, y in ((0, -31.5), (1, 31.5)):
             centre = np.array([-8.0, y, 0.0]) + rng.normal(0, 1.0, 3)

@@ -3,11 +3,15 @@ size."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
 from eyerender.gaze.cornea import from_all_glints, from_plane, line_to_centre
 from eyerender.gaze.crossratio import CrossRatio
+from eyerender.gaze.estimate import GazeEstimator
 from eyerender.gaze.guestrin import GuestrinEizenman
 from eyerender.gaze.hennessey import Hennessey
 from eyerender.gaze.homography import Homography
@@ -26,7 +30,7 @@ def hennessey_eye(data, **options):
     return Hennessey(parameters, **options)
 
 
-CASES = {
+CASES: dict[str, Callable[[Any], GazeEstimator]] = {
     "interpolate_biquadratic": lambda d: Regression((BIQUADRATIC, BIQUADRATIC), normalised=False),
     # The vectors' transform is the plain algebraic least squares in metres.
     "homography_glint4": lambda d: Homography(conditioned=False),

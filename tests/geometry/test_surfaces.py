@@ -24,8 +24,8 @@ SURFACES = {
     "ellipsoid": Quadric.ellipsoid((10.67, 9.08, 9.09), (-10.67, 0.22, -0.22), TILT),
     "ellipsoid back": Quadric.ellipsoid((10.67, 9.08, 9.09), (-12.0, 0.22, -0.22), TILT, front=False),
     "plane": Quadric.plane((-3.6, 0.0, 0.0), TILT),
-    "biconic": Biconic((0.0, 0.22, -0.23), TILT, (7.76, 7.74), (-0.272, -0.361)),
-    "biconic back": Biconic((-7.0, 0.0, 0.0), np.eye(3), (-6.0, -6.9), (-0.8, 0.4)),
+    "biconic": Biconic(np.array([0.0, 0.22, -0.23]), TILT, np.array([7.76, 7.74]), np.array([-0.272, -0.361])),
+    "biconic back": Biconic(np.array([-7.0, 0.0, 0.0]), np.eye(3), np.array([-6.0, -6.9]), np.array([-0.8, 0.4])),
 }
 cases = pytest.mark.parametrize("surface", SURFACES.values(), ids=SURFACES.keys())
 
@@ -175,7 +175,7 @@ def test_the_graph_is_the_surface_with_its_derivatives(surface):
 
 
 def test_a_biconic_of_equal_meridians_is_a_conic():
-    biconic = Biconic((0.0, 0.2, -0.2), TILT, (7.8, 7.8), (-0.25, -0.25))
+    biconic = Biconic(np.array([0.0, 0.2, -0.2]), TILT, np.array([7.8, 7.8]), np.array([-0.25, -0.25]))
     conic = Quadric.conic(7.8, -0.25, (0.0, 0.2, -0.2), TILT)
     points = points_on(biconic)
     assert np.abs(conic.implicit(points)).max() < 1e-13
@@ -188,6 +188,7 @@ def test_the_centre_of_a_sphere_is_a_radius_behind_its_apex():
 
 def test_a_quadric_seen_from_another_frame_is_the_same_surface():
     surface, origin = SURFACES["hyperboloid"], np.array([1.0, -2.0, 0.5])
+    assert isinstance(surface, Quadric)
     turned = tilt_rotation(np.radians([5.0, 10.0, -7.0]))
     points = points_on(surface)
     assert np.abs(surface.seen_from(origin, turned).implicit((points - origin) @ turned)).max() < 3e-13

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from eyerender.geometry.surfaces import Surface
 from eyerender.geometry.surfaces_biconic import Biconic
 from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.geometry.transforms import tilt_rotation
@@ -17,21 +18,23 @@ from tests.support.exhaustive import WIDTH_MM, exhaustive
 def cornea(rng, biconics):
     """Three decentred, tilted surfaces, outside in, with their indices: biconics and conics in a random order."""
     while True:
-        surfaces = []
+        surfaces: list[Surface] = []
         x, radius = 0.0, rng.uniform(7.2, 8.4)
         for is_biconic in rng.permutation([True] * biconics + [False] * (3 - biconics)):
             apex = np.array([x, *rng.uniform(-0.25, 0.25, 2)])
             turn = tilt_rotation([rng.uniform(-1.0, 1.0) if is_biconic else 0.0, *rng.uniform(-0.06, 0.06, 2)])
             if is_biconic:
                 radii = (radius, radius * rng.uniform(0.95, 1.05))
-                surfaces.append(Biconic(apex, turn, radii, tuple(rng.uniform(-0.5, 0.3, 2))))
+                surfaces.append(Biconic(apex, turn, np.array(radii), rng.uniform(-0.5, 0.3, 2)))
             else:
                 surfaces.append(Quadric.conic(radius, rng.uniform(-0.5, 0.3), apex, turn))
             x -= rng.uniform(0.1, 0.7)
             radius -= rng.uniform(0.0, 0.6)
         indices = [rng.uniform(1.33, 1.42), rng.uniform(1.33, 1.42), rng.uniform(1.33, 1.40)]
         y, z = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-WIDTH_MM, WIDTH_MM, 41)]))
-        line = tuple(axis[np.hypot(y, z) < WIDTH_MM] for axis in (np.full(y.shape, 50.0), y, z))
+        inside = np.hypot(y, z) < WIDTH_MM
+        y, z = y[inside], z[inside]
+        line = (np.full(y.shape, 50.0), y, z)
         hits = [s.hit(line, (-np.ones_like(line[1]), 0.0 * line[1], 0.0 * line[2]), True) for s in surfaces]
         height = np.array([np.where(hit.ok, hit.point[0], np.nan) for hit in hits])
         if (height[:-1] > height[1:]).all():
@@ -70,7 +73,7 @@ def check(biconics, seed, corneas, count=200):
         if not ok.all():
             missed = exhaustive(surfaces, indices, things[~ok], places[~ok])
             assert np.isnan(missed).all(), f"missed rays over {missed[np.isfinite(missed).all(axis=-1)]}"
-            refused += np.count_nonzero(~ok)
+            refused += int(np.count_nonzero(~ok))
     return refused
 
 

@@ -97,7 +97,7 @@ def test_rays_obey_the_ray_equation_as_another_solver_has_it():
     def leaves(_, state):
         return float(back.implicit(state[:3]))
 
-    leaves.terminal, leaves.direction = True, -1
+    leaves.terminal, leaves.direction = True, -1  # type: ignore[attr-defined]  # how SciPy is told
     for k in range(len(points)):
         start = np.concatenate([points[k], float(medium.core - medium.fall) * ways[k], [0.0]])
         done = solve_ivp(rates, (0.0, 8.0), start, "DOP853", events=leaves, rtol=1e-11, atol=1e-12, max_step=0.5)

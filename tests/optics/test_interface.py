@@ -21,8 +21,8 @@ def test_refraction_keeps_the_tangential_component_of_n_times_direction():
     """n1 d x N = n2 w x N, whichever way N points."""
     d, normal = rays()
     for n1, n2 in ((1.0, 1.3375), (1.42, 1.336), (1.5, 1.0)):
-        w, passes = refract(components(d), components(normal), n1, n2)
-        w = join(w)
+        bent, passes = refract(components(d), components(normal), n1, n2)
+        w = join(bent)
         assert np.allclose(np.linalg.norm(w, axis=1)[passes], 1.0, atol=1e-14)
         assert np.allclose(n1 * np.cross(d, normal)[passes], n2 * np.cross(w, normal)[passes], atol=1e-14)
         assert (np.sign(np.sum(d * normal, 1)) == np.sign(np.sum(w * normal, 1)))[passes].all()
@@ -33,7 +33,7 @@ def test_refraction_keeps_the_tangential_component_of_n_times_direction():
 def test_a_refracted_ray_runs_back_the_way_it_came():
     d, normal = rays(1)
     w, passes = refract(components(d), components(normal), 1.0, 1.376)
-    back, _ = refract(tuple(-c for c in w), components(normal), 1.376, 1.0)
+    back, _ = refract((-w[0], -w[1], -w[2]), components(normal), 1.376, 1.0)
     assert passes.all()
     # Near grazing the square root of a small number doubles the digits lost.
     assert np.allclose(join(back), -d, atol=1e-12)

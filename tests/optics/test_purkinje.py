@@ -48,7 +48,10 @@ def rigs(kind, count, seed=0):
     if kind == "remote":
         view = away(rng.uniform(-30, 30, count), rng.uniform(-30, 30, count), rng.uniform(400, 800, count))
         return view + rng.uniform(-150, 150, (count, 3)), view
-    place = [away(*rng.uniform(-45, 45, (2, count)), rng.uniform(25, 40, count)) for _ in range(2)]
+    place = []
+    for _ in range(2):
+        azimuth, elevation = rng.uniform(-45, 45, (2, count))
+        place.append(away(azimuth, elevation, rng.uniform(25, 40, count)))
     return place[0], place[1]
 
 

@@ -21,9 +21,9 @@ MODELS = ("E1", "E2", "E3", "E4", "E5")
 INTO_MM = 0.05  # the bar for any interpenetration
 
 
-def posed(model, azimuth, elevation, side="right"):
+def posed(model, pose_deg, side="right"):
     eye = load_eye(model).build(eye=side, wavelength_nm=850.0, pupil_diameter_mm=4.0)
-    M, t = rigid_motion(Poses.from_degrees([azimuth], [elevation]), eye)
+    M, t = rigid_motion(Poses.from_degrees(pose_deg[:1], pose_deg[1:]), eye)
     sclera = eye.sclera
     globe = Globe(
         eye.front[0], float(eye.limbus_radius_mm), sclera.centre_mm, float(sclera.radius_mm), M[0], t[0], side == "left"
@@ -52,7 +52,7 @@ def instance(i):
     blink = float(rng.choice([0.0, rng.uniform(), 1.0], p=[0.5, 0.4, 0.1]))
     side = ("right", "left")[i % 2]
     spec = Region.drawn(i, spread=float(rng.uniform(0.3, 1.0)), blink=blink)
-    eye, globe = posed(MODELS[i % 5], *rng.uniform(-25, 25, 2), side)
+    eye, globe = posed(MODELS[i % 5], rng.uniform(-25, 25, 2), side)
     return spec, eye, globe, region_mesh(spec, globe)
 
 
@@ -75,7 +75,8 @@ def crossings(start, end, mesh):
     segment = np.repeat(np.arange(len(start)), [len(n) for n in near])
     triangle = np.concatenate([np.asarray(n, dtype=int) for n in near])
     o, d = start[segment], (end - start)[segment]
-    a, e1, e2 = corners[triangle, 0], *np.swapaxes(corners[triangle, 1:] - corners[triangle, :1], 0, 1)
+    a = corners[triangle, 0]
+    e1, e2 = corners[triangle, 1] - a, corners[triangle, 2] - a
     p = np.cross(d, e2)
     det = np.sum(e1 * p, axis=-1)
     det = np.where(np.abs(det) < 1e-12, 1e-12, det)

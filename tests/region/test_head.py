@@ -57,7 +57,7 @@ def test_the_other_eye_is_the_mirror_image_or_its_own(tmp_path):
     np.testing.assert_array_equal(left.layout.faces, right.layout.faces[:, ::-1])
     # A symmetric head: its own left eye sees the same surface as the mirror image, in other vertices.
     bounds = [np.stack([m.vertices.min(axis=0), m.vertices.max(axis=0)]) for m in (left, own)]
-    np.testing.assert_allclose(*bounds, atol=1e-4)
+    np.testing.assert_allclose(bounds[0], bounds[1], atol=1e-4)
     for mesh in (left, own):
         whole = trimesh.Trimesh(mesh.vertices, mesh.layout.faces, process=False)
         assert whole.volume > 0  # faces look outwards
@@ -68,7 +68,7 @@ def test_normals_do_not_see_seams(tmp_path):
     lines = ["o a", "v 0 0 0", "v 40 0 0", "v 0 40 0", "v 0 0 0", "v 40 0 0", "v 0 -40 20", "f 1 2 3", "f 5 4 6"]
     (tmp_path / "two.obj").write_text("\n".join(lines) + "\n")
     head = load_head(spec_of(tmp_path, file="two.obj", right_eye=[0, 0, 0]))
-    at = {tuple(np.round(v, 6)): [] for v in head.vertices}
+    at: dict[tuple, list] = {tuple(np.round(v, 6)): [] for v in head.vertices}
     for v, n in zip(head.vertices, head.normals, strict=True):
         at[tuple(np.round(v, 6))].append(n)
     shared = [n for n in at.values() if len(n) == 2]

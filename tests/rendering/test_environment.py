@@ -32,8 +32,8 @@ def directions(height: int) -> np.ndarray:
     return np.stack([np.sin(p) * np.cos(t), np.sin(p) * np.sin(t), np.cos(p)], axis=-1)
 
 
-def patch(height: int, azimuth_deg: float, elevation_deg: float, radius_deg: float, value: float) -> np.ndarray:
-    near = directions(height) @ unit(azimuth_deg, elevation_deg) > np.cos(np.radians(radius_deg))
+def patch(height: int, centre_deg: tuple[float, float], radius_deg: float, value: float) -> np.ndarray:
+    near = directions(height) @ unit(*centre_deg) > np.cos(np.radians(radius_deg))
     return np.where(near, value, 0.0)
 
 
@@ -81,7 +81,8 @@ def test_the_apex_mirrors_the_map_by_fresnel(renderer, tmp_path):
     [((20.0, 10.0), {}), ((-25.0, -5.0), {}), ((0.0, 0.0), {"azimuth_deg": 20.0, "elevation_deg": 10.0})],
 )
 def test_a_bright_patch_is_seen_where_a_far_lamp_is(renderer, tmp_path, patch_deg, turn):
-    ambient = ambient_of(tmp_path / "patch.npy", patch(256, *patch_deg, 4.0, 100.0), **turn)
+    bright = patch(256, patch_deg, radius_deg=4.0, value=100.0)
+    ambient = ambient_of(tmp_path / "patch.npy", bright, **turn)
     job, seen = radiance(renderer, ambient, spp=64, look=BLACK)
     where = unit(20.0, 10.0) if turn else unit(*patch_deg)
     # The image of an extended patch is mirrored point by point; its middle by radiance is compared with the same mean
@@ -114,7 +115,7 @@ def test_brow_and_lids_hide_what_lies_behind_them(renderer, tmp_path):
     region = Region.from_mapping({"lashes": {"upper_count": 0, "lower_count": 0}, "brow": {"count": 0}})
     sums = {}
     for elevation in (5.0, 70.0):
-        ambient = ambient_of(tmp_path / f"{elevation}.npy", patch(128, 10, elevation, 6, 50.0))
+        ambient = ambient_of(tmp_path / f"{elevation}.npy", patch(128, (10, elevation), 6, 50.0))
         job, bare = radiance(renderer, ambient, look=BLACK)
         _, between = radiance(renderer, ambient, look=BLACK, region=region)
         # The part of the clear cornea that is seen in both, away from the lids, which the map lights.
@@ -127,8 +128,8 @@ def test_brow_and_lids_hide_what_lies_behind_them(renderer, tmp_path):
 
 def test_roll_turns_the_map_about_its_middle(renderer, tmp_path):
     # Rolled clockwise by 90 degrees, as the subject sees it, what lies to the left comes up.
-    _, left = radiance(renderer, ambient_of(tmp_path / "a.npy", patch(128, 20, 0, 4, 9.0), roll_deg=90.0), look=BLACK)
-    _, above = radiance(renderer, ambient_of(tmp_path / "b.npy", patch(128, 0, 20, 4, 9.0)), look=BLACK)
+    _, left = radiance(renderer, ambient_of(tmp_path / "a.npy", patch(128, (20, 0), 4, 9.0), roll_deg=90.0), look=BLACK)
+    _, above = radiance(renderer, ambient_of(tmp_path / "b.npy", patch(128, (0, 20), 4, 9.0)), look=BLACK)
     v, u = np.mgrid[: left.shape[0], : left.shape[1]]
     a, b = (np.array([np.sum(s * u), np.sum(s * v)]) / s.sum() for s in (left, above))
     assert np.hypot(*(a - b)) < 0.2
@@ -189,10 +190,10 @@ def test_a_panels_irradiance_against_the_integral(renderer, point, normal):
 def test_maps_strength_and_turn_compile_nothing_and_send_nothing_anew(renderer, tmp_path):
     import drjit as dr
 
-    first = ambient_of(tmp_path / "a.npy", patch(64, 20, 10, 10, 5.0))
+    first = ambient_of(tmp_path / "a.npy", patch(64, (20, 10), 10, 5.0))
     radiance(renderer, first)
     radiance(renderer, Ambient(irradiance_w_m2=1.0))
-    other = ambient_of(tmp_path / "b.npy", patch(100, -20, 10, 10, 5.0), scale_w_m2_sr=0.3, azimuth_deg=12.0)
+    other = ambient_of(tmp_path / "b.npy", patch(100, (-20, 10), 10, 5.0), scale_w_m2_sr=0.3, azimuth_deg=12.0)
     panel = Panel(centre_mm=(500.0, 60.0, 90.0), size_mm=(520.0, 290.0), radiance_w_m2_sr=2.0)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()

@@ -369,5 +369,5 @@ def test_the_export_holds_the_head(renderer, folder):
     names = {p.stem for p in (folder / "out" / "meshes").glob("*.ply")}
     assert {"region_skin", "region_head", "cornea_front"} <= names
     assert "backdrop" not in names
-    skin = trimesh.load(folder / "out" / "meshes" / "region_skin.ply", process=False)
+    skin = trimesh.load_mesh(folder / "out" / "meshes" / "region_skin.ply", process=False)
     np.testing.assert_allclose(np.asarray(skin.vertices)[:, 0], X_MM, atol=1e-5)

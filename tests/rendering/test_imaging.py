@@ -71,7 +71,7 @@ def test_the_circle_of_confusion_follows_similar_triangles():
     expected = aperture * abs(image_z - image_s) / image_z / 5e-3
     assert confusion_px(Lens(focus_mm=s), camera, sensor, z) == pytest.approx(expected, rel=1e-9)
     assert confusion_px(Lens(focus_mm=z), camera, sensor, z) == 0
-    corner = vignette(Lens(vignetting=0.4), camera, (0, 0, 640, 480))
+    corner = np.asarray(vignette(Lens(vignetting=0.4), camera, (0, 0, 640, 480)))
     assert corner[0, 0] == pytest.approx(0.6, abs=1e-9)
     assert corner[239:241, 319:321].min() > 0.9999
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,8 @@ def shares(upper, lower, height, points):
         y = np.linspace(14.0, -14.0, 30)  # a left eye's run the other way
         return np.stack([np.zeros(30), y, np.full(30, z)], axis=1) if z is not None else np.zeros((0, 3))
 
-    shade = LidShade(SimpleNamespace(upper_margin=margin(upper), lower_margin=margin(lower)), height)
+    posed: Any = SimpleNamespace(upper_margin=margin(upper), lower_margin=margin(lower))  # all that it reads
+    shade = LidShade(posed, height)
     return shade.share(mi.Point3f(*np.asarray(points, dtype=np.float32).T)).numpy()
 
 

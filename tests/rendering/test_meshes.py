@@ -94,7 +94,7 @@ def test_baked_meshes_match_their_manifest(tmp_path):
     assert {p.name for p in tmp_path.glob("*.ply")} == set(manifest["files"])
     for name, entry in manifest["files"].items():
         assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() == entry["sha256"]
-    front = trimesh.load(tmp_path / "cornea_front.ply", process=False)
+    front = trimesh.load_mesh(tmp_path / "cornea_front.ply", process=False)
     assert len(front.vertices) == manifest["files"]["cornea_front.ply"]["vertices"]
     assert np.max(np.abs(eye.front[0].implicit(front.vertices))) < 2e-5  # PLY holds single precision
     again = json.loads(bake_meshes(eye, tmp_path / "again", rings=6, sectors=24).read_text())

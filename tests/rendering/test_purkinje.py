@@ -21,12 +21,12 @@ from tests.support.render_rigs import BLACK, RIGS, eye_of, head_rig, job_of, rem
 def test_the_ray_tube_is_the_same_from_the_lamp(model, order):
     # Reciprocity: |d x / d omega| is the same both ways where both ends are in air.
     eye = eye_of(model)
-    *lens, gradient = stack(eye, order)
+    surfaces, indices, rims, passing, gradient = stack(eye, order)
     lamp, node = np.array([[560.0, 20.0, -120.0]]), np.array([[520.0, 0.0, -60.0]])
-    path = purkinje_path(*lens, gradient)
+    path = purkinje_path(surfaces, indices, rims, passing, gradient)
     ways = []
     for a, b in ((lamp, node), (node, lamp)):
-        found = purkinje_points(*lens, a, b[0], gradient)
+        found = purkinje_points(surfaces, indices, rims, passing, a, b[0], gradient)
         assert found.status[0] == 0
         tube = ray_tube(path, 1.0, components(b), components(-found.directions), components(a))
         ways.append(tube.cross_section_mm2_sr[0])
@@ -77,9 +77,9 @@ def test_place_in_the_picture(renderer, order):
     job = replace(job, window=rig.window(48, 48, np.round(xy)))
     image = renderer.render(job, spp=1).irradiance
     assert np.linalg.norm(centroid(image, job.window) - xy) < 1e-3
-    *lens, gradient = stack(eye, order)
+    surfaces, indices, rims, passing, gradient = stack(eye, order)
     node, source = (job.M.T @ (p - job.t) for p in (job.camera.nodal_point_mm, lamp.position_mm))
-    found = purkinje_points(*lens, source[None], node, gradient)
+    found = purkinje_points(surfaces, indices, rims, passing, source[None], node, gradient)
     truth = job.camera.project(found.exit_points_mm @ job.M.T + job.t)[0][0]
     assert np.linalg.norm(xy - truth) < 1e-6
 

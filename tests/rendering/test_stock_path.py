@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,7 +96,7 @@ def test_a_ring_is_a_disc_without_its_middle(renderer):
     # Equal radiance: a disc of radius 8 is a ring from 5 to 8 and a disc of radius 5, in light and in glints.
     rig = remote_rig()
     lamp = rig.lights[0]
-    parts = {
+    parts: dict[str, Any] = {
         "disc": (replace(lamp, radius_mm=8.0, intensity_mw_sr=64.0),),
         "ring": (Ring(lamp.position_mm, lamp.axis, 8.0, 39.0, 1.0, 5.0),),
         "middle": (replace(lamp, radius_mm=5.0, intensity_mw_sr=25.0),),

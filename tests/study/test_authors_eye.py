@@ -7,7 +7,7 @@ import pytest
 
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.landmarks import field_direction
-from eyerender.geometry.surfaces_quadric import centre_of
+from eyerender.geometry.surfaces_quadric import Quadric, centre_of
 from eyerender.scene import load_scene
 
 
@@ -31,6 +31,7 @@ def test_the_published_lens_is_the_authors_software():
         middle = np.array([-5.0, -0.3205, 0.064])
         for k, surface in enumerate(half[1:]):
             p = np.sqrt(1.0 - k / 42.0)
+            assert isinstance(surface, Quadric)
             assert np.allclose(centre_of(surface), middle + p * (np.array(centre) - middle), atol=1e-9)
     assert np.abs(eye.incident_node_mm - [-7.08250041, 0.12055175, -0.15770869]).max() < 1e-8
 

@@ -7,6 +7,7 @@ import random
 import signal
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,7 +153,7 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path):
 @pytest.mark.render
 @pytest.mark.slow
 def test_image_study_resumes(tmp_path):
-    arguments = {"observer": "both", "protocol": "corrected", "eyes": ("E2",), "spp": 4}
+    arguments: dict[str, Any] = {"observer": "both", "protocol": "corrected", "eyes": ("E2",), "spp": 4}
     first = run_study("guestrin2006", tmp_path / "out", **arguments)
     images = sorted((tmp_path / "out" / "images").rglob("*.png"))
     assert len(images) == 3 * 90  # images with noise and without it, and masks
@@ -181,7 +182,7 @@ def test_image_study_resumes(tmp_path):
 def test_a_study_killed_again_and_again_ends_with_the_same_summary(tmp_path):
     command = [sys.executable, "-m", "eyerender", "study", "guestrin2006", "--observer", "both", "--eyes", "E2"]
     command += ["--protocol", "published", "--spp", "1", "--workers", "2"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     hook = stages.environment(tmp_path, tmp_path / "whole")
     subprocess.run([*command, "-o", str(tmp_path / "whole")], check=True, env=hook, **quiet)
     draws = random.Random(5)

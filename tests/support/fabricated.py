@@ -52,8 +52,8 @@ def fabricate(folder: Path, source: Path, rows: int) -> None:
             place = f"shards/{shard:05d}/lines.jsonl"
             _made(folder / place).write_bytes(text)
             files[place] = _sum(folder / place)
-            own = {"shard": shard, "samples": [first, first + count], "images": count, "files": files}
-            (folder / "shards" / f"{shard:05d}" / "done.json").write_text(json.dumps({**done, **own}))
+            finished = {"shard": shard, "samples": [first, first + count], "images": count, "files": files}
+            (folder / "shards" / f"{shard:05d}" / "done.json").write_text(json.dumps({**done, **finished}))
             metadata.write(text)
             sums.update(text)
             total += len(text)

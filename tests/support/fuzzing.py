@@ -95,7 +95,7 @@ TEXTS = (
     "", "x", "E1", "right", "../../etc/passwd", "/dev/zero", "a\x1b[31m\nb", "\x00", "ø" * 300, "x" * 20_000, "1e400",
     ".inf", "nan", "2020-13-45", "\ud800", "draw", "images/000000/../../x", "\u202e\u2028",
 )  # fmt: skip
-OTHERS = (
+OTHERS: tuple[Any, ...] = (
     None, True, False, [], {}, [[]], {"": 1}, _nested(40), [1] * 2000, [[0, 0, 0]] * 300, {"draw": "uniform"},
     {"draw": "choice", "values": [1, "a"]}, {"draw": "integer", "low": -(10**200), "high": 10**200},
     {"draw": "grid", "low": -1e308, "high": 1e308, "steps": 1_000_000},

@@ -162,7 +162,8 @@ def means_deg(eye, camera, lights, targets, heads, position, plane=650.0, index=
         runs.append(features(eye, camera, lights, motions))
 
     def misses(parameters, run):
-        return gaze(parameters, index, camera, lights, *run, plane) - targets
+        pupil, glints = run
+        return gaze(parameters, index, camera, lights, pupil, glints, plane) - targets
 
     done = least_squares(lambda x: misses(x, runs[0]).ravel(), [7.8, 4.2, 5.0, 1.5], xtol=1e-12, ftol=1e-12, gtol=1e-12)
     errors = []

@@ -72,7 +72,7 @@ def centroid(image: np.ndarray, window: tuple[int, int, int, int]) -> np.ndarray
     )
 
 
-def mirror_pixel(eye, job, lamp_mm) -> np.ndarray:
+def mirror_pixel(eye, job, lamp_mm) -> tuple[np.ndarray, float]:
     """Fermat's principle in float64: the mirror point makes lamp - cornea - nodal point stationary."""
     surface = eye.front[0]
     lamp, node = job.M.T @ (lamp_mm - job.t), job.M.T @ (job.camera.nodal_point_mm - job.t)
@@ -142,7 +142,8 @@ def contour_error(rendered: np.ndarray, polygon: np.ndarray, window: tuple[int, 
     # A displaced edge also changes the next pixels; summing over 3 x 3 makes the linear model whole.
     def box(image: np.ndarray) -> np.ndarray:
         padded = np.pad(image.reshape(window[3], window[2]), 1)
-        return sum(np.roll(padded, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))[1:-1, 1:-1].ravel()
+        moved = [np.roll(padded, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        return np.sum(moved, axis=0)[1:-1, 1:-1].ravel()
 
     wide = np.stack([box(c) for c in A.T], axis=1)
     rows = np.abs(wide).sum(axis=1) > 0
