@@ -19,6 +19,7 @@ from scipy import ndimage, optimize
 from eyerender.analytic.observer import trace
 from eyerender.capture import render_windows
 from eyerender.geometry.ellipse import Ellipse, signed_distance
+from eyerender.labels import PUPIL
 from eyerender.scene import Scene
 from eyerender.scenespec import SceneSpec
 from make_ideal_images import Drawing
@@ -148,7 +149,9 @@ def photograph(renderer: Any, scene: Scene) -> Photograph:
         "glints": [{"status": "ok" if xy is not None else "missing", "xy_px": xy} for xy in places],
     }  # fmt: skip
     levels = PUPIL_DN + (irradiance - inside) * (STEP_DN / (outside - inside))
-    return Photograph(levels, label, shot.labels["pupil_visible_fraction"] or 0.0)
+    labels = shot.rendered.labels
+    visible = float(np.nan_to_num(labels.visible_fraction(PUPIL))) if labels is not None else 0.0
+    return Photograph(levels, label, visible)
 
 
 def _median_near(image: Array, ellipse: Ellipse, mask: NDArray[np.uint8], part: int, away: float) -> float:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ def place(tmp_path, monkeypatch):
     os.mkfifo("pipe.yaml")
     Path("broken.py").write_text("def", encoding="utf-8")
     Path("exits.py").write_text("raise SystemExit(3)", encoding="utf-8")
-    records = {"records": [], "rig": None}
+    records: dict[str, Any] = {"records": [], "rig": None}
     Path("f.json").write_text(json.dumps(records), encoding="utf-8")
     own = {"schema": "eyerender/gaze-calibration/3", "estimator": {"reference": "exits:Mine"}, "rig": None, "state": {}}
     Path("own.json").write_text(json.dumps(own), encoding="utf-8")

@@ -10,6 +10,7 @@ import resource
 import struct
 import zlib
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +45,7 @@ def _encoded(image: np.ndarray, kind: str) -> bytes:
         "palette": grey.convert("P"),
         "one": Image.fromarray(image[:1, :1]),
     }
-    options = {
+    options: dict[str, dict[str, Any]] = {
         "jpeg": {"quality": 95},
         "tiff16": {"compression": "tiff_lzw"},
         "animated": {"save_all": True, "append_images": [Image.fromarray(255 - image)]},

@@ -208,6 +208,7 @@ def test_a_state_that_the_class_cannot_read_gets_one_line(place, tmp_path, capsy
 def test_the_api_takes_it_as_it_is(place):
     """Without the command line a class needs no wrapper: any object that follows the protocol will do."""
     chosen = choose_estimator(f"{place}:Unstored")
+    assert isinstance(chosen, OwnEstimator)
     seen, rig = er.gaze.load_observations("features.json")
     errors = er.gaze.leave_one_target_out(chosen.estimator, seen, rig)
     np.testing.assert_array_equal(errors.point_mm, np.zeros_like(errors.point_mm))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.analytic.observer import observe
+from eyerender.analytic.observer import trace
 from eyerender.rig.rig import RigGeometry
 
 ONE_CAMERA = [
@@ -58,23 +58,23 @@ def check(estimator, seen, authored):
 
 @pytest.mark.parametrize("estimator", ONE_CAMERA, ids=lambda e: type(e).__name__)
 def test_one_camera(scene, estimator):
-    check(estimator, observe(scene), scene.spec.rig)
+    check(estimator, trace(scene), scene.spec.rig)
 
 
 @pytest.mark.parametrize("estimator", [er.gaze.Homography(), er.gaze.CrossRatio()], ids=lambda e: type(e).__name__)
 def test_projective(five_lights, estimator):
-    check(estimator, observe(five_lights), five_lights.spec.rig)
+    check(estimator, trace(five_lights), five_lights.spec.rig)
 
 
 def test_two_cameras(scene):
     spec = scene.spec.to_mapping()
     spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})
     two = er.Scene.of(er.SceneSpec.from_mapping(spec))
-    check(er.gaze.ShihWuLiu(), observe(two), two.spec.rig)
+    check(er.gaze.ShihWuLiu(), trace(two), two.spec.rig)
 
 
 def test_leave_one_target_out_takes_an_authored_rig(scene):
-    seen = observe(scene)
+    seen = trace(scene)
     one = er.gaze.leave_one_target_out(er.gaze.Regression("R2"), seen, scene.spec.rig)
     other = er.gaze.leave_one_target_out(er.gaze.Regression("R2"), seen, scene.rig)
     assert isinstance(one, er.gaze.GazeErrors)
@@ -82,7 +82,7 @@ def test_leave_one_target_out_takes_an_authored_rig(scene):
 
 
 def test_other_targets_make_another_calibration(scene):
-    seen, rig = observe(scene), scene.spec.rig
+    seen, rig = trace(scene), scene.spec.rig
     shifted = seen.with_targets(seen.index.target_mm + np.array([0.0, 10.0, 0.0]))
     a, b = (er.gaze.Regression("R2").fit(s, rig).predict(seen, rig).point_mm for s in (seen, shifted))
     np.testing.assert_allclose(b - a, np.broadcast_to([0.0, 10.0, 0.0], a.shape), atol=1e-9)

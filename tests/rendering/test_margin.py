@@ -141,7 +141,7 @@ def test_the_ellipse_of_the_picture_is_that_of_the_analytic_observer(renderer, r
 
     scene = drawn_scene(rig_name, "right", seed)
     truth = trace(scene)
-    job = render_job(scene, truth, 0)
+    job = render_job(scene.frames(), 0)
     black, grey = (
         renderer.radiance(replace(job, look=PLAIN.model_copy(update={"pupil_albedo": albedo})), spp=64)
         for albedo in (0.0, PLAIN.iris_albedo)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from eyerender.scene import Scene, SceneSpec
+from eyerender.scene import Scene
+from eyerender.scenespec import SceneSpec
 from eyerender.study import guestrin
 from eyerender.study.images import shots
 
