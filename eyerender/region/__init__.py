@@ -1,1 +1,1 @@
-"""The region of the eye: materials and textures as geometry and numbers, without any renderer."""
+"""The eye region: materials and textures as geometry and numbers, without any renderer."""

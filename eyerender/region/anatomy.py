@@ -50,7 +50,7 @@ class Fissure(Spec):
 
 
 class Lid(Spec):
-    """The lids themselves and how they move."""
+    """Shape and movement of the lids."""
 
     margin_mm: float = _number(1.9, 1.4, 2.5, "of the upper margin; the lower is thinner (Zhu, and rows of lashes)")
     margin_tilt_deg: float = _number(-4.0, -8.0, 20.0, "how far the upper margin opens outwards (chosen)")
@@ -94,7 +94,7 @@ class Brow(Spec):
 
 
 class Face(Spec):
-    """The face around the lids; differences from the average face."""
+    """The face around the lids, as differences from the average face."""
 
     brow_ridge_mm: float = _number(0.0, -4.0, 5.0, "ridge further forward (chosen)")
     sulcus_mm: float = _number(0.0, -4.0, 3.0, "hollow between lid and brow further forward (chosen)")
@@ -103,7 +103,7 @@ class Face(Spec):
 
 
 class Skin(Spec):
-    """How the surfaces look at 850 nm."""
+    """Appearance of the surfaces at 850 nm."""
 
     albedo: float = _number(0.55, 0.30, 0.75, "of the skin (chosen; forearms: Cooksey, Allen, Tsai 2017)")
     mottling: Share = Field(default=0.5, description="unevenness of the albedo (chosen)")
@@ -122,7 +122,7 @@ class TearFilm(Spec):
 
 
 class Region(Spec):
-    """The eye region of one subject. Without this key a scene shows the bare eye before a matte surround."""
+    """The eye region of one subject. Without this key a scene shows the bare eye in front of a matte surround."""
 
     fissure: Fissure = Fissure()
     lids: Lid = Lid()
@@ -144,7 +144,7 @@ class Region(Spec):
 
     @classmethod
     def drawn(cls, seed: int, *, spread: float = 1.0, blink: float = 0.0) -> Self:
-        """A seeded subject: every bounded number uniform over `spread` of its range about the default.
+        """Draw a subject: every bounded number is uniform over `spread` of its range about the default.
 
         Each number is a pure function of (seed, key).
         """

@@ -1,7 +1,7 @@
 """The brow: hairs in a band over the supraorbital ridge, lying on the skin.
 
-At its head, near the nose, hairs stand up; along the arch they turn to the temple, those of the upper border downwards,
-so that they meet in a line (directions as commonly described). The brow does not move.
+At its head, near the nose, hairs stand up. Along the arch they turn to the temple, and those of the upper border
+downwards, so that they meet in a line (directions as commonly described). The brow does not move.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ POINTS = 5
 
 @lru_cache(maxsize=16)
 def brow(spec: Region) -> Hairs:
-    """The brow of a subject in the region's frame."""
+    """Make the brow of a subject in the region's frame."""
     b = spec.brow
     rng = np.random.default_rng((0xB405, spec.seed))
     n = b.count
-    # 0 at the head, 1 at the tail; thinning out at both ends and at both borders.
+    # s is 0 at the head and 1 at the tail. The density falls towards both ends and both borders.
     s = -0.04 + 1.1 * rng.beta(1.25, 1.55, n)
     across = rng.beta(1.7, 1.7, n)
     y, low, high = brow_band(spec, s)
     z = low + across * (high - low) + 0.5 * rng.normal(0, 1, n)
     head = 1 - step(s, -0.02, 0.36)
     upper = step(across, 0.3, 0.95)
-    # Direction from +z towards the temple (-y): up at the head, then along the band, from the upper border down to it.
+    # This is the direction from +z towards the temple (-y): up at the head, then along the band, and down from the
+    # upper border.
     along = 70.0 + 26.0 * step(s, 0.45, 0.95)
     lean = np.radians(along + (14.0 - along) * head + 26.0 * (upper - 0.25) * (1 - 0.7 * head))
-    # Neighbours lie alike, a few stray.
+    # Neighbouring hairs have similar directions; a few differ.
     drift = np.interp(s, np.linspace(-0.1, 1.1, 22), rng.normal(0, 1, 22))
     lean = lean + np.radians(5.0) * drift + np.radians(6.0) * np.clip(rng.standard_t(5, n), -3.5, 3.5)
     length = b.length_mm * rng.triangular(0.35, 0.85, 1.0, n) * (0.62 + 0.38 * np.sin(np.pi * np.clip(s, 0, 1) ** 0.8))
@@ -54,7 +55,7 @@ def brow(spec: Region) -> Hairs:
 
 
 def brow_band(spec: Region, s: Floats) -> tuple[Floats, Floats, Floats]:
-    """(y, lower z, upper z) of the band at s."""
+    """Coordinates y, lower z and upper z of the band at s."""
     b = spec.brow
     y = 21.0 - 46.0 * s
     arch = b.arch_mm * np.sin(np.pi * np.clip(s / 1.25, 0, 1)) ** 1.5
@@ -64,5 +65,5 @@ def brow_band(spec: Region, s: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _skin(spec: Region, y: Floats, z: Floats) -> Floats:
-    # Up here nothing but the face is under the hairs; the joint with the lids' shell adds less than a tenth of a mm.
+    # Here the hairs lie on the face alone; the transition to the lids' shell adds less than a tenth of a mm.
     return face_depth(spec.face, y, z)

@@ -2,15 +2,15 @@
 
 Columns run once around the fissure: angle 0 at the medial canthus, 90 degrees in the middle of the upper lid, 180 at
 the lateral canthus, 270 in the middle of the lower lid. Along the chord between the canthi a = cos(angle) is -1
-temporal and +1 nasal; a lid stands above or below the chord by
+temporal and +1 nasal; the height of a lid above or below the chord is
 
     h(a) = H (1 + a)^p (1 - a)^q / max,
 
-its peak at a = (p - q) / (p + q). The upper lid's height follows the turn of the eye and the blink: its middle lies at
-an angle about the globe's centre that turns by `upper_follows` of the eye's elevation.
+with its peak at a = (p - q) / (p + q). The upper lid's height follows the turn of the eye and the blink: its middle
+lies at an angle about the globe's centre that turns by `upper_follows` of the eye's elevation.
 
-Where the contour lies in front of the globe it lies on it; past a polar angle of 51 (nasal) to 58 degrees (temporal) it
-leaves along the tangent, which softens towards the canthi.
+Where the contour is in front of the globe it lies on the globe. Beyond a polar angle of 51 (nasal) to 58 degrees
+(temporal) it leaves along the tangent, which softens towards the canthi.
 """
 
 from __future__ import annotations
@@ -54,18 +54,18 @@ class Contour(ArrayValue):
 
 
 def step(x: Floats | float, low: float, high: float) -> Floats:
-    """A smooth step from 0 at `low` to 1 at `high`."""
+    """Smooth step from 0 at `low` to 1 at `high`."""
     s = np.clip((np.asarray(x, dtype=float) - low) / (high - low), 0, 1)
     return np.asarray(s * s * (3 - 2 * s))
 
 
 def unit(v: Floats) -> Floats:
-    """Vectors (..., 3) of length 1."""
+    """Unit vectors (..., 3)."""
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))
 
 
 def canthi(spec: Region) -> tuple[Floats, Floats]:
-    """(y, z) of the middle of the chord between the canthi, and half the chord from there to the medial one."""
+    """Middle (y, z) of the chord between the canthi, and half the chord from there to the medial one."""
     f = spec.fissure
     tilt = np.radians(f.tilt_deg)
     half = f.width_mm / 2 * np.array([np.cos(tilt), -np.sin(tilt)])
@@ -74,7 +74,7 @@ def canthi(spec: Region) -> tuple[Floats, Floats]:
 
 
 def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
-    """The fissure's contour for a posed globe."""
+    """Contour of the fissure for a posed globe."""
     angle = 2 * np.pi * np.arange(columns) / columns
     a = np.cos(angle)
     upper = np.where(np.sin(angle) >= -1e-12, 1.0, -1.0)
@@ -93,13 +93,13 @@ def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
 
 
 def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floats, float]:
-    """(y, z) of the inner edge as seen from the front (n, 2), and the openness."""
+    """Inner edge (y, z) as seen from the front (n, 2), and the openness."""
     f, lids = spec.fissure, spec.lids
     middle, half = canthi(spec)
     chord = middle + a[:, None] * half
     middle_z = middle[1] + f.peak * half[1]
     reach = globe.radius_mm + 0.5
-    # Where the margins' middles stand, as angles about the globe's centre; lids never quite touch unless they blink.
+    # The middles of the margins are angles about the globe's centre. Lids never quite touch unless they blink.
     turn = globe.elevation_rad
 
     def height(rest_mm: float, follows: float) -> float:
@@ -110,12 +110,12 @@ def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floa
     low = min(low, -0.6)
     high = max(height(f.upper_mm, lids.upper_follows) - middle_z, low + 1.0)
     rest = f.upper_mm - middle_z
-    # Shut, they meet near the lower lid's place; one that stands very low comes up to meet the other.
+    # Closed lids meet near the place of the lower lid. A lower lid that is very low moves up to meet the other.
     shut = 0.92 * low + 0.08 * min(high, 0.0)
     shut = max(shut, -3.2 + 0.5 * (shut + 3.2))
     shape_up = _shape(a, f.peak, 0.98)
     shape_low = _shape(a, -0.08, 0.92)
-    # Beside the caruncle both lids run close together.
+    # Beside the caruncle the lids run close together.
     bay = 1 - 0.42 * np.exp(-(((1 - a) / 0.19) ** 2))
     closed = shut * shape_low
     b = spec.blink

@@ -1,9 +1,9 @@
-"""The face around the eye without its lids: how far forward (x, mm) the skin stands over (y nasal, z up).
+"""The face around the eye without its lids: depth x (mm) of the skin over (y nasal, z up).
 
-A smooth surface through a table of depths about the corneal apex. The lateral orbital rim lies 16 to 18 mm behind it
-(Hertel's exophthalmometry: means of 15.0 mm, Wu et al. 2015, and 15.7 mm, Karti et al. 2015, with 2 to 3 mm of spread);
-the inner canthus (8 mm behind), nasion (8 to 10 mm before), supraorbital ridge (5 mm before), tip of the nose (28 mm
-before) and all in between are drawn by eye. Beyond the middle of the face it is mirrored.
+It is a smooth surface through a table of depths about the corneal apex. The lateral orbital rim lies 16 to 18 mm behind
+it (Hertel's exophthalmometry: means of 15.0 mm, Wu et al. 2015, and 15.7 mm, Karti et al. 2015, with 2 to 3 mm of
+spread). The inner canthus (8 mm behind), nasion (8 to 10 mm in front), supraorbital ridge (5 mm in front), tip of the
+nose (28 mm in front) and everything in between were set by eye. Beyond the middle of the face it is mirrored.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .anatomy import Face
 MIDDLE_MM = 31.5
 _Y = np.array([-75.0, -60.0, -46.0, -36.0, -27.0, -19.0, -11.0, 0.0, 10.0, 16.5, 22.0, 27.0, 31.5])
 _Z = np.array([-62.0, -53.0, -45.0, -32.0, -22.0, -14.0, -7.0, 0.0, 6.0, 12.0, 17.0, 22.0, 28.0, 38.0, 52.0, 68.0])
-# Rows z from below upwards, columns y from the temple to the middle of the nose.
+# Rows are z from below upwards, columns y from the temple to the middle of the nose.
 _DEPTH = np.array([
     [-62, -44, -33, -25, -18, -13, -8.5, -3.0, 2.0, 6.5, 11.0, 14.0, 15.0],
     [-60, -42, -31, -23, -16, -11, -7.2, -3.0, 1.5, 9.0, 14.0, 17.0, 18.5],
@@ -43,7 +43,7 @@ _DEPTH = np.array([
 def face_depth(face: Face, y_mm: Floats, z_mm: Floats) -> Floats:
     """Depth x (mm) of the face over points (y, z) of the region's frame."""
     off = MIDDLE_MM - y_mm
-    # Mirrored, and rounded where the halves meet: as far off as it was beyond a centimetre.
+    # The face is mirrored, and rounded where the halves meet. More than a centimetre away the rounding has no effect.
     folded = MIDDLE_MM - (np.sqrt(off * off + 5.5**2) - 5.5 * np.exp(-((off / 9.0) ** 2)))
     spline = _spline(face)
     return np.asarray(spline.ev(np.clip(z_mm, _Z[0], _Z[-1]), np.clip(folded, _Y[0], _Y[-1])))

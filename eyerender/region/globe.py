@@ -1,10 +1,10 @@
-"""The globe as it really stands, as a distance from its centre over direction: what lids lie on.
+"""The posed globe, as a distance from its centre over direction: the surface on which the lids lie.
 
     r(n) = max(R, distance to the front cornea along n where that lies within the limbus)
 
-with n a unit direction from the centre of the sclera's sphere (radius R). The globe is star-shaped from there, so r
-tells everything. All points are in the region's frame: the eye frame of the unrotated right eye (a left eye's region is
-the mirror image).
+Here n is a unit direction from the centre of the sclera's sphere (radius R). The globe is star-shaped from there, so r
+describes it completely. All points are in the region's frame: the eye frame of the unrotated right eye (a left eye's
+region is the mirror image).
 """
 
 from __future__ import annotations
@@ -24,9 +24,16 @@ _WIDEST = np.radians(40.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Globe(ArrayValue):
-    """A posed globe: `cornea` and `centre_mm` (3,) in the eye frame, the motion p = M x + t into the unrotated frame.
+    """A posed globe.
 
-    `mirrored`: a left eye, whose region's frame has y the other way round. Without a cornea it is the bare sphere.
+    Attributes:
+        cornea: front of the cornea in the eye frame; None for the bare sphere.
+        limbus_radius_mm: radius of the limbus.
+        centre_mm: (3,) centre of the sphere in the eye frame.
+        radius_mm: radius of the sphere.
+        M: (3, 3) rotation of the motion p = M x + t into the unrotated frame.
+        t: (3,) translation of that motion.
+        mirrored: whether it is a left eye, whose region's frame has y reversed.
     """
 
     cornea: Surface | None
@@ -43,7 +50,7 @@ class Globe(ArrayValue):
 
     @classmethod
     def sphere(cls, radius_mm: float = 12.0, depth_mm: float = 13.0) -> Globe:
-        """An average globe at rest, without a cornea."""
+        """Make an average globe at rest, without a cornea."""
         return cls(None, 0.0, np.array([-depth_mm, 0.0, 0.0]), radius_mm, np.eye(3), np.zeros(3))
 
     @property
@@ -53,7 +60,7 @@ class Globe(ArrayValue):
 
     @property
     def rest(self) -> Floats:
-        """The same for the unrotated eye."""
+        """Centre of the sphere of the unrotated eye, (3,) mm."""
         return self._mirror(self.centre_mm)
 
     @property
@@ -87,7 +94,7 @@ class Globe(ArrayValue):
         return np.asarray(distance - self.radial(away / distance[..., None]))
 
     def pushed_out(self, points: Floats, clearance_mm: Floats | float) -> Floats:
-        """The points, moved along the line from the globe's centre where they lie nearer to it than `clearance_mm`."""
+        """Move points that are closer to the globe than `clearance_mm` outwards along the line from its centre."""
         away = points - self.centre
         distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-9)
         direction = away / distance[..., None]
@@ -99,7 +106,7 @@ class Globe(ArrayValue):
 
     @property
     def _bulge(self) -> Floats:
-        """How far the cornea stands out of the sphere over polar angle and turn, mm."""
+        """Height of the cornea above the sphere over polar angle and turn, mm."""
         if self.cornea is None:
             raise ValueError("a bare sphere has no cornea")
         return _table(self.cornea, self.limbus_radius_mm, tuple(self.centre_mm.tolist()), self.radius_mm)
@@ -110,7 +117,7 @@ class Globe(ArrayValue):
 
 @lru_cache(maxsize=32)
 def _table(cornea: Surface, limbus_mm: float, centre: tuple[float, ...], radius_mm: float) -> Floats:
-    """How far the cornea stands out of the sphere (polar angle, turn about x), the last column as the first; mm."""
+    """Height of the cornea above the sphere over (polar angle, turn about x), mm; the last column equals the first."""
     polar = np.linspace(0, _WIDEST, _POLAR)[:, None]
     turn = (2 * np.pi * np.arange(_TURNS + 1) / _TURNS)[None, :]
     n = np.stack(
@@ -118,7 +125,7 @@ def _table(cornea: Surface, limbus_mm: float, centre: tuple[float, ...], radius_
     )
     n = n / np.linalg.norm(n, axis=-1, keepdims=True)
     c = np.array(centre)
-    # From outside inwards: the front of the cornea is what such a ray meets first.
+    # Rays run from outside inwards, so that they meet the front of the cornea first.
     start = radius_mm + 8.0
     distance, met = cornea.intersect(c + start * n, -n)
     r = np.where(met, start - distance, radius_mm)

@@ -1,6 +1,6 @@
 """Hairs as curves, and curves as tapered three-sided tubes.
 
-A hair is a polyline of `SEGMENTS` + 1 points with a radius at each, thinning towards the tip.
+A hair is a polyline of `SEGMENTS` + 1 points with a radius at each, which decreases towards the tip.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SEGMENTS = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hairs(ArrayValue):
-    """`points` (n, k, 3) mm from root to tip, `radii` (n, k) mm."""
+    """Curves: `points` (n, k, 3) mm from root to tip, and `radii` (n, k) mm."""
 
     points: Floats
     radii: Floats
@@ -32,7 +32,7 @@ class Hairs(ArrayValue):
         along[:, 1:-1] = p[:, 2:] - p[:, :-2]
         along[:, 0], along[:, -1] = p[:, 1] - p[:, 0], p[:, -1] - p[:, -2]
         along = unit(along)
-        # One reference per hair, across its chord, so that a tube does not twist.
+        # Each hair has one reference direction, across its chord, so that its tube does not twist.
         chord = unit(p[:, -1] - p[:, 0])
         helper = np.where(np.abs(chord[:, 1:2]) < 0.8, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
         e1 = unit(np.cross(along, helper[:, None, :]))
@@ -52,6 +52,6 @@ def tube_faces(count: int, points: int) -> Ints:
 
 
 def taper(length: Floats, root_mm: float, points: int) -> Floats:
-    """Radii (n, k): full at the root, thinning to a tenth at the tip."""
+    """Radii (n, k), which decrease from the root to a tenth at the tip."""
     s = np.linspace(0, 1, points)
     return np.asarray(np.broadcast_to(root_mm / 2 * (1 - 0.9 * s**1.4), (len(length), points)))

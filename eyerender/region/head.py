@@ -1,11 +1,11 @@
-"""A user's own head mesh: read, checked, placed about an eye, and its looks as a map like the procedural region's.
+"""A user's own head mesh: reading, checks, placement about an eye, and its appearance as a map.
 
-The mesh keeps still: neither gaze nor blink moves it. With the files' coordinates q, unit s, axes R (rows forward,
-left, up) and the globe's centre c there, it stands in the frame of the unrotated eye at
+The mesh is fixed: neither gaze nor blink moves it. With the files' coordinates q, unit s, axes R (rows forward, left,
+up) and the globe's centre c there, its place in the frame of the unrotated eye is
 
     x = s R (q - c) + g,
 
-g the centre of the eye's globe. An eye whose centre is not given gets the other's mesh, mirrored.
+where g is the centre of the eye's globe. An eye whose centre is not given gets the other eye's mesh, mirrored.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from .mesh import PARTS, RegionLayout, RegionMesh
 
 HEAD_PARTS = (*PARTS, "head")
 _UNIT_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-# A patch around one eye, and a head with shoulders: outside of it the unit is wrong.
+# These are the sizes of a patch around one eye and of a head with shoulders. Outside of them the unit is wrong.
 _SMALLEST_MM, _LARGEST_MM = 15.0, 1500.0
 _NEAR_MM = 40.0
 _PAD, _BAND, _PLAIN = 4, 8, 8
 _TEXTURE = 2048
-# Pillow knows many more, some of which start other programs.
+# Pillow supports many more formats, some of which start other programs.
 _PICTURES = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "WEBP")
 _HAIR_GLOSS = 0.12
 
@@ -46,8 +46,15 @@ _HAIR_GLOSS = 0.12
 class HeadMesh(ArrayValue):
     """A head about its own origin, mm, +x where the face looks, +y to its left, +z up.
 
-    `vertices`, unit `normals` (n, 3), `faces` (m, 3), `uv` (n, 2; NaN where the file has none), `vertex_ends` and
-    `face_ends` of the parts in the order of `HEAD_PARTS`, and the globes' centres (3,), NaN where they are not given.
+    Attributes:
+        vertices: (n, 3).
+        normals: (n, 3) unit normals.
+        faces: (m, 3).
+        uv: (n, 2); NaN where the file has none.
+        vertex_ends: where the vertices of each part end, in the order of `HEAD_PARTS`.
+        face_ends: where the faces of each part end.
+        right_eye: (3,) centre of the globe; NaN where it is not given.
+        left_eye: (3,) likewise.
     """
 
     vertices: Floats
@@ -61,11 +68,13 @@ class HeadMesh(ArrayValue):
 
 
 def load_head(spec: Head) -> HeadMesh:
-    """Read and check the files of a spec with absolute paths (`Head.resolved`); kept while they do not change.
+    """Read and check the files of a spec with absolute paths (`Head.resolved`).
+
+    The result is kept until a file changes.
 
     Raises:
-        InputError: a file that is missing, not readable, or not the one that its check sum belongs to; a part that is
-            not there; numbers that are not finite; a size that the unit cannot have given.
+        InputError: a file is missing, unreadable or has another checksum; a part does not exist; numbers are not
+            finite; the size does not fit the unit.
     """
     if spec.manifest:
         raise InputError("is a manifest; resolve it first", source=spec.files[0])
@@ -73,7 +82,11 @@ def load_head(spec: Head) -> HeadMesh:
 
 
 def file_states(spec: Head) -> tuple[tuple[int, int], ...]:
-    """Time of change and size of each file of a spec with absolute paths; raises `InputError` where one is missing."""
+    """Time of change and size of each file of a spec with absolute paths.
+
+    Raises:
+        InputError: a file is missing.
+    """
     states = []
     for file in (*spec.files, *(() if spec.texture is None else (spec.texture,))):
         with opened(file) as stream:
@@ -137,7 +150,7 @@ def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
 
 
 def placed(head: HeadMesh, globe: Globe, texture: int = 0) -> RegionMesh:
-    """The head about an eye at rest, as the procedural region is given; it has no lid margins of its own.
+    """Place the head about an eye at rest, in the form of the procedural region; it has no lid margins.
 
     `texture` is the number of rows of its texture, 0 without one.
     """
@@ -152,10 +165,10 @@ def placed(head: HeadMesh, globe: Globe, texture: int = 0) -> RegionMesh:
 
 
 def head_map(spec: Region, head: HeadMesh) -> Singles:
-    """The map (rows, columns, 4) of a head: albedo, two slopes (0), gloss; the texture, then a band for each part.
+    """Map (rows, columns, 4) of a head: albedo, two slopes (0), gloss.
 
-    The texture's red channel counts, made linear and relative to its mean over the skin's vertices: the level is that
-    of `skin.albedo`.
+    The texture comes first, then a band for each part. The texture's red channel is used, made linear and relative to
+    its mean over the skin's vertices. `skin.albedo` sets the level.
     """
     skin = spec.skin
     picture = np.ones((_PLAIN, _PLAIN))
@@ -201,13 +214,13 @@ def _map_uv(head: HeadMesh, texture: int) -> Floats:
 
 
 def texture_rows(spec: Head) -> int:
-    """Rows of the texture as the map holds it, 0 without one."""
+    """Number of rows of the texture in the map, 0 without one."""
     return 0 if spec.texture is None else len(_picture(Path(spec.texture), Path(spec.texture).stat().st_mtime_ns))
 
 
 @lru_cache(maxsize=2)
 def _picture(path: Path, changed_ns: int) -> Floats:
-    """The red channel of a picture, linear, 0 to 1, at most 2048 rows and columns."""
+    """Red channel of an image, linear, 0 to 1, at most 2048 rows and columns."""
     del changed_ns
     try:
         with opened(path) as stream, Image.open(stream, formats=_PICTURES) as file:
@@ -216,22 +229,22 @@ def _picture(path: Path, changed_ns: int) -> Floats:
     except InputError:
         raise
     except Exception as error:
-        # A damaged file makes Pillow's decoders raise whatever their arithmetic comes upon.
+        # For a damaged file Pillow's decoders may raise any exception.
         raise InputError(f"is not a readable picture ({error})", source=str(path)) from None
     values = (data[..., 0] if data.ndim == 3 else data).astype(float)
     if data.dtype != np.uint8:
         return frozen(values / (65535.0 if data.dtype.kind in "iu" else max(float(values.max()), 1e-9)))
-    # 8 bits are taken for sRGB (IEC 61966-2-1).
+    # Images of 8 bits are assumed to be sRGB (IEC 61966-2-1).
     s = values / 255
     return frozen(np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4))
 
 
 def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
-    """The named objects of a file: an OBJ's objects, or its groups where it has none; a PLY under its stem."""
+    """Named objects of a file: an OBJ's objects, or its groups where it has none; a PLY under its stem."""
     source, kind = str(path), path.suffix.lower()
     if kind not in (".obj", ".ply"):
         raise InputError("must end with .obj or .ply", source=source)
-    # Without its materials a file names no other files.
+    # Without its materials a file refers to no other files.
     options: dict[str, Any] = {"skip_materials": True}
     data = read_bytes(path)
     try:
@@ -244,7 +257,7 @@ def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
         scene = trimesh.load_scene(BytesIO(data), file_type=kind[1:], process=False, **options)
         found = {name: g for name, g in scene.geometry.items() if isinstance(g, trimesh.Trimesh) and len(g.faces)}
     except Exception as error:
-        # Readers of meshes raise whatever a broken file makes of them.
+        # For a broken file, mesh readers may raise any exception.
         detail = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"is not a readable mesh ({detail})", source=source) from None
     if not found:
@@ -282,12 +295,12 @@ def _axes(spec: Head, source: str) -> Floats:
 
 
 def _smooth(vertices: Floats, faces: Ints) -> Floats:
-    """Unit normals of the vertices, those of one place alike, so that seams of a texture do not show."""
+    """Unit normals of the vertices, equal for vertices at one place, so that seams of a texture do not show."""
     _, first, same = np.unique(np.round(vertices, 6), axis=0, return_index=True, return_inverse=True)
     same = np.ravel(same)
     merged = trimesh.Trimesh(vertices[first], same[faces], process=False)
     normals = np.array(merged.vertex_normals)[same]
-    # A place without any area about it has no normal.
+    # A vertex without any area around it has no normal.
     lost = ~(np.linalg.norm(normals, axis=1) > 0.5)
     normals[lost] = (1.0, 0.0, 0.0)
     return normals

@@ -24,9 +24,10 @@ Sum = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 class HeadParts(Spec):
-    """What the mesh's objects are: names of an OBJ's objects (or groups, where it has none), of a PLY its file's stem.
+    """Which objects of the mesh are which parts.
 
-    What stands in no list is left out, such as the head's own eyeballs.
+    Objects are named as in an OBJ (or its groups, where it has no objects), and by the file's stem for a PLY. Objects
+    in no list are left out, for example the head's own eyeballs.
     """
 
     skin: Names = Field(default=(), description="lids and face: 'occluded by lid'")
@@ -57,12 +58,12 @@ class Head(Spec):
 
     @property
     def files(self) -> tuple[str, ...]:
-        """The files as they are written."""
+        """Files as they are written in the spec."""
         return (self.file,) if isinstance(self.file, str) else self.file
 
     @property
     def manifest(self) -> bool:
-        """Whether all else stands in a manifest."""
+        """Whether the other keys are in a manifest."""
         return isinstance(self.file, str) and is_manifest(self.file)
 
     @model_validator(mode="after")
@@ -83,11 +84,11 @@ class Head(Spec):
 
     @property
     def sums(self) -> tuple[str, ...]:
-        """The check sums that are given."""
+        """Checksums that are given."""
         return () if self.sha256 is None else (self.sha256,) if isinstance(self.sha256, str) else self.sha256
 
     def resolved(self, base: Path | None) -> Head:
-        """The same with absolute paths (relative ones start at `base`, or the current folder), a manifest read."""
+        """Read a manifest, and make paths absolute (relative ones start at `base`, or the current folder)."""
         base = Path.cwd() if base is None else base.resolve()
         if self.manifest:
             path = base / self.files[0]
@@ -103,10 +104,10 @@ def is_manifest(name: str) -> bool:
 
 
 def read_manifest(path: Path) -> Head:
-    """What a manifest says, its paths relative to it; read again when the file has changed.
+    """Read a manifest, whose paths are relative to it; it is read again when the file has changed.
 
     Raises:
-        InputError: it is missing, not readable, or no manifest of a head.
+        InputError: it is missing, not readable, or not a manifest of a head.
     """
     with opened(path) as stream:
         state = os.fstat(stream.fileno())

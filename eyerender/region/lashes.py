@@ -1,11 +1,11 @@
-"""Lashes: curves that grow from the outer edge of the lids' margins, and move with them.
+"""Lashes: curves that grow from the outer edge of the lids' margins and move with them.
 
 A lash starts in the lash line and turns in the plane of the lid's normal n and the direction m away from the fissure:
 
     d(s) = cos(f) (cos(b) n + sin(b) m) + sin(f) t,   b(s) = b0 + curl s,
 
-b0 < 0 points towards the fissure, the fan f follows the lid from one canthus to the other. Tips of neighbours lean
-together by `clumping`. A lash that would dip into the skin is lifted out of it.
+where b0 < 0 points towards the fissure. The fan f varies along the lid from one canthus to the other. Tips of
+neighbours lean together by `clumping`. A lash that would enter the skin is lifted out of it.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from .globe import Globe
 from .hairs import SEGMENTS, Hairs, taper
 from .lids import CONJUNCTIVA, EDGE_MM, LID, MARGIN, Sheet
 
-_ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # of the points beyond the root; they start on the skin
+_ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # of the points after the root, which is on the skin
 _REACH_ROWS = 16
-_CAUGHT_MM = 0.3  # a lash that still has so far to go is caught
+_CAUGHT_MM = 0.3  # a lash that is still this far inside is caught
 _NEAR_COLUMNS = 6
-_KINK = 0.45  # cosine of the sharpest bend between two pieces, sharper than any lash's curl
+_KINK = 0.45  # cosine of the sharpest bend between two pieces; no lash's curl is this sharp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +49,7 @@ class LashPlan(ArrayValue):
 
 @lru_cache(maxsize=16)
 def plan(spec: Lashes, seed: int) -> LashPlan:
-    """The lashes of a subject; upper ones first."""
+    """Plan the lashes of a subject; upper ones first."""
     parts = [_lid(spec, seed, True), _lid(spec, seed, False)]
     return LashPlan(*(frozen(np.concatenate([p[i] for p in parts])) for i in range(7)))
 
@@ -57,17 +57,17 @@ def plan(spec: Lashes, seed: int) -> LashPlan:
 def _lid(spec: Lashes, seed: int, upper: bool) -> tuple[Floats, ...]:
     rng = np.random.default_rng((0x1A5, seed, int(upper)))
     count = spec.upper_count if upper else spec.lower_count
-    # Beside the nose, from the lacrimal puncta on, margins have none.
+    # The margins have no lashes between the lacrimal puncta and the nose.
     low, high = (-0.955, 0.62) if upper else (-0.93, 0.58)
     place = (np.arange(count) + 0.5 + rng.uniform(-0.45, 0.45, count)) / max(count, 1)
-    # Denser towards the temple.
+    # Lashes are denser towards the temple.
     a = low + (high - low) * place**1.08
     across = rng.choice([0.76, 0.87, 0.97], count, p=[0.25, 0.4, 0.35]) + rng.normal(0, 0.03, count)
-    # Longest a little temporal of the middle, short at both ends.
+    # They are longest slightly temporal of the middle and short at both ends.
     end = (a - low) / (high - low)
     profile = 0.45 + 0.55 * np.sin(np.pi * np.clip(end, 0, 1) ** 0.9) ** 0.6
     most = spec.upper_length_mm if upper else spec.lower_length_mm
-    # Lashes of all ages stand side by side: most are grown, some are short.
+    # Lashes of all ages stand side by side: most are full-grown, some are short.
     length = most * profile * np.where(rng.uniform(size=count) < 0.22, rng.uniform(0.3, 0.7, count),
                                        rng.triangular(0.6, 0.88, 1.0, count))  # fmt: skip
     spread = np.radians(spec.spread_deg)
@@ -75,7 +75,7 @@ def _lid(spec: Lashes, seed: int, upper: bool) -> tuple[Floats, ...]:
     droop = np.radians(spec.upper_droop_deg if upper else -8.0)
     start = -droop + 0.8 * spread * rng.normal(0, 1, count)
     curl = np.radians(spec.upper_curl_deg if upper else spec.lower_curl_deg) * rng.uniform(0.7, 1.2, count)
-    # Clumps: groups of two to five share fan and curl towards their tips.
+    # Groups of two to five lashes share fan and curl towards their tips.
     group = np.cumsum((rng.uniform(size=count) < 0.36).astype(np.int64))
     for values in (fan, start, curl):
         for g in np.unique(group):
@@ -99,22 +99,22 @@ def _lean(a: Floats, group: Ints, clumping: float, length: float) -> Floats:
 
 
 def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
-    """The lashes of a posed sheet."""
+    """Make the lashes of a posed sheet."""
     p = plan(spec.lashes, spec.seed)
     c = sheet.contour
     inner, outer, n, m, t = (_at(p.angle, v) for v in (c.point, sheet.lash_line, c.normal, c.away, c.along_lid))
-    # On the margin's surface, which stands out of the chord between its rounded edges.
+    # The roots are on the margin's surface, which bulges beyond the chord between its rounded edges.
     width = np.linalg.norm(outer - inner, axis=-1)
     swell = EDGE_MM / spec.lids.margin_mm * width * (1 - (2 * p.across - 1) ** 4)
     root = inner + p.across[:, None] * (outer - inner) - swell[:, None] * m
-    # With the lids shut there is less room between them.
+    # There is less room between closed lids.
     fold_back = step(1 - c.openness, 0.5, 1.0)
     start = p.start * (1 - 0.6 * fold_back)
     # Beyond the other lid's edge they hang down over it.
     hang = np.where(p.angle < np.pi, -np.radians(44.0), -np.radians(6.0)) * fold_back
-    hang = hang * step(np.abs(np.sin(p.angle)), 0.3, 0.8)  # at the corners there is no room for that
+    hang = hang * step(np.abs(np.sin(p.angle)), 0.3, 0.8)  # there is no room for that at the corners
     k = SEGMENTS + 1
-    # Shorter pieces where it bends most.
+    # Pieces are shorter where the lash bends most.
     ends = np.linspace(0, 1, k) ** 1.25
     points = np.empty((len(root), k, 3))
     points[:, 0] = root - 0.06 * n + 0.08 * m
@@ -128,7 +128,8 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
     straight = root[:, None] + (p.length_mm[:, None] * ends)[..., None] * ahead[:, None]
     points[:, 1:] = _out_of_skin(globe, sheet, points, straight)
     if fold_back > 0.2:
-        # In the corners of shut lids the nearest skin tells little: what still goes through it stays in its root.
+        # In the corners of closed lids the nearest skin is a poor guide. A lash that still crosses it is reduced to its
+        # root.
         corner = np.flatnonzero(np.abs(np.sin(p.angle)) < 0.75)
         stuck = corner[_through_skin(sheet, p.angle[corner], points[corner, 1:])] if len(corner) else corner
         points[stuck, 1:] = points[stuck, :1] + 0.0005 * (straight[stuck, 1:] - points[stuck, :1])
@@ -164,7 +165,7 @@ def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
 
 
 def _at(angle: Floats, values: Floats) -> Floats:
-    """Values (columns, 3) at column angles, linear in between."""
+    """Values (columns, 3) at column angles, interpolated linearly."""
     n = len(values)
     place = angle / (2 * np.pi) * n
     i = np.floor(place).astype(int)
@@ -173,10 +174,10 @@ def _at(angle: Floats, values: Floats) -> Floats:
 
 
 def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -> Floats:
-    """The points (n, k, 3) beyond the roots, off the globe and lifted along the nearest skin's normal to `_ABOVE_MM`.
+    """Move the points (n, k, 3) after the roots off the globe and out of the skin, to the height `_ABOVE_MM`.
 
-    Places between points count too: a straight piece must not cut through a fold. A lash that stays caught gives way
-    towards `straight`, which stands off the lid.
+    They move along the normal of the nearest skin. Places between points are moved too, because a straight piece must
+    not cut through a fold. A lash that stays caught is moved towards `straight`, which points away from the lid.
     """
     if not points.size:
         return points[:, 1:]
@@ -199,7 +200,7 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
     active, left = np.arange(len(out)), np.zeros(len(out))
     for turn in range(16):
         some = out[active]
-        if turn >= 6:  # caught in a fold, where the nearest skin's normals disagree
+        if turn >= 6:  # caught in a fold, where the normals of the nearest skin disagree
             some = some + 0.35 * (straight[active] - some)
         middles = (2 * some[:, :-1] + some[:, 1:]) / 3, (some[:, :-1] + 2 * some[:, 1:]) / 3
         push = lift(np.concatenate([some, *middles], axis=1), 1.5, everywhere)
@@ -213,12 +214,12 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
         active = active[left[active] > 0.01]
         if not len(active):
             break
-    # Bent out of shape on the way, for want of room: it stays in its root.
+    # A lash that was deformed too much for want of room is reduced to its root.
     way = np.diff(out, axis=1)
     pieces, rest = (np.linalg.norm(v, axis=-1) for v in (way, np.diff(straight, axis=1)))
     spoilt = ((pieces / np.maximum(rest, 1e-9)).max(axis=1) > 1.7) | (left > _CAUGHT_MM)
     along = np.sum(way[:, 1:] * way[:, :-1], axis=-1)
     spoilt |= np.any(along < _KINK * pieces[:, 1:] * pieces[:, :-1], axis=1)
     out[spoilt] = root[spoilt] + 0.0005 * (straight[spoilt] - root[spoilt])
-    # And off the globe, for lashes that turn in.
+    # Lashes that turn inwards are moved off the globe.
     return globe.pushed_out(out, 0.3)

@@ -1,6 +1,7 @@
 """Lids and skin as one sheet: from the conjunctiva under the lids over their margins out to the face.
 
-A grid of `ROWS` rows by columns once around the fissure (see `contour`); its topology never changes. Rows, inside out:
+The sheet is a grid of `ROWS` rows by columns once around the fissure (see `contour`). Its topology never changes. From
+inside out its rows are:
 
     conjunctiva   from the globe (just below its surface, so that no gap shows) to the margin's inner edge; off the
                   globe, beside the nose, it carries the plica and the caruncle
@@ -28,7 +29,7 @@ from .globe import Globe
 CONJUNCTIVA, MARGIN, LID, FACE = 7, 7, 16, 26
 ROWS = CONJUNCTIVA + MARGIN + LID + FACE
 _DIP_MM = 0.031
-EDGE_MM = 0.26  # how far the margin's rounded edges fall back
+EDGE_MM = 0.26  # depth of the margin's rounded edges
 _FAR_MM = (66.0, 58.0)
 _JOINT_MM = 2.4
 _SOFT_MM = 9.0
@@ -37,9 +38,13 @@ _ON_GLOBE = (1.0, 0.8, 0.5, 0.2)  # share of the globe's normal in those of the 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet(ArrayValue):
-    """The posed sheet: `vertices`, `normals` (ROWS, columns, 3); the lash line's frame is in `contour`.
+    """The posed sheet.
 
-    `lash_line` (columns, 3) is the outer edge of the margin.
+    Attributes:
+        vertices: (ROWS, columns, 3).
+        normals: (ROWS, columns, 3).
+        contour: frame of the lash line.
+        lash_line: (columns, 3) outer edge of the margin.
     """
 
     vertices: Floats
@@ -49,7 +54,7 @@ class Sheet(ArrayValue):
 
 
 def sheet(spec: Region, globe: Globe) -> Sheet:
-    """The sheet for a posed globe, in the region's frame."""
+    """Make the sheet for a posed globe, in the region's frame."""
     c = contour(spec, globe)
     margin, lash_line = _margin(spec, globe, c)
     conjunctiva = _conjunctiva(spec, globe, c)
@@ -81,15 +86,16 @@ def grid_normals(vertices: Floats) -> Floats:
     out[0], out[-1] = vertices[1] - vertices[0], vertices[-1] - vertices[-2]
     normal = np.cross(out, across)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    # Where rows meet in a point the neighbour's normal serves.
+    # Where rows meet in a point, the neighbour's normal is used.
     normal = np.where(length > 1e-9, normal, np.array([1.0, 0.0, 0.0]))
     return unit(normal)
 
 
 def margin_width(spec: Region, c: Contour) -> Floats:
-    """Thickness of the margin (columns,): it thins towards the canthi; the lower one is thinner (Zhu et al. 2022).
+    """Thickness of the margin (columns,); the lower one is thinner (Zhu et al. 2022).
 
-    Shut, both are as thick, so that neither overhangs the other's lashes.
+    It decreases towards the canthi. The margins of closed lids are equally thick, so that neither overhangs the other's
+    lashes.
     """
     middle = spec.lids.margin_mm * np.where(c.upper > 0, 1.0, 1 - 0.2 * min(c.openness, 1.0))
     return np.asarray(
@@ -108,20 +114,20 @@ def _margin(spec: Region, globe: Globe, c: Contour) -> tuple[Floats, Floats]:
     rounding = EDGE_MM * (2 * u - 1) ** 4 * (width / spec.lids.margin_mm)[:, None]
     rows = c.point + width[:, None] * u * out + rounding * c.away
     rows = globe.pushed_out(rows, spec.lids.film_mm)
-    # The two lids meet in the middle between them, never beyond.
+    # The lids meet in the middle between them, never beyond.
     return rows, rows[-1]
 
 
 def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
-    """From under the globe's surface to the inner edge (exclusive)."""
+    """Rows from below the globe's surface to the inner edge (exclusive)."""
     away = c.point - globe.centre
     distance = np.linalg.norm(away, axis=-1)
     on_globe = step(distance - globe.radial(unit(away)), 0.6, 0.05)
-    # It starts under the lids, and in the corners of the fissure on lines across them: beside the nose a crescent about
-    # the cornea, the plica; at the temple where the globe's tangent leads to the canthus, so that the white goes on
-    # without an edge.
+    # It starts under the lids. In the corners of the fissure it starts on lines across them: beside the nose a crescent
+    # about the cornea, the plica; at the temple where the globe's tangent leads to the canthus, so that the white
+    # continues without an edge.
     y, z = (c.point[:, 1:] - globe.centre[1:]).T
-    y_fold = 9.5 + 2.5 * max(float(globe.axis[1]), 0.0)  # an eye that turns in draws the fold flat
+    y_fold = 9.5 + 2.5 * max(float(globe.axis[1]), 0.0)  # an eye that turns inwards flattens the fold
     y_temple = globe.radius_mm * np.sin(LATERAL)
     line = np.where(y > 0, y_fold, y_temple)
     t = np.abs(y) / line
@@ -135,13 +141,14 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     reach = globe.centre + reach * (globe.radial(reach) - _DIP_MM)[:, None]
     u = (np.arange(CONJUNCTIVA) / CONJUNCTIVA)[:, None, None]
     rows = reach + u * (c.point - reach)
-    # Plica: a low crescent on the globe; caruncle: a mound off it.
+    # The plica is a low crescent on the globe, the caruncle a mound beside it.
     s = u[..., 0]
     size = step(c.along, 0.66, 0.9)[None, :] * (1 - spec.blink)
     plica = 0.40 * np.exp(-(((s - 0.24) / 0.15) ** 2)) * size
     caruncle = 1.2 * np.exp(-(((s - 0.6) / 0.2) ** 2)) * step(c.along, 0.86, 0.99)[None, :] * (1 - 0.6 * spec.blink)
     rows = rows + (plica + caruncle)[..., None] * c.normal
-    # Long pieces are chords of the globe (0.7 of its radius: of the cornea): so far out that their middles are, too.
+    # Long pieces are chords of the globe (0.7 of its radius for the cornea), so the points are raised until their
+    # middles are outside, too.
     sag = np.sum((c.point - reach) ** 2, axis=-1) / CONJUNCTIVA**2 / (8 * 0.7 * globe.radius_mm)
     film = spec.lids.film_mm * on_globe + 0.05 * (1 - on_globe) + sag
     clear = globe.pushed_out(rows, np.where(u[..., 0] > 0, film, -_DIP_MM))
@@ -169,13 +176,13 @@ def _skin(spec: Region, globe: Globe, c: Contour, edge: Floats, lash_line: Float
     """Rows from the lash line (exclusive) outwards."""
     crease = _crease(spec, c)
     v, y, z = _spokes(c, crease, lash_line)
-    # Lids move their own skin, and that of the brow and the cheek the less, the further it is.
+    # Lids move their own skin, and move that of the brow and the cheek less the farther away it is.
     held = step(np.arange(LID + FACE, dtype=float), LID + 0.25 * FACE, LID + 0.72 * FACE)[:, None]
     y_rest, z_rest = _at_rest(spec.model_copy(update={"blink": 0.0}))
     y, z = y + held * (y_rest - y), z + held * (z_rest - z)
     x = skin_depth(spec, globe, y, z) + _fullness(spec, c, y, z)
     start = lash_line[:, 0] - skin_depth(spec, globe, lash_line[:, 1], lash_line[:, 2])
-    # Where the lids leave the globe, the canthi lie in a hollow: the deeper, the wider.
+    # Where the lids leave the globe, the canthi lie in a hollow, which is deeper the wider the gap is.
     x = x + start * np.exp(-((v / (2.2 + 0.8 * np.maximum(-start - 1.2, 0))) ** 2))
     strength = _fold_strength(c)
     lift, drop = _fold(spec, c, v, crease, strength)
@@ -207,7 +214,7 @@ def _at_rest(spec: Region) -> tuple[Floats, Floats]:
 
 
 def _border(c: Contour) -> tuple[Floats, Floats]:
-    """(y, z) of the sheet's outer end: a rounded rectangle."""
+    """Outer end (y, z) of the sheet: a rounded rectangle."""
     cos, sin = np.cos(c.angle), np.sin(c.angle)
     power = 0.72
     return (
@@ -235,7 +242,7 @@ def _fold_strength(c: Contour) -> Floats:
 def _distances(crease: Floats, length: Floats) -> Floats:
     """Distances v (LID + FACE, columns) from the lash line: dense at the lash line and about the crease."""
     s = np.arange(1, LID + 1) / LID
-    # Fine at both ends of the lid.
+    # Rows are dense at both ends of the lid.
     s = 0.5 - 0.5 * np.cos(np.pi * s) * (0.55 + 0.45 * np.cos(np.pi * s) ** 2)
     lid = s[:, None] * crease
     k = np.arange(1, FACE + 1) / FACE
@@ -245,7 +252,7 @@ def _distances(crease: Floats, length: Floats) -> Floats:
 
 
 def _fold(spec: Region, c: Contour, v: Floats, crease: Floats, strength: Floats) -> tuple[Floats, Floats]:
-    """What the fold adds to the depth, and how far it hangs over the crease (both rows x columns, mm)."""
+    """Depth that the fold adds, and its overhang over the crease (both rows x columns, mm)."""
     lids = spec.lids
     open_ = min(max(c.openness, 0.0), 1.15)
     height = lids.fold_mm * (0.4 + 0.6 * open_) * strength
@@ -254,7 +261,7 @@ def _fold(spec: Region, c: Contour, v: Floats, crease: Floats, strength: Floats)
     swell = step(w, -0.2, 2.2) * np.exp(-(np.maximum(w - 1.6, 0) ** 2) / 30.0)
     lift = height * swell + groove * strength
     drop = 0.55 * height * step(w, 0.0, 0.7) * np.exp(-(np.maximum(w - 0.7, 0) ** 2) / 5.0)
-    # What the fold holds when open lies in shallow pleats above the crease of the closed lid.
+    # When the lid is closed, the skin of the fold lies in shallow pleats above the crease.
     shut = max(1.0 - open_, 0.0)
     for place, depth in ((2.3, 0.16), (4.1, 0.11)) if shut > 0 else ():
         off = w - place - 0.5 * np.cos(2 * c.angle + place) - 0.35 * np.cos(c.angle)
@@ -265,7 +272,7 @@ def _fold(spec: Region, c: Contour, v: Floats, crease: Floats, strength: Floats)
 
 
 def _fullness(spec: Region, c: Contour, y: Floats, z: Floats) -> Floats:
-    """How far the hollow above the lid fills (mm) as the lid comes down and brings its skin and fat along."""
+    """Filling (mm) of the hollow above the lid as the lid comes down and brings its skin and fat along."""
     shut = 1 - min(c.openness, 1.0)
     return np.asarray(spec.lids.fill_mm * shut * np.exp(-(((z - 10.5) / 6.0) ** 2) - ((y - 1.0) / 18.0) ** 4))
 
@@ -275,13 +282,14 @@ def skin_depth(spec: Region, globe: Globe, y: Floats, z: Floats) -> Floats:
     centre = 0.5 * (globe.centre + globe.rest)
     dy, dz = y - centre[1], z - centre[2]
     outer = globe.radius_mm + spec.lids.thickness_mm
-    # Past 42 degrees from the front the shell leaves the sphere along its tangent and flattens: the orbit's fat.
+    # Beyond 42 degrees from the front the shell leaves the sphere along its tangent and flattens, because of the
+    # orbit's fat.
     rho, limit = np.hypot(dy, dz), np.radians(42.0)
     rho0 = outer * np.sin(limit)
     past = np.maximum(rho - rho0, 0.0)
     over = np.sqrt(outer * outer - np.minimum(rho, rho0) ** 2)
     shell = centre[0] + over - np.tan(limit) * _SOFT_MM * (1 - np.exp(-past / _SOFT_MM)) - 0.2 * past
-    # Towards the canthi, whose tendons hold them back, it falls faster.
+    # Towards the canthi it falls faster, because their tendons hold the lids back.
     sideways = dy / np.maximum(rho, 1e-9)
     shell = shell - 2.4 * step(-sideways, 0.45, 1.0) * step(rho, 7.5, 16.0)
     shell = shell - 1.8 * step(sideways, 0.5, 1.0) * step(rho, 8.0, 16.5)
@@ -292,7 +300,7 @@ def skin_depth(spec: Region, globe: Globe, y: Floats, z: Floats) -> Floats:
 
 
 def _canthal_hollow(spec: Region, y: Floats, z: Floats) -> Floats:
-    """How far the canthal tendons hold the skin about either canthus back, mm."""
+    """Depth by which the canthal tendons hold back the skin about either canthus, mm."""
     middle, half = canthi(spec)
     out = np.zeros_like(y)
     for end, depth, wide in ((middle - half, 2.2, 4.2), (middle + half, 1.4, 3.5)):
@@ -301,7 +309,7 @@ def _canthal_hollow(spec: Region, y: Floats, z: Floats) -> Floats:
 
 
 def _bulge(globe: Globe, y: Floats, z: Floats, outer: float) -> Floats:
-    """The cornea under a lid lifts it: a soft hill about the optic axis."""
+    """Lift of a lid by the cornea below it: a soft hill about the optic axis."""
     axis, centre = globe.axis, globe.centre
     apex = centre + outer * axis
     d2 = (y - apex[1]) ** 2 + (z - apex[2]) ** 2

@@ -1,10 +1,10 @@
-"""How the eye and its surround look at 850 nm: diffuse albedos and the contrast of their textures.
+"""Appearance of the eye and its surround at 850 nm: diffuse albedos and the contrast of their textures.
 
-All of it is chosen. Spectra of skin are published (Cooksey, Allen and Tsai 2017, J. Res. NIST 122, 26: forearms); the
-backdrop stands below such values, because a surround without lids would otherwise outshine the eye. No measured diffuse
-albedo at 850 nm is at hand for iris, sclera and fundus: these are chosen so that the grey levels stand
-to each other as in near-infrared photographs (apparent iris about half of the sclera, pupil a few per cent). The cornea
-passes (1 - F)^2 / n^2, about 0.53, of an iris' albedo on to the camera.
+All values are chosen. Spectra of skin are published (Cooksey, Allen and Tsai 2017, J. Res. NIST 122, 26: forearms). The
+backdrop is darker than that, because a surround without lids would otherwise outshine the eye. No measured diffuse
+albedo at 850 nm was available for iris, sclera and fundus. Their values give grey levels with the ratios of
+near-infrared photographs (apparent iris about half of the sclera, pupil a few per cent). The cornea transmits (1 - F)^2
+/ n^2, about 0.53, of an iris' albedo to the camera.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The whole region as one triangle mesh with one map, posed with the globe; its topology never changes.
 
-Vertices in the region's frame of a right eye are mirrored for a left one, whose faces then run the other way round.
+Vertices are in the region's frame of a right eye. For a left eye they are mirrored, and the faces have the other
+orientation.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ PARTS = ("skin", "tears", "lashes", "brow")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegionLayout(ArrayValue):
-    """What never moves: `faces` (m, 3), `uv` (n, 2), and where each part's vertices and faces start and end."""
+    """What never moves: `faces` (m, 3), `uv` (n, 2), and where each part's vertices and faces end."""
 
     faces: Ints
     uv: Floats
@@ -38,11 +39,18 @@ class RegionLayout(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegionMesh(ArrayValue):
-    """A posed region: `vertices`, unit `normals` (n, 3) in the scene's frame (mm), and its layout.
+    """A posed region in the scene's frame (mm).
 
-    `upper_margin`, `lower_margin` (k, 3): landmarks along the lids' inner edges from the temple to the nose. `border`
-    (k, 3) is the skin's outer end, closed; `strands` are the curves (n, k, 3) of all that stands before the skin. A
-    mesh of which none are known has none.
+    A mesh whose margins, border or strands are unknown has none of them.
+
+    Attributes:
+        vertices: (n, 3).
+        normals: (n, 3) unit normals.
+        layout: what never moves.
+        upper_margin: (k, 3) landmarks along the upper lid's inner edge, from the temple to the nose.
+        lower_margin: (k, 3) the same for the lower lid.
+        border: (k, 3) outer end of the skin, closed.
+        strands: curves (n, k, 3) of everything in front of the skin.
     """
 
     vertices: Floats
@@ -54,7 +62,7 @@ class RegionMesh(ArrayValue):
     strands: tuple[Floats, ...]
 
     def part(self, name: str) -> trimesh.Trimesh:
-        """One part as a trimesh: skin, tears, lashes or brow."""
+        """Return one part as a trimesh: skin, tears, lashes or brow."""
         i = PARTS.index(name)
         v0, f0 = (0, 0) if i == 0 else (int(self.layout.vertex_ends[i - 1]), int(self.layout.face_ends[i - 1]))
         v1, f1 = int(self.layout.vertex_ends[i]), int(self.layout.face_ends[i])
@@ -63,21 +71,21 @@ class RegionMesh(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidMargins(ArrayValue):
-    """Landmarks (k, 3) along the lids' inner edges, as a `RegionMesh` has them."""
+    """Landmarks (k, 3) along the lids' inner edges, like those of a `RegionMesh`."""
 
     upper_margin: Floats
     lower_margin: Floats
 
 
 def lid_margins(spec: Region, globe: Globe) -> LidMargins:
-    """The lids' inner edges alone, without the mesh around them."""
+    """Compute the lids' inner edges alone, without the mesh around them."""
     mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
     upper, lower = (frozen(edge * mirror) for edge in _margins(contour(spec, globe)))
     return LidMargins(upper, lower)
 
 
 def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
-    """The region of a subject around a posed globe."""
+    """Make the region of a subject around a posed globe."""
     s = sheet(spec, globe)
     tears = meniscus(spec, globe, s)
     lash = lashes(spec, globe, s)
@@ -96,13 +104,13 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
 
 
 def _closed(grid: Floats) -> Floats:
-    """A grid with its first column again at the end (where the map's u is 1), flat."""
+    """Flattened grid with its first column repeated at the end, where the map's u is 1."""
     return np.concatenate([grid, grid[:, :1]], axis=1).reshape(-1, 3)
 
 
 @lru_cache(maxsize=16)
 def _brow(spec: Region) -> tuple[Hairs, Floats, Floats]:
-    """The brow, its tubes and their normals; it does not blink."""
+    """Brow, its tubes and their normals; it does not blink."""
     hairs = brow(spec)
     tubes = frozen(hairs.tubes())
     return hairs, tubes, frozen(_round(hairs, tubes))

@@ -34,7 +34,7 @@ def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Floats:
     The height is the distance to the border between the nearest two seeds. `stretch` > 1 draws cells out across.
     """
     rng = np.random.default_rng((0xF0, seed))
-    # Distances count `stretch` times as much upwards.
+    # Vertical distances count `stretch` times as much.
     seeds = rng.uniform(0, 1, (cells, 2)) * np.array([1.0, stretch])
     tree = cKDTree(seeds, boxsize=np.array([1.0, stretch]))
     x, y = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size * stretch)
@@ -47,7 +47,7 @@ def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Floats:
 
 
 def sampled(tile: Floats, x: Floats, y: Floats, period_mm: float) -> Floats:
-    """A periodic square tile at (x, y) mm, linear in between."""
+    """Sample a periodic square tile at (x, y) mm by linear interpolation."""
     n = len(tile)
     flat = np.pad(tile, (0, 1), mode="wrap").astype(np.float32).ravel()
     u, v = np.asarray(x) * (n / period_mm), np.asarray(y) * (n / period_mm)

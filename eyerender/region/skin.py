@@ -1,8 +1,8 @@
-"""How the sheet looks: albedo, slope of the fine relief and gloss over the sheet's own coordinates.
+"""Appearance of the sheet: albedo, slope of the fine relief and gloss over the sheet's own coordinates.
 
-The map sticks to the tissue: columns run once around the fissure, rows from the conjunctiva outwards (see `lids`), so a
-lid carries its skin along when it moves. Its last rows hold the constant looks of lashes, brow and tears, so that the
-whole region is one mesh with one map. Four channels:
+The map is fixed to the tissue: columns run once around the fissure, rows from the conjunctiva outwards (see `lids`), so
+a moving lid takes its skin along. The last rows hold the constant values of lashes, brow and tears, so that the whole
+region is one mesh with one map. The map has four channels:
 
     albedo        diffuse reflectance
     slope y, z    d(height)/dy and d(height)/dz of the relief, over the region's frame
@@ -30,8 +30,8 @@ _COLUMNS = 1536
 LASH, BROW, TEAR = 0, 1, 2
 _LINE = CONJUNCTIVA + MARGIN - 1  # the lash line's row
 _TILE_MM, _TILE = 24.0, 640
-_SHOWN = 0.5  # of the furrows' slope: light that goes on under the skin blurs what is finer than half a millimetre
-_REFERENCE_BLINK = 0.3  # in which the tissue is laid out: neither stretched nor hidden in the fold
+_SHOWN = 0.5  # of the furrows' slope: light scattered under the skin blurs structures finer than half a millimetre
+_REFERENCE_BLINK = 0.3  # at which the tissue is laid out: neither stretched nor hidden in the fold
 
 
 def band_row(which: int) -> float:
@@ -46,7 +46,7 @@ def sheet_v(row: Floats) -> Floats:
 
 @lru_cache(maxsize=1)
 def _texels() -> Floats:
-    """Where in the map each row of the sheet stands, in texels: the wider rows lie apart, the more they have."""
+    """Row of the map, in texels, for each row of the sheet; wider rows of the sheet get more texels."""
     rest = sheet(Region(blink=_REFERENCE_BLINK), Globe.sphere()).vertices
     width = np.linalg.norm(np.diff(rest, axis=0), axis=-1).mean(axis=1) ** 0.6
     place = np.concatenate([[0.0], np.cumsum(width)])
@@ -55,7 +55,7 @@ def _texels() -> Floats:
 
 @lru_cache(maxsize=4)
 def skin_map(spec: Region) -> Singles:
-    """The map (rows, columns, 4) of a subject; its blink does not matter."""
+    """Map (rows, columns, 4) of a subject; it does not depend on the blink."""
     reference = spec.model_copy(update={"blink": _REFERENCE_BLINK})
     rest = sheet(reference, Globe.sphere()).vertices
     rows = np.interp(np.arange(SHEET_ROWS), _texels(), np.arange(ROWS))[:, None]
@@ -79,11 +79,11 @@ def skin_map(spec: Region) -> Singles:
     # The fold of the plica darkens the conjunctiva towards the caruncle.
     flesh = step(np.cos(turn), 0.60, 0.85) * within * step(rows, 0.0, 2.2)
     height = height + 0.02 * flesh * _field(seed + 6, y, z, (18, 45), (18, 45))
-    # Little light leaves a furrow.
+    # Furrows are darker because little light leaves them.
     open_ = 1 + 0.13 * (cells - 0.5) - 0.16 * pores - 0.32 * spec.skin.wrinkles * creases
     albedo = _albedo(spec, y, z, rows, upper, near, open_, flesh)
     wet = (0.78 - 0.21 * flesh) * (1 - step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN - 1.0))
-    # Oil lies in films of varying thickness and shines in points where the skin is swollen smooth, in short streaks
+    # Oil forms films of varying thickness. It shines in points where the skin is smooth and swollen, in short streaks
     # along the lids.
     oil = 0.55 + 0.2 * _field(seed + 5, y, z, (0, 8), (0, 8))
     points = np.maximum(_field(seed + 8, y, level, (30, 120), (70, 190)) - 0.7, 0.0)
@@ -114,7 +114,7 @@ def _cells(spec: Region, y: Floats, z: Floats, level: Floats, near: Floats) -> F
     coarse = sampled(furrows(spec.seed, _TILE, 1700), y, z, 0.72 * _TILE_MM)
     drawn = furrows(spec.seed + 7, _TILE, 1500, 0.6)
     lids = np.exp(-((np.hypot(y / 19.0, z / 13.0)) ** 4)) * near
-    # The finer net lies askew, so that both cross.
+    # The finer net is rotated so that the two nets cross.
     fine = sampled(drawn, 0.8 * y + 0.6 * z, 0.8 * z - 0.6 * y, 0.42 * _TILE_MM)
     wide = (1 - lids) * coarse + lids * sampled(drawn, y, level, 0.62 * _TILE_MM)
     return np.asarray(wide * (0.7 + 0.3 * fine))
@@ -126,7 +126,10 @@ def _along_lids(y: Floats, z: Floats) -> Floats:
 
 
 def _relief(spec: Region, y: Floats, z: Floats, level: Floats, cells: Floats) -> Floats:
-    """Height (mm) of cells parted by furrows, and lines along the lids and, at the temple, away from the canthus."""
+    """Height (mm) of the relief: cells separated by furrows, and lines.
+
+    The lines run along the lids and, at the temple, away from the canthus.
+    """
     skin = spec.skin
     grain = _field(spec.seed + 3, y, z, (60, 200), (60, 200))
     sway = 0.5 * _field(spec.seed + 12, y, z, (0, 10), (0, 10))
@@ -141,7 +144,7 @@ def _relief(spec: Region, y: Floats, z: Floats, level: Floats, cells: Floats) ->
 
 
 def _from_line(rest: Floats) -> Floats:
-    """Way (mm) over the sheet from the lash line, along each column; one column again at the end."""
+    """Distance (mm) over the sheet from the lash line along each column, with the first column repeated at the end."""
     way = np.linalg.norm(np.diff(rest, axis=0, prepend=rest[:1]), axis=-1).cumsum(axis=0)
     way = way - way[_LINE]
     return np.concatenate([way, way[:, :1]], axis=1)
@@ -168,7 +171,7 @@ def _creases(spec: Region, y: Floats, out_mm: Floats, upper: Floats) -> Floats:
 
 
 def _pores(spec: Region, y: Floats, z: Floats, near: Floats) -> Floats:
-    """Pits, 0 to 1, a third of a millimetre wide: on cheek, nose and forehead; the lids have next to none."""
+    """Pits, 0 to 1, a third of a millimetre wide, on cheek, nose and forehead; the lids have almost none."""
     spots = np.maximum(_field(spec.seed + 41, y, z, (20, 42), (20, 42)) - 1.25, 0.0)
     lids = np.exp(-((np.hypot(y / 19.0, z / 13.0)) ** 4)) * near
     much = (0.55 + 0.25 * _field(spec.seed + 42, y, z, (0, 5), (0, 5))) * (1 - 0.9 * lids)
@@ -184,7 +187,7 @@ def _slopes(height: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
     hr, yr, zr = (np.gradient(v, axis=0) for v in (height, y, z))
     hc, yc, zc = (along_columns(v) for v in (height, y, z))
     det = yr * zc - yc * zr
-    # Where the sheet is seen edge-on, the slope over (y, z) means nothing.
+    # Where the sheet is edge-on, the slope over (y, z) is undefined.
     good = np.abs(det) > 1e-5
     det = np.where(good, det, 1.0)
     sy = np.where(good, (hr * zc - hc * zr) / det, 0.0)
@@ -209,7 +212,7 @@ def _under_brow(spec: Region, y: Floats, z: Floats) -> Floats:
 
 
 def _hollows(spec: Region, y: Floats, z: Floats) -> Floats:
-    """Loss of light, -0.05 to 0.25, where the face is hollow: by how far it stands behind its own surroundings."""
+    """Loss of light, -0.05 to 0.25, where the face is hollow, from its depth behind its own surroundings."""
     at = np.arange(-76.0, 76.5)
     depth = skin_depth(spec, Globe.sphere(), *np.meshgrid(at, at))
     behind = ndimage.gaussian_filter(depth, 4.5, mode="nearest") - depth
@@ -218,7 +221,7 @@ def _hollows(spec: Region, y: Floats, z: Floats) -> Floats:
 
 
 def _veins(seed: int, y: Floats, z: Floats) -> Floats:
-    """Loss of light, 0 to about 0.2, over the veins under the lids' skin: broad, blurred, here and there."""
+    """Loss of light, 0 to about 0.2, over the veins under the lids' skin: broad, blurred and scattered."""
     lids = np.exp(-((np.hypot(y / 22.0, z / 17.0)) ** 4))
     out, some = np.zeros_like(y), lids > 1e-2
     y, z = y[some], z[some]
@@ -246,7 +249,7 @@ def _albedo(
     tone = tone * (1 - 0.34 * line * np.abs(upper))
     tone = tone * (1 - 0.06 * step(rows, CONJUNCTIVA + MARGIN, CONJUNCTIVA + MARGIN + LID) * near * (upper > 0))
     tone = tone * (1 - _under_brow(spec, y, z)) * (1 - _hollows(spec, y, z))
-    # In the crease skin lies against skin.
+    # In the crease, skin lies against skin.
     fold = np.exp(-(((rows - (CONJUNCTIVA + MARGIN + LID - 0.7)) / 0.9) ** 2))
     tone = tone * (1 - 0.12 * fold * step(upper, 0.12, 0.75))
     rng = np.random.default_rng((0x5407, seed))
@@ -257,7 +260,7 @@ def _albedo(
         away2 = (y[near_it] - sy) ** 2 + (z[near_it] - sz) ** 2
         spots[near_it] -= rng.uniform(0.1, 0.45) * np.exp(-away2 / r**2)
     outer = skin.albedo * tone * np.maximum(spots, 0.3)
-    # Where it lies on the globe the conjunctiva is as white as the sclera that it goes on from.
+    # Where the conjunctiva lies on the globe, it is as white as the adjacent sclera.
     white = Look().sclera_albedo
     moist = white + step(rows, 1.0, CONJUNCTIVA - 1.0) * (skin.wet_albedo - white)
     moist = moist * (1 - 0.40 * flesh) * (1 + 0.04 * blotch + 0.04 * fine)

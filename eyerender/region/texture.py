@@ -1,10 +1,10 @@
 """Procedural textures of iris, sclera and skin as relative albedos with mean 1: seeded, deterministic, numbers only.
 
-The iris follows its anatomy from the pupil's margin outwards: the pigment ruff, the pupillary zone with fine radial
-fibres, the collarette (a wavy ridge at about a third of the width), the ciliary zone with coarser, wavy fibres, Fuchs'
-crypts (dark, radially drawn out, with a paler rim) mostly along the collarette, concentric contraction furrows, and the
-darker periphery, as textbooks of the eye's anatomy describe them. At 850 nm melanin
-hardly absorbs, so that the stroma's relief shows in every eye colour.
+The iris follows its anatomy, as textbooks describe it, from the pupil's margin outwards: the pigment ruff, the
+pupillary zone with fine radial fibres, the collarette (a wavy ridge at about a third of the width), the ciliary zone
+with coarser, wavy fibres, Fuchs' crypts (dark, radially elongated, with a paler rim) mostly along the collarette,
+concentric contraction furrows, and the darker periphery. At 850 nm melanin hardly absorbs, so the stroma's relief is
+visible in every eye colour.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def _noise(
 
 
 def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) -> Floats:
-    """Gaussian noise of unit variance on a periodic square, the same in all directions, `low` to `high` cycles."""
+    """Isotropic Gaussian noise of unit variance on a periodic square, `low` to `high` cycles."""
     f = np.hypot((np.fft.fftfreq(size) * size)[:, None], (np.fft.rfftfreq(size) * size)[None, :])
     keep = np.exp(-((f / high) ** 2))
     if low > 0:
@@ -86,7 +86,7 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     )
     ciliary = _step(s - collarette, -0.02, 0.05)
 
-    # Fibres: angular noise drawn out along the radius, its columns bent by a slow sideways warp.
+    # Fibres are angular noise that is elongated along the radius; a slow sideways warp bends its columns.
     warp = 3.6 * _noise(rng, shape, (0, 2.2), (0, 14)) + 1.0 * _noise(rng, shape, (0, 6), (0, 60))
     rows, columns = np.meshgrid(np.arange(radial), np.arange(angular), indexing="ij")
 
@@ -96,8 +96,8 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     coarse = bent(_noise(rng, shape, (0, 1.6), (22, 60)), 1.0)
     medium = bent(_noise(rng, shape, (0, 2.5), (50, 120)), 1.0)
     fine = bent(_noise(rng, shape, (0, 3.0), (90, 190)), 0.7)
-    ridges = 1.0 - np.abs(medium)  # strands stand out bright between darker gaps
-    # Some strands stand out of the stroma, thick and pale, each over a part of the way.
+    ridges = 1.0 - np.abs(medium)  # bright strands between darker gaps
+    # Some strands protrude from the stroma, thick and pale, each over a part of the radius.
     strands = np.maximum(bent(_noise(rng, shape, (0, 2.6), (40, 85)), 1.2) - 0.9, 0)
     fibres = ciliary * (0.06 * coarse + 0.075 * (ridges - 0.2) + 0.045 * fine + 0.17 * (strands - 0.08)) + (
         1 - ciliary
@@ -111,7 +111,7 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
 
     texture = tone * (1.0 + 1.3 * fibres)
     texture = texture * _furrows(rng, s, turn) * _crypts(rng, s, turn, collarette, warp)
-    # The ruff: the pigment epithelium turned over the margin, a dark beaded seam.
+    # The ruff is the pigment epithelium turned over the margin, a dark beaded seam.
     beads = 0.018 * (1 + 0.35 * _noise(rng, (1, angular), (0, 1), (30, 75), True))
     texture = texture * (1 - 0.45 * np.exp(-((s / np.maximum(beads, 0.006)) ** 2)))
 
@@ -140,7 +140,7 @@ def _crypts(rng: np.random.Generator, s: Floats, turn: Floats, collarette: Float
     They form a lattice along the collarette that is deep in some sectors and closed in others, with a few single crypts
     towards the root.
     """
-    # Lattice in mm of an iris of 3.8 mm from margin to root, drawn out twofold along the radius.
+    # The lattice is in mm of an iris of 3.8 mm from margin to root, elongated twofold along the radius.
     around, along = 2 * np.pi * 3.2, 3.8 / 2.0
     count = 430
     seeds = np.stack([rng.uniform(0, around, count), rng.uniform(0, along, count)], axis=-1)
@@ -148,7 +148,7 @@ def _crypts(rng: np.random.Generator, s: Floats, turn: Floats, collarette: Float
     deep = np.where(rng.uniform(size=count) < 0.36, rng.uniform(0.15, 0.46, count), rng.uniform(0, 0.06, count))
     pale = rng.uniform(0.05, 0.42, count) * (rng.uniform(size=count) < 0.7)
     rows = np.flatnonzero((s[:, 0] > 0.16) & (s[:, 0] < 0.86))
-    # Trabeculae bend as the fibres beside them do.
+    # Trabeculae bend like the fibres beside them.
     x = (turn + 0.0035 * warp[rows]) * around
     y = np.broadcast_to(s[rows] * along, x.shape) + 0.02 * np.roll(warp[rows], 97, axis=1)
     distance, nearest = tree.query(np.stack([x, y], axis=-1), k=2)
@@ -167,8 +167,8 @@ def _crypts(rng: np.random.Generator, s: Floats, turn: Floats, collarette: Float
 def sclera_texture(seed: int, size: int = 768) -> Texture:
     """Relative albedo (size, size) of the globe's front, azimuthal equidistant to 108 degrees from the pole.
 
-    Slow unevenness and conjunctival vessels, which are faint at 850 nm: they run in from the fornices, branch and thin
-    out short of the limbus.
+    It has slow unevenness and conjunctival vessels, which are faint at 850 nm. The vessels run in from the fornices,
+    branch and end before the limbus.
     """
     rng = np.random.default_rng((0x5C1E, seed))
     shade = (
@@ -210,7 +210,7 @@ def sclera_texture(seed: int, size: int = 768) -> Texture:
 
 @lru_cache(maxsize=4)
 def skin_texture(seed: int, size: int = 768) -> Texture:
-    """Relative albedo (size, size) of a tile of skin, periodic: slow unevenness, the net of furrows, pores."""
+    """Relative albedo (size, size) of a periodic tile of skin: slow unevenness, the net of furrows, pores."""
     rng = np.random.default_rng((0x5817, seed))
     slow = 0.025 * _even_noise(rng, size, 0, 3)
     net = np.abs(_even_noise(rng, size, 45, 70))  # zero crossings: a net of furrows about a millimetre wide

@@ -1,7 +1,7 @@
-"""Light that does not come from the lamps: even light, emitting panels, and a surrounding given as an HDR map.
+"""Light other than that of the lamps: even light, emitting panels, and surroundings given as an HDR map.
 
-All of it is mirrored in the front cornea by exact rays (the integrator's), and lights matte surfaces by its irradiance,
-without shadows. A map is infinitely far away; its irradiance is its cosine convolution in spherical harmonics up to
+The front cornea mirrors all of it along exact rays (those of the integrator). Matte surfaces are lit by its irradiance,
+without shadows. A map is infinitely far away. Its irradiance is its cosine convolution in spherical harmonics up to
 order 2 (Ramamoorthi and Hanrahan 2001, equations 4 to 12; on average within a few per cent of the integral),
 
     E(n) = sum_lm A_l L_lm Y_lm(n),    A = (pi, 2 pi / 3, pi / 4),    L_lm = integral of L Y_lm over all directions.
@@ -48,21 +48,21 @@ _ENTRIES = 21  # even irradiance, 9 of the rotation, scale, rows, 9 of the irrad
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surrounding(ArrayValue):
-    """A map as it is used: `values` (h, w) float32, and `harmonics` (9,) of the irradiance per unit of its values."""
+    """A map made ready: `values` (h, w) float32, and `harmonics` (9,) of the irradiance per unit of its values."""
 
     values: Any
     harmonics: Floats
 
 
 def read_map(path: str | Path, channel: str = "red") -> Floats:
-    """The values (h, w) of a latitude-longitude map; w = 2 h.
+    """Read the values (h, w) of a latitude-longitude map; w = 2 h.
 
     Args:
         path: Radiance .hdr, OpenEXR .exr, .pfm, or a NumPy array .npy of shape (h, w) or (h, w, channels).
-        channel: what of a colour map counts: red, green, blue, or luminance (Rec. 709).
+        channel: channel of a colour map that is used: red, green, blue, or luminance (Rec. 709).
 
     Raises:
-        InputError: it is missing, not readable, of another shape, or holds negative or non-finite values.
+        InputError: it is missing, unreadable, of another shape, or holds negative or non-finite values.
     """
     source, path = str(path), Path(path)
     if path.suffix.lower() not in _FORMATS:
@@ -82,7 +82,7 @@ def read_map(path: str | Path, channel: str = "red") -> Floats:
     except InputError:
         raise
     except Exception as error:
-        # Readers of pictures raise whatever a broken file makes of them.
+        # For a broken file, image readers may raise any exception.
         detail = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"is not a readable map ({detail})", source=source) from None
     if data.dtype.kind not in "fiu" or data.ndim not in (2, 3):
@@ -108,9 +108,9 @@ def _channel(data: NDArray[Any], channel: str) -> NDArray[Any]:
 
 
 def _size(kind: str, head: bytes) -> int | None:
-    """The number of pixels that the beginning of a map's file tells of; None where it tells of none.
+    """Number of pixels that the header of a map's file declares; None where it declares none.
 
-    The reader allocates all of them before it finds out that the file is short.
+    The reader allocates all of them before it notices that the file is too short.
     """
     if kind == ".npy":
         shape = re.search(rb"'shape': *\(([0-9, ]{1,99})\)", head)
@@ -124,21 +124,24 @@ def _size(kind: str, head: bytes) -> int | None:
 
 
 def surrounding(values: Floats) -> Surrounding:
-    """A map (h, 2 h) made ready: averaged down to at most 1024 x 512, and its irradiance."""
+    """Prepare a map (h, 2 h): average it down to at most 1024 x 512, and compute its irradiance."""
     reduced = _reduced(values)
     return Surrounding(frozen(reduced, np.float32), frozen(irradiance_harmonics(reduced)))
 
 
 def irradiance_harmonics(values: Floats) -> Floats:
-    """A_l L_lm c_lm of the map (9,): E(n) is their sum with 1, y, z, x, xy, yz, 3 z^2 - 1, xz, x^2 - y^2 of n."""
+    """Coefficients A_l L_lm c_lm of a map's irradiance, (9,).
+
+    E(n) is their sum with the factors 1, y, z, x, xy, yz, 3 z^2 - 1, xz and x^2 - y^2 of n.
+    """
     fold = max(1, -(-_FINE // len(values)))
     h, w = len(values) * fold, values.shape[1] * fold
     edges = np.cos(np.pi * np.arange(h + 1) / h)
-    # Solid angle of a texel in each row; the map's texels are even in themselves.
+    # This is the solid angle of a texel in each row; values are constant within texels.
     weight = (edges[:-1] - edges[1:]) * (2 * np.pi / w)
     polar = np.pi * (np.arange(h) + 0.5) / h
     turn = 2 * np.pi * (0.5 - (np.arange(w) + 0.5) / w)
-    # Over the columns first: each basis function is a product of one of the row and one of the column.
+    # Columns are summed first, because each basis function is a product of one of the row and one of the column.
     rows = np.repeat(values, fold, axis=0)
 
     def along(f: Floats) -> Floats:
@@ -168,7 +171,10 @@ def irradiance_harmonics(values: Floats) -> Floats:
 
 
 def map_rotation(spec: RadianceMap) -> Floats:
-    """M (3, 3) from the map's frame (x its middle, y to the left of it, z up) to the world: Rz(az) Ry(-el) Rx(roll)."""
+    """Rotation M (3, 3) = Rz(az) Ry(-el) Rx(roll) from the map's frame to the world.
+
+    In the map's frame x is its middle, y to its left, z up.
+    """
     az, el, roll = np.radians([spec.azimuth_deg, spec.elevation_deg, spec.roll_deg])
     (ca, sa), (ce, se), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (az, el, roll))
     Rz = np.array([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1.0]])
@@ -185,7 +191,7 @@ class Maps:
         self._none = self._sent(Surrounding(frozen(np.zeros((2, 4)), np.float32), frozen(np.zeros(9))))
 
     def of(self, spec: RadianceMap | None) -> tuple[Any, Surrounding]:
-        """Texture and map of a spec (its file's path absolute or relative to the current folder)."""
+        """Texture and map of a spec (its file's path is absolute or relative to the current folder)."""
         if spec is None:
             return self._none
         path = Path(spec.file)
@@ -204,14 +210,14 @@ class Maps:
 
     @staticmethod
     def _sent(made: Surrounding) -> tuple[Any, Surrounding]:
-        # Repeated, so that the columns wrap; the poles are kept apart by rows of their own.
+        # The texture repeats so that the columns wrap. Additional rows separate the poles.
         rows = np.concatenate([made.values[:1], made.values, made.values[-1:]])
         texture: Any = mi.Texture2f
         return texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat), made
 
 
 class Ambience:
-    """Even light, panels and a surrounding, as the integrator asks for them; kernels depend on none of the numbers."""
+    """Even light, panels and surroundings for the integrator; kernels do not depend on the numbers."""
 
     def __init__(
         self,
@@ -267,14 +273,14 @@ class Ambience:
 
 
 def _reduced(values: Floats) -> Floats:
-    """The map averaged down by whole texels, or by linear resampling of its running sum, to at most 1024 x 512."""
+    """Average a map down to at most 1024 x 512, by whole texels or by linear resampling of its running sum."""
     if values.shape[0] <= _HEIGHT:
         return values
     return _averaged(_averaged(values, _HEIGHT).T, _WIDTH).T
 
 
 def _averaged(values: Floats, count: int) -> Floats:
-    """Means of rows over `count` even stretches."""
+    """Means of rows over `count` equal intervals."""
     running = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     at = np.linspace(0, len(values), count + 1)
     low = np.minimum(at.astype(int), len(values) - 1)

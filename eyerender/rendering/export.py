@@ -1,10 +1,10 @@
-"""A job as files that the stock `mitsuba` command renders: PLY meshes and a Mitsuba XML, so that anyone can check it.
+"""Export of a job to files that the stock `mitsuba` command renders: PLY meshes and XML, for independent checks.
 
     mitsuba -m scalar_rgb scene.xml        (or llvm_ad_rgb, cuda_ad_rgb)
 
-Lengths are mm, radiance is mW/mm^2/sr. What stock Mitsuba lacks is left out and said in the file: textures, the limbus'
-soft rim, lens distortion, the point-spread function, ambient light, and lamps that are neither Lambertian discs nor
-isotropic points.
+Lengths are mm, radiance is mW/mm^2/sr. What stock Mitsuba lacks is left out, and the file says so: textures, the
+limbus' soft rim, lens distortion, the point-spread function, ambient light, and lamps that are neither Lambertian discs
+nor isotropic points.
 """
 
 from __future__ import annotations
@@ -86,7 +86,9 @@ def export_scene(
 
 
 def bake_meshes(eye: EyeModel, folder: str | Path, *, rings: int = 24, sectors: int = 96) -> Path:
-    """Write every patch of an eye as PLY, and `manifest.json`: what it is, unit, frame, licence, indices, SHA-256.
+    """Write every patch of an eye as PLY, and describe them in `manifest.json`.
+
+    The manifest holds meaning, unit, frame, licence, indices and SHA-256.
 
     Returns:
         The path of the manifest.
@@ -142,7 +144,7 @@ def _sensor(root: ET.Element, job: RenderJob, spp: int) -> None:
     sensor = ET.SubElement(root, "sensor", type="perspective")
     _value(sensor, "string", "fov_axis", "x")
     _value(sensor, "float", "fov", float(np.degrees(2 * np.arctan(width / 2 / camera.K[0, 0]))))
-    # Mitsuba's pixels are [i, i + 1): a centre at integer i lies at i + 1/2.
+    # Mitsuba's pixels are [i, i + 1), so a centre at integer i is at i + 1/2 there.
     _value(sensor, "float", "principal_point_offset_x", float((camera.K[0, 2] + 0.5) / width - 0.5))
     _value(sensor, "float", "principal_point_offset_y", float((camera.K[1, 2] + 0.5) / height - 0.5))
     _value(sensor, "float", "near_clip", 1e-3)
@@ -199,7 +201,7 @@ def _lamp(root: ET.Element, k: int, position: Floats, axis: Floats, radius: floa
 
 
 def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
-    """The parts of the eye region or of the head mesh, each with its mean albedo; the sheen is left out."""
+    """Parts of the eye region or of the head mesh, each with its mean albedo; the sheen is left out."""
     globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
     mesh = region_mesh(spec, globe) if spec.head is None else placed(load_head(spec.head), globe)
     skin = spec.skin

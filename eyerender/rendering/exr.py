@@ -14,7 +14,7 @@ from ..errors import EyerenderError
 
 @contextmanager
 def second_thread() -> Iterator[None]:
-    """Mitsuba's OpenEXR waits for ever where Dr.Jit has a single thread: lend it another."""
+    """Lend Dr.Jit a second thread; Mitsuba's OpenEXR hangs where it has a single one."""
     import drjit as dr
 
     count = dr.thread_count()
@@ -29,11 +29,15 @@ def second_thread() -> Iterator[None]:
 
 
 def write_exr(path: Path, image: Singles) -> None:
-    """Write (h, w) float32 as a one-channel EXR; raises `EyerenderError` where the disk refuses it."""
+    """Write (h, w) float32 as a one-channel EXR.
+
+    Raises:
+        EyerenderError: the disk refuses it.
+    """
     import mitsuba as mi
 
     try:
-        # A copy, because Mitsuba takes no read-only array.
+        # Mitsuba accepts no read-only array, so this is a copy.
         with second_thread():
             mi.Bitmap(np.array(image, dtype=np.float32)[..., None]).write(str(path))
     except RuntimeError as error:

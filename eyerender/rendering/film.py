@@ -1,9 +1,9 @@
 """The film: a window's pixels, their samples, and the mean radiance of each pixel.
 
-Before an eye region, which fills the picture, `shade_group` lets several samples of a pixel share what they see of the
-skin and the rays from there to the lamps. The groups of a pixel take the lamps in turn; a lamp that c of G groups look
-at counts G / c times, so that every lamp has its exact share in every pixel. On the globe, which is shaded for every
-sample, the samples take the lamps in turn likewise.
+In front of an eye region, which fills the image, `shade_group` lets several samples of a pixel share the shading of the
+skin and the rays from there to the lamps. The groups of a pixel take the lamps in turn. A lamp used by c of G groups
+counts G / c times, so that every lamp has its exact share in every pixel. On the globe, which is shaded for every
+sample, the samples take the lamps in turn in the same way.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from .sampling import Sampler, Samples, camera_ray
 from .values import Lamp, Lights, Values
 from .view import Textures
 
-_LANES = 2**24  # samples in flight; more are rendered in several passes
+_LANES = 2**24  # samples at a time; more are rendered in several passes
 _LARGEST_GROUP = 4
 _PACKET = 16
 _LEAST_GROUPS = 4  # a pixel
-_FEW_LAMPS = 2  # whose shadows are dark: they are sampled finely
+_FEW_LAMPS = 2  # with so few lamps shadows are dark, and they are sampled finely
 
 
 @dataclass(frozen=True, slots=True)
 class Exposed:
-    """What a window's pixels see of a bound frame: its Mitsuba scene, its numbers, its lamps and its textures.
+    """A bound frame for rendering: its Mitsuba scene, its numbers, its lamps and its textures.
 
-    `plain` says which tiles of a window show nothing but skin, and how large they are (px).
+    `plain` returns which tiles of a window show nothing but skin, and their size (px).
     """
 
     scene: mi.Scene
@@ -54,7 +54,7 @@ def pixels_of(pixel: mi.UInt32, window: Window) -> tuple[mi.Int32, mi.Int32]:
 
 
 def group_size(spp: int) -> int:
-    """How many samples of a pixel are a group."""
+    """Number of samples of a pixel in a group."""
     size = _LARGEST_GROUP
     while size > 1 and (spp % size or spp // size < min(_LEAST_GROUPS, spp // 2)):
         size //= 2
@@ -83,14 +83,14 @@ def mean_radiance(
 
 
 def _samples(u: mi.Int32, v: mi.Int32, spp: int, seed: int) -> Samples:
-    # A pixel's place on the whole sensor, so that a window shows the same samples wherever it lies.
+    # Samples depend on a pixel's place on the whole sensor, so they are the same in every window.
     return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), spp, seed)
 
 
 def _singles(
     integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, spp: int, seed: int, first: int, count: int
 ) -> tuple[Floats, int]:
-    """Sums over `count` samples of each pixel, one a lane."""
+    """Sum over `count` samples of each pixel, one per lane."""
     index = dr.arange(mi.UInt32, window[2] * window[3] * count)
     n = dr.opaque(mi.UInt32, count)
     pixel = index // n
@@ -102,20 +102,20 @@ def _singles(
     seen, _, _ = integrator.sample(shown.scene, Sampler(samples, k), mi.Ray3f(mi.Point3f(o), d))
     cosine = cosine * cosine
     lanes, failures = seen[0] * cosine * cosine, integrator.failures
-    dr.eval(lanes, failures)  # together: a reduction of its own would trace everything anew
+    dr.eval(lanes, failures)  # together, because a separate reduction would trace everything again
     return dr.block_sum(lanes, count).numpy().astype(float), int(dr.sum(failures).numpy()[0])
 
 
 def _groups(
     shown: Exposed, window: Window, plain: tuple[Bools, int], spp: int, seed: int, first: int, count: int, size: int
 ) -> tuple[Floats, int]:
-    """Sums over `count` groups of each pixel, one group a lane; sample j of group g is number g size + j."""
+    """Sum over `count` groups of each pixel, one group per lane; sample j of group g is number g size + j."""
     pixels = window[2] * window[3]
-    # Sixteen neighbouring lanes, which Embree traces together: a few groups of a few pixels, so that their rays to the
-    # camera stay close and those to the lamps go few ways: fewer groups where each looks at lamps of its own.
+    # Embree traces sixteen neighbouring lanes together. They are a few groups of a few pixels, so that their camera
+    # rays stay close and their lamp rays have few directions. There are fewer groups where each uses lamps of its own.
     wide = next(w for w in ((2, 1) if len(shown.lights) > spp // size else (4, 2, 1)) if count % w == 0)
     tall = _PACKET // wide
-    blocks = -(-pixels // tall)  # the last may reach beyond the window
+    blocks = -(-pixels // tall)  # the last may extend beyond the window
     index = dr.arange(mi.UInt32, blocks * tall * count)
     n = dr.opaque(mi.UInt32, tall * count)
     block = index // n
@@ -140,7 +140,7 @@ def _groups(
 
     lights = shown.lights
     lamps, groups, all_samples = lights.count, dr.opaque(mi.UInt32, spp // size), dr.opaque(mi.UInt32, spp)
-    # With fewer samples than lamps, chance says with which a pixel begins.
+    # With fewer samples than lamps, the first lamp of a pixel is random.
     start = mi.UInt32(samples.pair(mi.UInt32(0), 1).x * mi.Float(lamps))
 
     def lamp(j: mi.UInt32) -> tuple[Lamp, mi.Float]:
@@ -180,5 +180,5 @@ def _plain(plain: tuple[Bools, int], window: Window, u: mi.Int32, v: mi.Int32) -
     """Whether pixels of a window show nothing but skin."""
     tiles, across = plain
     x, y, size, rows, columns = (dr.opaque(mi.Int32, k) for k in (*window[:2], across, *tiles.shape))
-    row = dr.minimum((v - y) // size, rows - 1)  # lanes may lie beyond the window
+    row = dr.minimum((v - y) // size, rows - 1)  # lanes may be outside the window
     return dr.gather(mi.UInt32, mi.UInt32(tiles.ravel().astype(np.uint32)), row * columns + (u - x) // size) > 0

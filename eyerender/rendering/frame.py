@@ -1,4 +1,4 @@
-"""From eye, pose, camera, lamps and look to the parameters of a frame: on the host, in float64, without Mitsuba."""
+"""The parameters of a frame, from eye, pose, camera, lamps and look: on the host, in float64, without Mitsuba."""
 
 from __future__ import annotations
 
@@ -38,12 +38,26 @@ _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderJob(ArrayValue):
-    """One window of one exposure: what is rendered.
+    """One window of one exposure to render.
 
-    eye, and its rigid motion x_world = M x + t; camera, lamps, sensor and look; `window` (x0, y0, width, height) in
-    full-sensor pixels. `apex_mm` is where the apex of the unrotated eye stands in the world (the surround keeps its
-    place to it); by default it follows from a turn about a point 13.5 mm behind the apex. `seed` fixes samples and
-    noise. `purkinje` lists the mirror images of the lamps to show, 1 (the glint) to 4.
+    Attributes:
+        eye: the eye.
+        M: (3, 3) rotation of its rigid motion x_world = M x + t.
+        t: (3,) translation of that motion, mm.
+        camera: the camera.
+        window: (x0, y0, width, height) in full-sensor pixels.
+        lights: the lamps.
+        sensor: the sensor.
+        look: albedos and textures.
+        wavelength_nm: wavelength in vacuum.
+        seed: seed of samples and noise.
+        labels: whether to compute raster labels.
+        purkinje: mirror images of the lamps to show, from 1 (the glint) to 4.
+        apex_mm: (3,) apex of the unrotated eye in the world, to which the surround is fixed. By default it follows from
+            a turn about a point 13.5 mm behind the apex.
+        region: the eye region; None for the bare eye.
+        lens: focus and vignetting.
+        ambient: light other than that of the lamps.
     """
 
     eye: EyeModel
@@ -72,7 +86,7 @@ class RenderJob(ArrayValue):
 
 
 def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
-    """The posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
+    """Posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
     sclera = eye.sclera
     return Globe(
         eye.front[0],
@@ -86,12 +100,12 @@ def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
 
 
 def kinds(eye: EyeModel) -> tuple[tuple[bool, bool], ...]:
-    """(biconic, tilted) of each refracting surface in front of the iris."""
+    """Whether each refracting surface in front of the iris is biconic, and whether it is tilted."""
     return tuple((isinstance(s, Biconic), not np.array_equal(s.rotation, np.eye(3))) for s in eye.front)
 
 
 def parameters_of(job: RenderJob) -> Parameters:
-    """The parameters of a frame on the host."""
+    """Compute the parameters of a frame on the host."""
     eye, look, anchor, camera = job.eye, job.look, job.anchor_mm, job.camera
     indices = np.asarray(eye.front_indices, dtype=float)
     surfaces = tuple(
@@ -147,7 +161,7 @@ def _surface_parameters(surface: Surface, eta: float) -> SurfaceParameters:
 def boundary_waves(eye: EyeModel) -> Floats:
     """Fourier coefficients (k, 2) of the pupil's relative radius over the angle in the stop's plane, as c_k and -s_k.
 
-    The stop's own angle runs the other way about for a left eye: f' = pi - f, cos(k f') = (-1)^k cos(k f),
+    The stop's own angle runs in the other direction for a left eye: f' = pi - f, cos(k f') = (-1)^k cos(k f),
     sin(k f') = -(-1)^k sin(k f).
     """
     cosines, sines = np.asarray(eye.stop.contour, dtype=float)
@@ -158,7 +172,7 @@ def boundary_waves(eye: EyeModel) -> Floats:
 
 
 def panel_table(ambient: Ambient, anchor: Floats) -> Floats:
-    """The panels in the scene's frame, (n, 13): centre, normal to the origin, right, up (over half sizes), radiance.
+    """Panels in the scene's frame, (n, 13): centre, normal to the origin, right, up (over half sizes), radiance.
 
     A panel faces the origin; its width is level.
     """
@@ -176,7 +190,7 @@ def panel_table(ambient: Ambient, anchor: Floats) -> Floats:
 
 
 def light_table(lights: Sequence[Lamp], M: Floats, t: Floats) -> Floats:
-    """The lamps in the eye frame, (n, 10): position, axis, radius, intensity, lobe exponent, inner radius."""
+    """Lamps in the eye frame, (n, 10): position, axis, radius, intensity, lobe exponent, inner radius."""
     rows = [
         [*(M.T @ (lamp.position_mm - t)), *(M.T @ lamp.axis), lamp.radius_mm, lamp.intensity_mw_sr,
          lamp.lobe_exponent, ring_radius_mm(lamp)]
@@ -186,7 +200,7 @@ def light_table(lights: Sequence[Lamp], M: Floats, t: Floats) -> Floats:
 
 
 def ring_radius_mm(lamp: Lamp) -> float:
-    """The radius of the dark middle of a ring-shaped lamp; 0 for points and discs."""
+    """Radius of the dark middle of a ring-shaped lamp; 0 for points and discs."""
     return lamp.inner_radius_mm
 
 
@@ -220,7 +234,7 @@ def _image(front: Sequence[Surface], indices: Floats, stop_x: float) -> tuple[fl
 
 
 def apex_of(surface: Surface) -> Floats:
-    """The surface's apex in the eye frame, (3,) mm."""
+    """Apex of a surface in the eye frame, (3,) mm."""
     return np.asarray(surface.origin_mm + surface.rotation[:, 0] * float(surface.sag(0.0, 0.0)))
 
 

@@ -7,8 +7,8 @@ The mirror point of each point of an LED comes from `optics.solve`, the ray tube
     e = E f_x f_y D / cos^3(theta)                          energy of the spot, in radiance times pixels
 
 theta is the angle to the optical axis, D the determinant of the Jacobian of the lens distortion. An LED of finite size
-is integrated by Gauss-Legendre nodes in r^2 and even angles, each with its own position and energy. Near LEDs, whose
-images span several pixels, thus become an energy-weighted disc.
+is integrated with Gauss-Legendre nodes in r^2 and equal angles, each with its own position and energy. The image of a
+near LED, which spans several pixels, is thus an energy-weighted disc.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class GlintTable(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spots(ArrayValue):
-    """The points that a lamp's image is made of: places (k, 2) px and energies (k,)."""
+    """Points of a lamp's image: places (k, 2) px and energies (k,)."""
 
     xy_px: Floats
     energy: Floats
@@ -62,7 +62,15 @@ class Spots(ArrayValue):
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """A lamp's points, where their light meets the eye and leaves it (world), pixels, energies (0: no glint there)."""
+    """A lamp's image, one row per point of the lamp.
+
+    Attributes:
+        source_mm: (k, 3) points of the lamp, world.
+        entry_mm: (k, 3) where their light enters the eye.
+        exit_mm: (k, 3) where it leaves the eye.
+        xy_px: (k, 2) pixels.
+        energy: (k,) energies; 0 where there is no glint.
+    """
 
     source_mm: Floats
     entry_mm: Floats
@@ -73,9 +81,9 @@ class Image:
 
 @dataclass(frozen=True, slots=True)
 class GlintScene:
-    """What glints need: the front cornea and its rim, the pose (x_world = M x + t), camera, and what may stand between.
+    """Input of the glints: front cornea and rim, pose (x_world = M x + t), camera, and obstacles.
 
-    `clear` takes points (n, 3) and (n, 3) of the world and says where nothing of the scene stands between them.
+    `clear` takes points (n, 3) and (n, 3) of the world and returns whether nothing of the scene stands between them.
     """
 
     surface: Surface
@@ -89,7 +97,7 @@ class GlintScene:
     clear: Visibility
 
     def images(self, lights: Sequence[Lamp], sigma_px: float) -> list[Image]:
-        """The image of each lamp, as finely as its size and the point-spread function ask for."""
+        """Compute the image of each lamp, as finely as its size and the point-spread function require."""
         if all(lamp.radius_mm == 0 for lamp in lights):
             return self._trace(lights, [POINT] * len(lights))
         rough = self._trace(lights, [quadrature(1, 4) if lamp.radius_mm > 0 else POINT for lamp in lights])
@@ -106,7 +114,7 @@ class GlintScene:
         return self._trace(lights, nodes)
 
     def _trace(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:
-        """Images of lamps by the given points of their discs; all lamps in one batch."""
+        """Images of lamps through the given points of their discs; all lamps in one batch."""
         camera = self.camera
         points = np.concatenate([disc_points(lamp, n) for lamp, n in zip(lights, nodes, strict=True)])
         counts = [len(n.weight) for n in nodes]
@@ -122,7 +130,7 @@ class GlintScene:
         found = np.asarray(rays.status == Status.OK)
         mirror = (Crossing(self.surface, 1.0, reflects=True),)
         J = ray_tube(mirror, 1.0, node_xyz, rays.way, lamp_xyz).cross_section_mm2_sr
-        # The solver's ray runs from the camera to the lamp, the light the other way.
+        # The solver's ray runs from the camera to the lamp, the light in the other direction.
         y, d, w = (
             np.where(found[:, None], a, (1.0, 0.0, 0.0)) for a in (join(rays.exit), -join(rays.end), -join(rays.way))
         )
@@ -143,7 +151,7 @@ class GlintScene:
         return [Image(*c) for c in zip(*columns, strict=True)]
 
     def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
-        """Whether the way from points of the cornea is barred by the sclera's sphere (eye frame)."""
+        """Whether the sclera's sphere blocks the way from points of the cornea (eye frame)."""
         d = normalize(towards)
         o = y - self.sclera_centre_mm
         b = _dot(o, d)
@@ -180,7 +188,7 @@ def glint_table(scene: GlintScene, images: Sequence[Image]) -> tuple[GlintTable,
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """A quadrature over the unit disc: points (k, 2) and weights (k,) that add up to 1."""
+    """A quadrature over the unit disc: points (k, 2) and weights (k,) whose sum is 1."""
 
     point: Floats
     weight: Floats
@@ -191,7 +199,7 @@ POINT = Nodes(np.zeros((1, 2)), np.ones(1))
 
 @lru_cache(maxsize=64)
 def quadrature(radial: int, angular: int) -> Nodes:
-    """Gauss-Legendre nodes in r^2, even angles."""
+    """Gauss-Legendre nodes in r^2 and equal angles."""
     x, weight = np.polynomial.legendre.leggauss(radial)
     angle = 2 * np.pi * (np.arange(angular) + 0.5) / angular
     r = np.sqrt(0.5 * (x + 1))
@@ -206,7 +214,7 @@ def disc_points(light: Lamp, nodes: Nodes) -> Floats:
     e2 = np.cross(axis, e1)
     outer, inner = float(light.radius_mm), ring_radius_mm(light)
     r2 = _dot(nodes.point, nodes.point)
-    # Even area on the disc stays even on the ring: r^2 runs from inner^2 to outer^2.
+    # Equal areas on the disc stay equal on the ring: r^2 runs from inner^2 to outer^2.
     stretch = np.sqrt(inner**2 + r2 * (outer**2 - inner**2)) / np.sqrt(np.maximum(r2, 1e-300))
     offset = (stretch[:, None] if outer > 0 else 0.0) * nodes.point
     return np.asarray(light.position_mm + offset[:, :1] * e1 + offset[:, 1:] * e2)

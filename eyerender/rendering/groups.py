@@ -1,4 +1,4 @@
-"""Before an eye region, a pixel's samples in groups: what they see of the skin is shaded once for all."""
+"""Groups of a pixel's samples in front of an eye region: what they see of the skin is shaded once for all."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from .view import Textures, View, look_at_skin, meet, outer_albedo
 if TYPE_CHECKING:
     from .region import SkinGeometry
 
-_LIDS_MM = 18.0  # about the axis of the unrotated eye: the lids, and where lashes cast shadows
+_LIDS_MM = 18.0  # about the axis of the unrotated eye: the region of the lids, where lashes cast shadows
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """The samples of a lane, numbered from 0 to `count`; which lamps they look at, and how often each then counts.
+    """The samples of a lane, numbered from 0 to `count`, and the lamps that they use with their weights.
 
     Attributes:
+        count: number of samples.
         ray: origin, direction (scene's frame) and weight of sample j.
         spot: place of sample j on the lamps' discs, [0, 1)^2.
-        lamp: the lamp that sample j looks at where it meets the globe, and how much that counts.
-        lamps: how many the group looks at together where it meets the region.
-        shared: the k-th of these, and how much it counts.
-        fine: whether, about the lids and on hairs, where lashes cast shadows finer than a pixel, pairs of samples send
-            rays of their own to the lamp. There is one, then.
-        plain: nothing but the sheet of skin is to be seen in the samples' pixel.
+        lamp: lamp that sample j uses where it meets the globe, and its weight.
+        lamps: number of lamps that the whole group uses where it meets the region.
+        shared: the k-th of these lamps, and its weight.
+        fine: whether pairs of samples send rays of their own to the lamp about the lids and on hairs, where lashes cast
+            shadows finer than a pixel. There is one lamp then.
+        plain: whether the samples' pixel shows nothing but the sheet of skin.
     """
 
     count: mi.UInt32
@@ -48,11 +49,11 @@ class Group:
 def shade_group(
     values: Values, lights: Lights, textures: Textures, scene: mi.Scene, group: Group
 ) -> tuple[mi.Float, mi.UInt32]:
-    """Sums over a group's samples before an eye region: radiance, and failed light paths.
+    """Sum radiance and failed light paths over a group's samples in front of an eye region.
 
     Every sample has a ray of its own, and the globe is shaded for each. The region is shaded once for the sheet of skin
-    and once for everything in front of it (hairs, tears), at the first sample that hits it. The result counts as often
-    as the surface was hit. In a plain pixel the first sample that hits the skin speaks for the others.
+    and once for everything in front of it (hairs, tears), at the first sample that hits it. The result is multiplied by
+    the number of hits on that surface. In a plain pixel the first sample that hits the skin represents the others.
     """
     assert textures.region is not None
     shading = _GroupShading(values, lights, textures, textures.region, scene, group)
@@ -75,7 +76,7 @@ def shade_group(
 
 @dataclass(frozen=True, slots=True)
 class _GroupShading:
-    """The steps of `shade_group` for one frame."""
+    """Steps of `shade_group` for one frame."""
 
     values: Values
     lights: Lights
@@ -85,12 +86,12 @@ class _GroupShading:
     group: Group
 
     def number(self, i: mi.UInt32) -> mi.UInt32:
-        """The i-th sample to trace: the middle one first, then the others in turn."""
+        """Index of the i-th sample to trace: the middle one first, then the others in turn."""
         middle = self.group.count >> 1
         return dr.select(i == 0, middle, dr.select(i <= middle, i - 1, i))
 
     def lamp_point(self, lamp: Lamp, j: mi.UInt32) -> mi.Vector3f:
-        """Sample j's point on a lamp."""
+        """Point of sample j on a lamp."""
         u, v = self.group.spot(j)
         return lamp.point(u, *dr.sincos(v * (2 * dr.pi)))
 
@@ -109,9 +110,10 @@ class _GroupShading:
         blocked: mi.Bool,
         failures: mi.UInt32,
     ) -> tuple[mi.UInt32, mi.Bool, mi.Float, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32]:
-        """Trace one sample: shade the globe where it hits that, else keep the hit on the region.
+        """Trace one sample: shade the globe if the sample hits it, else keep the hit on the region.
 
-        `known`, `blocked`: whether the sample before has sent its own ray to the lamp, and what that met.
+        `known` says whether the previous sample has sent its own ray to the lamp, `blocked` whether that ray met
+        anything.
         """
         values, group, skin = self.values, self.group, self.skin
         j = self.number(i)
@@ -128,7 +130,7 @@ class _GroupShading:
         at = o + hit.t * d
         alone = view.other & group.fine & (~on_sheet | (at.y * at.y + at.z * at.z < _LIDS_MM * _LIDS_MM))
 
-        # Two samples share the ray.
+        # Two samples share one ray.
         known &= (i & 1) == 1
         asked = alone & ~known
 
@@ -158,7 +160,7 @@ class _GroupShading:
         return rest + dr.select(barred, 0, lit * share), missed
 
     def with_untraced(self, sheet: Kept, i: mi.UInt32, settled: mi.Bool) -> Kept:
-        """The skin's hit with the weights of the samples that a plain pixel left untraced, from the i-th on."""
+        """Add to the skin's hit the weights of the samples from the i-th on, which a plain pixel left untraced."""
 
         def more(i: mi.UInt32, *_: object) -> mi.Bool:
             return settled & (i < self.group.count)
@@ -172,7 +174,7 @@ class _GroupShading:
         return replace(sheet, weight=weight, shared=shared)
 
     def add_region(self, total: mi.Float, kept: Kept) -> mi.Float:
-        """`total` with the radiance of a kept hit on the region, by the lamps that the group looks at."""
+        """Add to `total` the radiance of a kept hit on the region, from the lamps that the group uses."""
         values, group = self.values, self.group
         _, d, _ = group.ray(kept.j)
         view = look_at_skin(values, self.skin, kept.face, kept.uv, d, kept.weight > 0)
@@ -210,7 +212,7 @@ class Kept:
 
     @classmethod
     def none(cls) -> Kept:
-        """No hit yet."""
+        """Return an empty hit."""
         return cls(mi.UInt32(0), mi.UInt32(0), mi.Point2f(0), mi.Float(0), mi.Float(0), mi.Float(0))
 
     def with_(
@@ -223,7 +225,7 @@ class Kept:
         alone: mi.Bool,
         blocked: mi.Bool,
     ) -> Kept:
-        """With sample `j` where it has `met` the surface; the first stands for all."""
+        """Add sample `j` where it has `met` the surface; the first sample stands for all."""
         taken = met & (self.weight == 0)
         weight = dr.select(met, weight, 0)
         return Kept(

@@ -1,4 +1,4 @@
-"""A user's own head mesh in Mitsuba, in place of the procedural eye region: the same mesh with one map, kept still."""
+"""A user's own head mesh in Mitsuba, in place of the procedural eye region: one fixed mesh with one map."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _RINGS, _TURNS = 40, 240
 
 
 def place_scene(spec: Region, globe: Globe) -> RegionScene:
-    """The scene of a spec: its head mesh, or the procedural region."""
+    """Make the scene of a spec: its head mesh, or the procedural region."""
     return RegionScene(spec, globe) if spec.head is None else HeadScene(spec, globe)
 
 
@@ -28,18 +28,18 @@ class HeadScene(RegionScene):
     """The Mitsuba scene of a head mesh about one eye.
 
     Raises:
-        InputError: the mesh cannot be read, or stands in the cornea of the eye as it looks.
+        InputError: the mesh cannot be read, or reaches into the cornea in the eye's pose.
     """
 
     parts = HEAD_PARTS
-    moving = 0  # it keeps still
+    moving = 0  # the mesh is fixed
 
     def __init__(self, spec: Region, globe: Globe) -> None:
         super().__init__(spec, globe)
         self._refuse_crossing(spec, globe)
 
     def show(self, spec: Region, globe: Globe) -> RegionMesh:
-        """Turn to an eye and its pose; the mesh itself moves only with where the globe is at rest."""
+        """Turn to an eye and its pose; the mesh itself moves only with the place of the globe at rest."""
         new = self._shown != (spec, globe)
         posed = super().show(spec, globe)
         if new:
@@ -67,7 +67,7 @@ class HeadScene(RegionScene):
         depth = cornea_depth_mm(self, globe)
         deepest = int(np.argmax(depth))
         if depth[deepest] > head.tolerance_mm:
-            # Another pose may be free of it: what is shown now does not count as shown.
+            # Another pose may be valid, so this one is not recorded as shown.
             self._shown = None
             raise InputError(
                 f"reaches {depth[deepest]:.2f} mm into the cornea as the eye looks (tolerance_mm is "
@@ -77,7 +77,7 @@ class HeadScene(RegionScene):
 
 
 def cornea_depth_mm(place: RegionScene, globe: Globe) -> Floats:
-    """How deep (mm, 0 to 4) the mesh reaches into the posed cornea along lines from the globe's centre, (n,)."""
+    """Depth (mm, 0 to 4) by which the mesh reaches into the posed cornea along lines from the globe's centre, (n,)."""
     surface = globe.cornea
     if surface is None:
         return np.zeros(1)
@@ -89,7 +89,7 @@ def cornea_depth_mm(place: RegionScene, globe: Globe) -> Floats:
     out = points - (globe.M @ globe.centre_mm + globe.t)
     out /= np.linalg.norm(out, axis=1, keepdims=True)
     table = np.column_stack([points - _DEPTH_MM * out, out]).astype(np.float32)
-    # Gathered from one buffer: the kernel would depend on the alignment of every array that NumPy owns.
+    # The values are gathered from one buffer, else the kernel would depend on the alignment of every NumPy array.
     buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 6
     o = [dr.gather(mi.Float, buffer, row + k) for k in range(6)]
     ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:]))

@@ -1,14 +1,14 @@
 """The Mitsuba integrator `eyerender`: near-infrared light through a refracting cornea, without noise from small lamps.
 
-A ray meets the eye in closed form (the exact surfaces, not a mesh of them) and everything else by Embree or OptiX; the
-nearer counts. At the cornea it splits deterministically; the refracted branch meets the iris plane, which every lamp
-lights through all refracting surfaces by manifold next-event estimation:
+A ray is intersected with the eye in closed form (the exact surfaces, not a mesh) and with everything else by Embree or
+OptiX; the nearer hit is used. At the cornea the ray splits deterministically. The refracted branch meets the iris
+plane, which every lamp lights through all refracting surfaces by manifold next-event estimation:
 
     L = (1 - F) / n^2 * albedo / pi * sum_l I_l (1 - F_l) cos(theta) / J_l
 
-Sclera and surround are matte and lit directly. Glints are not sampled here; they are splatted (`glints`).
-Frames: the scene's frame has the world's axes and its origin at the apex of the unrotated eye; the eye stays still in
-its own frame, so that a pose moves numbers and never geometry.
+Sclera and surround are matte and lit directly. Glints are not sampled here; they are splatted (`glints`). Frames: the
+scene's frame has the world's axes and its origin at the apex of the unrotated eye. The eye is fixed in its own frame,
+so a pose changes numbers and never geometry.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ NAME = "eyerender"
 def onward(
     values: Values, shaded: Shaded, d: mi.Vector3f, u: mi.Float, v: mi.Float
 ) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Bool]:
-    """How a path goes on: origin, direction (scene's frame), weight, and whether it does.
+    """Continue paths: origin, direction (scene's frame), weight, and whether the path continues.
 
-    From matte points in a cosine-distributed direction; from the clear cornea in the mirror's direction.
+    From matte points the direction is cosine-distributed; from the clear cornea it is the mirror's direction.
     """
     view = shaded.view
     normal = values.vector_to_scene(view.normal)
@@ -67,15 +67,16 @@ _registered: dict[str, type] = {}
 
 
 def integrator_class() -> type:
-    """The integrator's class for the variant in use, registered with Mitsuba under `NAME`."""
+    """Class of the integrator for the variant in use, registered with Mitsuba under `NAME`."""
     variant = str(mi.variant())
     if variant in _registered:
         return _registered[variant]
 
     class EyeIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
-        """Radiance (mW/mm^2/sr) along rays of the scene's frame; `bind` gives it the eye, the lamps and the look.
+        """Radiance (mW/mm^2/sr) along rays of the scene's frame; `bind` sets the eye, the lamps and the look.
 
-        `bounces` counts how often light goes on between sclera, surround and the cornea's mirror before it is seen.
+        `bounces` is the number of times that light may continue between sclera, surround and the cornea's mirror before
+        it is seen.
         """
 
         def __init__(self, props: mi.Properties | None = None) -> None:
@@ -87,13 +88,13 @@ def integrator_class() -> type:
             self.failures: Any = None
 
         def bind(self, values: Values, lights: Lights, textures: Textures) -> None:
-            """Set the frame that `sample` sees."""
+            """Set the frame that `sample` renders."""
             self.values, self.lights, self.textures = values, lights, textures
 
         def sample(
             self, scene: mi.Scene, sampler: Sampler, ray: mi.Ray3f, medium: object = None, active: mi.Bool | bool = True
         ) -> tuple[mi.Color1f, mi.Bool, list[mi.Float]]:
-            """Radiance along `ray`; the third item is empty, failed light paths are counted in `failures`."""
+            """Radiance along `ray`; the third item is empty, and failed light paths are counted in `failures`."""
             del medium
             if self.values is None or self.lights is None or self.textures is None:
                 raise RuntimeError("bind() the integrator to a frame first")

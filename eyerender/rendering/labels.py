@@ -1,4 +1,4 @@
-"""The parts of the eye that the pixels of a window show."""
+"""Raster labels: the parts of the eye that the pixels of a window show."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ BACKGROUND, SCLERA, IRIS, PUPIL = 0, 1, 2, 3
 class PartLabels(ArrayValue):
     """What each pixel's centre shows, seen through the cornea; arrays (height, width).
 
-    `part` and `amodal` hold 0 background or skin, 1 sclera, 2 iris, 3 pupil; `amodal` as if the eye stood alone.
-    `depth_mm` is the distance from the nodal point to the first surface, infinite where there is none. The visible
-    fractions are of the part of the amodal pupil and iris that lies in the window, NaN where none does.
+    Attributes:
+        part: 0 background or skin, 1 sclera, 2 iris, 3 pupil.
+        amodal: the same for the eye alone, without occluders.
+        depth_mm: distance from the nodal point to the first surface, infinite where there is none.
     """
 
     part: Bytes
@@ -31,14 +32,14 @@ class PartLabels(ArrayValue):
     depth_mm: Singles
 
     def visible_fraction(self, part: int) -> float:
-        """Share of the amodal pixels of a part that are visible."""
+        """Visible share of the amodal pixels of a part in the window; NaN where there are none."""
         whole = int(np.count_nonzero(self.amodal == part))
         both = int(np.count_nonzero((self.amodal == part) & (self.part == part)))
         return both / whole if whole else float("nan")
 
 
 def part_labels(shown: Exposed, window: Window) -> PartLabels:
-    """The labels of a window."""
+    """Compute the labels of a window."""
     width, height = window[2:]
     u, v = pixels_of(dr.arange(mi.UInt32, width * height), window)
     o, d, _ = camera_ray(shown.values, mi.Float(u), mi.Float(v))

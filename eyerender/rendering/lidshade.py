@@ -1,12 +1,13 @@
-"""How much of the ambient light reaches the globe between the lids.
+"""Share of the ambient light that reaches the globe between the lids.
 
-The margins stand out of the globe like the walls of a trough. Of an even sky a point of its floor, at distances a and b
-from walls of height h, gets the share
+The margins rise from the globe like the walls of a trough. From an even sky, a point of its floor at distances a and b
+from walls of height h receives the share
 
     F = (a / sqrt(a^2 + h^2) + b / sqrt(b^2 + h^2)) / 2
 
-(the view factor of a slot without ends: Hottel's crossed strings), and of the rest a part by way of the lids. Distances
-are taken upwards and downwards, h is the upper margin's thickness; the part that the lids send back is chosen.
+(the view factor of a slot without ends: Hottel's crossed strings), and a part of the rest by reflection from the lids.
+Distances are taken upwards and downwards, and h is the upper margin's thickness. The share that the lids reflect is
+chosen.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _SENT_BACK = 0.35
 
 
 class LidShade:
-    """The margins of a posed region on the device; without any (a head mesh has none) nothing is shaded."""
+    """The margins of a posed region on the device; without margins (a head mesh has none) nothing is shaded."""
 
     def __init__(self, posed: RegionMesh, height_mm: float) -> None:
         y = np.linspace(-_HALF_MM, _HALF_MM, _PLACES)
@@ -32,7 +33,7 @@ class LidShade:
             if len(margin):
                 order = np.argsort(margin[:, 1])
                 table[row] = np.interp(y, margin[order, 1], margin[order, 2])
-        # Upper and lower heights beside each other, so that both are read at once.
+        # Upper and lower heights are adjacent so that both are read at once.
         self._buffer = mi.Float(np.append(table.T.ravel(), height_mm * height_mm).astype(np.float32))
 
     def share(self, x: mi.Vector3f) -> mi.Float:

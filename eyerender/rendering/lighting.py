@@ -1,4 +1,4 @@
-"""The light of all lamps: directly on matte surfaces, through the cornea by manifold connections on the iris."""
+"""Light of all lamps: directly on matte surfaces, and through the cornea on the iris by manifold connections."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def lamp_blocked(
 ) -> mi.Bool:
     """Whether anything stands between a point of the eye frame and a lamp.
 
-    `sphere`, `cornea`: lanes whose way can be barred by the globe's sphere, by the cornea's bulge.
+    `sphere` and `cornea` mark the lanes that the globe's sphere and the cornea's bulge can block.
     """
     d = lamp - x
     distance = dr.norm(d)
@@ -48,7 +48,7 @@ def lamp_blocked(
 def _globe_blocks(
     values: Values, x: mi.Vector3f, r: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
 ) -> mi.Bool:
-    """Whether the globe stands in the way; r: the point from the sclera's centre."""
+    """Whether the globe blocks the way; r is the point relative to the sclera's centre."""
     t, met = meet_sphere(r, d, values.sclera.radius)
     blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
     front = values.surfaces[0]
@@ -101,7 +101,8 @@ def light(
         irradiance in the plane of the iris, and failed paths.
     """
     if values.structure.region:
-        # Skin fills the picture and every lamp costs a ray through the region: each sample sees one lamp, for all.
+        # Skin fills the image and every lamp costs a ray through the region, so each sample uses one lamp, which stands
+        # for all.
         count = mi.Float(lights.count)
         one = dr.minimum(mi.UInt32(u * count), lights.count - 1)
         lamp: Lamp = lights[one]
@@ -144,7 +145,7 @@ def _all_lamps(
 ) -> tuple[mi.Float, mi.Float, mi.UInt32]:
     """Sum over the lamps of `onto_matte` (lamp, its points) and of the irradiance behind the cornea; failed paths."""
     n = values.stop.normal
-    # The point's Gaussian image: where the straight line from a lamp must aim to be bent on to the point.
+    # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
     scale, shift = values.image.scale, values.image.shift
     aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
 

@@ -1,15 +1,15 @@
 """Manifold next-event estimation: the light path from a lamp through every refracting surface to a point behind them.
 
-Newton's method on the point y where the path enters the front surface, with exact ray differentials chained through the
-surfaces (Mitchell and Hanrahan 1992 for the principle; Hanika, Droske and Fascione 2015 for its use as next-event
-estimation). With the differentials a, b (per angle at the lamp) of the ray where it passes the target, w its direction
-there, r the miss, and ya, yb the differentials of y:
+It uses Newton's method on the point y where the path enters the front surface, with exact ray differentials chained
+through the surfaces (Mitchell and Hanrahan 1992 for the principle; Hanika, Droske and Fascione 2015 for its use as
+next-event estimation). With the differentials a, b (per angle at the lamp) of the ray where it passes the target, w its
+direction there, r the miss, and ya, yb the differentials of y:
 
     J = |w . (a x b)| = dA_perp / dOmega at the lamp,        E = I (1 - F) cos(theta) / J
     y <- y + ya w.(r x b)/det + yb w.(a x r)/det,            det = w . (a x b)
 
-Stepping in y and not in the direction at the lamp keeps the problem well scaled under grazing incidence, where oblique
-lamps light the far side of the iris.
+Steps in y, and not in the direction at the lamp, keep the problem well scaled at grazing incidence, where oblique lamps
+light the far side of the iris.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import mitsuba as mi
 from .surfaces import Bundle, Surface
 
 MAX_STEPS = 48
-TOLERANCE_MM = 1e-4  # moves the irradiance by less than 1e-4 of itself; float32 reaches about 1e-6 mm
+TOLERANCE_MM = 1e-4  # changes the irradiance by less than 1e-4 of itself; float32 reaches about 1e-6 mm
 _STANDOFF_MM = 15.0
 _STEP_MM = 2.5
 _GRAZING = 0.01
@@ -30,11 +30,11 @@ _GRAZING = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """The path found: irradiance per radiant intensity (mm^-2), the entry point, the direction that leaves the lamp.
+    """The path: irradiance per radiant intensity (mm^-2), the entry point, the direction on leaving the lamp.
 
-    `found` where there is a path. `failed` where Newton's method did not converge although it never left the part of
-    the cornea that the lamp sees; points in the cornea's own shadow have no path, and the steps towards it run over the
-    horizon.
+    `found` marks existing paths. `failed` marks those where Newton's method did not converge although it never left the
+    part of the cornea that the lamp sees. Points in the cornea's own shadow have no path, and the steps towards them
+    cross the horizon.
     """
 
     transfer: mi.Float
@@ -79,7 +79,7 @@ def connect(
         e1, e2 = mi.coordinate_system(d)
         b, passed, c = front.bend(Bundle(y, d, distance * e1, distance * e2, e1, e2))
         y1, y2 = b.da, b.db
-        over = c < _GRAZING  # beyond the horizon: half the way back
+        over = c < _GRAZING  # beyond the horizon, go half the way back
         ok = ~over
         for surface in surfaces[1:]:
             b, share, good = surface.refract_bundle(b)

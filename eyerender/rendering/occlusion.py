@@ -1,4 +1,4 @@
-"""What an eye region hides of the glints, in words and numbers for the labels, and where the lid margins are."""
+"""Occlusion of glints by an eye region, in words and numbers for the labels, and the lid margins."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _MARKS = 17
 
 
 def glint_reason(energy: Floats, open_: Bools, blockers: Sequence[str | None]) -> str:
-    """Why a lamp's mirror image is seen or not: visible, partly or fully occluded (by what most), or off the cornea.
+    """State whether a lamp's mirror image is visible, partly or fully occluded (and mostly by what), or off the cornea.
 
     Args:
         energy: (k,) of the points of the image, 0 where the cornea sends none of it to the camera.
-        open_: (k,) nothing of the scene is in the way.
+        open_: (k,) whether nothing of the scene is in the way.
         blockers: (k,) names of the parts in the way, None where there is none.
     """
     there = energy > 0

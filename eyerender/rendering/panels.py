@@ -1,10 +1,10 @@
-"""Emitting rectangles, screens and windows: the radiance that rays meet, and the irradiance of matte surfaces.
+"""Emitting rectangles such as screens and windows: the radiance along rays, and the irradiance of matte surfaces.
 
 A panel's irradiance is Lambert's formula for a polygon, cut at the horizon of the lit surface,
 
     E(n) = L / 2 sum_k theta_k n . g_k,
 
-theta_k the angle under which its edge k is seen and g_k the unit normal of the plane of edge and eye point (Lambert
+where theta_k is the angle that edge k subtends and g_k the unit normal of the plane of edge and lit point (Lambert
 1760; Arvo 1995, equation 2.9).
 """
 
@@ -46,7 +46,7 @@ class Panels:
         return Rectangle(centre, normal, right, up, row[12])
 
     def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Radiance (mW/mm^2/sr) that rays of the scene's frame meet; panels that overlap add up."""
+        """Radiance (mW/mm^2/sr) along rays of the scene's frame; overlapping panels add up."""
 
         def met(panel: Rectangle) -> mi.Float:
             facing = -dr.dot(d, panel.normal)
@@ -83,7 +83,8 @@ class Panels:
 def polygon_irradiance(corners: list[mi.Vector3f], n: mi.Vector3f) -> mi.Float:
     """Irradiance per radiance of a convex polygon, its corners given from the lit point, on a surface of normal n.
 
-    What lies below the horizon is cut off: the edges' parts above it and the arc of the horizon between them remain.
+    The part below the horizon is cut off. The parts of the edges above it and the arc of the horizon between them
+    remain.
     """
     total = mi.Float(0)
     leave, enter = mi.Vector3f(0), mi.Vector3f(0)
@@ -100,7 +101,7 @@ def polygon_irradiance(corners: list[mi.Vector3f], n: mi.Vector3f) -> mi.Float:
 
 
 def _arc(a: mi.Vector3f, b: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
-    """The angle between two directions times n . unit(a x b)."""
+    """Angle between two directions times n . unit(a x b)."""
     c = dr.cross(a, b)
     s = dr.norm(c)
     return dr.atan2(s, dr.dot(a, b)) * dr.dot(n, c) / dr.maximum(s, 1e-20)

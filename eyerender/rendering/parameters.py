@@ -1,7 +1,7 @@
 """The parameters of a frame: the numbers that change from frame to frame, by name.
 
-The same classes serve on both sides. On the host (`frame.parameters_of`) their leaves are NumPy numbers in float64. On
-the device (`values.Values`) they are Dr.Jit arrays of size one: a Float, a Vector3f for three numbers, or a tuple of
+The same classes are used on both sides. On the host (`frame.parameters_of`) their leaves are NumPy numbers in float64.
+On the device (`values.Values`) they are Dr.Jit arrays of size one: a Float, a Vector3f for three numbers, or a tuple of
 Floats. Nothing here depends on Mitsuba.
 """
 
@@ -38,7 +38,7 @@ class SurfaceParameters:
 
 @dataclass(frozen=True, slots=True)
 class StopParameters:
-    """The aperture stop: centre, normal, the directions u and v of its semi-axes (all (3,)), and these two (mm)."""
+    """The aperture stop: centre, normal, directions u and v of its semi-axes (all (3,)), and the semi-axes (mm)."""
 
     centre: mi.Vector3f
     normal: mi.Vector3f
@@ -49,7 +49,7 @@ class StopParameters:
 
 @dataclass(frozen=True, slots=True)
 class IrisParameters:
-    """Radius of the root (mm), mean albedo and contrast of the texture."""
+    """The iris: radius of the root (mm), mean albedo and contrast of the texture."""
 
     root_radius: mi.Float
     albedo: mi.Float
@@ -58,7 +58,7 @@ class IrisParameters:
 
 @dataclass(frozen=True, slots=True)
 class LimbusParameters:
-    """Radius about the front surface's axis (mm), lowest x of the cornea (mm), 1 / width of the transition (1/mm)."""
+    """The limbus: radius about the front surface's axis (mm), lowest x of the cornea (mm), 1 / width (1/mm), albedo."""
 
     radius: mi.Float
     floor: mi.Float
@@ -68,7 +68,7 @@ class LimbusParameters:
 
 @dataclass(frozen=True, slots=True)
 class ScleraParameters:
-    """Centre (3,) and radius of the sphere (mm), mean albedo and contrast of the texture."""
+    """The sclera: centre (3,) and radius of the sphere (mm), mean albedo and contrast of the texture."""
 
     centre: mi.Vector3f
     radius: mi.Float
@@ -78,7 +78,7 @@ class ScleraParameters:
 
 @dataclass(frozen=True, slots=True)
 class PoseParameters:
-    """x_scene = columns x_eye + shift: the three columns of the rotation (3,) each, and the shift (3,) mm."""
+    """The pose x_scene = columns x_eye + shift: three columns of the rotation (3,) each, and the shift (3,) mm."""
 
     columns: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]
     shift: mi.Vector3f
@@ -138,12 +138,12 @@ class Parameters:
 
 
 def packed(tree: Any) -> np.ndarray[Any, np.dtype[np.float32]]:
-    """The leaves of host parameters as one vector, in the order of the fields."""
+    """Pack the leaves of host parameters into one vector, in the order of the fields."""
     return np.concatenate([np.asarray(leaf, dtype=np.float64).reshape(-1) for leaf in _leaves(tree)]).astype(np.float32)
 
 
 def rebuilt(tree: _Tree, leaf: Callable[[int], Any]) -> _Tree:
-    """The same tree with other leaves: `leaf(size)` gives each, called in the order of `packed`."""
+    """Rebuild a tree with other leaves: `leaf(size)` returns each, called in the order of `packed`."""
     node: Any = tree
     made: Any
     if is_dataclass(node):

@@ -1,8 +1,9 @@
-"""Where a picture shows nothing but skin: tiles of its window that no hair, no rim and no part of the globe reaches.
+"""Plain tiles: the parts of a window that show nothing but skin, without hairs, margins or the globe.
 
-A sheet of skin with a hole, the fissure, that ends at a border: a ray whose pixel lies within the border's outline and
-not within the hole's crosses the sheet, since it crosses it as often as the one winds about the pixel more than the
-other. Hairs and the line of tears stand before it; they, and both outlines, are marked with some pixels to spare.
+The skin is a sheet with a hole, the fissure, that ends at a border. A ray whose pixel lies within the border's outline
+and not within the hole's outline crosses the sheet, because the number of crossings is the difference of the two
+winding numbers. Hairs and the line of tears are in front of the sheet. They and both outlines are marked, with some
+pixels to spare.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from ..rig.camera import PinholeCamera, Window
 _TILE_PX = 8
 _STEP_PX = 4.0  # between marked points of a curve
 _SPARE_PX = 1.0
-_HAIR_MM = 0.1  # no hair and no part of a rim is thicker
-_NEAREST_MM = 3.0  # with hairs nearer to the camera nothing is plain
+_HAIR_MM = 0.1  # no hair and no part of a margin is thicker
+_NEAREST_MM = 3.0  # if hairs are closer to the camera, nothing is plain
 
 
 def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, int]:
-    """Which tiles (rows, columns) of a window show nothing but skin, and the size of a tile in pixels.
+    """Tiles (rows, columns) of a window that show nothing but skin, and the size of a tile in pixels.
 
-    None does where the region's border is not known, and where hairs come too near to the camera.
+    No tile does where the region's border is unknown or hairs come too close to the camera.
     """
     nothing = np.zeros((1, 1), dtype=bool), max(window[2:])
     if len(region.border) == 0:
@@ -51,7 +52,7 @@ def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, wi
 
 
 def _pieces(xy: Floats, shape: tuple[int, int]) -> Floats:
-    """The straight pieces (m, 2, 2) of polylines (n, k, 2) that come near the tiles."""
+    """Straight pieces (m, 2, 2) of polylines (n, k, 2) that come near the tiles."""
     ends = np.stack([xy[:, :-1], xy[:, 1:]], axis=-2).reshape(-1, 2, 2)
     limit = np.array(shape[::-1]) + 1.0
     return ends[np.all((ends.max(axis=1) > -1) & (ends.min(axis=1) < limit), axis=1)]
@@ -74,7 +75,7 @@ def _mark(marked: Bools, pieces: Floats, step: float, reach: float) -> None:
 
 
 def _winding(xy: Floats, shape: tuple[int, int]) -> Floats:
-    """How often a closed polyline (k + 1, 2) winds about the middle of each tile (rows, columns)."""
+    """Winding number of a closed polyline (k + 1, 2) about the middle of each tile (rows, columns)."""
     rows, columns = shape
     y = np.arange(rows) + 0.5
     (ax, ay), (bx, by) = xy[:-1].T[..., None], xy[1:].T[..., None]

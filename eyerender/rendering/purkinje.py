@@ -1,12 +1,12 @@
 """Purkinje images 2 to 4: lamps mirrored by the back of the cornea, the lens' front and its back, with their energy.
 
-The path from the camera's nodal point through the surfaces, back at the mirror and out to the lamp is found by the
-solver of `optics`; here it gets its energy. With T the product of 1 - F at every refraction and F at the mirror, and J
+The solver of `optics` finds the path from the camera's nodal point through the surfaces, back at the mirror and out to
+the lamp. This module computes its energy. With T the product of 1 - F at every refraction and F at the mirror, and J
 the ray tube's cross section at the lamp per solid angle at the camera (equal to the reverse, both being in air):
 
     e = I(d) T f_x f_y D / (J cos^3(theta))        as for the first image (`glints`)
 
-Images 3 and 4 pass the pupil twice, and are there only where both passages lie inside it.
+Images 3 and 4 pass the pupil twice, and exist only where both passages are inside it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .glints import GlintScene, Image, Nodes, disc_points, distortion_determinan
 def purkinje_images(
     scene: GlintScene, eye: EyeModel, order: int, lights: Sequence[Lamp], nodes: Sequence[Nodes]
 ) -> list[Image]:
-    """Images of the lamps by the given points of their discs."""
+    """Compute the images of the lamps through the given points of their discs."""
     camera, M, t = scene.camera, scene.M, scene.t
     images = []
     surfaces, indices, rims, passing, gradient = stack(eye, order)
@@ -64,7 +64,10 @@ def purkinje_images(
 
 
 def transmittance(path: Sequence[Crossing], traced: Traced, behind: float) -> Floats:
-    """F at the mirror, `behind` which the index is given, times 1 - F at every other crossing that the rays meet."""
+    """Transmittance of paths: F at the mirror, times 1 - F at every other crossing that the rays meet.
+
+    `behind` is the index behind the mirror.
+    """
     share = np.ones(traced.points_mm.shape[1])
     index = np.ones_like(share)
     for k, crossing in enumerate(path):
@@ -73,7 +76,7 @@ def transmittance(path: Sequence[Crossing], traced: Traced, behind: float) -> Fl
         if crossing.reflects:
             share *= np.asarray(fresnel(cosine, index, behind).unpolarized)
             continue
-        # A ray passes by the shells of a gradient lens that do not reach as far as it.
+        # A ray misses the shells of a gradient lens that do not extend to it.
         met = np.any(traced.directions[k + 1] != before, axis=1)
         after = float(np.asarray(crossing.n_after))
         share *= np.where(met, 1 - np.asarray(fresnel(cosine, index, after).unpolarized), 1.0)
@@ -94,7 +97,11 @@ def _through_pupil(eye: EyeModel, points: Floats, corneal: int) -> Bools:
 def stack(
     eye: EyeModel, order: int
 ) -> tuple[tuple[Surface, ...], tuple[float, ...], tuple[float, ...], tuple[bool, ...], GradientMedium | None]:
-    """Surfaces down to the mirror, indices behind, rims, which a ray may pass by, and the gradient before the mirror.
+    """Surfaces down to the mirror, with what a ray needs to pass them.
+
+    Returns:
+        The surfaces, the indices behind them, their rims, whether a ray may miss them, and the gradient before the
+        mirror.
 
     Raises:
         InputError: the eye has no such image.

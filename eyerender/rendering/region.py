@@ -1,9 +1,9 @@
-"""The eye region in Mitsuba: triangles with one map, moved in place; their topology is a subject's.
+"""The eye region in Mitsuba: triangles with one map, moved in place; a subject's topology is constant.
 
-They stand in the scene's frame (the world's axes, origin at the apex of the unrotated eye) as two instances, of what
-moves with the eye and of what keeps still, the brow. A pose rebuilds the tree over the first alone, and Mitsuba has
-Embree build an instance's tree without the spatial splits of a scene's own meshes, in a third of the time. What a hit
-shows is read from buffers of our own (`Skin`), so kernels stay what they are.
+The triangles are in the scene's frame (the world's axes, origin at the apex of the unrotated eye) as two instances: the
+parts that move with the eye, and the fixed brow. A pose rebuilds the tree over the first alone. Mitsuba lets Embree
+build an instance's tree without the spatial splits of a scene's own meshes, which takes a third of the time. The
+appearance of a hit is read from buffers of our own (`SkinGeometry`), so kernels do not change.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..region.skin import skin_map
 from .surround import clear_between, rays_between
 from .values import aligned
 
-_F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, about the same (n 1.40 and 1.33)
+_F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, which is about the same (n 1.40 and 1.33)
 _ROUGH_SKIN, _ROUGH_WET = 0.19, 0.04
 _RIPPLE = 0.032  # slope of wet tissue
 
@@ -34,15 +34,15 @@ class RegionScene:
 
     obstructed = True
     parts: tuple[str, ...] = PARTS
-    moving = 3  # parts that the eye moves, the first ones
+    moving = 3  # the first parts, which the eye moves
 
     def __init__(self, spec: Region, globe: Globe) -> None:
         posed = self._posed(spec, globe)
         layout = posed.layout
         moved = [int(ends[self.moving - 1]) if self.moving else 0 for ends in (layout.vertex_ends, layout.face_ends)]
         self._vertices, faces = moved
-        # Without robust intersections rays slip between the triangles of a large face, on some processors. An instance
-        # cannot have them; its triangles are small.
+        # Without robust intersections rays slip between the triangles of a large face on some processors. An instance
+        # cannot have them, but its triangles are small.
         parts: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True}
         if self.moving:
             parts |= _instance("moving", _mesh(posed, slice(0, moved[0]), slice(0, moved[1])))
@@ -62,7 +62,7 @@ class RegionScene:
 
     @staticmethod
     def key(spec: Region, globe: Globe) -> tuple[Any, ...]:
-        """What a scene is made for: a subject and a side, and a head mesh's files as they are."""
+        """What a scene is made for: a subject, a side, and the state of a head mesh's files."""
         files = () if spec.head is None else file_states(spec.head)
         return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files
 
@@ -102,7 +102,7 @@ def _floats(values: Floats) -> mi.Float:
 
 
 def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
-    """Some of the triangles."""
+    """Make a mesh of some of the triangles."""
     corners, triangles = posed.vertices[vertices], posed.layout.faces[faces] - (vertices.start or 0)
     mesh = mi.Mesh("region", len(corners), len(triangles))
     params = mi.traverse(mesh)
@@ -113,14 +113,14 @@ def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
 
 
 def _instance(name: str, mesh: mi.Mesh) -> dict[str, Any]:
-    """A mesh as a group of its own, and the group's only instance."""
+    """Make a group of one mesh, and the group's only instance."""
     group = {"type": "shapegroup", "mesh": mesh}
     return {name: group, f"shown_{name}": {"type": "instance", "of": {"type": "ref", "id": name}}}
 
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """What is known of points of the region: place, shading normal (scene's frame), albedo, gloss."""
+    """Points of the region: place, shading normal (scene's frame), albedo, gloss."""
 
     point: mi.Vector3f
     normal: mi.Vector3f
@@ -129,13 +129,13 @@ class Surface:
 
 
 class SkinGeometry:
-    """A posed region as kernels read it: the corners of its triangles, and the map."""
+    """A posed region for the kernels: the corners of its triangles, and the map."""
 
     def __init__(
         self, look: mi.Texture2f, layout: RegionLayout, moving: int, instance: mi.Shape | None, mirror: float
     ) -> None:
         self._map = look
-        corners = np.zeros((len(layout.faces), 4), np.uint32)  # of four, which are gathered together
+        corners = np.zeros((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
         corners[:, :3] = layout.faces
         self._corners = mi.UInt32(aligned(corners.ravel()))
         self._records = np.zeros((len(layout.uv), 8), np.float32)
@@ -146,20 +146,20 @@ class SkinGeometry:
         dr.make_opaque(self._moving, self._first_still, self._sheet, self._mirror)
 
     def pose(self, posed: RegionMesh) -> None:
-        """Bring the corners to a pose."""
+        """Update the corners to a pose."""
         self._records[:, 0:3], self._records[:, 4:7] = posed.vertices, posed.normals
         self._buffer = mi.Float(aligned(self._records.ravel()))
 
     def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
-        """Which of the layout's triangles was hit."""
+        """Index of the layout's triangle that was hit."""
         return hit.prim_index + dr.select(hit.instance == self._moving, 0, self._first_still)
 
     def on_sheet(self, face: mi.UInt32) -> mi.Bool:
-        """Whether a triangle belongs to the sheet of skin, not to what stands before it."""
+        """Whether a triangle belongs to the sheet of skin, not to what is in front of it."""
         return face < self._sheet
 
     def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Surface:
-        """The surface at barycentric coordinates `uv` of triangles.
+        """Surface at barycentric coordinates `uv` of triangles.
 
         The relief tilts the normal n by its slope g over the tangent plane: n - (g - n (n . g)).
         """
@@ -177,7 +177,7 @@ class SkinGeometry:
 
 
 def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:
-    """The first part of the region between points (n, 3) a and b of the scene's frame, None where there is none."""
+    """First part of the region between points (n, 3) a and b of the scene's frame, None where there is none."""
     hit = place.scene.ray_intersect_preliminary(rays_between(a, b), coherent=False, active=True)
     valid, face = hit.is_valid(), place.skin.face(hit)
     dr.eval(valid, face)
@@ -207,14 +207,14 @@ def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, glo
 
 
 def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
-    """The normal of the film of tears (eye frame): the conjunctiva under it is uneven, and its highlights break up."""
+    """Normal of the tear film (eye frame); the uneven conjunctiva below it breaks up its highlights."""
     p, q = 71 * normal.y + 23 * normal.z, 67 * normal.z - 29 * normal.y
     ripple = _RIPPLE * mi.Vector3f(0, dr.sin(p + 1.7 * dr.sin(q)), dr.sin(q + 1.7 * dr.sin(p)))
     return dr.normalize(normal + ripple)
 
 
 def film_reflectance(cosine: mi.Float, gloss: mi.Float) -> mi.Float:
-    """What the film of wet tissue mirrors of light from wide surroundings."""
+    """Share of the light from wide surroundings that the film of wet tissue mirrors."""
     return (2 * gloss - 1) * _schlick(dr.clip(cosine, 0, 1))
 
 

@@ -1,4 +1,4 @@
-"""The renderer: jobs in, windows of the sensor out; NumPy on both sides."""
+"""The renderer turns jobs into windows of the sensor, with NumPy on both sides."""
 
 from __future__ import annotations
 
@@ -35,11 +35,19 @@ __all__ = ["BACKGROUND", "IRIS", "PUPIL", "SCLERA", "PartLabels", "RenderJob", "
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedWindow(ArrayValue):
-    """A rendered window: `irradiance` (height, width) W/m^2 of the sensor, `dn` after the sensor, labels, glints.
+    """A rendered window.
 
-    `purkinje` holds (order, table) of the mirror images beyond the first that were asked for. `failed_paths` counts
-    light paths that did not converge (they are missing from the irradiance). `glint_reasons` says of each
-    glint whether it is visible or what hides it; `lid_margins_px` holds landmarks along the lids where there are any.
+    Attributes:
+        window: (x0, y0, width, height) in full-sensor pixels.
+        irradiance: (height, width) W/m^2 of the sensor.
+        dn: (height, width) digital numbers of the sensor.
+        bit_depth: bits of `dn`.
+        labels: raster labels, if they were requested.
+        glints: the first images.
+        purkinje: (order, table) of the further mirror images that were requested.
+        failed_paths: number of light paths that did not converge; they are missing from the irradiance.
+        glint_reasons: for each glint, whether it is visible or what hides it.
+        lid_margins_px: landmarks along the lids, where there are any.
     """
 
     window: Window
@@ -57,9 +65,14 @@ class RenderedWindow(ArrayValue):
 class Renderer:
     """Renders jobs on one backend, which `choose_backend` must have set up before this module is imported.
 
-    Kernels are compiled once per kind of eye; every number may change between jobs. `obstacles` stand in the scene's
-    frame: they hide and shade the eye. `bounces` is how often light may go on between sclera, surround and the cornea's
-    mirror (0: only light that comes straight from a lamp; more adds some noise and costs as much again each).
+    Kernels are compiled once per kind of eye; every number may change between jobs.
+
+    Args:
+        backend: the backend.
+        spp: samples per pixel.
+        bounces: how often light may continue between sclera, surround and the cornea's mirror. 0 allows only light
+            straight from a lamp; each further one adds some noise and the same cost again.
+        obstacles: bodies in the scene's frame that hide and shade the eye.
     """
 
     def __init__(
@@ -74,8 +87,11 @@ class Renderer:
     def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()) -> RenderedWindow:
         """Render one window.
 
-        `moments` are the same window at moments of the exposure: their mean is the picture, with the samples shared
-        among them; labels, glints and margins are those of `job`, the middle of the exposure.
+        Args:
+            job: what to render.
+            spp: samples per pixel; None: those of the renderer.
+            moments: the same window at moments of the exposure. Their mean is the image, with the samples shared among
+                them; labels, glints and margins are those of `job`, the middle of the exposure.
 
         Raises:
             InputError: numbers so extreme that the image is not finite.
@@ -93,7 +109,7 @@ class Renderer:
         irradiance = frozen(blurred * exposure.radiance_to_irradiance(job.sensor), np.float32)
         if not np.all(np.isfinite(irradiance)):
             raise InputError("numbers of the scene are too extreme: its image is not finite")
-        # Of the irradiance as it is given away, so that exposing that again gives the same counts.
+        # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
         dn = exposure.expose(job.sensor, irradiance.astype(float), job.wavelength_nm, job.seed)
         margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
         return RenderedWindow(
@@ -112,7 +128,7 @@ class Renderer:
     def _picture(
         self, job: RenderJob, shown: Exposed, place: Surround | RegionScene, spp: int
     ) -> tuple[Floats, Mirrored, int]:
-        """Radiance of a window behind the lens, glints included; the glints; failed light paths."""
+        """Radiance of a window behind the lens, including the glints; the glints; failed light paths."""
         depth = float(job.camera.R[2] @ (job.anchor_mm - job.camera.nodal_point_mm))
         kernel = defocus.disc(defocus.confusion_px(job.lens, job.camera, job.sensor, depth))
         x0, y0, width, height = job.window
@@ -132,23 +148,26 @@ class Renderer:
         return mean_radiance(self._integrator, shown, job.window, spp or self.spp, job.seed)[0]
 
     def iris_irradiance(self, job: RenderJob, points_mm: Floats) -> Floats:
-        """Irradiance (n,) mW/mm^2 that points (n, 3) of the iris' plane (eye frame, mm) get from all lamps.
+        """Irradiance (n,) mW/mm^2 of points (n, 3) of the iris' plane (eye frame, mm) from all lamps.
 
         A lamp of finite size is represented by its centre.
         """
         shown, _ = self.bind(job)
         x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
-        corner = mi.Float(0)  # of the unit square: the disc's centre
+        corner = mi.Float(0)  # of the unit square, which is the disc's centre
         inside = dr.full(mi.Bool, True, len(points_mm))
         bent, _ = through_cornea(shown.values, shown.lights, shown.scene, x, inside, corner, corner)
         return np.asarray(bent.numpy(), dtype=float)
 
     def labels(self, job: RenderJob) -> PartLabels:
-        """The labels of a window alone."""
+        """Compute the labels of a window alone."""
         return part_labels(self.bind(job)[0], job.window)
 
     def bind(self, job: RenderJob) -> tuple[Exposed, Surround | RegionScene]:
-        """A job's frame on the device, with what stands around its eye; the integrator sees it until the next."""
+        """Set up a job's frame on the device, with the surroundings of its eye.
+
+        The integrator uses it until the next call.
+        """
         shown, place = self._stage.set(job)
         self._integrator.bind(shown.values, shown.lights, shown.textures)
         return shown, place

@@ -1,13 +1,13 @@
 """Camera rays and sample points of a window of the sensor, on Dr.Jit arrays.
 
-Places in the pixel: a rank-1 lattice, x = (k + 1/2) / N, y = frac((k a + 1/2) / N), with the a of the largest smallest
-distance, tiled over the sensor. The edges of a frame are thus sampled by one regular lattice, which places a contour
-far better than independent samples of the same number would (Sloan and Joe 1994, chapter 4). Its mean is the pixel's
-centre in every image: a random shift of the whole lattice would move the picture, but not the computed glints, by up to
-1 / (2 N) px.
+Places in the pixel form a rank-1 lattice, x = (k + 1/2) / N, y = frac((k a + 1/2) / N), with the a whose smallest
+distance is largest, tiled over the sensor. The edges of a frame are thus sampled by one regular lattice, which places a
+contour far better than the same number of independent samples (Sloan and Joe 1994, chapter 4). Its mean is the pixel's
+centre in every image: a random shift of the whole lattice would move the image, but not the computed glints, by up to 1
+/ (2 N) px.
 
-Places on the lamps: sample k at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018), the
-shift a hash of the pixel's place on the whole sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft
+Places on the lamps: sample k is at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018). The
+shift is a hash of the pixel's place on the whole sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft
 shadows show noise and no bands. Nothing depends on threads, on the window, or on what was rendered before.
 """
 
@@ -32,7 +32,7 @@ def lattice_generator(count: int) -> int:
     """The a, prime to `count`, whose lattice {(k, k a mod N)} / N has the largest smallest distance on the torus."""
     if count <= 2:
         return 1
-    # Long lattices: near the golden section every a is good, and the best of a few is found at once.
+    # For long lattices every a near the golden section is good, so the best of a few is found quickly.
     golden = round(count * 0.6180339887498949)
     choice = range(1, count) if count <= 1024 else range(max(1, golden - 64), min(count, golden + 64))
     k = np.arange(1, count)
@@ -65,7 +65,7 @@ class Samples:
         return mi.Point2f((mi.Float(k) + 0.5) * scale, (mi.Float((k * self._a) % self._n) + 0.5) * scale)
 
     def pair(self, k: mi.UInt32, call: int) -> mi.Point2f:
-        """Two further numbers of sample `k`, [0, 1)^2: each call of a pixel has a shift of its own."""
+        """Two further numbers of sample `k`, [0, 1)^2: each call of a pixel has its own shift."""
         tea: Any = mi.sample_tea_32
         return mi.Point2f(
             *(
@@ -76,13 +76,13 @@ class Samples:
 
 
 class Sampler:
-    """Sample `k` as Mitsuba's integrators ask for it."""
+    """Sample `k` with the interface of Mitsuba's integrators."""
 
     def __init__(self, samples: Samples, k: mi.UInt32) -> None:
         self._samples, self._k, self._calls = samples, k, 0
 
     def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
-        """The next pair, [0, 1)^2."""
+        """Next pair, [0, 1)^2."""
         del active
         self._calls += 1
         return self._samples.pair(self._k, self._calls - 1)

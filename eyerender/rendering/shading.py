@@ -1,4 +1,4 @@
-"""What one ray sees: lamps and surroundings on matte surfaces, the iris behind the cornea, and what wet ones mirror.
+"""Shading of one ray: light on matte surfaces, the iris behind the cornea, and mirroring by wet surfaces.
 
     L = (1 - F) / n^2 * albedo / pi * sum_l I_l (1 - F_l) cos(theta) / J_l
 
@@ -23,7 +23,7 @@ _THROUGH = 0.7  # share of the outer hemisphere that the iris sees, times transm
 
 @dataclass(frozen=True, slots=True)
 class Shaded:
-    """What a ray sees: radiance (mW/mm^2/sr), what it met, the albedo there where it is matte, failed light paths."""
+    """Result of a ray: radiance (mW/mm^2/sr), what it met, the albedo there where it is matte, failed light paths."""
 
     radiance: mi.Float
     view: View
@@ -42,7 +42,7 @@ def shade(
     u: mi.Float,
     v: mi.Float,
 ) -> Shaded:
-    """Radiance along rays of the scene's frame by light that comes from the lamps on the shortest way.
+    """Radiance along rays of the scene's frame, from light that comes from the lamps by the shortest way.
 
     u, v: place on each lamp's disc, [0, 1).
     """
@@ -54,7 +54,7 @@ def shade(
 
 
 def direct(view: View, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
-    """Radiance by the lamps' light on matte surfaces: of their irradiance, and of their sheen."""
+    """Radiance of matte surfaces lit by the lamps: from their irradiance, and from their sheen."""
     cover = dr.select(view.cornea, view.opacity, 1)
     return dr.select(view.met, cover * (albedo * outer * dr.inv_pi + shine), 0)
 
@@ -62,13 +62,13 @@ def direct(view: View, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi
 def indirect(
     values: Values, textures: Textures, scene: mi.Scene, view: View, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float
 ) -> mi.Float:
-    """Radiance but for that; `inner` is the lamps' irradiance in the plane of the iris."""
+    """Radiance other than `direct`; `inner` is the lamps' irradiance in the plane of the iris."""
     rest = mi.Float(0)
     index = values.inner_index
     if values.structure.ambient:
         ambience = textures.ambience
         assert ambience is not None
-        # Even light from all sides; through the cornea the iris sees n^2 times its radiance in a smaller cone.
+        # This is even light from all sides. Through the cornea the iris sees n^2 times its radiance in a smaller cone.
         cover = dr.select(view.cornea, view.opacity, 1)
         scene_of = values.point_to_scene
         axis = values.vector_to_scene(values.stop.normal)
@@ -77,7 +77,7 @@ def indirect(
         if values.structure.region:
             assert ambience.lids is not None
             reaching = ambience.lids.share(scene_of(view.point))
-            # Of the region only what is wet lies between the lids.
+            # Only the wet parts of the region are between the lids.
             even *= 1 - dr.clip(10 * view.gloss - 4.5, 0, 1) * (1 - reaching)
             within *= reaching
         rest += cover * albedo * even * dr.inv_pi

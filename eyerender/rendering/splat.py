@@ -1,4 +1,4 @@
-"""The lamps' mirror images in a picture: splatted where they are seen, with what hides the others."""
+"""Splatting of the lamps' visible mirror images into an image, with the reasons for those that are hidden."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .surround import Surround
 
 @dataclass(frozen=True, slots=True)
 class Mirrored:
-    """The first images (glints), (order, table) of the further ones asked for, and why each glint is seen or not."""
+    """The glints, (order, table) of the requested further images, and why each glint is visible or not."""
 
     glints: GlintTable
     others: tuple[tuple[int, GlintTable], ...]
@@ -27,7 +27,7 @@ class Mirrored:
 
 
 def add_glints(job: RenderJob, place: Surround | RegionScene, image: Floats) -> Mirrored:
-    """Add the lamps' mirror images that a job shows to its blurred picture (height, width)."""
+    """Add the mirror images of a job's lamps to its blurred image (height, width)."""
     eye, anchor, sigma = job.eye, job.anchor_mm, job.sensor.psf_sigma_px
 
     def clear(a: Floats, b: Floats) -> Bools:
@@ -43,7 +43,7 @@ def add_glints(job: RenderJob, place: Surround | RegionScene, image: Floats) -> 
         if order == 1:
             images = scene.images(job.lights, sigma)
         else:
-            # These images are small: their mirrors are strongly curved, or concave with a short focus.
+            # These images are small, because their mirrors are strongly curved, or concave with a short focus.
             nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in job.lights]
             images = purkinje_images(scene, eye, order, job.lights, nodes)
         tables[order], spots, ways = glint_table(scene, images)
@@ -56,7 +56,7 @@ def add_glints(job: RenderJob, place: Surround | RegionScene, image: Floats) -> 
 
 
 def _reason(job: RenderJob, place: Surround | RegionScene, image: Image, open_: Bools) -> str:
-    """Why a lamp's glint is seen or not; `open_` (k,) says where nothing stands in the ways of its points."""
+    """State whether or why not a lamp's glint is visible; `open_` (k,) marks the points that nothing blocks."""
     if not place.obstructed:
         open_ = np.ones(len(open_), dtype=bool)
     names: list[str | None] = [None] * len(open_)

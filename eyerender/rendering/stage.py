@@ -1,4 +1,4 @@
-"""What is kept from frame to frame, scenes, textures and maps, and a job's frame set up from it."""
+"""What is kept from frame to frame (scenes, textures, maps), and the set-up of a job's frame from it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NOTHING_PLAIN = frozen(np.zeros((1, 1)), np.bool_)
 
 
 class Stage:
-    """Scenes, textures and maps; `obstacles` stand in the scene's frame about eyes without a region."""
+    """Scenes, textures and maps; `obstacles` are in the scene's frame about eyes without a region."""
 
     def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
         self._surround = Surround(obstacles)
@@ -37,7 +37,7 @@ class Stage:
         self._maps = Maps()
 
     def set(self, job: RenderJob) -> tuple[Exposed, Surround | RegionScene]:
-        """The frame of a job, and what stands around its eye: moved to its pose until the next is set."""
+        """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call."""
         place = self._place(job)
         region = place if isinstance(place, RegionScene) else None
         structure = Structure(

@@ -36,9 +36,12 @@ class Bundle:
 class Surface:
     """One refracting surface; every number is a Dr.Jit array of size one.
 
-    `axes` are the unit axes of the surface's frame in the eye frame, or None if they are the eye's own. `shape` is
-    (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic. `eta` is the index before over the index
-    behind, for light that enters the eye.
+    Attributes:
+        origin: origin of the surface's frame.
+        axes: unit axes of the surface's frame in the eye frame, or None if they are the eye's own.
+        shape: (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic.
+        eta: index before over index behind, for light that enters the eye.
+        biconic: which of the two it is.
     """
 
     origin: mi.Vector3f
@@ -48,26 +51,26 @@ class Surface:
     biconic: bool
 
     def point_in(self, x: mi.Vector3f) -> mi.Vector3f:
-        """A point of the eye frame in the surface's frame."""
+        """Transform a point from the eye frame to the surface's frame."""
         return self.vector_in(x - self.origin)
 
     def vector_in(self, v: mi.Vector3f) -> mi.Vector3f:
-        """A direction of the eye frame in the surface's frame."""
+        """Transform a direction from the eye frame to the surface's frame."""
         if self.axes is None:
             return v
         return mi.Vector3f(*(dr.dot(axis, v) for axis in self.axes))
 
     def vector_out(self, v: mi.Vector3f) -> mi.Vector3f:
-        """A direction of the surface's frame in the eye frame."""
+        """Transform a direction from the surface's frame to the eye frame."""
         if self.axes is None:
             return v
         a, b, c = self.axes
         return a * v.x + b * v.y + c * v.z
 
     def hit(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool]:
-        """Distance to where a ray from outside enters, and whether it does; in the surface's frame.
+        """Distance to the point where a ray from outside enters, and whether it does, in the surface's frame.
 
-        The origin must stand within some centimetres, or single precision costs more than a micrometre.
+        The origin must be within some centimetres, or single precision costs more than a micrometre.
         """
         if self.biconic:
             Ry, Rz, py, pz, _ = self.shape
@@ -87,17 +90,17 @@ class Surface:
                 value, slope = self._sag_form(o + t * d)
                 step = value / dr.dot(slope, d)
                 t -= step
-            # A ray that meets the quadric and just misses the biconic jumps to and fro by centimetres.
+            # For a ray that meets the quadric and just misses the biconic, Newton's steps jump by centimetres.
             ok &= dr.abs(step) < _SETTLED_MM
         return t, ok
 
     def _sag_form(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f]:
-        """The biconic's F = x + g(y, z) and its gradient."""
+        """Biconic's F = x + g(y, z) and its gradient."""
         g, gy, gz, *_ = self._sag(x.y, x.z)
         return x.x + g, mi.Vector3f(1, gy, gz)
 
     def _sag(self, y: mi.Float, z: mi.Float) -> tuple[mi.Float, ...]:
-        """g, its two first and three second derivatives (yy, yz, zz)."""
+        """Sag g, its two first and three second derivatives (yy, yz, zz)."""
         Ry, Rz, py, pz, _ = self.shape
         cy, cz = 1 / Ry, 1 / Rz
         e = cy * y * y + cz * z * z
@@ -154,7 +157,7 @@ class Surface:
         return o + t * d, self.vector_out(w), 1 - fresnel(c, c2, self.eta), ok & (c > 0)
 
     def on_surface(self, x: mi.Vector3f) -> mi.Vector3f:
-        """The point of the surface (eye frame) over the same local (y, z) as a point near it."""
+        """Point of the surface (eye frame) at the same local (y, z) as a point near it."""
         l = self.point_in(x)
         if self.biconic:
             sag = -self._sag(l.y, l.z)[0]
@@ -162,7 +165,7 @@ class Surface:
             ax, ay, az, b, c = self.shape
             C = ay * l.y * l.y + az * l.z * l.z + c
             sag = -C / (b + dr.sqrt(dr.maximum(b * b - ax * C, 1e-3)))
-        # Single precision: the change is small, the point is not.
+        # In single precision the change must be computed apart from the point, because it is much smaller.
         return x + self.vector_out(mi.Vector3f(sag - l.x, 0, 0))
 
     def refract_bundle(self, b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:

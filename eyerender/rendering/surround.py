@@ -1,8 +1,8 @@
-"""Everything in the scene that is not the eye: the matte surround and whatever else stands in the way.
+"""Everything in the scene that is not the eye: the matte surround and other obstacles.
 
-It keeps still in the scene's frame (the world's axes, origin at the apex of the unrotated eye), so neither a pose nor a
-camera rebuilds it. The surround is a plane of matte skin behind the apex, the globe protrudes through it: honest, since
-lids and brow are not modelled.
+It is fixed in the scene's frame (the world's axes, origin at the apex of the unrotated eye), so neither a pose nor a
+camera rebuilds it. The surround is a plane of matte skin behind the apex, through which the globe protrudes. It does
+not imitate lids and brow, because these are not modelled here.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Surround:
     """The Mitsuba scene of the surround; `show` changes its look in place."""
 
     def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
-        # Without robust intersections rays slip between neighbouring triangles, on some processors.
+        # Without robust intersections rays slip between neighbouring triangles on some processors.
         parts: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True, "backdrop": self._backdrop()}
         for i, body in enumerate(obstacles):
             material = _matte(mi.TensorXf(np.full((1, 1, 1), body.albedo, np.float32)))
@@ -47,14 +47,14 @@ class Surround:
         self._shown: tuple[float, float, float] | None = None
 
     def show(self, look: Look) -> None:
-        """Bring the surround to a look: its plane, albedo and unevenness."""
+        """Update the surround to a look: its plane, albedo and unevenness."""
         wanted = (look.backdrop_distance_mm, look.backdrop_albedo, look.backdrop_contrast)
         if wanted == self._shown:
             return
         if self._shown is None or self._shown[0] != wanted[0]:
             self._params["backdrop.vertex_positions"] = mi.Float(_corners(wanted[0]).ravel())
         tile = wanted[1] * (1 + wanted[2] * (skin_texture(1) - 1))
-        names: list[str] = list(self._params.keys())  # iterating itself gives pairs
+        names: list[str] = list(self._params.keys())  # iterating over it would give pairs
         (key,) = (k for k in names if k.startswith("backdrop") and k.endswith("reflectance.data"))
         self._params[key] = mi.TensorXf(np.clip(tile, 0.0, 0.98).astype(np.float32)[..., None])
         self._params.update()
@@ -77,11 +77,11 @@ def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:
 
 
 def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> mi.Ray3f:
-    """Rays from points (n, 3) towards points b, both ends left out by `margin_mm`."""
+    """Rays from points (n, 3) towards points b, without the last `margin_mm` at both ends."""
     length = np.linalg.norm(b - a, axis=-1)
     d = (b - a) / length[:, None]
     table = np.column_stack([a + margin_mm * d, d, length - 2 * margin_mm]).astype(np.float32)
-    # Gathered from one buffer: the kernel would depend on the alignment of every array that NumPy owns.
+    # The values are gathered from one buffer, else the kernel would depend on the alignment of every NumPy array.
     buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 7
     o = [dr.gather(mi.Float, buffer, row + k) for k in range(7)]
     ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:6]))

@@ -1,7 +1,7 @@
 """The parameters of a frame on the device, as opaque Dr.Jit arrays of size one.
 
-A literal that changes between frames would be compiled into the kernel, so everything that can change goes through
-here. What shapes the kernel (the kinds of surfaces, whether the lens distorts) is the `Structure`.
+A literal that changes between frames would be compiled into the kernel, so everything that can change is stored here.
+What determines the kernel (the kinds of surfaces, whether the lens distorts) is the `Structure`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ LIGHT_WIDTH = 10  # position 3, axis 3, radius, intensity, lobe exponent, inner 
 
 
 def aligned(values: NDArray[Any]) -> NDArray[Any]:
-    """A copy that starts at a multiple of 64 bytes.
+    """Copy an array so that it starts at a multiple of 64 bytes.
 
-    Dr.Jit shares NumPy's memory. It gathers several numbers at once only from memory that is aligned, so without this
-    the place of an allocation would decide which kernel a frame is compiled to.
+    Dr.Jit shares NumPy's memory. It gathers several numbers at once only from aligned memory, so without this the place
+    of an allocation would decide which kernel is compiled for a frame.
     """
     memory = np.empty(values.nbytes + _ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % _ALIGNMENT
@@ -83,24 +83,24 @@ class Values:
         self.ambient_irradiance = found.ambient_irradiance
 
     def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
-        """A point of the scene's frame in the eye frame: M^T (x - t)."""
+        """Transform a point from the scene's frame to the eye frame: M^T (x - t)."""
         return self.vector_to_eye(x - self.pose.shift)
 
     def vector_to_eye(self, v: mi.Vector3f) -> mi.Vector3f:
-        """A direction of the scene's frame in the eye frame: M^T v."""
+        """Transform a direction from the scene's frame to the eye frame: M^T v."""
         return mi.Vector3f(*(dr.dot(column, v) for column in self.pose.columns))
 
     def vector_to_scene(self, v: mi.Vector3f) -> mi.Vector3f:
-        """A direction of the eye frame in the scene's frame: M v."""
+        """Transform a direction from the eye frame to the scene's frame: M v."""
         a, b, c = self.pose.columns
         return a * v.x + b * v.y + c * v.z
 
     def point_to_scene(self, x: mi.Vector3f) -> mi.Vector3f:
-        """A point of the eye frame in the scene's frame: M x + t."""
+        """Transform a point from the eye frame to the scene's frame: M x + t."""
         return self.vector_to_scene(x) + self.pose.shift
 
 
-HARMONICS = 32  # of the pupil's boundary, at most
+HARMONICS = 32  # largest number for the pupil's boundary
 
 
 class PupilBoundary:
@@ -162,7 +162,7 @@ class Lamp:
     inner_radius: mi.Float
 
     def point(self, u: mi.Float, sine: mi.Float, cosine: mi.Float) -> mi.Vector3f:
-        """A point of the emitting disc or ring, uniform by area: u in [0, 1) and a direction in its plane."""
+        """Point of the emitting disc or ring, uniform by area: u in [0, 1) and a direction in its plane."""
         e1, e2 = mi.coordinate_system(self.axis)
         inner = self.inner_radius * self.inner_radius
         r = dr.sqrt(inner + u * (self.radius * self.radius - inner))
@@ -171,7 +171,7 @@ class Lamp:
     def radiant_intensity(self, direction: mi.Vector3f) -> mi.Float:
         """Radiant intensity (mW/sr) into a unit direction that leaves the lamp."""
         c = dr.dot(direction, self.axis)
-        # A Lambertian lamp, the usual one, is spared the power.
+        # A Lambertian lamp, the usual one, needs no power function.
         lobe = dr.if_stmt(
             (c, self.exponent),
             self.exponent != 1,

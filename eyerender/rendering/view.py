@@ -1,7 +1,7 @@
-"""What a camera ray meets: the exact surfaces of the eye, or the scene; and the albedo there.
+"""Intersection of camera rays with the exact surfaces of the eye or with the scene, and the albedo there.
 
-A ray meets the eye in closed form (the exact surfaces, not a mesh of them) and everything else by Embree or OptiX; the
-nearer counts. Through the clear cornea it goes on to the plane of the iris.
+A ray is intersected with the eye in closed form (the exact surfaces, not a mesh) and with everything else by Embree or
+OptiX; the nearer hit is used. Through the clear cornea the ray continues to the plane of the iris.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .environment import Ambience
     from .region import SkinGeometry
 
-EPSILON_MM = 2e-3  # lengths below are one and the same point in single precision
+EPSILON_MM = 2e-3  # points closer than this are the same in single precision
 _NEAR_MM = 20.0
 _FAR = float(np.finfo(np.float32).max)
 _WET = 0.8  # gloss of the sclera
@@ -29,7 +29,7 @@ _WET = 0.8  # gloss of the sclera
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What a camera ray meets, points and normals in the eye frame."""
+    """What a camera ray meets, with points and normals in the eye frame."""
 
     cornea: mi.Bool  # it enters through the clear part of the cornea
     sclera: mi.Bool
@@ -55,7 +55,7 @@ class View:
 
     @property
     def lit_inside(self) -> mi.Bool:
-        """Whether light behind the cornea is seen."""
+        """Whether light from behind the cornea is visible."""
         return self.cornea & (self.opacity < 1) & (self.passed > 0)
 
     @property
@@ -75,9 +75,9 @@ class Textures:
 
     @classmethod
     def of_seed(cls, seed: int) -> Textures:
-        """The textures of one eye."""
+        """Make the textures of one eye."""
         rows = iris_texture(seed)
-        # Repeated, so that the angle wraps; the ends along the radius are kept apart by rows of their own.
+        # The texture repeats so that the angle wraps. Additional rows separate the ends along the radius.
         rows = np.concatenate([rows[:1], rows, rows[-1:]])
         texture: Any = mi.Texture2f
         iris = texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
@@ -86,7 +86,7 @@ class Textures:
 
 
 def opacity(values: Values, rho: mi.Float) -> mi.Float:
-    """How much of the cornea's rim has turned to sclera at radius `rho` (mm): a smooth step that ends at the limbus."""
+    """Share by which the cornea's rim has turned to sclera at radius `rho` (mm): a smooth step up to the limbus."""
     s = dr.clip((rho - values.limbus.radius) * values.limbus.gain + 1, 0, 1)
     return s * s * (3 - 2 * s)
 
@@ -96,7 +96,7 @@ def look(
 ) -> View:
     """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris.
 
-    `region` is the skin of an eye region, whose normals and albedos then count.
+    `region` is the skin of an eye region, whose normals and albedos are then used.
     """
     view, hit = meet(values, scene, o, d, active)
     if region is not None:
@@ -116,8 +116,8 @@ def look(
 def meet(
     values: Values, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool
 ) -> tuple[View, mi.PreliminaryIntersection3f]:
-    """The view of the globe along camera rays, and what Embree or OptiX hits: nothing is said yet of its surface."""
-    # Single precision: start next to the eye.
+    """View of the globe along camera rays, and the hit of Embree or OptiX, whose surface is not evaluated yet."""
+    # In single precision the ray must start next to the eye.
     t0 = -dr.dot(o, d) - _NEAR_MM
     oe, de = values.point_to_eye(o + t0 * d), values.vector_to_eye(d)
     front = values.surfaces[0]
@@ -127,15 +127,15 @@ def meet(
     rho = dr.sqrt(yl.y * yl.y + yl.z * yl.z)
     on_cornea &= (rho < values.limbus.radius) & (yl.x > values.limbus.floor)
     ts, on_sclera = meet_sphere(oe - values.sclera.centre, de, values.sclera.radius)
-    # The sphere's front lies behind the cornea, so a ray that meets it first has met no clear cornea: no cracks, even
-    # where the rim of a tilted or toric cornea is no circle of the sphere.
+    # The sphere's front is behind the cornea, so a ray that meets the sphere first has met no clear cornea. This avoids
+    # cracks, even where the rim of a tilted or toric cornea is no circle of the sphere.
     on_cornea &= ~on_sclera | (tc < ts)
     on_sclera &= ~on_cornea
     t_eye = t0 + dr.select(on_cornea, tc, ts)
     amodal_cornea, amodal_sclera = on_cornea & (t_eye > EPSILON_MM), on_sclera & (t_eye > EPSILON_MM)
     on_eye = amodal_cornea | amodal_sclera
     ray = mi.Ray3f(mi.Point3f(o), d)
-    ray.maxt = dr.select(on_eye, t_eye, _FAR)  # what lies behind the eye does not matter
+    ray.maxt = dr.select(on_eye, t_eye, _FAR)  # whatever is behind the eye does not matter
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     on_eye &= ~hit.is_valid() & active
     on_cornea &= on_eye
@@ -171,7 +171,7 @@ def meet(
 def _look_around(
     values: Values, hit: mi.PreliminaryIntersection3f, o: mi.Vector3f, d: mi.Vector3f, other: mi.Bool
 ) -> View:
-    """The view of rays that meet something of the surround, where `other`."""
+    """View of rays that meet something of the surround, where `other`."""
     flags = mi.RayFlags.Minimal | mi.RayFlags.UV
     interaction = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(o), d), flags, other)
     view = _matte(values, mi.Vector3f(interaction.p), mi.Vector3f(interaction.n), d, other)
@@ -181,14 +181,14 @@ def _look_around(
 def look_at_skin(
     values: Values, region: SkinGeometry, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, other: mi.Bool
 ) -> View:
-    """The view of rays that meet places on triangles of an eye region, where `other`."""
+    """View of rays that meet places on triangles of an eye region, where `other`."""
     skin = region.surface(face, uv, other)
     view = _matte(values, skin.point, skin.normal, d, other)
     return replace(view, albedo=skin.albedo, gloss=skin.gloss)
 
 
 def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector3f, other: mi.Bool) -> View:
-    """The view of matte points of the scene; normals are turned to the viewer."""
+    """View of matte points of the scene; normals are turned to the viewer."""
     normal = values.vector_to_eye(facing)
     normal = dr.select(dr.dot(normal, values.vector_to_eye(d)) > 0, -normal, normal)
     no, nothing = mi.Bool(False), mi.Float(0)
@@ -289,13 +289,13 @@ def outer_albedo(values: Values, textures: Textures, view: View, active: mi.Bool
 
 def _sclera_albedo(values: Values, textures: Textures, point: mi.Vector3f) -> mi.Float:
     r = point - values.sclera.centre
-    # Azimuthal equidistant map of the front of the globe, from the pole out to 108 degrees.
+    # The map of the globe's front is azimuthal equidistant, from the pole out to 108 degrees.
     polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / (0.6 * dr.pi)
     inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
     uv = mi.Point2f(0.5 + 0.5 * polar * r.y * inv, 0.5 + 0.5 * polar * r.z * inv)
     texture = textures.sclera.eval(uv)[0]
     sclera = values.sclera.albedo * dr.maximum(1 + values.sclera.contrast * (texture - 1), 0.02)
-    # The limbus' grey ring fades into the white over its width, on the side of the sclera.
+    # The grey ring of the limbus fades into the white over its width, on the side of the sclera.
     local = values.surfaces[0].point_in(point)
     away = dr.sqrt(local.y * local.y + local.z * local.z) - values.limbus.radius
     s = dr.clip(0.5 + 0.5 * away * values.limbus.gain, 0, 1)
