@@ -1,4 +1,4 @@
-"""The simplest usual pupil finder, as a baseline to measure others against: threshold, contour, ellipse."""
+"""The simplest common pupil finder, as a baseline: threshold, contour, ellipse."""
 
 from __future__ import annotations
 
@@ -19,14 +19,20 @@ _RADIUS_PX = (7.0, 160.0)
 def contour_pupil(
     image: NDArray[np.generic], *, bit_depth: int, radius_px: Sequence[float] | None = None
 ) -> RotatedRect | str:
-    """OpenCV's rotated rectangle (centre, full axes, degrees) of the pupil in a (h, w) image; or why there is none.
+    """Find the pupil as OpenCV's rotated rectangle (centre, full axes, degrees); a string gives the reason for failure.
 
-    Smoothing by a 5 x 5 Gaussian; Otsu's threshold, and again among what lies below it, which parts the pupil from the
-    iris; of the dark regions of a likely size that neither touch the frame nor have less than 0.7 of their hull's
-    area, the largest; `cv2.fitEllipse` on its contour. The contour runs through the centres of the outermost dark
-    pixels, so the axes come out about half a pixel short: that is the baseline's, not mended here.
+    The image is smoothed with a 5 x 5 Gaussian. Otsu's threshold is applied, and again to the part below it, which
+    separates the pupil from the iris. Dark regions of a likely size are kept if they do not touch the frame and fill at
+    least 0.7 of their hull. `cv2.fitEllipse` is applied to the contour of the largest one. The contour runs through the
+    centres of the outermost dark pixels, so the axes are about half a pixel too short. This error belongs to the
+    baseline and is not corrected.
 
-    radius_px: (2,) smallest and largest semi-axis looked for. Source of the threshold: Otsu (1979).
+    Source of the threshold: Otsu (1979).
+
+    Args:
+        image: (h, w) image.
+        bit_depth: bits of the image.
+        radius_px: (2,) smallest and largest semi-axis to look for.
     """
     full = float(2**bit_depth - 1) if image.dtype.kind in "ui" else float(image.max())
     if full <= 0.0:
@@ -59,7 +65,7 @@ def contour_pupil(
 
 
 def _levels(smooth: Bytes) -> list[float]:
-    """Otsu's threshold of all that lies below Otsu's threshold; then the first one."""
+    """Otsu's threshold of everything below Otsu's threshold, then the first threshold."""
     first = float(cv2.threshold(smooth, 0, 255, cv2.THRESH_OTSU)[0])
     dark = smooth[smooth <= first]
     if dark.size < 16 or dark.min() == dark.max():

@@ -1,4 +1,4 @@
-"""From an image to the pupil and the glints."""
+"""The extraction of pupil and glints from an image, step by step."""
 
 from __future__ import annotations
 
@@ -39,12 +39,19 @@ def extract(
     gamma: float = 1.0,
     settings: ExtractionSettings | None = None,
 ) -> Extraction:
-    """The pupil ellipse and the glints of a single-channel image.
+    """Find the pupil ellipse and the glints of a single-channel image.
 
-    image: (h, w) array of unsigned integers (full scale 2^bit_depth - 1, or that of the type) or floats.
-    gamma: the image stores intensity^(1 / gamma); 1 for linear data.
-    Raises `InputError` for what is no single-channel image or contradicts bit_depth; whatever an image may show,
-    nothing at all included, is a result with a status and a reason.
+    Args:
+        image: (h, w) array of unsigned integers (full scale 2^bit_depth - 1, or that of the type) or floats.
+        bit_depth: bits of an integer image; None: those of its type.
+        gamma: the image stores intensity^(1 / gamma); 1 for linear data.
+        settings: settings of the extractor.
+
+    Returns:
+        What was found. Whatever an image shows, even nothing, gives a result with a status and a reason.
+
+    Raises:
+        InputError: it is not a single-channel image, or it contradicts bit_depth.
     """
     settings = settings or ExtractionSettings()
     prepared = prepare(image, bit_depth, gamma)
@@ -66,12 +73,12 @@ def extract(
 
 
 def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -> Extraction:
-    """The pupil whose boundary was found, with the glints about it."""
+    """Complete a boundary to a result: the pupil, with the glints around it."""
     size = (int(prepared.linear.shape[0]), int(prepared.linear.shape[1]))
     noise = prepared.noise_dn / DN
     model = found.model
     refined = settings.method == "refined"
-    pupil = None if refined else pupil_of(found, None, settings)  # no glint moves a fast one
+    pupil = None if refined else pupil_of(found, None, settings)  # glints do not affect a fast fit
     if pupil is not None and not pupil.ok:
         return Extraction(pupil, (), (), noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
@@ -87,13 +94,17 @@ def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -
 
 
 def _refined(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[PixelFit | None, SpotFit]:
-    """The pixel model's fit to the image without the spots, if there is one that goes with the edges; and the spots."""
+    """Fit the pixel model to the image without the spots.
+
+    Returns:
+        The fit, None where it contradicts the edges, and the spots.
+    """
     cleared = _cleared(prepared, found, spots, fit)
     first = _boundary_fit(found, cleared)
     on_boundary = None if first is None else _on_boundary(spots, fit, first.model)
     if first is None or on_boundary is None:
         return first, fit
-    # A spot and the boundary below it were each fitted with a rough idea of the other.
+    # A spot and the boundary below it were each fitted with a rough estimate of the other.
     fit = _fitted_again(prepared, found.image, spots, fit, on_boundary, first.model)
     again = _cleared(prepared, found, spots, fit)
     if cv2.norm(again[0], cleared[0], cv2.NORM_INF) < SAME_LIGHT * prepared.noise_dn:
@@ -102,7 +113,7 @@ def _refined(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tu
 
 
 def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[Image, Bools]:
-    """The image less the light of spots that their fits tell, and the pixels where spots are still in the way."""
+    """Image without the light of well-fitted spots, and mask of the pixels that other spots affect."""
     if found.image.inverted:
         return found.image.linear, affected_pixels(prepared, spots)
     known = well_fitted(prepared, fit)
@@ -113,13 +124,13 @@ def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tu
 def _boundary_fit(found: Found, cleared: tuple[Image, Bools], before: PixelFit | None = None) -> PixelFit | None:
     try:
         fit = refine(cleared[0], found.model, found.sectors, cleared[1], found.image.noise_dn, before)
-    except np.linalg.LinAlgError:  # the pixels do not tell the parameters apart
+    except np.linalg.LinAlgError:  # the pixels do not determine the parameters
         return None
     return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None
 
 
 def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> Bools | None:
-    """(n,) the spots whose window reaches the boundary, or None."""
+    """Spots (n,) whose window reaches the boundary, or None."""
     apart = np.abs(signed_distance(model.ellipse, spots.xy_px))
     on_boundary = fit.converged & (apart < window_radius(spots.width_px) + 3.0 * model.sigma_px)
     return np.asarray(on_boundary) if on_boundary.any() else None
@@ -128,7 +139,7 @@ def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> Bools | None:
 def _fitted_again(
     prepared: Prepared, work: Prepared, spots: Spots, fit: SpotFit, on_boundary: Bools, model: EdgeModel
 ) -> SpotFit:
-    """The spots on the boundary fitted before the refined boundary, where that explains them as well."""
+    """Fit the spots on the boundary again with the refined boundary, and use these fits where they are no worse."""
     linear, _ = subtract_spots(prepared, fit, fit.converged & ~on_boundary, model.ellipse)
     starts = (spots.xy_px[on_boundary], spots.width_px[on_boundary], spots.height_dn[on_boundary])
     again = fit_spots(linear, _background(work, model), *starts, _limits(prepared, model)).fit
@@ -139,12 +150,12 @@ def _fitted_again(
 
 
 def _agrees(fit: PixelFit, found: Found) -> bool:
-    """Whether the refined boundary still passes along the edges, and is no less certain than they make it.
+    """Whether the refined boundary agrees with the edges and is at least as certain as they are.
 
-    It may move by what noise and texture move it, no more; and where glints leave it too few pixels, it is of no use.
+    Noise and texture may move it, but no more. Where glints leave too few pixels, it is not used.
     """
     by_edges = boundary_deviation(found.boundary.ellipse, found.covariance)
-    # Both are estimates from a few dozen sectors, which scatter by a fifth and more.
+    # Both are estimates from a few dozen sectors, which scatter by a fifth or more.
     if boundary_deviation(fit.ellipse, fit.covariance) > 2.0 * by_edges:
         return False
     boundary = found.boundary
@@ -156,7 +167,10 @@ def _agrees(fit: PixelFit, found: Found) -> bool:
 
 
 def _fit_spots(prepared: Prepared, found: Found, spots: Spots) -> tuple[Spots, SpotFit]:
-    """The spots fitted before the boundary as the edges have it; blends count as the spots they split into."""
+    """Fit the spots on top of the boundary from the edges.
+
+    Blends are replaced by the spots into which they split.
+    """
     model = found.model
     known, limits = _background(found.image, model), _limits(prepared, model)
     starts = (spots.xy_px, spots.width_px, spots.height_dn)
@@ -168,7 +182,7 @@ def _fit_spots(prepared: Prepared, found: Found, spots: Spots) -> tuple[Spots, S
 
 
 def _background(work: Prepared, model: EdgeModel) -> Callable[[Floats, Floats], Floats]:
-    """Level without spots at pixels (x, y), up to a constant, which their fit has anyway."""
+    """Level without spots at pixels (x, y), up to a constant, which the spots' fit contains."""
     return (lambda x, y: -model.level(x, y)) if work.inverted else model.level
 
 

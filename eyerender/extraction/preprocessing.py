@@ -1,4 +1,4 @@
-"""From whatever was read to linear grey levels: type, depth, gamma, clip level and noise."""
+"""Conversion of an input image to linear grey levels: type, depth, gamma, clip level and noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DN = 255.0  # grey levels of full scale; every level inside the extractor is in 
 
 
 def as_image(array: NDArray[np.generic]) -> Image:
-    """float32 without a copy where it is that already (OpenCV's types say less than it returns)."""
+    """Convert to float32, without a copy where possible (OpenCV's types are less precise than what it returns)."""
     return np.asarray(array, dtype=np.float32)
 
 
@@ -42,10 +42,16 @@ class Prepared:
 
 
 def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | str:
-    """The prepared image, or the reason why nothing can be found in it.
+    """Prepare an image, or give the reason why nothing can be found in it.
 
-    image: (h, w) integers (full scale 2^bit_depth - 1; without bit_depth, that of the type) or floats (linear scale
-    free). gamma: the image stores intensity^(1 / gamma). Raises `InputError` for what is no single-channel image.
+    Args:
+        image: (h, w) integers (full scale 2^bit_depth - 1; without bit_depth, that of the type) or floats (any linear
+            scale).
+        bit_depth: bits of an integer image.
+        gamma: the image stores intensity^(1 / gamma).
+
+    Raises:
+        InputError: it is not a single-channel image.
     """
     array = _checked(image)
     if not (np.isfinite(gamma) and 0.1 <= gamma <= 10.0):
@@ -66,9 +72,9 @@ def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | st
     if low == high:
         name = "all black" if high == 0.0 else "all white" if high >= clip else "of one grey level"
         return f"the image is {name}"
-    # Rounding to integers is noise of 1/sqrt(12) of a step.
+    # Rounding to integers adds noise of 1/sqrt(12) of a step.
     noise = max(estimate_noise(linear), quantum / np.sqrt(12.0), 1e-3)
-    # A sensor's own noise comes after its wells are full: clipped pixels scatter a little below full scale.
+    # Sensor noise is added after the wells are full, so clipped pixels scatter slightly below full scale.
     if np.isfinite(clip):
         clip -= float(np.clip(3.0 * noise, 0.004 * DN, 0.02 * DN))
     return Prepared(linear, clip, float(noise))
@@ -99,7 +105,7 @@ def _from_integers(array: NDArray[np.generic], bit_depth: int | None, gamma: flo
         return np.multiply(array, np.float32(DN / full), dtype=np.float32), DN, DN / full
     table = (DN * (np.arange(full + 1) / full) ** gamma).astype(np.float32)
     linear = table[array.astype(np.intp, copy=False)]
-    # The decoded step at the image's own middle level.
+    # This is the decoded step at the image's own middle level.
     middle = max(int(median(array[::4, ::4].ravel())), 1)
     return linear, DN, float(table[middle] - table[middle - 1])
 
@@ -118,7 +124,7 @@ def _from_float(array: NDArray[np.generic], gamma: float) -> Image | str:
         return "the image holds no positive intensity"
     with np.errstate(over="ignore"):
         values = values * (DN / (1.7 * scale))
-    # float32 overflows at 3e38, and squares are taken.
+    # float32 overflows at 3e38, and values are squared.
     if not np.abs(values).max() < 1e12:
         return "the image's range is too large"
     return values.astype(np.float32)
@@ -136,7 +142,7 @@ def estimate_noise(linear: Image) -> float:
     a, b = linear[:-1:step, :-1:step], linear[:-1:step, 1::step]
     c, d = linear[1::step, :-1:step], linear[1::step, 1::step]
     difference = np.abs(a - b - c + d).ravel()
-    # Flat areas that sensor clipping made exactly constant say nothing about the noise.
+    # Flat areas that clipping made constant contain no information on the noise.
     moving = difference[difference > 0.0]
     if moving.size < 0.05 * difference.size:
         return 0.0
@@ -145,10 +151,10 @@ def estimate_noise(linear: Image) -> float:
 
 
 def invert(prepared: Prepared) -> Prepared:
-    """The negative, for bright pupils: level -> ceiling - level, with the ceiling above the pupil.
+    """Invert an image for bright pupils: level -> ceiling - level, with the ceiling above the pupil.
 
-    Glints, brighter than the pupil, become dark specks; they are cut at the ceiling, the 99th percentile of the
-    smoothed image, so that a bright pupil's own level stays apart from them.
+    Glints, which are brighter than the pupil, become dark specks. They are cut at the ceiling, the 99th percentile of
+    the smoothed image, so that a bright pupil's own level differs from them.
     """
     smooth = cv2.medianBlur(prepared.linear, 5)
     ceiling = quantile(smooth[::2, ::2].ravel(), 0.999) + 3.0 * prepared.noise_dn

@@ -1,4 +1,4 @@
-"""What the extractor reports: a pupil and glints, each found or not, with the reason."""
+"""Results of the extractor: a pupil and glints, each with a status and, where it is missing, a reason."""
 
 from __future__ import annotations
 
@@ -51,11 +51,17 @@ class Goodness:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PupilResult:
-    """The pupil, or why there is none.
+    """The pupil, or the reason why there is none.
 
-    covariance: (5, 5) of (cx, cy, a, b, angle), px and rad. confidence: probability that the ellipse overlaps the true
-    one with IoU > 0.9. contour_px: (n, 2) the edge points the fit rests on. Where the status is NOT_FOUND, `stage` and
-    `reason` say what failed, confidence is 0 and the rest is None or empty.
+    Attributes:
+        status: OK, or NOT_FOUND.
+        stage: the stage that failed; None for a pupil.
+        reason: why it failed.
+        ellipse: the ellipse.
+        covariance: (5, 5) of (cx, cy, a, b, angle), px and rad.
+        confidence: probability that the ellipse overlaps the true one with IoU > 0.9; 0 for a missing pupil.
+        goodness: how well the ellipse explains the image.
+        contour_px: (n, 2) edge points of the fit.
     """
 
     status: Status
@@ -74,7 +80,7 @@ class PupilResult:
 
     @staticmethod
     def missing(stage: Stage, reason: str) -> PupilResult:
-        """No pupil: the stage that failed and why."""
+        """Make a missing pupil from the stage that failed and the reason."""
         return PupilResult(status=Status.NOT_FOUND, stage=stage, reason=f"{stage}: {reason}")
 
 
@@ -82,9 +88,14 @@ class PupilResult:
 class GlintResult:
     """One bright spot.
 
-    xy_px: (2,). covariance: (2, 2) px^2. amplitude: peak over the background as a share of full scale (the fitted one:
-    above 1 for a clipped spot). sigma_px: of the spot. status: OK, or REJECTED for a reflection that is no glint of the
-    cornea, with the reason.
+    Attributes:
+        status: OK, or REJECTED for a reflection that is not a glint of the cornea.
+        reason: why it was rejected.
+        xy_px: (2,) centre.
+        covariance: (2, 2) px^2.
+        amplitude: fitted peak over the background as a share of full scale; above 1 for a clipped spot.
+        sigma_px: standard deviation of the spot.
+        saturated: whether it is clipped.
     """
 
     status: Status
@@ -103,11 +114,17 @@ class GlintResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extraction:
-    """All that was found in one image; coordinates are relative to it, pixel centres at integers.
+    """Everything that was found in one image; coordinates are relative to it, pixel centres at integers.
 
-    glints: accepted ones, brightest first. rejected: reflections turned down, each with its reason. noise: standard
-    deviation of a pixel's noise as a share of full scale. Full scale is the largest code of the stated bit depth; a
-    float image's full scale is 1.7 times its 99.5th percentile.
+    Full scale is the largest code of the stated bit depth. A float image's full scale is 1.7 times its 99.5th
+    percentile.
+
+    Attributes:
+        pupil: the pupil.
+        glints: accepted glints, brightest first.
+        rejected: rejected reflections, each with its reason.
+        noise: standard deviation of a pixel's noise as a share of full scale.
+        shape: (h, w) of the image.
     """
 
     pupil: PupilResult

@@ -1,4 +1,4 @@
-"""What the extractor may be told: polarity, sizes, and how much work to spend."""
+"""Settings of the extractor: polarity, sizes and effort."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..spec import Positive, Spec
 class ExtractionSettings(Spec):
     """Settings of `extract`; the defaults suit dark pupils in 320 x 240 to 1280 x 1024 images.
 
-    Nothing here is tuned to a data set: thresholds follow the image's own noise and contrast.
+    Nothing here is tuned to a data set: thresholds adapt to the image's own noise and contrast.
     """
 
     method: Literal["fast", "refined"] = Field(

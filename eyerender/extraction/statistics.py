@@ -1,4 +1,7 @@
-"""Medians and quantiles of one row of values; numpy's own spend several times as long on their options."""
+"""Medians and quantiles of one row of values.
+
+Numpy's own functions take several times as long because of their options.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +13,12 @@ from numpy.typing import NDArray
 
 
 def median(values: NDArray[Any]) -> float:
-    """The median of (n,) values; the mean of the middle two where n is even, NaN of none."""
+    """Median of (n,) values: the mean of the middle two where n is even, NaN for none."""
     return quantile(values, 0.5)
 
 
 def quantile(values: NDArray[Any], share: float) -> float:
-    """The value below which `share` of (n,) values lie, linear between neighbours; NaN of none."""
+    """Value below which `share` of (n,) values lie, by linear interpolation; NaN for none."""
     if values.size == 0:
         return math.nan
     at = share * (values.size - 1)

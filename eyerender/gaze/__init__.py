@@ -1,4 +1,4 @@
-"""Gaze estimators: observations of known targets in, a calibrated estimator out; observations in, gaze points out.
+"""Gaze estimators: fitted to observations of known targets, they estimate the gaze points of other observations.
 
     gaze = er.gaze.Regression("R3").fit(truth, rig).predict(found, rig)
 

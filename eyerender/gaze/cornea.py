@@ -18,19 +18,23 @@ import numpy as np
 from ..arrays import ArrayValue, Bools, Floats, frozen
 from .rays import unit
 
-# Distances of a cornea from its camera that are tried to start from, in corneal radii: 30 mm to 10 m.
+# Starting distances of a cornea from its camera, in corneal radii: 30 mm to 10 m.
 _START = np.geomspace(4.0, 1300.0, 12)
 _ITERATIONS = 60
-# Two rays closer than this to one plane's normal leave the line to the centre undefined (rad).
+# If two rays are closer than this to one plane's normal (rad), the line to the centre is undefined.
 COPLANAR = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorneaCentres(ArrayValue):
-    """Centres (..., 3) mm, distances (..., m) mm of the mirror points along their rays, the disagreement (...) mm.
+    """Centres of corneal curvature.
 
-    `residual_mm` is the root mean square distance of the single glints' centres from their mean (method A), or of the
-    centre from the line it must lie on (method B); `ok` (...) is False where no centre was found.
+    Attributes:
+        centre_mm: (..., 3) centres.
+        distance_mm: (..., m) distances of the mirror points along their rays.
+        residual_mm: (...) root mean square distance of the single glints' centres from their mean (method A), or
+            distance of the centre from the line on which it must lie (method B).
+        ok: (...) False where no centre was found.
     """
 
     centre_mm: Floats
@@ -83,7 +87,8 @@ def from_all_glints(
         c, slope = np.where(pick, c_new, c), np.where(pick, slope_new, slope)
         deviation, cost = np.where(pick, deviation_new, deviation), np.where(better, cost_new, cost)
         damping = np.where(better, np.maximum(damping * 0.1, 1e-14), np.maximum(damping * 30, 1e-10))
-        # Newton's steps square the error: after one of 1e-9 only rounding is left. A row that no step betters is done.
+        # Newton's steps square the error: after one of 1e-9 only rounding is left. A row that no step improves is
+        # finished.
         if bool(np.all((settled <= 1e-9) | (damping > 1.0) | ~np.isfinite(settled))):
             break
     ok = np.array(np.isfinite(c).all(axis=(-1, -2)) & (settled < 1e-5), dtype=bool)
@@ -94,9 +99,9 @@ def from_all_glints(
 def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple[Floats, Bools]:
     """Unit direction (..., 3) from the camera to the cornea's centre, without any eye parameter, and whether it exists.
 
-    Each plane of camera, light and glint holds the centre: b is normal to all (L_i - O) x u_i. With two lights
-    b = unit[((L_1 - O) x u_1) x ((L_2 - O) x u_2)] (Guestrin & Eizenman 2006; Shih, Wu & Liu 2000); with more the right
-    singular vector of the smallest singular value. There is none where camera, lights and centre are coplanar.
+    Each plane of camera, light and glint contains the centre: b is normal to all (L_i - O) x u_i. With two lights b =
+    unit[((L_1 - O) x u_1) x ((L_2 - O) x u_2)] (Guestrin & Eizenman 2006; Shih, Wu & Liu 2000); with more it is the
+    right singular vector of the smallest singular value. There is none where camera, lights and centre are coplanar.
     """
     normals = unit(np.cross(light_mm - origin_mm[..., None, :], glints))
     if glints.shape[-2] == 2:
@@ -117,8 +122,9 @@ def from_plane(
 ) -> CorneaCentres:
     """Method B: c = O + k_c b, with k_c from the mirror condition of the one glint `mirror`.
 
-    In the plane of camera, light and glint, with e the unit vector normal to b: (c(k) - O) . e = k u.e - R n(k).e = 0,
-    solved by Newton's method for the distance k of the mirror point. The arguments are those of `from_all_glints`.
+    In the plane of camera, light and glint, with e the unit vector normal to b: (c(k) - O) . e = k u.e - R n(k).e = 0.
+    Newton's method solves it for the distance k of the mirror point. The other arguments are those of
+    `from_all_glints`.
     """
     b, ok = line_to_centre(origin_mm, glints, light_mm)
     radius = _radii(radius_mm, b.shape[:-1])
@@ -130,7 +136,7 @@ def from_plane(
     for step in range(_ITERATIONS):
         c, slope = _mirror_centres(origin, u[..., None, :], light[None, :], radius, k[..., None])
         value = ((c[..., 0, :] - origin_mm) * e).sum(axis=-1)
-        # The first step takes the normal as it is, which holds from any distance; then Newton's.
+        # The first step treats the normal as constant, which works from any distance. Newton's steps follow.
         rate = side if step == 0 else (slope[..., 0, :] * e).sum(axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
             change = value / rate
@@ -195,7 +201,7 @@ def _near_intersection(origin: Floats, ray: Floats, centre: Floats, radius: Floa
 def _mirror_centres(
     origin: Floats, glints: Floats, light_mm: Floats, radius: Floats, k: Floats
 ) -> tuple[Floats, Floats]:
-    """c_i(k_i) and dc_i/dk_i, both (..., m, 3)."""
+    """Centres c_i(k_i) and their derivatives dc_i/dk_i, both (..., m, 3)."""
     q = origin + k[..., None] * glints
     to_light = light_mm - q
     far = np.sqrt((to_light * to_light).sum(axis=-1, keepdims=True))
@@ -210,7 +216,7 @@ def _mirror_centres(
 
 
 def _coarse(origin: Floats, glints: Floats, light_mm: Floats, radius: Floats) -> Floats:
-    """The equal distances, of some, whose centres disagree least, (..., m)."""
+    """Starting distances (..., m): all equal, with the value of a coarse grid whose centres disagree least."""
     m = glints.shape[-2]
     k = _START.reshape(-1, *([1] * radius.ndim)) * radius
     c, _ = _mirror_centres(
@@ -222,7 +228,7 @@ def _coarse(origin: Floats, glints: Floats, light_mm: Floats, radius: Floats) ->
 
 
 def _solved(system: Floats, right: Floats) -> Floats:
-    """Solutions of small symmetric systems (..., m, m); by Cramer's rule for two, which is what most rigs have."""
+    """Solve small symmetric systems (..., m, m), by Cramer's rule for two, which most rigs have."""
     if system.shape[-1] == 2:
         a, b, d = system[..., 0, 0], system[..., 0, 1], system[..., 1, 1]
         first, second = d * right[..., 0] - b * right[..., 1], a * right[..., 1] - b * right[..., 0]

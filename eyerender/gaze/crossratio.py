@@ -3,8 +3,8 @@
     u_v,i = u_c + alpha_i (u_r,i - u_c),     alpha_i = |u_p - u_c| / |u_r,i - u_c| when the eye looks at corner i
 
 u_c is the glint of the light at the camera, u_r,i that of corner i, u_p the pupil centre. The virtual points u_v and
-the pupil centre are the image, through one projective plane, of the corners and the gaze point, so that the cross
-ratios of the two figures agree; that is the same as mapping the pupil centre by the homography u_v,i -> corner i.
+the pupil centre are the image, through one projective plane, of the corners and the gaze point, so the cross ratios of
+the two figures agree. That is equivalent to mapping the pupil centre by the homography u_v,i -> corner i.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class CrossRatio:
     Args:
         corners: the four lights at the screen's corners, in order around it.
         at_camera: the light at the camera.
-        tolerance: how far a calibration target may lie from its corner light, as a share of the corners' diagonal.
-        alphas: by eye (0 right, 1 left), four each; `fit` fills it in.
+        tolerance: largest distance of a calibration target from its corner light, as a share of the corners' diagonal.
+        alphas: four by eye (0 right, 1 left), set by `fit`.
     """
 
     corners: tuple[int, int, int, int] = (0, 1, 2, 3)
@@ -41,7 +41,7 @@ class CrossRatio:
     alphas: Mapping[int, Floats] = field(default_factory=dict)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """Calibrate alpha_i of each eye on its fixations of the four corner lights (averaged, where repeated).
+        """Calibrate alpha_i of each eye on its fixations of the four corner lights; repeated ones are averaged.
 
         Raises:
             InputError: no usable observation of an eye looks at one of the corner lights.
@@ -66,7 +66,7 @@ class CrossRatio:
         return replace(self, alphas=found)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
-        """Gaze points on the screen's plane."""
+        """Estimate gaze points on the screen's plane."""
         if not self.alphas:
             raise InputError("the estimator is not calibrated; call fit first")
         rig = rig.build()

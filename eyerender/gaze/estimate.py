@@ -1,9 +1,9 @@
-"""What every gaze estimator takes and gives.
+"""The interface of gaze estimators.
 
     fit(observations, rig) -> fitted copy;   predict(observations, rig) -> GazePoints
 
 The targets of a calibration are those of the observations (`index.target_mm`). Targets and gaze points are world points
-in mm, one row an observation.
+in mm, one row per observation.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class GazePoints(ArrayValue):
 
     @property
     def ok(self) -> Bools:
-        """Where there is an estimate, (n,)."""
+        """Whether there is an estimate, (n,)."""
         return np.asarray(self.status == OK)
 
 
@@ -60,7 +60,7 @@ class GazeRays(ArrayValue):
 
     @classmethod
     def of(cls, origin_mm: Floats, direction: Floats, reason: Objects) -> GazeRays:
-        """Rays, with NaN wherever there is a reason."""
+        """Make rays that are NaN wherever there is a reason."""
         ok = np.array([r is None for r in reason], dtype=bool)[:, None]
         return cls(
             frozen(np.where(ok, origin_mm, np.nan)), frozen(np.where(ok, direction, np.nan)), frozen(reason, object)
@@ -76,21 +76,15 @@ class GazeEstimator(Protocol):
     """
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """Calibrate each eye on the observations whose `index.target_mm` (n, 3) mm is finite.
-
-        Observations without the features that the estimator needs are left out.
+        """Calibrate on observations of known targets (n, 3) mm.
 
         Raises:
-            InputError: the observations or the rig do not determine the calibration.
+            InputError: a calibration is impossible.
         """
         ...
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
-        """Gaze points of observations, one row each; where there is none the row has a reason.
-
-        Raises:
-            InputError: the estimator is not calibrated, or the rig lacks what it needs.
-        """
+        """Estimate gaze points of observations, one row each."""
         ...
 
 
@@ -112,7 +106,7 @@ class StoredEstimator(GazeEstimator, Protocol):
 
 
 def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Observations, GazePoints]:
-    """The mean of both eyes' gaze points of each frame, and the frames' first observations.
+    """Mean of both eyes' gaze points of each frame, and the frames' first observations.
 
     A frame in which either eye is missing has no binocular estimate: the mean of one eye would be biased towards it.
     """
@@ -131,7 +125,7 @@ def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Obs
 def angular_error_deg(point_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> Floats:
     """Angle at `from_mm` between the directions to estimate and target, (n,) degrees; arguments (n, 3) or (3,) mm.
 
-    By atan2 of cross and dot product, which keeps its accuracy at small angles where arccos loses it.
+    It uses atan2 of cross and dot product, which is accurate at small angles where arccos is not.
     """
     a = np.asarray(point_mm, dtype=float) - np.asarray(from_mm, dtype=float)
     b = np.asarray(target_mm, dtype=float) - np.asarray(from_mm, dtype=float)

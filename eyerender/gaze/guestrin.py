@@ -29,25 +29,25 @@ from .parameters import HUMAN_BOUNDS, MEAN_EYE, NAMES, Calibration, EyeParameter
 from .rays import FeatureRays, feature_rays, nasal_sign, screen_of
 from .search import Misses, calibrate
 
-# Chebyshev degree of the centre as a function of sqrt(R): its last terms are below 1e-6 mm over 3 to 20 mm.
+# Chebyshev degree of the centre as a function of sqrt(R); its last terms are below 1e-6 mm over 3 to 20 mm.
 _DEGREE = 14
-_OFF_SCREEN_MM = 1e4  # the miss of a visual axis that never meets the screen's plane, in a search
+_OFF_SCREEN_MM = 1e4  # miss, in a search, of a visual axis that never meets the screen's plane
 
 
 @dataclass(frozen=True, slots=True)
 class GuestrinEizenman:
     """Corneal centre from the glints, optic axis from the pupil, visual axis by two angles.
 
+    A subclass may define another visual axis (`turned`) or another search (`search`).
+
     Args:
-        lights: which lights' glints to use; None: all of the rig's.
+        lights: lights whose glints are used; None: all of the rig's.
         centre: "all_glints" (method A, the source's own) or "plane" (method B, the first light's mirror condition).
-        start: parameters to start the calibration from; its index is kept unless `free_index`.
-        bounds: where the parameters may lie.
+        start: parameters at the start of the calibration; its index is kept unless `free_index`.
+        bounds: limits of the parameters.
         free_index: calibrate the index too.
         tolerance: relative change of cost and parameters at which the search ends.
-        calibrations: by eye (0 right, 1 left); `fit` fills it in.
-
-    A subclass may define another visual axis (`turned`) or another search (`search`).
+        calibrations: by eye (0 right, 1 left), set by `fit`.
     """
 
     lights: tuple[int, ...] | None = None
@@ -59,7 +59,7 @@ class GuestrinEizenman:
     calibrations: Mapping[int, Calibration] = field(default_factory=dict)
 
     def with_parameters(self, parameters: Mapping[int, EyeParameters]) -> Self:
-        """An estimator with given parameters by eye (0 right, 1 left), without a calibration."""
+        """Make an estimator with given parameters by eye (0 right, 1 left), without a calibration."""
         known = {k: Calibration(p, p, 0.0, "given", 0, True, "given", ()) for k, p in parameters.items()}
         return replace(self, calibrations=known)
 
@@ -67,7 +67,7 @@ class GuestrinEizenman:
         """Calibrate R, K, alpha, beta (and n) of each eye by bounded nonlinear least squares.
 
         Raises:
-            InputError: fewer usable targets than determine the parameters.
+            InputError: there are too few usable targets to determine the parameters.
         """
         models = self._models(observations, rig.build())
         return replace(self, calibrations={eye: model.calibrate(self.start) for eye, model in models.items()})
@@ -75,12 +75,12 @@ class GuestrinEizenman:
     def restarts(
         self, observations: Observations, rig: RigLike, starts: Sequence[EyeParameters]
     ) -> dict[int, list[Calibration]]:
-        """Calibrations of each eye from several starts, to see whether the search finds one minimum."""
+        """Calibrate each eye from several starts, to see whether the search finds a single minimum."""
         models = self._models(observations, rig.build())
         return {eye: [model.calibrate(start) for start in starts] for eye, model in models.items()}
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
-        """Gaze points on the screen's plane."""
+        """Estimate gaze points on the screen's plane."""
         rig = rig.build()
         screen = screen_of(rig)
         rays = self.visual_axes(observations, rig)
@@ -130,18 +130,18 @@ class GuestrinEizenman:
         return from_all_glints(origin, glints, rays.light_mm, radius)
 
     def turned(self, w: Floats, alpha: ArrayLike, beta: ArrayLike) -> Floats:
-        """The visual axes (..., 3) of optic axes w (..., 3); alpha towards +y and beta upwards, in radians."""
+        """Visual axes (..., 3) of optic axes w (..., 3); alpha towards +y and beta upwards, in radians."""
         theta = np.arctan2(w[..., 1], w[..., 0]) + alpha
         phi = np.arcsin(np.clip(w[..., 2], -1.0, 1.0)) + beta
         return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
 
     def search(self, misses: Misses, start: EyeParameters) -> Calibration:
-        """One eye's parameters with the least sum of squared misses, searched for from `start`."""
+        """Find one eye's parameters with the least sum of squared misses, from `start`."""
         return calibrate(misses, start, self.bounds, self.free, self.tolerance)
 
     @property
     def free(self) -> Bools:
-        """Which of the five parameters are calibrated."""
+        """Whether each of the five parameters is calibrated."""
         return np.array([self.free_index or name != "index" for name in NAMES])
 
     def _models(self, observations: Observations, rig: RigGeometry) -> dict[int, _Model]:
@@ -164,7 +164,7 @@ class GuestrinEizenman:
 
 
 class _Model:
-    """One eye's calibration data: the estimator at many sets of parameters at once."""
+    """Calibration data of one eye, evaluated at many sets of parameters at once."""
 
     def __init__(
         self,
@@ -181,8 +181,9 @@ class _Model:
         self.off_plane = -((targets_mm - screen.centre_mm) @ screen.normal)
         self.axes = np.stack([screen.right, screen.up, screen.normal], axis=-1)
         low, high = estimator.bounds.lower.cornea_radius_mm, estimator.bounds.upper.cornea_radius_mm
-        # The centre depends on R alone, and smoothly: one batch of solutions serves every step of every search. Its
-        # distance goes nearly as sqrt(R), for the glints' separation goes as R over the distance squared.
+        # The centre depends on R alone, and smoothly, so one batch of solutions serves every step of every search. Its
+        # distance is nearly proportional to sqrt(R), because the glints' separation is proportional to R over the
+        # distance squared.
         self.middle, self.half = 0.5 * (np.sqrt(low) + np.sqrt(high)), 0.5 * (np.sqrt(high) - np.sqrt(low))
         nodes = np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
         radius = np.broadcast_to(((self.middle + self.half * nodes) ** 2)[:, None], (_DEGREE + 1, len(rows)))
@@ -197,7 +198,7 @@ class _Model:
         R, K, index = (np.broadcast_to(parameters[:, k, None], shape) for k in range(3))
         w, _, _ = optic_axis(self.origin, self.pupil, centre, R, K, index)
         alpha, beta = np.radians(parameters[:, 3, None]) * self.sign, np.radians(parameters[:, 4, None])
-        # Both in the screen's axes: right, up, and towards the eye.
+        # Both are in the screen's axes: right, up, and towards the eye.
         v, c = self.estimator.turned(w, alpha, beta) @ self.axes, (centre - self.screen.centre_mm) @ self.axes
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = -c[..., 2] / v[..., 2]
@@ -214,7 +215,7 @@ class _Model:
 
 
 def _why(found: CorneaCentres, meets: Bools, inside: Bools) -> Objects:
-    """Why an observation has no optic axis; None where it has."""
+    """Reason why an observation has no optic axis; None where it has one."""
     out = np.full(len(meets), None, dtype=object)
     out[~inside] = "the refracted pupil ray misses the sphere that holds the pupil"
     out[~meets] = "the pupil ray misses the cornea"

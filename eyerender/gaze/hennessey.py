@@ -1,8 +1,8 @@
 """Model-based gaze estimation with population parameters (Hennessey, Noureddin & Lawrence, ETRA 2006).
 
-One camera and two lights give the centre of corneal curvature c for an assumed radius R; the pupil ray, refracted
-into the eye (index n), gives the pupil at distance K from c; the optic axis meets the screen. What the assumed eye
-and the angle to the visual axis leave wrong is taken up by a polynomial (recalibration.py). The source solves for c
+One camera and two lights give the centre of corneal curvature c for an assumed radius R. The pupil ray, refracted
+into the eye (index n), gives the pupil at distance K from c. The optic axis meets the screen. A polynomial
+(recalibration.py) corrects the errors of the assumed eye and the angle to the visual axis. The source solves for c
 in planes of its own; the conditions are those of `cornea.from_all_glints`, and so is the least-squares solution.
 """
 
@@ -28,7 +28,8 @@ class Hennessey:
     Args:
         parameters: the assumed eye; its alpha and beta are not used.
         recalibration: "angle", "screen" or "none".
-        lights: which lights' glints to use; None: all of the rig's.
+        lights: lights whose glints are used; None: all of the rig's.
+        correction: the calibrated correction, set by `fit`.
     """
 
     parameters: EyeParameters = MEAN_EYE
@@ -37,13 +38,17 @@ class Hennessey:
     correction: Recalibration | None = field(default=None, repr=False)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """Calibrate the correction of each eye; raises `InputError` for fewer than six usable targets."""
+        """Calibrate the correction of each eye.
+
+        Raises:
+            InputError: there are fewer than six usable targets.
+        """
         rig = rig.build()
         rays = self.optic_axes(observations, rig)
         return replace(self, correction=Recalibration(self.recalibration).fit(observations, rays, rig))
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
-        """Gaze points on the screen's plane."""
+        """Estimate gaze points on the screen's plane."""
         rig = rig.build()
         correction = self.correction or Recalibration(self.recalibration)
         return correction.apply(observations, self.optic_axes(observations, rig), rig)

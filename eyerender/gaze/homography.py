@@ -1,9 +1,9 @@
-"""Homography normalisation (Hansen, Agustin & Villanueva, ETRA 2010), and the homographies it is made of.
+"""Homography normalisation (Hansen, Agustin & Villanueva, ETRA 2010), and direct linear transforms.
 
     s = H_n(glints -> unit square) pupil,   gaze = H_c s
 
-H_n is found anew in every image, so it takes up head movement; H_c is calibrated. Each homography comes from the direct
-linear transform: the null vector of
+H_n is computed anew in every image, so it compensates head movement; H_c is calibrated. Each homography comes from the
+direct linear transform: the null vector of
 
     [x y 1 0 0 0 -ux -uy -u; 0 0 0 x y 1 -vx -vy -v]       (Hartley & Zisserman, Multiple View Geometry, 4.1)
 """
@@ -24,7 +24,7 @@ from ..rig.rig import RigGeometry, RigLike
 from .estimate import GazePoints
 from .rays import chosen_lights, screen_of
 
-# The four lights' images: top left, top right, bottom right, bottom left of the square, u to the right and v up.
+# Corners of the square for the four lights: top left, top right, bottom right, bottom left, u to the right and v up.
 SQUARE = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
 _DEGENERATE = 1e-10  # ratio of singular values below which points determine no homography
 
@@ -35,9 +35,9 @@ class Homography:
 
     Args:
         lights: the four lights in the order top left, top right, bottom right, bottom left.
-        conditioned: scale and centre the points before the calibration's transform is solved (Hartley 1997); False is
-        the
-            plain algebraic least squares, whose result depends on the targets' unit and origin.
+        conditioned: scale and centre the points before the calibration's transform is solved (Hartley 1997). False is
+            the plain algebraic least squares, whose result depends on the targets' unit and origin.
+        homographies: by eye (0 right, 1 left), set by `fit`.
     """
 
     lights: tuple[int, int, int, int] = (0, 1, 2, 3)
@@ -45,7 +45,11 @@ class Homography:
     homographies: Mapping[int, Floats] = field(default_factory=dict)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """Calibrate H_c of each eye; raises `InputError` for fewer than four targets or collinear ones."""
+        """Calibrate H_c of each eye.
+
+        Raises:
+            InputError: there are fewer than four targets, or they are collinear.
+        """
         rig = rig.build()
         wanted = screen_of(rig).flat(observations.index.target_mm)
         s, reason = self.normalised(observations, rig)
@@ -63,7 +67,7 @@ class Homography:
         return replace(self, homographies=found)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
-        """Gaze points on the screen's plane."""
+        """Estimate gaze points on the screen's plane."""
         if not self.homographies:
             raise InputError("the estimator is not calibrated; call fit first")
         rig = rig.build()
@@ -83,7 +87,7 @@ class Homography:
         return GazePoints.of(screen.world(on_screen), reason)
 
     def normalised(self, observations: Observations, rig: RigGeometry) -> tuple[Floats, Objects]:
-        """The pupil centre in the unit square of the glints (n, 2), and why there is none (n,)."""
+        """Pupil centre in the unit square of the glints (n, 2), and the reason why there is none (n,)."""
         chosen_lights(rig, self.lights, 4)
         glints, reason = glints_of(observations, self.lights)
         H, ok = homography(glints, np.broadcast_to(SQUARE, glints.shape))
@@ -95,10 +99,10 @@ class Homography:
 
 
 def homography(source: ArrayLike, target: ArrayLike, *, conditioned: bool = False) -> tuple[Floats, Bools]:
-    """Homographies (..., 3, 3) of unit norm from points (..., k, 2) to (..., k, 2), k >= 4, and whether there is one.
+    """Homographies (..., 3, 3) of unit norm from points (..., k, 2) to (..., k, 2), k >= 4, and whether they exist.
 
-    Four points give it exactly; more by least squares of the algebraic error. False where the points do not determine
-    it (NaN among them, three of four on a line).
+    Four points determine it exactly; for more it is the least-squares solution of the algebraic error. It does not
+    exist where the points do not determine it (NaN among them, three of four on a line).
     """
     p, q = np.asarray(source, dtype=float), np.asarray(target, dtype=float)
     if conditioned:
@@ -124,7 +128,7 @@ def homography(source: ArrayLike, target: ArrayLike, *, conditioned: bool = Fals
 
 
 def transformed(H: Floats, points: ArrayLike) -> tuple[Floats, Bools]:
-    """H (..., 3, 3) applied to points (..., 2) or (..., k, 2), and whether the result is finite."""
+    """Apply H (..., 3, 3) to points (..., 2) or (..., k, 2); also returns whether the result is finite."""
     p = np.asarray(points, dtype=float)
     many = p.ndim > H.ndim - 1 or H.ndim == 2
     h = np.concatenate([p, np.ones((*p.shape[:-1], 1))], axis=-1)
@@ -149,7 +153,7 @@ def glints_of(observations: Observations, lights: tuple[int, ...]) -> tuple[Floa
 
 
 def _conditioning(points: Floats) -> Floats:
-    """The similarity (..., 3, 3) that brings points (..., k, 2) to zero mean and mean distance sqrt(2)."""
+    """Similarity (..., 3, 3) that brings points (..., k, 2) to zero mean and mean distance sqrt(2)."""
     mean = points.mean(axis=-2)
     size = np.linalg.norm(points - mean[..., None, :], axis=-1).mean(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -162,10 +166,10 @@ def _conditioning(points: Floats) -> Floats:
 
 
 def _spread(points: Floats) -> Floats:
-    """How far k >= 4 points (..., k, 2) are from having no four in general position; relative, 0 where they have none.
+    """Relative measure of how well k >= 4 points (..., k, 2) are in general position; 0 if they are not.
 
-    With four, the smallest triangle's area over the square of their extent; with more, the second of the two extents
-    over the first.
+    With four points it is the smallest triangle's area over the square of their extent. With more it is the smaller
+    extent over the larger one.
     """
     d = points - points.mean(axis=-2, keepdims=True)
     size = (d * d).sum(axis=(-1, -2))

@@ -14,11 +14,16 @@ from ..errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class EyeParameters:
-    """What the model knows of an eye.
+    """Parameters of the model eye.
 
-    Corneal radius R (mm), distance K from the centre of corneal curvature to the pupil (mm), index n of what lies
-    behind the cornea, and the angles from the optic to the visual axis: alpha horizontally towards the nose, beta
-    upwards (deg). Defaults: population means (Guestrin & Eizenman 2006, after Gullstrand's eye).
+    Defaults are population means (Guestrin & Eizenman 2006, after Gullstrand's eye).
+
+    Attributes:
+        cornea_radius_mm: corneal radius R.
+        pupil_distance_mm: distance K from the centre of corneal curvature to the pupil.
+        index: index n of what lies behind the cornea.
+        alpha_deg: angle from the optic to the visual axis, horizontally towards the nose.
+        beta_deg: the same angle upwards.
     """
 
     cornea_radius_mm: float = 7.8
@@ -28,16 +33,16 @@ class EyeParameters:
     beta_deg: float = 1.5
 
     def vector(self) -> Floats:
-        """The five numbers in this order."""
+        """Return the five numbers in the order of the fields."""
         return np.array([getattr(self, f.name) for f in fields(self)], dtype=float)
 
     @classmethod
     def of(cls, values: Sequence[float] | Floats) -> EyeParameters:
-        """From five numbers in this order."""
+        """Make parameters from five numbers in the order of the fields."""
         return cls(*(float(v) for v in values))
 
     def to_mapping(self) -> dict[str, float]:
-        """For JSON."""
+        """Convert to a mapping for JSON."""
         return asdict(self)
 
 
@@ -50,7 +55,7 @@ _LOWER, _UPPER = EyeParameters(6.5, 3.0, 1.30, -10.0, -6.0), EyeParameters(9.5, 
 
 @dataclass(frozen=True, slots=True)
 class ParameterBounds:
-    """Where the parameters may lie. The default is what human eyes have, with room."""
+    """Limits of the parameters. The default covers human eyes, with some room."""
 
     lower: EyeParameters = _LOWER
     upper: EyeParameters = _UPPER
@@ -63,7 +68,7 @@ class ParameterBounds:
             raise InputError("radii must be > 0 and the index >= 1")
 
     def draw(self, count: int, seed: int) -> list[EyeParameters]:
-        """`count` seeded random parameters, uniform between the bounds."""
+        """Draw `count` seeded random parameters, uniform between the bounds."""
         low, high = self.lower.vector(), self.upper.vector()
         return [EyeParameters.of(v) for v in np.random.default_rng(seed).uniform(low, high, (count, len(low)))]
 
@@ -73,10 +78,17 @@ HUMAN_BOUNDS = ParameterBounds()
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """One eye's calibrated parameters and how the search ended.
+    """Calibrated parameters of one eye, and how the search ended.
 
-    `cost` is the objective at the end (mm^2, mm or degrees, after the objective), `at_bound` the parameters that a
-    bound holds, `evaluations` the calls of the model.
+    Attributes:
+        parameters: the result.
+        start: where the search started.
+        cost: final value of the objective (mm^2, mm or degrees, depending on the objective).
+        objective: what was minimised.
+        evaluations: number of evaluations of the model.
+        converged: whether the search converged.
+        message: how it ended.
+        at_bound: parameters that a bound limits.
     """
 
     parameters: EyeParameters
@@ -89,7 +101,7 @@ class Calibration:
     at_bound: tuple[str, ...]
 
     def to_mapping(self) -> dict[str, Any]:
-        """For JSON."""
+        """Convert to a mapping for JSON."""
         return {
             "parameters": self.parameters.to_mapping(),
             "start": self.start.to_mapping(),

@@ -1,4 +1,4 @@
-"""From features to rays: what the model-based estimators work on.
+"""Rays of features, the input of the model-based estimators.
 
 u = direction in which the camera sees a feature;  O = its nodal point;  L = a light.
 """
@@ -19,9 +19,14 @@ from ..rig.screen import ScreenPlane
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureRays(ArrayValue):
-    """Rays of observations: nodal points (n, 3) mm, unit rays to the pupil centre (n, 3) and to the glints (n, m, 3).
+    """Rays of observations.
 
-    `light_mm` (m, 3) are the glints' lights; `reason` (n,) says why an observation has no rays, None where it has.
+    Attributes:
+        origin_mm: (n, 3) nodal points.
+        pupil: (n, 3) unit rays to the pupil centre.
+        glints: (n, m, 3) unit rays to the glints.
+        light_mm: (m, 3) lights of the glints.
+        reason: (n,) why an observation has no rays, None where it has.
     """
 
     origin_mm: Floats
@@ -34,7 +39,7 @@ class FeatureRays(ArrayValue):
 def feature_rays(
     observations: Observations, rig: RigGeometry, lights: Sequence[int] | None, *, least: int
 ) -> FeatureRays:
-    """Rays to the pupil centre and to the glints of `lights` (None: all of the rig's).
+    """Compute rays to the pupil centre and to the glints of `lights` (None: all of the rig's).
 
     Raises:
         InputError: the rig has fewer than `least` lights, or not those that are named.
@@ -59,7 +64,11 @@ def feature_rays(
 
 
 def chosen_lights(rig: RigGeometry, lights: Sequence[int] | None, least: int) -> tuple[int, ...]:
-    """The lights to use, at least `least` different ones of the rig's; raises `InputError`."""
+    """Choose the lights to use, at least `least` different ones of the rig's.
+
+    Raises:
+        InputError: they are not different lights of the rig, or too few.
+    """
     wanted = tuple(range(len(rig.lights))) if lights is None else tuple(lights)
     if len(set(wanted)) != len(wanted) or any(not 0 <= k < len(rig.lights) for k in wanted):
         raise InputError(f"lights {list(wanted)} are not different lights of a rig that has {len(rig.lights)}")
@@ -69,7 +78,7 @@ def chosen_lights(rig: RigGeometry, lights: Sequence[int] | None, least: int) ->
 
 
 def camera_of(observations: Observations, rig: RigGeometry) -> tuple[Ints, Objects]:
-    """The camera of each observation (n,), -1 with a reason (n,) where it is not known; one camera is always known."""
+    """Camera of each observation (n,), -1 with a reason (n,) where it is unknown; a single camera is always known."""
     camera = np.array(observations.index.camera, dtype=np.int64)
     if len(rig.cameras) == 1:
         camera[camera < 0] = 0
@@ -81,7 +90,11 @@ def camera_of(observations: Observations, rig: RigGeometry) -> tuple[Ints, Objec
 
 
 def screen_of(rig: RigGeometry) -> ScreenPlane:
-    """The rig's screen; raises `InputError` without one."""
+    """Screen of the rig.
+
+    Raises:
+        InputError: there is none.
+    """
     if rig.screen is None:
         raise InputError("this estimator needs a screen in the rig")
     return rig.screen
@@ -95,5 +108,5 @@ def unit(v: Floats) -> Floats:
 
 
 def nasal_sign(eye: Ints) -> Floats:
-    """+1 where +y is nasal (right eye, and eyes of unknown side), -1 for a left eye."""
+    """Sign of the nasal direction along y: +1 for a right eye and eyes of unknown side, -1 for a left eye."""
     return np.where(np.asarray(eye) == 1, -1.0, 1.0)

@@ -1,8 +1,8 @@
-"""Corrections of a model-based estimate by a polynomial (Hennessey, Noureddin & Lawrence, ETRA 2006).
+"""Polynomial corrections of a model-based estimate (Hennessey, Noureddin & Lawrence, ETRA 2006).
 
     on the screen:  (x, y) = A m(x0, y0);      on the angles:  (theta, phi) = A m(theta0, phi0)
 
-with m(a, b) = (1, a, b, ab, a^2, b^2), theta = atan2(d_y, d_x) and phi = asin(d_z) of the gaze ray's direction;
+with m(a, b) = (1, a, b, ab, a^2, b^2), theta = atan2(d_y, d_x) and phi = asin(d_z) of the gaze ray's direction,
 fitted by least squares for each eye.
 """
 
@@ -27,7 +27,7 @@ TERMS = 6
 
 @dataclass(frozen=True, slots=True)
 class Recalibration:
-    """A correction of gaze rays by eye; `coefficients` (2, 6) by eye, empty before the calibration."""
+    """A correction of gaze rays; `coefficients` (2, 6) by eye are empty before the calibration."""
 
     kind: RecalibrationKind = "angle"
     coefficients: Mapping[int, Floats] = field(default_factory=dict)
@@ -36,7 +36,7 @@ class Recalibration:
         """Calibrate on the rays (n) of observations (n) with known targets.
 
         Raises:
-            InputError: fewer than six usable targets, or targets that do not determine the polynomial.
+            InputError: there are fewer than six usable targets, or they do not determine the polynomial.
         """
         if self.kind == "none":
             return self
@@ -56,7 +56,7 @@ class Recalibration:
                 raise InputError(
                     f"{name} eye: {rows.sum()} usable calibration targets, the correction has {TERMS} terms"
                 )
-            # Scaled columns, so that the rank does not depend on the unit.
+            # The columns are scaled so that the rank does not depend on the unit.
             design = monomials(measured[rows])
             scale = np.abs(design).max(axis=0)
             solution, _, rank, _ = np.linalg.lstsq(design / scale, wanted[rows], rcond=1e-10)
@@ -66,7 +66,7 @@ class Recalibration:
         return Recalibration(self.kind, out)
 
     def apply(self, observations: Observations, rays: GazeRays, rig: RigLike) -> GazePoints:
-        """Corrected gaze points on the screen's plane."""
+        """Correct gaze points on the screen's plane."""
         screen = screen_of(rig.build())
         reason = rays.reason.copy()
         direction, on_screen = rays.direction.copy(), np.full((len(observations), 2), np.nan)
@@ -105,6 +105,6 @@ def direction_of(angles: Floats) -> Floats:
 
 
 def monomials(v: Floats) -> Floats:
-    """(1, a, b, ab, a^2, b^2) of (..., 2)."""
+    """Monomials (1, a, b, ab, a^2, b^2) of (..., 2)."""
     a, b = v[..., 0], v[..., 1]
     return np.stack([np.ones_like(a), a, b, a * b, a * a, b * b], axis=-1)

@@ -1,4 +1,4 @@
-"""Records of features and their rig as input: what `gaze fit` and `gaze predict` read."""
+"""Records of features and their rig, read for `gaze fit` and `gaze predict`."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from ..spec import LARGEST
 ReadArray = Callable[[Any, tuple[int, ...], str], Floats]
 """Turns a value into an array of a shape; raises `InputError` with the path."""
 
-# Records of some 40,000 observations. All of them are held at once.
+# This is about 40,000 observations. All of them are held in memory at once.
 MAX_RECORDS_BYTES = 128 * 2**20
 
 
 def load_observations(path: str | Path, scene: str | Scene | None = None) -> tuple[Observations, RigGeometry]:
-    """Observations and rig of a file of records.
+    """Load observations and rig from a file of records.
 
-    The file is JSON as `features` writes it, with the rig inside, or JSONL with one record a line; `scene` gives the
-    rig otherwise, and wins.
+    The file is JSON as `features` writes it, which includes the rig, or JSONL with one record a line. `scene`, if
+    given, provides the rig instead.
 
     Raises:
         InputError: naming the file and the key.
@@ -50,10 +50,10 @@ def load_observations(path: str | Path, scene: str | Scene | None = None) -> tup
 def _read(text: str, source: str) -> tuple[list[Any], Any]:
     """Records and rig (None: there is none) of the text of a file."""
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
-    # One record a line: the first line is a whole object, and not the last.
+    # With one record a line, the first line is a whole object and not the last line.
     if len(lines) > 1 and lines[0][1].rstrip().endswith("}"):
         objects = [parse_json(line, source=source, path=f"line {k}") for k, line in lines]
-        # A line of a folder's metadata holds the records of its image.
+        # A line of a folder's metadata contains the records of its image.
         return [r for o in objects for r in (o["records"] if _is_image_line(o) else [o])], None
     if not lines:
         return [], None
@@ -68,7 +68,11 @@ def _read(text: str, source: str) -> tuple[list[Any], Any]:
 
 
 def rig_from_mapping(data: Any, *, source: str = "") -> RigGeometry:
-    """The rig as `features --json` writes it; raises `InputError` naming the part that is wrong."""
+    """Read a rig as `features --json` writes it.
+
+    Raises:
+        InputError: naming the part that is wrong.
+    """
 
     def array(value: Any, shape: tuple[int, ...], path: str) -> Floats:
         try:
@@ -101,7 +105,7 @@ def _camera(data: Any, array: ReadArray, source: str, at: str) -> PinholeCamera:
         raise InputError("must be whole numbers from 1 to 65536", source=source, path=f"{at}.resolution_px")
     K, R, t = (array(data.get(key), (3, 3)[: 1 + (key != "t")], f"{at}.{key}") for key in ("K", "R", "t"))
     distortion = array(data.get("distortion", [0.0] * 5), (5,), f"{at}.distortion")
-    # The same rules as those of a camera in a scene.
+    # The rules are those of a camera in a scene.
     calibration = {"K": K.tolist(), "R": R.tolist(), "t_mm": t.tolist(), "distortion": distortion.tolist()}
     try:
         CameraCalibration.from_mapping(calibration)

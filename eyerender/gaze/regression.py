@@ -25,7 +25,7 @@ Terms = tuple[tuple[int, int], ...]  # exponents (i, j) of x^i y^j
 
 
 def _terms(text: str) -> Terms:
-    """Terms written as in the literature, 'x + x2y + 1': exponents after the letters."""
+    """Parse terms as written in the literature, 'x + x2y + 1': exponents after the letters."""
     out = []
     for term in text.replace(" ", "").split("+"):
         i = j = 0
@@ -82,10 +82,11 @@ class Regression:
 
     Args:
         function: R1 to R12 of Table 2, or the terms of x and y, as ("x + y + 1", "x + y2 + 1").
-        light: which light's glint the vector runs from.
-        normalised: divide by the distance of the two pupils; False takes the vector in pixels, of one eye alone.
-        centred: take the polynomial about the calibration vectors' mean. That is another function wherever the terms
-            are not closed under a shift, as in R4 and R6 to R12.
+        light: the light whose glint is the start of the vector.
+        normalised: divide by the distance of the two pupils; False uses the vector in pixels, of one eye alone.
+        centred: define the polynomial about the calibration vectors' mean. That is a different function wherever the
+            terms are not closed under a shift, as in R4 and R6 to R12.
+        fits: by eye (0 right, 1 left), set by `fit`.
     """
 
     function: str | tuple[str, str] = "R3"
@@ -106,7 +107,11 @@ class Regression:
         return _terms(x), _terms(y)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """Calibrate each eye; raises `InputError` for too few usable targets or targets that do not determine it."""
+        """Calibrate each eye.
+
+        Raises:
+            InputError: there are too few usable targets, or they do not determine the polynomial.
+        """
         wanted = screen_of(rig.build()).flat(observations.index.target_mm)
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
         usable = np.array([r is None for r in reason], dtype=bool) & np.isfinite(wanted).all(axis=1)
@@ -118,9 +123,12 @@ class Regression:
         return replace(self, fits=fits)
 
     def fit_eye(self, vectors: Floats, wanted: Floats, name: str) -> EyeFit:
-        """The coefficients of one eye: vectors (n, 2) to points on the screen (n, 2) mm; raises as `fit` does.
+        """Fit the coefficients of one eye: vectors (n, 2) to points on the screen (n, 2) mm.
 
-        The polynomial is of scaled vectors, which leaves the function the same. A subclass may solve otherwise.
+        The polynomial is of scaled vectors, which does not change the function. A subclass may solve differently.
+
+        Raises:
+            InputError: as for `fit`.
         """
         x_terms, y_terms = self.terms
         need = max(len(x_terms), len(y_terms))
@@ -136,7 +144,7 @@ class Regression:
         return EyeFit(origin, scale, a, b)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
-        """Gaze points on the screen's plane."""
+        """Estimate gaze points on the screen's plane."""
         if not self.fits:
             raise InputError("the estimator is not calibrated; call fit first")
         screen = screen_of(rig.build())
@@ -162,9 +170,10 @@ class Regression:
 
 
 def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: bool = True) -> tuple[Floats, Objects]:
-    """The pupil-glint vector (n, 2) and why there is none (n,), None where there is.
+    """Pupil-glint vectors (n, 2), and the reasons why there are none (n,), None where there are.
 
-    Normalised, both eyes of one frame are needed: the distance of their pupils is the unit. Otherwise it is in pixels.
+    Normalised vectors need both eyes of a frame: the distance of their pupils is the unit. Otherwise the unit is
+    pixels.
     """
     index, pupil = observations.index, observations.pupil
     n = len(observations)
@@ -189,7 +198,7 @@ def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: 
 
 def _partners(frame: Ints, eye: Ints) -> Ints:
     """Row of the other eye of the same frame, -1 where there is none."""
-    # One number for each (frame, eye) whose partner's is its neighbour; eyes of unknown side have none.
+    # This is one number for each (frame, eye), next to that of its partner. Eyes of unknown side have no partner.
     key = 2 * frame + eye
     order = np.argsort(key, kind="stable")
     at = np.minimum(np.searchsorted(key[order], key ^ 1), len(key) - 1)
@@ -198,5 +207,5 @@ def _partners(frame: Ints, eye: Ints) -> Ints:
 
 
 def monomials(v: Floats, terms: Terms) -> Floats:
-    """The design matrix (n, m) of vectors (n, 2): x^i y^j for each of the m terms (i, j)."""
+    """Design matrix (n, m) of vectors (n, 2): x^i y^j for each of the m terms (i, j)."""
     return np.stack([v[:, 0] ** i * v[:, 1] ** j for i, j in terms], axis=1)

@@ -1,4 +1,4 @@
-"""The search for eye parameters: bounded, deterministic, and it reports how it ended.
+"""The search for eye parameters, which is bounded and deterministic and reports how it ended.
 
     min sum |miss|^2     trust region reflective (Branch, Coleman & Li 1999; scipy `least_squares`)
 
@@ -17,7 +17,7 @@ from ..arrays import Bools, Floats
 from ..errors import InputError
 from .parameters import NAMES, Calibration, EyeParameters, ParameterBounds
 
-# What a parameter changes by: for the trust region, and 1e-5 of it for differences.
+# Typical change of each parameter for the trust region; differences use 1e-5 of it.
 _SCALE = np.array([1.0, 1.0, 0.05, 1.0, 1.0])
 MOST_ITERATIONS = 400
 
@@ -28,12 +28,20 @@ Misses = Callable[[Floats], Floats]
 class FreeParameters:
     """The k parameters that a search varies within their bounds; the others keep their start.
 
-    first (5,): the start; low, high, scale (k,): bounds and typical change of the free ones; evaluations: how often
-    the search has asked for sets of parameters.
+    Attributes:
+        first: (5,) the start.
+        low: (k,) lower bounds of the free parameters.
+        high: (k,) upper bounds.
+        scale: (k,) typical changes.
+        evaluations: number of parameter sets that the search has evaluated.
     """
 
     def __init__(self, start: EyeParameters, bounds: ParameterBounds, free: Bools) -> None:
-        """Raises `InputError` where the start lies outside the bounds."""
+        """Choose the free parameters.
+
+        Raises:
+            InputError: the start lies outside the bounds.
+        """
         self.start, self.free, self.first = start, free, start.vector()
         self.low, self.high = bounds.lower.vector()[free], bounds.upper.vector()[free]
         self.scale = _SCALE[free]
@@ -42,7 +50,7 @@ class FreeParameters:
             raise InputError("the calibration's start lies outside its bounds")
 
     def full(self, x: Floats) -> Floats:
-        """All five parameters (m, 5) of free ones (m, k)."""
+        """All five parameters (m, 5) for free ones (m, k)."""
         self.evaluations += 1
         out = np.repeat(self.first[None], len(x), axis=0)
         out[:, self.free] = x
@@ -59,7 +67,7 @@ class FreeParameters:
         return np.asarray((r[:k] - r[k:]) / (up - down)[:, None])
 
     def calibration(self, done: Any, total: Callable[[Floats], Floats], objective: str) -> Calibration:
-        """The end of a search: scipy's result, and the objective `total` (P,) of parameter sets (P, 5)."""
+        """Make the calibration from scipy's result and the objective `total` (P,) of parameter sets (P, 5)."""
         values, free = self.first.copy(), self.free
         values[free] = np.clip(done.x, self.low, self.high)
         reach = 1e-4 * (self.high - self.low)
@@ -79,7 +87,7 @@ class FreeParameters:
 def calibrate(
     misses: Misses, start: EyeParameters, bounds: ParameterBounds, free: Bools, tolerance: float
 ) -> Calibration:
-    """The parameters within `bounds` with the least sum of squared misses; those not `free` stay as in `start`.
+    """Find the parameters within `bounds` with the least sum of squared misses; those not `free` stay as in `start`.
 
     Raises:
         InputError: the start lies outside the bounds.

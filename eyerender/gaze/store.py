@@ -1,4 +1,4 @@
-"""Estimators by name and their calibrations as files: what `gaze fit` and `gaze predict` do."""
+"""Estimators by name, and their calibrations as files, for `gaze fit` and `gaze predict`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ NAMES: tuple[str, ...] = get_args(Name)
 
 
 class EstimatorSpec(Spec):
-    """Which estimator, and its options; those of other estimators are not looked at."""
+    """Name and options of an estimator; options of other estimators are ignored."""
 
     name: Name
     function: str = "R3"
@@ -54,11 +54,11 @@ class EstimatorSpec(Spec):
     recalibration: Literal["angle", "screen", "none"] = "angle"
 
     def build(self) -> GazeEstimator:
-        """The estimator, not calibrated."""
+        """Build the estimator, not calibrated."""
         eye = MEAN_EYE if self.index is None else EyeParameters(index=self.index)
         if self.name == "regression":
             regression = Regression(self.terms or self.function, normalised=self.normalised)
-            _ = regression.terms  # a bad function is an error now, not at the first fit
+            _ = regression.terms  # a wrong function is an error here, not at the first fit
             return regression
         if self.name == "homography":
             return Homography()
@@ -94,12 +94,12 @@ def fit_estimator(
     source: str = "",
     warn: Warn | None = None,
 ) -> tuple[GazeEstimator, dict[str, Any]]:
-    """A calibrated estimator and a summary (schema eyerender/gaze-fit/1).
+    """Calibrate an estimator and summarise it (schema eyerender/gaze-fit/1).
 
-    `warn` hears of targets off the screen before anything is calibrated; it may raise.
+    `warn` is called for targets off the screen before anything is calibrated; it may raise.
 
     Raises:
-        InputError: no targets, an unknown fixation, or what the estimator itself refuses.
+        InputError: there are no targets, a fixation is unknown, or the estimator itself refuses.
     """
     index = observations.index
     rows = np.isfinite(index.target_mm).all(axis=1)
@@ -137,7 +137,7 @@ def fit_estimator(
 
 
 def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGeometry) -> dict[str, Any]:
-    """Gaze points of every observation and of every frame with two eyes (schema eyerender/gaze/1).
+    """Estimate gaze points of every observation and of every frame with two eyes (schema eyerender/gaze/1).
 
     Errors are angles at the eye's place, or at the mid-point of the eyes; null without a target or a place.
     """
@@ -179,7 +179,7 @@ def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGe
 def save_estimator(
     path: str | Path, spec: EstimatorSpec | OwnEstimator, estimator: GazeEstimator, rig: RigGeometry | None = None
 ) -> None:
-    """Write a calibration as JSON, with the rig that it was made on where that is known."""
+    """Write a calibration as JSON, with the rig of the calibration where that is known."""
     write_json(
         path,
         {
@@ -192,15 +192,15 @@ def save_estimator(
 
 
 def load_estimator(path: str | Path, own: str | None = None) -> GazeEstimator:
-    """The estimator of a calibration; as `load_calibration`."""
+    """Load the estimator of a calibration; see `load_calibration`."""
     return load_calibration(path, own)[0]
 
 
 def load_calibration(path: str | Path, own: str | None = None) -> tuple[GazeEstimator, RigGeometry | None]:
-    """Read a calibration back: the estimator, and the rig that it was made on (None where the file does not say).
+    """Read a calibration: the estimator, and the rig of the calibration (None where the file has none).
 
-    The calibration of a user's own class is read only where `own` names that class again, as `module:Class`: a file
-    never has code loaded.
+    The calibration of a user's own class is read only where `own` names that class again, as `module:Class`, because a
+    file must never cause code to be loaded.
 
     Raises:
         InputError: naming the file and the key.
@@ -291,7 +291,11 @@ class _ModelState(Spec):
 
 
 def _checked(estimator: GazeEstimator, state: object) -> Spec:
-    """One eye's part of a calibration's file; raises `InputError` with the key's path."""
+    """Validate one eye's part of a calibration's file.
+
+    Raises:
+        InputError: with the path of the key.
+    """
     if isinstance(estimator, Regression):
         regression = _RegressionState.from_mapping(state)
         for key, values, terms in zip("ab", (regression.a, regression.b), estimator.terms, strict=True):
@@ -308,7 +312,7 @@ def _checked(estimator: GazeEstimator, state: object) -> Spec:
 
 
 def _state(estimator: GazeEstimator) -> dict[str, Any]:
-    """What a calibration found, by eye."""
+    """Calibrated values by eye."""
     found: dict[int, Any]
     if isinstance(estimator, Regression):
         found = {
@@ -330,7 +334,7 @@ def _state(estimator: GazeEstimator) -> dict[str, Any]:
 
 
 def _restored(estimator: GazeEstimator, eyes: dict[int, Any]) -> GazeEstimator:
-    """An estimator with the calibrations that a file holds, by eye, as `_checked` gives them."""
+    """Restore an estimator with the calibrations of a file by eye, as `_checked` returns them."""
 
     def arrays(key: str) -> dict[int, Floats]:
         return {e: frozen(getattr(state, key)) for e, state in eyes.items()}

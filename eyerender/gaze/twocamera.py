@@ -22,7 +22,7 @@ from .estimate import GazePoints, GazeRays
 from .rays import FeatureRays, feature_rays, unit
 from .recalibration import Recalibration, RecalibrationKind
 
-# Below this sine two lines or planes count as parallel: rounding alone would decide where they meet.
+# Below this sine two lines or planes count as parallel, because rounding would determine where they meet.
 _PARALLEL = 1e-7
 
 
@@ -30,12 +30,13 @@ _PARALLEL = 1e-7
 class ShihWuLiu:
     """Optic axis from two cameras, corrected by a polynomial.
 
-    The observations of the two cameras belong together by head position, fixation and eye; both get the same estimate.
+    Observations of the two cameras are paired by head position, fixation and eye; both get the same estimate.
 
     Args:
         recalibration: "angle", "screen" or "none".
         cameras: the two cameras.
-        lights: which lights' glints to use; None: all of the rig's.
+        lights: lights whose glints are used; None: all of the rig's.
+        correction: the calibrated correction, set by `fit`.
     """
 
     recalibration: RecalibrationKind = "angle"
@@ -44,22 +45,26 @@ class ShihWuLiu:
     correction: Recalibration | None = field(default=None, repr=False)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """Calibrate the correction of each eye; raises `InputError` for fewer than six usable targets."""
+        """Calibrate the correction of each eye.
+
+        Raises:
+            InputError: there are fewer than six usable targets.
+        """
         rig = rig.build()
         rays = self.optic_axes(observations, rig)
-        # One row of each pair, so that every fixation counts once.
+        # One row of each pair is used, so that every fixation counts once.
         rows = np.flatnonzero(observations.index.camera == self.cameras[0])
         part = GazeRays.of(rays.origin_mm[rows], rays.direction[rows], rays.reason[rows].copy())
         return replace(self, correction=Recalibration(self.recalibration).fit(observations.take(rows), part, rig))
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
-        """Gaze points on the screen's plane."""
+        """Estimate gaze points on the screen's plane."""
         rig = rig.build()
         correction = self.correction or Recalibration(self.recalibration)
         return correction.apply(observations, self.optic_axes(observations, rig), rig)
 
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
-        """Optic axes from the centre of corneal curvature, one row an observation."""
+        """Optic axes from the centre of corneal curvature, one row per observation."""
         if len(set(self.cameras)) != 2 or not all(0 <= k < len(rig.cameras) for k in self.cameras):
             raise InputError(f"this estimator needs two cameras, the rig has {len(rig.cameras)}")
         rays = feature_rays(observations, rig, self.lights, least=2)
@@ -96,7 +101,7 @@ class ShihWuLiu:
 
 
 def _closest(o1: Floats, b1: Floats, o2: Floats, b2: Floats) -> tuple[Floats, Bools]:
-    """The middle of the closest approach of two lines (n, 3), and whether they are not parallel (n,)."""
+    """Middle of the closest approach of two lines (n, 3), and whether they are not parallel (n,)."""
     w = o2 - o1
     cosine = (b1 * b2).sum(axis=-1)
     cross = np.cross(b1, b2)
@@ -109,7 +114,7 @@ def _closest(o1: Floats, b1: Floats, o2: Floats, b2: Floats) -> tuple[Floats, Bo
 
 
 def _normal_to_both(rays: FeatureRays, first: Ints, second: Ints, c: Floats) -> tuple[Floats, Bools]:
-    """The optic axis (n, 3), towards the cameras, and whether it is defined (n,)."""
+    """Optic axis (n, 3), towards the cameras, and whether it is defined (n,)."""
     one, two = (unit(np.cross(c - rays.origin_mm[rows], rays.pupil[rows])) for rows in (first, second))
     cross = np.cross(one, two)
     d = unit(cross)

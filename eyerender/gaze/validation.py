@@ -1,4 +1,4 @@
-"""How good a gaze estimator is on observations of known targets."""
+"""Errors of a gaze estimator on observations of known targets."""
 
 from __future__ import annotations
 
@@ -15,9 +15,14 @@ from .estimate import GazeEstimator, GazePoints, angular_error_deg, binocular_av
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GazeErrors(ArrayValue):
-    """Binocular gaze errors by frame: estimate and target (f, 3) mm, error (f,) degrees at the mid-point of the eyes.
+    """Binocular gaze errors by frame.
 
-    Where a frame has no estimate the error is NaN and `reason` (f,) says why.
+    Attributes:
+        frame: (f,) frames.
+        point_mm: (f, 3) estimates.
+        target_mm: (f, 3) targets.
+        error_deg: (f,) degrees at the mid-point of the eyes; NaN where a frame has no estimate.
+        reason: (f,) why there is none.
     """
 
     frame: Floats
@@ -28,22 +33,22 @@ class GazeErrors(ArrayValue):
 
     @property
     def ok(self) -> Bools:
-        """Frames with an estimate, (f,)."""
+        """Whether a frame has an estimate, (f,)."""
         return np.isfinite(self.error_deg)
 
     @property
     def mean_deg(self) -> float | None:
-        """Mean over the frames with an estimate; None without any."""
+        """Mean over the frames with an estimate; None if there are none."""
         return float(self.error_deg[self.ok].mean()) if self.ok.any() else None
 
     @property
     def max_deg(self) -> float | None:
-        """Largest error; None without any."""
+        """Largest error; None if there are none."""
         return float(self.error_deg[self.ok].max()) if self.ok.any() else None
 
 
 def leave_one_target_out(estimator: GazeEstimator, observations: Observations, rig: RigLike) -> GazeErrors:
-    """Errors of each target estimated by a calibration on all the others.
+    """Estimate each target by a calibration on all the others.
 
     A residual at the calibration targets themselves would flatter every estimator with many terms.
 
@@ -70,7 +75,7 @@ def leave_one_target_out(estimator: GazeEstimator, observations: Observations, r
 
 
 def gaze_errors(observations: Observations, gaze: GazePoints) -> GazeErrors:
-    """Binocular errors of gaze points (n) of observations (n): both eyes' mean against the target."""
+    """Binocular errors of gaze points (n) of observations (n): the mean of both eyes against the target."""
     frames, both = binocular_average(observations, gaze)
     index = frames.index
     error = angular_error_deg(both.point_mm, index.target_mm, index.head_mm)

@@ -1,4 +1,4 @@
-"""Which fitted spots are glints, and the reasons why a reflection is no glint of the cornea."""
+"""Classification of fitted spots: which are glints, and the reasons why other reflections are not."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from ..statistics import quantile
 from .detection import Spots, optics_sigma, widest
 from .fits import SpotFit
 
-# A glint's bright patch is no longer than that many times its width, and the product of that ratio and the fit's is no
-# larger; the true ones' of the development images are below 1.99 and 2.2.
+# Largest ratio of length to width of a glint's bright patch, and largest product of that ratio and the fit's. True
+# glints of the development images are below 1.99 and 2.2.
 LONG, LONG_TWICE = 2.0, 2.4
 
-_PIXEL = 1.0 / 12.0  # variance of a pixel: keeps a spot of one row of pixels from being a line
+_PIXEL = 1.0 / 12.0  # variance of a pixel; without it a spot of one row of pixels would be a line
 
 
 def classify_spots(
     spots: Spots, fit: SpotFit, prepared: Prepared, step_dn: float, blur_px: float, settings: ExtractionSettings
 ) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
-    """(accepted, rejected), brightest first."""
+    """Divide spots into (accepted, rejected), brightest first."""
     accepted: list[GlintResult] = []
     rejected: list[GlintResult] = []
     looks = _Look.of_all(spots, fit)
@@ -80,7 +80,7 @@ class _Look:
 
 
 def _objection(look: _Look, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float) -> str | None:
-    """Why spot i is no glint, or None."""
+    """Reason why spot i is not a glint, or None."""
     if not look.converged:
         return "the spot's fit did not converge"
     if look.moved > max(2.5, 2.0 * look.wide):
@@ -103,9 +103,9 @@ def _objection(look: _Look, fit: SpotFit, i: int, prepared: Prepared, step_dn: f
 
 
 def _outshines(fit: SpotFit, i: int, prepared: Prepared) -> bool:
-    """Whether a spot's peak stands above the brightest surroundings, other spots apart, by half its own height.
+    """Whether a spot's peak is above the brightest surroundings (without other spots) by half its own height.
 
-    Asked of wide spots only: a narrow one has no time to be anything else.
+    This test is for wide spots only, because a narrow spot cannot be anything but a glint.
     """
     x, y = fit.xy_px[i]
     wide = float(fit.sigma_px[i].max())

@@ -1,8 +1,8 @@
-"""Which glint belongs to which light, from the geometry of the rig; nothing is known of the true gaze.
+"""Assignment of glints to lights from the geometry of the rig; nothing about the true gaze is used.
 
 The lights are mirrored in a sphere (the cornea) whose centre follows from the image of the pupil and a rough position
-of the eye. That layout may be off by a shift (where exactly the eye is) and a scale (corneal radius, distance); the
-glints are matched to it with both left free within what those can do, missing and surplus glints allowed.
+of the eye. That layout may be wrong by a shift (of the eye's position) and a scale (of corneal radius and distance).
+The glints are matched to it with shift and scale free within plausible limits. Missing and surplus glints are allowed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from ...arrays import Floats, Indices
 from ...errors import InputError
 
 CORNEA_RADIUS_MM = 7.8
-# Of a typical adult eye: apex to centre of rotation, that to the entrance pupil and to the cornea's centre.
+# Distances in a typical adult eye: apex to centre of rotation, and from there to the entrance pupil and to the cornea's
+# centre.
 APEX_TO_ROTATION_MM = 13.5
 ROTATION_TO_PUPIL_MM = 10.4
 ROTATION_TO_CORNEA_MM = 5.7
@@ -44,10 +45,16 @@ class Assignment:
 
 
 def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLike, lights_mm: ArrayLike) -> Floats:
-    """(l, 3) points of a sphere that mirror the lights to the camera: normal = bisector of the two directions.
+    """Points (l, 3) of a sphere that mirror the lights to the camera: the normal bisects the two directions.
 
-    Fixed-point iteration n <- (unit to camera + unit to light) / |...| from the point centre + radius n; it contracts
-    by about radius / distance. centre (3,), camera (3,), lights (l, 3), mm.
+    The fixed-point iteration n <- (unit to camera + unit to light) / |...| from the point centre + radius n contracts
+    by about radius / distance.
+
+    Args:
+        centre_mm: (3,) centre of the sphere.
+        radius_mm: its radius.
+        camera_mm: (3,) nodal point of the camera.
+        lights_mm: (l, 3) lights.
     """
     centre, camera = np.asarray(centre_mm, dtype=np.float64), np.asarray(camera_mm, dtype=np.float64)
     lights = np.atleast_2d(np.asarray(lights_mm, dtype=np.float64))
@@ -63,7 +70,7 @@ def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLik
 
 
 def project(points_mm: ArrayLike, K: ArrayLike, R: ArrayLike, t_mm: ArrayLike) -> Floats:
-    """(n, 2) px of world points (n, 3): K (R X + t), OpenCV's pinhole without distortion."""
+    """Project world points (n, 3) to pixels (n, 2) by K (R X + t), OpenCV's pinhole model without distortion."""
     camera = np.asarray(points_mm, dtype=np.float64) @ np.asarray(R, dtype=np.float64).T + np.asarray(
         t_mm, dtype=np.float64
     )
@@ -81,12 +88,26 @@ def predict_glints(
     *,
     radius_mm: float = CORNEA_RADIUS_MM,
 ) -> tuple[Floats, float]:
-    """((l, 2) expected glints, px; image scale at the eye, px per mm).
+    """Predict where the glints should be.
 
-    pupil_px: (2,) centre of the pupil on the full sensor. K (3, 3), R (3, 3), t (3,): the camera. lights (l, 3).
-    eye_mm: (3,) rough world position of the corneal apex when the eye looks along +x; where not finite, the pupil's ray
-    is cut with the plane x = 0. The gaze is the direction from the centre of rotation to where the pupil's ray meets
-    the sphere on which the entrance pupil turns (its nearest point where it misses); the cornea's centre lies on it.
+    The gaze is taken as the direction from the centre of rotation to the point where the pupil's ray meets the sphere
+    on which the entrance pupil turns (its nearest point where it misses). The cornea's centre lies on that direction.
+
+    Args:
+        pupil_px: (2,) centre of the pupil on the full sensor.
+        K: (3, 3) camera matrix.
+        R: (3, 3) rotation, world to camera.
+        t_mm: (3,) translation, world to camera.
+        lights_mm: (l, 3) lights.
+        eye_mm: (3,) rough world position of the corneal apex when the eye looks along +x. Where it is not finite, the
+            point where the pupil's ray meets the plane x = 0 is used.
+        radius_mm: corneal radius.
+
+    Returns:
+        Expected glints (l, 2) in px, and the image scale at the eye in px per mm.
+
+    Raises:
+        InputError: the pupil's ray is parallel to the plane x = 0, and there is no position.
     """
     K3, R3, t3 = (np.asarray(value, dtype=np.float64) for value in (K, R, t_mm))
     camera = -R3.T @ t3
@@ -105,7 +126,7 @@ def predict_glints(
     pupil = nearest - math.sqrt(max(reach2, 0.0)) * ray
     gaze = _unit(pupil - rotation)
     cornea = rotation + ROTATION_TO_CORNEA_MM * gaze
-    # The pupil's own ray is exact; the model's length errors are taken out along it.
+    # The pupil's own ray is exact. The errors of the model's lengths are removed along it.
     cornea = cornea + (pupil - (rotation + ROTATION_TO_PUPIL_MM * gaze)) if reach2 > 0.0 else cornea
     depth = float((R3 @ cornea + t3)[2])
     scale = float(math.sqrt(abs(K3[0, 0] * K3[1, 1]))) / max(depth, 1e-6)
@@ -122,16 +143,22 @@ def assign_lights(
     tolerance_px: float = 1.5,
     slack: float = 0.08,
 ) -> Assignment:
-    """The lights of glints (m, 2), given where the rig's lights (l, 2) are expected.
+    """Assign glints to lights, given where the lights' glints are expected.
 
-    shift_sd_px: how far the whole layout may be off (standard deviation). scale_range: of the layout, 6.6 to 9.2 mm of
-    corneal radius about 7.8. A glint fits a light when, after shift and scale, it lies within tolerance_px plus `slack`
-    times the light's distance from the layout's middle (corneas are no spheres).
+    A glint fits a light if, after shift and scale, its distance is at most tolerance_px plus `slack` times the light's
+    distance from the layout's middle (corneas are not spheres).
 
-    Every pairing of one glint with one light, and of two with two, proposes a layout; the others are matched one to
-    one.
-    A layout's merit is the number matched, less their squared misfit and the improbability of its shift. When another
-    layout that names other lights comes within 0.25 of the best, neither is chosen.
+    Every pairing of one glint with one light, and of two with two, proposes a layout. The other glints are then matched
+    one to one. A layout's merit is the number of matches minus their squared misfits and the improbability of its
+    shift. If another layout that names different lights comes within 0.25 of the best one, neither is chosen.
+
+    Args:
+        glints_px: (m, 2) glints.
+        predicted_px: (l, 2) expected glints of the rig's lights.
+        shift_sd_px: standard deviation of the whole layout's shift.
+        scale_range: limits of the layout's scale; the default is a corneal radius of 6.6 to 9.2 mm instead of 7.8.
+        tolerance_px: largest distance in the middle of the layout.
+        slack: additional distance as a share of the light's distance from the middle.
     """
     glints = np.asarray(glints_px, dtype=np.float64).reshape(-1, 2)
     lights = np.asarray(predicted_px, dtype=np.float64).reshape(-1, 2)
@@ -176,9 +203,18 @@ def identify(
     *,
     position_sd_mm: float = 1.0,
 ) -> Assignment:
-    """`predict_glints`, then `assign_lights`. All pixels are of the full sensor.
+    """Predict the glints, then assign them to the lights; all pixels are those of the full sensor.
 
-    position_sd_mm: how well the cornea's place across the line of sight follows from the pupil and `eye_mm`.
+    Args:
+        glints_px: (m, 2) glints.
+        pupil_px: see `predict_glints`, as are the next five.
+        K: (3, 3).
+        R: (3, 3).
+        t_mm: (3,).
+        lights_mm: (l, 3).
+        eye_mm: (3,).
+        position_sd_mm: standard deviation of the cornea's position across the line of sight, given the pupil and
+            `eye_mm`.
     """
     lights = np.asarray(lights_mm, dtype=np.float64).reshape(-1, 3)
     if lights.shape[0] == 0:
@@ -225,10 +261,10 @@ def _promising(
 
 
 def _match(glints: Floats, lights: Floats, middle: Floats, reach: Floats, shift: Floats, scale: float) -> Indices:
-    """(m,) light of every glint, one to one, least sum of squared misfits within reach; -1 where none is."""
+    """Light (m,) of every glint, one to one, with the least sum of squared misfits within reach; -1 for none."""
     offset = glints[:, None, :] - _placed(lights, middle, shift, scale)[None]
     misfit = np.hypot(offset[..., 0], offset[..., 1]) / reach[None, :]
-    cost = np.where(misfit < 1.0, misfit**2 - 1.0, 0.0)  # leaving both alone costs nothing
+    cost = np.where(misfit < 1.0, misfit**2 - 1.0, 0.0)  # not matching them costs nothing
     rows, columns = linear_sum_assignment(cost)
     match = np.full(glints.shape[0], -1, dtype=np.intp)
     taken = misfit[rows, columns] < 1.0

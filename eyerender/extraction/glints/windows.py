@@ -1,4 +1,4 @@
-"""The pixels about bright spots, every spot's in a round window of its own, and the spots' light in them."""
+"""Round windows of pixels around bright spots, and the light of all spots in them."""
 
 from __future__ import annotations
 
@@ -22,17 +22,25 @@ LARGEST_PX = 20  # radius of a window at most
 
 
 def window_radius(width: Floats) -> Floats:
-    """Radius, px, of the pixels that a spot of that sigma is fitted to."""
+    """Radius, px, of the pixels to which a spot of that sigma is fitted."""
     return 2.7 * width + 1.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpotPixels:
-    """Windows of n spots: P pixels, one spot's after the other's.
+    """Windows of n spots: P pixels, one spot after the other.
 
-    centre (n, 2): a window's middle pixel, px. radius (n,) px. first (n + 1,): where each spot's pixels begin, and the
-    end. spot (P,): whose pixel each is. middle_dn (n,): B in the middle. plane (3, P): 1 and the place from there.
-    data, known (P,): image and B. clip (P,): whether the sensor clipped the pixel; clipped: whether it did any.
+    Attributes:
+        centre: (n, 2) middle pixel of each window, px.
+        radius: (n,) px.
+        first: (n + 1,) where each spot's pixels begin, and the end.
+        spot: (P,) the spot of each pixel.
+        middle_dn: (n,) B in the middle.
+        plane: (3, P) 1 and the offset from the middle.
+        data: (P,) image.
+        known: (P,) B.
+        clip: (P,) whether the sensor clipped the pixel.
+        clipped: whether any pixel is clipped.
     """
 
     centre: Floats
@@ -48,30 +56,30 @@ class SpotPixels:
 
     @property
     def count(self) -> Floats:
-        """(n,) of every spot's pixels."""
+        """Number (n,) of each spot's pixels."""
         return np.asarray(self.first[1:] - self.first[:-1], dtype=np.float64)
 
     @property
     def dx(self) -> Floats:
-        """(P,) from the window's middle."""
+        """Horizontal offset (P,) from the window's middle."""
         return np.asarray(self.plane[1], dtype=np.float64)
 
     @property
     def dy(self) -> Floats:
-        """(P,) from the window's middle."""
+        """Vertical offset (P,) from the window's middle."""
         return np.asarray(self.plane[2], dtype=np.float64)
 
     def parts(self, values: NDArray[_T]) -> list[NDArray[_T]]:
-        """Every spot's own of values (..., P)."""
+        """Split values (..., P) by spot."""
         ends = self.first.tolist()
         return [values[..., begin:end] for begin, end in pairwise(ends)]
 
     def rows(self, spots: Indices) -> Indices:
-        """Which of the pixels are those spots', in the spots' order."""
+        """Indices of the pixels of given spots, in the order of the spots."""
         return _ranges(self.first[spots], self.first[spots + 1] - self.first[spots])
 
     def taken(self, spots: Indices) -> SpotPixels:
-        """The chosen spots'."""
+        """Windows of the chosen spots."""
         if spots.size == self.radius.size and bool((spots == np.arange(spots.size)).all()):
             return self
         count = self.first[spots + 1] - self.first[spots]
@@ -85,11 +93,11 @@ class SpotPixels:
         )  # fmt: skip
 
     def total(self, values: NDArray[np.generic]) -> Floats:
-        """(n,) sum of a value (P,) over every spot's pixels."""
+        """Sum (n,) of a value (P,) over each spot's pixels."""
         return np.asarray(np.bincount(self.spot, weights=values, minlength=self.radius.size), dtype=np.float64)
 
     def most(self, values: Floats) -> Floats:
-        """(n,) largest value (P,), none below 0, in every spot's pixels."""
+        """Largest value (n,) of a value (P,) among each spot's pixels, at least 0."""
         out = np.zeros(self.radius.size)
         some = self.first[:-1] < self.first[1:]
         if values.size:
@@ -98,14 +106,14 @@ class SpotPixels:
 
 
 def _starts(count: Indices) -> Indices:
-    """0, count[0], count[0] + count[1], ..., their sum."""
+    """Cumulative sum 0, count[0], count[0] + count[1], ..., with the total at the end."""
     out = np.zeros(count.size + 1, dtype=np.intp)
     np.cumsum(count, out=out[1:])
     return out
 
 
 def _ranges(first: Indices, count: Indices) -> Indices:
-    """first[0], first[0] + 1, ... (count[0] of them), first[1], ..."""
+    """Concatenated ranges first[0], first[0] + 1, ... (count[0] of them), first[1], ..."""
     start = _starts(count)
     return np.asarray(np.arange(start[-1]) + np.repeat(first - start[:-1], count), dtype=np.intp)
 
@@ -113,9 +121,14 @@ def _ranges(first: Indices, count: Indices) -> Indices:
 def cut(
     linear: Image, known: Callable[[Floats, Floats], Floats], start: Floats, width: Floats, clip_dn: float
 ) -> SpotPixels:
-    """Round windows, each as wide as its spot needs: the less of the limbus and of other edges is in them.
+    """Cut round windows, each only as wide as its spot needs, so that little of the limbus and other edges is in them.
 
-    start (n, 2), width (n,): where the spots are and their sigma. known: B at pixels (x, y).
+    Args:
+        linear: the image, DN.
+        known: gives the background B at pixels (x, y).
+        start: (n, 2) places of the spots.
+        width: (n,) their sigma.
+        clip_dn: level at which the sensor clips.
     """
     rows, columns = linear.shape
     centre, radius = np.rint(start), np.minimum(window_radius(width), LARGEST_PX)
@@ -142,10 +155,14 @@ def cut(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """Where the columns and rows of n windows begin and end, so that a spot's profile is worked out once for each.
+    """Borders of the columns and rows of n windows, so that a spot's profile is computed once per column and row.
 
-    edges (2 E,): from the windows' middles, the columns' of one window after the other's, then the rows'. owner (2 E,):
-    whose, the rows' owners counted on from n. column, row (P,): the edge before each pixel. split: E.
+    Attributes:
+        edges: (2 E,) from the windows' middles: the columns' borders of one window after the other, then the rows'.
+        owner: (2 E,) the window of each border; those of rows are counted from n.
+        column: (P,) the border before each pixel's column.
+        row: (P,) the border before each pixel's row.
+        split: E.
     """
 
     edges: Floats
@@ -156,7 +173,7 @@ class Grid:
 
     @staticmethod
     def of(radius: Floats, spot: Indices, dx: Floats, dy: Floats) -> Grid:
-        """The windows' radius (n,); and of every pixel (P,) whose it is and its offset from the window's middle."""
+        """Make the grid from the radius (n,) of the windows, and the window and offset of every pixel (P,)."""
         n, half = radius.size, np.ceil(radius + 0.5).astype(np.intp)
         size = np.tile(2 * half + 2, 2)
         middle = np.cumsum(size) - size + np.tile(half, 2)
@@ -166,14 +183,18 @@ class Grid:
         return Grid(edges, owner, column, row, owner.size // 2)
 
     def profiles(self, at: Floats, sigma: Floats, amplitude: Floats) -> tuple[Floats, Floats]:
-        """((3, P), (3, P)): the spots' profiles across the pixels' columns, times the amplitude, and along their rows.
+        """Profiles of the spots across the pixels' columns, times the amplitude, and along their rows, (3, P) each.
 
-        Of each the derivative by its centre, the value, the derivative by ln sigma. at (n, 2): the spots' centres from
-        the windows' middles, sigma (n, 2), amplitude (n,).
+        Each has the derivative by its centre, the value, and the derivative by ln sigma.
+
+        Args:
+            at: (n, 2) centres of the spots from the windows' middles.
+            sigma: (n, 2).
+            amplitude: (n,).
         """
         owner = self.owner
         parts = profile(self.edges, at.T.ravel()[owner], sigma.T.ravel()[owner])
-        # Along the rows the profiles stay as they are.
+        # The profiles along the rows are not multiplied.
         across = parts[:, : self.split] * amplitude[owner[: self.split]]
         return across.take(self.column, axis=1), parts.take(self.row, axis=1)
 
@@ -232,7 +253,7 @@ class Others:
         """
         to, by = np.nonzero(pairs)
         gap = np.hypot(*(pixels.centre[to] - theta[by, :2]).T) - pixels.radius[to] - 2.0
-        wide2 = np.exp(2.0 * theta[by, 3:5].max(axis=1)) * 1.5 + 0.1  # room for what the fit may make of it
+        wide2 = np.exp(2.0 * theta[by, 3:5].max(axis=1)) * 1.5 + 0.1  # room for changes during the fit
         shines = theta[by, 2] - 0.5 * np.maximum(gap, 0.0) ** 2 / wide2 > math.log(1e-3 * noise_dn)
         to, by = to[shines], by[shines]
         if to.size == 0:
@@ -243,7 +264,7 @@ class Others:
         return Others(by, rows, pair, grid, pixels.centre[to])
 
     def light(self, theta: Floats, pixels: int, shining: Bools | None = None) -> Floats:
-        """(pixels,) the light of other spots, all or those `shining` (n,), in every spot's pixels."""
+        """Light (pixels,) of other spots, all or those `shining` (n,), in every spot's pixels."""
         own = theta[self.by]
         amplitude = np.exp(own[:, 2]) if shining is None else np.exp(own[:, 2]) * shining[self.by]
         across, along = self.grid.profiles(own[:, :2] - self.centre, np.exp(own[:, 3:5]), amplitude)

@@ -1,4 +1,7 @@
-"""Candidates for the pupil: dark elliptical blobs over a sweep of thresholds; of nested blobs the innermost wins."""
+"""Candidates for the pupil: dark elliptical blobs over a sweep of thresholds.
+
+Of nested blobs the innermost is taken.
+"""
 
 from __future__ import annotations
 

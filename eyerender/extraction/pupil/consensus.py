@@ -1,4 +1,4 @@
-"""Which edge points belong to one ellipse: random samples of arcs, consensus, and OpenCV's AMS fit."""
+"""Selection of the edge points that lie on one ellipse: random samples of arcs, consensus, and OpenCV's AMS fit."""
 
 from __future__ import annotations
 
@@ -17,20 +17,25 @@ from .candidates import Candidate
 from .edges import EdgePoints
 from .stretches import Cuts, turn_of
 
-SECTORS = 48  # of the outline, for support
-PIECES = 16  # arcs are cut at these sectors, so that a lid's margin parts from the boundary it joins
+SECTORS = 48  # sectors of the outline, to measure support
+PIECES = 16  # arcs are cut at these sectors, to separate a lid margin from the boundary it joins
 SAMPLES = 240
 POINTS_PER_PIECE = 3
-FINALISTS = 24  # of the random ellipses, counted with all points
-ALL_AGREE = 0.85  # of the highest support: the root mean square distance is then 0.39 of the tolerance at most
+FINALISTS = 24  # random ellipses whose support is counted with all points
+ALL_AGREE = 0.85  # share of the highest support; the root mean square distance is then at most 0.39 of the tolerance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundaryFit:
     """The ellipse through the edge points, corrected for curvature.
 
-    inliers: (n,) which edge points it rests on. points_px: those points, corrected. support: share of the outline they
-    cover; gap: of the longest stretch they leave. residual_px: their root mean square distance.
+    Attributes:
+        ellipse: the ellipse.
+        inliers: (n,) edge points that it is fitted to.
+        points_px: those points, corrected.
+        support: share of the outline that they cover.
+        gap: share of the outline in the longest stretch without them.
+        residual_px: their root mean square distance.
     """
 
     ellipse: Ellipse
@@ -41,15 +46,15 @@ class BoundaryFit:
     residual_px: float
 
 
-# How far a margin is from an ellipse, in its radius (rms; Wyatt 1995: 1.7 %, of which an ellipse takes about half);
-# with less room only a part of an uneven margin would be fitted.
+# Deviation of a pupil boundary from an ellipse, in its radius (rms; Wyatt 1995: 1.7 %, of which an ellipse takes about
+# half). With a smaller value only a part of an uneven boundary would be fitted.
 UNEVEN = 0.01
 
 
 def fit_boundary(
     edges: EdgePoints, candidate: Candidate, settings: ExtractionSettings, expected_noise_px: float
 ) -> BoundaryFit | str:
-    """The boundary of the pupil among `edges`, or the reason why there is none."""
+    """Fit the boundary of the pupil to `edges`, or give the reason why there is none."""
     if edges.points_px.shape[0] < 8:
         return f"only {edges.points_px.shape[0]} edge points around the darkest blob"
     uneven = UNEVEN * float(np.sqrt(np.prod(candidate.ellipse.semi_axes_px)))
@@ -61,7 +66,8 @@ def fit_boundary(
     boundary = _polished(edges, start, settings, tolerance)
     if isinstance(boundary, str) or boundary.residual_px < 1.3 * expected_noise_px:
         return boundary
-    # Parts of an uneven margin fit an ellipse better than the whole, but not as well as the edges' noise allows.
+    # A part of an uneven boundary fits an ellipse better than the whole, but not as well as the noise of the edges
+    # allows.
     cuts = Cuts.of(edges.points_px[boundary.inliers], boundary.ellipse, 12, (0.12, 0.2, 0.3, 0.42), 1.6)
     freed, allowed = _without_lid(cuts, boundary, expected_noise_px, 0.7 * expected_noise_px), expected_noise_px
     if not freed and boundary.residual_px >= 1.3 * expected_px:
@@ -99,9 +105,9 @@ def boundaries_without_stretch(
 def _consensus(
     edges: EdgePoints, candidate: Candidate, settings: ExtractionSettings, tolerance: float
 ) -> Ellipse | None:
-    """The ellipse, of those through all points and through random triples of arc pieces, that most outline supports.
+    """Choose the ellipse with the most support among those through all points and through random triples of arc pieces.
 
-    Where all points are about as close to theirs as their noise makes them, no other is looked for.
+    If all points are about as close to their ellipse as noise allows, no others are tried.
     """
     points = edges.points_px
     whole = _sane(fit_ellipse_direct(points[None]), candidate, settings)
@@ -110,14 +116,14 @@ def _consensus(
     fits = np.concatenate([whole, _sane(_random_fits(edges, candidate), candidate, settings)])
     if fits.shape[0] == 0:
         return None
-    # Every third point tells which are worth counting all.
+    # Every third point suffices to choose the ellipses that are worth counting with all points.
     rough = _support(points[::3], edges.normals[::3], fits, tolerance)
     fits = fits[np.argsort(-rough, kind="stable")[:FINALISTS]]
     return _ellipse(fits[int(np.argmax(_support(points, edges.normals, fits, tolerance)))])
 
 
 def _random_fits(edges: EdgePoints, candidate: Candidate) -> EllipseFit:
-    """Ellipses through points of random triples of arc pieces."""
+    """Fit ellipses to the points of random triples of arc pieces."""
     points = edges.points_px
     offset = points - candidate.ellipse.centre_px
     bearing = np.arctan2(offset[:, 1], offset[:, 0])
@@ -127,7 +133,7 @@ def _random_fits(edges: EdgePoints, candidate: Candidate) -> EllipseFit:
     usable = np.nonzero(sizes >= 4)[0]
     if usable.size < 3:
         return fit_ellipse_direct(np.zeros((0, 5, 2)))
-    rng = np.random.default_rng(0)  # the same image gives the same answer
+    rng = np.random.default_rng(0)  # the same image must give the same result
     order = np.argsort(piece, kind="stable")
     first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     chance = sizes[usable] / sizes[usable].sum()
@@ -139,7 +145,7 @@ def _random_fits(edges: EdgePoints, candidate: Candidate) -> EllipseFit:
 
 
 def _sane(fit: EllipseFit, candidate: Candidate, settings: ExtractionSettings) -> Floats:
-    """(m, 5) centre, semi-axes and angle of those fits whose size and shape may be the candidate's."""
+    """Centre, semi-axes and angle (m, 5) of the fits with plausible size and shape."""
     a, b = fit.semi_axes_px[:, 0], fit.semi_axes_px[:, 1]
     a0, b0 = candidate.ellipse.semi_axes_px
     with np.errstate(invalid="ignore"):
@@ -167,22 +173,23 @@ def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) ->
     distance = (radius - 1.0) * radius / slope
     agree = (nx * cos - ny * sin) * normals[:, 0] + (nx * sin + ny * cos) * normals[:, 1] > 0.9 * slope
     closeness = np.maximum(1.0 - (distance / tolerance) ** 2, 0.0)
-    # Per length of outline, so that a large loose ellipse does not win by points of other edges; total as well.
+    # The score is per length of outline, so that a large loose ellipse does not win by points of other edges.
     score: Floats = np.einsum("mn,mn->m", closeness, agree) / np.sqrt(np.pi * (a + b)[:, 0])
     return score
 
 
 def _most(points: Floats, fits: Floats) -> Floats:
-    """(m,) what `_support` would be if all points were on every ellipse."""
+    """Value (m,) of `_support` if all points were on every ellipse."""
     return np.asarray(points.shape[0] / np.sqrt(np.pi * fits[:, 2:4].sum(axis=1)))
 
 
 def _polished(
     edges: EdgePoints, start: Ellipse, settings: ExtractionSettings, tolerance: float, *, free: bool = False
 ) -> BoundaryFit | str:
-    """Re-select and refit with AMS until the selection settles; edge points are moved outward by the curvature shift.
+    """Select points and refit with AMS until the selection settles.
 
-    A blurred convex edge has its steepest place sigma^2 kappa / 2 inside the true one.
+    Edge points are moved outward by the curvature shift. The steepest place of a blurred convex edge is sigma^2 kappa /
+    2 inside the true edge.
     """
     ellipse, inliers = start, np.zeros(edges.points_px.shape[0], dtype=bool)
     points = edges.points_px
@@ -219,7 +226,7 @@ def _polished(
 
 
 def ams_fit(points: Floats) -> Ellipse | None:
-    """cv2.fitEllipseAMS about the points' mean and scale, because OpenCV computes in float32."""
+    """Apply cv2.fitEllipseAMS relative to the points' mean and scale, because OpenCV computes in float32."""
     mean = points.mean(axis=0)
     scale = float(np.abs(points - mean).max())
     if not scale > 0.0:
@@ -250,7 +257,7 @@ def outline_support(ellipse: Ellipse, points: Floats) -> tuple[float, float]:
 
 
 def relative_to(ellipse: Ellipse, points: Floats) -> tuple[Floats, Floats, Floats]:
-    """(signed distance (n,), outward normal (n, 2), the outline's curvature (n,)) about points near an ellipse."""
+    """Signed distance (n,), outward normal (n, 2) and curvature of the outline (n,) at points near an ellipse."""
     a, b = ellipse.semi_axes_px.tolist()
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
     dx, dy = points[:, 0] - ellipse.centre_px[0], points[:, 1] - ellipse.centre_px[1]

@@ -20,7 +20,10 @@ SELECTION = 1.6
 
 
 def gram(slopes: Floats) -> Floats:
-    """S S^T of (p, n), in blocks of columns: for the whole, BLAS would start threads and take several times as long."""
+    """Products S S^T of (p, n), computed in blocks of columns.
+
+    For all columns at once, BLAS would start threads and take several times as long.
+    """
     columns = max(1, 200_000 // slopes.shape[0] ** 2)
     out = np.zeros((slopes.shape[0], slopes.shape[0]))
     for start in range(0, slopes.shape[1], columns):
@@ -30,13 +33,13 @@ def gram(slopes: Floats) -> Floats:
 
 
 def project(slopes: Floats, residual: Floats) -> Floats:
-    """S r of (p, n), without BLAS for the same reason as in `gram`."""
+    """Products S r of (p, n), without BLAS for the same reason as in `gram`."""
     out: Floats = np.einsum("pn,n->p", slopes, residual)
     return out
 
 
 def distance_slopes(ellipse: Ellipse, place: Place) -> Floats:
-    """(5, n) derivatives of the signed distance by cx, cy and the shape matrix (aa, bb, ab) in the ellipse's axes."""
+    """Derivatives (5, n) of the signed distance by cx, cy and the shape matrix (aa, bb, ab) in the ellipse's axes."""
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
     out = np.empty((SHAPE, place.nx.size))
     np.subtract(place.ny * sin, place.nx * cos, out=out[0])
@@ -61,7 +64,7 @@ def sector_excess(plain: Floats, inverse: Floats, sums: Floats) -> float:
 
 
 def edge_covariance(ellipse: Ellipse, points: Floats, residual_px: float) -> Floats:
-    """(5, 5) covariance of (cx, cy, a, b, angle) of an ellipse fitted to edge points with this residual.
+    """Covariance (5, 5) of (cx, cy, a, b, angle) of an ellipse fitted to edge points with this residual.
 
     Neighbouring edge points share noise (through the filter) and texture. `sector_excess` accounts for that.
     """

@@ -55,7 +55,7 @@ class EdgeModel:
 
     @property
     def step_dn(self) -> float:
-        """Mean outer level less the inner one."""
+        """Mean outer level minus the inner level."""
         return float(self.outer[0]) - self.inner_dn
 
     def level(self, x: Floats, y: Floats) -> Floats:
@@ -96,19 +96,19 @@ class Place:
     sin_u: Floats
 
     def taken(self, which: Bools | Indices) -> Place:
-        """The chosen points'."""
+        """Places of the chosen points."""
         parts = (self.distance, self.cos_t, self.sin_t, self.nx, self.ny, self.curvature, self.cos_u, self.sin_u)
         return Place(*(part[which] for part in parts))
 
     @staticmethod
     def middles(ellipse: Ellipse, count: int = SECTORS) -> Place:
-        """On the ellipse, in the middle of every one of `count` sectors."""
+        """Places on the ellipse, in the middle of each of `count` sectors."""
         t = 2.0 * np.pi * ((np.arange(count) + 0.5) / count - 0.5) - ellipse.angle_rad
         return Place.on(ellipse, np.cos(t), np.sin(t))
 
     @staticmethod
     def on(ellipse: Ellipse, cos_t: Floats, sin_t: Floats) -> Place:
-        """On the ellipse."""
+        """Places on the ellipse itself."""
         a, b = ellipse.semi_axes_px.tolist()
         nx, ny = b * cos_t, a * sin_t
         height = np.sqrt(nx * nx + ny * ny)
@@ -117,7 +117,7 @@ class Place:
 
     @staticmethod
     def of(ellipse: Ellipse, x: Floats, y: Floats, steps: int = 3) -> Place:
-        """By Newton's iteration on the nearest point's parameter, from the point's own direction.
+        """Find places by Newton's iteration on the nearest point's parameter, from the point's own direction.
 
         f(t) = (a^2 - b^2) cos t sin t - a p sin t + b q cos t = 0. Three steps reach 1e-6 px up to b / 2 away.
         """
@@ -135,7 +135,7 @@ class Place:
             for _ in range(steps):
                 value = eccentric * c * s - ap * s + bq * c
                 slope = eccentric * (c * c - s * s) - ap * c - bq * s
-                # Far inside (beyond the evolute) the slope changes sign; there no pixel counts.
+                # Far inside (beyond the evolute) the slope changes sign, but no pixel is used there.
                 turn = np.minimum(np.maximum(value / np.minimum(slope, -1e-9), -0.3), 0.3)
                 c, s = c + turn * s, s - turn * c
                 length = np.sqrt(c * c + s * s)
@@ -166,7 +166,14 @@ class Profile:
 
     @staticmethod
     def of(distance: Floats, curvature: Floats, sigma: float, kurtosis: float = 0.0) -> Profile:
-        """distance, curvature: (n,) px and 1/px of the nearest point of the boundary. sigma: px."""
+        """Compute the profile.
+
+        Args:
+            distance: (n,) px from the boundary.
+            curvature: (n,) 1/px of the nearest point of the boundary.
+            sigma: standard deviation of the blur, px.
+            kurtosis: its excess kurtosis.
+        """
         z = distance / sigma
         z2 = z * z
         density = _DENSITY * np.exp(-0.5 * z2)
@@ -187,7 +194,7 @@ class Profile:
 
 
 def sector_of(place: Place) -> Indices:
-    """(n,) which of the SECTORS equal steps of the ellipse's parameter u each point belongs to."""
+    """Sector (n,) of each point: which of the SECTORS equal steps of the ellipse's parameter u."""
     share = np.arctan2(place.sin_u, place.cos_u) / (2.0 * np.pi) + 0.5
     return (share * SECTORS).astype(np.intp) % SECTORS
 
@@ -199,7 +206,7 @@ def _turned(cos_t: Floats, sin_t: Floats, angle: float) -> tuple[Floats, Floats]
 
 
 def _between(values: Floats, place: Place) -> Floats:
-    """(n,) values of the SECTORS at places, linear between the sectors' middles."""
+    """Values (n,) at places, interpolated linearly between the middles of the SECTORS."""
     share = np.arctan2(place.sin_u, place.cos_u) / (2.0 * np.pi) + 0.5
     at = share * SECTORS - 0.5
     low = np.floor(at).astype(np.intp)
@@ -208,7 +215,7 @@ def _between(values: Floats, place: Place) -> Floats:
 
 
 def harmonics(cos_u: Floats, sin_u: Floats, order: int) -> Floats:
-    """(1 + 2 K, n): 1, cos u, sin u, ..., cos K u, sin K u."""
+    """Harmonics (1 + 2 K, n): 1, cos u, sin u, ..., cos K u, sin K u."""
     out = np.empty((1 + 2 * order, cos_u.size))
     out[0] = 1.0
     if order:

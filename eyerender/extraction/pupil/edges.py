@@ -1,4 +1,4 @@
-"""Sub-pixel edge points on the boundary of a candidate: gradients, ridges, polarity and darkness gates."""
+"""Sub-pixel edge points on the boundary of a candidate: gradients, ridges, and tests of polarity and darkness."""
 
 from __future__ import annotations
 
@@ -39,12 +39,21 @@ class EdgePoints:
 def find_edges(
     linear: Image, candidate: Candidate, noise_dn: float, bright_dn: float, filter_px: float, *, band: float
 ) -> EdgePoints:
-    """Edge points within `band` times the semi-axes of the candidate's outline (and at least 4 px).
+    """Find edge points within `band` times the semi-axes of the candidate's outline (and at least 4 px).
 
-    A gradient ridge is kept when it points outward (within 45 deg of the candidate's normal), stands out of the noise,
-    has dark pupil behind it, and is not the flank of a spot brighter than `bright_dn`.
-    Sub-pixel position: along the gradient's larger component, the vertex of the parabola through the logarithms of
-    three magnitudes, exact for a Gaussian-blurred straight edge. Source: Devernay (1995), with the logarithm.
+    A gradient ridge is kept if it points outward (within 45 deg of the candidate's normal), exceeds the noise, has dark
+    pupil behind it, and is not the flank of a spot brighter than `bright_dn`.
+
+    The sub-pixel position, along the gradient's larger component, is the vertex of the parabola through the logarithms
+    of three magnitudes. It is exact for a Gaussian-blurred straight edge. Source: Devernay (1995), with the logarithm.
+
+    Args:
+        linear: the image, DN.
+        candidate: the dark blob.
+        noise_dn: standard deviation of a pixel's noise.
+        bright_dn: level of a bright spot.
+        filter_px: sigma of the derivative filter.
+        band: width of the search, in semi-axes.
     """
     ellipse = candidate.ellipse
     b = float(ellipse.semi_axes_px[1])
@@ -53,7 +62,7 @@ def find_edges(
     gx, gy = _gradient(crop, sigma)
     magnitude = as_image(cv2.magnitude(gx, gy))
     half_band = max(band, 4.0 / b)
-    # The coarse gates first: the rest works on the few pixels they leave.
+    # The coarse tests come first, so that the others work on few pixels.
     floor = 3.5 * noise_dn / (2.0 * math.sqrt(2.0 * math.pi) * sigma**2)
     strong = magnitude > floor
     strong[[0, -1], :] = False
@@ -84,7 +93,7 @@ def find_edges(
     plain = ahead < bright_dn
     keep = dark & plain
     arc = _arcs(crop.shape, row, column)
-    # The profile's width: log of a Gaussian bends by -1 / sigma^2 along the normal, less along the axis.
+    # Width of the profile: the logarithm of a Gaussian bends by -1 / sigma^2 along the normal, less along the axis.
     lean = np.where(level, np.abs(normals[:, 0]), np.abs(normals[:, 1]))
     spread = sigma * 1.1
     if keep.sum() >= 8:
@@ -100,15 +109,16 @@ def find_edges(
 
 
 def filter_sigma(step_dn: float, noise_dn: float, b: float) -> float:
-    """Width of the derivative filter: 1 px where the edge is clear, up to 2.5 px (and b / 6) where noise needs it."""
+    """Width of the derivative filter: 1 px for a clear edge, up to 2.5 px (and b / 6) for a noisy one."""
     return float(np.clip(9.0 * noise_dn / max(step_dn, 1e-6), 1.0, max(1.0, min(2.5, b / 6.0))))
 
 
 def edge_noise_px(step_dn: float, noise_dn: float, sigma_filter: float, sigma_total: float) -> float:
     """Standard deviation of one edge point along its normal, px.
 
-    sigma_x = n'' / |g''|: the noise's second derivative along the normal after filtering, noise sqrt(3 / (16 pi)) /
-    s_f^3, over the bend of the gradient's ridge, step / (sqrt(2 pi) s_t^3); s_f of the filter, s_t of the whole blur.
+    sigma_x = n'' / |g''|. The noise's second derivative along the normal after filtering is noise sqrt(3 / (16 pi)) /
+    s_f^3. The curvature of the gradient's ridge is step / (sqrt(2 pi) s_t^3). s_f is the width of the filter, s_t that
+    of the whole blur.
     """
     curvature = step_dn / (math.sqrt(2.0 * math.pi) * sigma_total**3)
     slope_noise = noise_dn * math.sqrt(3.0 / (16.0 * math.pi)) / sigma_filter**3
@@ -151,7 +161,7 @@ def _outward(ellipse: Ellipse, x: Floats, y: Floats) -> tuple[Floats, Floats, Fl
 
 
 def _typical(strength: Image) -> float:
-    """The strong edges' level: an upper percentile, because a ridge has more flank than crest."""
+    """Level of strong edges: an upper percentile, because a ridge has more flank than crest."""
     return quantile(strength, 0.9) if strength.size else 0.0
 
 

@@ -1,8 +1,8 @@
 """The least-squares system of the boundary's pixel model: slopes, normal equations, Gauss-Newton steps.
 
-A margin is not quite an ellipse: every sector of it may be displaced, by amounts whose standard deviation is given. To
-first order a sector's displacement is one more linear parameter of that sector's pixels alone, so that a step of the
-others eliminates them all (Schur's complement).
+A pupil boundary is not exactly an ellipse: every sector of it may be displaced, by amounts whose standard deviation is
+given. To first order a sector's displacement is one more linear parameter that affects only that sector's pixels. A
+step of the other parameters therefore eliminates all displacements (Schur's complement).
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from .edge_model import EdgeModel, Place, Profile, harmonics
 
 # Parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, lean (two), mean outer level.
 FIXED = SHAPE + 7
-# Standard deviations of what is about 0 beforehand: the harmonics of the outer level, in steps (nothing else holds them
-# under a lid); its change over a semi-axis b, in steps (lamps beside the camera bring it about); the blur's kurtosis;
-# how the inner level leans, in steps: scattered light only, so that noise does not find a lean where there is none.
+# Standard deviations of parameters that are expected to be near 0: the harmonics of the outer level, in steps (under a
+# lid nothing else constrains them); its change over a semi-axis b, in steps (caused by lamps beside the camera); the
+# kurtosis of the blur; the lean of the inner level, in steps (scattered light only, so that noise does not produce a
+# lean).
 HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
 KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond them the edge would not be monotonic
-NEAR = 2  # steps to the nearest point: the band is within a few tenths of b, and the boundary's own pixels far nearer
-STILL_PX = 1e-3  # a step smaller than that is the last one of a fit
+NEAR = 2  # steps to the nearest point; the band is within a few tenths of b, the boundary's own pixels closer
+STILL_PX = 1e-3  # a fit ends with a step smaller than this
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +57,7 @@ class Pixels:
         return Pixels(x, y, level, np.cumsum(new) - 1, first, sector[first])
 
     def sums(self, values: Floats) -> Floats:
-        """(..., k) sums of values (..., n) over every sector's pixels."""
+        """Sums (..., k) of values (..., n) over each sector's pixels."""
         return np.asarray(np.add.reduceat(values, self.first, axis=-1), dtype=np.float64)
 
 
@@ -74,7 +75,7 @@ class Prior:
 
     @staticmethod
     def of(start: EdgeModel, noise_dn: float, uneven_px: float) -> Prior:
-        """For a model that starts from there."""
+        """Make the priors of a fit that starts from a model."""
         displacement = (noise_dn / uneven_px) ** 2 if uneven_px > 0.0 else math.inf
         step = max(start.step_dn, noise_dn)
         slope = SLOPE_SD * step / float(start.ellipse.semi_axes_px[1])
@@ -82,7 +83,7 @@ class Prior:
         return Prior(weights, uneven_px, displacement)
 
     def of_all(self, size: int) -> Floats:
-        """(size,) every parameter's, displacements apart."""
+        """Weight (size,) of every parameter except the displacements."""
         out = np.zeros(size)
         out[7], out[8], out[9:11], out[FIXED:] = self.weights
         return out
@@ -90,7 +91,13 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """residual (n,); jacobian (p, n); slope (n,), the level's derivative by the distance."""
+    """Linearised model at the pixels.
+
+    Attributes:
+        residual: (n,).
+        jacobian: (p, n).
+        slope: (n,) derivative of the level by the distance.
+    """
 
     residual: Floats
     jacobian: Floats
@@ -125,7 +132,7 @@ class Normal:
     inverse: Floats
 
     def displaced_by(self, step: Floats) -> Floats:
-        """(k,) how the displacements change with a step of the parameters."""
+        """Change (k,) of the displacements with a step of the parameters."""
         return np.asarray((self.along - step @ self.across) * self.inverse)
 
     @staticmethod
@@ -183,12 +190,12 @@ def jacobian(model: EdgeModel, place: Place) -> tuple[Floats, Floats, Floats]:
 
 
 def _values(model: EdgeModel) -> Floats:
-    """The parameters that a prior may hold, at their places; the others are 0."""
+    """Parameters that have a prior, at their places; the others are 0."""
     return np.concatenate([np.zeros(7), [model.slope, model.kurtosis, *model.lean, 0.0], model.outer[1:]])
 
 
 def moved(model: EdgeModel, step: Floats) -> EdgeModel:
-    """The model after a step of the parameters; the shape matrix's eigenvectors give the new axes."""
+    """Apply a step of the parameters to a model; the eigenvectors of the shape matrix give the new axes."""
     x, y, aa, bb, ab, sigma, inner, slope, kurtosis, lean_x, lean_y = step[:11].tolist()
     cx, cy = model.ellipse.centre_px.tolist()
     a, b = model.ellipse.semi_axes_px.tolist()
@@ -206,9 +213,9 @@ def moved(model: EdgeModel, step: Floats) -> EdgeModel:
 def gauss_newton(
     pixels: Pixels, model: EdgeModel, displaced: Floats, place: Place, prior: Prior, steps: int
 ) -> Solution:
-    """The model after at most `steps` steps with Levenberg's damping; cost = sum r^2 + what the priors add.
+    """Fit the model with at most `steps` Gauss-Newton steps with Levenberg's damping.
 
-    displaced (k,): where the sectors are to begin with.
+    The cost is sum r^2 plus the priors' part. displaced (k,) is the start of the sectors' displacements.
     """
     rows = Rows.of(pixels, model, place, displaced)
     held = prior.of_all(rows.jacobian.shape[0])
@@ -229,7 +236,7 @@ def gauss_newton(
         further = normal.displaced_by(step)
         trial, trial_displaced = moved(model, step), displaced + further
         if largest < STILL_PX and abs(float(step[SHAPE])) < 10.0 * STILL_PX and damping < 1e-3:
-            # So small a step does what the slopes say, and another would be smaller by a factor of several.
+            # For so small a step the linear prediction holds, and another step would be several times smaller.
             left = rows.residual - project(rows.jacobian.T, step) - rows.slope * further[pixels.index]
             return Solution(trial, trial_displaced, replace(rows, residual=left), place)
         trial_place = Place.of(trial.ellipse, pixels.x, pixels.y, steps=NEAR)

@@ -1,10 +1,10 @@
-"""Confidence: the probability that the ellipse found overlaps the true one with IoU > 0.9.
+"""Confidence: the probability that the ellipse overlaps the true one with IoU > 0.9.
 
-A logistic function of what the fit itself knows. Every feature is limited to the range it had in the development
-images, scaled to 0..1 there, and enters with its value and its excess over 1/3 and 2/3 (two bends). The weights are
-maximum a-posteriori estimates (Gaussian prior of variance 20 on each), calibrated by cross-validation, made by
-`scripts/fit_confidence.py` from seeds below 10,000: 8,000 mixed images (noise 0.5 to 30 DN, blur 0.7 to 4 px, steps of
-12 to 75 DN, lids over up to half the pupil, iris texture) and 800 without an eye.
+It is a logistic function of properties of the fit. Every feature is limited to its range in the development images,
+scaled to 0..1 there, and enters with its value and its excess over 1/3 and 2/3 (two bends). The weights are maximum
+a-posteriori estimates (Gaussian prior of variance 20 on each), calibrated by cross-validation.
+`scripts/fit_confidence.py` made them from seeds below 10,000: 8,000 mixed images (noise 0.5 to 30 DN, blur 0.7 to 4 px,
+steps of 12 to 75 DN, lids over up to half the pupil, iris texture) and 800 without an eye.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FEATURES = (
 
 
 def features(ellipse: Ellipse, goodness: Goodness) -> Floats:
-    """(15,) what the confidence depends on, in the order of FEATURES."""
+    """Features (15,) on which the confidence depends, in the order of FEATURES."""
     g = goodness
     b = float(ellipse.semi_axes_px[1])
     return np.array(
@@ -57,7 +57,10 @@ def features(ellipse: Ellipse, goodness: Goodness) -> Floats:
 
 
 def design(rows: Floats, low: Floats, high: Floats) -> Floats:
-    """(n, 1 + 3 x 15) columns: 1, every feature scaled to 0..1 within its limits, the excess over 1/3, over 2/3."""
+    """Design matrix (n, 1 + 3 x 15): 1, every feature scaled to 0..1 within its limits, and its two excesses.
+
+    The excesses are those over 1/3 and over 2/3.
+    """
     scaled = (np.clip(rows, low, high) - low) / np.where(high > low, high - low, 1.0)
     bends = [np.maximum(scaled - knot, 0.0) for knot in (1.0 / 3.0, 2.0 / 3.0)]
     return np.concatenate([np.ones((rows.shape[0], 1)), scaled, *bends], axis=1)
@@ -72,12 +75,12 @@ def confidence(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "re
 
 
 def calibrated(logit: Floats, bend: Floats) -> Floats:
-    """c0 + c1 logit + c2 min(logit, 1): what the logits of cross-validation were worth, doubtful ones apart."""
+    """Calibrated logit c0 + c1 logit + c2 min(logit, 1), which corrects low ones separately."""
     return np.asarray(bend[0] + bend[1] * logit + bend[2] * np.minimum(logit, 1.0))
 
 
 def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -> PupilResult:
-    """The pupil of a boundary, by its edges or by the pixel model's fit; missing where it is too unlikely right."""
+    """Make the pupil of a boundary, from its edges or the pixel model; missing where it is too unlikely to be right."""
     boundary, image = found.boundary, found.image
     if fit is None:
         model, ellipse, covariance, inside = found.model, boundary.ellipse, found.covariance, found.interior
@@ -113,7 +116,7 @@ def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -
     )
 
 
-# Lower limits, upper limits, weights, calibration; printed by scripts/fit_confidence.py.
+# Lower limits, upper limits, weights and calibration, as printed by scripts/fit_confidence.py.
 TABLE: dict[str, tuple[tuple[float, ...], ...]] = {
     "fast": (
         (

@@ -60,7 +60,7 @@ class Cuts:
         first, count, left, widths = first[enough], count[enough], left[enough], widths[enough]
         if left.size == 0:
             return Cuts(np.zeros((0, 5)), np.zeros(0), np.zeros(0), first, count, points)
-        # The points kept follow on the stretch.
+        # The points that are kept follow the stretch.
         share = np.arange(CUT_POINTS) / CUT_POINTS
         taken = points[(first[:, None] + count[:, None] + (share * left[:, None]).astype(np.intp)) % n]
         fit = fit_ellipse_direct(taken)
@@ -90,7 +90,7 @@ class Cuts:
 
 
 def turn_of(points: Floats, ellipse: Ellipse) -> Floats:
-    """(n,) where along the outline points lie, 0..1 by the ellipse's parameter."""
+    """Position (n,) of points along the outline, 0..1 by the ellipse's parameter."""
     dx, dy = (points - ellipse.centre_px).T
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
     a, b = ellipse.semi_axes_px
@@ -98,7 +98,7 @@ def turn_of(points: Floats, ellipse: Ellipse) -> Floats:
 
 
 def _distances(points: Floats, fits: Floats) -> Floats:
-    """(m, n) signed distances, as `signed_distance`, of points (m, n, 2) to an ellipse (m, 5) each."""
+    """Signed distances (m, n), as in `signed_distance`, of points (m, n, 2) to one ellipse (m, 5) each."""
     cos, sin = np.cos(fits[:, 4:]), np.sin(fits[:, 4:])
     a, b = fits[:, 2:3], fits[:, 3:4]
     dx, dy = points[..., 0] - fits[:, :1], points[..., 1] - fits[:, 1:2]
