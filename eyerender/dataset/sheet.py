@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,8 @@ from PIL import Image, ImageDraw
 from ..arrays import Bytes
 from ..backends.choose import BackendChoice
 from ..capture import make_renderer, render_windows
-from ..errors import EyerenderError, InputError, Warn
+from ..errors import InputError, Warn
+from ..files import written
 from ..imagefile import preview
 from ..plausibility import is_saturated, saturation_warnings
 from ..progress import Progress
@@ -24,7 +24,7 @@ from .realise import frames_of
 
 TILES = 16
 _COLUMNS, _WIDTH, _GAP = 4, 320, 4
-FORMATS = (".png", ".jpg", ".jpeg", ".webp")
+FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WEBP"}
 Tile = tuple[Bytes, str]
 
 
@@ -58,14 +58,8 @@ def write_sheet(
             progress(len(tiles), total, "")
     if warn is not None:
         warn(saturation_warnings(saturated, len(tiles), what.source))
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
-        contact_sheet(tiles).save(part)
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+    with written(path) as file:
+        contact_sheet(tiles).save(file, format=FORMATS[path.suffix.lower()])
     return len(tiles)
 
 
