@@ -1,6 +1,10 @@
 """Who may write to a folder: one writer, or several runs over disjoint parts of its shards.
 
 Locks are the kernel's (flock), held by an open file: a process that dies in any way lets go of them.
+
+Why not filelock: its kernel locks are exclusive only, and runs over parts of a folder share the folder's lock. Its
+read-write locks are a SQLite database, or files that outlive a dead process until they expire. What else it does here
+would replace one call of flock.
 """
 
 from __future__ import annotations
