@@ -103,7 +103,7 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
 
 
 def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> dict[str, Any]:
-    """The labels that follow from pose and parameters alone, without a picture: a part of `image_labels`."""
+    """Labels that follow from pose and parameters alone, without an image: a part of `image_labels`."""
     camera = scene.rig.cameras[view.camera]
     return {
         "pupil": {"amodal": _ellipse_of_record(observations, view.row)},
@@ -124,9 +124,9 @@ def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | E
 
 
 def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:
-    """The ellipse with the moments of a mask's pixels, in full-sensor pixels; null numbers where there are none.
+    """Ellipse with the moments of a mask's pixels, in full-sensor pixels; null numbers where there are none.
 
-    `pixels` is their count, `cut` whether they reach the window's edge.
+    `pixels` is their number, `cut` whether they touch the window's edge.
     """
     v, u = np.nonzero(inside)
     out: dict[str, Any] = {"centre_px": None, "semi_axes_px": None, "angle_rad": None, "pixels": len(u), "cut": False}
@@ -175,7 +175,7 @@ def visible_arcs_deg(
 
 
 def iris_outline(scene: Scene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
-    """The ellipse of the apparent limbus (`limbus_px`), with a status and a reason where there is none."""
+    """Ellipse of the apparent limbus (`limbus_px`), with a status and a reason where there is none."""
     nothing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
     pixels, reason = limbus_px(scene, view, _OUTLINE_POINTS)
     if reason is not None:
@@ -229,7 +229,7 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
     pupil = observations.pupil
     ok = bool(pupil.ok[row])
     return {
-        # The whole outline: one of which only arcs are seen is missing here.
+        # The label needs the whole outline. A pupil of which only arcs are visible is missing here.
         "status": OK if ok else MISSING,
         "reason": pupil.reason[row] or None,
         "centre_px": pupil.centre_px[row].tolist() if ok else None,
@@ -239,7 +239,7 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
 
 
 def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> list[dict[str, Any]]:
-    """Where ray optics puts the centre of each lamp's glint."""
+    """Place of each lamp's glint centre by ray optics."""
     glints, row = observations.glints, view.row
     x0, y0, w, h = view.window
     out = []
@@ -262,7 +262,7 @@ def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeIma
 
 
 def _seen_glint(image: EyeImage, k: int, in_window: bool, hidden_by: str | None) -> dict[str, Any]:
-    """What of a lamp's glint the camera gets."""
+    """Visible part of a lamp's glint."""
     table = image.rendered.glints
     lit = np.isfinite(table.xy_px[k]).all()
     return {
@@ -305,7 +305,7 @@ def _space(
 
 
 def _line_of_sight(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> tuple[Floats, Floats]:
-    """The line of sight of the unturned eye: the fixed chief ray, or the one that the entrance window gives."""
+    """Line of sight of the unturned eye: the fixed chief ray, or that of the entrance window."""
     index, row = observations.index, view.row
     if scene.spec.eye.line_of_sight == "entrance_window" and np.isfinite(index.target_mm[row]).all():
         place = index.eye_position_mm[[row]] + index.head_mm[[row]]

@@ -1,4 +1,7 @@
-"""The finished dataset out of its shards: metadata.jsonl, failures.jsonl, the data card and, last, dataset.json."""
+"""Assembly of the finished dataset from its shards.
+
+It writes metadata.jsonl, failures.jsonl, the data card and, last, dataset.json.
+"""
 
 from __future__ import annotations
 
@@ -35,13 +38,13 @@ FAILURES, CARD = "failures.jsonl", "README.md"
 
 
 def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
-    """Put the dataset together; the same shards give the same bytes. Returns its statistics.
+    """Assemble the dataset from verified shards, and return its statistics.
 
-    The shards must have been verified.
+    The same shards give the same bytes.
 
     Raises:
         EyerenderError: no sample could be made, or the disk is full or not writable.
-        InputError: a shard's lines are not those that this version writes.
+        InputError: a shard's lines are not as this version writes them.
     """
     for name in (FAILURES, METADATA, CROISSANT, CARD, DATASET):
         remove_parts(folder / name)
@@ -78,13 +81,13 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
 
 
 def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
-    """What is wrong with what a dataset's shards were put together into: dataset.json and the files that it sums up.
+    """List what is wrong with the assembled files of a dataset: dataset.json and the files whose checksums it contains.
 
-    Where dataset.json holds no checksums, as older versions wrote it, metadata.jsonl is compared with the shards.
+    Where dataset.json has no checksums, as older versions wrote it, metadata.jsonl is compared with the shards.
 
     Args:
         folder: the dataset.
-        digest: of the plan that it must be made by; any where it is None.
+        digest: digest of the plan by which it must be made; None: any plan.
         quick: compare sizes only.
     """
     try:
@@ -105,7 +108,7 @@ def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> I
 
 
 def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
-    """What is wrong with the files of a finished dataset: what `damage` finds, and what `verify` finds in its shards.
+    """List what is wrong with the files of a finished dataset: the results of `damage`, and of `verify` for its shards.
 
     Args:
         folder: the dataset.
@@ -126,7 +129,7 @@ def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
 
 
 def _lines(folder: Path, shards: Iterable[int], take: Callable[[dict[str, Any]], None]) -> Iterator[bytes]:
-    """The lines of metadata.jsonl; `take` gets each, parsed."""
+    """Lines of metadata.jsonl; `take` receives each, parsed."""
 
     def lines() -> Iterator[str]:
         for shard in shards:
@@ -164,7 +167,7 @@ class Statistics:
         self.glints = 0
 
     def take_shard(self, done: dict[str, Any]) -> None:
-        """A shard's done.json."""
+        """Count a shard's done.json."""
         backend = done["backend"]
         self.backends.add(f"{backend['name']} ({backend['device']}; {done['cpu']})")
         self.samples += done["samples"][1] - done["samples"][0]
@@ -174,7 +177,7 @@ class Statistics:
         self.bytes += sum(entry["bytes"] for entry in done["files"].values())
 
     def take_line(self, line: dict[str, Any]) -> None:
-        """An image's line of metadata."""
+        """Count an image's line of metadata."""
         self.images += 1
         self.splits[line["split"]] += 1
         self.subjects.setdefault(line["split"], set()).add(line["subject"])
@@ -186,7 +189,7 @@ class Statistics:
         self.glints += sum(g["visible"] for g in labels["glints"])
 
     def to_mapping(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Convert to a mapping for JSON."""
         sizes = sorted(self.pupil_px)
         return {
             "samples": self.samples,

@@ -1,4 +1,4 @@
-"""The data card: what is in a dataset, in words."""
+"""The data card: the content of a dataset, in words."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MORE = {
 
 
 def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
-    """The text of README.md."""
+    """Text of README.md."""
     spec = plan.spec
     splits = sorted(statistics["images_by_split"])
     shown = {name: number for name, number in run_versions().items() if name not in ("python", "results")}

@@ -1,7 +1,7 @@
-"""The Ray engine: an actor a worker, on one machine or many; one a GPU where Ray has GPUs.
+"""The Ray engine: one actor per worker, on one machine or many; one per GPU where Ray has GPUs.
 
-The folder must be one that every machine sees under the same path. Ray restarts an actor that dies and has it
-make its shard again. The engine puts shards in place, as the local engine does.
+Every machine must see the folder under the same path. Ray restarts an actor that dies and lets it make its shard again.
+The engine puts shards in place, as the local engine does.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from .pool import RECYCLE_IMAGES, TRIES, Events, end_of, signals_held
 from .shard import Staged, cpu_family, write_shard
 from .worker import Job
 
-# What finds a libLLVM or a GPU's driver on the driver's machine finds it on the others, installed alike.
+# These variables locate a libLLVM or a GPU's driver on the driver's machine, and so on the others, installed alike.
 PASSED_ON = ("DRJIT_LIBLLVM_PATH", "DRJIT_LIBCUDA_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "XDG_CACHE_HOME")
 
 _FAILURES = {"backend": BackendError, "input": InputError, "disk": EyerenderError}
 
 
 class ShardActor:
-    """A worker on a cluster; Ray makes it an actor."""
+    """A worker on a cluster; Ray turns it into an actor."""
 
     def __init__(self, job: dict[str, Any]) -> None:
         self._job = Job(**job)
@@ -42,7 +42,7 @@ class ShardActor:
         self._made = 0
 
     def render(self, shard: int, known: int) -> dict[str, Any]:
-        """Make a shard; a mapping with `ok`, and the summary or the kind and reason of the failure."""
+        """Make a shard; returns a mapping with `ok`, and the summary or the kind and reason of the failure."""
         try:
             if self._maker is None:
                 self._maker = self._job.maker()
@@ -64,15 +64,15 @@ class ShardActor:
         return {"ok": True, **summary, "backend": {**self._maker.backend, "cpu": cpu_family()}}
 
     def pid(self) -> int:
-        """The actor's process."""
+        """Process id of the actor."""
         return os.getpid()
 
 
 class RayEngine:
     """Runs shards on the actors of a Ray cluster.
 
-    A process of its own, the driver, talks to Ray, because Ray takes over its driver's signals: SIGTERM would end this
-    process with a stack trace. When this process ends in whatever way, the driver ends what Ray has started here.
+    A separate process, the driver, talks to Ray, because Ray takes over its driver's signals: SIGTERM would end this
+    process with a stack trace. However this process ends, the driver then ends everything that Ray has started here.
     """
 
     def __init__(self, job: Job, workers: int | None, *, address: str | None = None, timeout_s: float = 600.0) -> None:
@@ -82,11 +82,12 @@ class RayEngine:
         self.timeout_s = timeout_s
 
     def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
-        """Make shards; returns those that were given up, with the reason.
+        """Make shards, and return those that were given up, with the reasons.
 
         Raises:
-            InputError: Ray is not installed, or the cluster cannot be reached; or as the local engine.
-            BackendError, EyerenderError: as the local engine.
+            InputError: Ray is not installed, or the cluster cannot be reached; or as for the local engine.
+            BackendError: as for the local engine.
+            EyerenderError: as for the local engine.
         """
         if find_spec("ray") is None:
             raise InputError("needs Ray (the extra 'ray'); run: pip install ray", source="--engine")
@@ -110,7 +111,7 @@ class RayEngine:
                     raise message[0]
                 getattr(events, kind)(*message)
         finally:
-            ours.close()  # tells the driver to end
+            ours.close()  # this tells the driver to end
             wait([process.sentinel], timeout=10)
             process.kill()
             end_session(process.pid or 0)
@@ -118,13 +119,14 @@ class RayEngine:
 
 
 def drive(pipe: Connection, driver: _Driver, shards: list[int]) -> None:
-    """The driver's life. Messages out: the names and arguments of events, ("failed", error) or ("end", shards lost).
+    """Run the driver.
 
-    When the pipe's other end closes, because the engine was interrupted or its process killed, the driver ends all that
-    Ray has started on this machine: the session of processes that it leads.
+    It sends the names and arguments of events, ("failed", error), or ("end", shards lost). When the pipe's other end
+    closes, because the engine was interrupted or its process killed, the driver ends everything that Ray has started on
+    this machine: the session of processes that it leads.
     """
     if hasattr(os, "setsid"):
-        os.setsid()  # out of reach of Ctrl-C, too
+        os.setsid()  # this also protects it from Ctrl-C
     silence = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silence, 1)
     os.dup2(silence, 2)
@@ -146,10 +148,10 @@ def _end_with(pipe: Connection) -> None:
 
 
 def end_session(session: int, patience_s: float = 3.0) -> None:
-    """End the other processes of a session: with SIGTERM first, after a while with SIGKILL.
+    """End the other processes of a session, first with SIGTERM, later with SIGKILL.
 
-    Ray's agents carry no other mark: they lose their parents, change their titles and overwrite their environment.
-    Does nothing where there is no /proc; there a process of Ray's own watches over its driver.
+    Ray's agents can be recognised by nothing else: they lose their parents, change their titles and overwrite their
+    environment. Where there is no /proc this does nothing; there a process of Ray's own watches over its driver.
     """
     start = time.monotonic()
     asked: set[int] = set()
@@ -163,17 +165,17 @@ def end_session(session: int, patience_s: float = 3.0) -> None:
 
 
 def _members(session: int) -> Iterator[int]:
-    """The living processes of a session but for this one."""
+    """Living processes of a session except this one."""
     for place in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # it has ended
-            # After the name, which may hold anything: state, parent, group, session.
+            # After the name, which may contain anything, follow state, parent, group and session.
             state, _, _, its = (place / "stat").read_text().rpartition(")")[2].split()[:4]
             if int(its) == session and state not in ("Z", "X") and int(place.name) != os.getpid():
                 yield int(place.name)
 
 
 class _Sender:
-    """Events of an engine, sent to another process."""
+    """Sends the events of an engine to another process."""
 
     def __init__(self, pipe: Connection) -> None:
         self.pipe = pipe
@@ -200,7 +202,7 @@ class _Held:
 
 @dataclass
 class _Driver:
-    """What talks to Ray, in a process of its own."""
+    """Talks to Ray, in a process of its own."""
 
     job: Job
     workers: int | None
@@ -208,7 +210,7 @@ class _Driver:
     timeout_s: float
 
     def run(self, pending: deque[int], events: Events) -> dict[int, str]:
-        """Make shards as the engine does; raises as it does."""
+        """Make shards as the engine does, with the same errors."""
         ray: Any = import_module("ray")
         variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
         try:
@@ -269,13 +271,13 @@ class _Driver:
                     idle.append(remote.remote(asdict(self.job)))
             for job in held.values():
                 if time.monotonic() - job.since > self._limit():
-                    # Ray starts it again, with its task.
+                    # Ray starts it again with its task.
                     job.since = time.monotonic()
                     ray.kill(job.actor, no_restart=False)
         return lost
 
     def _limit(self) -> float:
-        """Seconds a whole shard may take: `timeout_s` is of one sample."""
+        """Largest time for a whole shard, s; `timeout_s` is for one sample."""
         return self.timeout_s * max(1, int(self.job.plan["spec"].get("shard_size", 64)) // 8)
 
     @staticmethod

@@ -1,7 +1,8 @@
-"""The order of metadata.jsonl: lines that are the first to fill a column stand first, all others follow as they come.
+"""Order of metadata.jsonl: lines that are the first to fill a column come first, all others keep their order.
 
-Loaders take a column's type from the first lines of the file (Hugging Face from its first 10 MB). A column that is null
-there, the reason of a glint that lids hide once in ten thousand images, would get no type and fail when it is filled.
+Loaders determine a column's type from the first lines of the file (Hugging Face from its first 10 MB). A column that is
+null there would get no type, and loading would fail at the first value. An example is the reason of a glint that lids
+hide once in ten thousand images.
 """
 
 from __future__ import annotations
@@ -12,7 +13,10 @@ from typing import Any
 
 
 def type_first(lines: Callable[[], Iterable[str]], take: Callable[[dict[str, Any]], None]) -> Iterator[str]:
-    """Lines of JSON in the order of the module; `lines` is gone through twice, `take` gets each once, parsed."""
+    """Order lines of JSON as the module describes.
+
+    `lines` is called twice, and `take` receives each line once, parsed.
+    """
     seen: set[str] = set()
     first: dict[int, str] = {}
     for number, text in enumerate(lines()):
@@ -29,7 +33,7 @@ def type_first(lines: Callable[[], Iterable[str]], take: Callable[[dict[str, Any
 
 
 def _filled(node: Any, path: str) -> Iterator[str]:
-    """The paths of what is neither null nor an empty list."""
+    """Paths of everything that is neither null nor an empty list."""
     if isinstance(node, dict):
         for key, value in node.items():
             yield from _filled(value, f"{path}.{key}")

@@ -57,7 +57,7 @@ _CONTEXT: dict[str, Any] = {
 
 
 def croissant(plan: Plan, metadata_sha256: str) -> dict[str, Any]:
-    """The description, as JSON-LD."""
+    """Description as JSON-LD."""
     spec = plan.spec
     name = "".join(c if c.isalnum() else "_" for c in spec.name)
     return {

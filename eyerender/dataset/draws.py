@@ -1,12 +1,12 @@
-"""Distributions that may stand in place of any value of a scene template.
+"""Distributions, which may replace any value of a scene template.
 
 A draw is a mapping with the key `draw`. Its value is a pure function of the dataset's seed, the draw's dotted path in
 the template, the unit it belongs to (a sample or a subject) and the attempt:
 
     u = (m + 1/2) / 2^53,   m = the first 53 bits of SHA-256("seed/path/unit/number/attempt")
 
-so it depends neither on any other draw nor on who makes the sample. Grids form one joint full factorial design, Sobol
-draws one joint scrambled sequence (Owen 1998, as `scipy.stats.qmc.Sobol` has it).
+Therefore it depends neither on any other draw nor on the process that makes the sample. Grids form one joint full
+factorial design. Sobol draws form one joint scrambled sequence (Owen 1998, as in `scipy.stats.qmc.Sobol`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ..spec import Positive, Spec
 
 Unit = Literal["sample", "subject"]
 MARK = "draw"
-# Cauchy's coefficients of an eye's media are the largest numbers that may be drawn, seeds the largest integers.
+# The largest numbers that may be drawn are Cauchy's coefficients of an eye's media; the largest integers are seeds.
 Drawn = Annotated[float, Field(ge=-1e20, le=1e20)]
 Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
@@ -44,20 +44,20 @@ class _RangeDraw(_Draw):
 
 
 class FixedDraw(_Draw):
-    """The value itself; lets `per` and comments stand beside it."""
+    """The value itself; this form allows `per` and comments beside it."""
 
     draw: Literal["fixed"]
     value: Any
 
 
 class UniformDraw(_RangeDraw):
-    """low + (high - low) u."""
+    """Uniform distribution: low + (high - low) u."""
 
     draw: Literal["uniform"]
 
 
 class IntegerDraw(_RangeDraw):
-    """A whole number from low to high, both included."""
+    """Whole number from low to high, both included."""
 
     draw: Literal["integer"]
     low: Whole
@@ -65,7 +65,7 @@ class IntegerDraw(_RangeDraw):
 
 
 class NormalDraw(_RangeDraw):
-    """A normal distribution cut off at `low` and `high` and scaled to 1 in between."""
+    """Normal distribution truncated at `low` and `high`."""
 
     draw: Literal["truncated_normal"]
     mean: Drawn
@@ -73,7 +73,7 @@ class NormalDraw(_RangeDraw):
 
 
 class ChoiceDraw(_Draw):
-    """One of `values`, which may be anything, whole sub-mappings with draws of their own too."""
+    """One of `values`, which may be anything, including mappings with draws of their own."""
 
     draw: Literal["choice"]
     values: Annotated[tuple[Any, ...], Field(min_length=1)]
@@ -90,7 +90,7 @@ class ChoiceDraw(_Draw):
 
 
 class GridDraw(_Draw):
-    """Evenly spaced numbers or given values, gone through in order; several grids form their full product."""
+    """Evenly spaced numbers or given values, taken in order; several grids form their full product."""
 
     draw: Literal["grid"]
     low: Drawn | None = None
@@ -109,11 +109,11 @@ class GridDraw(_Draw):
 
     @property
     def size(self) -> int:
-        """How many values there are."""
+        """Number of values."""
         return len(self.values) if self.values is not None else self.steps or 1
 
     def point(self, k: int) -> Any:
-        """The k-th value."""
+        """Value number k."""
         if self.values is not None:
             return self.values[k]
         if self.low is None or self.high is None or self.steps is None or self.steps == 1:
@@ -122,13 +122,13 @@ class GridDraw(_Draw):
 
 
 class SobolDraw(_RangeDraw):
-    """low + (high - low) s, s one dimension of the joint Sobol sequence of all such draws."""
+    """Quasi-random number low + (high - low) s; s is one dimension of the joint Sobol sequence of all such draws."""
 
     draw: Literal["sobol"]
 
 
 class SequenceDraw(_Draw):
-    """The k-th value for the k-th frame of a subject, from the start again after the last: a fixation sequence."""
+    """Value number k for frame number k of a subject, cyclically: a fixation sequence."""
 
     draw: Literal["sequence"]
     values: Annotated[tuple[Any, ...], Field(min_length=1)]
@@ -154,7 +154,11 @@ def is_draw(node: object) -> bool:
 
 
 def parse_draw(node: dict[str, Any], *, source: str, path: str) -> Draw:
-    """The distribution that a node describes; raises `InputError` with the path of the bad key."""
+    """Parse the distribution that a node describes.
+
+    Raises:
+        InputError: with the path of the wrong key.
+    """
     kind = _KINDS.get(str(node[MARK]))
     if kind is None:
         raise InputError(f"must be one of {', '.join(KINDS)}, not {node[MARK]!r}", source=source, path=f"{path}.draw")
@@ -172,7 +176,7 @@ def unit_number(seed: int, path: str, unit: str, number: int, attempt: int) -> f
 
 
 def random_value(draw: Draw, u: float) -> Any:
-    """The value of a random draw at u; choices give the index of the value."""
+    """Value of a random draw at u; for a choice the index of the value."""
     if isinstance(draw, UniformDraw | SobolDraw):
         return draw.low + (draw.high - draw.low) * u
     if isinstance(draw, IntegerDraw):
@@ -191,10 +195,10 @@ def random_value(draw: Draw, u: float) -> Any:
 
 
 def truncated_normal(u: float, mean: float, sd: float, low: float, high: float) -> float:
-    """The quantile of the truncated normal: Phi^-1(Phi(a) + u (Phi(b) - Phi(a))), in logarithms so that tails hold."""
+    """Quantile of the truncated normal, Phi^-1(Phi(a) + u (Phi(b) - Phi(a))), in logarithms for accurate tails."""
     a, b = (low - mean) / sd, (high - mean) / sd
     if a > 0:
-        # The upper tail by symmetry: there Phi is too close to 1 to be told from it.
+        # The upper tail is computed by symmetry, because Phi is indistinguishable from 1 there.
         return -truncated_normal(1 - u, -mean, sd, -high, -low)
     log_a, log_b = float(log_ndtr(a)), float(log_ndtr(b))
     # log(Phi(a) + u (Phi(b) - Phi(a))) = log Phi(b) + log(r + u (1 - r)),  r = Phi(a) / Phi(b)

@@ -1,4 +1,4 @@
-"""What a run would take: from the rate that was last measured, or from a few samples made in memory."""
+"""Estimated cost of a run, from the last measured rate or from a few samples made in memory."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _SUBJECTS = 3
 def estimate(plan: Plan, options: Options, *, measure: bool = False) -> dict[str, Any]:
     """Time and disk of a run (schema eyerender/estimate/2): seconds = (samples t + subjects t_subject) / workers.
 
-    The rate is the last one of this spec on this machine, whatever the seed and the number of samples were; with
-    `measure` two samples each of a few subjects are made. `seconds` and `bytes` are None where no rate is known.
+    The rate is the last one of this spec on this machine, for any seed and number of samples. With `measure`, two
+    samples of each of a few subjects are made instead. `seconds` and `bytes` are None where no rate is known.
 
     Raises:
         InputError: the first sample cannot be made at all.
@@ -58,14 +58,14 @@ def estimate(plan: Plan, options: Options, *, measure: bool = False) -> dict[str
 
 
 def measured_rate(plan: Plan, maker: Maker) -> Rate:
-    """The rate of one worker, from two samples each of a few subjects; it is remembered.
+    """Measure the rate of one worker from two samples of each of a few subjects, and store it.
 
-    A subject's first sample also pays for its eye and its textures.
+    A subject's first sample includes the time for its eye and its textures.
     """
     spec = plan.spec
     subjects = plan.subject_of(spec.count - 1)[0] + 1
     starts = [plan.first_of(s) for s in sorted({int(s) for s in np.linspace(0, subjects - 1, _SUBJECTS)})]
-    maker.make(starts[0])  # kernels are compiled once a worker
+    maker.make(starts[0])  # kernels are compiled once per worker
     first: list[float] = []
     again: list[float] = []
     sizes: list[int] = []
@@ -78,7 +78,7 @@ def measured_rate(plan: Plan, maker: Maker) -> Rate:
             began = time.perf_counter()
             made = maker.make(sample)
             pictures = [picture for image in made.images for picture in image.pictures.values()]
-            # Metadata stands in the shards and in the whole.
+            # Metadata is stored in the shards and in the assembled file.
             size = sum(map(_bytes, pictures)) + 2 * sum(len(json.dumps(image.line)) for image in made.images)
             times.append(time.perf_counter() - began)
             sizes.append(size)

@@ -1,7 +1,7 @@
-"""The files that a dataset's spec names (HDR maps, head meshes, eye files): which they are, and what they hold.
+"""Files that a dataset's spec names (HDR maps, head meshes, eye files), and their checksums.
 
-Their content shapes the images as the spec does, so its check sums are a part of what a run is, by the names that the
-spec gives them. `Plan.of` adds the eye files, which it reads itself.
+Their content affects the images as the spec does. Their checksums, by the names in the spec, are therefore part of a
+run's identity. `Plan.of` adds the eye files, which it reads itself.
 """
 
 from __future__ import annotations
@@ -18,18 +18,22 @@ from .template import possible
 
 
 def sums_of_files(scene: Mapping[str, Any], base: Path) -> dict[str, str]:
-    """Name -> SHA-256 of every file that a scene of the template may name, a manifest's own files included.
+    """Map every file that a scene of the template may name to its SHA-256, including a manifest's own files.
 
-    Names are as they are written, those in a manifest as seen from `base`, which all are relative to.
+    Names are as written; those in a manifest are relative to `base`, like all others.
 
     Raises:
-        InputError: one is missing or cannot be read.
+        InputError: a file is missing or cannot be read.
     """
     return {name: sum_of_file(base / name) for name in sorted(set(_names(scene, base)))}
 
 
 def check_files(files: Mapping[str, str], base: Path) -> None:
-    """Raise `InputError` where a file holds something else than its sum says; cheap while no file changes."""
+    """Check that files still have their checksums; this is cheap while no file changes.
+
+    Raises:
+        InputError: a file has changed.
+    """
     for name, wanted in files.items():
         if sum_of_file(base / name) != wanted:
             raise InputError("has changed since the run began", source=str(base / name))
@@ -47,7 +51,7 @@ def _names(scene: Mapping[str, Any], base: Path) -> Iterator[str]:
 
 
 def _texts(node: Any, *keys: str) -> Iterator[str]:
-    """Every text that may stand at a place of a template, or in a list there."""
+    """Every text that may be at a place of a template, or in a list there."""
     for value in possible(node):
         if keys and isinstance(value, Mapping):
             yield from _texts(value.get(keys[0]), *keys[1:])
@@ -59,11 +63,15 @@ def _texts(node: Any, *keys: str) -> Iterator[str]:
 
 
 def sum_of_file(path: Path) -> str:
-    """SHA-256 of a file, kept while the file seems the same; raises `InputError`."""
+    """SHA-256 of a file, cached while the file seems unchanged.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
     try:
         state = path.stat()
     except OSError:
-        return file_digest(path)  # says what is wrong with it
+        return file_digest(path)  # this reports what is wrong with it
     return _kept_sum(path, (state.st_mtime_ns, state.st_size, state.st_ino))
 
 

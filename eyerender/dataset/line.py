@@ -1,4 +1,4 @@
-"""The line of metadata of one image of a sample, but for the names of its files; and its own name."""
+"""Line of metadata of one image of a sample, without the names of its files, and the image's name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .realise import Realised
 
 
 def image_name(sample: int, frame: int, frames: int, side: str) -> str:
-    """An image's name without ending; `frame` counts within the sample, which has `frames` of them."""
+    """Name of an image without ending; `frame` counts within the sample, which has `frames` of them."""
     return f"{sample:08d}-{f'{frame:03d}-' if frames > 1 else ''}{side}"
 
 
@@ -23,7 +23,7 @@ def image_line(
     labels: dict[str, Any],
     record_version: int = RECORD,
 ) -> tuple[str, dict[str, Any]]:
-    """The name and the line of observation `row` of a sample that was made; `frames` is how many each sample has."""
+    """Name and line of observation `row` of a sample; `frames` is the number of frames of each sample."""
     sample, scene, observations = found.sample, found.scene, found.observations
     assert sample is not None
     assert scene is not None
@@ -39,7 +39,7 @@ def image_line(
         "sequence_index": turn.sequence,
         "window_px": dict(zip(("x0", "y0", "width", "height"), window, strict=True)),
         "bit_depth": scene.spec.sensor.bit_depth,
-        # A frame's number is its own in the whole dataset.
+        # A frame's number is unique in the whole dataset.
         "records": [{**record, "frame": turn.sample * frames + frame}],
         "labels": labels,
         "parameters": {
@@ -52,7 +52,7 @@ def image_line(
             "attempt": turn.attempt,
             "subject_attempt": turn.subject_attempt,
             "draws": sample.draws,
-            # As text: what is nested in them may differ from sample to sample, the columns must not.
+            # They are stored as text, because their nested keys may differ between samples, which columns must not.
             "scene_json": json.dumps(sample.scene, sort_keys=True),
             "eye_json": json.dumps({k: v for k, v in sample.eye.items() if k != "sources"}, sort_keys=True),
         },

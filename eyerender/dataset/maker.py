@@ -1,4 +1,4 @@
-"""Making samples: one renderer, used for every sample of a worker."""
+"""Making of samples, with one renderer for all samples of a worker."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class MadeImage:
 
 @dataclass(frozen=True)
 class MadeSample:
-    """The images of one sample (none where it was given up), and the attempts that could not be made."""
+    """The images of one sample (none where it was given up), and the attempts that failed."""
 
     index: int
     images: tuple[MadeImage, ...]
@@ -57,12 +57,12 @@ class Maker:
 
     @property
     def backend(self) -> dict[str, Any]:
-        """What renders: name, device, versions."""
+        """Name, device and versions of the backend."""
         b = self.renderer.backend
         return {"name": b.name, "device": b.device, "threads": b.threads, **b.versions}
 
     def make(self, index: int) -> MadeSample:
-        """Sample `index` with its images."""
+        """Make sample `index` with its images."""
         found = realise(self.plan, index, self.frames)
         return MadeSample(index, tuple(self._images(found)), found.rejections)
 

@@ -1,8 +1,8 @@
-"""What sample i of a dataset is: a pure function of (spec, i).
+"""The plan of a dataset, which defines sample i as a pure function of (spec, i).
 
-Sample i belongs to subject floor(i S / N), N samples planned and S subjects, so a subject's frames stand together and
-counts differ by one at most. A hash of the subject decides on its split (`Plan.split_of`). A plan takes no more memory
-for more samples.
+Sample i belongs to subject floor(i S / N) for N planned samples and S subjects. A subject's frames are therefore
+consecutive, and their numbers differ by one at most. A hash of the subject determines its split (`Plan.split_of`). The
+memory of a plan does not grow with the number of samples.
 """
 
 from __future__ import annotations
@@ -31,15 +31,21 @@ from .template import Template, Turn, possible
 
 # Beyond this many subjects, splits are drawn without sorting them.
 RANKED_SUBJECTS = 1_000_000
-_LOOKED_AT = 16  # samples in which `Plan.warnings` looks for what was not meant
+_LOOKED_AT = 16  # samples that `Plan.warnings` checks for probable mistakes
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One sample as drawn: a plain mapping `scene` that `SceneSpec` validates, and the eye file it looks with.
+    """One sample as drawn.
 
-    `eye` is the eye file's mapping; `modified` tells whether it differs from the model's own. `draws`: every draw of
-    the spec by its path, None where it was not asked for. `base` is what files that the scene names are relative to.
+    Attributes:
+        turn: which sample it is.
+        split: its split.
+        scene: plain mapping that `SceneSpec` validates.
+        eye: mapping of its eye file.
+        modified: whether the eye differs from the model's own.
+        draws: every draw of the spec by its path, None where it was not used.
+        base: folder to which the files of the scene are relative.
     """
 
     turn: Turn
@@ -51,14 +57,18 @@ class Sample:
     base: Path
 
     def build(self) -> Scene:
-        """The scene ready to be observed; raises `InputError` where the drawn values do not go together."""
+        """Build the scene, ready to be observed.
+
+        Raises:
+            InputError: the drawn values do not fit together.
+        """
         spec = SceneSpec.from_mapping(self.scene, source=f"sample {self.turn.sample}")
         scene = Scene(spec, _eye(json.dumps(self.eye, sort_keys=True)), spec.rig.build(), self.base)
         scene.eye("right")
         return scene
 
     def to_mapping(self) -> dict[str, Any]:
-        """As JSON and YAML have it."""
+        """Convert to a mapping for JSON and YAML."""
         turn = self.turn
         return {
             "sample": turn.sample,
@@ -75,9 +85,10 @@ class Sample:
 
 @dataclass(frozen=True)
 class Plan:
-    """A dataset spec with the eyes it names, and check sums of the files that it names, eye files among them.
+    """A dataset spec with the eyes it names, and checksums of the files that it names, including eye files.
 
-    `files`: SHA-256 by name, relative to the folder `base`, in which a run finds them wherever its workers are.
+    `files` maps names, relative to the folder `base`, to SHA-256. Workers of a run find the files there, wherever they
+    run.
     """
 
     spec: DatasetSpec
@@ -90,10 +101,13 @@ class Plan:
     def load(
         cls, path: str | Path, *, eye: str | None = None, seed: int | None = None, count: int | None = None
     ) -> Plan:
-        """From a file, or the bare name of a shipped dataset; raises `InputError` with one line.
+        """Load a plan from a file, or from the bare name of a shipped dataset.
 
-        `eye` and `seed` replace the spec's; with another eye model, parameters of the others fall away. `count` asks
-        for the first samples of the plan, or for a larger plan (see `DatasetSpec.first`).
+        `eye` and `seed` replace those of the spec; parameters of other eye models are then dropped. `count` requests
+        the first samples of the plan, or a larger plan (see `DatasetSpec.first`).
+
+        Raises:
+            InputError: with one line.
         """
         file = find_dataset(path)
         spec = DatasetSpec.load(file)
@@ -107,9 +121,12 @@ class Plan:
 
     @classmethod
     def of(cls, spec: DatasetSpec, *, base: Path | None = None, source: str = "") -> Plan:
-        """Check the template, read the eyes it names and sum up its files.
+        """Check the template, read the eyes it names and compute the checksums of its files.
 
-        All are relative to `base`, by default the current folder. Raises `InputError` where one cannot be read.
+        All names are relative to `base`, by default the current folder.
+
+        Raises:
+            InputError: a file cannot be read.
         """
         eyes: dict[str, Mapping[str, Any]] = {}
         sums: dict[str, str] = {}
@@ -123,7 +140,8 @@ class Plan:
             file = str(base / name) if base is not None and name not in catalogue_names() else name
             try:
                 if name not in catalogue_names() and os.path.isfile(file):
-                    # Before it is read, so that a change in between is found when the run checks its files.
+                    # The checksum is computed before the file is read, so that a change in between is detected when the
+                    # run checks its files.
                     sums[name] = sum_of_file(Path(file))
                 eyes[name] = load_eye(file).to_mapping()
             except InputError as error:
@@ -143,12 +161,12 @@ class Plan:
 
     @cached_property
     def scene_template(self) -> Template:
-        """The template of the scene."""
+        """Template of the scene."""
         return Template.of(self.spec.scene, self.spec.seed, source=self.source, prefix="scene")
 
     @cached_property
     def eye_template(self) -> Template:
-        """The template of the eyes' parameters."""
+        """Template of the eyes' parameters."""
         tree = {"eye_parameters": self.spec.eye_parameters}
         return Template.of(tree, self.spec.seed, source=self.source)
 
@@ -159,36 +177,40 @@ class Plan:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def to_mapping(self) -> dict[str, Any]:
-        """What `from_mapping` reads back, without the eye files; `files` only where there are any."""
+        """Convert to the mapping that `from_mapping` reads, without the eye files; `files` only where there are any."""
         data: dict[str, Any] = {"spec": self.spec.to_mapping(), "eyes": self.eyes}
         return dict(_sorted(data | ({"files": self.files} if self.files else {})))
 
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any], base: Path) -> Plan:
-        """The plan that another process has, its files relative to `base`."""
+        """Make the plan of another process, its files relative to `base`."""
         return cls(DatasetSpec.from_mapping(data["spec"]), data["eyes"], data.get("files", {}), base)
 
     def warnings(self) -> list[InputWarning]:
-        """What of the scenes of some samples, spread over the dataset, was probably not meant; each thing once."""
+        """Probable mistakes in the scenes of some samples, spread over the dataset; each is reported once."""
         found: dict[tuple[str, str], InputWarning] = {}
         count = min(self.spec.count, _LOOKED_AT)
         for sample in (k * self.spec.count // count for k in range(count)):
             try:
                 warnings = self.draw(sample).build().warnings()
             except InputError:
-                continue  # it is drawn again, or told when it is made
+                continue  # it is drawn again, or reported when it is made
             for w in warnings:
                 path, reason = f"scene.{w.path}", f"{w.reason} (sample {sample})"
                 found.setdefault((w.code, path), InputWarning(w.code, reason, self.source, path))
         return list(found.values())
 
     def check_files(self) -> None:
-        """Raise `InputError` where a file that the spec names is no longer what it was when the plan was made."""
+        """Check that the files that the spec names are unchanged since the plan was made.
+
+        Raises:
+            InputError: a file has changed.
+        """
         check_files(self.files, self.base)
 
     @cached_property
     def _ranked(self) -> NDArray[np.int32]:
-        """The place of each subject's split in the order of their names: subjects by rank of their number u."""
+        """Index of each subject's split in the order of their names, from the rank of its number u."""
         n = self.spec.subject_count
         order = np.argsort(np.fromiter(map(self._split_number, range(n)), float, n), kind="stable")
         out = np.zeros(n, dtype=np.int32)
@@ -201,7 +223,10 @@ class Plan:
 
     @cached_property
     def _shares(self) -> tuple[float, ...]:
-        """The cumulative shares of the splits, in the order of their names: that of keys in a file means nothing."""
+        """Cumulative shares of the splits, in the order of their names.
+
+        The order of keys in a file therefore has no effect.
+        """
         splits = self.spec.splits
         total, share, out = sum(splits.values()), 0.0, []
         for name in sorted(splits):
@@ -213,10 +238,10 @@ class Plan:
         return unit_number(self.spec.seed, "split", "subject", subject, 0)
 
     def split_of(self, subject: int) -> str:
-        """The split that a subject belongs to.
+        """Split of a subject.
 
-        A number u in (0, 1) of each subject decides. Up to `RANKED_SUBJECTS` of them they are put in the order of u and
-        cut at the cumulative shares, so counts are exact; more are not sorted, and u itself is compared with the
+        It follows from a number u in (0, 1) of each subject. Up to `RANKED_SUBJECTS` subjects are sorted by u and cut
+        at the cumulative shares, so counts are exact. More subjects are not sorted: u itself is compared with the
         shares, so counts are those of a random draw.
         """
         names = sorted(self.spec.splits)
@@ -228,19 +253,19 @@ class Plan:
         return next((name for name, share in zip(names, self._shares, strict=True) if u < share), names[-1])
 
     def subject_of(self, sample: int) -> tuple[int, int]:
-        """(subject, place in the subject's sequence) of a sample."""
+        """Subject of a sample, and the sample's place in the subject's sequence."""
         subject = sample * self.spec.subject_count // self.spec.planned_count
         return subject, sample - self.first_of(subject)
 
     def first_of(self, subject: int) -> int:
-        """The first sample of a subject."""
+        """First sample of a subject."""
         return -(-subject * self.spec.planned_count // self.spec.subject_count)
 
     def draw(self, sample: int, attempt: int = 0) -> Sample:
-        """Sample `sample` at an attempt.
+        """Draw sample `sample` at an attempt.
 
         Raises:
-            InputError: no such sample, or its subject's eye cannot be made in any attempt.
+            InputError: there is no such sample, or its subject's eye cannot be made in any attempt.
         """
         spec = self.spec
         if not 0 <= sample < spec.count:
@@ -261,7 +286,7 @@ class Plan:
         return {}
 
     def identity(self, subject: int) -> tuple[int, tuple[str, ...]]:
-        """The first attempt in which a subject's eye can be made, and why the earlier ones failed."""
+        """First attempt in which a subject's eye can be made, and the reasons why earlier ones failed."""
         if subject not in self._identities:
             if len(self._identities) >= 1024:
                 self._identities.clear()
@@ -295,18 +320,18 @@ class Plan:
             _set(eye, path, value, f"eye_parameters.{model}", self.source)
         if mine:
             eye["name"] = f"{model} of subject {turn.subject}"
-        # Another eye's parameters were not asked for.
+        # Parameters of other eyes were not used.
         asked = {k: v if k.startswith(f"eye_parameters.{model}.") else None for k, v in drawn.items()}
         return eye, asked, bool(mine)
 
 
 def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
-    """The parts of a spec in which another eye model takes the place of its own."""
+    """Parts of a spec with another eye model in place of its own."""
     part = spec.scene.get("eye", {})
     if not isinstance(part, Mapping) or is_draw(part):
         raise InputError("the spec draws its whole eye; name the model there", source="--eye")
     load_eye(eye)
-    # A file is meant from where the command runs, a name in a spec from where the spec lies.
+    # A path in a command is relative to the current folder, a name in a spec to the folder of the spec.
     model = eye if eye in catalogue_names() else str(Path(eye).resolve())
     parameters = {name: values for name, values in spec.eye_parameters.items() if name == model}
     return {"scene": {**spec.scene, "eye": {**part, "model": model}}, "eye_parameters": parameters}
@@ -314,12 +339,12 @@ def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
 
 @lru_cache(maxsize=64)
 def _eye(text: str) -> EyeSpec:
-    """An eye file from its JSON; the frames of a subject share it, and with it what was computed for it."""
+    """Eye file from its JSON; the frames of a subject share it and its computed values."""
     return EyeSpec.from_mapping(json.loads(text))
 
 
 def _sorted(node: Any) -> Any:
-    """A copy whose mappings have their keys in order."""
+    """Copy a tree with the keys of its mappings sorted."""
     if isinstance(node, Mapping):
         return {key: _sorted(node[key]) for key in sorted(node)}
     return [_sorted(value) for value in node] if isinstance(node, list | tuple) else node
@@ -332,7 +357,7 @@ def _copy(node: Any) -> Any:
 
 
 def _set(tree: Any, path: str, value: Any, prefix: str, source: str) -> None:
-    """Put a value at a dotted path that is there already."""
+    """Set the value at an existing dotted path."""
     keys = path.split(".")
     node = tree
     for key in keys[:-1]:

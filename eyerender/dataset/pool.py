@@ -1,4 +1,4 @@
-"""The local engine: spawned workers, recycled, watched; a shard whose worker crashes or hangs is tried again."""
+"""The local engine: spawned, recycled and monitored workers. A shard whose worker crashes or hangs is tried again."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from .shard import Staged
 from .worker import Job, work
 
 TRIES = 3
-HOPELESS = 3  # shards given up before any was made: the rest would fare alike
+HOPELESS = 3  # if so many shards are given up before any is made, the others would fail too
 RECYCLE_IMAGES = 2000
 NO_SHARD = -1  # the shard of a worker that ends without one
 
 
 class Events(Protocol):
-    """What an engine reports to."""
+    """Receiver of an engine's reports."""
 
     def ready(self, backend: dict[str, Any], worker: str) -> None:
-        """A worker can render."""
+        """Report that a worker can render."""
 
     def sample(self, shard: int, samples: int, images: int) -> None:
-        """`samples` of a shard are made; the last one gave `images`."""
+        """Report that `samples` of a shard are made; the last one gave `images`."""
 
     def staged(self, staged: Staged, worker: str) -> None:
-        """A shard is written and may be put in place."""
+        """Report that a shard is written and may be put in place."""
 
     def retry(self, shard: int, reason: str, tries: int) -> None:
-        """A shard's worker ended; it is tried again."""
+        """Report that a shard's worker ended, and that the shard is tried again."""
 
 
 @dataclass(slots=True)
@@ -66,7 +66,7 @@ class LocalPool:
         self._made = 0
 
     def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
-        """Make shards; returns those that were given up, with the reason.
+        """Make shards, and return those that were given up, with the reasons.
 
         Raises:
             BackendError: a worker has nothing to render with.
@@ -83,10 +83,10 @@ class LocalPool:
                     made = self._made
                     reason = self._listen(worker, events)
                     if self._made > made:
-                        del tries[NO_SHARD]  # so workers do start: only deaths one after the other end a run
+                        del tries[NO_SHARD]  # so workers do start; only consecutive deaths end a run
                     if reason is None:
                         if worker.shard is None and worker.images >= self.recycle_images:
-                            self._end(worker)  # before what its libraries leak adds up
+                            self._end(worker)  # before leaks of its libraries add up
                         continue
                     self._end(worker)
                     shard = NO_SHARD if worker.shard is None else worker.shard
@@ -134,11 +134,11 @@ class LocalPool:
 
     def _give(self, worker: _Worker, shard: int) -> None:
         worker.shard, worker.heard = shard, time.monotonic()
-        with suppress(OSError):  # a worker that has just died is noticed when it is listened to
+        with suppress(OSError):  # a worker that has just died is noticed when its pipe is read
             worker.pipe.send(shard)
 
     def _listen(self, worker: _Worker, events: Events) -> str | None:
-        """Take in a worker's messages; the reason why it must be ended, if so."""
+        """Receive a worker's messages; return the reason why it must be ended, if there is one."""
         while True:
             try:
                 if not worker.pipe.poll():
@@ -148,7 +148,7 @@ class LocalPool:
                 worker.process.join(5)
                 break
             worker.heard = time.monotonic()
-            # An error of the events' receiver, such as a full disk, is none of the pipe's.
+            # An error of the events' receiver, such as a full disk, is not an error of the pipe.
             reason = self._take(worker, message, events)
             if reason is not None:
                 return reason
@@ -193,7 +193,7 @@ class LocalPool:
 
 
 def end_of(code: int | None, who: str = "the worker") -> str:
-    """How a process ended, in words."""
+    """Describe how a process ended."""
     if code is not None and code < 0:
         try:
             return f"{who} was ended by {signal.Signals(-code).name}"
@@ -204,7 +204,10 @@ def end_of(code: int | None, who: str = "the worker") -> str:
 
 @contextmanager
 def _environment(threads: int) -> Iterator[None]:
-    """Numerical libraries of a worker take as many threads as it has; they read these when they are imported."""
+    """Limit numerical libraries of a worker to its number of threads.
+
+    They read these variables when they are imported.
+    """
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, str(threads)))
@@ -220,7 +223,7 @@ def _environment(threads: int) -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """A child inherits the mask: Ctrl-C must not hit it while it still imports."""
+    """Block Ctrl-C while a child, which inherits the signal mask, still imports its modules."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

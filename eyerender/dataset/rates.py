@@ -1,6 +1,6 @@
-"""The last measured rate of a spec on this machine, kept in the user's cache folder.
+"""The last measured rate of a spec on this machine, stored in the user's cache folder.
 
-A file there is only a memory: without one, or with a damaged one, the rate is unknown.
+The file is only a cache: if it is missing or damaged, the rate is unknown.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _Count = Annotated[float, Field(ge=0, le=1e15)]
 
 
 class Rate(Spec):
-    """How fast samples of a spec were made, and how large they were."""
+    """Time and size of the samples of a spec."""
 
     format: Literal["eyerender/rate/1"] = "eyerender/rate/1"
     how: Literal["run", "measured"] = Field(description="by a run, or by a few samples that were made to measure it")
@@ -41,12 +41,12 @@ class Rate(Spec):
 
 
 def now() -> str:
-    """The time of a rate that is measured now."""
+    """Current time in the format of a rate."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
 
 def keep_rate(plan: Plan, rate: Rate) -> None:
-    """Remember a rate; where the cache cannot be written it is forgotten."""
+    """Store a rate; it is dropped where the cache cannot be written."""
     path = _path(plan)
     if path is not None:
         with suppress(OSError, EyerenderError):
@@ -55,7 +55,7 @@ def keep_rate(plan: Plan, rate: Rate) -> None:
 
 
 def last_rate(plan: Plan, backend: str = "auto") -> Rate | None:
-    """The rate that was last measured on this machine with a backend; None where none is known."""
+    """Rate that was last measured on this machine with a backend; None where none is known."""
     path = _path(plan)
     if path is None:
         return None
@@ -67,7 +67,7 @@ def last_rate(plan: Plan, backend: str = "auto") -> Rate | None:
 
 
 def _path(plan: Plan) -> Path | None:
-    """Where the rate of a plan stands, whatever its seed and number of samples, on this machine."""
+    """Path of the rate of a plan on this machine; it does not depend on the seed and the number of samples."""
     folder = cache_folder()
     if folder is None:
         return None

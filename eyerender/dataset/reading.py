@@ -1,4 +1,4 @@
-"""How to read images of 16 bits: the words and the code that data cards show."""
+"""Instructions for reading images of 16 bits: the text and the code that data cards show."""
 
 from __future__ import annotations
 

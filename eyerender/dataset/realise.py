@@ -1,8 +1,8 @@
-"""From sample i to a scene with its analytic observations: drawn again, by a stated rule, while it cannot be made.
+"""From sample i to a scene with its analytic observations; a sample that cannot be made is drawn again by a fixed rule.
 
-Attempt a of sample i draws every random value of the sample anew (grids and sequences stay: they are the design; a
-Sobol draw becomes a random one); the subject's identity stays. The first attempt that can be made is the sample. After
-`attempts` of them, or at once where nothing random is left to draw, the sample is given up.
+Attempt a of sample i draws every random value of the sample again. Grids and sequences stay, because they are the
+design; a Sobol draw becomes a random one; the subject's identity stays. The first attempt that can be made is the
+sample. After `attempts` of them, or at once where nothing random is left to draw, the sample is given up.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .plan import Plan, Sample
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """An attempt that could not be made, and why; of the sample, or of its subject's identity."""
+    """A failed attempt and its reason; it concerns the sample, or its subject's identity."""
 
     sample: int
     attempt: int
@@ -33,7 +33,7 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Realised:
-    """A sample with what the analytic observer sees; `sample` is None where it was given up."""
+    """A sample with its analytic observations; `sample` is None where it was given up."""
 
     index: int
     sample: Sample | None
@@ -48,7 +48,10 @@ class Realised:
 
 
 def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
-    """Sample `index` in the first attempt that can be made; `frames` is how many each sample must have."""
+    """Make sample `index` by the first attempt that succeeds.
+
+    `frames` is the number of frames that each sample must have.
+    """
     spec = plan.spec
     subject, sequence = plan.subject_of(index)
     rejections: list[Rejection] = []
@@ -83,7 +86,11 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
 
 
 def frames_of(plan: Plan) -> int:
-    """How many frames each sample has, from sample 0; raises `InputError` where that cannot be made at all."""
+    """Number of frames of each sample, from sample 0.
+
+    Raises:
+        InputError: sample 0 cannot be made at all.
+    """
     first = realise(plan, 0)
     if first.observations is None:
         reason = first.rejections[-1].reason if first.rejections else "no reason known"
@@ -92,7 +99,7 @@ def frames_of(plan: Plan) -> int:
 
 
 def windows_of(scene: Scene, observations: Observations) -> list[Window]:
-    """The rendered window of each observation."""
+    """Rendered window of each observation."""
     index, windows = observations.index, scene.windows()
     return [windows[int(index.camera[r]), int(index.head[r]), int(index.eye[r])] for r in range(len(observations))]
 

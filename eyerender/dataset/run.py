@@ -1,4 +1,4 @@
-"""A dataset run: claim the folder, make the shards that are missing, put the dataset together."""
+"""A dataset run: claim the folder, make the missing shards, assemble the dataset."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ MEMORY_A_WORKER = 0.8e9  # bytes, measured resident size with head-room
 
 
 class Engine(Protocol):
-    """Makes shards somewhere."""
+    """Makes shards in some way."""
 
     def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
-        """Make shards; returns those that were given up, with the reason."""
+        """Make shards, and return those that were given up, with the reasons."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How a run is done; nothing here changes a byte of the result."""
+    """Options of a run; none of them changes a byte of the result."""
 
     workers: int | None = None
     part: tuple[int, int] = (1, 1)
@@ -69,8 +69,8 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
         A summary: schema eyerender/generate/1.
 
     Raises:
-        InputError: the folder is taken, held by another run, or of another spec or version; the spec makes no sample;
-            a file that its scenes name cannot be used, or has changed.
+        InputError: the folder is taken, held by another run, or of another spec or version; the spec makes no sample; a
+            file that its scenes name cannot be used, or has changed.
         BackendError: there is nothing to render with.
         EyerenderError: the disk is full or not writable, or shards were given up after repeated tries.
     """
@@ -99,7 +99,7 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
             except InputError:
                 if not resumed and n == 1 and not finished(folder):
                     with suppress(InputError):
-                        clear(folder)  # nothing can come of it
+                        clear(folder)  # the folder is useless
                 raise
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
@@ -112,12 +112,12 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
 
 
 def usable_cpus() -> int:
-    """Processors that this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_count(options: Options, shards: int) -> tuple[int, int]:
-    """(workers, threads of each): a worker a processor while memory lasts, or as asked for."""
+    """Numbers of workers and of threads of each: by default one worker per processor while memory suffices."""
     cpus = options.threads or usable_cpus()
     workers = options.workers
     if workers is None:
@@ -130,7 +130,7 @@ def worker_count(options: Options, shards: int) -> tuple[int, int]:
 
 @dataclass
 class _Run:
-    """One run; also what the engine reports to."""
+    """One run, which also receives the engine's reports."""
 
     plan: Plan
     folder: Path
@@ -145,17 +145,17 @@ class _Run:
     given_up: int = 0
     retries: int = 0
     total: int = 0
-    samples: int = 0  # the sum of `made`
+    samples: int = 0  # sum of `made`
     timed: int = 0  # samples of the shards that this run has finished
-    worker_seconds: float = 0.0  # and what they took
+    worker_seconds: float = 0.0  # and the time that they took
     staged_images: int = 0
     bytes: int = 0
     backends: set[str] = field(default_factory=set)
     seen: set[str] = field(default_factory=set)
-    verified: set[int] = field(default_factory=set)  # shards whose checksums this run has seen to be right
+    verified: set[int] = field(default_factory=set)  # shards whose checksums this run has verified
 
     def make(self, resumed: bool) -> dict[str, Any]:
-        """Make this part's missing shards, and put the dataset together when none is missing."""
+        """Make this part's missing shards, and assemble the dataset when none is missing."""
         spec, (k, n) = self.plan.spec, self.options.part
         mine = set(range(k - 1, spec.shard_count, n))
         done = finished(self.folder)
@@ -188,7 +188,7 @@ class _Run:
         statistics = None
         if not missing:
             with final_lock(self.folder, self.say):
-                # Those of other parts; this run has verified or made its own.
+                # These are the shards of other parts; this run has verified or made its own.
                 self._withdraw(set(range(spec.shard_count)) - self.verified)
                 missing = self._missing()
                 if not missing:
@@ -211,7 +211,7 @@ class _Run:
         return summary
 
     def repaired(self, what: str) -> None:
-        """Something was damaged and is made or written again."""
+        """Report that something was damaged and is made or written again."""
         self.say(f"repairing: {what}")
         self._log("repair", what=what)
 
@@ -219,7 +219,7 @@ class _Run:
         return set(range(self.plan.spec.shard_count)) - finished(self.folder)
 
     def _withdraw(self, shards: set[int]) -> None:
-        """Verify finished shards, so that the damaged ones are made again."""
+        """Verify finished shards, so that damaged ones are made again."""
         damaged = withdraw_damaged(self.folder, sorted(shards), self.plan.digest)
         for shard, problem in damaged.items():
             self.repaired(f"shard {shard} is made again: {problem}")
@@ -236,7 +236,7 @@ class _Run:
         return LocalPool(job, min(workers, shards), timeout_s=options.timeout_s)
 
     def _keep_rate(self) -> None:
-        """Remember how fast this machine was, for an estimate of the next run of this spec."""
+        """Store the speed of this machine, for an estimate of the next run of this spec."""
         if self.options.engine != "local" or not self.timed or len(self.backends) != 1:
             return
         rate = Rate(
@@ -251,22 +251,22 @@ class _Run:
         )
         keep_rate(self.plan, rate)
 
-    # What the engine reports.
+    # Reports of the engine.
 
     def ready(self, backend: dict[str, Any], worker: str) -> None:
-        """A worker can render."""
+        """Record that a worker can render."""
         self._log("worker", worker=worker, backend=backend)
         self.backends.add(backend["name"])
         self._mixed({"backend": backend, "cpu": cpu_family() if self.options.engine == "local" else None})
 
     def sample(self, shard: int, samples: int, images: int) -> None:
-        """A sample of a shard is made."""
+        """Record that a sample of a shard is made."""
         self._count(shard, samples)
         self.images += images
         self._show()
 
     def staged(self, staged: Staged, worker: str) -> None:
-        """A shard is written."""
+        """Record that a shard is written."""
         if not is_finished(self.folder, staged.shard):
             commit(self.folder, staged)
             self.verified.add(staged.shard)
@@ -289,7 +289,7 @@ class _Run:
         self._show()
 
     def retry(self, shard: int, reason: str, tries: int) -> None:
-        """A shard's worker ended."""
+        """Record that a shard's worker ended."""
         self.retries += 1
         self._count(shard, 0)
         what = "a worker" if shard == NO_SHARD else f"shard {shard}"
@@ -311,11 +311,11 @@ class _Run:
 
     def _note_backends(self, done: set[int]) -> None:
         for shard in sorted(done):
-            with suppress(InputError):  # another part's, which is damaged
+            with suppress(InputError):  # a damaged shard of another part
                 self._mixed(read_done(self.folder, shard), old=True)
 
     def _mixed(self, made_by: dict[str, Any], *, old: bool = False) -> None:
-        """Warn when shards of different backends or processors come together: their bytes may differ in rounding."""
+        """Warn if shards of different backends or processors are combined: their bytes may differ in rounding."""
         backend = made_by["backend"]
         key = json.dumps([backend["name"], backend.get("llvm"), backend.get("device"), made_by.get("cpu")])
         if self.seen and key not in self.seen and not old:
@@ -334,7 +334,7 @@ class _Run:
         with open(self.folder / LOG, "ab+") as file:
             if file.tell():
                 file.seek(-1, os.SEEK_END)
-                if file.read(1) != b"\n":  # a power cut may have cut the last line short
+                if file.read(1) != b"\n":  # a power cut may have truncated the last line
                     file.write(b"\n")
             file.write(json.dumps(line).encode() + b"\n")
 

@@ -1,4 +1,4 @@
-"""What a folder is being filled with: run.json, and the refusal of anything else, with the difference shown."""
+"""The identity of a run in its folder: run.json, and the refusal of any other run, with the differences shown."""
 
 from __future__ import annotations
 
@@ -28,9 +28,12 @@ _SHOWN = 4
 
 
 def refuse_taken(folder: Path) -> None:
-    """Raise `InputError` where a folder holds something else than a run, before anything is put into it.
+    """Check that a folder holds nothing but a run, before anything is written into it.
 
-    A link in the place of what a run writes is refused too: making or removing shards would change what it leads to.
+    A link in the place of a run's files is refused too: making or removing shards would change what it points to.
+
+    Raises:
+        InputError: the folder holds something else.
     """
     try:
         link = next(_links(folder), None)
@@ -44,11 +47,11 @@ def refuse_taken(folder: Path) -> None:
 
 
 def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
-    """Claim a folder for a plan, or find that it was claimed for the same one before (True).
+    """Claim a folder for a plan; returns True if it was claimed for the same plan before.
 
-    Where run.json is damaged or missing, the finished shards tell whose the folder is, for each names its plan. Where
-    nothing tells, and the folder holds only what a run writes, the run starts over. `repaired` is told of either. The
-    caller holds the folder's final lock, so that two parts of a run do not repair it at the same time.
+    Where run.json is damaged or missing, the finished shards identify the folder's plan, because each names it. Where
+    nothing identifies it, and the folder holds only files of a run, the run starts over. `repaired` is called in both
+    cases. The caller holds the folder's final lock, so that two parts of a run do not repair it at the same time.
 
     Raises:
         InputError: it holds something else, or a run of another spec or other versions.
@@ -67,7 +70,7 @@ def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
     if shards and not same:
         raise InputError(f"holds a run of another spec, whose {RUN} is damaged; {_ELSE}", source=str(folder))
     if same:
-        # The other shards are of another plan; resuming finds that and makes them again.
+        # The other shards belong to another plan; resuming detects that and makes them again.
         _refuse_another(folder, {**mine, "versions": same[0]["versions"]}, mine, plan.files)
         write_json(path, mine)
         repaired(f"{RUN} is written again: {reason}")
@@ -81,7 +84,11 @@ def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
 
 
 def _read(path: Path) -> tuple[dict[str, Any] | None, str]:
-    """What run.json says, or None and why it says nothing; raises `InputError` where it is no run's of this version."""
+    """Content of run.json, or None and the reason why it cannot be used.
+
+    Raises:
+        InputError: it is not from a run of this version.
+    """
     try:
         found = read_json(path, limit=MAX_FILE_BYTES, follow=False)
     except InputError as error:
@@ -92,8 +99,8 @@ def _read(path: Path) -> tuple[dict[str, Any] | None, str]:
 
 
 def _refuse_another(folder: Path, found: Mapping[str, Any], mine: Mapping[str, Any], files: Mapping[str, str]) -> None:
-    """Raise `InputError` with the difference where a folder is of another spec or other versions."""
-    # Python's own version shapes no byte; it may differ from machine to machine.
+    """Raise an error with the differences where a folder is of another spec or other versions."""
+    # Python's own version affects no byte and may differ between machines.
     skip = ("versions.python:", "digest:", "files.", "files:")
     changes = [c for c in differences(found, json.loads(json.dumps(mine))) if not c.startswith(skip)]
     old = found.get("files")
@@ -107,14 +114,14 @@ def _refuse_another(folder: Path, found: Mapping[str, Any], mine: Mapping[str, A
 
 
 def _readable(folder: Path) -> Iterator[dict[str, Any]]:
-    """The content of every done.json that can be read."""
+    """Content of every readable done.json."""
     for shard in sorted(finished(folder)):
         with suppress(InputError):
             yield read_done(folder, shard)
 
 
 def _is_taken(folder: Path) -> bool:
-    """Whether a folder holds anything that is not a run's, or nothing that tells that it is a run's."""
+    """Whether a folder holds anything that is not a run's, or nothing that identifies it as a run's."""
     if _read(folder / RUN)[0] is not None or any(_readable(folder)):
         return False
     names = {p.name for p in folder.iterdir() if not _is_passing(p.name)}
@@ -126,12 +133,12 @@ def _is_taken(folder: Path) -> bool:
             return True
     if names <= {RUN}:
         return False
-    # A run has a log and shards from its start, and puts the dataset together when all shards are finished.
+    # A run has a log and shards from its start, and assembles the dataset when all shards are finished.
     return not names & {LOG, SHARDS} or (RUN not in names and bool(names & {METADATA, DATASET}))
 
 
 def _links(folder: Path) -> Iterator[str]:
-    """What a run writes into that is a symbolic link."""
+    """Symbolic links in the places of a run's files."""
     for name in sorted(_OWN):
         place = folder / name
         if place.is_symlink():
@@ -153,7 +160,7 @@ def _is_passing(name: str) -> bool:
 
 
 def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
-    """Where two JSON values differ, as `path: old -> new`."""
+    """Differences of two JSON values, as `path: old -> new`."""
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         for key in [*old, *(k for k in new if k not in old)]:
             yield from differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))

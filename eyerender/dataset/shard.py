@@ -1,9 +1,10 @@
-"""Shards: written to a folder of a temporary name, renamed when complete.
+"""Shards, which are written to a temporary folder and renamed when complete.
 
     images/00003/*.png   masks/00003/*.png   shards/00003/lines.jsonl, done.json
 
-`done.json` is put in place last, after everything else is in its place and synced. So a shard that has one is complete,
-also after a power cut, and its checksums tell whether it still is. Whatever else an ended run left is removed.
+`done.json` is put in place last, after everything else is in its place and synced. A shard that has one is therefore
+complete, even after a power cut, and its checksums show whether it still is. All other remains of an ended run are
+removed.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from .maker import MadeImage, Maker
 
 SHARD_SCHEMA = "eyerender/shard/1"
 DONE, SHARDS = "done.json", "shards"
-# Not called metadata.jsonl: loaders of image folders would read it besides the dataset's own.
+# The file is not called metadata.jsonl, because loaders of image folders would read it besides the dataset's own.
 LINES = "lines.jsonl"
-# Kind of picture -> what a line of metadata calls its file.
+# Kind of image -> key of its file in a line of metadata.
 KINDS = {
     "images": "file_name",
     "masks": "mask_file_name",
@@ -47,19 +48,19 @@ def _are(value: object, fits: Callable[[Any], bool]) -> bool:
 
 
 def is_sums(value: object) -> bool:
-    """Whether a value from a file maps names to sizes and SHA-256, as `compare_sums` takes them."""
+    """Whether a value from a file maps names to sizes and SHA-256, as `compare_sums` requires."""
     return isinstance(value, Mapping) and all(
         isinstance(entry, Mapping) and _is_count(entry.get("bytes")) and isinstance(entry.get("sha256"), str)
         for entry in value.values()
     )
 
 
-# What stands under each key of done.json.
+# Test for the value of each key of done.json.
 _DONE_KEYS: dict[str, Callable[[Any], bool]] = {
     "shard": _is_count,
     "samples": lambda v: _are(v, _is_count) and len(v) == 2,
     "images": _is_count,
-    "images_saturated": lambda v: v is None or _is_count(v),  # older versions did not count them
+    "images_saturated": lambda v: v is None or _is_count(v),  # older versions did not count saturated images
     "digest": lambda v: isinstance(v, str),
     "versions": lambda v: isinstance(v, Mapping),
     "backend": lambda v: isinstance(v, Mapping) and all(isinstance(v.get(key), str) for key in ("name", "device")),
@@ -71,7 +72,7 @@ _DONE_KEYS: dict[str, Callable[[Any], bool]] = {
 
 
 def shard_name(shard: int) -> str:
-    """The name of a shard's folders."""
+    """Name of a shard's folders."""
     return f"{shard:05d}"
 
 
@@ -85,15 +86,16 @@ class Staged:
     rejected: int
     given_up: int
     seconds: float
-    bytes: int  # on disk in the end: metadata stands in the shard and in the whole
+    bytes: int  # final size on disk; metadata is stored in the shard and in the assembled file
 
 
 def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int, int], None]) -> Staged:
-    """Make a shard's samples into a new folder of a temporary name; `on_sample` gets counts of samples and images.
+    """Make a shard's samples in a new temporary folder; `on_sample` is called with counts of samples and images.
 
     Raises:
-        OSError, EyerenderError: the disk is full or not writable.
-        InputError: a file that the scenes name cannot be used, or is not what it was when the plan was made.
+        OSError: the disk is full or not writable.
+        EyerenderError: the same.
+        InputError: a file that the scenes name cannot be used, or has changed since the plan was made.
     """
     start = time.monotonic()
     stage = folder / f"{STAGE}{shard_name(shard)}-{uuid.uuid4().hex[:12]}"
@@ -117,7 +119,7 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
                 count += len(made.images)
                 saturated += sum(image.saturated for image in made.images)
                 on_sample(k + 1, len(made.images))
-        maker.plan.check_files()  # a shard is of one state of them
+        maker.plan.check_files()  # all samples of a shard must use the same files
         seconds = time.monotonic() - start
         files = _checksums(stage, shard, kinds)
         done = {
@@ -145,7 +147,7 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
 
 
 def _write_image(stage: Path, shard: int, image: MadeImage) -> dict[str, str]:
-    """Write an image's pictures; returns their names in the dataset."""
+    """Write an image's files and return their names in the dataset."""
     file = f"{image.name}.png"
     for kind, picture in image.pictures.items():
         write_png(stage / kind / file, picture)
@@ -153,12 +155,16 @@ def _write_image(stage: Path, shard: int, image: MadeImage) -> dict[str, str]:
 
 
 def commit(folder: Path, staged: Staged) -> None:
-    """Put a staged shard in place, done.json last; raises `OSError`."""
+    """Put a staged shard in place, done.json last.
+
+    Raises:
+        OSError: a file cannot be moved.
+    """
     stage, name = Path(staged.stage), shard_name(staged.shard)
     moves = [(stage / kind, folder / kind / name) for kind in KINDS if (stage / kind).is_dir()]
     moves.append((stage / "shard", folder / SHARDS / name))
     for source, place in moves:
-        shutil.rmtree(place, ignore_errors=True)  # of a run that ended between these renames
+        shutil.rmtree(place, ignore_errors=True)  # remains of a run that ended between these renames
         make_folder(place.parent)
         os.rename(source, place)
     for _, place in moves:
@@ -174,7 +180,7 @@ def is_finished(folder: Path, shard: int) -> bool:
 
 
 def finished(folder: Path) -> set[int]:
-    """The shards that have a done.json."""
+    """Shards that have a done.json."""
     place = folder / SHARDS
     if not place.is_dir():
         return set()
@@ -182,7 +188,11 @@ def finished(folder: Path) -> set[int]:
 
 
 def read_done(folder: Path, shard: int) -> dict[str, Any]:
-    """A finished shard's done.json, every key of its type; raises `InputError` for what is none."""
+    """Read a finished shard's done.json and check the type of every key.
+
+    Raises:
+        InputError: it is not valid.
+    """
     path = folder / SHARDS / shard_name(shard) / DONE
     data = read_json(path, limit=MAX_FILE_BYTES, follow=False)
     if data.get("schema") != SHARD_SCHEMA:
@@ -194,12 +204,12 @@ def read_done(folder: Path, shard: int) -> dict[str, Any]:
 
 
 def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
-    """What is wrong with a finished shard: its done.json, and its files against their sizes and SHA-256.
+    """List what is wrong with a finished shard: its done.json, and the sizes and SHA-256 of its files.
 
     Args:
         folder: the dataset.
-        shard: a shard that is said to be finished.
-        digest: of the plan that the shard must be made by; any where it is None.
+        shard: a finished shard.
+        digest: digest of the plan by which the shard must be made; None: any plan.
         quick: compare sizes only.
     """
     name = shard_name(shard)
@@ -219,7 +229,7 @@ def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool =
 
 
 def compare_sums(folder: Path, sums: Mapping[str, Mapping[str, Any]], *, quick: bool = False) -> Iterator[str]:
-    """What is wrong with files of a folder, whose sizes and SHA-256 are given by name; `quick` compares sizes only."""
+    """List files of a folder whose sizes or SHA-256 differ from those given by name; `quick` compares sizes only."""
     for name, entry in sums.items():
         try:
             path = inside(folder, name)
@@ -235,10 +245,12 @@ def compare_sums(folder: Path, sums: Mapping[str, Mapping[str, Any]], *, quick: 
 
 
 def withdraw_damaged(folder: Path, shards: Iterable[int], digest: str) -> dict[int, str]:
-    """Verify finished shards; those that are damaged or of another plan lose their done.json, so they are made again.
+    """Verify finished shards, and remove the done.json of those that are damaged or of another plan.
+
+    They are then made again.
 
     Returns:
-        The shards withdrawn, with the first thing that is wrong with each.
+        The withdrawn shards, with the first problem of each.
 
     Raises:
         OSError: a done.json cannot be removed.
@@ -253,7 +265,7 @@ def withdraw_damaged(folder: Path, shards: Iterable[int], digest: str) -> dict[i
 
 
 def remove_leftovers(folder: Path, mine: set[int], done: set[int]) -> None:
-    """Remove what ended runs left of shards that this run is to make."""
+    """Remove what earlier runs left of shards that this run makes."""
     for stage in folder.glob(f"{STAGE}*"):
         number = stage.name.removeprefix(STAGE).split("-")[0]
         if number.isdigit() and int(number) in mine:
@@ -277,7 +289,7 @@ def sum_of(path: Path) -> dict[str, Any]:
 
 
 def run_versions() -> dict[str, str]:
-    """The versions that a dataset's bytes depend on."""
+    """Versions that affect a dataset's bytes."""
     from importlib.metadata import PackageNotFoundError, version
 
     from ..imagefolder import versions
@@ -292,7 +304,7 @@ def run_versions() -> dict[str, str]:
 
 
 def cpu_family() -> str:
-    """The processor's name, or its architecture."""
+    """Name of the processor, or its architecture."""
     from ..backends.probe import cpu_name
 
     return cpu_name()
@@ -303,7 +315,7 @@ def _place(kind: str, shard: int, file: str) -> str:
 
 
 def _checksums(stage: Path, shard: int, kinds: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Final name -> size and SHA-256 of every file of a staged shard."""
+    """Map the final name of every file of a staged shard to its size and SHA-256."""
     out = {}
     for kind in kinds:
         for path in sorted((stage / kind).iterdir()):

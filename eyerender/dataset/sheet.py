@@ -1,4 +1,4 @@
-"""A contact sheet of sixteen images, for people: of a dataset spec's samples, or of a scene's windows."""
+"""A contact sheet of sixteen images: of a dataset spec's samples, or of a scene's windows."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def write_sheet(
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> int:
-    """Render a contact sheet into a picture file; returns the number of images on it.
+    """Render a contact sheet into an image file, and return the number of images on it.
 
-    `warn` hears of saturated images before the file is written; if it raises, nothing is.
+    `warn` is called for saturated images before the file is written; if it raises, nothing is written.
 
     Raises:
-        InputError: a file ending that is no picture's, or a spec none of whose samples can be made.
+        InputError: the file ending is not an image's, or no sample of the spec can be made.
         EyerenderError: the file cannot be written.
     """
     path = Path(path)
@@ -64,7 +64,7 @@ def write_sheet(
 
 
 def contact_sheet(tiles: list[Tile]) -> Image.Image:
-    """Tiles with their captions, four in a row."""
+    """Arrange tiles with their captions, four in a row."""
     shown = []
     for image, caption in tiles:
         picture = Image.fromarray(image)

@@ -1,4 +1,4 @@
-"""The spec of a dataset: a scene template, how many samples, whose, and how they are split and labelled."""
+"""The spec of a dataset: a scene template, numbers of samples and subjects, splits and labels."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ..scene import is_shipped_dataset, refuse_folder, shipped_files
 from ..scenespec import DATASET_KIND, NOT_A_DATASET
 from ..spec import FileSpec, Positive, Spec
 
-# Samples of a run; a Sobol sequence has no more points.
+# Largest number of samples of a run; a Sobol sequence has no more points.
 MAX_COUNT = 10**9
 _SPLIT = re.compile(r"[a-z][a-z0-9]*")
 
 
 class LabelsSpec(Spec):
-    """Which labels are written besides those that every image has."""
+    """Labels in addition to those that every image has."""
 
     boundary_points: Annotated[int, Field(ge=6, le=360)] = Field(default=30, description="of the pupil, in the record")
     amodal_masks: bool = Field(default=False, description="also masks of the eye as if nothing stood before it")
@@ -29,13 +29,13 @@ class LabelsSpec(Spec):
 
     @property
     def pictures(self) -> tuple[str, ...]:
-        """The kinds of pictures that every image has; each kind has a folder of its own."""
+        """Kinds of images that every sample has; each kind has a folder of its own."""
         more = {"amodal_masks": self.amodal_masks, "noiseless": self.noiseless}
         return ("images", "masks", *(kind for kind, wanted in more.items() if wanted))
 
 
 class DatasetSpec(FileSpec):
-    """A dataset file; see the documentation for draws, which may stand in place of any value of `scene`."""
+    """A dataset file; see the documentation for draws, which may replace any value of `scene`."""
 
     kind: Literal["dataset"]
     name: Annotated[str, Field(min_length=1, max_length=100)]
@@ -79,7 +79,11 @@ class DatasetSpec(FileSpec):
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
-        """Raise `InputError` where a mapping does not say that it is a dataset's."""
+        """Check that a mapping is declared as a dataset.
+
+        Raises:
+            InputError: it is not.
+        """
         if data.get("kind") != DATASET_KIND:
             if "rig" in data:
                 raise InputError(NOT_A_DATASET, source=source)
@@ -87,36 +91,40 @@ class DatasetSpec(FileSpec):
 
     @property
     def planned_count(self) -> int:
-        """How many samples the whole plan has; subjects and splits are parts of it."""
+        """Number of samples of the whole plan; subjects and splits are parts of it."""
         return self.planned or self.count
 
     @property
     def subject_count(self) -> int:
-        """How many identities the whole plan has."""
+        """Number of subjects of the whole plan."""
         return self.subjects or self.planned_count
 
     def first(self, count: int) -> Self:
-        """The spec of the first `count` samples of the same plan; of a larger plan where it has fewer than that."""
+        """Spec of the first `count` samples of the same plan, or of a larger plan where it has fewer."""
         planned = self.planned_count if count < self.planned_count else None
         return self.replaced("--count", {"count": count, "planned": planned})
 
     @property
     def shard_count(self) -> int:
-        """How many shards there are."""
+        """Number of shards."""
         return -(-self.count // self.shard_size)
 
     def shard_samples(self, shard: int) -> range:
-        """The samples of a shard."""
+        """Samples of a shard."""
         return range(shard * self.shard_size, min((shard + 1) * self.shard_size, self.count))
 
 
 def shipped_datasets() -> dict[str, Path]:
-    """Name -> file of the dataset specs that come with the package."""
+    """Map the names of the dataset specs that come with the package to their files."""
     return {name: path for name, path in shipped_files().items() if is_shipped_dataset(path)}
 
 
 def find_dataset(spec: str | Path) -> Path:
-    """The file of a dataset spec, by its path or by the bare name of a shipped one; raises `InputError`."""
+    """Find the file of a dataset spec, by its path or by the bare name of a shipped one.
+
+    Raises:
+        InputError: there is none.
+    """
     path, shipped = Path(spec), shipped_datasets()
     if not os.path.isfile(path):
         if str(spec) in shipped:

@@ -1,4 +1,4 @@
-"""A scene template: a scene in which any value may be a draw, and how its draws become values."""
+"""A scene template: a scene in which any value may be a draw, and the evaluation of its draws."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from .draws import (
     unit_number,
 )
 
-# What makes an identity: drawn once a subject unless the draw says otherwise.
+# Values of a subject's identity, which are drawn once per subject unless the draw says otherwise.
 IDENTITY = ("eye.model", "eye.margin", "look", "region", "subject.ipd_mm", "subject.eyes", "eye_parameters")
-# What of it changes from frame to frame.
+# Exceptions, which change from frame to frame.
 PASSING = ("region.blink",)
-# An eye does not change from frame to frame, whatever the draw says.
+# Values of the eye, which never change from frame to frame, whatever the draw says.
 FIXED_IDENTITY = ("eye.model", "eye.margin", "eye_parameters")
 _BLOCK = 256
-# Each becomes a column of the run, and all Sobol draws together one sequence of as many dimensions.
+# Each draw becomes a column of the run, and all Sobol draws form one sequence of as many dimensions.
 MAX_DRAWS = 1000
 _CHOSEN = re.compile(r"#\d+")
 
 
 @dataclass(frozen=True, slots=True)
 class PlacedDraw:
-    """A draw, where it stands and what it is drawn for."""
+    """A draw and the unit for which it is drawn."""
 
     draw: Draw
     unit: Unit
@@ -50,7 +50,7 @@ class PlacedDraw:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """Which sample is drawn: its index, its subject and place in the subject's sequence, and both attempts."""
+    """The sample that is drawn: its index, its subject and place in the subject's sequence, and both attempts."""
 
     sample: int
     subject: int
@@ -69,14 +69,18 @@ class Template:
 
     @classmethod
     def of(cls, tree: Mapping[str, Any], seed: int, *, source: str = "", prefix: str = "") -> Template:
-        """Find and check every draw; raises `InputError` with its path (after `prefix`)."""
+        """Find and check every draw.
+
+        Raises:
+            InputError: with the path of the draw (after `prefix`).
+        """
         draws: dict[str, PlacedDraw] = {}
         _collect(tree, "", draws, source, prefix)
-        # In the order of their names, so that the order of keys in a file means nothing.
+        # Draws are sorted by name, so that the order of keys in a file has no effect.
         return cls(tree, dict(sorted(draws.items())), seed)
 
     def values(self, turn: Turn) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The tree of plain values of one sample, and every draw's value (None where it was not asked for)."""
+        """Tree of plain values of one sample, and every draw's value (None where it was not used)."""
         drawn: dict[str, Any] = dict.fromkeys(self.draws)
         tree = self._resolve(self.tree, "", turn, drawn)
         return tree, drawn
@@ -94,7 +98,7 @@ class Template:
         return node
 
     def _value(self, placed: PlacedDraw, path: str, turn: Turn) -> tuple[Any, int]:
-        """The value of a draw, and which of its values it is (0 where it has none to choose from)."""
+        """Value of a draw, and its index among the draw's values (0 where it has none to choose from)."""
         draw, unit = placed.draw, placed.unit
         number = turn.sample if unit == "sample" else turn.subject
         attempt = turn.attempt if unit == "sample" else turn.subject_attempt
@@ -116,7 +120,7 @@ class Template:
         return value, 0
 
     def _grid_index(self, path: str, unit: Unit, number: int) -> int:
-        """The place in one grid of the full product, of which the last grid (by name) turns fastest."""
+        """Index in one grid of the full product, of which the last grid (by name) varies fastest."""
         grids = [(p, d.draw) for p, d in self.draws.items() if isinstance(d.draw, GridDraw) and d.unit == unit]
         for name, grid in reversed(grids):
             size = grid.size
@@ -135,7 +139,7 @@ def possible(node: Any) -> list[Any]:
 
 
 def _label(draw: Draw, value: Any, k: int) -> Any:
-    """How a drawn value is recorded, of one type for every sample: the value, or which it is of unlike ones."""
+    """Recorded form of a drawn value, of one type for every sample: the value, or its index among unlike ones."""
     if isinstance(draw, FixedDraw):
         every: tuple[Any, ...] = (draw.value,)
     elif isinstance(draw, GridDraw) and draw.values is None:
@@ -157,7 +161,7 @@ def sobol_block(seed: int, unit: str, dimensions: int, block: int) -> Floats:
     generator = np.random.default_rng([seed, 1 if unit == "subject" else 0])
     engine = qmc.Sobol(dimensions, scramble=True, rng=generator)
     if block:
-        # As `fast_forward`, which takes a step for each point that it leaves out: point n is the shift and, for each
+        # This is `fast_forward`, which takes a step for each point that it skips: point n is the shift and, for each
         # bit of n's Gray code, a direction number, all combined by exclusive or (Antonov and Saleev 1979).
         last = block * _BLOCK - 1
         gray = last ^ (last >> 1)
@@ -166,7 +170,7 @@ def sobol_block(seed: int, unit: str, dimensions: int, block: int) -> Floats:
                 engine._quasi ^= engine._sv[:, bit]
         engine.num_generated = last + 1
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about counts that are no powers of two: a sequence may stop anywhere
+        warnings.simplefilter("ignore")  # about counts that are not powers of two; a sequence may stop anywhere
         return np.asarray(engine.random(_BLOCK))
 
 
@@ -188,7 +192,7 @@ def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, pr
 def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
     """The draw at a path, which messages call `shown`."""
     draw = parse_draw(node, source=source, path=shown)
-    bare = _CHOSEN.sub("", path)  # a place means the same inside a choice
+    bare = _CHOSEN.sub("", path)  # a place has the same meaning inside a choice
     identity = _under(bare, IDENTITY) and not _under(bare, PASSING)
     unit: Unit = draw.per or ("subject" if identity else "sample")
     if unit == "sample" and _under(bare, FIXED_IDENTITY):

@@ -30,16 +30,16 @@ _BATCH = 256
 def validate(
     path: str | Path, *, quick: bool = False, deep: bool = False, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Check a folder; returns a report (schema eyerender/validation/1).
+    """Check a folder and return a report (schema eyerender/validation/1).
 
     Args:
         path: the folder.
-        quick: do not open or hash pictures: a changed byte in one, and a wrong mask, are not found.
-        deep: compute all lines again, not `SAMPLE` of them (see `sampled`).
-        progress: called with how much is done, of how much, and of what.
+        quick: do not open or hash images; a changed byte and a wrong mask are then not found.
+        deep: compute all lines again, not only `SAMPLE` of them (see `sampled`).
+        progress: called with the amount done, the total, and the kind.
 
     Raises:
-        InputError: it is no folder of images, or a run that is not finished.
+        InputError: it is not a folder of images, or its run is not finished.
     """
     path = Path(path)
     folder = ImageFolder.load(path)
@@ -111,9 +111,9 @@ def _find_files(entry: ImageEntry) -> None:
 
 
 def sampled(total: int, digest: str) -> list[int]:
-    """The lines that are computed again by default: one at a hashed place in each of `SAMPLE` even parts of the file.
+    """Lines that are computed again by default: one at a hashed place in each of `SAMPLE` equal parts of the file.
 
-    A pure function of the folder's digest, so two checks of a folder look at the same lines.
+    They are a pure function of the folder's digest, so two checks of a folder use the same lines.
     """
     if total <= SAMPLE:
         return list(range(total))
@@ -126,13 +126,13 @@ def sampled(total: int, digest: str) -> list[int]:
 
 
 def _batches(entries: Entries, problems: Problems) -> Iterator[tuple[int, list[ImageEntry]]]:
-    """The lines of a folder, some at a time, with the number of the first; a line that cannot be read is left out."""
+    """Lines of a folder in batches, with the number of the first; a line that cannot be read is left out."""
     row = 0
     while row < len(entries):
         batch: list[ImageEntry] = []
         failed = 0
         try:
-            # One by one: what was read before a wrong line is kept.
+            # Lines are read one by one, so that those before a wrong line are kept.
             for entry in entries[row : row + _BATCH]:
                 batch.append(entry)
         except InputError as error:

@@ -1,4 +1,4 @@
-"""A worker process: makes the shards it is told to, and says after each sample that it is alive."""
+"""A worker process, which makes the shards that it is told to make and sends a message after each sample."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class Job:
 
     @classmethod
     def of(cls, plan: Plan, frames: int, folder: Path, backend: str, threads: int) -> Job:
-        """The job of a plan."""
+        """Make the job of a plan."""
         return cls(plan.to_mapping(), str(plan.base), frames, str(folder.resolve()), backend, threads)
 
     def maker(self) -> Maker:
-        """The worker's maker."""
+        """Make the worker's maker."""
         plan = Plan.from_mapping(self.plan, Path(self.base))
         return Maker(plan, self.frames, backend=self.backend, threads=self.threads)  # type: ignore[arg-type]
 
@@ -49,7 +49,7 @@ def work(pipe: Connection, job: Job) -> None:
     The worker sends ("ready", backend), ("sample", shard, samples, images), ("done", summary) and ("failed", kind,
     reason), where kind is backend, input, disk or error. It receives the number of a shard, or None to end.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group, and the parent decides
     threading.Thread(target=_die_with_parent, daemon=True).start()
     try:
         maker = job.maker()

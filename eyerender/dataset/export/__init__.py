@@ -1,7 +1,8 @@
-"""Generated datasets in the layouts that existing training code reads.
+"""Exports of generated datasets in the layouts that existing training code reads.
 
 Places are in pixels of the image (the window), pixel centres at integers. The images have 8 bits and a gamma of 2.2
-with one exposure gain for the whole export, unless asked otherwise (`encoding`); `export.json` and `README.md` say so.
+with one exposure gain for the whole export, unless requested otherwise (`encoding`); `export.json` and `README.md`
+state this.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ FORMATS: dict[str, Writer] = {
     "ellseg": ellseg.write,
     "teyed": teyed.write,
 }
-# The others hold 8 bits by definition.
+# The other layouts have 8 bits by definition.
 _SIXTEEN_BITS = ("webdataset", "coco", "csv")
 
 
@@ -51,21 +52,21 @@ def export(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Write a generated dataset in another layout; complete or not at all.
+    """Write a generated dataset in another layout, completely or not at all.
 
     Args:
         path: the dataset's folder.
         out: the folder to write.
         format: one of `FORMATS`.
-        bits: of the images, 8 or 16 (webdataset, coco and csv).
+        bits: bits of the images, 8 or 16 (webdataset, coco and csv).
         encoding: `linear` or `gamma`; by default gamma for 8 bits, linear for 16.
-        gain: multiplies all values; by default it is measured on a sample of the images, but 1 for 16 bits, linear.
+        gain: factor for all values; by default it is measured on a sample of the images, but is 1 for 16 bits, linear.
         overwrite: replace what `out` holds.
         progress: called with images done, images in all and "".
 
     Raises:
-        InputError: no such layout or encoding, no generated dataset, a file that its checksum does not fit, labels of
-            another shape than this version writes, or OUT is taken.
+        InputError: the layout or encoding is unknown, the folder is not a generated dataset, a checksum is wrong,
+            labels are not as this version writes them, or OUT is taken.
         EyerenderError: OUT cannot be written.
     """
     if format not in FORMATS:
@@ -115,7 +116,7 @@ def _encoding(items: Items, bits: int, curve: Curve, gain: float | None) -> Enco
 
 @contextmanager
 def _labels_as_made(items: Items) -> Iterator[None]:
-    """Labels that are not as this package writes them are the user's mistake: a line that was changed by hand."""
+    """Report labels that this package did not write as the user's mistake: a line was changed by hand."""
     try:
         yield
     except WRONG as error:

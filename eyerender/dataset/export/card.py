@@ -1,4 +1,4 @@
-"""README.md of an export: what it is, how its images are encoded, how they are read."""
+"""README.md of an export: its content, and how to decode and read its images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ their pixels to at most {LEVEL:g} of the full scale, and lies within 1 to {LARGE
 
 
 def export_card(name: str, done: dict[str, Any], layout: str, encoding: Encoding) -> str:
-    """The text of README.md; `layout` describes the files."""
+    """Text of README.md; `layout` describes the files."""
     image = encoding.to_mapping()
     splits = "\n".join(f"| {split} | {count} |" for split, count in done["images_by_split"].items())
     depths = " or ".join(str(depth) for depth in done["source_bit_depths"])

@@ -19,7 +19,7 @@ from ...geometry.ellipse import Ellipse
 from ...imagefile import write_png
 from .item import Items
 
-# A category's id is the part's value in the mask, but for the glints.
+# Except for the glints, a category's id is the part's value in the mask.
 CATEGORIES: list[dict[str, Any]] = [
     {"id": 1, "name": "sclera", "supercategory": "eye"},
     {"id": 2, "name": "iris", "supercategory": "eye"},
@@ -29,7 +29,7 @@ CATEGORIES: list[dict[str, Any]] = [
 
 
 def write(items: Items, out: Path) -> None:
-    """Images and annotations of every split."""
+    """Write images and annotations of every split."""
     (out / "annotations").mkdir()
     with ExitStack() as stack:
         files = {split: stack.enter_context(_Annotations(items, out, split)) for split in items.splits}
@@ -49,7 +49,7 @@ def write(items: Items, out: Path) -> None:
 
 
 class _Annotations:
-    """annotations/instances_SPLIT.json, written as it comes: images at once, annotations beside them until the end."""
+    """Writer of annotations/instances_SPLIT.json: images at once, annotations to a second file until the end."""
 
     def __init__(self, items: Items, out: Path, split: str) -> None:
         (out / split).mkdir()
@@ -66,11 +66,11 @@ class _Annotations:
         self._images.write(json.dumps(head)[:-1] + ', "images": [')
 
     def add_image(self, image: dict[str, Any]) -> None:
-        """One more image."""
+        """Add an image."""
         self._image_count = _append(self._images, self._image_count, image)
 
     def add_mark(self, image: int, mark: dict[str, Any]) -> None:
-        """One more annotation of an image."""
+        """Add an annotation of an image."""
         mark = {"id": self._mark_count + 1, "image_id": image, **mark}
         self._mark_count = _append(self._marks, self._mark_count, mark)
 

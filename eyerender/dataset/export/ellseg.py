@@ -19,7 +19,7 @@ from .item import Item, Items
 
 
 def write(items: Items, out: Path) -> None:
-    """Archives and keys of every split."""
+    """Write archives and keys of every split."""
     try:
         h5py: Any = import_module("h5py")
     except ImportError:
@@ -66,7 +66,7 @@ def write(items: Items, out: Path) -> None:
 
 
 def fit_of(item: Item, part: str) -> Floats:
-    """x, y, a, b, angle of the amodal outline, or -1 five times."""
+    """Amodal outline as x, y, a, b, angle, or -1 five times."""
     ellipse = item.ellipse(part)
     if ellipse is None:
         return np.full(5, -1.0)

@@ -1,11 +1,11 @@
-"""How an export stores the sensor's counts: bits, curve, and one exposure gain for the whole export.
+"""Encoding of the sensor's counts in an export: bits, curve, and one exposure gain for the whole export.
 
 With s = count / (2^source_bit_depth - 1), the share of the source's full scale, and F = 2^bits - 1:
 
     linear:  code = round(F min(1, gain s))              s = code / F / gain
     gamma:   code = round(F min(1, gain s)^(1 / 2.2))    s = (code / F)^2.2 / gain
 
-The inverse is exact to half a code, but for the code F, where the image was clipped.
+The inverse is exact to half a code, except for the code F, where the image was clipped.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from numpy.typing import NDArray
 from ...errors import InputError
 
 GAMMA = 2.2
-# A measured gain takes this share of all pixels to at most this part of the full scale. What is left above is for
-# brighter subjects, and so that skin is not as white as a glint. It is at most so large, because the black level is
-# 1/256 of the full scale by default, and images without light must stay dark.
+# A measured gain brings this share of all pixels to at most this part of the full scale. The rest is for brighter
+# subjects, and keeps skin darker than glints. The gain is limited because the black level is 1/256 of the full scale by
+# default, and images without light must stay dark.
 SHARE, LEVEL = 0.995, 0.8
 LARGEST_GAIN = 32.0
-SAMPLED = 256  # images that a gain is measured on
+SAMPLED = 256  # images used to measure a gain
 
 Curve = Literal["linear", "gamma"]
 
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """Bits (8 or 16), curve and gain of the images of an export; `gain_from` says where the gain comes from."""
+    """Bits (8 or 16), curve and gain of the images of an export; `gain_from` names the source of the gain."""
 
     bits: int
     curve: Curve
@@ -41,7 +41,7 @@ class Encoding:
     gain_from: str
 
     def apply(self, image: NDArray[Any], bit_depth: int) -> NDArray[Any]:
-        """The stored codes, (h, w) uint8 or uint16, of an image's counts, (h, w) unsigned integers of `bit_depth`."""
+        """Codes, (h, w) uint8 or uint16, of an image's counts, (h, w) unsigned integers of `bit_depth`."""
         table = _table(self.bits, self.curve, self.gain, 2**bit_depth - 1)
         return np.asarray(table[np.minimum(image.astype(np.intp), len(table) - 1)])
 
@@ -50,7 +50,7 @@ class Encoding:
         return self.curve == "linear" and self.gain == 1 and self.bits == bit_depth
 
     def to_mapping(self) -> dict[str, Any]:
-        """As export.json holds it."""
+        """Convert to the mapping in export.json."""
         full = 2**self.bits - 1
         gamma = self.curve == "gamma"
         return {
@@ -72,7 +72,7 @@ RAW = Encoding(16, "linear", 1.0, "none")
 
 
 def measured_gain(images: Iterable[tuple[NDArray[Any], int]]) -> float:
-    """The gain that takes the quantile `SHARE` of all pixels to `LEVEL`: 1 to `LARGEST_GAIN`, to four digits.
+    """Gain that brings the quantile `SHARE` of all pixels to `LEVEL`: 1 to `LARGEST_GAIN`, to four digits.
 
     Args:
         images: counts (h, w) and their bit depths.
@@ -88,7 +88,11 @@ def measured_gain(images: Iterable[tuple[NDArray[Any], int]]) -> float:
 
 
 def check(bits: int, curve: str | None, gain: float | None) -> None:
-    """Raise `InputError` for what is no encoding."""
+    """Check the options of an encoding.
+
+    Raises:
+        InputError: they are not valid.
+    """
     if bits not in (8, 16):
         raise InputError(f"must be 8 or 16, not {bits!r}", source="--bits")
     if curve not in (None, "linear", "gamma"):
@@ -99,7 +103,7 @@ def check(bits: int, curve: str | None, gain: float | None) -> None:
 
 @lru_cache(maxsize=4)
 def _table(bits: int, curve: Curve, gain: float, full: int) -> NDArray[Any]:
-    """The code of each count."""
+    """Code of each count."""
     value = np.minimum(1.0, gain * (np.arange(full + 1) / full))
     if curve == "gamma":
         value = value ** (1 / GAMMA)

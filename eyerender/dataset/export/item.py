@@ -1,4 +1,4 @@
-"""One image of a dataset as exports see it: places in pixels of the image."""
+"""Images of a dataset for exports, with places in pixels of the image."""
 
 from __future__ import annotations
 
@@ -26,29 +26,33 @@ IRIS, PUPIL = 2, 3
 
 @dataclass(frozen=True)
 class Item:
-    """An image of a dataset and its labels, moved into the window's pixels; `encoding` is that of the export."""
+    """An image of a dataset and its labels in the window's pixels; `encoding` is that of the export."""
 
     entry: ImageEntry
     encoding: Encoding = RAW
 
     @property
     def line(self) -> dict[str, Any]:
-        """The line of metadata."""
+        """Line of metadata."""
         return self.entry.line
 
     @property
     def name(self) -> str:
-        """The image's name without folder and ending."""
+        """Name of the image without folder and ending."""
         return PurePosixPath(self.entry.name).stem
 
     @property
     def split(self) -> str:
-        """The split it is in."""
+        """Split of the image."""
         return str(self.line["split"])
 
     @property
     def bit_depth(self) -> int:
-        """Of the counts in the dataset; raises `InputError` where it is not 1 to 16."""
+        """Bit depth of the counts in the dataset.
+
+        Raises:
+            InputError: it is not 1 to 16.
+        """
         depth = self.line.get("bit_depth")
         if not isinstance(depth, int) or isinstance(depth, bool) or not 1 <= depth <= 16:
             raise InputError("must be 1 to 16", source=str(self.entry.folder / METADATA), path=self._where("bit_depth"))
@@ -56,16 +60,24 @@ class Item:
 
     @cached_property
     def image(self) -> NDArray[Any]:
-        """The sensor's counts, (h, w) uint8 or uint16; raises `InputError`."""
+        """Counts of the sensor, (h, w) uint8 or uint16.
+
+        Raises:
+            InputError: the file cannot be read.
+        """
         return _integers(self.entry.image(), self.entry.path)
 
     @property
     def encoded(self) -> NDArray[Any]:
-        """The image as the export stores it, (h, w) uint8 or uint16."""
+        """Image as the export stores it, (h, w) uint8 or uint16."""
         return self.encoding.apply(self.image, self.bit_depth)
 
     def encode(self, path: Path) -> bytes:
-        """One of the sample's pictures of counts as the PNG file that the export stores; raises `InputError`."""
+        """Encode one of the sample's images of counts as the PNG file that the export stores.
+
+        Raises:
+            InputError: the file cannot be read.
+        """
         if self.encoding.keeps(self.bit_depth):
             return read_bytes(path, follow=False)
         buffer = io.BytesIO()
@@ -73,7 +85,7 @@ class Item:
         return buffer.getvalue()
 
     def exported_line(self) -> dict[str, Any]:
-        """The line of metadata for the exported image."""
+        """Line of metadata for the exported image."""
         own = {"bit_depth": self.encoding.bits, "encoding": self.encoding.curve, "gain": self.encoding.gain}
         return {**self.line, **own, "source_bit_depth": self.bit_depth}
 
@@ -82,13 +94,13 @@ class Item:
 
     @cached_property
     def mask(self) -> Bytes:
-        """0 background or skin, 1 sclera, 2 iris, 3 pupil, (h, w)."""
+        """Mask (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil."""
         mask = self.entry.mask()
         return np.zeros(self.image.shape, np.uint8) if mask is None else mask
 
     @cached_property
     def amodal(self) -> Bytes:
-        """The same as if nothing stood before the eye: the file, or the mask with both ellipses filled in."""
+        """Mask of the eye without occluders: the file, or the mask with both ellipses filled in."""
         whole = self.entry.amodal_mask()
         if whole is not None:
             return whole
@@ -101,7 +113,7 @@ class Item:
         return out
 
     def ellipse(self, part: str, kind: str = "amodal") -> Ellipse | None:
-        """The pupil's or the iris' ellipse; None where there is none."""
+        """Ellipse of the pupil or the iris; None where there is none."""
         found = self.line["labels"][part][kind]
         if found["centre_px"] is None or min(found["semi_axes_px"]) <= 0:
             return None
@@ -110,11 +122,11 @@ class Item:
         return Ellipse(np.array([x - x0, y - y0]), np.array(found["semi_axes_px"]), found["angle_rad"])
 
     def visible(self, part: str) -> bool:
-        """Whether any of the pupil or the iris is seen."""
+        """Whether any of the pupil or the iris is visible."""
         return bool(self.line["labels"][part]["visible"]["pixels"] > 0)
 
     def glints(self) -> list[tuple[int, float, float, bool]]:
-        """(light, x, y, visible) of each reflection that ray optics finds."""
+        """List (light, x, y, visible) of each reflection that ray optics finds."""
         x0, y0 = self.entry.window[:2]
         return [
             (g["light"], g["xy_px"][0] - x0, g["xy_px"][1] - y0, g["visible"])
@@ -123,7 +135,7 @@ class Item:
         ]
 
     def pixel_of(self, point_mm: Any) -> Floats:
-        """The pixel of a point of the camera's frame (no lens distortion)."""
+        """Pixel of a point of the camera's frame (no lens distortion)."""
         K = np.array(self.line["labels"]["camera"]["K"])
         x = K @ np.asarray(point_mm, dtype=float)
         return np.asarray(x[:2] / x[2] - self.entry.window[:2])
@@ -136,18 +148,18 @@ def _integers(image: NDArray[Any], path: Path) -> NDArray[Any]:
 
 
 class Items:
-    """The images of a dataset in the order of its samples; going through them tells how far it is.
+    """The images of a dataset in the order of its samples; iteration reports its progress.
 
-    The lines of metadata are read once by `survey`, for what must be known before the first image is written, and again
-    with each image. No more than some bytes of a line are kept.
+    `survey` reads the lines of metadata once, for what must be known before the first image is written. They are read
+    again with each image. Only a few bytes of each line are kept.
 
     Attributes:
         encoding: that of the export.
         order: (n,) the rows of metadata.jsonl in the order of samples.
-        images_by_split: how many images each split has, by name.
+        images_by_split: number of images of each split, by name.
         bit_depths: those of the images.
         sizes: (width, height) of the images.
-        lights: the largest number of reflections that a line names.
+        lights: the largest number of reflections in a line.
         file_name_bytes: length of the longest name of an image, in UTF-8.
         row: the row that is being read, for messages.
     """
@@ -162,7 +174,11 @@ class Items:
         self.lights = self.file_name_bytes = self.row = 0
 
     def survey(self) -> None:
-        """Read all lines once; raises `InputError` where a line is wrong or two images have one name."""
+        """Read all lines once.
+
+        Raises:
+            InputError: a line is wrong, or two images have one name.
+        """
         splits: Counter[str] = Counter()
         samples = np.empty(len(self), dtype=np.int64)
         names = np.empty(len(self), dtype=np.int64)
@@ -184,7 +200,7 @@ class Items:
 
     def __iter__(self) -> Iterator[Item]:
         done = 0
-        # Rows that follow each other in the file are read in one go.
+        # Consecutive rows of the file are read together.
         for rows in np.split(self.order, np.flatnonzero(np.diff(self.order) != 1) + 1):
             for entry in self.folder.entries[int(rows[0]) : int(rows[-1]) + 1]:
                 self.row = entry.number - 1
@@ -193,18 +209,18 @@ class Items:
                 self.step(done)
 
     def sample(self, count: int) -> Iterator[Item]:
-        """At most `count` images, spread evenly over the samples."""
+        """Yield at most `count` images, spread evenly over the samples."""
         for at in np.unique(np.linspace(0, len(self), min(count, len(self)), endpoint=False, dtype=np.int64)):
             self.row = int(self.order[at])
             yield Item(self.folder.entries[self.row])
 
     @property
     def splits(self) -> list[str]:
-        """The names of the splits."""
+        """Names of the splits."""
         return list(self.images_by_split)
 
     @property
     def name(self) -> str:
-        """The dataset's name, in letters, digits and underscores."""
+        """Name of the dataset, in letters, digits and underscores."""
         name = str(self.folder.dataset["spec"]["name"])
         return "".join(c if c.isalnum() else "_" for c in name)

@@ -15,7 +15,7 @@ from .item import Items
 
 
 def write(items: Items, out: Path) -> None:
-    """Images and labels of every split; files.csv says which image became which."""
+    """Write images and labels of every split; files.csv maps images to their files."""
     counts: dict[str, int] = {}
     for split in items.splits:
         (out / split / "images").mkdir(parents=True)
@@ -24,7 +24,7 @@ def write(items: Items, out: Path) -> None:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["file", "from", "subject"])
         for item in items:
-            # Names of digits only: readers strip letters of '.png' off both ends of a name.
+            # The names have digits only, because readers strip letters of '.png' off both ends of a name.
             name = f"{counts.get(item.split, 0):06d}"
             counts[item.split] = counts.get(item.split, 0) + 1
             write_png(out / item.split / "images" / f"{name}.png", item.encoded)

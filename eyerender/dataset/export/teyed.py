@@ -46,10 +46,10 @@ _COLUMNS: dict[str, tuple[str, ...]] = {
 
 
 def write(items: Items, out: Path) -> None:
-    """A video and its annotations for each (subject, eye, camera); splits.csv says which split each is in."""
+    """Write a video and its annotations for each (subject, eye, camera); splits.csv maps videos to splits."""
     (out / "VIDEOS").mkdir()
     (out / "ANNOTATIONS").mkdir()
-    # A subject's samples follow each other, so its videos are all that is open at a time.
+    # A subject's samples are consecutive, so only its videos are open at a time.
     subject, videos = None, dict[str, _Video]()
     with open(out / "splits.csv", "w", newline="", encoding="utf-8") as file, ExitStack() as stack:
         table = csv.writer(file)
@@ -74,7 +74,7 @@ def write(items: Items, out: Path) -> None:
 
 
 class _Video:
-    """The files of a video, open until its last frame is added."""
+    """Files of a video, open until its last frame is added."""
 
     def __init__(self, name: str, first: Item, out: Path) -> None:
         self.split, self.frames = first.split, 0
@@ -92,7 +92,7 @@ class _Video:
             self._open = stack.pop_all()
 
     def add(self, item: Item) -> None:
-        """One more frame."""
+        """Add a frame."""
         if item.image.shape != self._pictures[0].size[::-1]:
             raise InputError("needs images of one size", source="--format teyed")
         self.frames += 1
@@ -110,7 +110,7 @@ class _Video:
 
 
 def rows_of(item: Item) -> dict[str, list[float]]:
-    """The annotations of a frame, without its number."""
+    """Annotations of a frame, without its number."""
     space = item.line["labels"]["space"]["camera"]
     globe, turn, pupil = (np.array(space[k]) for k in ("globe_centre_mm", "rotation_centre_mm", "pupil_centre_mm"))
     gaze = (pupil - turn) / np.linalg.norm(pupil - turn)

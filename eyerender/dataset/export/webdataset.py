@@ -17,7 +17,7 @@ SAMPLES = 1000
 
 
 def write(items: Items, out: Path) -> None:
-    """SPLIT-000000.tar and so on; the line in NAME.json says how its image is encoded."""
+    """Write SPLIT-000000.tar and so on; the line in NAME.json states the encoding of its image."""
     counts: dict[str, int] = {}
     tars: dict[str, tarfile.TarFile] = {}
     try:
@@ -50,4 +50,4 @@ def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
     member = tarfile.TarInfo(name)  # no times or owners: the same dataset gives the same bytes
     member.size = len(data)
     tar.addfile(member, io.BytesIO(data))
-    tar.members.clear()  # type: ignore[attr-defined]  # they are kept for reading
+    tar.members.clear()  # type: ignore[attr-defined]  # the library keeps them for reading

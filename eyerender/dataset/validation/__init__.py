@@ -1,1 +1,1 @@
-"""The parts of `validate`: files against checksums, lines against shards and plan, values recomputed, masks."""
+"""The parts of `validate`: checksums of files, lines against shards and plan, recomputed values, masks."""

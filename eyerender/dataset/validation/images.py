@@ -1,4 +1,4 @@
-"""The pictures of one image: their sizes and values, and the masks against the outlines and the labels."""
+"""Checks of the files of one image: their sizes and values, and the masks against the outlines and the labels."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ Mask = NDArray[Any]
 
 
 class Tally:
-    """Statistics of the pixels, of which only sums are kept."""
+    """Statistics of pixels, stored as sums."""
 
     def __init__(self) -> None:
         self.images = 0
         self.level = self.saturated = 0.0
 
     def take(self, image: NDArray[Any], full: float) -> None:
-        """One image, whose greatest value is `full`."""
+        """Add one image, whose greatest possible value is `full`."""
         self.images += 1
         self.level += float(image.mean()) / full
         self.saturated += float(np.mean(image >= full))
 
     def to_mapping(self) -> dict[str, Any]:
-        """Means over all images; nothing where there were none."""
+        """Means over all images; empty where there were none."""
         if not self.images:
             return {}
         return {
@@ -44,7 +44,7 @@ class Tally:
 
 
 def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> Iterator[str]:
-    """What is wrong with an image's files; `limbus_px` (k, 2) is the iris' outline where it was recomputed.
+    """List what is wrong with an image's files; `limbus_px` (k, 2) is the iris' outline where it was recomputed.
 
     Raises:
         InputError: a file cannot be read.
@@ -95,7 +95,7 @@ def _size(picture: NDArray[Any]) -> str:
 
 
 def _visible(line: dict[str, Any], mask: Mask, window: Window) -> Iterator[str]:
-    """The visible ellipses, which are those of the mask's own pixels."""
+    """Compare the visible ellipses with those of the mask's own pixels."""
     for name, inside in (("pupil", mask == PUPIL), ("iris", mask >= IRIS)):
         own = line.get("labels", {}).get(name)
         if isinstance(own, dict):
@@ -107,16 +107,16 @@ def _visible(line: dict[str, Any], mask: Mask, window: Window) -> Iterator[str]:
 def _outlines(
     line: dict[str, Any], mask: Mask, whole: Mask | None, limbus_px: Floats | None, window: Window
 ) -> Iterator[str]:
-    """Masks against the apparent outlines of pupil and limbus.
+    """Compare masks with the apparent outlines of pupil and limbus.
 
-    Within them is what the part hides or what hides it. So a pixel that shows the eye at all must show the part exactly
-    where its centre lies within the outline, lids or no lids; skin within it is right unless the labels say that
-    nothing hides the part.
+    Pixels within an outline show the part or what hides it. A pixel that shows the eye must therefore show the part
+    exactly where its centre is within the outline, with or without lids. Skin within the outline is right unless the
+    labels say that nothing hides the part.
     """
     labels = line.get("labels", {})
     pupil, iris = pupil_outline(line), iris_outline(line, limbus_px)
     shares = [_share(labels, name) for name in ("pupil", "iris")]
-    # The iris' share does not count what hides before the pupil, so both must be whole.
+    # The iris' share ignores what hides the pupil, so both must be whole.
     bare = all(share is not None and share >= 1.0 for share in shares)
     within = None if iris is None else iris.inside(window)
     for picture, what, alone in ((mask, "mask", bare), (whole, "amodal mask", True)):
@@ -124,7 +124,7 @@ def _outlines(
             continue
         other = (picture == SKIN) if alone else np.zeros(picture.shape, dtype=bool)
         if pupil is not None:
-            # Where the rim of the cornea has turned to sclera it hides the pupil behind it.
+            # Where the cornea's rim has turned to sclera it hides the pupil behind it.
             clear = picture == IRIS if within is None else (picture == IRIS) | ((picture == SCLERA) & within)
             yield from _compare(f"{what} of its pupil", picture == PUPIL, clear | other, pupil, window)
         if iris is not None:
@@ -140,7 +140,7 @@ def _outlines(
 
 
 def _compare(name: str, shown: Bools, not_shown: Bools, outline: Outline, window: Window) -> Iterator[str]:
-    """Pixels that show a part beyond its outline, and pixels within it that show something else."""
+    """List pixels that show a part beyond its outline, and pixels within it that show something else."""
     area = outline.inside(window)
     for wrong, words in ((shown & ~area, "leaves its outline"), (not_shown & area, "does not fill its outline")):
         if wrong.any():
@@ -150,7 +150,7 @@ def _compare(name: str, shown: Bools, not_shown: Bools, outline: Outline, window
 
 
 def pupil_outline(line: dict[str, Any]) -> Outline | None:
-    """The apparent outline of the pupil in a line's record; None where there is none, or not the whole of it."""
+    """Apparent outline of the pupil in a line's record; None where it is missing or incomplete."""
     if len(line["records"]) != 1:
         return None
     pupil = line["records"][0]["pupil"]
@@ -163,7 +163,7 @@ def pupil_outline(line: dict[str, Any]) -> Outline | None:
 
 
 def iris_outline(line: dict[str, Any], limbus_px: Floats | None) -> Outline | None:
-    """The apparent limbus, recomputed or the ellipse of the labels; None where there is none."""
+    """Apparent limbus, recomputed or the ellipse of the labels; None where there is none."""
     if limbus_px is not None:
         return Outline(limbus_px, EXACT_PX)
     own = line.get("labels", {}).get("iris")
@@ -178,7 +178,7 @@ def _ellipse(values: dict[str, Any], tolerance_px: float) -> Outline:
 
 
 def _share(labels: dict[str, Any], name: str) -> float | None:
-    """The visible fraction of a part, as a dataset's labels or as a rendered folder's have it."""
+    """Visible fraction of a part in the labels of a dataset or of a rendered folder."""
     own = labels.get(name)
     value = own["visible_fraction"] if isinstance(own, dict) else labels.get(f"{name}_visible_fraction")
     return None if value is None else float(value)

@@ -1,6 +1,6 @@
 """Checks of every line of metadata: names, keys, records, labels that must agree with records, subjects and splits.
 
-A few bytes are kept of each line, never the line.
+Only a few bytes are kept of each line.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ...observation import MISSING, OK, PARTIAL, Observations
 from .problems import WRONG, Problems
 from .truth import DatasetTruth, SceneTruth
 
-# Parts of the labels that every image of a dataset has, whatever it shows.
+# Labels that every image of a dataset has, whatever it shows.
 _ALWAYS = (
     ("labels", "pupil", "amodal"),
     ("labels", "pupil", "visible"),
@@ -36,7 +36,7 @@ _ALWAYS = (
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """The keys of an object, and the shapes of its values that are objects, or lists of objects of one shape."""
+    """Keys of an object, and the shapes of its values that are objects, or lists of objects of one shape."""
 
     keys: frozenset[str]
     objects: tuple[tuple[str, _Shape], ...]
@@ -59,7 +59,7 @@ class _Shape:
 
 
 class Lines:
-    """Checks lines one after the other, and at the end what concerns several of them."""
+    """Checks lines one by one, and at the end what concerns several of them."""
 
     def __init__(self, folder: ImageFolder, truth: DatasetTruth | SceneTruth | None) -> None:
         self._folder = folder
@@ -72,7 +72,10 @@ class Lines:
         self._shape: _Shape | None = None
 
     def take(self, number: int, entry: ImageEntry) -> Iterator[str]:
-        """What is wrong with line `number`, counted from 0; raises one of `WRONG` for a line that cannot be read."""
+        """List what is wrong with line `number`, counted from 0.
+
+        A line that cannot be read raises one of `WRONG`.
+        """
         line = entry.line
         self._names[number] = _hash(line["file_name"])
         if self._truth is not None:
@@ -95,7 +98,7 @@ class Lines:
         yield from _agree(line)
 
     def finish(self, problems: Problems) -> None:
-        """What concerns several lines: their number, names that stand twice, subjects in two splits."""
+        """Check what concerns several lines: their number, duplicate names, subjects in two splits."""
         entries = self._folder.entries
         statistics = self._folder.dataset.get("statistics")
         expected = statistics.get("images") if isinstance(statistics, dict) else None
@@ -109,7 +112,7 @@ class Lines:
             problems.add(f"{METADATA} line {k + 1}: subject {self._subjects[k]} is in two splits")
 
     def _moved(self) -> Ints:
-        """The lines whose subject was in another split before."""
+        """Lines whose subject was in another split before."""
         order = np.argsort(self._subjects, kind="stable")
         subject, split = self._subjects[order], self._splits[order]
         first = np.concatenate([[True], subject[1:] != subject[:-1]])
@@ -118,13 +121,13 @@ class Lines:
 
 
 def check_records(batch: list[dict[str, Any]]) -> list[list[str]]:
-    """What is wrong with the records of each line of a batch."""
+    """List what is wrong with the records of each line of a batch."""
     problems: list[list[str]] = [[] for _ in batch]
     try:
         rows = [k for k, line in enumerate(batch) for _ in line["records"]]
         found = Observations.from_records([record for line in batch for record in line["records"]])
     except (InputError, *WRONG):
-        # One of them is wrong; which one is seen alone.
+        # One of them is wrong, and separate checks show which.
         if len(batch) > 1:
             return [check_records([line])[0] for line in batch]
         try:
@@ -152,12 +155,12 @@ def check_records(batch: list[dict[str, Any]]) -> list[list[str]]:
 
 
 def _agree(line: dict[str, Any]) -> Iterator[str]:
-    """Labels repeat numbers of the record; both were written from the same ones."""
+    """Compare labels with the numbers of the record that they repeat."""
     (record,) = line["records"]
     labels = line["labels"]
     own, pupil = labels["pupil"]["amodal"], record["pupil"]
     keys = ("status", "centre_px", "semi_axes_px", "angle_rad") if own["status"] == OK else ("status",)
-    # Labels are of the whole outline: a partial pupil is missing there.
+    # Labels need the whole outline, so a partial pupil is missing there.
     record_pupil = {**pupil, "status": MISSING if pupil["status"] == PARTIAL else pupil["status"]}
     if any(own[key] != record_pupil[key] for key in keys):
         yield "the pupil of its labels is not that of its record"
@@ -168,7 +171,7 @@ def _agree(line: dict[str, Any]) -> Iterator[str]:
 
 
 def _other_keys(line: dict[str, Any], first: dict[str, Any]) -> Iterator[str]:
-    """The keys that one of two lines has and the other has not; below a null there may be anything."""
+    """Keys that only one of two lines has; below a null any keys are allowed."""
     keys: set[str] = set()
     known: set[str] = set()
     nulls: set[str] = set()
@@ -180,7 +183,7 @@ def _other_keys(line: dict[str, Any], first: dict[str, Any]) -> Iterator[str]:
 
 
 def _collect(node: Any, path: str, found: set[str], nulls: set[str]) -> None:
-    """The key paths of a line; lists count as one entry; `nulls` gets the beginnings of what would be below a null."""
+    """Collect the key paths of a line; lists count as one entry; `nulls` gets the prefixes of paths below a null."""
     found.add(path)
     if isinstance(node, dict):
         for key, value in node.items():

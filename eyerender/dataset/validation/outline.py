@@ -10,35 +10,35 @@ from ...arrays import Bools, Floats
 from ...geometry.ellipse import points_on_ellipse
 from ...rig.camera import Window
 
-# A mask is traced in single precision, which moves an outline by .004 px at most (measured on the shipped eyes, seen at
-# up to 35 deg); the polygon of `_POINTS` chords lies within r pi^2 / (2 n^2) of the curve, 0.02 px at r = 500 px.
+# A mask is traced in single precision, which moves an outline by at most .004 px (measured on the shipped eyes, seen at
+# up to 35 deg). The polygon of `_POINTS` chords is within r pi^2 / (2 n^2) of the curve, 0.02 px at r = 500 px.
 EXACT_PX = 0.05
-# Where only the ellipse that fits best is known. The limbus is off it by .06 px at most, in E5; uneven pupils and
-# pupils seen from the side are off it by up to 1.05 px.
+# Tolerances where only the best-fitting ellipse is known. The limbus deviates from it by .06 px at most, in E5.
+# Irregular pupils and pupils seen from the side deviate by up to 1.05 px.
 LIMBUS_PX, PUPIL_PX = 0.25, 1.5
 _POINTS = 360
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outline:
-    """A closed polygon `curve` (n, 2) px, and how far from it a pixel's centre may lie on either side."""
+    """A closed polygon `curve` (n, 2) px, and the tolerance for a pixel's centre on either side."""
 
     curve: Floats
     tolerance_px: float
 
     @classmethod
     def through(cls, points_px: Floats) -> Outline:
-        """The closed curve through boundary points (k, 2) at even steps of a parameter, k >= 6.
+        """Closed curve through boundary points (k, 2) at equal steps of a parameter, k >= 6.
 
-        Trigonometric interpolation: exact for a curve with fewer than k / 2 harmonics. The outline of a stop has few,
-        so those above k / 4 tell how far the interpolation may be off.
+        It is a trigonometric interpolation, which is exact for a curve with fewer than k / 2 harmonics. The outline of
+        a stop has few, so the harmonics above k / 4 give the possible error of the interpolation.
         """
         k = len(points_px)
         harmonics = np.fft.fft(points_px[:, 0] + 1j * points_px[:, 1]) / k
         order = np.fft.fftfreq(k, 1 / k)
         error = float(np.abs(harmonics[np.abs(order) > k / 4]).sum())
         t = np.arange(_POINTS) / _POINTS
-        # The highest harmonic of an even number of points stands for both its signs.
+        # For an even number of points the highest harmonic has both signs.
         waves = np.exp(2j * np.pi * np.outer(t, order))
         if k % 2 == 0:
             waves[:, k // 2] = np.cos(np.pi * k * t)
@@ -47,7 +47,7 @@ class Outline:
 
     @classmethod
     def ellipse(cls, centre_px: Floats, semi_axes_px: Floats, angle_rad: float, tolerance_px: float) -> Outline:
-        """The outline where nothing but the ellipse that fits it best is known."""
+        """Outline where only the best-fitting ellipse is known."""
         return cls(points_on_ellipse(centre_px, semi_axes_px, angle_rad, _POINTS), tolerance_px)
 
     def inside(self, window: Window) -> Bools:
@@ -59,7 +59,7 @@ class Outline:
         return np.asarray(polygon2mask((height, width), corners))  # type: ignore[no-untyped-call]
 
     def beyond(self, pixels: Bools, window: Window) -> Floats:
-        """How far from the outline those of a window's pixels are that lie farther from it than the tolerance, px."""
+        """Distances from the outline, px, of those of a window's pixels that exceed the tolerance."""
         v, u = np.nonzero(pixels)
         at = np.stack([u + window[0], v + window[1]], axis=1).astype(float)
         p, way = self.curve, np.roll(self.curve, -1, axis=0) - self.curve

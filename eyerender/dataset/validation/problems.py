@@ -1,4 +1,4 @@
-"""What is wrong with a folder: counted, and the first of it kept in words."""
+"""Problems of a folder: their number, and the first ones in words."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator
 from math import sin
 from typing import Any
 
-# A damaged folder of a million images has a million problems; the first ones say what happened.
+# A damaged folder of a million images has a million problems; the first ones suffice to explain.
 SHOWN = 50
 MAX_LENGTH = 400
-# What a value that is not what it should be makes the code that reads it raise.
+# Exceptions that code raises when it reads a wrong value.
 WRONG = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError)
 
 
@@ -21,23 +21,23 @@ class Problems:
         self.shown: list[str] = []
 
     def add(self, text: str) -> None:
-        """One problem, in one line."""
+        """Add one problem, in one line."""
         self.count += 1
         if len(self.shown) < SHOWN:
             line = "".join(c if c.isprintable() else "?" for c in text)
             self.shown.append(line if len(line) <= MAX_LENGTH else line[: MAX_LENGTH - 3] + "...")
 
     def extend(self, texts: Iterable[str]) -> None:
-        """Several problems."""
+        """Add several problems."""
         for text in texts:
             self.add(text)
 
 
 def differences(expected: Any, found: Any, tolerance: float, path: str = "") -> Iterator[str]:
-    """Where a JSON value differs from the expected one, as `path is FOUND, not EXPECTED`.
+    """List where a JSON value differs from the expected one, as `path is FOUND, not EXPECTED`.
 
-    Numbers may differ by `tolerance` (1 + |expected|). What `found` has beyond the expected keys is not looked at. The
-    angle of an ellipse counts as far as it moves the ellipse's edge: a circle has none.
+    Numbers may differ by `tolerance` (1 + |expected|). Keys of `found` beyond the expected ones are ignored. The angle
+    of an ellipse counts only as far as it moves the ellipse's edge: a circle has none.
     """
     if isinstance(expected, dict) and isinstance(found, dict):
         yield from _differences_of_keys(expected, found, tolerance, path)
@@ -63,7 +63,7 @@ def _differences_of_keys(expected: dict[str, Any], found: dict[str, Any], tolera
 
 
 def _same_angle(expected: dict[str, Any], found: dict[str, Any], tolerance: float) -> bool:
-    """Whether two ellipses of the same axes are the same for all their angles say."""
+    """Whether two ellipses with the same axes are equal within the tolerance, given their angles."""
     axes, a, b = expected.get("semi_axes_px"), expected.get("angle_rad"), found.get("angle_rad")
     if axes is None or not (isinstance(a, float) and isinstance(b, int | float)):
         return False

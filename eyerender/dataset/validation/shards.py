@@ -1,4 +1,7 @@
-"""The finished dataset against its shards: the checksums of files, and metadata.jsonl against the shards' lines."""
+"""Checks of the finished dataset against its shards.
+
+Files are compared with their checksums, and metadata.jsonl with the shards' lines.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: P
 
     A shard must exist and belong to the plan. Its files must have the stated sizes and, unless `quick`, checksums.
     """
-    # Without checksums of its own, as older versions wrote it, metadata.jsonl is left to `compare_lines`.
+    # Where dataset.json has no checksums, as older versions wrote it, `compare_lines` checks metadata.jsonl.
     problems.extend(damage(folder, quick=quick or dataset.get("checksums") is None))
     there = sorted(finished(folder))
     digest = dataset.get("digest")
@@ -42,7 +45,7 @@ def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: P
     spec = dataset.get("spec")
     count, size = (spec.get(key) if isinstance(spec, dict) else None for key in ("count", "shard_size"))
     if not (isinstance(count, int) and isinstance(size, int) and 0 < count <= MAX_COUNT and size > 0):
-        return  # the plan cannot be read either
+        return  # then the plan cannot be read either
     asked = range(-(-count // size))
     known = frozenset(there)
     missing = len(asked) - sum(shard in asked for shard in there)
@@ -52,10 +55,10 @@ def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: P
 
 
 def compare_lines(folder: Path, problems: Problems) -> None:
-    """metadata.jsonl against the shards' lines, as values: the order of lines and of keys does not matter.
+    """Compare metadata.jsonl with the shards' lines as values; the order of lines and of keys does not matter.
 
-    Lines whose text does not stand in both are read, and compared by their image's name; whole numbers are equal to
-    their floating-point form. It takes some ten bytes of memory a line.
+    Lines whose text is not in both are parsed and compared by their image's name. Whole numbers are equal to their
+    floating-point form. This takes some ten bytes of memory per line.
     """
     mine = [folder / METADATA]
     theirs = [folder / SHARDS / shard_name(shard) / LINES for shard in sorted(finished(folder))]
@@ -85,7 +88,7 @@ def _values(files: Sequence[Path], numbers: Ints) -> NDArray[np.void]:
 
     def rows() -> Iterator[tuple[int, int, int]]:
         for number, line in _objects(files, numbers):
-            with suppress(RecursionError):  # nested too deeply for a line; it is found elsewhere
+            with suppress(RecursionError):  # nested too deeply for a line; another check reports it
                 values = json.dumps(_plain(line), sort_keys=True)
                 yield number, _hash(str(line.get("file_name")).encode()), _hash(values.encode())
 
@@ -93,7 +96,7 @@ def _values(files: Sequence[Path], numbers: Ints) -> NDArray[np.void]:
 
 
 def _objects(files: Sequence[Path], numbers: Ints) -> Iterator[tuple[int, dict[str, Any]]]:
-    """The lines of some numbers, in order, that hold objects; what is no object is found elsewhere."""
+    """Lines with given numbers, in order, that are objects; other checks report what is not an object."""
     if not len(numbers):
         return
     wanted = iter(numbers.tolist())
@@ -110,7 +113,7 @@ def _objects(files: Sequence[Path], numbers: Ints) -> Iterator[tuple[int, dict[s
 
 
 def _lines(files: Sequence[Path]) -> Iterator[tuple[int, bytes]]:
-    """The lines of files one after the other, numbered from 0; a file that cannot be read has none."""
+    """Lines of several files, numbered from 0; a file that cannot be read has none."""
     number = 0
     for path in files:
         with suppress(InputError, OSError), opened(path, limit=MAX_BYTES, follow=False) as file:
@@ -120,7 +123,7 @@ def _lines(files: Sequence[Path]) -> Iterator[tuple[int, bytes]]:
 
 
 def _plain(node: Any) -> Any:
-    """A JSON value whose whole numbers are floating-point ones where these are exact."""
+    """JSON value with whole numbers in floating-point form where that is exact."""
     if isinstance(node, dict):
         return {key: _plain(value) for key, value in node.items()}
     if isinstance(node, list):

@@ -1,7 +1,7 @@
-"""What can be computed again: from the plan of a dataset, or from the scene of a rendered folder, to lines of metadata.
+"""Lines of metadata computed again, from the plan of a dataset or from the scene of a rendered folder.
 
-A line but for what its pixels say: whose image it is, what was drawn, the names of its files, the analytic record, and
-the labels that follow from pose and parameters.
+These are the values of a line that do not depend on its pixels: the image's identity, what was drawn, the names of its
+files, the analytic record, and the labels that follow from pose and parameters.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ from ..realise import Realised, frames_of, realise
 from ..shard import KINDS, shard_name
 from .problems import WRONG, Problems, differences
 
-# Rays are traced to 1e-9 mm, and another machine's mathematical functions change the last digits: 1e-8 px at the
-# sharpest of the shipped cameras. A number may differ by this times 1 + its size.
+# Rays are traced to 1e-9 mm, and other machines' mathematical functions change the last digits: 1e-8 px at the sharpest
+# of the shipped cameras. A number may differ by this times 1 + its size.
 TOLERANCE = 1e-7
-# The centre of a lamp's image, of which hidden points may be missing, is a mean of points that are traced as exactly.
+# The centre of a lamp's image, of which hidden points may be missing, is a mean of points that are traced equally
+# exactly.
 SPOT_PX = 1e-3
 # Landmarks of the lids are written with four decimals.
 ROUNDED = 1e-6
@@ -46,12 +47,12 @@ _SHOWN = 2
 
 
 class NoTruth(Exception):
-    """Nothing can be computed again, for a reason that is no fault of the folder."""
+    """Nothing can be computed again, for a reason that is not a fault of the folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class Again:
-    """An image computed again: what its line differs in, and its limbus (k, 2) px where the whole of it is seen."""
+    """An image computed again: the differences of its line, and its limbus (k, 2) px where it is visible as a whole."""
 
     problems: tuple[str, ...]
     limbus_px: Floats | None = None
@@ -59,9 +60,9 @@ class Again:
 
 @dataclass
 class DatasetTruth:
-    """Lines of a generated dataset, from its plan; `frames` is how many each sample has.
+    """Lines of a generated dataset, from its plan; `frames` is the number of frames of each sample.
 
-    `stale` says why records and labels cannot be computed again, None where they can.
+    `stale` is the reason why records and labels cannot be computed again, None where they can.
     """
 
     plan: Plan
@@ -71,7 +72,7 @@ class DatasetTruth:
 
     @classmethod
     def of(cls, dataset: Mapping[str, Any], problems: Problems) -> DatasetTruth | None:
-        """From dataset.json; what is wrong with it is added to the problems."""
+        """Read the plan in dataset.json; what is wrong with it is added to the problems."""
         try:
             plan = Plan.from_mapping(dataset, Path())
             text = json.dumps({k: dataset[k] for k in plan.to_mapping()}, sort_keys=True, separators=(",", ":"))
@@ -94,7 +95,7 @@ class DatasetTruth:
         return {**files, "subject": subject, "sequence_index": sequence, "split": self.plan.split_of(subject)}
 
     def again(self, line: dict[str, Any]) -> Again:
-        """A line computed again; raises one of `WRONG` where it is no line of a dataset."""
+        """Compute a line again; raises one of `WRONG` for what is not a line of a dataset."""
         number, record = line["sample"], line["records"][0]
         if self._last is None or self._last.index != number:
             self._last = realise(self.plan, number, self.frames)
@@ -117,7 +118,7 @@ class DatasetTruth:
 
 @dataclass
 class SceneTruth:
-    """Lines of a folder that one scene was rendered into."""
+    """Lines of a rendered folder, from its scene."""
 
     frames: Frames
     observations: Observations
@@ -125,10 +126,10 @@ class SceneTruth:
 
     @classmethod
     def of(cls, dataset: Mapping[str, Any], problems: Problems) -> SceneTruth:
-        """From dataset.json.
+        """Read the scene in dataset.json.
 
         Raises:
-            NoTruth: a file of the scene is not at hand, another version rendered it, or the folder is no scene's.
+            NoTruth: a file of the scene is missing, another version rendered it, or the folder has no scene.
         """
         stale = _other_results(dataset)
         if stale is not None:
@@ -142,7 +143,7 @@ class SceneTruth:
         except InputError as error:
             raise NoTruth(str(error)) from None
         if digest != dataset.get("digest"):
-            # Another version of the package may know keys that this digest does not have.
+            # Another version of the package may have keys that this digest does not include.
             made_by = dataset.get("versions")
             if isinstance(made_by, dict) and made_by.get("eyerender") != versions()["eyerender"]:
                 raise NoTruth("another version of the package made it")
@@ -155,7 +156,7 @@ class SceneTruth:
         return {"file_name": f"images/{name}.png", "mask_file_name": f"masks/{name}.png"}
 
     def again(self, line: dict[str, Any]) -> Again:
-        """A line computed again; raises one of `WRONG` where it is no line of a rendered folder."""
+        """Compute a line again; raises one of `WRONG` for what is not a line of a rendered folder."""
         scene, found = self.frames.scene, self.observations
         record = line["records"][0]
         row = _row(found, record["frame"], record["eye"])
@@ -180,14 +181,14 @@ class SceneTruth:
 
 
 def truth_of(folder: ImageFolder, problems: Problems) -> DatasetTruth | SceneTruth | None:
-    """What a folder's lines can be compared with; None where dataset.json is damaged; raises `NoTruth`."""
+    """Find what a folder's lines can be compared with; None where dataset.json is damaged; raises `NoTruth`."""
     if folder.dataset.get("kind") == "dataset":
         return DatasetTruth.of(folder.dataset, problems)
     return SceneTruth.of(folder.dataset, problems)
 
 
 def _other_results(dataset: Mapping[str, Any]) -> str | None:
-    """Whether a folder says that another version of the results made it, in words."""
+    """State whether another version of the results made a folder; None if not."""
     made_by = dataset.get("versions")
     results = made_by.get("results", RESULTS) if isinstance(made_by, dict) else RESULTS
     return None if str(results) == str(RESULTS) else f"it has results of version {shown(results)}, not {RESULTS}"
@@ -200,7 +201,7 @@ def _row(observations: Observations, frame: int, eye: str) -> int | None:
 
 
 def _open(line: dict[str, Any], texts: tuple[str, ...]) -> dict[str, Any]:
-    """A line with JSON that it holds as text as values."""
+    """Replace JSON that a line holds as text by its values."""
     parameters = line["parameters"]
     return {**line, "parameters": {**parameters, **{key: parse_json(parameters[key]) for key in texts}}}
 
@@ -210,7 +211,7 @@ def _differences(expected: dict[str, Any], line: dict[str, Any]) -> list[str]:
 
 
 def _summed(texts: Iterator[str]) -> list[str]:
-    """The first of several differences, and how many more there are."""
+    """First of several differences, and the number of the others."""
     found = list(texts)
     if len(found) > _SHOWN:
         found = [*found[:_SHOWN], f"{len(found) - _SHOWN} more values differ"]
@@ -223,7 +224,7 @@ def _limbus(scene: Scene, view: EyeInWindow) -> Floats | None:
 
 
 def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
-    """The spots of the glints: the mean of the lamp's image, or within it where a part of it is hidden."""
+    """Check the spots of the glints: each is the mean of the lamp's image, or within it where a part is hidden."""
     eye, camera = view.eye, scene.rig.cameras[view.camera]
     mirror = GlintScene(
         eye.front[0], float(eye.front_indices[0]), float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm),
@@ -246,7 +247,7 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
 
 
 def _lids(scene: Scene, observations: Observations, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
-    """The landmarks along the lids; those of a head mesh, which are not known, are null."""
+    """Check the landmarks along the lids; those of a head mesh are unknown and null."""
     expected = None
     if scene.spec.region is not None and scene.spec.region.head is None:
         index = observations.index
