@@ -13,16 +13,26 @@ if TYPE_CHECKING:
     from . import gaze
     from .analytic.observer import AnalyticObserver
     from .benchmark.protocol import Extractor
+    from .benchmark.run import bench_extractors
     from .capture import render_windows
     from .comparison import Comparison, compare
+    from .dataset.estimate import estimate
+    from .dataset.export import export
+    from .dataset.realise import sample
+    from .dataset.run import generate
+    from .dataset.sheet import preview
+    from .dataset.spec import DatasetSpec
+    from .dataset.validate import validate
     from .errors import BackendError, EyerenderError, InputError
+    from .extraction import ExtractionSettings, extract
     from .eye.catalogue import load_eye
     from .eye.model import EyeModel
     from .eye.spec import EyeSpec
     from .imagefolder import ImageFolder
     from .imageobserver import ImageObserver
     from .observation import Observations
-    from .renderedfolder import render_folder
+    from .quickstart import compare_folder, run_quickstart
+    from .renderedfolder import export_scene, render_folder
     from .report.comparison import write_report
     from .rig.rig import RigGeometry
     from .scene import Scene, load_scene, shipped_scenes
@@ -32,6 +42,8 @@ _HOMES = {
     "AnalyticObserver": "analytic.observer",
     "BackendError": "errors",
     "Comparison": "comparison",
+    "DatasetSpec": "dataset.spec",
+    "ExtractionSettings": "extraction",
     "Extractor": "benchmark.protocol",
     "EyeModel": "eye.model",
     "EyeSpec": "eye.spec",
@@ -43,12 +55,23 @@ _HOMES = {
     "RigGeometry": "rig.rig",
     "Scene": "scene",
     "SceneSpec": "scenespec",
+    "bench_extractors": "benchmark.run",
     "compare": "comparison",
+    "compare_folder": "quickstart",
+    "estimate": "dataset.estimate",
+    "export": "dataset.export",
+    "export_scene": "renderedfolder",
+    "extract": "extraction",
+    "generate": "dataset.run",
     "load_eye": "eye.catalogue",
     "load_scene": "scene",
+    "preview": "dataset.sheet",
     "render_folder": "renderedfolder",
     "render_windows": "capture",
+    "run_quickstart": "quickstart",
+    "sample": "dataset.realise",
     "shipped_scenes": "scene",
+    "validate": "dataset.validate",
     "write_report": "report.comparison",
 }
 
@@ -56,6 +79,8 @@ __all__ = [
     "AnalyticObserver",
     "BackendError",
     "Comparison",
+    "DatasetSpec",
+    "ExtractionSettings",
     "Extractor",
     "EyeModel",
     "EyeSpec",
@@ -68,13 +93,24 @@ __all__ = [
     "Scene",
     "SceneSpec",
     "__version__",
+    "bench_extractors",
     "compare",
+    "compare_folder",
+    "estimate",
+    "export",
+    "export_scene",
+    "extract",
     "gaze",
+    "generate",
     "load_eye",
     "load_scene",
+    "preview",
     "render_folder",
     "render_windows",
+    "run_quickstart",
+    "sample",
     "shipped_scenes",
+    "validate",
     "write_report",
 ]
 

@@ -76,6 +76,33 @@ class Comparison:
             "gaze_reason": self.gaze_reason,
         }
 
+    def to_text(self) -> str:
+        """The comparison as a few lines of text."""
+        data = self.to_mapping()
+        f, gaze = data["features"], data["gaze"]
+        lines = [
+            f"pupils found   {f['pupils']['found']} of {f['pupils']['expected']}",
+            f"glints found   {f['glints']['found']} of {f['glints']['expected']}",
+            "error of the image observer against the analytic one, px     median      p95      max",
+        ]
+        for key, name in (("pupil_centre_px", "pupil centre"), ("semi_axes_px", "semi-axes"), ("glint_px", "glint")):
+            d = f[key]
+            if d["n"]:
+                lines.append(f"  {name:<56} {d['median']:>9.4f} {d['p95']:>8.4f} {d['max']:>8.4f}")
+        if gaze is None:
+            lines.append(f"gaze: none ({data['gaze_reason']})")
+        else:
+            lines.append(f"gaze error, degrees ({gaze['estimator']}, {gaze['protocol']})     mean      max     n")
+            for key in ("analytic", "image"):
+                d = gaze[key]
+                if d is None:
+                    lines.append(f"  {key:<10} none ({data['gaze_reason']})")
+                elif d["n"]:
+                    lines.append(f"  {key:<10} {d['mean_deg']:>8.4f} {d['max_deg']:>8.4f} {d['n']:>5}")
+                else:
+                    lines.append(f"  {key:<10} no frame has an estimate")
+        return "\n".join(lines)
+
 
 def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
     """Errors of `found` against `truth`, row by row; `InputError` unless both are of the same frames and eyes."""

@@ -1,4 +1,4 @@
-"""A scene rendered into a folder of labelled images."""
+"""A scene in a folder: rendered as labelled images, or exported for the stock renderer."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from typing import Any
 
 from .analytic.observer import trace
 from .backends.choose import BackendChoice
-from .capture import render_windows
-from .errors import Warn
+from .capture import check_windows, render_job, render_windows
+from .errors import InputError, Warn
 from .imagefile import write_png
 from .imagefolder import write_dataset
 from .labels import seen_labels
-from .outfolder import refuse_non_empty, staged
+from .observation import EYES
+from .outfolder import MARKER, refuse_non_empty, staged
 from .plausibility import is_saturated, saturation_warnings
 from .progress import Progress
 from .scene import Scene
@@ -84,3 +85,46 @@ def render_folder(
         "images": len(lines),
         "warnings": [warning.to_mapping() for warning in (*warnings, *found)],
     }
+
+
+def export_scene(
+    scene: Scene,
+    path: str | Path,
+    *,
+    frame: int = 0,
+    side: str | None = None,
+    spp: int = 64,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Write one frame as PLY meshes and a Mitsuba XML file, which the stock `mitsuba` command renders as it is.
+
+    Args:
+        scene: the scene.
+        path: the folder to write; complete or not at all.
+        frame: the frame, counted from 0.
+        side: the eye, right or left; by default the first one that the frame shows.
+        spp: samples per pixel that the file asks for.
+        overwrite: replace what the folder holds.
+
+    Returns:
+        Schema eyerender/export-scene/1: path, name of the XML file, names of all files.
+
+    Raises:
+        InputError: there is no such frame or eye, the scene cannot be rendered, or the folder is not empty.
+    """
+    from .rendering.export import export_scene as write_job
+
+    check_windows(scene)
+    frames = scene.frames()
+    if side is not None and side not in EYES:
+        raise InputError("must be right or left", source="--side")
+    index = frames.index
+    rows = [r for r in range(len(frames)) if index.frame[r] == frame and side in (None, EYES[index.eye[r]])]
+    if not rows:
+        shown = " and ".join(scene.spec.subject.eyes)
+        raise InputError(f"the scene has frames 0 to {int(index.frame.max())}, eyes {shown}", source="--frame")
+    with staged(path, overwrite=overwrite) as folder:
+        name = write_job(render_job(frames, rows[0]), folder, spp=spp).name
+    made = Path(path)
+    files = sorted(str(p.relative_to(made)) for p in made.rglob("*") if p.is_file() and p.name != MARKER)
+    return {"schema": "eyerender/export-scene/1", "path": str(path), "scene": name, "files": files}

@@ -13,7 +13,7 @@ er.render_folder(scene, out)  # near-infrared images with labels
 folder = er.ImageFolder.load(out)
 found = er.ImageObserver().observe_folder(folder, scene)  # the same features from the pixels
 
-result = er.compare(truth, found, scene.rig, er.gaze.Regression("R3"), "regression R3")
+result = er.compare(truth, found, scene.rig, er.gaze.Regression("R3"))
 er.write_report(out / "report.html", scene, result, folder.entries)
 
 errors = result.features.summary()

@@ -206,10 +206,11 @@ def test_import_is_light():
 
 def test_public_names_are_pinned():
     assert eyerender.__all__ == [
-        "AnalyticObserver", "BackendError", "Comparison", "Extractor", "EyeModel", "EyeSpec", "EyerenderError",
-        "ImageFolder", "ImageObserver", "InputError", "Observations", "RigGeometry", "Scene",
-        "SceneSpec", "__version__", "compare", "gaze", "load_eye", "load_scene", "render_folder",
-        "render_windows", "shipped_scenes", "write_report",
+        "AnalyticObserver", "BackendError", "Comparison", "DatasetSpec", "ExtractionSettings", "Extractor",
+        "EyeModel", "EyeSpec", "EyerenderError", "ImageFolder", "ImageObserver", "InputError", "Observations",
+        "RigGeometry", "Scene", "SceneSpec", "__version__", "bench_extractors", "compare", "compare_folder",
+        "estimate", "export", "export_scene", "extract", "gaze", "generate", "load_eye", "load_scene", "preview",
+        "render_folder", "render_windows", "run_quickstart", "sample", "shipped_scenes", "validate", "write_report",
     ]  # fmt: skip
     for name in eyerender.__all__:
         assert getattr(eyerender, name) is not None

@@ -25,7 +25,7 @@ from .bound import Edge, edge_of
 from .folder import LabelledImage, load_labelled
 from .process import ExtractorProcess, Failed
 from .protocol import Greeting, Request
-from .registry import ExtractorCommand
+from .registry import ExtractorCommand, defaults, resolve
 from .score import Score, failed, score
 from .summary import FACTORS, breakdown, failures, summarise
 
@@ -53,12 +53,11 @@ class Run:
 def bench_extractors(
     folder: str | Path,
     output: str | Path,
-    extractors: Sequence[ExtractorCommand],
+    extractors: Sequence[str | ExtractorCommand] | None = None,
     *,
     timeout_s: float = 30.0,
     start_timeout_s: float = START_S,
     overwrite: bool = False,
-    absent: dict[str, str] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Run extractors over a labelled folder and write report.html, results.json and results.csv.
@@ -66,11 +65,12 @@ def bench_extractors(
     Args:
         folder: the labelled images.
         output: the folder that receives the results.
-        extractors: what to run, each under a name of its own.
+        extractors: what to run, each under its own name: an installed name, `module:callable` (see `Extractor`), or
+            a command line, each perhaps after `NAME=`. By default all installed ones; the results name those that
+            cannot run here, and why.
         timeout_s: longest time for an image.
         start_timeout_s: longest time until an extractor greets.
         overwrite: replace what `output` holds.
-        absent: extractors that cannot be run here, and why; they are named in the results.
         progress: called with (done, total, note).
 
     Returns:
@@ -79,9 +79,14 @@ def bench_extractors(
     Raises:
         InputError: the folder cannot be used, two extractors share a name, or there is none.
     """
-    if not extractors:
+    absent: dict[str, str] = {}
+    if extractors is None:
+        chosen, absent = defaults()
+    else:
+        chosen = [resolve(given) if isinstance(given, str) else given for given in extractors]
+    if not chosen:
         raise InputError("none to run", source="--extractor")
-    titles = [e.name for e in extractors]
+    titles = [e.name for e in chosen]
     for name in titles:
         if titles.count(name) > 1:
             raise InputError(f"two are called {name!r}; give one another name: NAME=...", source="--extractor")
@@ -91,11 +96,11 @@ def bench_extractors(
     sigmas = [e.centre_sigma_px(i.pupil) if e and i.pupil else None for e, i in zip(edges, images, strict=True)]
     factors = [_factors(image, edge) for image, edge in zip(images, edges, strict=True)]
     runs = []
-    for k, extractor in enumerate(extractors):
+    for k, extractor in enumerate(chosen):
 
         def step(done: int, name: str = extractor.name, before: int = k * len(images)) -> None:
             if progress is not None:
-                progress(before + done, len(extractors) * len(images), name)
+                progress(before + done, len(chosen) * len(images), name)
 
         runs.append(run_extractor(extractor, images, timeout_s=timeout_s, start_timeout_s=start_timeout_s, step=step))
     data = {
@@ -109,7 +114,7 @@ def bench_extractors(
         "edge": _edge_summary(edges, images),
         "factors": {name: {"what": what, "unit": unit} for name, (what, unit) in FACTORS.items()},
         "extractors": [_entry(run, images, sigmas, factors) for run in runs],
-        "not_run": [{"name": name, "reason": reason} for name, reason in sorted((absent or {}).items())],
+        "not_run": [{"name": name, "reason": reason} for name, reason in sorted(absent.items())],
     }
     rows = [_row(run, k, images[k], sigmas[k], factors[k]) for run in runs for k in range(len(images))]
     with staged(output, overwrite=overwrite or _is_bench(Path(output))) as place:

@@ -37,19 +37,13 @@ def bench_extractors(
             Repeat the option for several extractors (default: all installed ones).
         timeout: Seconds that an extractor may take for one image.
     """
-    from ..benchmark.registry import defaults, resolve
     from ..benchmark.run import REPORT, bench_extractors
 
     if not 0 < timeout <= 86400:
         raise InputError("must be above 0 and at most 86400 seconds", source="--timeout")
-    absent: dict[str, str] = {}
-    if extractor:
-        chosen = [resolve(given) for given in extractor]
-    else:
-        chosen, absent = defaults()  # what is absent stands in the result, with the reason
     with progress("benching") as steps:
         data = bench_extractors(
-            folder, output, chosen, timeout_s=timeout, overwrite=overwrite, absent=absent, progress=steps
+            folder, output, extractor or None, timeout_s=timeout, overwrite=overwrite, progress=steps
         )
     emit(data, f"{_table(data)}\n\nreport: {output / REPORT}", json)
     return 0

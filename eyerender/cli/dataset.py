@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -11,9 +11,6 @@ from ..errors import EyerenderError, InputError
 from .app import app
 from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads, positive
 from .output import Heed, emit, progress, say
-
-if TYPE_CHECKING:
-    from ..scene import Scene
 
 
 @app.command(name="generate")
@@ -55,26 +52,11 @@ def generate(
         count: Make the first COUNT samples of the spec's plan. A count above the spec's own plans a larger dataset.
         timeout: Seconds without a sign of life after which a worker is ended and its shard is retried.
     """
-    from ..dataset.plan import Plan
-    from ..dataset.run import Options
-    from ..dataset.run import generate as run
-    from ..plausibility import saturation_warnings
-
-    plan = Plan.load(spec, eye=eye, seed=seed, count=count)
     positive("--workers", workers)
     positive("--threads", threads)
     if not timeout > 0:
         raise InputError("must be > 0", source="--timeout")
-    options = Options(
-        workers=workers,
-        part=_part(shard),
-        engine=engine,
-        address=address,
-        backend=backend,
-        threads=threads,
-        timeout_s=timeout,
-        overwrite=overwrite,
-    )
+    part = _part(shard)
     if measure and not dry_run:
         raise InputError("needs --dry-run", source="--measure")
     if folder is None and not dry_run:
@@ -84,18 +66,43 @@ def generate(
             "cannot be combined with --shard, because other jobs may be writing to the folder", source="--overwrite"
         )
     heed = Heed(strict)
-    heed(plan.warnings())
-    if dry_run:
+    if folder is None or dry_run:
         from ..dataset.estimate import estimate
 
-        found = estimate(plan, options, measure=measure)
+        found = estimate(
+            spec,
+            eye=eye,
+            seed=seed,
+            count=count,
+            workers=workers,
+            backend=backend,
+            threads=threads,
+            measure=measure,
+            warn=heed,
+        )
         emit(found, _estimate_text(found), json, heed)
         return 0
-    assert folder is not None
+    from ..dataset.run import generate as run
+
     with progress("generating") as steps:
-        done = run(plan, folder, options, progress=steps, say=say)
-    statistics = done.get("statistics", {})
-    heed(saturation_warnings(statistics.get("images_saturated", 0), statistics.get("images", 0), str(folder)))
+        done = run(
+            spec,
+            folder,
+            eye=eye,
+            seed=seed,
+            count=count,
+            workers=workers,
+            part=part,
+            engine=engine,
+            address=address,
+            backend=backend,
+            threads=threads,
+            timeout_s=timeout,
+            overwrite=overwrite,
+            progress=steps,
+            say=say,
+            warn=heed,
+        )
     emit(done, _generate_text(done), json, heed)
     return 0
 
@@ -121,25 +128,14 @@ def sample(
     """
     import yaml
 
-    from ..dataset.plan import Plan
-    from ..dataset.realise import realise
+    from ..dataset.realise import sample as drawn
 
-    plan = Plan.load(spec, eye=eye, seed=seed)
-    if not 0 <= index < plan.spec.count:
-        raise InputError(
-            f"must be 0 to {plan.spec.count - 1}, not {index}: {spec} has {plan.spec.count} samples; "
-            "choose one of them, or raise 'count' in the spec",
-            source="I",
-        )
-    found = realise(plan, index)
-    if found.sample is None or found.scene is None:
-        raise InputError(f"sample {index} was given up: {found.rejections[-1].reason}", source=plan.source)
+    found = drawn(spec, index, eye=eye, seed=seed)
     heed = Heed(strict)
-    heed(warning.at(plan.source) for warning in found.scene.warnings())
-    data = {"schema": "eyerender/sample/1", **found.sample.to_mapping()}
-    data["rejections"] = [f"{r.of}, attempt {r.attempt}: {r.reason}" for r in found.rejections]
+    heed(found.warnings())
     if output is not None:
-        _write_sample(output, found.scene)
+        found.write(output)
+    data = found.to_mapping()
     text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100).rstrip()
     emit(data, text, json, heed)
     return 0
@@ -166,24 +162,11 @@ def preview(
         output: The picture to write.
     """
     positive("--threads", threads)
-    from ..dataset.plan import Plan
-    from ..dataset.sheet import FORMATS, write_sheet
-    from ..dataset.spec import shipped_datasets
-    from ..scene import is_dataset, load_scene, refuse_folder, shipped_files
+    from ..dataset.sheet import preview as render
 
-    if output.suffix.lower() not in FORMATS:
-        raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(output))
-    what: Plan | Scene
-    if spec not in shipped_files():
-        refuse_folder(Path(spec), "a scene or dataset file, or the name of a shipped one")
-    if spec in shipped_datasets() or is_dataset(Path(spec)):
-        what = Plan.load(spec, eye=eye, seed=seed)
-    else:
-        what = load_scene(spec, eye=eye, seed=seed)
     heed = Heed(strict)
-    heed(what.warnings())
     with progress("rendering") as steps:
-        write_sheet(what, output, backend=backend, threads=threads, progress=steps, warn=heed)
+        render(spec, output, eye=eye, seed=seed, backend=backend, threads=threads, progress=steps, warn=heed)
     print(output)
     return 0
 
@@ -242,9 +225,8 @@ def export_dataset(
     """
     from ..dataset.export import export
 
-    options: dict[str, Any] = {"bits": bits, "encoding": encoding, "gain": gain}
     with progress("exporting") as steps:
-        done = export(folder, out, format, **options, overwrite=overwrite, progress=steps)
+        done = export(folder, format, out, bits=bits, encoding=encoding, gain=gain, overwrite=overwrite, progress=steps)
     image = done["image"]
     how = f"{bits} bits, {image['encoding']}, gain {image['gain']:g}"
     emit(done, f"{done['images']} images as {format} in {out} ({how})", json)
@@ -258,20 +240,6 @@ def _part(text: str | None) -> tuple[int, int]:
     if not (slash and k.isdigit() and n.isdigit() and 1 <= int(k) <= int(n)):
         raise InputError(f"must be K/N with 1 <= K <= N, not {text!r}", source="--shard")
     return int(k), int(n)
-
-
-def _write_sample(folder: Path, scene: Scene) -> None:
-    from ..outfolder import refuse_non_empty
-
-    refuse_non_empty(folder, False)
-    spec = scene.located()
-    spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": "eye.yaml"})})
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        scene.eye_spec.dump(folder / "eye.yaml")
-        spec.dump(folder / "scene.yaml")
-    except OSError as error:
-        raise EyerenderError(f"{folder}: cannot be written ({error.strerror or error})") from None
 
 
 def _generate_text(done: dict[str, Any]) -> str:

@@ -8,7 +8,6 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from .app import app
-from .observe import comparison_text
 from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads, positive
 from .output import Heed, emit, progress
 
@@ -77,6 +76,5 @@ def quickstart(
         result = run_quickstart(
             folder, eye=eye, backend=backend, threads=threads, overwrite=overwrite, progress=steps, warn=heed
         )
-    data = result.to_mapping()
-    emit(data, f"{comparison_text(data)}\nreport: {folder / 'report.html'}", json, heed)
+    emit(result.to_mapping(), f"{result.to_text()}\nreport: {folder / 'report.html'}", json, heed)
     return 0

@@ -125,35 +125,8 @@ def compare(
     name = f"regression {function}" if estimator == "regression" else estimator
     with progress("extracting") as steps:
         result = compare_folder(folder, estimator=chosen, name=name, progress=steps)
-    emit(result.to_mapping(), comparison_text(result.to_mapping()), json)
+    emit(result.to_mapping(), result.to_text(), json)
     return 0
-
-
-def comparison_text(data: dict[str, Any]) -> str:
-    """The comparison as a few lines of text."""
-    f, gaze = data["features"], data["gaze"]
-    lines = [
-        f"pupils found   {f['pupils']['found']} of {f['pupils']['expected']}",
-        f"glints found   {f['glints']['found']} of {f['glints']['expected']}",
-        "error of the image observer against the analytic one, px     median      p95      max",
-    ]
-    for key, name in (("pupil_centre_px", "pupil centre"), ("semi_axes_px", "semi-axes"), ("glint_px", "glint")):
-        d = f[key]
-        if d["n"]:
-            lines.append(f"  {name:<56} {d['median']:>9.4f} {d['p95']:>8.4f} {d['max']:>8.4f}")
-    if gaze is None:
-        lines.append(f"gaze: none ({data['gaze_reason']})")
-    else:
-        lines.append(f"gaze error, degrees ({gaze['estimator']}, {gaze['protocol']})     mean      max     n")
-        for key in ("analytic", "image"):
-            d = gaze[key]
-            if d is None:
-                lines.append(f"  {key:<10} none ({data['gaze_reason']})")
-            elif d["n"]:
-                lines.append(f"  {key:<10} {d['mean_deg']:>8.4f} {d['max_deg']:>8.4f} {d['n']:>5}")
-            else:
-                lines.append(f"  {key:<10} no frame has an estimate")
-    return "\n".join(lines)
 
 
 def _check_record(version: int) -> None:

@@ -5,54 +5,85 @@ from __future__ import annotations
 import io
 import json
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..backends.choose import BackendChoice
+from ..errors import Warn
 from ..imagefile import encode_png
 from .maker import Maker
 from .plan import Plan
 from .rates import Rate, keep_rate, last_rate, now
 from .realise import frames_of, realise
 from .run import Options, worker_count
+from .spec import DatasetSpec
 
 _SUBJECTS = 3
 
 
-def estimate(plan: Plan, options: Options, *, measure: bool = False) -> dict[str, Any]:
-    """Time and disk of a run (schema eyerender/estimate/2): seconds = (samples t + subjects t_subject) / workers.
+def estimate(
+    spec: str | Path | DatasetSpec | Plan,
+    *,
+    eye: str | None = None,
+    seed: int | None = None,
+    count: int | None = None,
+    workers: int | None = None,
+    backend: BackendChoice = "auto",
+    threads: int | None = None,
+    measure: bool = False,
+    warn: Warn | None = None,
+) -> dict[str, Any]:
+    """Time and disk that `generate` would take: seconds = (samples t + subjects t_subject) / workers.
 
-    The rate is the last one of this spec on this machine, for any seed and number of samples. With `measure`, two
-    samples of each of a few subjects are made instead. `seconds` and `bytes` are None where no rate is known.
+    The rate is the last one of this spec on this machine, for any seed and number of samples.
+
+    Args:
+        spec: as of `generate`.
+        eye: as of `generate`.
+        seed: as of `generate`.
+        count: as of `generate`.
+        workers: as of `generate`.
+        backend: as of `generate`.
+        threads: as of `generate`.
+        measure: make two samples of each of a few subjects to measure the rate.
+        warn: called with warnings about the spec; it may raise.
+
+    Returns:
+        Schema eyerender/estimate/2; `seconds` and `bytes` are None where no rate is known.
 
     Raises:
         InputError: the first sample cannot be made at all.
         BackendError: with `measure`; there is nothing to render with.
     """
-    spec = plan.spec
-    workers, threads = worker_count(options, spec.shard_count)
+    plan = Plan.load(spec, eye=eye, seed=seed, count=count)
+    if warn is not None:
+        warn(plan.warnings())
+    samples, shards = plan.spec.count, plan.spec.shard_count
+    processes, each = worker_count(Options(workers=workers, threads=threads), shards)
     frames = frames_of(plan)
     if measure:
-        rate: Rate | None = measured_rate(plan, Maker(plan, frames, backend=options.backend, threads=threads))
+        rate: Rate | None = measured_rate(plan, Maker(plan, frames, backend=backend, threads=each))
     else:
-        rate = last_rate(plan, options.backend)
+        rate = last_rate(plan, backend)
     seconds = None
     if rate is not None:
-        subjects = plan.subject_of(spec.count - 1)[0] + 1
-        seconds = (spec.count * rate.seconds + subjects * rate.subject_seconds) / min(workers, spec.shard_count)
+        subjects = plan.subject_of(samples - 1)[0] + 1
+        seconds = (samples * rate.seconds + subjects * rate.subject_seconds) / min(processes, shards)
         images = rate.images
     else:
         first = realise(plan, 0, frames).observations
         images = 0 if first is None else len(first)
     return {
         "schema": "eyerender/estimate/2",
-        "samples": spec.count,
-        "images": round(spec.count * images),
-        "shards": spec.shard_count,
-        "workers": workers,
-        "threads_per_worker": threads,
+        "samples": samples,
+        "images": round(samples * images),
+        "shards": shards,
+        "workers": processes,
+        "threads_per_worker": each,
         "seconds": None if seconds is None else round(seconds, 1),
-        "bytes": None if rate is None else round(spec.count * rate.bytes),
+        "bytes": None if rate is None else round(samples * rate.bytes),
         "rate": None if rate is None else rate.to_mapping(),
     }
 

@@ -99,9 +99,14 @@ class Plan:
 
     @classmethod
     def load(
-        cls, path: str | Path, *, eye: str | None = None, seed: int | None = None, count: int | None = None
+        cls,
+        given: str | Path | DatasetSpec | Plan,
+        *,
+        eye: str | None = None,
+        seed: int | None = None,
+        count: int | None = None,
     ) -> Plan:
-        """Load a plan from a file, or from the bare name of a shipped dataset.
+        """Load a plan from a file, the bare name of a shipped dataset, or a spec; a plan is returned as it is.
 
         `eye` and `seed` replace those of the spec; parameters of other eye models are then dropped. `count` requests
         the first samples of the plan, or a larger plan (see `DatasetSpec.first`).
@@ -109,15 +114,22 @@ class Plan:
         Raises:
             InputError: with one line.
         """
-        file = find_dataset(path)
-        spec = DatasetSpec.load(file)
+        if isinstance(given, Plan):
+            if (eye, seed, count) != (None, None, None):
+                raise InputError("a plan has its eye, seed and count already; give its spec", path="spec")
+            return given
+        if isinstance(given, DatasetSpec):
+            file, spec = None, given
+        else:
+            file = find_dataset(given)
+            spec = DatasetSpec.load(file)
         if seed is not None:
             spec = spec.replaced("--seed", {"seed": seed})
         if count is not None:
             spec = spec.first(count)
         if eye is not None:
             spec = spec.replaced("--eye", _with_eye(spec, eye))
-        return cls.of(spec, base=file.parent, source=str(file))
+        return cls.of(spec) if file is None else cls.of(spec, base=file.parent, source=str(file))
 
     @classmethod
     def of(cls, spec: DatasetSpec, *, base: Path | None = None, source: str = "") -> Plan:

@@ -7,18 +7,22 @@ sample. After `attempts` of them, or at once where nothing random is left to dra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..analytic.observer import trace
 from ..arrays import Bools, Floats
 from ..capture import check_windows
-from ..errors import InputError
+from ..errors import EyerenderError, InputError, InputWarning
 from ..observation import Observations
+from ..outfolder import refuse_non_empty
 from ..rig.camera import Window
 from ..scene import Frames, Scene
 from .plan import Plan, Sample
+from .spec import DatasetSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +44,70 @@ class Realised:
     frames: Frames | None
     observations: Observations | None
     rejections: tuple[Rejection, ...]
+    source: str = ""
 
     @property
     def scene(self) -> Scene | None:
         """The sample's scene."""
         return None if self.frames is None else self.frames.scene
+
+    def warnings(self) -> list[InputWarning]:
+        """What was probably not meant in the scene (see `Scene.warnings`)."""
+        return [] if self.scene is None else [warning.at(self.source) for warning in self.scene.warnings()]
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The sample as `sample --json` writes it: schema eyerender/sample/1."""
+        drawn = {} if self.sample is None else self.sample.to_mapping()
+        rejections = [f"{r.of}, attempt {r.attempt}: {r.reason}" for r in self.rejections]
+        return {"schema": "eyerender/sample/1", **drawn, "rejections": rejections}
+
+    def write(self, path: str | Path) -> None:
+        """Write scene.yaml and eye.yaml of the sample into a new folder, for other commands to read.
+
+        Raises:
+            InputError: the sample was given up, or the folder is not empty.
+            EyerenderError: the folder cannot be written.
+        """
+        if self.scene is None:
+            raise InputError(f"sample {self.index} was given up: {self.rejections[-1].reason}")
+        folder = Path(path)
+        refuse_non_empty(folder, False)
+        spec = self.scene.located()
+        spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": "eye.yaml"})})
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self.scene.eye_spec.dump(folder / "eye.yaml")
+            spec.dump(folder / "scene.yaml")
+        except OSError as error:
+            raise EyerenderError(f"{folder}: cannot be written ({error.strerror or error})") from None
+
+
+def sample(
+    spec: str | Path | DatasetSpec | Plan, index: int, *, eye: str | None = None, seed: int | None = None
+) -> Realised:
+    """Sample `index` of a dataset, as `generate` makes it: what was drawn, its scene and what ray optics see.
+
+    Args:
+        spec: as of `generate`.
+        index: of the sample, counted from 0.
+        eye: as of `generate`.
+        seed: as of `generate`.
+
+    Raises:
+        InputError: there is no such sample, or it was given up.
+    """
+    plan = Plan.load(spec, eye=eye, seed=seed)
+    if not 0 <= index < plan.spec.count:
+        name = spec if isinstance(spec, str | Path) else plan.spec.name
+        raise InputError(
+            f"must be 0 to {plan.spec.count - 1}, not {index}: {name} has {plan.spec.count} samples; "
+            "choose one of them, or raise 'count' in the spec",
+            source="I",
+        )
+    found = realise(plan, index)
+    if found.sample is None:
+        raise InputError(f"sample {index} was given up: {found.rejections[-1].reason}", source=plan.source)
+    return replace(found, source=plan.source)
 
 
 def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:

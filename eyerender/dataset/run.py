@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from ..backends.choose import BackendChoice
-from ..errors import EyerenderError, InputError
+from ..errors import EyerenderError, InputError, Warn
 from ..files import make_folder, remove_file
 from ..imagefolder import DATASET
 from ..lock import LOCK, final_lock, run_lock
 from ..outfolder import clear, refuse_non_empty
+from ..plausibility import saturation_warnings
 from ..progress import Progress, Say
 from .assemble import assemble, damage
 from .plan import Plan
@@ -36,6 +37,7 @@ from .shard import (
     remove_leftovers,
     withdraw_damaged,
 )
+from .spec import DatasetSpec
 from .worker import Job
 
 MEMORY_A_WORKER = 0.8e9  # bytes, measured resident size with head-room
@@ -61,9 +63,56 @@ class Options:
     timeout_s: float = 600.0
     overwrite: bool = False
 
+    def __post_init__(self) -> None:
+        for name in ("workers", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"must be >= 1, not {value}", path=name)
+        if not self.timeout_s > 0:
+            raise InputError(f"must be > 0, not {self.timeout_s:g}", path="timeout_s")
 
-def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progress, say: Say) -> dict[str, Any]:
-    """Make a dataset, or what is missing of it.
+
+def generate(
+    spec: str | Path | DatasetSpec | Plan,
+    path: str | Path,
+    *,
+    eye: str | None = None,
+    seed: int | None = None,
+    count: int | None = None,
+    workers: int | None = None,
+    part: tuple[int, int] = (1, 1),
+    engine: Literal["local", "ray"] = "local",
+    address: str | None = None,
+    backend: BackendChoice = "auto",
+    threads: int | None = None,
+    timeout_s: float = 600.0,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    say: Say | None = None,
+    warn: Warn | None = None,
+) -> dict[str, Any]:
+    """Make a labelled dataset, or what is missing of it in a folder where a run was stopped.
+
+    The bytes of the dataset depend on the spec, `eye`, `seed` and `count` alone.
+
+    Args:
+        spec: a dataset file, the name of a shipped one, a spec built in Python, or a plan.
+        path: the folder to write.
+        eye: replaces the eye model of the spec: a name of the catalogue or an eye file.
+        seed: replaces the seed of the spec.
+        count: makes the first `count` samples of the spec's plan, or plans a larger dataset.
+        workers: processes; by default one per processor, as far as memory allows.
+        part: (k, n) makes only every n-th shard, starting with the k-th; for array jobs that write to one folder.
+        engine: processes of this machine, or actors on a Ray cluster.
+        address: of the Ray cluster; by default one is started on this machine.
+        backend: the render backend.
+        threads: total number of processor threads; by default all.
+        timeout_s: seconds without a sign of life after which a worker is ended and its shard is tried again.
+        overwrite: replace what the folder holds.
+        progress: called with (images done, images in all, note).
+        say: called with lines for the log.
+        warn: called with warnings about the spec before the run, where it may raise to stop it, and about saturated
+            images after it.
 
     Returns:
         A summary: schema eyerender/generate/1.
@@ -74,6 +123,18 @@ def generate(plan: Plan, path: str | Path, options: Options, *, progress: Progre
         BackendError: there is nothing to render with.
         EyerenderError: the disk is full or not writable, or shards were given up after repeated tries.
     """
+    plan = Plan.load(spec, eye=eye, seed=seed, count=count)
+    options = Options(workers, part, engine, address, backend, threads, timeout_s, overwrite)
+    if warn is not None:
+        warn(plan.warnings())
+    done = _generate(plan, path, options, progress or (lambda *_: None), say or (lambda _: None))
+    if warn is not None:
+        statistics = done.get("statistics", {})
+        warn(saturation_warnings(statistics.get("images_saturated", 0), statistics.get("images", 0), str(path)))
+    return done
+
+
+def _generate(plan: Plan, path: str | Path, options: Options, progress: Progress, say: Say) -> dict[str, Any]:
     folder = Path(path)
     k, n = options.part
     if not 1 <= k <= n:

@@ -14,13 +14,14 @@ from ..backends.choose import BackendChoice
 from ..capture import make_renderer, render_windows
 from ..errors import InputError, Warn
 from ..files import written
-from ..imagefile import preview
+from ..imagefile import preview as eight_bit
 from ..plausibility import is_saturated, saturation_warnings
 from ..progress import Progress
-from ..scene import Scene
+from ..scene import Scene, is_dataset, load_scene, refuse_folder, shipped_files
 from .maker import Maker
 from .plan import Plan
 from .realise import frames_of
+from .spec import DatasetSpec, shipped_datasets
 
 TILES = 16
 _COLUMNS, _WIDTH, _GAP = 4, 320, 4
@@ -28,18 +29,32 @@ FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WEBP"}
 Tile = tuple[Bytes, str]
 
 
-def write_sheet(
-    what: Plan | Scene,
+def preview(
+    given: str | Path | DatasetSpec | Plan | Scene,
     path: str | Path,
     *,
+    eye: str | None = None,
+    seed: int | None = None,
     backend: BackendChoice = "auto",
     threads: int | None = None,
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> int:
-    """Render a contact sheet into an image file, and return the number of images on it.
+    """Render a contact sheet of up to sixteen images into an image file; it is for looking at, not for measurements.
 
-    `warn` is called for saturated images before the file is written; if it raises, nothing is written.
+    Args:
+        given: a scene or a dataset: a file, the name of a shipped one, or an object.
+        path: the image file; its ending is one of `FORMATS`.
+        eye: replaces the eye model of a file: a name of the catalogue or an eye file.
+        seed: replaces the seed of a file.
+        backend: the render backend.
+        threads: total number of processor threads; by default all.
+        progress: called with (images done, images in all, "").
+        warn: called with warnings about the scene or spec before anything is rendered, and about saturated images
+            before the file is written; if it raises, nothing is written.
+
+    Returns:
+        The number of images on the sheet.
 
     Raises:
         InputError: the file ending is not an image's, or no sample of the spec can be made.
@@ -48,6 +63,9 @@ def write_sheet(
     path = Path(path)
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(path))
+    what = _found(given, eye, seed)
+    if warn is not None:
+        warn(what.warnings())
     maker = _of_plan(what, backend, threads) if isinstance(what, Plan) else _of_scene(what, backend, threads)
     tiles: list[Tile] = []
     saturated = 0
@@ -61,6 +79,17 @@ def write_sheet(
     with written(path) as file:
         contact_sheet(tiles).save(file, format=FORMATS[path.suffix.lower()])
     return len(tiles)
+
+
+def _found(given: str | Path | DatasetSpec | Plan | Scene, eye: str | None, seed: int | None) -> Plan | Scene:
+    if isinstance(given, Scene):
+        return given
+    if isinstance(given, str | Path):
+        if str(given) not in shipped_files():
+            refuse_folder(Path(given), "a scene or dataset file, or the name of a shipped one")
+        if str(given) not in shipped_datasets() and not is_dataset(Path(given)):
+            return load_scene(given, eye=eye, seed=seed)
+    return Plan.load(given, eye=eye, seed=seed)
 
 
 def contact_sheet(tiles: list[Tile]) -> Image.Image:
@@ -106,4 +135,4 @@ def _of_scene(scene: Scene, backend: BackendChoice, threads: int | None) -> Iter
 
 
 def _tile(dn: Any, bit_depth: int, caption: str) -> Tile:
-    return preview(dn, 2.0**bit_depth - 1), caption
+    return eight_bit(dn, 2.0**bit_depth - 1), caption

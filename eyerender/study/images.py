@@ -123,25 +123,22 @@ def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) ->
         EyerenderError: the disk is full, or a worker died again and again.
     """
     from ..dataset.plan import Plan
-    from ..dataset.run import Options, generate
+    from ..dataset.run import generate
 
     scenes = list({_digest(scene): scene for scene in scenes}.values())
     found = read_images(settings.folder)
     if found is None or not all(found.holds(scene) for scene in scenes):
         plan = Plan.of(dataset_spec(study, scenes), source=str(settings.folder))
-        options = Options(
+        generate(
+            plan,
+            settings.folder,
             workers=settings.workers,
             backend=settings.backend,
             threads=settings.threads,
             timeout_s=600.0 + _PATIENCE_S * len(scenes[0].index()),
             overwrite=not _begun(settings.folder, plan),
-        )
-        generate(
-            plan,
-            settings.folder,
-            options,
-            progress=settings.progress or (lambda done, total, note: None),
-            say=settings.say or (lambda text: None),
+            progress=settings.progress,
+            say=settings.say,
         )
         found = read_images(settings.folder)
     if found is None or not all(found.holds(scene) for scene in scenes):

@@ -42,7 +42,7 @@ def exported(tiny, tmp_path_factory):
     def made(format):
         folder = place / format
         if not folder.exists():
-            assert export(tiny, folder, format)["images"] == 24
+            assert export(tiny, format, folder)["images"] == 24
         return folder
 
     return made
@@ -343,11 +343,11 @@ def test_ellseg_without_its_library_is_one_line(tiny, tmp_path, monkeypatch, cap
 
 def test_what_cannot_be_exported_is_refused(tiny, tmp_path):
     with pytest.raises(InputError, match="must be one of webdataset, coco"):
-        export(tiny, tmp_path / "out", "zip")
+        export(tiny, "zip", tmp_path / "out")
     (tmp_path / "taken").mkdir()
     write_png(tmp_path / "taken" / "a.png", np.zeros((4, 4), np.uint8))
     for format in FORMATS:
         with pytest.raises(InputError, match="is not empty"):
-            export(tiny, tmp_path / "taken", format)
+            export(tiny, format, tmp_path / "taken")
     with pytest.raises(InputError, match="no such folder"):
-        export(tmp_path / "nowhere", tmp_path / "out", "coco")
+        export(tmp_path / "nowhere", "coco", tmp_path / "out")

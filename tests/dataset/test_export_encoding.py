@@ -77,7 +77,7 @@ def test_the_gain_looks_at_most_pixels_and_not_at_the_brightest():
 )
 def test_what_is_no_encoding_is_refused(tmp_path, options, words):
     with pytest.raises(InputError, match=re.escape(words)):
-        export(tmp_path, tmp_path / "out", "csv", **options)
+        export(tmp_path, "csv", tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
 
 
@@ -93,9 +93,9 @@ def test_common_loaders_show_the_images_as_they_are(tiny, tmp_path):
     import webdataset as wds
 
     masks = {entry.path.stem: read_image(entry.mask_path)[0] for entry in ImageFolder.load(tiny).entries}
-    export(tiny, tmp_path / "tars", "webdataset")
-    export(tiny, tmp_path / "table", "csv")
-    export(tiny, tmp_path / "plain", "csv", encoding="linear", gain=1)
+    export(tiny, "webdataset", tmp_path / "tars")
+    export(tiny, "csv", tmp_path / "table")
+    export(tiny, "csv", tmp_path / "plain", encoding="linear", gain=1)
     seen = 0
     for split in ("train", "validation", "test"):
         url = str(tmp_path / "tars" / f"{split}-000000.tar")
@@ -115,16 +115,16 @@ def test_common_loaders_show_the_images_as_they_are(tiny, tmp_path):
 
 @pytest.mark.render
 def test_sixteen_bits_are_the_files_of_the_dataset(tiny, tmp_path):
-    done = export(tiny, tmp_path / "out", "csv", bits=16)
+    done = export(tiny, "csv", tmp_path / "out", bits=16)
     assert (done["image"]["encoding"], done["image"]["gain"]) == ("linear", 1.0)
     for entry in ImageFolder.load(tiny).entries:
         assert (tmp_path / "out" / "images" / entry.path.name).read_bytes() == entry.path.read_bytes()
-    done = export(tiny, tmp_path / "gamma", "coco", bits=16, encoding="gamma")
+    done = export(tiny, "coco", tmp_path / "gamma", bits=16, encoding="gamma")
     assert done["image"]["gain"] > 1
     assert read_image(next((tmp_path / "gamma" / "train").iterdir()))[1] == 16
     for format in ("openeds", "ellseg", "teyed"):
         with pytest.raises(InputError, match=f"--bits: the layout {format} holds 8 bits; webdataset, coco, csv can"):
-            export(tiny, tmp_path / "none", format, bits=16)
+            export(tiny, format, tmp_path / "none", bits=16)
 
 
 @pytest.mark.render
@@ -148,7 +148,7 @@ def test_an_export_says_how_its_images_are_encoded(tiny, tmp_path, capsys):
     ]
     assert trees[0] == trees[1]
     for format in FORMATS:
-        done = export(tiny, tmp_path / format, format, gain=1.5)
+        done = export(tiny, format, tmp_path / format, gain=1.5)
         card = (tmp_path / format / "README.md").read_text()
         for words in (done["image"]["formula"], done["image"]["inverse"], "gain of 1.5", "8 bits", "It was given."):
             assert words in card
@@ -174,7 +174,7 @@ def test_the_cards_code_reads_sixteen_bits(tiny, tmp_path):
                 np.testing.assert_array_equal(names["counts"], wanted)
     assert names["picture"].dtype == np.uint8
     np.testing.assert_array_equal(names["picture"], Encoding(8, "gamma", 2.0, "given").apply(wanted, 16))
-    export(tiny, tmp_path / "out", "webdataset", bits=16)
+    export(tiny, "webdataset", tmp_path / "out", bits=16)
     names = {"path": entry.path, "tar": str(tmp_path / "out" / f"{entry.line['split']}-000000.tar")}
     for code in blocks(tmp_path / "out" / "README.md"):
         exec(code, names)

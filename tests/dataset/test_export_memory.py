@@ -27,7 +27,7 @@ tracemalloc.start()
 peaks = []
 for source in (few, few, many):
     tracemalloc.reset_peak()
-    export(source, out, format, overwrite=True)
+    export(source, format, out, overwrite=True)
     peaks.append(tracemalloc.get_traced_memory()[1])
 print(peaks[2] - peaks[1])
 """
@@ -70,7 +70,7 @@ def test_an_image_more_takes_few_bytes_more(folders, tmp_path, format):
 @pytest.mark.parametrize("format", FORMATS)
 def test_ten_thousand_images_fit_into_the_bar(folders, tmp_path, format):
     few, many = 100, 10_000
-    peaks = [peak_bytes(EXPORT, str(folders(n)), str(tmp_path / str(n)), format) for n in (few, many)]
+    peaks = [peak_bytes(EXPORT, str(folders(n)), format, str(tmp_path / str(n))) for n in (few, many)]
     shutil.rmtree(tmp_path)
     # Of what does not grow with the images, some MB are buffers that few images do not fill.
     assert peaks[1] - peaks[0] < 8 * 2**20 + BAR_BYTES / ROWS * (many - few)
@@ -87,8 +87,8 @@ def test_samples_come_in_order_whatever_the_order_of_lines(folders, tmp_path):
     dataset["checksums"] = {"metadata.jsonl": sum_of(folder / "metadata.jsonl")}
     (folder / "dataset.json").write_text(json.dumps(dataset))
     for format in ("csv", "teyed"):
-        export(folders(50), tmp_path / f"whole-{format}", format)
-        export(folder, tmp_path / f"mixed-{format}", format)
+        export(folders(50), format, tmp_path / f"whole-{format}")
+        export(folder, format, tmp_path / f"mixed-{format}")
     rows = (tmp_path / "whole-csv" / "labels.csv").read_text()
     assert rows.count("\n") == 51
     assert (tmp_path / "mixed-csv" / "labels.csv").read_text() == rows
@@ -119,6 +119,6 @@ def test_a_wrong_line_ends_an_export_with_its_number(folders, tmp_path, format, 
     dataset["checksums"] = {"metadata.jsonl": sum_of(folder / "metadata.jsonl")}
     (folder / "dataset.json").write_text(json.dumps(dataset))
     with pytest.raises(InputError) as refused:
-        export(folder, tmp_path / "out", format)
+        export(folder, format, tmp_path / "out")
     assert words in str(refused.value)
     assert not (tmp_path / "out").exists()

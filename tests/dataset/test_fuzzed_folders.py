@@ -164,7 +164,7 @@ def use(folder: Path, action: str, out: Path) -> Any:
         return None
     if action == "records":
         return load_observations(folder / "metadata.jsonl", "guestrin2006")
-    return export(folder, out, action)
+    return export(folder, action, out)
 
 
 def fuzz(four: Path, tmp_path: Path, examples: int, actions: tuple[str, ...]) -> None:

@@ -49,7 +49,7 @@ def test_they_are_checked_and_exported(folders, tmp_path):
     assert validate(folders / "both")["ok"]
     told = [(folders / name / "README.md").read_text() for name in ("both", "noisy")]
     assert ["noiseless_file_name" in text for text in told] == [True, False]
-    export(folders / "both", tmp_path / "out", "webdataset", gain=1.0)
+    export(folders / "both", "webdataset", tmp_path / "out", gain=1.0)
     samples = list(wds.WebDataset(str(tmp_path / "out" / "train-000000.tar"), shardshuffle=False, empty_check=False))
     assert len(samples) == 4
     for sample in samples:

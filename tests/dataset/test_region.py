@@ -80,7 +80,7 @@ def test_its_lines_have_the_keys_of_bare_eyes(tiny, folder):
 def test_webdataset_has_its_amodal_masks(folder, tmp_path):
     import webdataset as wds
 
-    export(folder, tmp_path / "out", "webdataset")
+    export(folder, "webdataset", tmp_path / "out")
     samples = list(wds.WebDataset(str(tmp_path / "out" / "train-000000.tar"), shardshuffle=False, empty_check=False))
     assert len(samples) == 3
     for sample in samples:

@@ -116,7 +116,7 @@ def test_what_is_no_finished_dataset_is_refused(copy, tmp_path):
     with pytest.raises(InputError, match="not finished"):
         validate(copy)
     with pytest.raises(InputError, match="not finished"):
-        export(copy, tmp_path / "out", "csv")
+        export(copy, "csv", tmp_path / "out")
     with pytest.raises(InputError, match="no such folder"):
         validate(tmp_path / "nowhere")
 

@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from eyerender.dataset.plan import Plan
-from eyerender.dataset.run import Options, generate
+from eyerender.dataset.run import generate
 from eyerender.dataset.spec import DatasetSpec
 
 TINY: dict[str, Any] = {
@@ -81,7 +81,7 @@ def make(folder: Path, made: Plan, **options: Any) -> dict[str, Any]:
     said: list[str] = []
     options.setdefault("workers", 1)
     options.setdefault("threads", 1)
-    done = generate(made, folder, Options(**options), progress=lambda *_: None, say=said.append)
+    done = generate(made, folder, **options, say=said.append)
     return {**done, "said": said}
 
 

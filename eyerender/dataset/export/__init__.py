@@ -43,8 +43,8 @@ _SIXTEEN_BITS = ("webdataset", "coco", "csv")
 
 def export(
     path: str | Path,
-    out: str | Path,
     format: str,
+    out: str | Path,
     *,
     bits: int = 8,
     encoding: Curve | None = None,
@@ -56,8 +56,8 @@ def export(
 
     Args:
         path: the dataset's folder.
-        out: the folder to write.
         format: one of `FORMATS`.
+        out: the folder to write.
         bits: bits of the images, 8 or 16 (webdataset, coco and csv).
         encoding: `linear` or `gamma`; by default gamma for 8 bits, linear for 16.
         gain: factor for all values; by default it is measured on a sample of the images, but is 1 for 16 bits, linear.

@@ -1,0 +1,34 @@
+"""Two observers compared with any estimator, from Python."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import eyerender as er
+
+
+@dataclass(frozen=True)
+class Centre:
+    """A user's own estimator: everybody looks at the middle of the screen."""
+
+    def fit(self, observations, rig):
+        return self
+
+    def predict(self, observations, rig):
+        return er.gaze.GazePoints.of(np.tile(rig.build().screen.centre_mm, (len(observations), 1)))
+
+
+def test_a_comparison_names_its_estimator_and_writes_itself():
+    scene = er.load_scene("blignaut2014")
+    truth = er.AnalyticObserver().observe(scene.frames())
+    own = er.compare(truth, truth, scene.rig, Centre())
+    assert own.estimator == "Centre"
+    assert own.gaze_truth.mean_deg > 1.0
+    result = er.compare(truth, truth, scene.rig, er.gaze.Regression("R3"))
+    assert result.estimator == "regression R3"
+    text = result.to_text()
+    assert "gaze error, degrees (regression R3, leave one target out" in text
+    assert f"{result.gaze_truth.mean_deg:8.4f}" in text
+    assert "nan" not in text
