@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import eyerender as er
 from tests.support.paths import ROOT
@@ -26,7 +27,7 @@ def test_every_name_on_the_page_exists():
 
 
 def test_the_examples_of_gaze_run(capsys):
-    space = {"er": er}
+    space: dict[str, Any] = {"er": er}
     for block in blocks():
         if "leave_one_target_out" in block or "class Middle" in block:
             exec(block, space)
