@@ -1,4 +1,4 @@
-"""The package archive of Debian and Ubuntu, read with the machine's own apt settings but without root."""
+"""Access to the package archive of Debian and Ubuntu with the machine's own apt settings but without root."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 PAUSES_S = (3.0, 10.0)
-# Preferred first: the version this project's Mitsuba is tested with, then its neighbours. 15 and 16 end the process.
+# Preferred versions: the one that this project's Mitsuba is tested with, then its neighbours. Versions 15 and 16 end
+# the process.
 _PREFERRED = (19, 18, 20, 17, 21)
-# What every system with apt and Python has; a second C or C++ runtime in one process must not be.
+# Packages that every system with apt and Python has. A process must not have a second C or C++ runtime.
 _PRESENT = re.compile(r"libc6|libc-bin|libcrypt1|libgcc-s1|libstdc\+\+6|gcc-\d+-base|debconf.*|cdebconf|dpkg")
 
 
 class Apt:
-    """apt with its lists and caches in `folder`, so that it needs neither root nor its system-wide lock."""
+    """Runs apt with its lists and caches in `folder`, so that it needs neither root nor its system-wide lock."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -25,8 +26,8 @@ class Apt:
         for name in ("lists/partial", "cache/archives/partial", "packages"):
             (folder / name).mkdir(parents=True)
         (folder / "status").touch()
-        # Read after the machine's own settings: its sources and proxies stay, its hooks on system folders do not.
-        # The empty status makes the archive's versions the candidates, whatever is installed.
+        # These settings follow the machine's own: its sources and proxies stay, its hooks on system folders do not. The
+        # empty status makes the archive's versions the candidates, whatever is installed.
         settings = folder / "apt.conf"
         settings.write_text(
             f'Dir::State::Lists "{folder}/lists";\nDir::State::status "{folder}/status";\n'
@@ -42,14 +43,14 @@ class Apt:
 
     @property
     def complaint(self) -> str:
-        """The last error that apt gave, in brackets, to append to a sentence; empty if none."""
+        """Last error of apt, in brackets, to append to a sentence; empty if there was none."""
         return f" ({self._complaint})" if self._complaint else ""
 
     def llvm_packages(self) -> list[str]:
-        """Packages of LLVM's library that may fit, preferred first, from lists fetched now."""
+        """Packages of LLVM's library that may fit, preferred ones first, from freshly fetched lists."""
         for pause in (0.0, *PAUSES_S):
             time.sleep(pause)
-            # A source that fails, a third party's for instance, does not matter as long as the archive answers.
+            # A failing source, for instance a third party's, does not matter as long as the archive answers.
             self._run("apt-get", "update")
             names = self._run("apt-cache", "pkgnames", "libllvm").stdout.split()
             if names:
@@ -66,7 +67,11 @@ class Apt:
         return sorted(fitting, key=rank)
 
     def unpack(self, packages: Sequence[str], tree: Path) -> bool:
-        """Fetch packages with what they depend on, and unpack all of it into `tree`; false where that fails."""
+        """Fetch packages with their dependencies, and unpack all of them into `tree`.
+
+        Returns:
+            Whether that succeeded.
+        """
         others = ("recommends", "suggests", "conflicts", "breaks", "replaces", "enhances")
         closure = self._run("apt-cache", "depends", "--recurse", *(f"--no-{kind}" for kind in others), *packages).stdout
         names = {line for line in closure.splitlines() if re.fullmatch(r"[a-z0-9][a-z0-9+.-]+", line)}

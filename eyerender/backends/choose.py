@@ -1,4 +1,4 @@
-"""The choice of what renders: the processor (llvm) or an NVIDIA GPU (cuda).
+"""The choice of the backend: the processor (llvm) or an NVIDIA GPU (cuda).
 
 Call `choose_backend` before anything imports mitsuba or drjit (see `llvm`); it sets Mitsuba's variant.
 """
@@ -27,10 +27,17 @@ VARIANTS: dict[BackendName, str] = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mon
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """The backend this process renders with.
+    """The backend with which this process renders.
 
-    `device` names the processor or the GPU, `threads` is the size of Dr.Jit's thread pool, `llvm` the version of
-    libLLVM and `library` its file (both None with cuda).
+    Attributes:
+        name: cuda or llvm.
+        variant: Mitsuba's variant.
+        device: name of the processor or the GPU.
+        threads: size of Dr.Jit's thread pool.
+        mitsuba: version of Mitsuba.
+        drjit: version of Dr.Jit.
+        llvm: version of libLLVM; None with cuda.
+        library: file of libLLVM; None with cuda.
     """
 
     name: BackendName
@@ -44,14 +51,14 @@ class Backend:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Versions that shape the pixels, by package."""
+        """Versions that affect the pixels, by package."""
         versions = {"mitsuba": self.mitsuba, "drjit": self.drjit}
         return versions | ({"llvm": self.llvm} if self.llvm else {})
 
 
 @dataclass(frozen=True, slots=True)
 class BackendState:
-    """Whether a backend renders on this machine; `detail` says what was found, `fix` what would help."""
+    """Whether a backend renders on this machine; `detail` describes what was found, `fix` how to repair it."""
 
     name: BackendName
     ok: bool
@@ -60,7 +67,7 @@ class BackendState:
 
 
 def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> Backend:
-    """Make this process render with a backend that was seen to work.
+    """Make this process render with a backend that was tested successfully.
 
     Args:
         name: "auto" takes the GPU where one renders, else the processor.
@@ -126,7 +133,7 @@ def cuda_state(*, refresh: bool = False) -> BackendState:
 
 
 def _cuda_driver() -> str | None:
-    """What tells one driver and set of GPUs from another; None, at no cost, where there is no driver to load."""
+    """Text that identifies the driver and the GPUs; None, at no cost, where there is no driver to load."""
     named = os.environ.get("DRJIT_LIBCUDA_PATH")
     library = named or ("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     try:

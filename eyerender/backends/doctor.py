@@ -16,7 +16,7 @@ from .remedies import llvm_fix
 
 @dataclass(frozen=True, slots=True)
 class DoctorReport:
-    """State of an installation: `ok` where some backend renders, `chosen` the one that "auto" takes."""
+    """State of an installation: `ok` where a backend renders, `chosen` the one that "auto" takes."""
 
     ok: bool
     chosen: BackendName | None
@@ -29,12 +29,12 @@ class DoctorReport:
 
 
 def backend_states() -> list[BackendState]:
-    """Whether each backend renders on this machine. It is tried in other processes, so this one is not changed."""
+    """Whether each backend renders on this machine, tried in other processes so that this one is not changed."""
     return [cuda_state(refresh=True), _llvm_state()]
 
 
 def doctor_report() -> DoctorReport:
-    """What a bug report should say about the installation."""
+    """Report on the installation, for instance for a bug report."""
     states = tuple(backend_states())
     packages = ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless", "scikit-image")
     return DoctorReport(

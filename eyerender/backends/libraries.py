@@ -1,4 +1,4 @@
-"""Loading shared libraries that are not where the system's loader looks."""
+"""Loading of shared libraries that are not where the system's loader searches."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-# What Dr.Jit itself is linked with and a bare Linux lacks, with the packages that bring it on Debian and on Fedora.
+# Libraries that Dr.Jit is linked with and a bare Linux lacks, with their packages on Debian and on Fedora.
 RUNTIME = {"libatomic.so.1": ("libatomic1", "libatomic")} if sys.platform == "linux" else {}
 
 
 def cache_folder() -> Path | None:
-    """Where this package keeps what it found and fetched; None where the user has no home folder."""
+    """Folder for what this package found and fetched; None where the user has no home folder."""
     given = os.environ.get("XDG_CACHE_HOME", "")
     if os.path.isabs(given):
         return Path(given) / "eyerender"
@@ -25,13 +25,13 @@ def cache_folder() -> Path | None:
 
 
 def llvm_store() -> Path | None:
-    """Folder that `setup_llvm` unpacks into, one folder a package; None without a home folder."""
+    """Folder into which `setup_llvm` unpacks, one folder per package; None without a home folder."""
     folder = cache_folder()
     return folder / "llvm" if folder else None
 
 
 def stored_folders() -> tuple[Path, ...]:
-    """The library folders of everything that `setup_llvm` has unpacked."""
+    """Library folders of everything that `setup_llvm` has unpacked."""
     store = llvm_store()
     patterns = ("*/usr/lib/*", "*/usr/lib", "*/lib/*")
     return tuple(p for pattern in patterns for p in sorted(store.glob(pattern)) if p.is_dir()) if store else ()
@@ -56,7 +56,7 @@ def load_runtime(folders: Sequence[Path] = ()) -> None:
 
 
 def load_library(library: Path, folders: Sequence[Path] = ()) -> None:
-    """Load a shared library, and before it those of its dependencies that only `folders` hold.
+    """Load a shared library after those of its dependencies that only `folders` have.
 
     LD_LIBRARY_PATH is read when a process starts, so a library that was unpacked into a folder of ours does not find
     what was unpacked beside it. The system's libraries have priority. The loader's message names the missing object.

@@ -1,7 +1,7 @@
-"""libLLVM for Mitsuba's llvm variants: finding one that renders, and having Dr.Jit load it.
+"""The libLLVM of Mitsuba's llvm variants: finding one that renders, and making Dr.Jit load it.
 
-pip brings none. Some versions are refused, some end the process at their first kernel, so each candidate is probed in a
-process of its own (`probe`). Dr.Jit loads a libLLVM when drjit is first imported, and only then: `ensure_llvm` runs
+pip provides none. Some versions are refused, and some end the process at their first kernel, so each candidate is
+probed in a process of its own (`probe`). Dr.Jit loads a libLLVM only when drjit is first imported. `ensure_llvm` runs
 before that, or checks what was loaded.
 """
 
@@ -34,13 +34,13 @@ class LibLlvm:
 
     @classmethod
     def probed(cls, path: Path, verdict: Verdict) -> LibLlvm:
-        """From the verdict that it renders."""
+        """Make it from the verdict that it renders."""
         return cls(path, verdict.detail.removeprefix("LLVM "))
 
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """A candidate and what probing it said."""
+    """A candidate and the result of its probe."""
 
     path: Path
     verdict: Verdict
@@ -50,7 +50,7 @@ _active: LibLlvm | None = None
 
 
 def candidates() -> Iterator[Path]:
-    """Every libLLVM of this machine, once: the one the user names, our own, then the system's, newest first."""
+    """Every libLLVM of this machine, once: the one that the user names, our own, then the system's, newest first."""
     seen: set[Path] = set()
     for group in (_named, _stored, _installed):
         for path in sorted(group(), key=_order):
@@ -61,7 +61,7 @@ def candidates() -> Iterator[Path]:
 
 
 def examine(*, refresh: bool = False) -> Iterator[Examined]:
-    """Probe the candidates one after another, lazily; `refresh` forgets earlier refusals (never successes)."""
+    """Probe the candidates one by one, lazily; `refresh` ignores earlier refusals (never successes)."""
     for path in candidates():
         verdict = probe(VARIANT, path)
         if refresh and not verdict.ok:
@@ -70,7 +70,7 @@ def examine(*, refresh: bool = False) -> Iterator[Examined]:
 
 
 def find_llvm(*, refresh: bool = False) -> LibLlvm | None:
-    """The first candidate that renders."""
+    """Find the first candidate that renders."""
     for examined in examine(refresh=refresh):
         if examined.verdict.ok:
             return LibLlvm.probed(examined.path, examined.verdict)
@@ -91,7 +91,7 @@ def ensure_llvm() -> LibLlvm:
 
 
 def version_of(path: Path) -> tuple[int, ...]:
-    """Version that a file's name tells ("libLLVM-19.so", "libLLVM.so.19.1", "libLLVM.19.1.dylib"), () if none."""
+    """Version in a file's name ("libLLVM-19.so", "libLLVM.so.19.1", "libLLVM.19.1.dylib"), () if there is none."""
     match = re.match(r"(?:lib)?LLVM(?:-C)?[-.](?:so\.)?(\d+(?:\.\d+)*)", path.name)
     return tuple(int(part) for part in match[1].split(".")) if match else ()
 
@@ -106,7 +106,7 @@ def _activate() -> LibLlvm:
             load_runtime(folders)
             load_library(examined.path, folders)
         except OSError:
-            # Remembered as good, and something it needs is gone since.
+            # It is cached as good, but something that it needs has been removed since.
             probe(VARIANT, examined.path, refresh=True)
             continue
         os.environ[ENVIRONMENT] = str(examined.path)
@@ -121,7 +121,7 @@ def _activate() -> LibLlvm:
 
 
 def _loaded() -> LibLlvm:
-    """What the drjit that was imported before us has loaded, if it renders."""
+    """Library that an earlier import of drjit has loaded, if it renders."""
     import drjit as dr
 
     if not dr.has_backend(dr.JitBackend.LLVM):
@@ -148,7 +148,7 @@ def _too_late() -> str:
 
 
 def _mapped(version: tuple[int, ...]) -> Path | None:
-    """The file of the libLLVM in this process that has this version; other packages may have loaded others."""
+    """File of the libLLVM with this version in this process; other packages may have loaded others."""
     try:
         lines = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -159,7 +159,7 @@ def _mapped(version: tuple[int, ...]) -> Path | None:
 
 
 def _order(path: Path) -> tuple[bool, list[int], str]:
-    """Newest first; those whose name tells no version after them; those too old for Mitsuba 3.9 last."""
+    """Sort key: newest first, then names without a version, then versions too old for Mitsuba 3.9."""
     version = version_of(path.resolve()) or version_of(path)
     return bool(version) and version[0] < 17, [-part for part in version] or [0], str(path)
 

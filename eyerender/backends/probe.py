@@ -1,6 +1,7 @@
-"""Whether a backend renders, found out in a process of its own, because a wrong libLLVM ends the process it is used in.
+"""Test whether a backend renders, in a process of its own, because a wrong libLLVM ends the process that uses it.
 
-`python -m eyerender.backends.probe VARIANT [LIBRARY]` is that process; `run_probe` starts it, `probe` also remembers.
+`python -m eyerender.backends.probe VARIANT [LIBRARY]` is that process. `run_probe` starts it, `probe` also caches the
+result.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from typing import Any
 from .libraries import cache_folder, library_folders, load_library, load_runtime
 
 TIMEOUT_S = 180.0
-REFUSAL_AGE_S = 86400.0  # a GPU may have been busy, memory short: a refusal is looked into again after a day
+REFUSAL_AGE_S = 86400.0  # a refusal is checked again after a day, because the GPU may have been busy or memory short
 _MARK = "eyerender-probe: "
 
 
@@ -35,8 +36,11 @@ _MARK = "eyerender-probe: "
 class Verdict:
     """Outcome of a probe.
 
-    `detail` says why not, or what was found (LLVM's version, the GPU's name). `lasting` is false for what may change
-    without the library changing: a dependency that is missing, a time-out.
+    Attributes:
+        ok: whether the backend renders.
+        detail: the reason why not, or what was found (LLVM's version, the GPU's name).
+        lasting: False for a reason that may disappear without a change of the library: a missing dependency, a
+            time-out.
     """
 
     ok: bool
@@ -53,7 +57,7 @@ def package_version(name: str) -> str:
 
 
 def cpu_name() -> str:
-    """The processor's name as its maker writes it."""
+    """Name of the processor as its maker writes it."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
             for line in lines:
@@ -65,18 +69,13 @@ def cpu_name() -> str:
 
 
 def probe(variant: str, library: Path | None = None, *, context: str = "", refresh: bool = False) -> Verdict:
-    """`run_probe`, remembered on disk for this library, interpreter, processor and these versions.
+    """Run `run_probe`, with its result cached on disk for this library, interpreter, processor and these versions.
 
-    Parameters
-    ----------
-    variant
-        Mitsuba's variant, "llvm_ad_mono" or "cuda_ad_mono".
-    library
-        The libLLVM to use; None leaves the choice to Dr.Jit.
-    context
-        Whatever else the verdict depends on (the GPU's driver).
-    refresh
-        Probe even where a verdict is remembered.
+    Args:
+        variant: Mitsuba's variant, "llvm_ad_mono" or "cuda_ad_mono".
+        library: the libLLVM to use; None leaves the choice to Dr.Jit.
+        context: anything else on which the verdict depends (the GPU's driver).
+        refresh: probe even where a verdict is cached.
     """
     key: dict[str, Any] = {
         "variant": variant,
@@ -99,10 +98,11 @@ def probe(variant: str, library: Path | None = None, *, context: str = "", refre
 
 
 def run_probe(variant: str, library: Path | None = None, timeout_s: float = TIMEOUT_S) -> Verdict:
-    """Render a small picture with `variant` in a new process and say whether it came out right."""
+    """Render a small image with `variant` in a new process and check the result."""
     with tempfile.TemporaryDirectory(prefix="eyerender-probe-") as home:
         environment = dict(os.environ)
-        # An own HOME: Dr.Jit keeps compiled kernels there, and one that another libLLVM compiled would be taken.
+        # The process has its own HOME, because Dr.Jit stores compiled kernels there and would use one from another
+        # libLLVM.
         environment["HOME"] = home
         environment["PYTHONPATH"] = os.pathsep.join(os.path.abspath(p) for p in sys.path)
         if library is not None:
@@ -130,7 +130,7 @@ def _judge(status: int, out: str, err: str) -> Verdict:
                 return Verdict(answer["ok"], answer["detail"], answer["lasting"])
     if status < 0:
         name = signal.Signals(-status).name if -status in set(signal.Signals) else f"signal {-status}"
-        # A kill comes from outside (memory, a person) and says nothing about the library.
+        # A kill comes from outside (memory, a person) and is no information about the library.
         return Verdict(False, f"rendering with it ends the process ({name})", lasting=name != "SIGKILL")
     return Verdict(False, (err.strip().splitlines() or [f"exit status {status}"])[-1], lasting=False)
 
@@ -155,7 +155,7 @@ def _read_verdict(file: Path) -> Verdict | None:
 
 
 def _write_verdict(file: Path, key: Mapping[str, Any], verdict: Verdict) -> None:
-    """Written beside and renamed: no reader meets half a file. A cache that cannot be written is done without."""
+    """Write atomically, so that no reader finds half a file. A cache that cannot be written is ignored."""
     beside = file.with_suffix(f".{os.getpid()}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -167,14 +167,14 @@ def _write_verdict(file: Path, key: Mapping[str, Any], verdict: Verdict) -> None
 
 
 def _work(variant: str) -> str:
-    """What the process does: arithmetic that wrong versions die of, then a ray-traced picture. Returns the detail."""
+    """Test arithmetic that wrong versions crash on, then a ray-traced image; returns the detail."""
     import drjit as dr
     import mitsuba as mi
 
     mi.set_variant(variant)
     if variant.startswith("llvm"):
         dr.set_thread_count(2)
-    # A literal no kernel was ever compiled for: this compiles here and now.
+    # No kernel with this literal was compiled before, so it is compiled here and now.
     offset = float(time.time_ns() % 65521) / 64
     x = dr.arange(mi.Float, 64) + offset
     y = dr.minimum(x, offset + 31.5) - offset
@@ -207,7 +207,7 @@ def _work(variant: str) -> str:
 
 
 def _gpu_name() -> str:
-    """The first GPU's name, from the driver that the process has just rendered with."""
+    """Name of the first GPU, from the driver that the process has just used."""
     driver = ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")
     device, name = ctypes.c_int(), ctypes.create_string_buffer(128)
     if driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0) or driver.cuDeviceGetName(name, 128, device):
@@ -216,7 +216,7 @@ def _gpu_name() -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of the probing process: one line of JSON on stdout, exit status 0 where the variant renders."""
+    """Run the probing process: one line of JSON on stdout, exit status 0 where the variant renders."""
     lasting = True
     try:
         if sys.platform != "win32":
@@ -225,7 +225,7 @@ def main(arguments: Sequence[str]) -> int:
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         library = Path(arguments[1]) if len(arguments) > 1 else None
         folders = library_folders(library) if library else ()
-        lasting = False  # a library that does not load lacks something, which an installation may bring
+        lasting = False  # a library that does not load lacks something that may be installed later
         load_runtime(folders)
         if library:
             load_library(library, folders)

@@ -1,4 +1,4 @@
-"""How to get a missing backend: one line for this machine."""
+"""Instructions to install a missing backend: one line for this machine."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def has_archive() -> bool:
 
 
 def llvm_fix() -> str:
-    """The command that brings a libLLVM here; on Debian and Ubuntu that is this package's own."""
+    """Command that installs a libLLVM here; on Debian and Ubuntu that is this package's own."""
     return "run: eyerender setup-llvm" if has_archive() else llvm_command()
 
 
 def llvm_command() -> str:
-    """The command of this machine's own package manager that brings a libLLVM."""
+    """Command of this machine's own package manager that installs a libLLVM."""
     if os.environ.get("CONDA_PREFIX") or (Path(sys.prefix) / "conda-meta").is_dir():
         return "run: conda install -c conda-forge libllvm19"
     if sys.platform == "darwin":
@@ -42,7 +42,7 @@ def llvm_command() -> str:
 
 
 def _distribution() -> list[str]:
-    """The ids of this Linux distribution and of those it derives from, nearest first."""
+    """Ids of this Linux distribution and of those from which it derives, nearest first."""
     try:
         text = Path("/etc/os-release").read_text(encoding="utf-8")
     except OSError:

@@ -1,7 +1,7 @@
-"""`setup_llvm`: bring a libLLVM to a machine that has none, from Debian's or Ubuntu's archive, without root.
+"""`setup_llvm`: install a libLLVM from Debian's or Ubuntu's archive, without root.
 
 The packages are fetched with the machine's own apt settings but into folders of ours, and only unpacked, so nothing on
-the system changes. `python -m eyerender.backends.set_up [--quiet]` does it and prints the library's path.
+the system changes. `python -m eyerender.backends.set_up [--quiet]` runs it and prints the library's path.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ def setup_llvm(*, say: Say = _silent) -> LibLlvm:
     try:
         store.mkdir(parents=True, exist_ok=True)
         with _locked(store / "lock", say):
-            # Another process may have brought it while this one waited.
+            # Another process may have installed it while this one waited.
             return find_llvm() or _fetch(store, say)
     except OSError as error:
         raise BackendError(f"cannot set up libLLVM in {store}: {error.strerror or error}") from error
 
 
 def _fetch(store: Path, say: Say) -> LibLlvm:
-    for left in store.glob("fetch-*"):  # of a process that was killed; this one holds the lock
+    for left in store.glob("fetch-*"):  # remains of a killed process; this one holds the lock
         shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(prefix="fetch-", dir=store) as scratch:
         apt = Apt(Path(scratch))
@@ -77,9 +77,9 @@ def _fetch(store: Path, say: Say) -> LibLlvm:
 
 
 def _keep(tree: Path, library: Path, store: Path) -> LibLlvm:
-    """Move a tree whose library has passed its probe to its place, and probe it there, which is remembered."""
+    """Move a tree whose library has passed its probe to its place, and probe it there, so that the result is cached."""
     place = store / tree.name
-    if place.exists():  # an earlier one, which does not pass any more
+    if place.exists():  # an earlier one, which does not pass the probe any more
         shutil.rmtree(place)
     tree.rename(place)
     kept = (place / library.relative_to(tree.resolve())).resolve()
@@ -108,14 +108,14 @@ def _locked(file: Path, say: Say) -> Iterator[None]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of `python -m eyerender.backends.set_up`: the library's path on stdout, one line on stderr if none."""
+    """Run `python -m eyerender.backends.set_up`: the library's path on stdout, or one line on stderr."""
     quiet = "--quiet" in arguments
 
     def say(line: str) -> None:
         print(f"eyerender: {line} ...", file=sys.stderr, flush=True)
 
     try:
-        # Even quietly, what takes long is announced: a first run stands still for half a minute.
+        # Slow steps are announced even with --quiet, because a first run takes half a minute.
         library = setup_llvm(say=say)
     except BackendError as error:
         print(f"eyerender: {'warning: rendering on the processor is not possible: ' * quiet}{error}", file=sys.stderr)

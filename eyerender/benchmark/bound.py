@@ -1,9 +1,9 @@
-"""The least error any extractor can have: the Cramer-Rao bound of a blurred step, and what it needs of an image.
+"""The smallest possible error of an extractor: the Cramer-Rao bound of a blurred step, and its inputs from an image.
 
     sigma_c = (s / step) sqrt(2 sigma_b / (sqrt(pi) R)) per axis, sigma_b^2 = blur^2 + 1/12, R = sqrt(a b)
 
-for white noise s, all of the outline seen, and free centre. Of a centre with this standard deviation along both axes
-the distance from the truth has the median 1.177 sigma_c. Grey levels are DN of an 8-bit scale, whatever the depth.
+for white noise s, a fully visible outline, and a free centre. For a centre with this standard deviation along both axes
+the median distance from the truth is 1.177 sigma_c. Grey levels are DN of an 8-bit scale, whatever the depth.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _GLINT_PX = 8.0
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """The pupil's edge in an image: noise s (DN, rounding included), step (DN), sigma_b (px, the pixel included)."""
+    """The pupil's edge in an image: noise s (DN, with rounding), step (DN), sigma_b (px, with the pixel)."""
 
     noise_dn: float
     step_dn: float
     sigma_px: float
 
     def centre_sigma_px(self, pupil: Ellipse) -> float:
-        """sigma_c per axis, px."""
+        """Standard deviation sigma_c per axis, px."""
         radius = math.sqrt(float(pupil.semi_axes_px.prod()))
         return self.noise_dn / abs(self.step_dn) * math.sqrt(2.0 * self.sigma_px / (math.sqrt(math.pi) * radius))
 
@@ -48,9 +48,10 @@ def edge_of(
     glints_px: Floats,
     known: Mapping[str, float],
 ) -> Edge | None:
-    """The edge as the folder states it (`known`), else measured along the true outline.
+    """Edge as the folder states it (`known`), else measured along the true outline.
 
-    None where the image shows no pupil or hides part of it, which the bound does not cover, or nothing can be measured.
+    None where the image shows no pupil or hides part of it, which the bound does not cover, or where nothing can be
+    measured.
     """
     if pupil is None or (visible is not None and visible < _LEAST_VISIBLE) or (visible is None and known):
         return None
@@ -62,13 +63,17 @@ def edge_of(
 
 
 def measure_edge(grey_dn: Floats, pupil: Ellipse, glints_px: Floats, quantum_dn: float = 0.0) -> Edge | None:
-    """Noise, step and blur along a known outline.
+    """Measure noise, step and blur along a known outline.
 
-    The levels inside and outside follow lines in the distance d from the outline, with an error function between them
+    The levels inside and outside are linear in the distance d from the outline, with an error function between them
     (robust least squares over |d| < 6 px, then over 5 sigma where the edge is wider). The noise is half the root mean
-    square of I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1) away from the edge, cut at 4 sigma: no slope enters.
+    square of I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1) away from the edge, cut at 4 sigma, so no slope contributes.
 
-    grey_dn: (h, w). glints_px: (n, 2) places to leave out. quantum_dn: the least step of a stored value.
+    Args:
+        grey_dn: (h, w).
+        pupil: the outline.
+        glints_px: (n, 2) places to leave out.
+        quantum_dn: smallest step of a stored value.
     """
     widest = 0.6 * float(pupil.semi_axes_px[1])
     reach = min(6.0, widest)
@@ -87,7 +92,7 @@ def measure_edge(grey_dn: Floats, pupil: Ellipse, glints_px: Floats, quantum_dn:
 def _profile(
     grey_dn: Floats, pupil: Ellipse, glints_px: Floats, reach: float
 ) -> tuple[float, float, Floats, Bools] | None:
-    """Step, sigma, the part of the image about the pupil, and its pixels off the edge and the glints."""
+    """Step, sigma, the part of the image around the pupil, and its pixels off the edge and the glints."""
     x0, y0 = np.maximum(np.floor(pupil.centre_px - pupil.semi_axes_px[0] - reach - 2), 0).astype(int)
     x1, y1 = np.ceil(pupil.centre_px + pupil.semi_axes_px[0] + reach + 3).astype(int)
     part = grey_dn[y0:y1, x0:x1]
@@ -116,7 +121,7 @@ def _profile(
     start = np.array([dark, light - dark, 0.0, 0.0, 0.0, 0.0])
     fit = least_squares(misfit, start, loss="soft_l1", f_scale=0.1)
     sigma = math.exp(min(float(fit.x[4]), 5.0))
-    # Not far outside either, where the iris ends.
+    # Pixels far outside are left out too, because the iris ends there.
     flat = free & (distance < reach) & (np.abs(distance - fit.x[5]) > 2.5 * sigma + 1.0)
     return float(fit.x[1]), sigma, part, flat
 

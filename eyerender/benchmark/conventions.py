@@ -1,6 +1,6 @@
-"""What an extractor's numbers mean, and the one place where they become this package's.
+"""The conventions of an extractor's numbers, and their conversion to this package's.
 
-Here: pixel centres at integers, x right, y down, semi-axes a >= b, angle of a from +x toward +y in [0, pi).
+This package: pixel centres at integers, x right, y down, semi-axes a >= b, angle of a from +x toward +y in [0, pi).
 """
 
 from __future__ import annotations
@@ -16,14 +16,17 @@ from ..geometry.ellipse import Ellipse
 
 @dataclass(frozen=True, slots=True)
 class Conventions:
-    """How an extractor states places, axes and angles; the defaults are this package's own.
-
-    pixel_origin: what (0, 0) is: the centre of the first pixel, or its outer corner (whose centre is then (.5, .5)).
-    axes: semi-axes or full ones. angle_unit: of the angle. angle_of: the axis the angle belongs to: the major one, the
-    minor one, or the first of the two. angle_toward: the turn from +x that counts as positive: toward +y, down the
-    image ("down"), or up.
+    """Conventions of an extractor for places, axes and angles; the defaults are this package's own.
 
     OpenCV's rotated rectangle is full, deg, first, down, centre.
+
+    Attributes:
+        pixel_origin: meaning of (0, 0): the centre of the first pixel, or its outer corner (the centre is then (.5,
+            .5)).
+        axes: semi-axes or full ones.
+        angle_unit: unit of the angle.
+        angle_of: the axis to which the angle belongs: the major one, the minor one, or the first of the two.
+        angle_toward: direction from +x that counts as positive: toward +y, down the image ("down"), or up.
     """
 
     pixel_origin: Literal["centre", "corner"] = "centre"
@@ -34,7 +37,11 @@ class Conventions:
 
     @classmethod
     def of(cls, stated: object) -> Conventions:
-        """Conventions out of a mapping of some of the names above; raises `InputError` for any other word."""
+        """Make conventions from a mapping of some of the names above.
+
+        Raises:
+            InputError: a name or a value is unknown.
+        """
         if isinstance(stated, Conventions):
             return stated
         if stated is None:
@@ -53,16 +60,20 @@ class Conventions:
         return cls(**stated)
 
     def to_mapping(self) -> dict[str, str]:
-        """As JSON has it."""
+        """Convert to a mapping for JSON."""
         return asdict(self)
 
     def point(self, xy: Sequence[float]) -> tuple[float, float]:
-        """A place in the image, in px."""
+        """Convert a place in the image to px."""
         shift = 0.5 if self.pixel_origin == "corner" else 0.0
         return xy[0] - shift, xy[1] - shift
 
     def ellipse(self, centre: Sequence[float], axes: Sequence[float], angle: float) -> Ellipse:
-        """An ellipse; raises `InputError` for an axis that is not positive or a number that is not finite."""
+        """Convert an ellipse.
+
+        Raises:
+            InputError: an axis is not positive, or a number is not finite.
+        """
         first, second = axes
         if (self.angle_of == "major" and second > first) or (self.angle_of == "minor" and second < first):
             first, second = second, first
@@ -76,16 +87,24 @@ OPENCV = Conventions(axes="full", angle_unit="deg", angle_of="first")
 
 
 def number(value: Any, path: str, limit: float = 1e6) -> float:
-    """A finite number within reason; raises `InputError` naming the path."""
+    """Read a finite number of plausible size.
+
+    Raises:
+        InputError: naming the path.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"must be a number, not {_shown(value)}", path=path)
-    if abs(value) > limit or not math.isfinite(value):  # in this order: an integer may be too large for a float
+    if abs(value) > limit or not math.isfinite(value):  # in this order, because an integer may be too large for a float
         raise InputError(f"must be a finite number within {limit:g}, not {_shown(value)}", path=path)
     return float(value)
 
 
 def pair(value: Any, path: str) -> tuple[float, float]:
-    """Two numbers; raises `InputError` naming the path."""
+    """Read two numbers.
+
+    Raises:
+        InputError: naming the path.
+    """
     if isinstance(value, str | Mapping) or not isinstance(value, Sequence) or len(value) != 2:
         raise InputError(f"must be two numbers, not {_shown(value)}", path=path)
     return number(value[0], f"{path}.0"), number(value[1], f"{path}.1")

@@ -1,4 +1,4 @@
-"""A labelled folder as the bench sees it: images, true features in image coordinates, hints, what varies.
+"""A labelled folder for the bench: images, true features in image coordinates, hints, and factors that vary.
 
 Two kinds are read: what this package renders (docs/formats.md), and folders of ideal images.
 """
@@ -27,13 +27,13 @@ from ..scene import Scene
 from ..scenespec import SceneSpec
 
 IDEAL_SCHEMA = "eyerender/ideal-images/1"
-# Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens.
+# Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens them.
 _RADIUS_MM = (0.6, 5.0)
 
 
 @dataclass(frozen=True, slots=True)
 class TrueGlint:
-    """A glint that the image shows: its light, its place in px of the image."""
+    """A glint that the image shows: its light and its place in px of the image."""
 
     light: int
     xy_px: tuple[float, float]
@@ -41,11 +41,20 @@ class TrueGlint:
 
 @dataclass(frozen=True, slots=True)
 class LabelledImage:
-    """One image, one eye; places are relative to the image, pixel centres at integers.
+    """One image of one eye; places are relative to the image, pixel centres at integers.
 
-    pupil: None where the image shows none. outline_px (n, 2): of the pupil. visible: the share of the pupil that is
-    seen, None where unknown. glints: those the image shows. known: what the folder itself says of noise (DN), blur
-    (px) and step (DN). factors: what may explain an error, by name.
+    Attributes:
+        name: name of the image.
+        path: file.
+        bit_depth: bits of the file.
+        size: (width, height).
+        pupil: None where the image shows none.
+        outline_px: (n, 2) outline of the pupil.
+        visible: visible share of the pupil, None where unknown.
+        glints: those that the image shows.
+        hints: what an extractor may know.
+        known: what the folder itself states of noise (DN), blur (px) and step (DN).
+        factors: possible causes of an error, by name.
     """
 
     name: str
@@ -62,10 +71,10 @@ class LabelledImage:
 
 
 def load_labelled(folder: str | Path) -> list[LabelledImage]:
-    """Every image of a folder.
+    """Load every image of a folder.
 
     Raises:
-        InputError: it is no such folder, an image is missing or has another size, or holds other than one eye.
+        InputError: it is not such a folder, an image is missing or has another size, or does not have exactly one eye.
     """
     path = Path(folder)
     if _is_ideal(path):
@@ -80,7 +89,7 @@ def load_labelled(folder: str | Path) -> list[LabelledImage]:
             raise InputError(
                 f"holds {count} eyes; the bench takes images of one", source=str(path / METADATA), path=f"line {k + 1}"
             )
-        # One record an image: an image's row in the truth is its number.
+        # There is one record per image, so an image's row in the truth is its number.
         out.append(_rendered(entry, truth, k, scene_rig))
     return out
 
@@ -146,7 +155,10 @@ def _ellipse_factors(pupil: Ellipse | None, visible: float | None) -> dict[str, 
 def _hints(
     line: Mapping[str, Any], truth: Observations, row: int, scene_rig: RigGeometry | None, corner: Floats
 ) -> dict[str, Any]:
-    """What an extractor may know: the rig, roughly where the eye is, and so the range of sizes; never the truth."""
+    """Information that an extractor may have, but never the truth.
+
+    It is the rig, a rough place of the eye, and thus a range of sizes.
+    """
     eye_mm = truth.index.eye_position_mm[row] + truth.index.head_mm[row]
     camera, lights = _camera_and_lights(line, int(truth.index.camera[row]), scene_rig)
     hints: dict[str, Any] = {"polarity": "dark", "gamma": 1.0, "radius_px": None, "rig": None}
@@ -171,7 +183,7 @@ def _hints(
 def _camera_and_lights(
     line: Mapping[str, Any], camera: int, rig: RigGeometry | None
 ) -> tuple[PinholeCamera | None, Floats]:
-    """An image's own camera and lights where its labels hold them (datasets vary theirs), else the scene's."""
+    """Camera and lights of an image from its labels where they are there (datasets vary them), else from the scene."""
     labels = line.get("labels") or {}
     own, lights = labels.get("camera"), labels.get("lights_mm")
     if own and lights is not None:
@@ -183,7 +195,7 @@ def _camera_and_lights(
 
 
 def _rig_of(folder: ImageFolder) -> RigGeometry | None:
-    """The rig of the scene that the folder was rendered from; None for a dataset, whose images carry their own."""
+    """Rig of the scene from which the folder was rendered; None for a dataset, whose images have their own."""
     spec = folder.dataset.get("spec")
     if not isinstance(spec, dict) or folder.dataset.get("kind") == "dataset":
         return None

@@ -1,4 +1,4 @@
-"""An extractor as a process: asked over pipes, watched by the clock, killed with all it started."""
+"""An extractor as a process that answers over pipes, has time limits, and is killed with all its children."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .protocol import Greeting, Reply, Request
 
 _LONGEST_LINE = 4_000_000
 _TAIL_BYTES = 4096
-# One core: seconds of different extractors are only comparable when none spreads over more.
+# Every extractor uses one core, because times are comparable only then.
 _ONE_CORE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 
 
 class Failed(Exception):
-    """The extractor did not answer as it must; the message is the reason."""
+    """The extractor did not answer properly; the message is the reason."""
 
 
 class _Tail:
@@ -44,14 +44,14 @@ class _Tail:
             self._kept = (self._kept + chunk)[-_TAIL_BYTES:]
 
     def read(self) -> bytes:
-        """The last bytes so far; all of them where the writer has ended."""
+        """Last bytes so far; all of the last ones where the writer has ended."""
         self._thread.join(timeout=0.5)
         return self._kept
 
     def close(self) -> None:
         """Close the pipe once its writers have ended."""
         self._thread.join(timeout=0.5)
-        # A process that has left the group may still hold the pipe: its reader then goes on until that one ends.
+        # A process that has left the group may still hold the pipe. Its reader then continues until that process ends.
         if not self._thread.is_alive():
             self._pipe.close()
 
@@ -59,7 +59,7 @@ class _Tail:
 class ExtractorProcess:
     """A running extractor; a context manager that leaves nothing running.
 
-    After `Failed` the process is dead; a new one must be started.
+    After `Failed` the process is dead, and a new one must be started.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class ExtractorProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
-                # A group of its own, so that killing it takes along whatever it started.
+                # It has a group of its own, so that killing the group also kills its children.
                 start_new_session=True,
                 env={**os.environ, **_ONE_CORE, **(env or {})},
             )
@@ -83,7 +83,7 @@ class ExtractorProcess:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         assert self._process.stderr is not None
-        # It may stop reading at any time: writing must not wait longer than for an answer.
+        # It may stop reading at any time, and writing must not wait longer than for an answer.
         os.set_blocking(self._process.stdin.fileno(), False)
         self._stderr = _Tail(self._process.stderr)
         try:
@@ -101,7 +101,7 @@ class ExtractorProcess:
         return not self._closed
 
     def ask(self, request: Request) -> tuple[Reply, float]:
-        """The answer to one request, and the seconds the round trip took."""
+        """Return the answer to one request, and the seconds of the round trip."""
         begin = time.monotonic()
         self._send(request.to_line().encode())
         line = self._line(self._timeout_s, "no answer")
@@ -109,16 +109,16 @@ class ExtractorProcess:
         try:
             return Reply.parse(line, request.id, self.greeting.conventions), seconds
         except InputError as error:
-            # What it says next may belong to any image: it is not to be trusted any more.
+            # Its next answer may belong to any image, so it is not trusted any more.
             self.close()
             raise Failed(f"unusable answer: {error}") from None
 
     def close(self) -> None:
-        """End the process and all it started; may be called again."""
+        """End the process and its children; it may be called again."""
         if self._closed:
             return
         self._closed = True
-        # Also when it has ended by itself: what it started may live on in its group.
+        # This is also needed when it has ended by itself, because its children may still run in its group.
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -156,7 +156,11 @@ class ExtractorProcess:
                     raise self._died() from None
 
     def _line(self, timeout_s: float, what: str) -> str:
-        """The next line of its output; raises `Failed` when it takes longer, ends, or the line never does."""
+        """Read the next line of its output.
+
+        Raises:
+            Failed: it takes too long or ends, or the line does not end.
+        """
         assert self._process.stdout is not None
         end = time.monotonic() + timeout_s
         with selectors.DefaultSelector() as selector:
@@ -177,7 +181,7 @@ class ExtractorProcess:
         return line.decode("utf-8", "replace")
 
     def _died(self) -> Failed:
-        """Why it ended: its exit status and the last line it wrote to stderr."""
+        """Reason why it ended: its exit status and the last line it wrote to stderr."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=0.5)
         code = self._process.poll()

@@ -5,10 +5,10 @@
     extractor -> bench  {"id", "record": {"pupil": {..}, "glints": [..]}, "cpu_s": null, "wall_s": null}
                     or  {"id", "error": "why this image could not be looked at"}
 
-One object a line, the greeting once, then an answer to each request in turn; end of input is the end. The record is the
-package's (eyerender/record/2); only `pupil.status` is needed of it, and with "ok" centre, axes and angle: either
-`semi_axes_px` and `angle_rad`, which say what they are, or `axes_px` and `angle` as `conventions` declares. Places are
-relative to the image.
+Every line is one object. The greeting comes once, then an answer to each request in turn; the extractor ends with its
+input. The record is the package's (eyerender/record/2). Only `pupil.status` is required, and with "ok" centre, axes and
+angle: either `semi_axes_px` and `angle_rad`, whose names define them, or `axes_px` and `angle` as `conventions`
+declares. Places are relative to the image.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 
 
 class Extractor(Protocol):
-    """What an extractor in Python does: a function of an image, with no state.
+    """Interface of an extractor in Python: a function of an image, without state.
 
-    Two attributes of the function may say more: `conventions`, what the numbers of its records mean (the keys of
-    `Conventions`; without it this package's own), and `reports`, the features that it looks for at all (`FEATURES`).
+    Two optional attributes of the function declare more: `conventions`, the meaning of the numbers in its records (the
+    keys of `Conventions`; without it this package's own), and `reports`, the features for which it looks (`FEATURES`).
     """
 
     def __call__(self, image: Image, request: Mapping[str, Any], /) -> Mapping[str, Any]:
-        """The record of an image: `{"pupil": {..}, "glints": [..]}`, as in the protocol above.
+        """Return the record of an image: `{"pupil": {..}, "glints": [..]}`, as in the protocol above.
 
         Args:
             image: (h, w) numbers as the file stores them.
-            request: the request above; `bit_depth` and `hints` are of use.
+            request: the request above; `bit_depth` and `hints` are useful.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Greeting:
-    """What an extractor says of itself. `reports`: the features it looks for at all."""
+    """Description that an extractor gives of itself; `reports` lists the features for which it looks."""
 
     name: str
     conventions: Conventions
@@ -59,7 +59,11 @@ class Greeting:
 
     @classmethod
     def parse(cls, line: str) -> Greeting:
-        """Raises `InputError` saying what is wrong with the line."""
+        """Parse a line.
+
+        Raises:
+            InputError: saying what is wrong with the line.
+        """
         data = _object(line)
         if data.get("schema") != SCHEMA:
             raise InputError(f"is {data.get('schema')!r}; this version speaks {SCHEMA!r}", path="schema")
@@ -73,7 +77,7 @@ class Greeting:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One image to look at. `hints`: what any extractor may know; never the truth."""
+    """One image to process; `hints` is what any extractor may know, never the truth."""
 
     id: int
     image: str
@@ -81,17 +85,23 @@ class Request:
     hints: Mapping[str, Any]
 
     def to_line(self) -> str:
-        """The line that is sent."""
+        """Line that is sent."""
         data = {"schema": SCHEMA, "id": self.id, "image": self.image, "bit_depth": self.bit_depth}
         return json.dumps({**data, "hints": dict(self.hints)}, allow_nan=False) + "\n"
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What an extractor found, in this package's conventions: `ellipse` is None where it found no pupil (`reason`).
+    """Result of an extractor, in this package's conventions.
 
-    `glints`: ((x, y), light or None) in px. `cpu_s`, `wall_s`: the extractor's own figures, None where it gives none.
-    `error`: why it failed on this image, in its own words; the rest is then empty.
+    Attributes:
+        ellipse: the pupil; None where it found none.
+        reason: why it found none.
+        confidence: its confidence, if it gives one.
+        glints: ((x, y), light or None) in px.
+        cpu_s: processor time that the extractor reports, None where it gives none.
+        wall_s: the same for elapsed time.
+        error: why it failed on this image, in its own words; the rest is then empty.
     """
 
     ellipse: Ellipse | None
@@ -104,7 +114,11 @@ class Reply:
 
     @classmethod
     def parse(cls, line: str, request_id: int, conventions: Conventions) -> Reply:
-        """Raises `InputError` saying what is wrong with the line."""
+        """Parse a line.
+
+        Raises:
+            InputError: saying what is wrong with the line.
+        """
         data = _object(line)
         if data.get("id") != request_id:
             raise InputError(f"must be {request_id}, not {shown(data.get('id'))}", path="id")
@@ -135,7 +149,7 @@ def _ellipse(pupil: Mapping[str, Any], conventions: Conventions) -> Ellipse:
     if "semi_axes_px" in pupil:
         axes = pair(pupil["semi_axes_px"], "pupil.semi_axes_px")
         angle = number(pupil.get("angle_rad"), "pupil.angle_rad")
-        # The names say what these are; only the origin is left to declare.
+        # The names define these values; only the origin is left to declare.
         conventions = Conventions(pixel_origin=conventions.pixel_origin)
     else:
         axes = pair(pupil.get("axes_px"), "pupil.axes_px")
@@ -163,7 +177,7 @@ def _glints(entries: Any, conventions: Conventions) -> tuple[tuple[tuple[float, 
 
 
 def _words(value: Any) -> str:
-    """What an extractor says, as one line that may be shown."""
+    """Text of an extractor as one line that may be shown."""
     return one_line(" ".join(str(value).split()), 200)
 
 

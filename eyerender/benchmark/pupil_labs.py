@@ -55,7 +55,7 @@ def main() -> int:
 
 
 def pupil_of(found: dict[str, Any]) -> dict[str, Any]:
-    """The record's pupil; the detector says "none" by a confidence of 0 or an empty ellipse."""
+    """Pupil of the record; the detector reports "none" by a confidence of 0 or an empty ellipse."""
     ellipse = found["ellipse"]
     if found["confidence"] <= 0.0 or min(ellipse["axes"]) <= 0.0:
         return {"status": "missing", "reason": "no pupil detected (confidence 0)"}
@@ -69,7 +69,7 @@ def pupil_of(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def eight_bits(path: str, bit_depth: int) -> Any:
-    """The image as a writable (h, w) uint8 array."""
+    """Image as a writable (h, w) uint8 array."""
     with Image.open(path) as file:
         data = np.array(file)
     if data.dtype != np.uint8:

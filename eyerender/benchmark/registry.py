@@ -1,4 +1,4 @@
-"""Which extractors there are: installed names, Python callables, commands."""
+"""The available extractors: installed names, Python callables, commands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORKER = "eyerender.benchmark.worker"
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """An entry point's object for an extractor that is a program: how to run it, or why it cannot be run here."""
+    """Object of an entry point for an extractor that is a program: its command, or why it cannot be run here."""
 
     argv: tuple[str, ...] | None
     missing: str = ""
@@ -28,7 +28,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class ExtractorCommand:
-    """An extractor to be run: its label, what was asked for, and the command that runs it."""
+    """An extractor to be run: its label, the request, and the command that runs it."""
 
     name: str
     given: str
@@ -36,15 +36,15 @@ class ExtractorCommand:
 
 
 def names() -> tuple[str, ...]:
-    """The names in the entry-point group `eyerender.extractors`, sorted."""
+    """Names in the entry-point group `eyerender.extractors`, sorted."""
     return tuple(sorted(_installed()))
 
 
 def resolve(given: str) -> ExtractorCommand:
-    """A name of the entry-point group, `module:callable`, or a command line, each perhaps after `LABEL=`.
+    """Resolve a name of the entry-point group, `module:callable`, or a command line, each optionally after `LABEL=`.
 
     Raises:
-        InputError: none of these, or a program that is not there.
+        InputError: it is none of these, or the program does not exist.
     """
     label, _, rest = given.partition("=")
     spec = rest.strip() if rest and re.fullmatch(r"[\w.-]+", label) else given.strip()
@@ -66,7 +66,7 @@ def resolve(given: str) -> ExtractorCommand:
 
 
 def defaults() -> tuple[list[ExtractorCommand], dict[str, str]]:
-    """Every installed extractor that can be run here; and why the others cannot."""
+    """Every installed extractor that can be run here, and the reasons why the others cannot."""
     ready, absent = [], {}
     for name, entry in sorted(_installed().items(), key=lambda item: item[0]):
         try:
@@ -82,7 +82,7 @@ def _installed() -> dict[str, EntryPoint]:
 
 def _of_entry_point(name: str, given: str, entry: EntryPoint) -> ExtractorCommand:
     argv: tuple[str, ...] = (sys.executable, "-m", WORKER, entry.value, name)
-    # Another package's code is only ever loaded in the worker, which alone it can harm.
+    # Code of other packages is loaded only in the worker, which is all that it can harm.
     if entry.value.startswith("eyerender."):
         found: Any = entry.load()
         if isinstance(found, Command):

@@ -1,4 +1,4 @@
-"""The bench: every extractor over every image of a folder, then figures, a table, plots."""
+"""The bench: run every extractor over every image of a folder, then write figures, a table and plots."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ START_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What one extractor gave: its greeting (None when it never came), a score an image."""
+    """Results of one extractor: its greeting (None when it never came), and a score per image."""
 
     extractor: ExtractorCommand
     greeting: Greeting | None
@@ -132,7 +132,7 @@ def run_extractor(
     start_timeout_s: float = START_S,
     step: Callable[[int], None] = lambda _done: None,
 ) -> Run:
-    """One extractor over all images; whatever it does is in its scores."""
+    """Run one extractor over all images; its scores include every failure."""
     process: ExtractorProcess | None = None
     greeting: Greeting | None = None
     scores: list[Score] = []
@@ -173,7 +173,7 @@ def _edge(image: LabelledImage) -> Edge | None:
 
 
 def _factors(image: LabelledImage, edge: Edge | None) -> dict[str, float]:
-    """What may explain an error; noise and blur as the folder states them, else as measured."""
+    """Possible causes of an error; noise and blur as the folder states them, else as measured."""
     out = dict(image.factors)
     if image.known:
         out |= {"noise_dn": image.known["noise_dn"], "blur_px": image.known["blur_px"]}
@@ -256,7 +256,7 @@ def _write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def _refuse(output: str | Path, overwrite: bool) -> None:
-    """A folder that an earlier bench wrote is written anew; any other that is not empty needs --overwrite."""
+    """Refuse a folder that is not empty, unless an earlier bench wrote it or --overwrite is given."""
     refuse_non_empty(output, overwrite or _is_bench(Path(output)))
 
 

@@ -1,4 +1,4 @@
-"""One answer against one label: the outcome, and how far off pupil and glints are."""
+"""The score of one answer against one label: the outcome, and the errors of pupil and glints."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ..geometry.ellipse import Ellipse, iou, signed_distance
 from .folder import LabelledImage
 from .protocol import Reply
 
-# right: IoU > 0.9. wrong: another ellipse. none: said that there is no pupil. error: no usable answer.
-# Where the image shows no pupil: absent when none was reported, else false.
+# right: IoU > 0.9. wrong: another ellipse. none: no pupil reported. error: no usable answer. Where the image shows no
+# pupil: absent when none was reported, else false.
 Outcome = Literal["right", "wrong", "none", "error", "absent", "false"]
 RIGHT_IOU = 0.9
 MATCH_PX = 2.0
@@ -41,11 +41,23 @@ class GlintScore:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """One extractor on one image.
+    """Score of one extractor on one image.
 
-    offset_px: (dx, dy) reported minus true centre. axes_px: (da, db). angle_deg: in (-90, 90]. iou: overlap of the
-    ellipses. boundary_px: mean distance of the true outline from the reported ellipse (Sampson). All None without an
-    ellipse. cpu_s, wall_s: the extractor's own figures; trip_s: from question to answer.
+    The errors are None without an ellipse.
+
+    Attributes:
+        outcome: see `Outcome`.
+        reason: why there is no ellipse.
+        offset_px: (dx, dy) reported minus true centre.
+        axes_px: (da, db).
+        angle_deg: in (-90, 90].
+        iou: overlap of the ellipses.
+        boundary_px: mean distance of the true outline from the reported ellipse (Sampson).
+        confidence: confidence of the extractor.
+        glints: scores of the glints.
+        cpu_s: processor time that the extractor reports.
+        wall_s: elapsed time that the extractor reports.
+        trip_s: time from question to answer.
     """
 
     outcome: Outcome
@@ -68,7 +80,7 @@ class Score:
 
 
 def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str, ...]) -> Score:
-    """Judge one answer."""
+    """Score one answer."""
     glints = score_glints(image, reply) if "glints" in reports else None
     times = (reply.cpu_s, reply.wall_s, trip_s)
     if reply.error is not None:
@@ -99,13 +111,13 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
 
 
 def failed(image: LabelledImage, reason: str, reports_glints: bool) -> Score:
-    """The score of no usable answer."""
+    """Score without a usable answer."""
     glints = GlintScore(true=len(image.glints)) if reports_glints else None
     return Score("error", reason, glints=glints)
 
 
 def score_glints(image: LabelledImage, reply: Reply) -> GlintScore:
-    """Match reported to true glints one to one, the most first and then the nearest, within 2 px."""
+    """Match reported to true glints one to one within 2 px: as many as possible, then the nearest."""
     true, reported = image.glints, reply.glints
     if not true or not reported:
         return GlintScore(len(true), len(reported))

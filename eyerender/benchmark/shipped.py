@@ -1,4 +1,4 @@
-"""The extractors that come with the package: its own fast and refined, the contour baseline, Pupil Labs' detector."""
+"""Extractors that come with the package: its own fast and refined, the contour baseline, Pupil Labs' detector."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from ..rig.camera import PinholeCamera
 from .registry import Command
 
 PUPIL_LABS_PYTHON = "EYERENDER_PUPIL_DETECTORS"
-# How far the reflections of a real eye lie from those of a typical one that is placed by its pupil.
+# Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
 _PLACE_MM = 1.5
 
 
 def own_fast(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
-    """This package's extractor: edges and an algebraic fit."""
+    """Run this package's extractor: edges and an algebraic fit."""
     return _own(FAST, image, request)
 
 
 def own_refined(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
-    """This package's extractor: a maximum-likelihood fit of the pixel model as well."""
+    """Run this package's extractor with a maximum-likelihood fit of the pixel model as well."""
     return _own(REFINED, image, request)
 
 
 def opencv_contour(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
-    """The contour baseline."""
+    """Run the contour baseline."""
     from ..extraction.baseline import contour_pupil
 
     hints = request["hints"]
@@ -46,9 +46,9 @@ opencv_contour.reports = ("pupil",)  # type: ignore[attr-defined]
 
 
 def pupil_labs_python() -> Path | None:
-    """The interpreter of the environment that holds `pupil-detectors`, where there is one.
+    """Interpreter of the environment with `pupil-detectors`, if there is one.
 
-    EYERENDER_PUPIL_DETECTORS names it; else it is where scripts/setup_pupil_detectors.sh makes it.
+    EYERENDER_PUPIL_DETECTORS names it; else it is where scripts/setup_pupil_detectors.sh puts it.
     """
     given = os.environ.get(PUPIL_LABS_PYTHON)
     if given:
@@ -67,7 +67,7 @@ def _pupil_labs() -> Command:
 
 
 def __getattr__(name: str) -> Command:
-    # Looked up at each use: the environment may have been made in the meantime.
+    # It is looked up at each use, because the environment may have been made in the meantime.
     if name == "pupil_detectors":
         return _pupil_labs()
     raise AttributeError(name)
@@ -102,7 +102,7 @@ def _own(settings: ExtractionSettings, image: NDArray[Any], request: Mapping[str
 
 
 def _lights(found: Extraction, rig: Mapping[str, Any] | None) -> list[int | None]:
-    """The light of each glint, where the rig is told."""
+    """Light of each glint, where the rig is known."""
     if rig is None or not found.glints or found.pupil.ellipse is None:
         return [None] * len(found.glints)
     camera = PinholeCamera.of(rig["K"], rig["R"], rig["t_mm"], (1, 1), rig["distortion"])

@@ -1,4 +1,4 @@
-"""Scores of many images as figures: over all, and broken down by what varies."""
+"""Summary of the scores of many images: overall, and by the factors that vary."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .bound import MEDIAN_OF_RADIAL
 from .folder import LabelledImage
 from .score import Score
 
-# name -> (what it is, unit)
+# name -> (meaning, unit)
 FACTORS = {
     "noise_dn": ("noise", "DN of 8 bits"),
     "blur_px": ("blur of the pupil's edge (sigma)", "px"),
@@ -27,14 +27,14 @@ FACTORS = {
     "phase_y": ("sub-pixel phase, y", "px"),
 }
 _BINS = 4
-# A factor is worth a breakdown where it varies by more than this share of its largest value.
+# A factor gets a breakdown where it varies by more than this share of its largest value.
 _VARIES = {"noise_dn": 0.25, "blur_px": 0.25, "contrast_to_noise": 0.25, "pupil_px": 0.1, "aspect": 0.05}
 
 
 def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], reports_glints: bool) -> dict[str, Any]:
-    """The figures over some images; `sigmas_px`: the bound's sigma_c of each, None where it does not apply.
+    """Summarise some images; `sigmas_px` are the bound's sigma_c of each, None where it does not apply.
 
-    Errors are of the pupils found right (IoU > 0.9), `centre_px_of_all_found` of wrong ones too.
+    Errors are those of correctly found pupils (IoU > 0.9); `centre_px_of_all_found` includes wrong ones.
     """
     counts = Counter(s.outcome for s in scores)
     shown = sum(counts[o] for o in ("right", "wrong", "none", "error"))
@@ -64,7 +64,7 @@ def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], report
 
 
 def efficiency(scores: Sequence[Score], sigmas_px: Sequence[float | None]) -> dict[str, Any]:
-    """1 / median of (centre error / 1.177 sigma_c) over the right ones; 1 reaches the Cramer-Rao bound."""
+    """Efficiency 1 / median of (centre error / 1.177 sigma_c) over the right ones; 1 reaches the Cramer-Rao bound."""
     pairs = [
         (c, MEDIAN_OF_RADIAL * sigma)
         for s, sigma in zip(scores, sigmas_px, strict=True)
@@ -82,7 +82,7 @@ def efficiency(scores: Sequence[Score], sigmas_px: Sequence[float | None]) -> di
 
 
 def failures(scores: Sequence[Score], images: Sequence[LabelledImage]) -> list[dict[str, Any]]:
-    """Every reason for a wrong, missing or unusable answer: how often, and where first."""
+    """Every reason for a wrong, missing or unusable answer, with its count and first image."""
     seen: dict[tuple[str, str], dict[str, Any]] = {}
     for s, image in zip(scores, images, strict=True):
         if s.outcome in ("right", "absent"):
@@ -105,7 +105,7 @@ def bins(values: Sequence[float | None], name: str) -> list[tuple[float, float, 
     if not len(there):
         return []
     some = known[there]
-    # Measured figures differ by rounding at least.
+    # Measured values differ at least by rounding.
     single = np.unique(np.round(some, 6))
     if name.startswith("phase"):
         edges = np.linspace(0.0, 1.0, _BINS + 1)
@@ -132,7 +132,7 @@ def breakdown(
     factors: Sequence[dict[str, float]],
     reports_glints: bool,
 ) -> dict[str, list[dict[str, Any]]]:
-    """The figures in every bin of every factor that varies, over the images that show a pupil."""
+    """Summaries for every bin of every factor that varies, over the images that show a pupil."""
     shown = [i for i, s in enumerate(scores) if s.outcome not in ("absent", "false")]
     out: dict[str, list[dict[str, Any]]] = {}
     for name in FACTORS:
@@ -177,7 +177,7 @@ def _times(scores: Sequence[Score]) -> dict[str, Any]:
 
 
 def _sizes(values: Floats, low: bool = False) -> dict[str, Any]:
-    """n, median, 95th percentile (5th where low is bad), worst."""
+    """Number, median, 95th percentile (5th where low is bad) and worst value."""
     tail = "p5" if low else "p95"
     if not len(values):
         return {"n": 0, "median": None, tail: None, "worst": None}

@@ -1,6 +1,6 @@
 """A Python callable behind the protocol: `python -m eyerender.benchmark.worker module:callable [NAME]`.
 
-The callable follows `protocol.Extractor`. What it prints goes to stderr. A `registry.Command` may stand in place of a
+The callable follows `protocol.Extractor`. What it prints goes to stderr. A `registry.Command` may take the place of a
 callable; it is then run instead.
 """
 
@@ -25,7 +25,7 @@ from .registry import Command
 def main(argv: list[str]) -> int:
     """Serve requests until the input ends."""
     stdout = os.dup(1)
-    # Nothing that a library or the callable prints may mix with the answers.
+    # Output of libraries or the callable must not mix with the answers.
     os.dup2(2, 1)
     sys.stdout = sys.stderr
     try:
@@ -60,7 +60,7 @@ def main(argv: list[str]) -> int:
             record = extractor(image, request)
             spent = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
             text = json.dumps({"id": request["id"], "record": record, **spent}, default=_plain)
-        except Exception as error:  # an extractor's defect on one image is that image's result
+        except Exception as error:  # a defect of the extractor on one image is that image's result
             text = json.dumps({"id": request["id"], "error": f"{type(error).__name__}: {error}"})
         _send(answers, text)
     return 0
@@ -72,7 +72,7 @@ def _send(stream: TextIO, line: str) -> None:
 
 
 def _plain(value: object) -> Any:
-    """NumPy's numbers and arrays as JSON knows them."""
+    """Convert NumPy's numbers and arrays to JSON types."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"the record holds a {type(value).__name__}, which JSON does not know")

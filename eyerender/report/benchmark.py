@@ -1,4 +1,4 @@
-"""The report of a bench of extractors: table, error plots, breakdowns, reasons; from the bench's own JSON and rows."""
+"""The report of a bench of extractors from its JSON and rows: table, error plots, breakdowns, reasons."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .style import TARGET, figure, svg
 
 Row = dict[str, Any]
 
-# Okabe and Ito's colours; an extractor keeps its colour and marker in every figure.
+# The colours are Okabe and Ito's; an extractor keeps its colour and marker in every figure.
 _LOOK = (
     ("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "^"), ("#CC79A7", "D"), ("#E69F00", "v"), ("#56B4E9", "P"),
     ("#777777", "X"), ("#000000", "*"),
@@ -23,12 +23,12 @@ _PANELS = 4
 
 
 def write_bench_report(path: Path, data: Row, rows: Sequence[Row]) -> None:
-    """Write one self-contained HTML file from the bench's JSON and its rows, one an extractor and image."""
+    """Write one self-contained HTML file from the bench's JSON and its rows, one per extractor and image."""
     write_page(path, bench_page(data, rows))
 
 
 def bench_page(data: Row, rows: Sequence[Row]) -> Page:
-    """The page."""
+    """Make the page."""
     entries, edge = data["extractors"], data["edge"]
     best = [e for e in entries if e["summary"]["right"]]
     cards = [Card(f"{data['with_pupil']} of {data['images']}", "images that show a pupil")]
@@ -77,7 +77,7 @@ def look(names: Sequence[str], name: str) -> tuple[str, str]:
 
 
 def cumulative_figure(data: Row, rows: Sequence[Row]) -> str:
-    """Share of the images with a pupil whose centre error is below x; failures never come below."""
+    """Draw the share of the images with a pupil whose centre error is below x; failures never are."""
     names = [e["name"] for e in data["extractors"]]
     with figure(9.0, 4.2) as (fig, ax):
         for name in names:
@@ -88,7 +88,7 @@ def cumulative_figure(data: Row, rows: Sequence[Row]) -> str:
                 ax.step(np.maximum(errors, 1e-5), share, where="post", color=look(names, name)[0], lw=1.8, label=name)
         bounds = np.array([r["bound_sigma_px"] for r in rows[: data["images"]] if r["bound_sigma_px"] is not None])
         if len(bounds):
-            # A radial error of two equal normal components: P(e < x) = 1 - exp(-x^2 / (2 sigma^2)).
+            # This is a radial error of two equal normal components: P(e < x) = 1 - exp(-x^2 / (2 sigma^2)).
             x = np.geomspace(bounds.min() * 0.05, bounds.max() * 5.0, 200)
             share = (1.0 - np.exp(-0.5 * (x[:, None] / bounds) ** 2)).mean(axis=1)
             ax.plot(x, share, color=TARGET, lw=1.2, ls="--", label="Cramér-Rao bound")
@@ -100,7 +100,7 @@ def cumulative_figure(data: Row, rows: Sequence[Row]) -> str:
 
 
 def outcome_figure(entries: Sequence[Row]) -> str:
-    """Right, wrong, none, error as shares of the images with a pupil."""
+    """Draw the outcomes right, wrong, none and error as shares of the images with a pupil."""
     with figure(9.0, 1.2 + 0.4 * len(entries)) as (fig, ax):
         y = np.arange(len(entries))
         left = np.zeros(len(entries))
@@ -117,7 +117,7 @@ def outcome_figure(entries: Sequence[Row]) -> str:
 
 
 def vector_figure(names: Sequence[str], everyone: Sequence[str], rows: Sequence[Row]) -> str:
-    """Centre errors as vectors, a panel an extractor, each on a scale of its own; up to four panels."""
+    """Draw centre errors as vectors, one panel per extractor with its own scale; up to four panels."""
     with figure(11.0, 3.3, _PANELS) as (fig, axes):
         for ax, name in zip(axes, names, strict=False):
             colour, marker = look(everyone, name)
@@ -136,12 +136,12 @@ def vector_figure(names: Sequence[str], everyone: Sequence[str], rows: Sequence[
             )  # fmt: skip
             ax.locator_params(nbins=4)
         for ax in axes[len(names) :]:
-            ax.axis("off")  # invisible axes would leave the layout
+            ax.axis("off")  # invisible axes would be excluded from the layout
         return svg(fig)
 
 
 def factor_figure(data: Row, name: str) -> str:
-    """Median centre error and share of right pupils over one factor."""
+    """Draw the median centre error and the share of right pupils over one factor."""
     entries = data["extractors"]
     names = [e["name"] for e in entries]
     what = data["factors"][name]
@@ -170,7 +170,7 @@ def factor_figure(data: Row, name: str) -> str:
 
 
 def _bounds(entries: Sequence[Row], name: str) -> list[float | None]:
-    """The median bound in each bin: the same for all extractors, but each states it for the pupils it found right."""
+    """Median bound in each bin; it is the same for all extractors, but each states it for the pupils it found right."""
     columns = [[b["efficiency"]["bound_median_px"] for b in e["breakdown"].get(name, [])] for e in entries]
     return [next((v for v in column if v is not None), None) for column in zip(*columns, strict=True)]
 

@@ -1,4 +1,4 @@
-"""The report of a comparison of the two observers: pictures, feature errors, gaze errors, provenance."""
+"""The report of a comparison of the two observers: images, feature errors, gaze errors, provenance."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .style import ANALYTIC, IMAGE, TARGET, figure, svg
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Seconds that a step of the job took."""
+    """Time of a step of the job, s."""
 
     step: str
     seconds: float
@@ -40,7 +40,7 @@ def write_report(
         data=comparison.to_mapping(),
         rows=_rows(comparison),
         pictures=_pictures(scene, comparison, entries),
-        # A grid of targets comes column by column; other lists are filled row by row.
+        # A grid of targets is listed column by column; other lists are filled row by row.
         grid=scene.spec.targets.grid if scene.spec.targets and scene.spec.targets.grid else (3, None),
         feature_figure=feature_figure(comparison),
         gaze_figure=gaze_figure(scene, comparison),
@@ -51,7 +51,7 @@ def write_report(
 
 
 def feature_figure(comparison: Comparison) -> str:
-    """Error vectors of pupil centre and glint, image-derived minus analytic, as SVG."""
+    """Draw error vectors of pupil centre and glint, image-derived minus analytic, as SVG."""
     errors = comparison.features
     with figure(8.4, 3.6, 2) as (fig, axes):
         panels = ((axes[0], errors.centre_px, "pupil centre"), (axes[1], errors.glint_px.reshape(-1, 2), "glint"))
@@ -76,7 +76,10 @@ def feature_figure(comparison: Comparison) -> str:
 
 
 def gaze_figure(scene: Scene, comparison: Comparison) -> str | None:
-    """Targets and both observers' binocular estimates on the screen, as SVG; None without a screen or estimates."""
+    """Draw targets and both observers' binocular estimates on the screen, as SVG.
+
+    None without a screen or estimates.
+    """
     screen = scene.rig.screen
     parts = [
         (comparison.gaze_truth, ANALYTIC, "s", "analytic features"),
@@ -111,14 +114,14 @@ def gaze_figure(scene: Scene, comparison: Comparison) -> str | None:
 
 def _pictures(scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry]) -> dict[str, list[dict[str, Any]]]:
     out: dict[str, list[dict[str, Any]]] = {}
-    # Matte parts stay well below full scale, so that glints have room; for people less than that is white enough.
+    # Matte parts are well below full scale, so that glints have room. This level is white enough for viewing.
     full = 0.7 * scene.spec.sensor.full_scale_dn
     truth, found = comparison.truth, comparison.found
     for row, entry in enumerate(entries):
         image = entry.image()
         side = EYES[int(truth.index.eye[row])]
         name = f"{side} eye, fixation {int(truth.index.fixation[row]) + 1}"
-        # The iris of an adult is 12 mm wide at most; three pupils' widths around the pupil show it whole.
+        # The iris of an adult is at most 12 mm wide, so three widths of the pupil around it show it as a whole.
         axis = truth.pupil.semi_axes_px[row, 0] if truth.pupil.ok[row] else np.nan
         width = int(np.clip(2 * np.ceil(4.6 * axis), 64, image.shape[1])) if np.isfinite(axis) else image.shape[1]
         crop = (width, min(image.shape[0], width * 3 // 4))

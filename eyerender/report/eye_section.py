@@ -1,4 +1,4 @@
-"""An eye's section, drawn: surfaces, stop, fovea, axes and centres of rotation."""
+"""Drawing of an eye's section: surfaces, stop, fovea, axes and centres of rotation."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from .style import ANALYTIC, IMAGE, TARGET, figure
 
 _SCLERA, _CORNEA, _LENS, _RETINA, _IRIS = "#9a9a9a", ANALYTIC, "#009E73", IMAGE, "#8c564b"
 _GRID, _LENS_GRID = 900, 300
-# Lenses of adults are 9 to 10 mm wide; their optical surfaces meet farther out than they do.
+# Adult lenses are 9 to 10 mm wide, but their optical surfaces meet farther out.
 _LENS_MM = 4.8
 
 
 def eye_section(eye: EyeModel, title: str = "") -> Any:
-    """A matplotlib figure with the horizontal section (from above) and the vertical one (from the temporal side)."""
+    """Draw the horizontal section (from above) and the vertical one (from the temporal side) as a matplotlib figure."""
     with figure(13.0, 5.4, 2) as (fig, axes):
         _draw(axes[0], eye, 1)
         _draw(axes[1], eye, 2)
@@ -34,7 +34,7 @@ def eye_section(eye: EyeModel, title: str = "") -> Any:
 
 
 def _draw(ax: Any, eye: EyeModel, across: int) -> None:
-    """One section: the plane of x and the coordinate `across` (1: y, 2: z)."""
+    """Draw one section: the plane of x and the coordinate `across` (1: y, 2: z)."""
     centre, radius = np.asarray(eye.sclera.centre_mm), eye.sclera.radius_mm
     low = float(min(centre[0] - radius, eye.fovea_mm[0])) - 1.2
     x, s = np.meshgrid(np.linspace(low, 1.0, _GRID), np.linspace(-radius - 0.8, radius + 0.8, _GRID))
@@ -44,7 +44,7 @@ def _draw(ax: Any, eye: EyeModel, across: int) -> None:
             rim &= x >= _iris_x(eye, s, across)
         _curve(ax, surface, x, s, across, rim, _CORNEA, 1.8, "cornea" if k == 0 else None)
     shells = shelled(eye)
-    # A gradient lens has dozens of shells: a grid of their own, no larger than they are.
+    # A gradient lens has dozens of shells, so they get a grid that is no larger than they are.
     back = float(eye.stop.centre_mm[0]) - 6.0
     lx, ls = np.meshgrid(np.linspace(back, back + 7.0, _LENS_GRID), np.linspace(-6.5, 6.5, _LENS_GRID))
     for k, (surface, rim_mm) in enumerate(zip(shells.back, shells.back_rims_mm, strict=True)):
@@ -111,7 +111,7 @@ def _iris_x(eye: EyeModel, s: Floats, across: int) -> Floats:
 
 
 def _iris(ax: Any, eye: EyeModel, across: int) -> None:
-    """The iris and the gap of the pupil, in the section's plane."""
+    """Draw the iris and the gap of the pupil in the section's plane."""
     stop = eye.stop
     axis = np.asarray(stop.rotation)[:, across]
     edge = float(stop.semi_axes_mm[across - 1])

@@ -1,4 +1,4 @@
-"""Pictures of an eye with the features of both observers drawn over them, as SVG around an embedded PNG."""
+"""Images of an eye with the features of both observers drawn over them, as SVG around an embedded PNG."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def eye_picture(
             place, diagonal = seen.glints.xy_px[row, j] - shift, name == "found"
             if seen.glints.light[row, j] >= 0:
                 parts.append(_cross(place, 3.2, diagonal=diagonal))
-            else:  # seen, but of no light: small and faint, with the reason
+            else:  # detected but without a light: small and faint, with the reason
                 reason = html.escape(str(seen.glints.reason[row, j] or "of no known light"))
                 parts.append(f'<g opacity=".6"><title>{reason}</title>{_cross(place, 1.6, diagonal=diagonal)}</g>')
         parts.append("</g>")
@@ -82,7 +82,7 @@ def eye_picture(
 
 
 def _cross(at: Floats, size: float, *, diagonal: bool) -> str:
-    """A cross that leaves its centre open, so that what it marks stays visible."""
+    """A cross with an open centre, so that the marked point stays visible."""
     x, y = at
     arms = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
     if diagonal:

@@ -18,7 +18,7 @@ from ..files import write_text
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """A number that stands for much, and what it is."""
+    """An important number and its meaning."""
 
     value: str
     text: str
@@ -45,7 +45,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A heading and what stands below it, in this order: text, figures, tables."""
+    """A heading and its content in this order: text, figures, tables."""
 
     heading: str
     text: Sequence[str] = ()
@@ -64,12 +64,12 @@ class Page:
 
 
 def write_page(path: Path, page: Page) -> None:
-    """Write one self-contained HTML file, complete or not at all."""
+    """Write one self-contained HTML file, completely or not at all."""
     write_template(path, "page.html.j2", {"page": page})
 
 
 def write_template(path: Path, template: str, values: Mapping[str, Any], package: str = "eyerender.report") -> None:
-    """Write a template of a package, filled with values, as one self-contained HTML file, complete or not at all."""
+    """Write a template of a package, filled with values, as one self-contained HTML file, completely or not at all."""
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package), PackageLoader("eyerender.report")]),
         autoescape=True,
@@ -77,5 +77,5 @@ def write_template(path: Path, template: str, values: Mapping[str, Any], package
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    # `contents` gathers the headings while the sections are rendered; the page lists them above.
+    # `contents` collects the headings while the sections are rendered; the page lists them at the top.
     write_text(path, environment.get_template(template).render(contents=[], **values))

@@ -1,4 +1,4 @@
-"""A scene's rig in three dimensions, with the traced rays of one fixation."""
+"""Drawing of a scene's rig in three dimensions, with the traced rays of one fixation."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def _screen(ax: Any, scene: Scene) -> None:
 
 
 def _camera(ax: Any, scene: Scene, number: int) -> None:
-    """The pyramid of a camera's field, to an eighth of its distance to the eyes."""
+    """Draw the pyramid of a camera's field, up to an eighth of its distance to the eyes."""
     camera = scene.rig.cameras[number]
     w, h = camera.resolution_px
     edge = np.array([[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]])
@@ -69,7 +69,10 @@ def _camera(ax: Any, scene: Scene, number: int) -> None:
 
 
 def _eye(ax: Any, scene: Scene, seen: Observations, row: int, *, first: bool) -> None:
-    """Globe, line of sight, and the rays from the cornea to the camera: exactly those of the image points."""
+    """Draw globe, line of sight, and the rays from the cornea to the camera.
+
+    The rays are exactly those of the image points.
+    """
     index = seen.index
     side = EYES[index.eye[row]]
     eye = scene.eye(side)
@@ -109,13 +112,13 @@ def _eye(ax: Any, scene: Scene, seen: Observations, row: int, *, first: bool) ->
 
 
 def _ray(ax: Any, origin: Floats, direction: Floats, apex: Floats, style: str, colour: str, name: str | None) -> Floats:
-    """A camera's ray up to the plane of the eye's apex across it; returns its end."""
+    """Draw a camera's ray up to the plane of the eye's apex across it; returns its end."""
     end = origin + direction * float((apex - origin) @ direction)
     ax.plot(*np.stack([origin, end]).T, color=colour, lw=1.0, ls=style, label=name)
     return np.asarray(end)
 
 
 def _equal(ax: Any) -> None:
-    """The same scale along all three axes."""
+    """Give all three axes the same scale."""
     spans = np.array([ax.get_xlim3d(), ax.get_ylim3d(), ax.get_zlim3d()])
     ax.set_box_aspect(np.maximum(spans[:, 1] - spans[:, 0], 1.0))

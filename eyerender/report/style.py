@@ -1,4 +1,4 @@
-"""The look that all figures and reports share; colours after Okabe and Ito, told apart with any colour vision."""
+"""The style of all figures and reports; the colours after Okabe and Ito are distinct with any colour vision."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 ANALYTIC, IMAGE, TARGET = "#0072B2", "#D55E00", "#222222"
-# On dark pictures the same two hues, light enough to be seen.
+# These are the same two hues, light enough for dark images.
 ANALYTIC_ON_DARK, IMAGE_ON_DARK = "#56B4E9", "#FF9F1C"
 
 _RC: dict[Any, Any] = {
@@ -39,7 +39,7 @@ def figure(width: float, height: float, columns: int = 1, rows: int = 1) -> Iter
 
 
 def svg(fig: Any) -> str:
-    """The figure as an <svg> element for an HTML page, without the XML prologue."""
+    """Convert a figure to an <svg> element for an HTML page, without the XML prologue."""
     text = io.StringIO()
     fig.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()[text.getvalue().index("<svg") :]

@@ -1,1 +1,1 @@
-"""The replications of two comparative studies, the comparison of observers on them, and what lies beyond the paper."""
+"""The replications of two comparative studies, the comparison of observers on them, and conditions beyond the paper."""

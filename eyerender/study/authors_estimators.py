@@ -1,4 +1,4 @@
-"""The estimators of the authors' software where they depart from the text: visual axis, objective, solution."""
+"""Estimators of the authors' software where they differ from the text: visual axis, objective, solution."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from ..gaze.parameters import Calibration, EyeParameters
 from ..gaze.regression import EyeFit, Regression, monomials
 from ..gaze.search import MOST_ITERATIONS, FreeParameters, Misses
 
-# A slots dataclass is a new class, which super() without arguments does not find: base classes are named instead.
+# A slots dataclass is a new class, which super() without arguments does not find, so base classes are named.
 
 
 @dataclass(frozen=True, slots=True)
 class AuthorsGuestrinEizenman(GuestrinEizenman):
-    """Guestrin & Eizenman's method with the departures of the authors' software, each by itself.
+    """Guestrin & Eizenman's method with the departures of the authors' software, each selectable.
 
     Args:
         visual_axis: "rotation" turns the optic axis by a rotation that is fixed in the world (beta about y, then alpha
             about z); "angles" is the method's own, which adds them to azimuth and elevation.
         objective: "sum_of_errors" minimises the sum of the angles atan(distance / viewing_distance_mm) in degrees by
             sequential quadratic programming (Kraft 1988; scipy `minimize`, SLSQP); "least_squares" is the method's own.
-        viewing_distance_mm: how far the software takes the screen to be.
+        viewing_distance_mm: distance of the screen that the software assumes.
     """
 
     visual_axis: Literal["angles", "rotation"] = "rotation"
@@ -36,7 +36,7 @@ class AuthorsGuestrinEizenman(GuestrinEizenman):
     viewing_distance_mm: float = 650.0
 
     def turned(self, w: Floats, alpha: ArrayLike, beta: ArrayLike) -> Floats:
-        """The visual axes (..., 3) of optic axes w (..., 3); angles in radians."""
+        """Visual axes (..., 3) of optic axes w (..., 3); angles in radians."""
         if self.visual_axis == "angles":
             return GuestrinEizenman.turned(self, w, alpha, beta)
         ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
@@ -44,7 +44,7 @@ class AuthorsGuestrinEizenman(GuestrinEizenman):
         return np.stack([ca * x - sa * w[..., 1], sa * x + ca * w[..., 1], z], axis=-1)
 
     def search(self, misses: Misses, start: EyeParameters) -> Calibration:
-        """One eye's parameters that minimise the objective, searched for from `start`."""
+        """Find one eye's parameters that minimise the objective, from `start`."""
         if self.objective == "least_squares":
             return GuestrinEizenman.search(self, misses, start)
         space = FreeParameters(start, self.bounds, self.free)
@@ -67,10 +67,13 @@ class AuthorsGuestrinEizenman(GuestrinEizenman):
 
 @dataclass(frozen=True, slots=True)
 class MinimumNormRegression(Regression):
-    """Regression that takes the minimum-norm solution where the targets do not determine the coefficients."""
+    """Regression with the minimum-norm solution where the targets do not determine the coefficients."""
 
     def fit_eye(self, vectors: Floats, wanted: Floats, name: str) -> EyeFit:
-        """The coefficients of one eye. Their norm depends on the vectors' scale; the software's are not scaled."""
+        """Fit the coefficients of one eye.
+
+        Their norm depends on the vectors' scale; the software does not scale them.
+        """
         if not len(vectors):
             raise InputError(f"{name} eye: no usable calibration targets")
         origin, scale = vectors.mean(axis=0) if self.centred else np.zeros(2), np.ones(2)

@@ -1,4 +1,4 @@
-"""Blignaut (2014), replicated: the scene, the regression and the error of each protocol."""
+"""The replication of Blignaut (2014): scene, regression and error of each protocol."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Outcome:
 
 
 def scene(eye: str, departures: Collection[str]) -> Scene:
-    """The scene of one eye model."""
+    """Make the scene of one eye model."""
     loaded = load_scene(SCENE, eye=eye)
     data = loaded.spec.to_mapping()
     if "focal" in departures:
@@ -87,15 +87,15 @@ def scene(eye: str, departures: Collection[str]) -> Scene:
 
 
 def scene_key(departures: Collection[str]) -> frozenset[str]:
-    """The departures that change what is observed."""
+    """Departures that change the observations."""
     return frozenset(departures) & {"focal", "screen"}
 
 
 def terms(function: str, departures: Collection[str]) -> tuple[str, str]:
-    """The terms of x and of y of a function of Table 2.
+    """Terms of x and of y of a function of Table 2.
 
-    The authors' loop: the different functions of x, and those of y, are numbered in the order in which Table 2 first
-    shows them, and the number of the function of x is used for both.
+    In the authors' loop, the different functions of x, and those of y, are numbered in the order of their first
+    appearance in Table 2. The number of the function of x is used for both.
     """
     x, y = FUNCTIONS[function]
     if "terms" not in departures:
@@ -107,7 +107,7 @@ def terms(function: str, departures: Collection[str]) -> tuple[str, str]:
 def run(
     observations: Observations, rig: RigGeometry, departures: Collection[str], *, centred: bool = False
 ) -> list[Outcome]:
-    """Every function calibrated on every set, tested on all targets; `centred` as in `Regression`."""
+    """Calibrate every function on every set and test it on all targets; `centred` as in `Regression`."""
     out = []
     fixation = observations.index.fixation
     for name, targets in CALIBRATION_SETS.items():
@@ -124,20 +124,20 @@ def run(
             index = frames.index
             eye = index.head_mm
             if "error" in departures and rig.screen is not None:
-                # As if the screen's centre were straight ahead of the origin.
+                # The software assumes that the screen's centre is straight ahead of the origin.
                 eye = eye + rig.screen.centre_mm * np.array([0.0, 1.0, 1.0])
             out.append(Outcome(function, name, angular_error_deg(gaze.point_mm, index.target_mm, eye), None))
     return out
 
 
 def best(outcomes: list[Outcome], calibration: str) -> Outcome | None:
-    """The function with the smallest mean error for a set; None without any."""
+    """Function with the smallest mean error for a set; None if there is none."""
     some = [o for o in outcomes if o.calibration == calibration and o.mean_deg is not None]
     return min(some, key=lambda o: o.mean_deg or 0.0) if some else None
 
 
 def rows_of(outcomes: list[Outcome], **keys: Any) -> list[Row]:
-    """One row a function and set."""
+    """One row per function and set."""
     out = []
     for o in outcomes:
         out.append(

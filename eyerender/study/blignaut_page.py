@@ -1,4 +1,4 @@
-"""The values of the report of the replication of Blignaut (2014)."""
+"""Values for the report of the replication of Blignaut (2014)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .page_parts import (
 from .replicate import BlignautPart
 from .results import Erratum, Finding
 
-# The regressions that are drawn: those that do best with few and with many targets.
+# These regressions are drawn: the best ones with few and with many targets.
 SHOWN = ("R2 on C5", "R4 on C9", "R8 on C14", "R8 on C135")
 SETS = tuple(lit.CALIBRATION_SETS)
 
@@ -38,7 +38,7 @@ def page(
     apart: Apart = ((), ()),
     made_of: Sequence[Budget] = (),
 ) -> Report:
-    """The report of [29]'s replication."""
+    """Make the report of the replication of [29]."""
     best = _best_by_key(parts)
     cells = {
         key: {m: f"{v[0]:.2f}/{v[1]:.2f}/{v[-1]:.3f}" for m, v in by_model.items()} for key, by_model in best.items()
@@ -73,11 +73,11 @@ def _best_by_key(parts: Sequence[BlignautPart]) -> dict[tuple[str, str], dict[st
 
 
 def _clouds(parts: Sequence[BlignautPart]) -> list[tuple[str, str, str]]:
-    """(scene, observer, figure) of the pupils' and the glints' clouds."""
+    """(scene, observer, figure) of the clouds of pupils and glints."""
     observers = list(dict.fromkeys(key for part in parts for key in part.clouds))
-    # One reading of the scene is enough to show the clouds; the corrected one where there is a choice.
+    # One reading of the scene suffices for the clouds: the corrected one where there is a choice.
     keys = [k for k in observers if k[0] == "corrected"] or observers
-    # The sensor's noise does not show at this scale.
+    # The sensor's noise is invisible at this scale.
     keys = [k for k in keys if k[1] != "image-noiseless" or (k[0], "image") not in keys]
     return [(*key, clouds_figure({p.eye_model: _points(p, key) for p in parts if key in p.clouds})) for key in keys]
 

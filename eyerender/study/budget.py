@@ -1,16 +1,14 @@
-"""What the gaze error is made of: the algorithm, the eye model, the images, their noise; paired, frame by frame.
+"""The composition of the gaze error: algorithm, eye model, images and noise, paired frame by frame.
 
     error from noisy images of eye M = A + (E - A) + (I - E) + (N - I)
-
     A   the algorithm's own: exact features of the simplest eye of the run (E1 where it is there)
     E   exact features of eye M:                               E - A is what the eye model adds
     I   features of M's images exposed without noise:          I - E is what forming and reading an image adds
     N   features of the same images with the sensor's noise:   N - I is what the noise adds
 
-each a mean over the frames that all four have an estimate of, so the terms add up exactly. A difference has its 95 %
-interval (Student's t of the paired differences). The frames are a design, not a sample, and a rig that is symmetric
-shows each with its mirror image, so the interval of E - A is narrower than independent frames would make it, by 2^1/2
-at most.
+Each is a mean over the frames for which all four have an estimate, so the terms add up exactly. A difference has a 95 %
+interval (Student's t of the paired differences). The frames are a design, not a sample, and a symmetric rig shows each
+with its mirror image. The interval of E - A is therefore narrower than for independent frames, by 2^1/2 at most.
 """
 
 from __future__ import annotations
@@ -25,12 +23,12 @@ from scipy.stats import t as student
 from ..arrays import Floats
 
 ALGORITHM, EYE, IMAGE, NOISE, BOTH = "algorithm", "eye model", "image", "noise", "image and noise"
-# The observers that may follow ray optics, in this order.
+# Observers that may follow ray optics, in this order.
 _STEPS = ("image-noiseless", "image")
 
 
 class Part(Protocol):
-    """What a study has of one eye model: errors (n,) deg by (protocol, observer) and name of the estimator."""
+    """Results of a study for one eye model: errors (n,) deg by (protocol, observer) and name of the estimator."""
 
     eye_model: str
     errors: dict[tuple[str, str], dict[str, Floats]]
@@ -38,7 +36,7 @@ class Part(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """A contribution in degrees, with its interval where it is a difference."""
+    """A contribution in degrees, with its interval if it is a difference."""
 
     name: str
     deg: float
@@ -59,18 +57,18 @@ class Budget:
     total_deg: float
 
     def term(self, name: str) -> Term | None:
-        """A term by its name."""
+        """Find a term by its name."""
         return next((term for term in self.terms if term.name == name), None)
 
     def to_mapping(self) -> dict[str, Any]:
-        """For JSON."""
+        """Convert to a mapping for JSON."""
         return {**asdict(self), "terms": [asdict(term) for term in self.terms]}
 
 
 def budgets(parts: Sequence[Part]) -> list[Budget]:
-    """The budget of each protocol, estimator and eye model; none where there are no errors by ray optics.
+    """Budget of each protocol, estimator and eye model; none where there are no errors by ray optics.
 
-    The reference is the first eye model of the run, which is E1 unless other models were asked for.
+    The reference is the first eye model of the run, which is E1 by default.
     """
     errors: dict[tuple[str, str, str, str], Floats] = {
         (protocol, name, part.eye_model, observer): found
@@ -111,7 +109,7 @@ def _budget(
 
 
 def _name(observer: str, steps: Mapping[str, Floats]) -> str:
-    """What the step to an observer adds."""
+    """Name of the contribution of the step to an observer."""
     if observer == "analytic":
         return EYE
     if observer == "image-noiseless":

@@ -16,34 +16,34 @@ COLUMNS, ROWS = 15, 9
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """Features of the right eye, one a target in the scene's order: pupil centres and glints, (135, 2) px."""
+    """Features of the right eye, one per target in the scene's order: pupil centres and glints, (135, 2) px."""
 
     pupil_px: Floats
     glint_px: Floats
 
     @classmethod
     def of(cls, observations: Observations) -> Cloud:
-        """The right eye's features; NaN where one is missing."""
+        """Take the right eye's features; NaN where one is missing."""
         seen = observations.take(observations.index.eye == 0)
         glint, _ = seen.glints.of_light(0)
         return cls(np.asarray(seen.pupil.centre_px), glint)
 
 
 def extent_px(points: Floats) -> float:
-    """The largest distance of a point from the cloud's mean."""
+    """Largest distance of a point from the cloud's mean."""
     good = points[np.isfinite(points).all(axis=1)]
     return float(np.linalg.norm(good - good.mean(axis=0), axis=1).max()) if len(good) else float("nan")
 
 
 def aspect(points: Floats) -> float:
-    """Spread across over spread along the cloud's long axis (ratio of singular values)."""
+    """Ratio of the spreads across and along the cloud's long axis (ratio of singular values)."""
     good = points[np.isfinite(points).all(axis=1)]
     values = np.linalg.svd(good - good.mean(axis=0), compute_uv=False)
     return float(values[1] / values[0]) if values[0] > 0 else float("nan")
 
 
 def bow(points: Floats) -> float:
-    """How far the rows of targets bend: the largest distance from the chord over its length, mean over the rows."""
+    """Curvature of the rows of targets: the largest distance from the chord over its length, mean over the rows."""
     grid = points.reshape(COLUMNS, ROWS, 2)
     out = []
     for row in range(ROWS):
@@ -56,7 +56,7 @@ def bow(points: Floats) -> float:
 
 
 def findings(clouds: Mapping[str, Cloud], protocol: str, observer: str) -> list[Finding]:
-    """F1 to F4, as far as the models they are about were run."""
+    """Test F1 to F4, as far as their models were run."""
     out = []
 
     def add(name: str, rule: str, value: float, threshold: str, verdict: bool, detail: str) -> None:

@@ -1,8 +1,8 @@
-"""Beyond the paper: how the errors depend on where one looks, where the head is, the pupil's size and the eye itself.
+"""Conditions beyond the paper: the errors over gaze direction, head position, pupil size and parameters of the eye.
 
-Two trackers, both calibrated at the central head position with a 4 mm pupil, on analytic features of both studies'
-corrected scenes: the model-based one of [28] (nine targets, index fixed) and the interpolation-based one of [29]
-(R8 on C14). Everything is seen from the right eye (model-based) or the mid-point of both (interpolation).
+Two trackers are calibrated at the central head position with a 4 mm pupil, on analytic features of both studies'
+corrected scenes: the model-based one of [28] (nine targets, index fixed) and the interpolation-based one of [29] (R8 on
+C14). Angles are measured from the right eye (model-based) or the mid-point of both (interpolation).
 """
 
 from __future__ import annotations
@@ -37,13 +37,16 @@ NOISE_PX, SAMPLES, SEED = 0.05, 100, 2014
 
 
 def _with_lens(axis: int) -> str:
-    """The paths of the stop's place and, where there is a lens, of the lens': it may not come through the stop."""
+    """Paths of the stop's place and of the lens' place, if there is a lens.
+
+    Both move together, so that the lens does not cross the stop.
+    """
     stop, where = f"stop.position_mm.{axis}", f"position_mm.{axis}"
     surfaces = f"{stop}&lens.surfaces.0.{where}&lens.surfaces.1.{where}"
     return f"{surfaces}|{stop}&lens.front.{where}&lens.back.{where}|{stop}"
 
 
-# Label, path in the eye file, step, unit. Each is changed by plus and minus one step.
+# Label, path in the eye file, step, unit. Each parameter is changed by plus and minus one step.
 PARAMETERS: tuple[tuple[str, str, float, str], ...] = (
     ("corneal radius", "cornea.0.shape.radius_mm|cornea.0.shape.radii_mm", 0.1, "mm"),
     ("corneal asphericity Q", "cornea.0.shape.conic_constant|cornea.0.shape.conic_constants", 0.05, ""),
@@ -65,7 +68,10 @@ PARAMETERS: tuple[tuple[str, str, float, str], ...] = (
 
 @dataclass(slots=True)
 class ConditionsPart:
-    """What one eye model gave; errors in degrees. Maps (rows, columns) by tracker; NaN where there is no estimate."""
+    """Results of one eye model; errors in degrees.
+
+    Maps (rows, columns) by tracker are NaN where there is no estimate.
+    """
 
     eye_model: str
     screen_maps: dict[str, Floats] = field(default_factory=dict)
@@ -78,7 +84,7 @@ class ConditionsPart:
 
 @dataclass(frozen=True, slots=True)
 class _Tracker:
-    """A calibrated tracker: errors of observations, one a target in the scene's order for each head position."""
+    """A calibrated tracker; observations have one row per target in the scene's order for each head position."""
 
     name: str
     estimator: GuestrinEizenman | Regression
@@ -92,7 +98,7 @@ class _Tracker:
         return seen, np.asarray(gaze.point_mm)
 
     def from_mm(self, seen: Observations) -> Floats:
-        """Where the angles are seen from, (n, 3)."""
+        """Points from which the angles are measured, (n, 3)."""
         place = np.asarray(seen.index.head_mm)
         return place if self.name == "interpolation" else place + seen.index.eye_position_mm
 
@@ -103,7 +109,7 @@ class _Tracker:
 
 
 def conditions_part(eye: str) -> ConditionsPart:
-    """All conditions for one eye model."""
+    """Compute all conditions for one eye model."""
     out = ConditionsPart(eye)
     for name in TRACKERS:
         tracker, seen = _calibrated(_scene(name, eye))
@@ -142,7 +148,7 @@ def conditions_part(eye: str) -> ConditionsPart:
             try:
                 up, down = (_mean(replace(_scene(name, eye), eye_spec=spec)) for spec in (more, less))
             except InputError as error:
-                # A changed eye may be one that no ray leaves: a result of this parameter, not of the others.
+                # A changed eye may let no ray through. That is a result for this parameter, not for the others.
                 entry[name]["reason"] = str(error)
                 continue
             entry[name] |= {"at_plus": up, "at_minus": down, "per_step": 0.5 * (up - down)}
@@ -151,7 +157,7 @@ def conditions_part(eye: str) -> ConditionsPart:
 
 
 def _scene(tracker: str, eye: str) -> Scene:
-    """The scene a tracker is calibrated in: one head position."""
+    """Scene in which a tracker is calibrated: one head position."""
     if tracker == "interpolation":
         return blignaut.scene(eye, blignaut.CORRECTED)
     scene = guestrin.scene(eye, guestrin.CORRECTED)
@@ -159,7 +165,7 @@ def _scene(tracker: str, eye: str) -> Scene:
 
 
 def _changed(scene: Scene, changes: dict[str, dict[str, Any]]) -> Scene:
-    """The scene with keys of its groups replaced; the eye's spec stays as it is."""
+    """Replace keys of a scene's groups; the eye's spec stays."""
     data = scene.spec.to_mapping()
     for group, values in changes.items():
         data[group] = values if group == "targets" else {**data[group], **values}
@@ -168,7 +174,7 @@ def _changed(scene: Scene, changes: dict[str, dict[str, Any]]) -> Scene:
 
 
 def _calibrated(scene: Scene) -> tuple[_Tracker, Observations]:
-    """The scene's tracker, calibrated in it, and what it was calibrated and tested on."""
+    """Calibrate the scene's tracker in it; also returns the observations used."""
     seen = trace(scene)
     if len(scene.rig.lights) > 1:
         fitted = guestrin.estimator(guestrin.CORRECTED).fit(seen, scene.rig)
@@ -213,7 +219,7 @@ def _precision(tracker: _Tracker, seen: Observations) -> dict[str, float]:
 
 
 def _noisy(seen: Observations, rng: np.random.Generator) -> Observations:
-    """Features with independent Gaussian noise of `NOISE_PX` in x and y."""
+    """Add independent Gaussian noise of `NOISE_PX` in x and y to features."""
     pupil = seen.pupil.centre_px + rng.normal(0.0, NOISE_PX, seen.pupil.centre_px.shape)
     glints = seen.glints.xy_px + rng.normal(0.0, NOISE_PX, seen.glints.xy_px.shape)
     return replace(
@@ -222,7 +228,7 @@ def _noisy(seen: Observations, rng: np.random.Generator) -> Observations:
 
 
 def _eye_with(spec: EyeSpec, paths: str, change: float) -> EyeSpec | None:
-    """The eye with a parameter changed; None where it has no such parameter.
+    """Change a parameter of an eye; None where it has no such parameter.
 
     `paths` names alternatives (|), each of one or more (&) dotted paths; a list is changed in all its numbers.
     """
@@ -237,7 +243,7 @@ def _eye_with(spec: EyeSpec, paths: str, change: float) -> EyeSpec | None:
 
 
 def _add(node: Any, path: Sequence[str], change: float) -> bool:
-    """Add to the number at a path in place; False where there is none."""
+    """Add to the number at a path, in place; False where there is none."""
     for k, key in enumerate(path):
         index: Any = int(key) if isinstance(node, list) else key
         if isinstance(node, list) and not 0 <= index < len(node):

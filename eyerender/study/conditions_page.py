@@ -1,4 +1,4 @@
-"""The findings, the summary and the values of the report of the study of conditions."""
+"""Findings, summary and report values of the study of conditions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _QUALITY = ("accuracy_deg", "rms_s2s_deg", "sd_deg")
 
 
 def findings(parts: Sequence[ConditionsPart]) -> list[Finding]:
-    """What the conditions do, as values; there is no published claim to hold them against."""
+    """Effects of the conditions as values; there is no published claim to compare them with."""
     out = []
     for tracker in c.TRACKERS:
         for part in parts:
@@ -45,7 +45,7 @@ def findings(parts: Sequence[ConditionsPart]) -> list[Finding]:
 
 
 def more(parts: Sequence[ConditionsPart]) -> dict[str, Any]:
-    """What the summary holds beside its rows."""
+    """Content of the summary besides its rows."""
     return {
         "trackers": _WHO,
         "noise": {"sigma_px": c.NOISE_PX, "samples": c.SAMPLES, "seed": c.SEED},
@@ -65,7 +65,7 @@ def more(parts: Sequence[ConditionsPart]) -> dict[str, Any]:
 
 
 def page(parts: Sequence[ConditionsPart], found: Sequence[Finding]) -> Report:
-    """The report."""
+    """Make the report."""
     head = np.array(c.HEAD_MM)
     moved = ("to the subject's left (mm)", "towards the screen (mm)", "mean error (deg)", [(0.0, 0.0)])
     across = ("to the subject's right (mm)", "up (mm)", "error (deg)")
@@ -124,7 +124,7 @@ def _sensitivity_figure(parts: Sequence[ConditionsPart]) -> str:
 
 
 def _screen_axes(tracker: str, values: Floats) -> tuple[Floats, Floats]:
-    """Screen coordinates of a map's columns and rows: columns run from the subject's left, rows from the top."""
+    """Screen coordinates of a map's columns and rows; columns run from the subject's left, rows from the top."""
     w, h = (377.0, 301.0) if tracker == "model-based" else (495.0, 280.0)
     return np.linspace(-w / 2, w / 2, values.shape[1]), np.linspace(h / 2, -h / 2, values.shape[0])
 

@@ -1,4 +1,4 @@
-"""What the paper's tables and text misprint, and what is used instead."""
+"""Misprints of the paper's tables and text, and the values used instead."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from .results import Erratum
 
 
 def guestrin(misprints: Mapping[str, Mapping[str, Any]]) -> list[Erratum]:
-    """Errata of [28]'s replication; effects from the models' own runs (eye model -> case -> H1, H2, counts)."""
+    """Errata for the replication of [28].
+
+    The effects come from the models' own runs (eye model -> case -> H1, H2, counts).
+    """
     return [
         Erratum(
             "Table 4, camera",
@@ -47,7 +50,7 @@ def guestrin(misprints: Mapping[str, Mapping[str, Any]]) -> list[Erratum]:
 
 
 def blignaut() -> list[Erratum]:
-    """Errata of [29]'s replication."""
+    """Errata for the replication of [29]."""
     return [
         Erratum(
             "Table 5, best functions",

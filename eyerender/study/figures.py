@@ -111,7 +111,7 @@ def heads_figure(
 def sets_figure(
     sets: Sequence[str], own: Mapping[str, Mapping[str, Sequence[float]]], measured: Sequence[float]
 ) -> str:
-    """Figure 5: the best function's error for each calibration set by eye model; a panel a label of `own`."""
+    """Figure 5: the best function's error for each calibration set by eye model; one panel per label of `own`."""
     columns = min(len(own), 3)
     lines = -(-len(own) // columns)
     with figure(max(5.4, 4.6 * columns), 0.5 + 3.7 * lines, columns, lines) as (fig, axes):
@@ -138,9 +138,9 @@ def sets_figure(
 
 
 def waterfall_figure(labels: Sequence[str], panels: Mapping[str, Mapping[str, Sequence[float | None]]]) -> str:
-    """From published to corrected: mean error after each correction, by eye model; a panel a measure."""
+    """Draw the mean error after each correction, from published to corrected, by eye model; one panel per measure."""
     with figure(max(7.0, 2.6 + 3.2 * len(panels)), 1.6 + 0.36 * len(labels), len(panels)) as (fig, axes):
-        fig.get_layout_engine().set(wspace=0.06)  # the last number of one panel stands beside the first of the next
+        fig.get_layout_engine().set(wspace=0.06)  # the last number of one panel is next to the first of the next
         y = np.arange(len(labels))
         for k, (ax, (name, by_model)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
             for model, values in by_model.items():
@@ -159,7 +159,7 @@ def waterfall_figure(labels: Sequence[str], panels: Mapping[str, Mapping[str, Se
 def map_figure(
     maps: Mapping[str, Floats], x: Floats, y: Floats, xlabel: str, ylabel: str, colour_label: str, marks: Any = None
 ) -> str:
-    """Maps of a mean error (len(y), len(x)) over two quantities, one a panel, on one scale; NaN stays white."""
+    """Draw maps of a mean error (len(y), len(x)) over two quantities, one per panel, on one scale; NaN is white."""
     top = max(float(np.nanmax(m)) for m in maps.values())
     with figure(max(5.0, 2.1 * len(maps) + 1.0), 2.5, len(maps)) as (fig, axes):
         for k, (ax, (name, values)) in enumerate(zip(np.atleast_1d(axes), maps.items(), strict=True)):
@@ -176,7 +176,7 @@ def map_figure(
 def lines_figure(
     panels: Mapping[str, Mapping[str, Sequence[float]]], x: Sequence[float], xlabel: str, ylabel: str
 ) -> str:
-    """Lines by eye model over one quantity; a panel a key."""
+    """Draw lines by eye model over one quantity; one panel per key."""
     with figure(max(5.4, 4.4 * len(panels)), 3.6, len(panels)) as (fig, axes):
         for ax, (name, by_model) in zip(np.atleast_1d(axes), panels.items(), strict=True):
             for model, values in by_model.items():
@@ -190,7 +190,7 @@ def lines_figure(
 
 
 def sensitivity_figure(names: Sequence[str], panels: Mapping[str, Mapping[str, Sequence[float]]], xlabel: str) -> str:
-    """Changes by one step of each parameter, a row each: panel -> eye model -> change by parameter (NaN: none)."""
+    """Draw changes by one step of each parameter, one row each: panel -> eye model -> change (NaN: none)."""
     with figure(11.0, 1.3 + 0.36 * len(names), len(panels)) as (fig, axes):
         y = np.arange(len(names))
         for k, (ax, (title, by_model)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):

@@ -1,4 +1,4 @@
-"""What a replication must test, each as true or false from its own data: G1 to G3, B1 to B5."""
+"""Statements that a replication must test, each true or false from its own data: G1 to G3, B1 to B5."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def blignaut(outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str
 
 
 def _ties(outcomes: Sequence[Outcome], calibration: str) -> list[str]:
-    """The functions that are as good as the best one for a set, the best first."""
+    """Functions that are as good as the best one for a set, the best first."""
     some = sorted((o.mean_deg, o.function) for o in outcomes if o.calibration == calibration and o.mean_deg is not None)
     return [name for mean, name in some if mean - some[0][0] < _TIE_DEG]
 

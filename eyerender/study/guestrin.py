@@ -1,4 +1,4 @@
-"""Guestrin & Eizenman (2006), replicated: the scene, the estimator and the error of each protocol.
+"""The replication of Guestrin & Eizenman (2006): scene, estimator and error of each protocol.
 
 `published` is every departure of the authors' software at once, `corrected` none; any set of them can be run.
 """
@@ -84,7 +84,7 @@ PUBLISHED = frozenset(d.id for d in DEPARTURES)
 CORRECTED: frozenset[str] = frozenset()
 
 SOFTWARE_START = EyeParameters(7.8, 4.2, 1.376, 5.0, 1.5)
-# The index is fixed there, so its bounds never act.
+# The index is fixed in the software, so its bounds never act.
 SOFTWARE_BOUNDS = ParameterBounds(
     EyeParameters(3.0, 2.0, 1.30, -10.0, -5.0), EyeParameters(20.0, 15.0, 1.45, 10.0, 5.0)
 )
@@ -106,13 +106,13 @@ class Outcome:
         return float(good.mean()) if len(good) else None
 
     def rows(self, head: str) -> Any:
-        """The observations at the central head position (H1) or the others (H2), (n,) bool."""
+        """Whether observations are at the central head position (H1) or the others (H2), (n,) bool."""
         central = self.observations.index.head == 0
         return central if head == "H1" else ~central
 
 
 def scene(eye: str, departures: Collection[str], changes: dict[str, Any] | None = None) -> Scene:
-    """The scene of one eye model; `changes` replaces further keys of the camera or the head positions."""
+    """Make the scene of one eye model; `changes` replaces further keys of the camera or the head positions."""
     loaded = load_scene(SCENE, eye=eye)
     data = loaded.spec.to_mapping()
     camera = data["rig"]["cameras"][0]
@@ -133,12 +133,12 @@ def scene(eye: str, departures: Collection[str], changes: dict[str, Any] | None 
 
 
 def scene_key(departures: Collection[str]) -> frozenset[str]:
-    """The departures that change what is observed."""
+    """Departures that change the observations."""
     return frozenset(departures) & {"eyes", "lights", "heads"}
 
 
 def estimator(departures: Collection[str], *, free_index: bool = False) -> AuthorsGuestrinEizenman:
-    """The estimator of a set of departures."""
+    """Make the estimator of a set of departures."""
     index = 1.376 if "index" in departures else 1.3375
     software = "objective" in departures
     return AuthorsGuestrinEizenman(
@@ -148,13 +148,14 @@ def estimator(departures: Collection[str], *, free_index: bool = False) -> Autho
         free_index=free_index and "index" not in departures,
         visual_axis="rotation" if "visual_axis" in departures else "angles",
         objective="sum_of_errors" if software else "least_squares",
-        # A sum of distances has a kink wherever one of them vanishes, where the last digits cost hundreds of steps.
+        # A sum of distances has a kink wherever one of them vanishes, and the last digits would cost hundreds of steps
+        # there.
         tolerance=1e-10 if software else 1e-12,
     )
 
 
 def estimation_rig(rig: RigGeometry, departures: Collection[str]) -> RigGeometry:
-    """The rig that the estimator is told: its screen lies 1 mm too far in the authors' software."""
+    """Rig given to the estimator; in the authors' software its screen is 1 mm too far."""
     if "plane" not in departures or rig.screen is None:
         return rig
     centre = frozen(rig.screen.centre_mm + np.array([1.0, 0.0, 0.0]))
@@ -162,7 +163,7 @@ def estimation_rig(rig: RigGeometry, departures: Collection[str]) -> RigGeometry
 
 
 def errors_deg(observations: Observations, gaze: GazePoints, departures: Collection[str]) -> Floats:
-    """The error of each observation (n,), NaN where there is no estimate."""
+    """Error of each observation (n,), NaN where there is no estimate."""
     index = observations.index
     if "error" in departures:
         miss = np.linalg.norm(gaze.point_mm - index.target_mm, axis=1)
@@ -197,7 +198,7 @@ def rows_of(outcome: Outcome, **keys: Any) -> list[Row]:
 
 @dataclass(frozen=True, slots=True)
 class Restarts:
-    """How one eye's calibration ends from random starts; errors are the means at H1 (deg)."""
+    """Results of one eye's calibration from random starts; errors are the means at H1 (deg)."""
 
     eye: str
     chosen: Calibration
@@ -207,7 +208,7 @@ class Restarts:
     parameters: tuple[EyeParameters, ...]
 
     def to_mapping(self) -> dict[str, Any]:
-        """For JSON: the calibration that is reported, and the spread over the starts."""
+        """Convert to a mapping for JSON: the calibration that is reported, and the spread over the starts."""
         errors, costs = np.array(self.errors_deg), np.array(self.costs)
         best = costs <= min(costs.min(), self.chosen.cost) * (1 + 1e-4) + 1e-12
         values = np.stack([p.vector() for p in self.parameters])
@@ -240,7 +241,7 @@ class Restarts:
 def restarts(
     outcome: Outcome, rig: RigGeometry, departures: Collection[str], *, starts: int = STARTS, eyes: Sequence[int] = (0,)
 ) -> list[Restarts]:
-    """Calibrate from random starts within the bounds; of `eyes` that were observed."""
+    """Calibrate those of `eyes` that were observed from random starts within the bounds."""
     told = estimation_rig(rig, departures)
     seen = outcome.observations
     out = []
@@ -269,7 +270,7 @@ def restarts(
 
 
 def optimiser_settings(protocols: Sequence[str]) -> dict[str, Any]:
-    """How each protocol's calibration searches: method, start, bounds, tolerance."""
+    """Settings of each protocol's calibration: method, start, bounds, tolerance."""
     out = {}
     for protocol in protocols:
         e = estimator(PUBLISHED if protocol == "published" else CORRECTED)

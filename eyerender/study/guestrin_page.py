@@ -1,4 +1,4 @@
-"""The values of the report of the replication of Guestrin & Eizenman (2006)."""
+"""Values for the report of the replication of Guestrin & Eizenman (2006)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from .page_parts import (
 from .replicate import GuestrinPart
 from .results import Erratum, Finding
 
-# The estimators that are drawn.
+# These estimators are drawn.
 SHOWN = ("model-based, index fixed", "model-based, index free")
 
 
@@ -39,7 +39,7 @@ def page(
     apart: Apart = ((), ()),
     made_of: Sequence[Budget] = (),
 ) -> Report:
-    """The report of [28]'s replication."""
+    """Make the report of the replication of [28]."""
     values: Values = {
         "overview": overview(_cells(parts)),
         "budget": budget_values(made_of, SHOWN),
@@ -71,7 +71,7 @@ def _cells(parts: Sequence[GuestrinPart]) -> dict[tuple[str, str], dict[str, str
 
 
 def _heads_figure(parts: Sequence[GuestrinPart]) -> str | None:
-    """The paper's Figure 4; None where every error is too large for it."""
+    """Figure 4 of the paper; None where every error is too large for it."""
     # A variant with errors above 11 deg would flatten everything else.
     shown = {
         f"{protocol}, {observer}": {m: v for m, v in means.items() if max(v.values()) < 3}
@@ -86,7 +86,7 @@ def _heads_figure(parts: Sequence[GuestrinPart]) -> str | None:
 
 
 def _about_e5(parts: Sequence[GuestrinPart]) -> dict[str, str] | None:
-    """What becomes of the paper's 'errors exceeding 11 deg': E5 and its variants, where all of them were run."""
+    """Explanation of the paper's 'errors exceeding 11 deg': E5 and its variants, if all of them were run."""
     means = {p.eye_model: p.means["published", "analytic"] for p in parts if ("published", "analytic") in p.means}
     told = {m: f"{v['H1']:.2f}/{v['H2']:.2f} deg" for m, v in means.items() if m.startswith("E5")}
     return told if {"E5", *lit.VARIANTS} <= set(told) else None

@@ -1,4 +1,4 @@
-"""Both observers on a head-mounted rig: features of 25 directions of one eye, and the direction found from them.
+"""Both observers on a head-mounted rig: features of 25 directions of one eye, and the direction estimated from them.
 
 The direction of the optic axis, in degrees, is a polynomial of second order of a feature (x, y) in px,
 
@@ -35,7 +35,7 @@ FEATURES = ("pupil-glint vector", "pupil centre")
 
 @dataclass(slots=True)
 class HeadMountedPart:
-    """What one eye model gave: rows; by (protocol, observer) the rig with what was observed, and errors (n,) deg."""
+    """Results of one eye model: rows; by (protocol, observer) the rig with its observations, and errors (n,) deg."""
 
     eye_model: str
     rows: list[Row] = field(default_factory=list)
@@ -44,7 +44,7 @@ class HeadMountedPart:
 
 
 def scene(eye: str) -> Scene:
-    """The shipped scene with more directions: 5 x 5 over the range of its own 3 x 3."""
+    """Make the shipped scene with more directions: 5 x 5 over the range of its own 3 x 3."""
     loaded = load_scene(SCENE, eye=eye)
     data = loaded.spec.to_mapping()
     data["poses"] = [{"azimuth_deg": a, "elevation_deg": e} for e in ELEVATIONS_DEG for a in AZIMUTHS_DEG]
@@ -52,13 +52,13 @@ def scene(eye: str) -> Scene:
 
 
 def calibration_rows() -> Bools:
-    """Which of the 25 directions are the shipped scene's nine."""
+    """Whether each of the 25 directions is one of the shipped scene's nine."""
     a, e = AZIMUTHS_DEG[::2], ELEVATIONS_DEG[::2]
     return np.array([x in a and y in e for y in ELEVATIONS_DEG for x in AZIMUTHS_DEG])
 
 
 def head_mounted_part(eye: str, observings: Sequence[Observing]) -> HeadMountedPart:
-    """One eye model seen by the given observers."""
+    """Compute the results of one eye model with the given observers."""
     own = scene(eye)
     out = HeadMountedPart(eye)
     learnt = calibration_rows()
@@ -85,7 +85,7 @@ def directions_deg() -> Floats:
 
 
 def feature(seen: Observations, name: str) -> Floats:
-    """The pupil's centre (n, 2) px, or its vector from the mean of all lights' glints; NaN where one is missing."""
+    """Pupil centre (n, 2) px, or its vector from the mean of all lights' glints; NaN where one is missing."""
     centre = np.where(seen.pupil.ok[:, None], seen.pupil.centre_px, np.nan)
     if name == "pupil centre":
         return np.asarray(centre)
@@ -121,7 +121,7 @@ def _unit(angles_deg: Floats) -> Floats:
 
 
 def findings(features: Sequence[FeatureDifference], gaze: Sequence[GazeDifference]) -> list[Finding]:
-    """What images do to features and directions, as values; there is no published claim to hold them against."""
+    """Effects of images on features and directions as values; there is no published claim to compare them with."""
     out = []
     for f in features:
         if f.feature in ("pupil centre", ALL_GLINTS):
@@ -137,7 +137,7 @@ def findings(features: Sequence[FeatureDifference], gaze: Sequence[GazeDifferenc
 
 
 def more() -> dict[str, Any]:
-    """What the summary holds beside its rows."""
+    """Content of the summary besides its rows."""
     return {
         "scene": SCENE,
         "directions_deg": {"azimuth": list(AZIMUTHS_DEG), "elevation": list(ELEVATIONS_DEG)},

@@ -1,4 +1,4 @@
-"""The values of the report of the observers on the head-mounted rig."""
+"""Values for the report of the observers on the head-mounted rig."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .results import Finding
 def page(
     parts: Sequence[HeadMountedPart], found: Sequence[Finding], apart: Apart, made_of: Sequence[Budget] = ()
 ) -> Report:
-    """The report."""
+    """Make the report."""
     values: Values = {
         "reach": {"azimuth_deg": f"{max(h.AZIMUTHS_DEG):g}", "elevation_deg": f"{max(h.ELEVATIONS_DEG):g}"},
         "centres": _centres(apart[0]),

@@ -1,10 +1,10 @@
-"""A study's images: one dataset run, in which a subject is an eye model and a sample one eye at one head position.
+"""A study's images: one dataset run, in which a subject is an eye model and a sample is one eye at one head position.
 
-A camera that the eye leaves is turned about its nodal point to face it, in a sample of its own. Everything in which the
-samples differ is a `sequence` of the dataset's spec, so a study's images are a dataset like any other: made by several
-workers, shard by shard, gone on with after a kill, and valid (`eyerender validate`). Images are found again by what
-they show, the scene and the eye file, so a finished dataset also serves a study that needs a part of it. Rendering is
-what costs: a scene that is wanted with the sensor's noise and without it is rendered once, and exposed twice.
+A camera that the eye leaves is turned about its nodal point to face it, in a sample of its own. Everything that differs
+between samples is a `sequence` of the dataset's spec. A study's images are therefore a dataset like any other: made by
+several workers, shard by shard, resumed after a kill, and valid (`eyerender validate`). Images are identified by what
+they show (the scene and the eye file), so a finished dataset also serves a study that needs a part of it. Rendering is
+the expensive step: a scene that is needed with the sensor's noise and without it is rendered once and exposed twice.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from ..progress import Progress, Say
 from ..scene import Scene
 from ..scenespec import SceneSpec
 
-_SHARD_IMAGES = 27  # two or three seconds of work: what a kill costs at most
-_PATIENCE_S = 60.0  # an image, before a worker that says nothing is taken for dead
+_SHARD_IMAGES = 27  # two or three seconds of work, the largest loss by a kill
+_PATIENCE_S = 60.0  # per image, after which a silent worker counts as dead
 
 
 @dataclass(frozen=True, slots=True)
 class ImageSettings:
-    """How images are made: the dataset's folder, samples per pixel (None: the scene's), and where to render."""
+    """Settings of the images: the dataset's folder, samples per pixel (None: the scene's), and where to render."""
 
     folder: Path
     spp: int | None = None
@@ -48,7 +48,7 @@ class ImageSettings:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """A scene whose images make one sample, and which observations (n,) of the study's own scene they are."""
+    """A scene whose images form one sample, and the rows (n,) of the study's own scene that they show."""
 
     scene: Scene
     rows: Ints
@@ -56,22 +56,26 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class StudyImages:
-    """The images of a finished dataset, in frame order, by a digest of what they show."""
+    """Images of a finished dataset, in frame order, by a digest of what they show."""
 
     entries: Mapping[str, tuple[ImageEntry, ...]]
     spp: int | None = None
 
     def of(self, scene: Scene) -> tuple[ImageEntry, ...]:
-        """The images of a shot's scene, in frame order; none where they were not made."""
+        """Images of a shot's scene, in frame order; empty where they were not made."""
         return self.entries.get(_digest(scene), ())
 
     def holds(self, scene: Scene) -> bool:
-        """Whether every image of a shot's scene is there."""
+        """Whether every image of a shot's scene exists."""
         found = self.of(scene)
         return len(found) == len(scene.index()) and all(entry.path.is_file() for entry in found)
 
     def observe(self, scene: Scene) -> Observations:
-        """The features of a shot's images; raises `InputError` where they are not there."""
+        """Features of a shot's images.
+
+        Raises:
+            InputError: they do not exist.
+        """
         from ..imageobserver import ImageObserver
 
         if not self.holds(scene):
@@ -80,7 +84,7 @@ class StudyImages:
 
 
 def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[Shot]:
-    """One shot an eye; with `facing` one an eye and head position, the cameras turned to the eye."""
+    """One shot per eye; with `facing` one per eye and head position, the cameras turned to the eye."""
     data = (scene.spec if spp is None else scene.spec.with_spp(spp)).to_mapping()
     data["sensor"]["noise"] = noise
     index, out = scene.index(), []
@@ -98,7 +102,7 @@ def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = 
 
 
 def facing_scene(scene: Scene, head_mm: tuple[float, float, float], side: str) -> Scene:
-    """The scene of one head position and one eye, with every camera turned about its nodal point to face that eye."""
+    """Scene of one head position and one eye, with every camera turned about its nodal point to face that eye."""
     data = scene.spec.to_mapping()
     apex = scene.eye_position_mm(side) + np.array(head_mm)
     data["subject"]["eyes"] = [side]
@@ -114,9 +118,9 @@ def facing_scene(scene: Scene, head_mm: tuple[float, float, float], side: str) -
 
 
 def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) -> StudyImages:
-    """The images of all shots' scenes, from the folder's dataset; what is missing of it is made.
+    """Get the images of all shots' scenes from the folder's dataset; missing ones are made.
 
-    The folder is the study's own: a dataset of other settings or of another version of the package is replaced.
+    The folder belongs to the study: a dataset of other settings or of another version of the package is replaced.
 
     Raises:
         BackendError: there is nothing to render with.
@@ -147,9 +151,9 @@ def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) ->
 
 
 def dataset_spec(study: str, scenes: Sequence[Scene]) -> Any:
-    """The spec of a dataset of scenes, the same ones for each eye model: a grid of models, a sequence of scenes.
+    """Spec of a dataset of scenes, the same ones for each eye model: a grid of models, a sequence of scenes.
 
-    A scene without noise that is also wanted with noise is no sample of its own: its images stand beside the others.
+    A scene without noise that is also needed with noise is no sample of its own; its images are stored with the others.
     """
     from ..dataset.spec import DatasetSpec
 
@@ -185,7 +189,7 @@ def dataset_spec(study: str, scenes: Sequence[Scene]) -> Any:
 
 
 def in_sequence(values: Sequence[Any]) -> Any:
-    """A template that gives the values one after the other: plain where they agree, else a `sequence`, leaf by leaf."""
+    """Template that yields the values in order: plain where they agree, else a `sequence`, leaf by leaf."""
     first = values[0]
     if all(json.dumps(v) == json.dumps(first) for v in values):
         return first
@@ -197,7 +201,7 @@ def in_sequence(values: Sequence[Any]) -> Any:
 
 
 def read_images(folder: Path) -> StudyImages | None:
-    """The images of a finished dataset that this version made; None where there is none."""
+    """Images of a finished dataset that this version made; None where there is none."""
     from ..dataset.shard import run_versions
 
     try:
@@ -207,14 +211,14 @@ def read_images(folder: Path) -> StudyImages | None:
         lines = JsonLines.index(folder / METADATA)
         for line in lines.read(range(len(lines))):
             eye, frame = line["parameters"]["eye_json"], line["records"][0]["frame"]
-            # Only what extraction reads is kept: a line's labels take many times as much memory.
+            # Only the keys that extraction reads are kept; a line's labels take many times as much memory.
             kept = {key: line[key] for key in ("window_px", "bit_depth")} | {"records": [{}]}
             for scene, name in _exposures(line):
                 entry = ImageEntry(folder, {"file_name": name, **kept})
                 found.setdefault(_digest_of(scene, eye), []).append((frame, entry))
     except (InputError, ValueError, KeyError, TypeError, IndexError):
         return None
-    # A dataset's lines need not stand in the order of its samples.
+    # A dataset's lines need not be in the order of its samples.
     in_order = {key: sorted(those, key=lambda pair: pair[0]) for key, those in found.items()}
     return StudyImages({key: tuple(entry for _, entry in those) for key, those in in_order.items()})
 
@@ -233,13 +237,13 @@ def _begun(folder: Path, plan: Any) -> bool:
 
 
 def without_noise(scene: Scene) -> Scene:
-    """The scene with a sensor that has no noise."""
+    """Replace the sensor of a scene by one without noise."""
     sensor = scene.spec.sensor.model_copy(update={"noise": False})
     return replace(scene, spec=scene.spec.model_copy(update={"sensor": sensor}))
 
 
 def _exposures(line: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The scenes, as JSON, that a line of metadata has an image of, each with the image's name."""
+    """Scenes, as JSON, of which a line of metadata has an image, each with the image's name."""
     scene = line["parameters"]["scene_json"]
     out = [(scene, line["file_name"])]
     if line.get("noiseless_file_name"):
@@ -250,7 +254,7 @@ def _exposures(line: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _digest(scene: Scene) -> str:
-    """A digest of what a scene's images show, as a dataset's lines of metadata tell it."""
+    """Digest of what a scene's images show, as in a dataset's lines of metadata."""
     eye = {key: value for key, value in scene.eye_spec.to_mapping().items() if key != "sources"}
     return _digest_of(json.dumps(scene.spec.to_mapping(), sort_keys=True), json.dumps(eye, sort_keys=True))
 

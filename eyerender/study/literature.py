@@ -1,4 +1,4 @@
-"""Published numbers: what the experiments measured and what the comparative study of eye models reports.
+"""Published numbers: the measurements of the experiments and the results of the comparative study of eye models.
 
 "The paper" is the comparative study (ACM Transactions on Applied Perception 22(1), 2025, doi 10.1145/3703008); [28] is
 Guestrin & Eizenman, IEEE TBME 53(6), 2006, and [29] Blignaut, Journal of Eye Movement Research 7(2), 2014.
@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import Floats
 
 MODELS: Final = ("E1", "E2", "E3", "E4", "E5")
-# What the authors' software made of E5.
+# Variants of E5 as the authors' software implemented them.
 VARIANTS: Final = ("E5-published", "E5-published-stop")
 SPHERICAL: Final = ("E1", "E3")
 CONIC: Final = ("E2", "E4")
@@ -22,9 +22,9 @@ CONIC: Final = ("E2", "E4")
 # [28]: mean errors of four participants on the screen (mm) at the central and at the other head positions, at 650 mm.
 GUESTRIN_MM: Final = MappingProxyType({"H1": (2.93, 4.88, 4.93, 4.68), "H2": (4.25, 5.33, 5.74, 8.12)})
 GUESTRIN_DISTANCE_MM: Final = 650.0
-# [28] as the paper quotes it: mean and standard deviation (deg).
+# The paper quotes these values of [28]: mean and standard deviation (deg).
 GUESTRIN_QUOTED: Final = MappingProxyType({"H1": (0.38, 0.08), "H2": (0.52, 0.14)})
-# The paper's simulated means (deg), H1 and H2; of E5 it says that both exceed 11.
+# The paper's simulated means (deg), H1 and H2. For E5 it only states that both exceed 11.
 PAPER_GUESTRIN: Final = MappingProxyType(
     {"E1": (0.16, 0.16), "E2": (0.41, 0.42), "E3": (0.16, 0.17), "E4": (0.43, 0.44)}
 )
@@ -32,7 +32,7 @@ PAPER_GUESTRIN_E5: Final = 11.0
 
 CALIBRATION_SETS: Final = MappingProxyType(
     {
-        # Targets counted from 1: 9 * column + row + 1, columns from y = +247.5 mm to -247.5 mm, rows from the top.
+        # Targets are counted from 1: 9 * column + row + 1, columns from y = +247.5 mm to -247.5 mm, rows from the top.
         "C5": (1, 9, 68, 127, 135),
         "C9": (1, 5, 9, 64, 68, 72, 127, 131, 135),
         "C14": (3, 9, 19, 25, 39, 45, 64, 70, 93, 99, 109, 115, 129, 135),
@@ -59,16 +59,16 @@ BLIGNAUT_DEG: Final = MappingProxyType(
         "R12": (8.74, 5.53, 0.70, 0.67, 0.62, 0.54),
     }
 )
-# The paper's Table 5: the function that it says was best in [29].
+# The paper's Table 5: the function that it names as the best in [29].
 PAPER_BEST: Final = MappingProxyType({"C5": "R2", "C9": "R5", "C14": "R8", "C18": "R8", "C23": "R8", "C135": "R8"})
 
 
 def guestrin_deg(head: str) -> Floats:
-    """The four participants' errors of [28] as angles at 650 mm, (4,) deg."""
+    """Errors of the four participants of [28] as angles at 650 mm, (4,) deg."""
     return np.asarray(np.degrees(np.arctan(np.array(GUESTRIN_MM[head]) / GUESTRIN_DISTANCE_MM)))
 
 
 def blignaut_best(calibration: str) -> tuple[str, float]:
-    """The best function of [29] for a calibration set, and its error (deg)."""
+    """Best function of [29] for a calibration set, and its error (deg)."""
     column = list(CALIBRATION_SETS).index(calibration)
     return min(((name, row[column]) for name, row in BLIGNAUT_DEG.items()), key=lambda p: p[1])

@@ -1,4 +1,4 @@
-"""Figures of the observers' comparison: a panel a feature or estimator, a colour a reading and observer."""
+"""Figures of the comparison of observers: one panel per feature or estimator, one colour per reading and observer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..report.style import figure, svg
 
 _STYLES = (("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9"), ("P", "#777777"))
 
-# Colour and hatch of the terms of an error budget: told apart in grey too.
+# Colour and hatch of the terms of an error budget, which are distinct in grey too.
 _TERMS = {
     "algorithm": ("#999999", ""),
     "eye model": ("#0072B2", ""),
@@ -22,7 +22,7 @@ _ADDS = {term: term if term == "algorithm" else f"+ {term}" for term in _TERMS}
 
 
 def distances_figure(panels: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
-    """Median distances (px) by eye model: feature -> series -> eye model -> px."""
+    """Draw median distances (px) by eye model: feature -> series -> eye model -> px."""
     models = list(dict.fromkeys(m for by in panels.values() for values in by.values() for m in values))
     with figure(_width(panels), 3.9, len(panels)) as (fig, axes):
         for k, (ax, (name, by)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
@@ -42,7 +42,7 @@ def distances_figure(panels: Mapping[str, Mapping[str, Mapping[str, float]]]) ->
 
 
 def differences_figure(panels: Mapping[str, Mapping[str, Mapping[str, tuple[float, float, float]]]]) -> str:
-    """Paired differences (deg) with their interval: estimator -> series -> eye model -> (mean, low, high)."""
+    """Draw paired differences (deg) with their interval: estimator -> series -> eye model -> (mean, low, high)."""
     models = list(dict.fromkeys(m for by in panels.values() for values in by.values() for m in values))
     with figure(_width(panels), 3.9, len(panels)) as (fig, axes):
         for k, (ax, (name, by)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
@@ -65,7 +65,7 @@ def differences_figure(panels: Mapping[str, Mapping[str, Mapping[str, tuple[floa
 
 
 def budget_figure(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float, float, float]]]]) -> str:
-    """What an error is made of, step by step: estimator -> eye model -> (term, deg, low, high), then the sum."""
+    """Draw the terms of an error step by step: estimator -> eye model -> (term, deg, low, high), then the sum."""
     terms = list(dict.fromkeys(t for by in panels.values() for steps in by.values() for t, *_ in steps))
     terms.sort(key=list(_TERMS).index)
     columns = min(len(panels), 2)
@@ -103,10 +103,10 @@ def budget_figure(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float, f
 
 
 def _width(panels: Mapping[str, object]) -> float:
-    """Inches."""
+    """Width of a figure, inches."""
     return max(5.4, min(4.4 * len(panels), 13.0))
 
 
 def _shift(i: int, n: int) -> float:
-    """Where the i-th of n series stands beside a tick."""
+    """Offset of the i-th of n series from a tick."""
     return (i - (n - 1) / 2) * min(0.16, 0.7 / n)

@@ -1,4 +1,4 @@
-"""The two observers on a study's own frames: errors of image-derived features, and what they do to the gaze error.
+"""Comparison of the two observers on a study's own frames: errors of image-derived features, and their effect on gaze.
 
 bias = mean(image - analytic),  spread = SD;      in mm at the eye: px times distance over focal length
 paired difference = mean(error from images - error from rays) with its 95 % confidence interval (Student's t)
@@ -22,7 +22,7 @@ ALL_GLINTS = "all glints"
 
 @dataclass(frozen=True, slots=True)
 class FeatureDifference:
-    """Image-derived minus analytic of one kind of feature, in x and y px, and in mm at the eye."""
+    """Difference, image-derived minus analytic, of one kind of feature, in x and y px, and in mm at the eye."""
 
     protocol: str
     observer: str
@@ -39,7 +39,7 @@ class FeatureDifference:
     sd_mm: float | None
 
     def to_mapping(self) -> dict[str, Any]:
-        """For JSON."""
+        """Convert to a mapping for JSON."""
         return asdict(self)
 
 
@@ -59,7 +59,7 @@ class GazeDifference:
     high_deg: float
 
     def to_mapping(self) -> dict[str, Any]:
-        """For JSON."""
+        """Convert to a mapping for JSON."""
         return asdict(self)
 
 
@@ -73,7 +73,7 @@ def features(
     mm_per_px = np.array(
         [1.0 / rig.cameras[max(int(c), 0)].scale_at(p) for c, p in zip(index.camera, place, strict=True)]
     )
-    # What is not in the image of the study's camera was seen by the same camera, turned: it counts all the same.
+    # Features outside the image of the study's camera were seen by the same camera, turned. They count too.
     moved = ~truth.pupil.in_image[:, None]
     centre = np.where(moved, found.pupil.centre_px - truth.pupil.centre_px, errors.centre_px)
     axes = np.where(moved, found.pupil.semi_axes_px - truth.pupil.semi_axes_px, errors.semi_axes_px)
@@ -95,7 +95,7 @@ def features(
 def gaze(
     analytic_deg: Floats, image_deg: Floats, protocol: str, observer: str, eye_model: str, estimator: str
 ) -> GazeDifference | None:
-    """The paired difference over the frames that both observers have an estimate of; None for fewer than two."""
+    """Paired difference over the frames with estimates by both observers; None for fewer than two."""
     both = np.isfinite(analytic_deg) & np.isfinite(image_deg)
     n = int(both.sum())
     if n < 2:

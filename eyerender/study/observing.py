@@ -1,12 +1,12 @@
-"""Observing a study's scenes: by ray optics, or in images, which are a dataset's (see `images`).
+"""Observation of a study's scenes: by ray optics, or in the images of a dataset (see `images`).
 
-A camera that does not see an eye is turned about its nodal point until it faces it. That changes no ray: the features
-it gives are brought back to the study's own camera along their rays,
+A camera that does not see an eye is turned about its nodal point until it faces it. That changes no ray. Its features
+are transferred to the study's own camera along their rays,
 
     x_cam = R R_turned^T ray,    pixel = K x_cam / z
 
-so that estimators and rig stay as they are. An ellipse is carried by its outline, for its centre is not the image of a
-centre: through a camera without distortion it becomes another ellipse exactly.
+so that estimators and rig do not change. An ellipse is transferred by its outline, because its centre is not the image
+of a centre. For a camera without distortion it becomes another ellipse exactly.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ ObserverKind = Literal["analytic", "image", "image-noiseless"]
 
 @dataclass(frozen=True, slots=True)
 class Observing:
-    """One of the observers, ready for a study's scenes: ray optics, or images with the sensor's noise or without it.
+    """One of the observers for a study's scenes: ray optics, or images with the sensor's noise or without it.
 
-    Images are needed for the image observers alone.
+    Only the image observers need images.
     """
 
     kind: ObserverKind = "analytic"
     images: StudyImages | None = None
 
     def observe(self, scene: Scene, *, facing: bool = False) -> Observations:
-        """Every (frame, eye) of a scene; with `facing` the cameras are turned to the eyes.
+        """Observe every (frame, eye) of a scene; with `facing` the cameras are turned to the eyes.
 
         Raises:
-            InputError: a target that no pose of an eye fixates, or images that are not there.
+            InputError: no pose of an eye fixates a target, or images do not exist.
         """
         if self.kind == "analytic":
             return trace(scene)
@@ -59,12 +59,12 @@ class Observing:
         return concatenate(parts).take(np.argsort(np.concatenate(order)))
 
     def shots(self, scene: Scene, *, facing: bool = False, spp: int | None = None) -> list[Shot]:
-        """The shots that this observer needs of a scene; none for ray optics."""
+        """Shots that this observer needs of a scene; none for ray optics."""
         return [] if self.kind == "analytic" else shots(scene, noise=self.kind == "image", facing=facing, spp=spp)
 
 
 def moved(observations: Observations, seen_by: PinholeCamera, told: PinholeCamera) -> Observations:
-    """Pupil ellipses and glints as another camera with the same nodal point has them; covariances are left out."""
+    """Transfer pupil ellipses and glints to another camera with the same nodal point; covariances are left out."""
 
     def pixels(places: Floats) -> Floats:
         cam = seen_by.rays(places) @ told.R.T
@@ -98,5 +98,5 @@ def moved(observations: Observations, seen_by: PinholeCamera, told: PinholeCamer
 
 
 def with_index_of(observations: Observations, scene: Scene, rows: Ints) -> Observations:
-    """The observations as rows of a scene's own index."""
+    """Make observations rows of a scene's own index."""
     return replace(observations, index=taken(scene.index(), rows))

@@ -1,4 +1,4 @@
-"""What the reports of several studies show: the values of the sections in `templates/sections.html.j2`."""
+"""Values of the sections that several studies' reports share, in `templates/sections.html.j2`."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ Values = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The template of a study's report and its values."""
+    """Template of a study's report and its values."""
 
     template: str
     values: Values
 
     def write(self, path: Path) -> None:
-        """Write one self-contained HTML file, complete or not at all."""
+        """Write one self-contained HTML file, completely or not at all."""
         write_template(path, self.template, self.values, package="eyerender.study")
 
 
 def overview(cells: Mapping[tuple[str, str], Mapping[str, str]]) -> Values:
-    """What a page says first, by (protocol, observer) and eye model: a card each, of more than four a table."""
+    """First values of a page, by (protocol, observer) and eye model: cards, or a table for more than four."""
     models = list(dict.fromkeys(m for by_model in cells.values() for m in by_model))
     if len(cells) <= 4:
         cards = [
@@ -46,7 +46,7 @@ def overview(cells: Mapping[tuple[str, str], Mapping[str, str]]) -> Values:
 
 
 def budget_values(made_of: Sequence[Budget], shown: Sequence[str]) -> Values | None:
-    """What the gaze error is made of; `shown` names the estimators drawn. None where there is one term only."""
+    """Composition of the gaze error; `shown` names the estimators drawn. None where there is only one term."""
     if not any(len(b.terms) > 1 for b in made_of):
         return None
     protocols = list(dict.fromkeys(b.protocol for b in made_of))
@@ -76,7 +76,7 @@ def budget_values(made_of: Sequence[Budget], shown: Sequence[str]) -> Values | N
 
 
 def _bar(term: Term) -> tuple[str, float, float, float]:
-    """Name, height and ends of the whisker, which has no length for what is no difference."""
+    """Name, height and ends of the whisker, which has no length for a term that is not a difference."""
     low, high = term.low_deg, term.high_deg
     return term.name, term.deg, term.deg if low is None else low, term.deg if high is None else high
 
@@ -90,7 +90,7 @@ def _told(term: Term | None) -> str:
 
 
 def _in_words(name: str, made_of: Sequence[Budget], terms: Sequence[str]) -> Values:
-    """One estimator: its own error, and the ranges of the terms over the eye models."""
+    """Summary of one estimator: its own error, and the ranges of the terms over the eye models."""
     ranges = []
     for term in terms[1:]:
         values = [t.deg for b in made_of if (t := b.term(term)) is not None]
@@ -102,7 +102,7 @@ def _in_words(name: str, made_of: Sequence[Budget], terms: Sequence[str]) -> Val
 
 
 def observers_values(apart: Apart, shown: Sequence[str] = ()) -> Values | None:
-    """How the observers differ; None where only one has seen. `shown` names the estimators drawn."""
+    """Differences of the observers; None where there is only one. `shown` names the estimators drawn."""
     features, gaze = apart
     if not features:
         return None
@@ -118,7 +118,7 @@ def observers_values(apart: Apart, shown: Sequence[str] = ()) -> Values | None:
 def _distances(features: Sequence[FeatureDifference]) -> dict[str, dict[str, dict[str, float]]]:
     """Median distances (px): feature -> series -> eye model."""
     series = list(dict.fromkeys((f.protocol, f.observer) for f in features))
-    # One light's glint stands for itself; of several lights the glints are drawn together.
+    # The glint of a single light is drawn itself; those of several lights are drawn together.
     drawn = list(dict.fromkeys(f.feature for f in features))
     if ALL_GLINTS in drawn:
         drawn = [name for name in drawn if not name.startswith("glint of light")]
@@ -179,7 +179,7 @@ def _micrometres(value: float | None) -> str:
 
 
 def findings_values(found: Sequence[Finding]) -> Values:
-    """Every finding with its details, and a row a statement with a column an observer (`together`)."""
+    """Every finding with its details, and one row per statement with one column per observer (`together`)."""
     told = {True: "true", False: "false", None: ""}
     rows = [
         (
@@ -203,7 +203,7 @@ def findings_values(found: Sequence[Finding]) -> Values:
 def waterfall_values(
     steps: Sequence[WaterfallStep], departures: Sequence[Departure], measures: Sequence[str]
 ) -> Values | None:
-    """From published to corrected; None where only one protocol was run."""
+    """Steps from published to corrected; None where only one protocol was run."""
     if not steps:
         return None
     models = list(dict.fromkeys(s.eye_model for s in steps))
@@ -229,7 +229,7 @@ def waterfall_values(
 
 
 def errata_values(departures: Sequence[Departure], faults: Sequence[Erratum]) -> Values:
-    """Departures of the software, misprints of the paper."""
+    """Departures of the software, and misprints of the paper."""
     return {
         "departures": [(d.title, d.paper, d.software, d.corrected) for d in departures],
         "misprints": [(e.where, e.printed, e.used, e.effect) for e in faults],
@@ -237,5 +237,5 @@ def errata_values(departures: Sequence[Departure], faults: Sequence[Erratum]) ->
 
 
 def number(value: float | None, decimals: int = 4) -> str:
-    """A number of a table; a dash for none."""
+    """Format a number of a table; a dash for none."""
     return "-" if value is None or not np.isfinite(value) else f"{value:.{decimals}f}"

@@ -1,4 +1,4 @@
-"""One eye model through a replication: every protocol and variant, the waterfall, the restarts, the misprints."""
+"""Replication with one eye model: every protocol and variant, the waterfall, the restarts, the misprints."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from .results import Row, WaterfallStep
 
 @dataclass(slots=True)
 class GuestrinPart:
-    """What one eye model gave: rows, calibrations with restarts; the others by (protocol, observer).
+    """Results of one eye model: rows, calibrations with restarts; the others by (protocol, observer).
 
-    `seen` is the rig and what was observed, `errors` the errors (n,) by name of the estimator.
+    `seen` is the rig and its observations, `errors` the errors (n,) by name of the estimator.
     """
 
     eye_model: str
@@ -40,9 +40,9 @@ class GuestrinPart:
 
 @dataclass(slots=True)
 class BlignautPart:
-    """What one eye model gave: rows, outcomes and feature clouds by (protocol, observer), the waterfall.
+    """Results of one eye model: rows, outcomes and feature clouds by (protocol, observer), the waterfall.
 
-    `seen` is the rig and what was observed, `errors` the errors (f,) by name of the estimator.
+    `seen` is the rig and its observations, `errors` the errors (f,) by name of the estimator.
     """
 
     eye_model: str
@@ -71,7 +71,7 @@ class _Scenes:
 
 
 def departures_of(module: Any, protocol: str) -> frozenset[str]:
-    """The departures of a protocol by name."""
+    """Departures of a protocol, given by name."""
     return frozenset(module.PUBLISHED if protocol == "published" else module.CORRECTED)
 
 
@@ -81,7 +81,7 @@ def facing(module: Any) -> bool:
 
 
 def scenes_of(module: Any, eyes: Sequence[str], protocols: Sequence[str]) -> list[Scene]:
-    """The scenes that a study observes in images."""
+    """Scenes that a study observes in images."""
     keys = dict.fromkeys(module.scene_key(departures_of(module, protocol)) for protocol in protocols)
     return [module.scene(eye, key) for eye in eyes for key in keys]
 
@@ -151,7 +151,7 @@ def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> B
 
 
 def _waterfall(eye: str, module: Any, measure: Any) -> list[WaterfallStep]:
-    """From `published` to `corrected`, one departure corrected after the other; and each of them corrected alone."""
+    """Steps from `published` to `corrected`, one departure after the other; and each of them corrected alone."""
     start = measure(module.PUBLISHED)
     steps = [WaterfallStep(eye, "published", start, start)]
     left = set(module.PUBLISHED)
@@ -170,7 +170,7 @@ def _guestrin_means(scenes: _Scenes, departures: Collection[str]) -> dict[str, f
 
 
 def _misprints(eye: str) -> dict[str, dict[str, Any]]:
-    """The corrected protocol with one of Table 4's or the text's misprints put in."""
+    """Results of the corrected protocol with each of the misprints of Table 4 or the text."""
     cases: dict[str, dict[str, Any]] = {
         "camera at x = 315": {"position_mm": [315.0, 0.0, -150.5], "tilt_deg": 13.8},
         "head positions in cm": {

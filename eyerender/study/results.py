@@ -1,4 +1,4 @@
-"""What a study gives: rows of errors and findings, and the files they are written to."""
+"""Results of a study: rows of errors and findings, and their files."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ FINDINGS_SCHEMA = "eyerender/study-findings/1"
 class Row:
     """One mean error; keys that do not apply are None.
 
-    `sd_deg` is over the fixations (n - 1), `missing` counts those without an estimate, `in_image` those whose features
-    lie on the sensor; `reason` says why there is no mean, `solution` how the coefficients were found.
+    `sd_deg` is over the fixations (n - 1). `missing` counts those without an estimate, `in_image` those whose features
+    lie on the sensor. `reason` explains a missing mean, `solution` names how the coefficients were found.
     """
 
     protocol: str
@@ -46,7 +46,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One statement tested on the study's own data; `verdict` is None where it cannot be."""
+    """One statement tested on the study's own data; `verdict` is None where it cannot be tested."""
 
     id: str
     protocol: str
@@ -60,7 +60,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """Where the authors' software departs from the paper's text."""
+    """A difference between the authors' software and the paper's text."""
 
     id: str
     title: str
@@ -71,7 +71,7 @@ class Departure:
 
 @dataclass(frozen=True, slots=True)
 class Erratum:
-    """What a table or the text misprints, what is used instead, and what the misprint does."""
+    """A misprint of a table or the text, the value used instead, and the effect of the misprint."""
 
     where: str
     printed: str
@@ -93,7 +93,7 @@ class WaterfallStep:
 
 
 def mean_row(error_deg: Floats, **keys: Any) -> Row:
-    """A row of the errors (n,) that there are; NaN counts as missing."""
+    """Row for errors (n,); NaN counts as missing."""
     good = error_deg[np.isfinite(error_deg)]
     n = len(good)
     return Row(
@@ -108,7 +108,7 @@ def mean_row(error_deg: Floats, **keys: Any) -> Row:
 def write_results(
     folder: Path, study: str, rows: Sequence[Row], findings: Sequence[Finding], more: dict[str, Any]
 ) -> dict[str, Any]:
-    """Write summary.json, findings.json and the CSV of both; returns the summary."""
+    """Write summary.json, findings.json and the CSV of both, and return the summary."""
     summary = {
         "schema": SUMMARY_SCHEMA,
         "study": study,

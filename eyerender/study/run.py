@@ -128,7 +128,7 @@ def run_study(
 
 
 def _kinds(observer: str, noise: str) -> list[ObserverKind]:
-    """The observers of a run."""
+    """Observers of a run."""
     kinds: list[ObserverKind] = []
     if observer != "image":
         kinds.append("analytic")
@@ -138,7 +138,7 @@ def _kinds(observer: str, noise: str) -> list[ObserverKind]:
 
 
 def _noted(progress: Progress | None) -> Progress | None:
-    """What a dataset run tells, as a study tells it."""
+    """Adapt the progress notes of a dataset run to a study."""
     if progress is None:
         return None
     return lambda done, total, note: progress(done, total, note.replace("samples", "samples of images", 1))
@@ -147,7 +147,7 @@ def _noted(progress: Progress | None) -> Progress | None:
 def _images(
     name: str, eyes: Sequence[str], protocols: Sequence[str], kinds: Sequence[ObserverKind], settings: ImageSettings
 ) -> StudyImages:
-    """The images of every scene of a study, made where they are missing."""
+    """Images of every scene of a study; missing ones are made."""
     module = _MODULES.get(name)
     scenes: list[Scene]
     if module is None:
@@ -159,7 +159,7 @@ def _images(
 
 
 def _observings(name: str, kinds: Sequence[ObserverKind], images: StudyImages | None) -> list[tuple[Observing, ...]]:
-    """The observers of each job: one by one, or all together where they are compared within it."""
+    """Observers of each job: one by one, or all together where a job compares them."""
     every = [Observing(kind, None if kind == "analytic" else images) for kind in kinds]
     return [tuple(every)] if name == "observers" else [(one,) for one in every]
 
@@ -167,7 +167,7 @@ def _observings(name: str, kinds: Sequence[ObserverKind], images: StudyImages | 
 def _models(
     name: str, eyes: Sequence[str], protocols: Sequence[str], observings: Sequence[Observing]
 ) -> list[tuple[str, tuple[str, ...]]]:
-    """Eye models with their protocols; the published variants of E5 stand under their own names, never as E5."""
+    """Eye models with their protocols; the published variants of E5 have their own names, never E5."""
     out = [(eye, tuple(protocols)) for eye in eyes]
     if name == "guestrin2006" and observings[0].kind == "analytic" and "E5" in eyes and "published" in protocols:
         out += [(v, ("published",)) for v in VARIANTS if v not in eyes]
@@ -175,7 +175,7 @@ def _models(
 
 
 def _told(job: tuple[tuple[Observing, ...], str, tuple[str, ...]]) -> str:
-    """What progress says of a job."""
+    """Progress note of a job."""
     return f"{job[1]}, {' and '.join(o.kind for o in job[0])}"
 
 
@@ -191,7 +191,7 @@ def _job(name: str, job: tuple[tuple[Observing, ...], str, tuple[str, ...]]) -> 
 def _collected(
     job: Callable[[Any], Any], items: list[Any], names: Sequence[str], workers: int, progress: Progress | None
 ) -> list[Any]:
-    """The results of a job for each item, in order."""
+    """Results of a job for each item, in order."""
     out = []
     with _mapper(min(workers, len(items))) as mapped:
         for k, part in enumerate(mapped(job, items)):
@@ -203,7 +203,7 @@ def _collected(
 
 @contextmanager
 def _mapper(workers: int) -> Iterator[Callable[..., Any]]:
-    """`map`, or that of a pool of processes; those start afresh, for a fork would take the parent's threads along."""
+    """`map`, or that of a pool of processes; they are spawned, because a fork would copy the parent's threads."""
     if workers <= 1:
         yield map
         return
@@ -213,10 +213,10 @@ def _mapper(workers: int) -> Iterator[Callable[..., Any]]:
 
 @contextmanager
 def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterator[None]:
-    """Mark a folder as this study's while it runs; one that fails before it wrote anything leaves nothing behind.
+    """Mark a folder as this study's while it runs; a run that fails before it wrote anything leaves nothing behind.
 
     Raises:
-        InputError: the folder holds something else, or another writer is at work in it.
+        InputError: the folder holds something else, or another writer uses it.
     """
     try:
         found = read_json(folder / MARKER)

@@ -1,4 +1,4 @@
-"""What the parts of a study give together: rows, findings, the rest of the summary, the report."""
+"""Combination of the parts of a study: rows, findings, the rest of the summary, the report."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Results = tuple[list[Row], list[Finding], dict[str, Any], Report]
 
 
 def guestrin_results(parts: Sequence[GuestrinPart], protocols: Sequence[str]) -> Results:
-    """Of guestrin2006: means tested against the paper's findings and the experiment."""
+    """Results of guestrin2006: means tested against the paper's findings and the experiment."""
     rows = [row for part in parts for row in part.rows]
     found, tests = [], []
     keys = list(dict.fromkeys(key for part in parts for key in part.means))
@@ -58,7 +58,7 @@ def guestrin_results(parts: Sequence[GuestrinPart], protocols: Sequence[str]) ->
 
 
 def blignaut_results(parts: Sequence[BlignautPart], protocols: Sequence[str]) -> Results:
-    """Of blignaut2014: means and feature clouds tested against the paper's findings."""
+    """Results of blignaut2014: means and feature clouds tested against the paper's findings."""
     rows = [row for part in parts for row in part.rows]
     found: list[Finding] = []
     keys = list(dict.fromkeys(key for part in parts for key in part.outcomes))
@@ -81,14 +81,14 @@ def blignaut_results(parts: Sequence[BlignautPart], protocols: Sequence[str]) ->
 
 
 def conditions_results(parts: Sequence[ConditionsPart], protocols: Sequence[str] = ()) -> Results:
-    """Of conditions: values without a published claim."""
+    """Results of conditions: values without a published claim."""
     rows = [row for part in parts for row in part.rows]
     found = conditions_page.findings(parts)
     return rows, found, conditions_page.more(parts), conditions_page.page(parts, found)
 
 
 def observers_results(parts: Sequence[HeadMountedPart], protocols: Sequence[str] = ()) -> Results:
-    """Of observers: what images do to features and directions."""
+    """Results of observers: effects of images on features and directions."""
     apart, made_of = _observers_apart(parts), _budgets(parts)
     found = head_mounted.findings(*apart)
     more = {**head_mounted.more(), **_as_mappings(apart, made_of)}
@@ -101,7 +101,7 @@ def observers_results(parts: Sequence[HeadMountedPart], protocols: Sequence[str]
 
 
 def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart | HeadMountedPart]) -> Apart:
-    """How the observers differ on the frames that both have seen."""
+    """Differences of the observers on the frames that both have seen."""
     features: list[observers_compared.FeatureDifference] = []
     gaze: list[observers_compared.GazeDifference] = []
     seen = {(p.eye_model, *key): (p, key) for p in parts for key in p.seen}
@@ -121,7 +121,7 @@ def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart | HeadMountedPa
 
 
 def _budgets(parts: Sequence[GuestrinPart | BlignautPart | HeadMountedPart]) -> list[Budget]:
-    """What the errors of the eye models are made of; the published variants of E5 are no eyes."""
+    """Error budgets of the eye models; the published variants of E5 are not eyes."""
     return budgets([part for part in parts if part.eye_model not in VARIANTS])
 
 
