@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from .rig.rig import RigGeometry
     from .scene import Scene, load_scene, shipped_scenes
     from .scenespec import SceneSpec
+    from .status import Status
 
 _HOMES = {
     "AnalyticObserver": "analytic.observer",
@@ -55,6 +56,7 @@ _HOMES = {
     "RigGeometry": "rig.rig",
     "Scene": "scene",
     "SceneSpec": "scenespec",
+    "Status": "status",
     "bench_extractors": "benchmark.run",
     "compare": "comparison",
     "compare_folder": "quickstart",
@@ -92,6 +94,7 @@ __all__ = [
     "RigGeometry",
     "Scene",
     "SceneSpec",
+    "Status",
     "__version__",
     "bench_extractors",
     "compare",

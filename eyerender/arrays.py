@@ -7,10 +7,12 @@ equality and the hash that the dataclass machinery cannot (arrays compare elemen
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -45,6 +47,52 @@ class ArrayValue:
 
     def __hash__(self) -> int:
         return hash(tuple(_key(getattr(self, f.name)) for f in dataclasses.fields(self)))  # type: ignore[arg-type]
+
+
+class Columns(ArrayValue):
+    """Mixin for frozen, slotted dataclasses (`eq=False, kw_only=True`) of arrays with common leading axes.
+
+    A field's annotation, one of the names above, gives its dtype and `column` its further axes. Any array-like is
+    taken and copied unless it is read-only. A column that is left out is unknown: NaN, -1, False or None.
+    """
+
+    __slots__ = ()
+
+    LEADING: ClassVar[int] = 1
+    """How many leading axes the columns share."""
+
+    def __post_init__(self) -> None:
+        columns = dataclasses.fields(self)  # type: ignore[arg-type]
+        given = [getattr(self, f.name) for f in columns]
+        leading = next((np.shape(v)[: self.LEADING] for v in given if v is not None), (0,) * self.LEADING)
+        for column, value in zip(columns, given, strict=True):
+            dtype, unknown = _DTYPES[str(column.type)]
+            further = column.metadata.get("axes", ())
+            array = frozen(np.full((*leading, *further), unknown, dtype) if value is None else value, dtype)
+            first, rest = array.shape[: self.LEADING], array.shape[self.LEADING :]
+            fits = first == leading and array.ndim == self.LEADING + len(further)
+            if not fits or any(axis not in (0, size) for axis, size in zip(further, rest, strict=True)):
+                sizes = ", ".join(str(size or "any") for size in (*leading, *further))
+                raise InputError(f"has the shape {array.shape} instead of ({sizes})", path=column.name)
+            object.__setattr__(self, column.name, array)
+
+    def take(self, rows: Any) -> Self:
+        """Some rows (indices, a slice or a mask) of every column."""
+        return dataclasses.replace(self, **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})  # type: ignore[type-var,arg-type]
+
+
+def column(*axes: int) -> Any:
+    """A field of `Columns` that may be left out, with its axes after the leading ones; 0 stands for any length."""
+    return dataclasses.field(default=None, metadata={"axes": axes})
+
+
+_DTYPES: dict[str, tuple[Any, Any]] = {
+    "Floats": (np.float64, np.nan),
+    "Ints": (np.int64, -1),
+    "Bools": (np.bool_, False),
+    "Objects": (np.object_, None),
+    "Statuses": (np.int8, -1),
+}
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import Floats, Ints, Objects, frozen
+from .arrays import Floats, Ints
 from .backends.choose import BackendChoice
 from .capture import EyeImage, render_windows
 from .errors import InputError
@@ -22,7 +22,7 @@ from .eye.spec import EyeSpec
 from .files import parse_json
 from .imagefile import read_image
 from .imagefolder import DATASET, ImageEntry, ImageFolder
-from .observation import MISSING, OK, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
+from .observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
 from .progress import Progress
 from .rig.camera import PinholeCamera
 from .rig.rig import RigLike
@@ -121,7 +121,7 @@ class ImageObserver:
                         f"is {image.shape[1]} x {image.shape[0]} px; the scene's sensor is not", source=str(path)
                     )
                 lights, reasons = _lights(found, np.zeros(2), scene, camera, np.full(3, np.nan))
-            parts.append(_observation(found, lights, reasons, np.zeros(2), _anonymous(k)))
+            parts.append(_observation(found, lights, reasons, np.zeros(2), Index(frame=np.array([k]))))
             if progress is not None:
                 progress(k + 1, len(paths), "")
         return concatenate(parts)
@@ -147,7 +147,7 @@ class ImageObserver:
             )
             found = extract(cut, bit_depth=depth, gamma=self.gamma, settings=settings)
             lights, reasons = _lights(found, corner, scene, camera, eye_mm)
-            parts.append(_observation(found, lights, reasons, corner, _one(index, row)))
+            parts.append(_observation(found, lights, reasons, corner, index.take([row])))
         return concatenate(parts)
 
 
@@ -199,27 +199,6 @@ def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: flo
     return image[y0:y1, x0:x1], corner + np.array([x0, y0])
 
 
-def _one(index: Index, row: int) -> Index:
-    return replace(index, **{f: frozen(a := getattr(index, f)[[row]], a.dtype) for f in Index.__dataclass_fields__})
-
-
-def _anonymous(frame: int) -> Index:
-    """The index of an image of which nothing is known."""
-    unknown = frozen([-1], np.int64)
-    nothing = frozen(np.full((1, 3), np.nan))
-    return Index(
-        frozen([frame], np.int64),
-        unknown,
-        unknown,
-        unknown,
-        unknown,
-        frozen(_texts([None]), object),
-        nothing,
-        nothing,
-        nothing,
-    )
-
-
 def _lights(
     found: Extraction, corner: Floats, scene: Scene, camera: PinholeCamera, eye_mm: Floats
 ) -> tuple[list[int], Sequence[str | None]]:
@@ -238,50 +217,28 @@ def _observation(
     found: Extraction, lights: Sequence[int], reasons: Sequence[str | None], corner: Floats, index: Index
 ) -> Observations:
     """What was extracted from one image as a batch of one; `corner` moves it to full-sensor pixels."""
-    nan = frozen([np.nan])
     pupil, glints = found.pupil, found.glints
-    centre, axes, angle = np.full((1, 2), np.nan), np.full((1, 2), np.nan), np.full(1, np.nan)
-    if pupil.ellipse is not None:
-        centre = np.asarray(pupil.ellipse.centre_px)[None] + corner
-        axes = np.asarray(pupil.ellipse.semi_axes_px, dtype=float)[None]
-        angle = np.array([pupil.ellipse.angle_rad])
-    covariance = np.full((1, 5, 5), np.nan) if pupil.covariance is None else pupil.covariance[None]
-    ok = pupil.ok
     m = len(glints)
-    xy = np.full((1, m, 2), np.nan)
-    spread = np.full((1, m, 2, 2), np.nan)
-    for j, glint in enumerate(glints):
-        xy[0, j] = glint.xy_px + corner
-        if glint.covariance is not None:
-            spread[0, j] = glint.covariance
+    known: dict[str, Any] = {"status": [pupil.status], "reason": [pupil.reason]}
+    if pupil.ellipse is not None:
+        known["centre_px"] = [pupil.ellipse.centre_px + corner]
+        known["semi_axes_px"] = [pupil.ellipse.semi_axes_px]
+        known["angle_rad"] = [pupil.ellipse.angle_rad]
+    if pupil.covariance is not None:
+        known["covariance"] = [pupil.covariance]
+    spreads = [np.full((2, 2), np.nan) if g.covariance is None else g.covariance for g in glints]
+    why = [g.reason or reason for g, reason in zip(glints, reasons, strict=True)]
     # What was measured in an image lies in the image.
-    seen = np.array([[g.ok for g in glints]], dtype=bool).reshape(1, m)
     return Observations(
-        index,
-        PoseTruth(nan, nan, nan, nan),
-        PupilFeatures(
-            frozen([OK if ok else MISSING], object),
-            frozen(_texts([pupil.reason]), object),
-            frozen([ok], bool),
-            frozen(centre),
-            frozen(axes),
-            frozen(angle),
-            frozen(np.full((1, 2), np.nan)),
-            frozen(np.full((1, 0, 2), np.nan)),
-            frozen(covariance),
-        ),
-        GlintFeatures(
-            frozen(np.array(lights, dtype=np.int64).reshape(1, m), np.int64),
-            frozen(_texts([OK if g.ok else MISSING for g in glints]).reshape(1, m), object),
-            frozen(_texts([g.reason or r for g, r in zip(glints, reasons, strict=True)]).reshape(1, m), object),
-            frozen(seen, bool),
-            frozen(xy),
-            frozen(spread),
+        index=index,
+        pose=PoseTruth(azimuth_rad=np.array([np.nan])),
+        pupil=PupilFeatures(**known, in_image=np.array([pupil.ok])),
+        glints=GlintFeatures(
+            status=np.array([g.status for g in glints], np.int8).reshape(1, m),
+            light=np.array(lights, np.int64).reshape(1, m),
+            reason=np.array(why, object).reshape(1, m),
+            in_image=np.array([g.ok for g in glints], bool).reshape(1, m),
+            xy_px=np.array([g.xy_px + corner for g in glints]).reshape(1, m, 2),
+            covariance=np.array(spreads).reshape(1, m, 2, 2),
         ),
     )
-
-
-def _texts(values: Sequence[str | None]) -> Objects:
-    out = np.empty(len(values), dtype=object)
-    out[:] = values
-    return out

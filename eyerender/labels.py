@@ -20,9 +20,10 @@ from .capture import EyeImage, eye_motion
 from .eye.fixation import fixations
 from .eye.model import EyeModel
 from .geometry.ellipse import fit_ellipse_direct
-from .observation import EYES, MISSING, OK, Observations
+from .observation import EYES, Observations
 from .rig.camera import PinholeCamera, Window
 from .scene import Frames, Scene
+from .status import Status
 
 _OUTLINE_POINTS = 60
 _SAG_STEP_MM = 0.05
@@ -230,7 +231,7 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
     ok = bool(pupil.ok[row])
     return {
         # The label needs the whole outline. A pupil of which only arcs are visible is missing here.
-        "status": OK if ok else MISSING,
+        "status": "ok" if ok else "missing",
         "reason": pupil.reason[row] or None,
         "centre_px": pupil.centre_px[row].tolist() if ok else None,
         "semi_axes_px": pupil.semi_axes_px[row].tolist() if ok else None,
@@ -246,13 +247,13 @@ def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeIma
     for k in range(len(scene.rig.lights)):
         xy, _ = glints.of_light(k)
         found = bool(np.isfinite(xy[row]).all())
-        at = (glints.light[row] == k) & (glints.status[row] != "")
+        at = (glints.light[row] == k) & (glints.status[row] != Status.NONE)
         slot = int(at.argmax())
         inside = found and bool(x0 - 0.5 <= xy[row, 0] <= x0 + w - 0.5 and y0 - 0.5 <= xy[row, 1] <= y0 + h - 0.5)
         out.append(
             {
                 "light": k,
-                "status": glints.status[row, slot],
+                "status": Status(glints.status[row, slot]).label,
                 "reason": glints.reason[row, slot] or None,
                 "xy_px": xy[row].tolist() if found else None,
                 "in_window": inside,

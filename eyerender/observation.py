@@ -2,26 +2,27 @@
 
 Both observers report this type and gaze estimators take nothing else. A frame is one exposure of one camera and may
 hold both eyes; an observation belongs to (frame, eye). Where a status is not OK the numbers beside it are NaN in memory
-and null in the record; the reason says why. A pupil of which only arcs are seen has a status of its own, PARTIAL.
+and null in the record; the reason says why. A pupil of which only arcs are seen has a status of its own, PARTIAL. In a
+record a status is a word: "ok", "partial", or "missing" for all others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, NoReturn, TypeVar
+from dataclasses import dataclass, fields, replace
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import ArrayValue, Bools, Floats, Ints, Objects, frozen
+from .arrays import ArrayValue, Bools, Columns, Floats, Ints, Objects, Statuses, column, frozen
 from .errors import InputError
 from .files import shown
+from .status import Status
 
 RECORD = 2
 """The record's version that is written unless another one is asked for; `SCHEMAS` are those that are read."""
 SCHEMAS = {1: "eyerender/record/1", 2: "eyerender/record/2"}
-OK, PARTIAL, MISSING = "ok", "partial", "missing"
 EYES = ("right", "left")
 
 # Boundary points of one pupil (ten a degree) and of all pupils of a batch, which take 25 bytes each.
@@ -32,17 +33,8 @@ MAX_GLINTS = 5_000_000
 _MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
 
 
-T = TypeVar("T", "Index", "PoseTruth", "PupilFeatures", "GlintFeatures")
-
-
-def taken(part: T, rows: Any) -> T:
-    """Some rows (indices, a slice or a mask) of a batch's part."""
-    arrays = {f.name: getattr(part, f.name)[rows] for f in fields(part)}
-    return replace(part, **{name: frozen(array, array.dtype) for name, array in arrays.items()})
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Index(ArrayValue):
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Index(Columns):
     """Which observation is which; all arrays (n,).
 
     `eye` is 0 for the right and 1 for the left eye; `fixation`, `camera`, `head` count from 0 in the scene's order and
@@ -51,32 +43,34 @@ class Index(ArrayValue):
     """
 
     frame: Ints
-    fixation: Ints
-    camera: Ints
-    head: Ints
-    eye: Ints
-    eye_model: Objects
-    target_mm: Floats
-    head_mm: Floats
-    eye_position_mm: Floats
+    fixation: Ints = column()
+    camera: Ints = column()
+    head: Ints = column()
+    eye: Ints = column()
+    eye_model: Objects = column()
+    target_mm: Floats = column(3)
+    head_mm: Floats = column(3)
+    eye_position_mm: Floats = column(3)
 
     def __len__(self) -> int:
         return len(self.frame)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseTruth(ArrayValue):
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PoseTruth(Columns):
     """The eye's pose, arrays (n,) in radians, NaN where unknown; `residual_mm` of the fixation at the fovea."""
 
     azimuth_rad: Floats
-    elevation_rad: Floats
-    torsion_rad: Floats
-    residual_mm: Floats
+    elevation_rad: Floats = column()
+    torsion_rad: Floats = column()
+    residual_mm: Floats = column()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PupilFeatures(ArrayValue):
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PupilFeatures(Columns):
     """The apparent pupil in full-sensor pixels, arrays with a leading axis n.
+
+    `status` (n,) are `Status`; `reason` (n,) says in words why it is not OK, with details where there are any.
 
     `centre_px` (n, 2), `semi_axes_px` (n, 2) with a >= b and `angle_rad` (n,) of a in [0, pi) are the direct
     least-squares ellipse of the boundary; `points_px` (n, k, 2) the boundary itself; `anatomical_centre_px` (n, 2) the
@@ -88,49 +82,45 @@ class PupilFeatures(ArrayValue):
     where they do not determine one; centre, axes and angle above are NaN.
     """
 
-    status: Objects
-    reason: Objects
-    in_image: Bools
-    centre_px: Floats
-    semi_axes_px: Floats
-    angle_rad: Floats
-    anatomical_centre_px: Floats
-    points_px: Floats
-    covariance: Floats
-    arcs_deg: Floats = field(default_factory=lambda: frozen(np.zeros((0, 0, 2))))
-    arc_ellipse: Floats = field(default_factory=lambda: frozen(np.zeros((0, 5))))
-
-    def __post_init__(self) -> None:
-        # Left out, they are not known.
-        if len(self.arcs_deg) != len(self.status):
-            object.__setattr__(self, "arcs_deg", frozen(np.full((len(self.status), 0, 2), np.nan)))
-        if len(self.arc_ellipse) != len(self.status):
-            object.__setattr__(self, "arc_ellipse", frozen(np.full((len(self.status), 5), np.nan)))
+    status: Statuses
+    reason: Objects = column()
+    in_image: Bools = column()
+    centre_px: Floats = column(2)
+    semi_axes_px: Floats = column(2)
+    angle_rad: Floats = column()
+    anatomical_centre_px: Floats = column(2)
+    points_px: Floats = column(0, 2)
+    covariance: Floats = column(5, 5)
+    arcs_deg: Floats = column(0, 2)
+    arc_ellipse: Floats = column(5)
 
     @property
     def ok(self) -> Bools:
         """Where the pupil was found, (n,); the whole of it."""
-        return np.asarray(self.status == OK)
+        return np.asarray(self.status == Status.OK)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GlintFeatures(ArrayValue):
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class GlintFeatures(Columns):
     """Glints in full-sensor pixels, arrays with leading axes (n, m); `light` is -1 where it is not known.
 
-    Rows with fewer than m glints are filled up with status "" (no entry at all).
+    `status` (n, m) are `Status`, with a `reason` in words where it is not OK. Rows with fewer than m glints are filled
+    up with status NONE.
     """
 
-    light: Ints
-    status: Objects
-    reason: Objects
-    in_image: Bools
-    xy_px: Floats
-    covariance: Floats
+    LEADING = 2
+
+    status: Statuses
+    light: Ints = column()
+    reason: Objects = column()
+    in_image: Bools = column()
+    xy_px: Floats = column(2)
+    covariance: Floats = column(2, 2)
 
     @property
     def ok(self) -> Bools:
         """Where a glint was found, (n, m)."""
-        return np.asarray(self.status == OK)
+        return np.asarray(self.status == Status.OK)
 
     def of_light(self, light: int) -> tuple[Floats, Bools]:
         """Place (n, 2) of one light's glint, and where it was found (n,)."""
@@ -143,7 +133,7 @@ class GlintFeatures(ArrayValue):
         return np.where(found[:, None], xy, np.nan), found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Observations(ArrayValue):
     """A batch of observations, in frame order and within a frame right eye first."""
 
@@ -157,8 +147,12 @@ class Observations(ArrayValue):
 
     def take(self, rows: Any) -> Observations:
         """The observations of some rows (indices, a slice or a mask)."""
-        index, pose = taken(self.index, rows), taken(self.pose, rows)
-        return Observations(index, pose, taken(self.pupil, rows), taken(self.glints, rows))
+        return Observations(
+            index=self.index.take(rows),
+            pose=self.pose.take(rows),
+            pupil=self.pupil.take(rows),
+            glints=self.glints.take(rows),
+        )
 
     def with_targets(self, target_mm: ArrayLike) -> Observations:
         """The same observations of other targets: (n, 3) or (3,) mm in the world, NaN where there is none."""
@@ -175,7 +169,9 @@ class Observations(ArrayValue):
 
     def _record(self, i: int, version: int) -> dict[str, Any]:
         at, pose, pupil, glints = self.index, self.pose, self.pupil, self.glints
-        status = MISSING if version == 1 and pupil.status[i] == PARTIAL else pupil.status[i]
+        status = Status(pupil.status[i])
+        if version == 1 and status == Status.PARTIAL:
+            status = Status.NOT_FOUND
         return {
             "schema": SCHEMAS[version],
             "frame": int(at.frame[i]),
@@ -193,9 +189,9 @@ class Observations(ArrayValue):
                 "residual_mm": _numbers(pose.residual_mm[i]),
             },
             "pupil": {
-                "status": status,
+                "status": status.label,
                 "reason": pupil.reason[i] or None,
-                "in_image": bool(pupil.in_image[i]) if status in (OK, PARTIAL) else None,
+                "in_image": bool(pupil.in_image[i]) if status in (Status.OK, Status.PARTIAL) else None,
                 "centre_px": _numbers(pupil.centre_px[i]),
                 "semi_axes_px": _numbers(pupil.semi_axes_px[i]),
                 "angle_rad": _numbers(pupil.angle_rad[i]),
@@ -207,14 +203,14 @@ class Observations(ArrayValue):
             "glints": [
                 {
                     "light": _count(glints.light[i, j]),
-                    "status": glints.status[i, j],
+                    "status": Status(glints.status[i, j]).label,
                     "reason": glints.reason[i, j] or None,
-                    "in_image": bool(glints.in_image[i, j]) if glints.status[i, j] == OK else None,
+                    "in_image": bool(glints.in_image[i, j]) if glints.status[i, j] == Status.OK else None,
                     "xy_px": _numbers(glints.xy_px[i, j]),
                     "covariance": _numbers(glints.covariance[i, j]),
                 }
                 for j in range(glints.status.shape[1])
-                if glints.status[i, j]
+                if glints.status[i, j] != Status.NONE
             ],
         }
 
@@ -237,42 +233,45 @@ class Observations(ArrayValue):
             if name is not None and name not in EYES:
                 raise InputError("must be 'right' or 'left'", source=source, path=f"records.{k}.eye")
         head = reader.array("head_mm", (3,))
-        status, centre = reader.statuses("pupil.status"), reader.array("pupil.centre_px", (2,))
+        reason = reader.texts("pupil.reason")
+        status, centre = reader.statuses("pupil.status", reason), reader.array("pupil.centre_px", (2,))
         semi_axes = reader.array("pupil.semi_axes_px", (2,))
-        for row in np.flatnonzero((status == OK) & ~(np.isfinite(centre).all(axis=1) & (semi_axes > 0).all(axis=1))):
-            reader.refuse(row, "pupil", f"is {OK!r}, but has no centre or semi-axes")
+        for row in np.flatnonzero(
+            (status == Status.OK) & ~(np.isfinite(centre).all(axis=1) & (semi_axes > 0).all(axis=1))
+        ):
+            reader.refuse(row, "pupil", "is 'ok', but has no centre or semi-axes")
         return cls(
-            Index(
-                reader.counts("frame"),
-                reader.counts("fixation"),
-                reader.counts("camera"),
-                count_heads(head),
-                frozen([EYES.index(e) if e else -1 for e in eye], np.int64),
-                reader.texts("eye_model"),
-                reader.array("target_mm", (3,)),
-                head,
-                reader.array("eye_position_mm", (3,)),
+            index=Index(
+                frame=reader.counts("frame"),
+                fixation=reader.counts("fixation"),
+                camera=reader.counts("camera"),
+                head=count_heads(head),
+                eye=np.array([EYES.index(e) if e else -1 for e in eye], np.int64),
+                eye_model=reader.texts("eye_model"),
+                target_mm=reader.array("target_mm", (3,)),
+                head_mm=head,
+                eye_position_mm=reader.array("eye_position_mm", (3,)),
             ),
-            PoseTruth(
-                frozen(np.radians(reader.array("pose.azimuth_deg", ()))),
-                frozen(np.radians(reader.array("pose.elevation_deg", ()))),
-                frozen(np.radians(reader.array("pose.torsion_deg", ()))),
-                reader.array("pose.residual_mm", ()),
+            pose=PoseTruth(
+                azimuth_rad=np.radians(reader.array("pose.azimuth_deg", ())),
+                elevation_rad=np.radians(reader.array("pose.elevation_deg", ())),
+                torsion_rad=np.radians(reader.array("pose.torsion_deg", ())),
+                residual_mm=reader.array("pose.residual_mm", ()),
             ),
-            PupilFeatures(
-                status,
-                reader.texts("pupil.reason"),
-                reader.flags("pupil.in_image"),
-                centre,
-                semi_axes,
-                reader.array("pupil.angle_rad", ()),
-                reader.array("pupil.anatomical_centre_px", (2,)),
-                reader.points("pupil.points_px"),
-                reader.array("pupil.covariance", (5, 5)),
-                reader.arcs(status),
-                reader.arc_ellipses(),
+            pupil=PupilFeatures(
+                status=status,
+                reason=reason,
+                in_image=reader.flags("pupil.in_image"),
+                centre_px=centre,
+                semi_axes_px=semi_axes,
+                angle_rad=reader.array("pupil.angle_rad", ()),
+                anatomical_centre_px=reader.array("pupil.anatomical_centre_px", (2,)),
+                points_px=reader.points("pupil.points_px"),
+                covariance=reader.array("pupil.covariance", (5, 5)),
+                arcs_deg=reader.arcs(),
+                arc_ellipse=reader.arc_ellipses(),
             ),
-            reader.glints(),
+            glints=reader.glints(),
         )
 
 
@@ -305,12 +304,14 @@ class _Reader:
             out[k] = value
         return frozen(out, object)
 
-    def statuses(self, path: str) -> Objects:
-        out = self.texts(path)
-        for k, value in enumerate(out):
-            if not value:
-                self.refuse(k, path, f"must be {OK!r} or {MISSING!r}")
-        return out
+    def statuses(self, path: str, reasons: Objects) -> Statuses:
+        labels = self.texts(path)
+        for k, (label, record) in enumerate(zip(labels, self.records, strict=True)):
+            if not label:
+                self.refuse(k, path, "must be 'ok' or 'missing'")
+            if record["schema"] != SCHEMAS[1] and label not in ("ok", "partial", "missing"):
+                self.refuse(k, path, "must be 'ok', 'partial' or 'missing'")
+        return frozen(list(map(Status.of_record, labels, reasons)), np.int8)
 
     def flags(self, path: str) -> Bools:
         values = self.values(path)
@@ -365,11 +366,8 @@ class _Reader:
             out[k] = value
         return out
 
-    def arcs(self, status: Objects) -> Floats:
+    def arcs(self) -> Floats:
         values = self.second("pupil.arcs_deg")
-        for k, record in enumerate(self.records):
-            if record["schema"] != SCHEMAS[1] and status[k] not in (OK, PARTIAL, MISSING):
-                self.refuse(k, "pupil.status", f"must be {OK!r}, {PARTIAL!r} or {MISSING!r}")
         for k, value in enumerate(values):
             if not (value is None or (isinstance(value, list) and len(value) <= MAX_BOUNDARY_POINTS)):
                 self.refuse(k, "pupil.arcs_deg", f"must be null or a list of at most {MAX_BOUNDARY_POINTS} arcs")
@@ -404,7 +402,7 @@ class _Reader:
                 self.refuse(k, "glints", f"must be a list of at most {_MAX_ENTRIES}")
         n, m = len(rows), max(map(len, rows), default=0)
         _check_width(n, m, MAX_GLINTS, "glints", self.source)
-        light, status = np.full((n, m), -1, np.int64), np.full((n, m), "", object)
+        light, status = np.full((n, m), -1, np.int64), np.full((n, m), Status.NONE, np.int8)
         reason = np.full((n, m), None, object)
         inside, xy, covariance = np.zeros((n, m), bool), np.full((n, m, 2), np.nan), np.full((n, m, 2, 2), np.nan)
         for k, entries in enumerate(rows):
@@ -413,18 +411,14 @@ class _Reader:
                 if why is not None:
                     self.refuse(k, f"glints.{j}", f"is no glint record: {why}")
                 light[k, j] = -1 if g["light"] is None else g["light"]
-                status[k, j], reason[k, j], inside[k, j] = g["status"], g["reason"], bool(g["in_image"])
+                status[k, j] = Status.of_record(g["status"], g["reason"])
+                reason[k, j], inside[k, j] = g["reason"], bool(g["in_image"])
                 if g["xy_px"] is not None:
                     xy[k, j] = g["xy_px"]
                 if g["covariance"] is not None:
                     covariance[k, j] = g["covariance"]
         return GlintFeatures(
-            frozen(light, np.int64),
-            frozen(status, object),
-            frozen(reason, object),
-            frozen(inside, bool),
-            frozen(xy),
-            frozen(covariance),
+            light=light, status=status, reason=reason, in_image=inside, xy_px=xy, covariance=covariance
         )
 
 
@@ -451,7 +445,7 @@ def _glint_problem(g: Any) -> str | None:
     light, status, reason, in_image = g["light"], g["status"], g["reason"], g["in_image"]
     for fits, message in (
         (light is None or _is_count(light), "light must be a whole number or null"),
-        (isinstance(status, str) and 0 < len(status) <= _MAX_TEXT, f"status must be {OK!r} or {MISSING!r}"),
+        (isinstance(status, str) and 0 < len(status) <= _MAX_TEXT, "status must be 'ok' or 'missing'"),
         (reason is None or (isinstance(reason, str) and len(reason) <= _MAX_TEXT), "reason must be null or a text"),
         (in_image is None or isinstance(in_image, bool), "in_image must be true, false or null"),
     ):
@@ -460,8 +454,8 @@ def _glint_problem(g: Any) -> str | None:
     for key, shape in (("xy_px", (2,)), ("covariance", (2, 2))):
         if g[key] is not None and ((found := _array(g[key])) is None or found.shape != shape):
             return f"{key} must be null or {'x'.join(map(str, shape))} numbers"
-    if g["status"] == OK and g["xy_px"] is None:
-        return f"it is {OK!r}, but has no xy_px"
+    if g["status"] == "ok" and g["xy_px"] is None:
+        return "it is 'ok', but has no xy_px"
     return None
 
 
@@ -515,16 +509,16 @@ def concatenate(parts: Iterable[Observations]) -> Observations:
             limit, what = (MAX_GLINTS, "glints") if name == "glints" else (MAX_POINTS, "boundary points")
             if f.name in ("points_px", "light"):
                 _check_width(sum(map(len, arrays)), width, limit, what)
-            columns[f.name] = frozen(np.concatenate([_widened(a, width) for a in arrays]), arrays[0].dtype)
+            columns[f.name] = np.concatenate([_widened(a, width) for a in arrays])
         return replace(groups[0], **columns)
 
-    return Observations(joined("index"), joined("pose"), joined("pupil"), joined("glints"))
+    return Observations(index=joined("index"), pose=joined("pose"), pupil=joined("pupil"), glints=joined("glints"))
 
 
 def _widened(a: Any, width: int) -> Any:
     if a.ndim < 2 or a.shape[1] == width:
         return a
-    fill = {"f": np.nan, "i": -1, "b": False, "O": ""}[a.dtype.kind]
+    fill = {"f": np.nan, "i": -1, "b": False, "O": None}[a.dtype.kind]  # -1 is Status.NONE as well
     return np.concatenate([a, np.full((len(a), width - a.shape[1], *a.shape[2:]), fill, dtype=a.dtype)], axis=1)
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .arrays import ArrayValue, Floats, frozen
+from .arrays import ArrayValue, Floats
 from .errors import InputError, InputWarning
 from .eye.catalogue import load_eye
 from .eye.fixation import fixations
@@ -22,7 +22,7 @@ from .eye.margin import PupilMargin
 from .eye.model import EyeModel
 from .eye.pose import listing_torsion
 from .eye.spec import EyeSpec
-from .observation import EYES, Index, PoseTruth, taken
+from .observation import EYES, Index, PoseTruth
 from .plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
 from .region.anatomy import Region
 from .rig.camera import Window
@@ -50,7 +50,7 @@ class Frames(ArrayValue):
 
     def take(self, rows: Any) -> Frames:
         """Some of the rows (indices, a slice or a mask)."""
-        return Frames(self.scene, taken(self.index, rows), taken(self.pose, rows))
+        return Frames(self.scene, self.index.take(rows), self.pose.take(rows))
 
     def seen_by(self, rig: RigLike | None) -> Frames:
         """The same eyes before another rig, which has the same number of cameras; None changes nothing.
@@ -230,15 +230,15 @@ class Scene:
         model = np.empty(n, dtype=object)
         model[:] = self.eye_spec.name
         return Index(
-            frozen((head * fixations + fixation) * cameras + camera, np.int64),
-            frozen(fixation, np.int64),
-            frozen(camera, np.int64),
-            frozen(head, np.int64),
-            frozen(eye, np.int64),
-            frozen(model, object),
-            frozen(targets[fixation] if targets is not None else np.full((n, 3), np.nan)),
-            frozen(heads[head]),
-            frozen(np.stack([self.eye_position_mm(EYES[e]) for e in (0, 1)])[eye]),
+            frame=(head * fixations + fixation) * cameras + camera,
+            fixation=fixation,
+            camera=camera,
+            head=head,
+            eye=eye,
+            eye_model=model,
+            target_mm=np.full((n, 3), np.nan) if targets is None else targets[fixation],
+            head_mm=heads[head],
+            eye_position_mm=np.stack([self.eye_position_mm(EYES[e]) for e in (0, 1)])[eye],
         )
 
     def frames(self) -> Frames:
@@ -252,10 +252,13 @@ class Scene:
             return Frames(self, index, self._fixating(index))
         wanted = np.radians([[p.azimuth_deg, p.elevation_deg] for p in self.spec.poses])
         azimuth, elevation = wanted[index.fixation].T
-        torsion = listing_torsion(azimuth, elevation)
-        return Frames(
-            self, index, PoseTruth(frozen(azimuth), frozen(elevation), frozen(torsion), frozen(np.zeros(len(index))))
+        pose = PoseTruth(
+            azimuth_rad=azimuth,
+            elevation_rad=elevation,
+            torsion_rad=listing_torsion(azimuth, elevation),
+            residual_mm=np.zeros(len(index)),
         )
+        return Frames(self, index, pose)
 
     def _fixating(self, index: Index) -> PoseTruth:
         # Cameras see the same pose: solve once for each head position, fixation and eye.
@@ -278,8 +281,12 @@ class Scene:
             )
         back = back.reshape(-1)
         azimuth, elevation = found.poses.azimuth_rad[back], found.poses.elevation_rad[back]
-        torsion = listing_torsion(azimuth, elevation)
-        return PoseTruth(frozen(azimuth), frozen(elevation), frozen(torsion), frozen(found.residual_mm[back]))
+        return PoseTruth(
+            azimuth_rad=azimuth,
+            elevation_rad=elevation,
+            torsion_rad=listing_torsion(azimuth, elevation),
+            residual_mm=found.residual_mm[back],
+        )
 
     def windows(self) -> dict[tuple[int, int, int], Window]:
         """The rendered window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.

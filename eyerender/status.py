@@ -1,7 +1,8 @@
 """Status: what became of a ray, a fixation, a feature or an estimate, with the reason in words.
 
 A computation that can expect to fail says so with a status, never with an exception. A batch holds its statuses as an
-array of int8 (`arrays.Statuses`): `status == Status.OK` selects what was found, `Status(status[i]).reason` reads one.
+array of int8 (`arrays.Statuses`): `status == Status.OK` selects what was found, `Status(status[i])` names one and
+`Status(status[i]).reason` puts it into words. Records hold a word instead, `Status(status[i]).label`.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ from .arrays import Bools, Statuses
 class Status(IntEnum):
     """What became of a ray, of the search for one, of a fixation, of a feature or of an estimate.
 
-    OK alone stands beside usable numbers. `reason` puts the others into words.
+    Only OK stands beside numbers that hold for the whole. NONE marks an entry that is not there: it fills up rows with
+    fewer entries than others.
     """
 
+    NONE = -1
     OK = 0
     # Rays.
     MISSED = 1
@@ -31,17 +34,37 @@ class Status(IntEnum):
     TARGET_TOO_NEAR = 9
     OUT_OF_REACH = 10
     NO_LINE_OF_SIGHT = 11
-    # Features in an image.
-    NOT_FOUND = 12
-    REJECTED = 13
+    # Features.
+    PARTIAL = 12
+    NO_ELLIPSE = 13
+    NOT_FOUND = 14
+    REJECTED = 15
+    # Gaze.
+    NO_ESTIMATE = 16
 
     @property
     def reason(self) -> str | None:
         """The status in words; None where nothing is wrong."""
         return _REASONS.get(self)
 
+    @property
+    def label(self) -> str:
+        """The word for it in a record: "ok", "partial" or "missing"; "" for no entry at all."""
+        return _LABELS.get(self, "missing")
+
+    @classmethod
+    def of_record(cls, label: str, reason: str | None = None) -> Status:
+        """The status that a record's word and reason stand for; NOT_FOUND where the reason is none of those here.
+
+        A reason may be followed by details in parentheses.
+        """
+        if label in _OF_LABEL:
+            return _OF_LABEL[label]
+        return _OF_REASON.get((reason or "").split(" (")[0], cls.NOT_FOUND)
+
 
 _REASONS = {
+    Status.NONE: "no entry",
     Status.MISSED: "the ray misses a surface",
     Status.TOTAL_REFLECTION: "total reflection",
     Status.OUTSIDE_LIMBUS: "outside the limbus",
@@ -53,9 +76,15 @@ _REASONS = {
     Status.TARGET_TOO_NEAR: "the target lies inside the eye",
     Status.OUT_OF_REACH: "the target is out of reach of the eye's rotation",
     Status.NO_LINE_OF_SIGHT: "no line of sight joins the target and the fovea",
+    Status.PARTIAL: "only arcs of the boundary are seen",
+    Status.NO_ELLIPSE: "no ellipse fits the boundary",
     Status.NOT_FOUND: "not found",
     Status.REJECTED: "a reflection, but no glint of the cornea",
+    Status.NO_ESTIMATE: "no estimate of gaze",
 }
+_LABELS = {Status.NONE: "", Status.OK: "ok", Status.PARTIAL: "partial"}
+_OF_LABEL = {label: status for status, label in _LABELS.items()}
+_OF_REASON = {reason: status for status, reason in _REASONS.items() if status.label == "missing"}
 
 
 def mark(status: Statuses, where: Bools, value: Status) -> None:

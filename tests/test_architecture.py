@@ -208,7 +208,7 @@ def test_public_names_are_pinned():
     assert eyerender.__all__ == [
         "AnalyticObserver", "BackendError", "Comparison", "DatasetSpec", "ExtractionSettings", "Extractor",
         "EyeModel", "EyeSpec", "EyerenderError", "ImageFolder", "ImageObserver", "InputError", "Observations",
-        "RigGeometry", "Scene", "SceneSpec", "__version__", "bench_extractors", "compare", "compare_folder",
+        "RigGeometry", "Scene", "SceneSpec", "Status", "__version__", "bench_extractors", "compare", "compare_folder",
         "estimate", "export", "export_scene", "extract", "gaze", "generate", "load_eye", "load_scene", "preview",
         "render_folder", "render_windows", "run_quickstart", "sample", "shipped_scenes", "validate", "write_report",
     ]  # fmt: skip

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import pickle
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from eyerender.arrays import frozen
 from eyerender.errors import InputError
 from eyerender.observation import (
     GlintFeatures,
@@ -18,66 +19,61 @@ from eyerender.observation import (
     PupilFeatures,
     concatenate,
 )
+from eyerender.status import Status
 
 
 def observations(n: int = 4, seed: int = 0, points: int = 6, lights: int = 2) -> Observations:
     """A batch with a missing pupil (row 1), a missing glint (row 2) and an entry that is not there (row 3)."""
     rng = np.random.default_rng(seed)
 
-    def objects(values):
-        out = np.empty(np.shape(values), dtype=object)
-        out[...] = values
-        return frozen(out, object)
-
-    status = np.full(n, "ok", dtype=object)
+    status = np.full(n, Status.OK)
     reason = np.full(n, None, dtype=object)
     centre, axes, angle = rng.uniform(0, 900, (n, 2)), np.sort(rng.uniform(5, 9, (n, 2)))[:, ::-1], rng.uniform(0, 3, n)
     anatomical, boundary, cov = rng.uniform(0, 900, (n, 2)), rng.uniform(0, 900, (n, points, 2)), rng.random((n, 5, 5))
-    status[1], reason[1] = "missing", "coarse search: no dark blob"
+    status[1], reason[1] = Status.NOT_FOUND, "coarse search: no dark blob"
     for a in (centre, axes, angle, anatomical, boundary, cov):
         a[1] = np.nan
-    g_status, g_reason = np.full((n, lights), "ok", dtype=object), np.full((n, lights), None, dtype=object)
+    g_status, g_reason = np.full((n, lights), Status.OK), np.full((n, lights), None, dtype=object)
     xy, g_cov = rng.uniform(0, 900, (n, lights, 2)), rng.random((n, lights, 2, 2))
     light = np.tile(np.arange(lights), (n, 1))
-    g_status[2, 0], g_reason[2, 0], xy[2, 0], g_cov[2, 0] = "missing", "outside the limbus", np.nan, np.nan
-    g_status[3, 1], xy[3, 1], g_cov[3, 1], light[3, 1] = "", np.nan, np.nan, -1
-    inside = g_status == "ok"
+    g_status[2, 0], g_reason[2, 0], xy[2, 0], g_cov[2, 0] = Status.OUTSIDE_LIMBUS, "outside the limbus", np.nan, np.nan
+    g_status[3, 1], xy[3, 1], g_cov[3, 1], light[3, 1] = Status.NONE, np.nan, np.nan, -1
     return Observations(
-        Index(
-            frozen(np.arange(n) // 2, np.int64),
-            frozen(np.arange(n) // 2, np.int64),
-            frozen(np.zeros(n), np.int64),
-            frozen(np.zeros(n), np.int64),
-            frozen(np.arange(n) % 2, np.int64),
-            objects(["E2"] * n),
-            frozen(rng.uniform(-300, 300, (n, 3))),
-            frozen(np.zeros((n, 3))),
-            frozen(np.array([[0, -31.5, 0], [0, 31.5, 0]])[np.arange(n) % 2]),
+        index=Index(
+            frame=np.arange(n) // 2,
+            fixation=np.arange(n) // 2,
+            camera=np.zeros(n, int),
+            head=np.zeros(n, int),
+            eye=np.arange(n) % 2,
+            eye_model=np.array(["E2"] * n, object),
+            target_mm=rng.uniform(-300, 300, (n, 3)),
+            head_mm=np.zeros((n, 3)),
+            eye_position_mm=np.array([[0, -31.5, 0], [0, 31.5, 0]])[np.arange(n) % 2],
         ),
-        PoseTruth(
-            frozen(np.radians(rng.uniform(-20, 20, n))),
-            frozen(np.radians(rng.uniform(-20, 20, n))),
-            frozen(np.radians(rng.uniform(-20, 20, n))),
-            frozen(rng.random(n) * 1e-9),
+        pose=PoseTruth(
+            azimuth_rad=np.radians(rng.uniform(-20, 20, n)),
+            elevation_rad=np.radians(rng.uniform(-20, 20, n)),
+            torsion_rad=np.radians(rng.uniform(-20, 20, n)),
+            residual_mm=rng.random(n) * 1e-9,
         ),
-        PupilFeatures(
-            frozen(status, object),
-            frozen(reason, object),
-            frozen(status == "ok", bool),
-            frozen(centre),
-            frozen(axes),
-            frozen(angle),
-            frozen(anatomical),
-            frozen(boundary),
-            frozen(cov),
+        pupil=PupilFeatures(
+            status=status,
+            reason=reason,
+            in_image=status == Status.OK,
+            centre_px=centre,
+            semi_axes_px=axes,
+            angle_rad=angle,
+            anatomical_centre_px=anatomical,
+            points_px=boundary,
+            covariance=cov,
         ),
-        GlintFeatures(
-            frozen(light, np.int64),
-            frozen(g_status, object),
-            frozen(g_reason, object),
-            frozen(inside, bool),
-            frozen(xy),
-            frozen(g_cov),
+        glints=GlintFeatures(
+            status=g_status,
+            light=light,
+            reason=g_reason,
+            in_image=g_status == Status.OK,
+            xy_px=xy,
+            covariance=g_cov,
         ),
     )
 
@@ -200,3 +196,68 @@ def test_bad_records_are_named(change, words):
     change(records[0])
     with pytest.raises(InputError, match=words):
         Observations.from_records(records)
+
+
+def test_columns_left_out_are_unknown():
+    given: dict[str, Any] = {"status": [Status.OK, Status.NOT_FOUND], "centre_px": [[3, 4], [np.nan, np.nan]]}
+    pupil = PupilFeatures(**given)
+    assert pupil.status.dtype == np.int8
+    assert pupil.ok.tolist() == [True, False]
+    assert pupil.centre_px[0].tolist() == [3.0, 4.0]
+    assert pupil.reason.tolist() == [None, None]
+    assert pupil.in_image.tolist() == [False, False]
+    assert np.isnan(pupil.covariance).all()
+    assert (pupil.covariance.shape, pupil.points_px.shape) == ((2, 5, 5), (2, 0, 2))
+    assert Index(frame=np.array([5, 6])).camera.tolist() == [-1, -1]
+    glints = GlintFeatures(status=np.zeros((2, 3), np.int8))
+    assert (glints.light.shape, glints.xy_px.shape) == ((2, 3), (2, 3, 2))
+
+
+def test_columns_keep_what_nobody_can_write_to():
+    centre = np.zeros((2, 2))
+    pupil = PupilFeatures(status=np.zeros(2, np.int8), centre_px=centre)
+    centre[:] = 1.0
+    assert not pupil.centre_px.any()
+    with pytest.raises(ValueError, match="read-only"):
+        pupil.centre_px[0] = 1.0
+    assert replace(pupil, angle_rad=np.zeros(2)).centre_px is pupil.centre_px
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "error"),
+    [
+        (
+            PupilFeatures,
+            {"status": [0, 0], "centre_px": [[1, 2]]},
+            r"centre_px: has the shape \(1, 2\) instead of \(2, 2\)",
+        ),
+        (
+            PupilFeatures,
+            {"status": [0], "points_px": [[1, 2]]},
+            r"points_px: has the shape .* instead of \(1, any, 2\)",
+        ),
+        (GlintFeatures, {"status": [0, 0]}, r"status: has the shape \(2,\)"),
+        (Index, {"frame": [[0]]}, r"frame: has the shape \(1, 1\) instead of \(1\)"),
+    ],
+)
+def test_columns_of_another_shape_are_refused_by_name(kind, given, error):
+    with pytest.raises(InputError, match=error):
+        kind(**given)
+
+
+def test_a_record_tells_each_status_in_its_word_and_gets_it_back():
+    failures = [s for s in Status if s not in (Status.NONE, Status.OK, Status.PARTIAL)]
+    n = len(failures)
+    reasons = [s.reason for s in failures]
+    batch = replace(
+        observations(n=n),
+        pupil=PupilFeatures(
+            status=np.array(failures), reason=np.array([f"{r} (2 of 3 points)" for r in reasons], object)
+        ),
+        glints=GlintFeatures(status=np.array(failures)[:, None], reason=np.array(reasons, dtype=object)[:, None]),
+    )
+    records = json.loads(json.dumps(list(batch.records())))
+    assert {r["pupil"]["status"] for r in records} == {r["glints"][0]["status"] for r in records} == {"missing"}
+    back = Observations.from_records(records)
+    assert back.pupil.status.tolist() == failures
+    assert back.glints.status[:, 0].tolist() == failures

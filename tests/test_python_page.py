@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import numpy as np
+
 import eyerender as er
 from tests.support.paths import ROOT
 
@@ -24,6 +26,14 @@ def test_every_name_on_the_page_exists():
             found = getattr(found, part)
     for name in re.findall(r"^\| `(\w+)\(", PAGE, re.MULTILINE):
         assert hasattr(er.gaze, name)
+
+
+def test_the_example_of_statuses_runs(capsys):
+    (block,) = [block for block in blocks() if "er.Status" in block]
+    exec(block, {"er": er, "np": np})
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "270 of 270 pupils"
+    assert lines[2:] == ["<Status.OK: 0> None"]
 
 
 def test_the_examples_of_gaze_run(capsys):

@@ -26,9 +26,9 @@ from ..status import Status
 from .rays import glint_exits, pupil_exits
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Features(ArrayValue):
-    """What cameras see of n eyes; pixels are full-sensor, NaN where the status is not 0.
+    """What cameras see of n eyes; pixels are full-sensor, NaN where the status is not OK.
 
     points_px (n, k, 2), point_status (n, k), point_residual_mm (n, k): the pupil's boundary. centre_px (n, 2),
     semi_axes_px (n, 2), angle_rad (n,), ellipse_residual_px (n,): its direct least-squares ellipse and how far (rms)
@@ -53,14 +53,14 @@ class Features(ArrayValue):
 
     @property
     def pupil_status(self) -> Statuses:
-        """The first boundary point's status that is not 0, or 0, (n,)."""
-        first = np.argmax(self.point_status != 0, axis=1)
+        """The first boundary point's status that is not OK, or OK, (n,)."""
+        first = np.argmax(self.point_status != Status.OK, axis=1)
         return np.asarray(self.point_status[np.arange(len(first)), first])
 
     @property
     def seen_in_image(self) -> Bools:
         """Whether all boundary points that are seen lie in the image, and there are some, (n,)."""
-        seen = self.point_status == 0
+        seen = self.point_status == Status.OK
         return np.asarray((self.point_in_image | ~seen).all(axis=1) & seen.any(axis=1))
 
     @property
@@ -128,19 +128,19 @@ def features(
     for array in results:
         array.setflags(write=False)
     return Features(
-        points,
-        point_status,
-        point_residual,
-        ellipse[:, :2],
-        ellipse[:, 2:4],
-        ellipse[:, 4],
-        ellipse[:, 5],
-        anatomical,
-        in_image,
-        glints,
-        glint_status,
-        glint_residual,
-        glint_in_image,
+        points_px=points,
+        point_status=point_status,
+        point_residual_mm=point_residual,
+        centre_px=ellipse[:, :2],
+        semi_axes_px=ellipse[:, 2:4],
+        angle_rad=ellipse[:, 4],
+        ellipse_residual_px=ellipse[:, 5],
+        anatomical_centre_px=anatomical,
+        point_in_image=in_image,
+        glints_px=glints,
+        glint_status=glint_status,
+        glint_residual_mm=glint_residual,
+        glint_in_image=glint_in_image,
     )
 
 
@@ -157,11 +157,6 @@ def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> 
         )
     if not set(purkinje) <= {1, 2, 3, 4} or len(set(purkinje)) != len(purkinje):
         raise InputError("must be different numbers from 1 to 4", path="purkinje")
-
-
-def reason_of(status: int) -> str | None:
-    """A point's status in words; None where nothing is wrong."""
-    return Status(status).reason
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, frozen
+from ..arrays import Bools, Floats
 from ..errors import InputError
 from ..eye.pose import Poses
 from ..geometry.ellipse import fit_ellipse_direct
-from ..observation import EYES, MISSING, OK, PARTIAL, GlintFeatures, Observations, PupilFeatures
+from ..observation import EYES, GlintFeatures, Observations, PupilFeatures
 from ..rig.rig import RigLike
 from ..scene import Frames, Scene
-from .features import Features, features, reason_of
+from ..status import Status
+from .features import Features, features
 
 ARC_POINTS = 6
 ARC_GAP_DEG = 120.0
@@ -69,7 +70,8 @@ class AnalyticObserver:
             boundary_points=self.boundary_points,
             purkinje=(1, *sorted(set(purkinje) - {1})),
         )
-        return Observations(index, pose, pupil_features(seen), glint_features(seen)), seen
+        observed = Observations(index=index, pose=pose, pupil=pupil_features(seen), glints=glint_features(seen))
+        return observed, seen
 
 
 def trace(frames: Frames | Scene, rig: RigLike | None = None, *, boundary_points: int = 30) -> Observations:
@@ -92,15 +94,16 @@ def purkinje_records(observed: Observations, seen: Features, orders: Sequence[in
     index = observed.index
     out = []
     for i, j, p in np.ndindex(seen.glint_status.shape):
-        ok = seen.glint_status[i, j, p] == 0
+        status = Status(int(seen.glint_status[i, j, p]))
+        ok = status == Status.OK
         out.append(
             {
                 "frame": int(index.frame[i]),
                 "eye": EYES[int(index.eye[i])],
                 "light": j,
                 "image": orders[p],
-                "status": OK if ok else MISSING,
-                "reason": None if ok else reason_of(int(seen.glint_status[i, j, p])),
+                "status": status.label,
+                "reason": status.reason,
                 "in_image": bool(seen.glint_in_image[i, j, p]) if ok else None,
                 "xy_px": seen.glints_px[i, j, p].tolist() if ok else None,
             }
@@ -118,17 +121,17 @@ def pupil_features(seen: Features) -> PupilFeatures:
     beyond these by less than one spacing of the points. An ellipse is fitted where there are at least `ARC_POINTS`
     points and no stretch of more than `ARC_GAP_DEG` is hidden.
     """
-    status, found = seen.pupil_status, seen.point_status == 0
-    whole = status == 0
+    status, found = seen.pupil_status, seen.point_status == Status.OK
+    whole = status == Status.OK
     ok = whole & np.isfinite(seen.ellipse_residual_px)
     partial = ~whole & found.any(axis=1)
     count = found.shape[1]
     reasons = np.full(len(seen), None, dtype=object)
     for k in np.flatnonzero(~ok):
         reasons[k] = (
-            "no ellipse fits the boundary"
+            Status.NO_ELLIPSE.reason
             if whole[k]
-            else f"{reason_of(int(status[k]))} ({np.count_nonzero(~found[k])} of {count} boundary points)"
+            else f"{Status(status[k]).reason} ({np.count_nonzero(~found[k])} of {count} boundary points)"
         )
     runs = {row: seen_arcs_deg(found[row]) for row in np.flatnonzero(partial).tolist()}
     arcs = np.full((len(seen), max((len(arc) for arc in runs.values()), default=1), 2), np.nan)
@@ -139,17 +142,16 @@ def pupil_features(seen: Features) -> PupilFeatures:
         ellipses[row] = _arc_ellipse(seen.points_px[row][found[row]], arc)
     inside = np.where(partial, seen.seen_in_image, seen.pupil_in_image & ok)
     return PupilFeatures(
-        frozen(np.select([ok, partial], [OK, PARTIAL], MISSING).astype(object), object),
-        frozen(reasons, object),
-        frozen(inside, bool),
-        _where(ok, seen.centre_px),
-        _where(ok, seen.semi_axes_px),
-        _where(ok, seen.angle_rad),
-        seen.anatomical_centre_px,
-        seen.points_px,
-        frozen(np.full((len(seen), 5, 5), np.nan)),
-        frozen(arcs),
-        frozen(ellipses),
+        status=np.select([ok, partial, whole], [Status.OK, Status.PARTIAL, Status.NO_ELLIPSE], status),
+        reason=reasons,
+        in_image=inside,
+        centre_px=np.where(ok[:, None], seen.centre_px, np.nan),
+        semi_axes_px=np.where(ok[:, None], seen.semi_axes_px, np.nan),
+        angle_rad=np.where(ok, seen.angle_rad, np.nan),
+        anatomical_centre_px=seen.anatomical_centre_px,
+        points_px=seen.points_px,
+        arcs_deg=arcs,
+        arc_ellipse=ellipses,
     )
 
 
@@ -182,22 +184,14 @@ def _arc_ellipse(points_px: Floats, arcs: Sequence[tuple[float, float]]) -> Floa
 
 def glint_features(seen: Features) -> GlintFeatures:
     """The glints (first Purkinje images) of a batch."""
-    status, xy = seen.glint_status[:, :, 0], seen.glints_px[:, :, 0]
-    n, m = status.shape
-    ok = status == 0
-    reasons = np.full((n, m), None, dtype=object)
-    for i, j in np.argwhere(~ok):
-        reasons[i, j] = reason_of(int(status[i, j]))
+    status = seen.glint_status[:, :, 0]
+    reasons = np.full(status.shape, None, dtype=object)
+    for i, j in np.argwhere(status != Status.OK):
+        reasons[i, j] = Status(status[i, j]).reason
     return GlintFeatures(
-        frozen(np.broadcast_to(np.arange(m), (n, m)), np.int64),
-        frozen(np.where(ok, OK, MISSING).astype(object), object),
-        frozen(reasons, object),
-        frozen(seen.glint_in_image[:, :, 0] & ok, bool),
-        frozen(xy),
-        frozen(np.full((n, m, 2, 2), np.nan)),
+        status=status,
+        light=np.broadcast_to(np.arange(status.shape[1]), status.shape),
+        reason=reasons,
+        in_image=seen.glint_in_image[:, :, 0] & (status == Status.OK),
+        xy_px=seen.glints_px[:, :, 0],
     )
-
-
-def _where(ok: Bools, values: Floats) -> Floats:
-    mask = ok.reshape(ok.shape + (1,) * (values.ndim - 1))
-    return frozen(np.where(mask, values, np.nan))

@@ -20,7 +20,7 @@ from ..geometry.ellipse import Ellipse
 from ..imagefile import read_image
 from ..imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ..jsonlines import JsonLines
-from ..observation import OK, Observations
+from ..observation import Observations
 from ..rig.camera import PinholeCamera
 from ..rig.rig import RigGeometry
 from ..scene import Scene
@@ -230,7 +230,7 @@ def _load_ideal(folder: Path) -> list[LabelledImage]:
 def _ideal(path: Path, name: str, record: Mapping[str, Any], said: Mapping[str, Any]) -> LabelledImage:
     image, _ = read_image(path)
     label = record["pupil"]
-    pupil = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"]) if label["status"] == OK else None
+    pupil = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"]) if label["status"] == "ok" else None
     visible = said.get("visible_fraction")
     if visible is None and not said["lid"]:
         visible = 1.0
@@ -245,7 +245,7 @@ def _ideal(path: Path, name: str, record: Mapping[str, Any], said: Mapping[str, 
         pupil,
         np.zeros((0, 2)) if pupil is None else pupil.points(120),
         visible,
-        tuple(TrueGlint(int(g["light"]), tuple(g["xy_px"])) for g in record["glints"] if g["status"] == OK),
+        tuple(TrueGlint(int(g["light"]), tuple(g["xy_px"])) for g in record["glints"] if g["status"] == "ok"),
         {"polarity": said["polarity"], "gamma": 1.0, "radius_px": None, "rig": None},
         known,
         _ellipse_factors(pupil, visible),

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from ..errors import InputError
 from ..observation import EYES, MAX_BOUNDARY_POINTS, RECORD, SCHEMAS, Observations
+from ..status import Status
 from .app import app
 from .options import EyeModel, Result, Strict
 from .output import Heed, emit, progress
@@ -145,13 +146,13 @@ def _feature_table(observed: Observations, names: list[str] | None = None) -> st
             text = f"{x:>10.4f} {y:>10.4f} {a:>8.4f} {b:>8.4f} {np.degrees(pupil.angle_rad[i]):>9.3f}"
             text += "" if pupil.in_image[i] else " (off the sensor)"
         else:
-            text = f"{f'{pupil.status[i]}: {pupil.reason[i]}':<49}"
+            text = f"{f'{Status(pupil.status[i]).label}: {pupil.reason[i]}':<49}"
         spots = []
         for j in range(glints.status.shape[1]):
             light = "?" if glints.light[i, j] < 0 else str(glints.light[i, j])
             if glints.ok[i, j]:
                 spots.append(f"{light}: ({glints.xy_px[i, j, 0]:.4f}, {glints.xy_px[i, j, 1]:.4f})")
-            elif glints.status[i, j]:
+            elif glints.status[i, j] != Status.NONE:
                 spots.append(f"{light}: missing ({glints.reason[i, j]})")
         name = f"  {names[i]}" if names else ""
         lines.append(f"{index.frame[i]:>5} {eye:<5} {text}  {'  '.join(spots)}{name}")

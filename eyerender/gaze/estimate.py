@@ -15,17 +15,18 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import ArrayValue, Bools, Floats, Objects, frozen
-from ..observation import MISSING, OK, Observations
+from ..arrays import ArrayValue, Bools, Floats, Objects, Statuses, frozen
+from ..observation import Observations
 from ..rig.rig import RigLike
+from ..status import Status
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GazePoints(ArrayValue):
-    """Estimated gaze points (n, 3) mm in the world, NaN where `status` (n,) is not 'ok'; the reason says why."""
+    """Estimated gaze points (n, 3) mm in the world, NaN where `status` (n,) is not OK; the reason says why."""
 
     point_mm: Floats
-    status: Objects
+    status: Statuses
     reason: Objects
 
     @classmethod
@@ -38,8 +39,8 @@ class GazePoints(ArrayValue):
         reasons = np.full(len(points), None, dtype=object) if reason is None else reason.copy()
         reasons[(reasons == None) & ~np.isfinite(points).all(axis=-1)] = "the estimate is not finite"  # noqa: E711
         ok = np.array([r is None for r in reasons], dtype=bool)
-        status = np.where(ok, OK, MISSING).astype(object)
-        return cls(frozen(np.where(ok[:, None], points, np.nan)), frozen(status, object), frozen(reasons, object))
+        status = np.where(ok, Status.OK, Status.NO_ESTIMATE)
+        return cls(frozen(np.where(ok[:, None], points, np.nan)), frozen(status, np.int8), frozen(reasons, object))
 
     def __len__(self) -> int:
         return len(self.status)
@@ -47,7 +48,7 @@ class GazePoints(ArrayValue):
     @property
     def ok(self) -> Bools:
         """Whether there is an estimate, (n,)."""
-        return np.asarray(self.status == OK)
+        return np.asarray(self.status == Status.OK)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,6 +18,7 @@ from ..plausibility import target_warnings
 from ..references import is_reference
 from ..rig.rig import RigGeometry
 from ..spec import Positive, Spec
+from ..status import Status
 from .crossratio import CrossRatio
 from .estimate import GazeEstimator, angular_error_deg, binocular_average
 from .guestrin import GuestrinEizenman
@@ -151,7 +152,7 @@ def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGe
             "fixation": int(index.fixation[i]) if index.fixation[i] >= 0 else None,
             "camera": int(index.camera[i]) if index.camera[i] >= 0 else None,
             "eye": EYES[int(index.eye[i])] if index.eye[i] >= 0 else None,
-            "status": gaze.status[i],
+            "status": Status(gaze.status[i]).label,
             "reason": gaze.reason[i],
             "point_mm": gaze.point_mm[i].tolist() if gaze.ok[i] else None,
             "target_mm": _numbers(index.target_mm[i]),
@@ -166,7 +167,7 @@ def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGe
         binocular = [
             {
                 "frame": int(frames.index.frame[i]),
-                "status": both.status[i],
+                "status": Status(both.status[i]).label,
                 "reason": both.reason[i],
                 "point_mm": both.point_mm[i].tolist() if both.ok[i] else None,
                 "error_deg": _number(at_middle[i]),

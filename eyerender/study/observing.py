@@ -20,7 +20,7 @@ from ..analytic.observer import trace
 from ..arrays import Floats, Ints, frozen
 from ..errors import InputError
 from ..geometry.ellipse import fit_ellipse_direct, points_on_ellipse
-from ..observation import Observations, concatenate, taken
+from ..observation import Observations, concatenate
 from ..rig.camera import PinholeCamera
 from ..scene import Scene
 from .images import Shot, StudyImages, shots
@@ -99,4 +99,4 @@ def moved(observations: Observations, seen_by: PinholeCamera, told: PinholeCamer
 
 def with_index_of(observations: Observations, scene: Scene, rows: Ints) -> Observations:
     """Make observations rows of a scene's own index."""
-    return replace(observations, index=taken(scene.index(), rows))
+    return replace(observations, index=scene.index().take(rows))

@@ -16,6 +16,7 @@ from eyerender.gaze.parameters import EyeParameters, ParameterBounds
 from eyerender.gaze.rays import unit
 from eyerender.gaze.twocamera import ShihWuLiu
 from eyerender.rig.camera import Camera
+from eyerender.status import Status
 from tests.support.gaze import observations, rig
 
 EYE = EyeParameters(7.9, 4.3, 1.3375, 5.2, 1.8)
@@ -148,7 +149,7 @@ def test_method_b_has_a_status_where_camera_lights_and_eye_are_coplanar():
     seen = observations([p], [g], [[650.0, 0.0, 0.0]])
     flat = rig([cam], lights, SCREEN)
     gaze = GuestrinEizenman(centre="plane").with_parameters({0: EYE}).predict(seen, flat)
-    assert gaze.status[0] == "missing"
+    assert gaze.status[0] == Status.NO_ESTIMATE
     assert "coplanar" in gaze.reason[0]
     # Both glints together still determine the centre.
     a = GuestrinEizenman().with_parameters({0: EYE}).predict(seen, flat)

@@ -8,6 +8,7 @@ import pytest
 import eyerender as er
 from eyerender.analytic.observer import trace
 from eyerender.rig.rig import RigGeometry
+from eyerender.status import Status
 
 ONE_CAMERA = [
     er.gaze.Regression("R3"),
@@ -92,5 +93,5 @@ def test_other_targets_make_another_calibration(scene):
 
 def test_points_without_a_finite_estimate_have_a_reason():
     gaze = er.gaze.GazePoints.of([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0]])
-    assert gaze.status.tolist() == ["ok", "missing"]
+    assert gaze.status.tolist() == [Status.OK, Status.NO_ESTIMATE]
     assert gaze.reason.tolist() == [None, "the estimate is not finite"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,22 +12,16 @@ from eyerender.errors import InputError
 from eyerender.gaze.estimate import angular_error_deg, binocular_average
 from eyerender.gaze.regression import FUNCTIONS, Regression, pupil_glint_vectors
 from eyerender.gaze.validation import gaze_errors, leave_one_target_out
-from eyerender.observation import GlintFeatures, Observations
+from eyerender.status import Status
 from tests.support.regression import RIG, synthetic
 
 
 def without_glint(observations, row):
     status = observations.glints.status.copy()
-    status[row] = "missing"
+    status[row] = Status.NOT_FOUND
     xy = observations.glints.xy_px.copy()
     xy[row] = np.nan
-    g = observations.glints
-    return Observations(
-        observations.index,
-        observations.pose,
-        observations.pupil,
-        GlintFeatures(g.light, frozen(status, object), g.reason, g.in_image, frozen(xy), g.covariance),
-    )
+    return replace(observations, glints=replace(observations.glints, status=status, xy_px=xy))
 
 
 def test_vector_is_the_difference_over_the_separation_of_the_pupils():
@@ -75,7 +71,7 @@ def test_missing_glint_is_a_status_not_a_number():
     observations = without_glint(synthetic(), 4)
     fitted = Regression("R2").fit(observations, RIG)
     gaze = fitted.predict(observations, RIG)
-    assert gaze.status[4] == "missing"
+    assert gaze.status[4] == Status.NO_ESTIMATE
     assert gaze.reason[4] == "no glint of light 0"
     assert np.isnan(gaze.point_mm[4]).all()
     errors = gaze_errors(observations, gaze)

@@ -16,6 +16,7 @@ from eyerender.rig.camera import PinholeCamera
 from eyerender.rig.light import Lamp
 from eyerender.rig.rig import RigGeometry
 from eyerender.rig.screen import ScreenPlane
+from eyerender.status import Status
 
 ETS_TO_WORLD = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 # (z away from the user, x to the user's right, y up), the user at z = +658: the one-camera vectors.
@@ -26,33 +27,35 @@ def observations(pupil, glints, targets=None, *, eye=None, camera=None, fixation
     """A batch of observations: pupil (n, 2), glints (n, m, 2) with NaN where missing, targets (n, 3)."""
     pupil, glints = np.asarray(pupil, dtype=float), np.asarray(glints, dtype=float)
     n, m = glints.shape[:2]
-    count = np.arange(n)
-    nan, none, model = np.full(n, np.nan), np.full(n, None, dtype=object), np.full(n, "model", dtype=object)
     pupil_ok, glint_ok = np.isfinite(pupil).all(axis=1), np.isfinite(glints).all(axis=2)
-
-    def ints(values, default):
-        return frozen(default if values is None else values, np.int64)
-
+    zero = np.zeros(n)
     return Observations(
-        Index(
-            ints(frame, count), ints(fixation, count), ints(camera, 0 * count), frozen(0 * count, np.int64),
-            ints(eye, 0 * count), frozen(model, object),
-            frozen(np.full((n, 3), np.nan) if targets is None else targets),
-            frozen(np.zeros((n, 3)) if head is None else head), frozen(np.zeros((n, 3))),
+        index=Index(
+            frame=np.arange(n) if frame is None else frame,
+            fixation=np.arange(n) if fixation is None else fixation,
+            camera=zero if camera is None else camera,
+            head=zero,
+            eye=zero if eye is None else eye,
+            eye_model=np.full(n, "model", dtype=object),
+            target_mm=targets,
+            head_mm=np.zeros((n, 3)) if head is None else head,
+            eye_position_mm=np.zeros((n, 3)),
         ),
-        PoseTruth(frozen(nan), frozen(nan), frozen(nan), frozen(nan)),
-        PupilFeatures(
-            frozen(np.where(pupil_ok, "ok", "missing").astype(object), object), frozen(none, object), frozen(pupil_ok,
-            bool), frozen(pupil), frozen(np.full((n, 2), 13.0)), frozen(nan), frozen(pupil), frozen(np.zeros((n, 0,
-            2))), frozen(np.full((n, 5, 5), np.nan)),
+        pose=PoseTruth(azimuth_rad=np.full(n, np.nan)),
+        pupil=PupilFeatures(
+            status=np.where(pupil_ok, Status.OK, Status.NOT_FOUND),
+            in_image=pupil_ok,
+            centre_px=pupil,
+            semi_axes_px=np.full((n, 2), 13.0),
+            anatomical_centre_px=pupil,
         ),
-        GlintFeatures(
-            frozen(np.broadcast_to(np.arange(m), (n, m)), np.int64),
-            frozen(np.where(glint_ok, "ok", "missing").astype(object), object),
-            frozen(np.full((n, m), None, dtype=object), object), frozen(glint_ok, bool), frozen(glints),
-            frozen(np.full((n, m, 2, 2), np.nan)),
+        glints=GlintFeatures(
+            status=np.where(glint_ok, Status.OK, Status.NOT_FOUND),
+            light=np.broadcast_to(np.arange(m), (n, m)),
+            in_image=glint_ok,
+            xy_px=glints,
         ),
-    )  # fmt: skip
+    )
 
 
 def rig(cameras, lights, screen_centre, size=(400.0, 300.0)):

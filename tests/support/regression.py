@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from eyerender.arrays import frozen
 from eyerender.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
 from eyerender.rig.rig import Rig
+from eyerender.status import Status
 
 RIG = Rig.from_mapping(
     {
@@ -35,24 +35,29 @@ def synthetic(columns=5, rows=4, polynomial=None, seed=0):
     wanted = np.stack(polynomial(v[:, 0], v[:, 1]), axis=-1)
     targets = np.repeat(RIG.screen.world(wanted), 2, axis=0)
     n = 2 * f
-    none, ok = np.full(n, None, dtype=object), np.full(n, "ok", dtype=object)
-    model = np.full(n, "E2", dtype=object)
-    nan = np.full(n, np.nan)
     xy = np.stack([glint[k % 2] for k in range(n)])[:, None]
     return Observations(
-        Index(
-            frozen(np.arange(n) // 2, np.int64), frozen(np.arange(n) // 2, np.int64), frozen(np.zeros(n), np.int64),
-            frozen(np.zeros(n), np.int64), frozen(np.arange(n) % 2, np.int64), frozen(model, object),
-            frozen(targets), frozen(np.zeros((n, 3))), frozen(np.zeros((n, 3))),
+        index=Index(
+            frame=np.arange(n) // 2,
+            fixation=np.arange(n) // 2,
+            camera=np.zeros(n, int),
+            head=np.zeros(n, int),
+            eye=np.arange(n) % 2,
+            eye_model=np.full(n, "E2", dtype=object),
+            target_mm=targets,
+            head_mm=np.zeros((n, 3)),
+            eye_position_mm=np.zeros((n, 3)),
         ),
-        PoseTruth(frozen(nan), frozen(nan), frozen(nan), frozen(nan)),
-        PupilFeatures(
-            frozen(ok, object), frozen(none, object), frozen(np.ones(n), bool), frozen(centre),
-            frozen(np.full((n, 2), 13.0)), frozen(np.zeros(n)), frozen(centre), frozen(np.zeros((n, 0, 2))),
-            frozen(np.full((n, 5, 5), np.nan)),
+        pose=PoseTruth(azimuth_rad=np.full(n, np.nan)),
+        pupil=PupilFeatures(
+            status=np.full(n, Status.OK),
+            in_image=np.ones(n, bool),
+            centre_px=centre,
+            semi_axes_px=np.full((n, 2), 13.0),
+            angle_rad=np.zeros(n),
+            anatomical_centre_px=centre,
         ),
-        GlintFeatures(
-            frozen(np.zeros((n, 1)), np.int64), frozen(ok[:, None], object), frozen(none[:, None], object),
-            frozen(np.ones((n, 1)), bool), frozen(xy), frozen(np.full((n, 1, 2, 2), np.nan)),
+        glints=GlintFeatures(
+            status=np.full((n, 1), Status.OK), light=np.zeros((n, 1), int), in_image=np.ones((n, 1), bool), xy_px=xy
         ),
-    )  # fmt: skip
+    )

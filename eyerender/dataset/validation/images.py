@@ -12,7 +12,6 @@ from ...arrays import Bools, Floats
 from ...imagefile import read_image
 from ...imagefolder import ImageEntry
 from ...labels import IRIS, PUPIL, moments_ellipse
-from ...observation import OK
 from ...rig.camera import Window
 from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
 
@@ -154,7 +153,7 @@ def pupil_outline(line: dict[str, Any]) -> Outline | None:
     if len(line["records"]) != 1:
         return None
     pupil = line["records"][0]["pupil"]
-    if pupil["status"] != OK:
+    if pupil["status"] != "ok":
         return None
     points = np.array(pupil["points_px"] or [], dtype=float)
     if len(points) >= 6 and np.isfinite(points).all():
@@ -167,7 +166,7 @@ def iris_outline(line: dict[str, Any], limbus_px: Floats | None) -> Outline | No
     if limbus_px is not None:
         return Outline(limbus_px, EXACT_PX)
     own = line.get("labels", {}).get("iris")
-    if not isinstance(own, dict) or own["amodal"]["status"] != OK:
+    if not isinstance(own, dict) or own["amodal"]["status"] != "ok":
         return None
     return _ellipse(own["amodal"], LIMBUS_PX)
 

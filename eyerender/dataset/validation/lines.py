@@ -16,7 +16,8 @@ from ...arrays import Ints
 from ...errors import InputError
 from ...files import shown
 from ...imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
-from ...observation import MISSING, OK, PARTIAL, Observations
+from ...observation import Observations
+from ...status import Status
 from .problems import WRONG, Problems
 from .truth import DatasetTruth, SceneTruth
 
@@ -138,7 +139,7 @@ def check_records(batch: list[dict[str, Any]]) -> list[list[str]]:
             return [[f"records cannot be read ({type(error).__name__}: {error})"]]
         return problems
     pupil = found.pupil
-    ok = pupil.status == OK
+    ok = pupil.ok
     with np.errstate(invalid="ignore"):
         a, b = pupil.semi_axes_px.T
         ellipse = np.isfinite(pupil.centre_px).all(axis=1) & (a >= b) & (b > 0)
@@ -147,9 +148,9 @@ def check_records(batch: list[dict[str, Any]]) -> list[list[str]]:
         problems[rows[i]].append("its pupil is no ellipse in the record's convention")
     for i in np.flatnonzero(~ok):
         if not pupil.reason[i]:
-            problems[rows[i]].append(f"its pupil is {pupil.status[i]} without a reason")
+            problems[rows[i]].append(f"its pupil is {Status(pupil.status[i]).label} without a reason")
     placed = np.isfinite(found.glints.xy_px).all(axis=2)
-    for i in np.flatnonzero(((found.glints.status == OK) & ~placed).any(axis=1)):
+    for i in np.flatnonzero((found.glints.ok & ~placed).any(axis=1)):
         problems[rows[i]].append("a glint has no place")
     return problems
 
@@ -159,12 +160,12 @@ def _agree(line: dict[str, Any]) -> Iterator[str]:
     (record,) = line["records"]
     labels = line["labels"]
     own, pupil = labels["pupil"]["amodal"], record["pupil"]
-    keys = ("status", "centre_px", "semi_axes_px", "angle_rad") if own["status"] == OK else ("status",)
+    keys = ("status", "centre_px", "semi_axes_px", "angle_rad") if own["status"] == "ok" else ("status",)
     # Labels need the whole outline, so a partial pupil is missing there.
-    record_pupil = {**pupil, "status": MISSING if pupil["status"] == PARTIAL else pupil["status"]}
+    record_pupil = {**pupil, "status": "missing" if pupil["status"] == "partial" else pupil["status"]}
     if any(own[key] != record_pupil[key] for key in keys):
         yield "the pupil of its labels is not that of its record"
-    places = {glint["light"]: glint["xy_px"] for glint in record["glints"] if glint["status"] == OK}
+    places = {glint["light"]: glint["xy_px"] for glint in record["glints"] if glint["status"] == "ok"}
     for glint in labels["glints"]:
         if glint["xy_px"] != places.get(glint["light"]):
             yield f"the glint of light {glint['light']} of its labels is not that of its record"
