@@ -163,13 +163,15 @@ def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...
 def check_windows(scene: Scene) -> None:
     """Raise `InputError` for a scene whose eyes cannot be rendered."""
     if scene.spec.image.window_px is None and len(scene.spec.subject.eyes) > 1:
-        raise InputError("missing; both eyes are rendered in a window each", path="image.window_px")
+        raise InputError("missing; a scene with both eyes needs a window for each eye", path="image.window_px")
     spp = scene.spec.image.spp
     for i, camera in enumerate(scene.rig.cameras):
         width, height = scene.spec.image.window_px or camera.resolution_px
         if width * height > MAX_PIXELS:
             what = "image.window_px" if scene.spec.image.window_px else f"rig.cameras.{i}.resolution_px"
-            raise InputError(f"{width} x {height} pixels are too many to render; at most {MAX_PIXELS}", path=what)
+            raise InputError(
+                f"{width} x {height} pixels are too many to render; at most {MAX_PIXELS} are allowed", path=what
+            )
         if width * height * spp > MAX_SAMPLES:
             raise InputError(
                 f"{width} x {height} pixels with {spp} samples each are more than {MAX_SAMPLES:.0e} samples",

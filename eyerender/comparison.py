@@ -108,7 +108,7 @@ def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
     """Errors of `found` against `truth`, row by row; `InputError` unless both are of the same frames and eyes."""
     same = len(truth) == len(found) and np.array_equal(truth.index.frame, found.index.frame)
     if not same or not np.array_equal(truth.index.eye, found.index.eye):
-        raise InputError("the two sets of observations are not of the same frames and eyes")
+        raise InputError("the two sets of observations have different frames or eyes")
     pupil_expected = truth.pupil.ok & truth.pupil.in_image
     both = pupil_expected & found.pupil.ok
     m = truth.glints.light.shape[1]

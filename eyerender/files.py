@@ -168,7 +168,7 @@ def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True
     except OSError as error:
         raise InputError(_why_unreadable(path, error), source=source) from None
     except ValueError:
-        raise InputError("is no file name", source=source) from None
+        raise InputError("is not a valid file name", source=source) from None
     state = os.fstat(handle)
     if not stat.S_ISREG(state.st_mode):
         os.close(handle)
@@ -301,7 +301,7 @@ def _size(count: int) -> str:
 
 
 def _refuse(text: str) -> Any:
-    raise ValueError(f"{text} is no number")
+    raise ValueError(f"{text} is not a number")
 
 
 def _integer(text: str) -> int:

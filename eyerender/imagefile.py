@@ -65,7 +65,7 @@ def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
     except InputError:
         raise
     except MemoryError:
-        raise InputError("needs more memory than there is", source=source) from None
+        raise InputError("needs more memory than is available", source=source) from None
     except Exception:
         # A damaged file makes Pillow's decoders raise whatever their arithmetic comes upon.
         raise InputError("is not a readable image", source=source) from None
@@ -76,14 +76,14 @@ def _decoded(file: Image.Image, source: str) -> tuple[NDArray[Any], int]:
         raise InputError(f"is too large ({file.width} x {file.height} pixels)", source=source)
     # Counting them would go through the whole file.
     if getattr(file, "is_animated", False):
-        raise InputError("holds several images; a file of one is read", source=source)
+        raise InputError("holds several images; give a file with one", source=source)
     mode = file.mode
     if mode in ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr", "HSV", "LAB"):
         if file.has_transparency_data and np.asarray(file.convert("RGBA"))[..., 3].min() < 255:
             raise InputError("has transparent pixels", source=source)
         grey = _same_channels(file)
         if grey is None:
-            raise InputError(f"has colour channels ({mode}); greyscale near-infrared images are read", source=source)
+            raise InputError(f"has colour channels ({mode}); give a greyscale near-infrared image", source=source)
         return grey, 8
     file.load()
     data = np.asarray(file)

@@ -220,9 +220,9 @@ class ImageFolder:
         if not os.path.isdir(folder):
             raise InputError("no such folder", source=str(path))
         if (folder / RUN).is_file() and not (folder / DATASET).is_file():
-            raise InputError("holds a run that is not finished; start generate again on it", source=str(path))
+            raise InputError("holds an unfinished run; start generate again on the folder", source=str(path))
         if not (folder / METADATA).exists():
-            raise InputError(f"holds no {METADATA}; not a folder of images that this package wrote", source=str(path))
+            raise InputError(f"holds no {METADATA}, so it is not a folder of images written by this package", source=str(path))
         dataset = read_json(folder / DATASET, follow=False)
         if dataset.get("schema") != DATASET_SCHEMA:
             raise InputError(
@@ -266,7 +266,7 @@ def _check_line(line: dict[str, Any], source: str, where: str) -> None:
         raise InputError(reason, source=source, path=f"{where}.{key}")
 
     if line.get("schema") != IMAGE_SCHEMA:
-        refuse("schema", f"is {shown(line.get('schema'))}, no image record of {IMAGE_SCHEMA!r}")
+        refuse("schema", f"is {shown(line.get('schema'))}, not an image record ({IMAGE_SCHEMA!r})")
     for key in FILE_KEYS:
         name = line.get(key)
         if not is_plain(name) and (name is not None or key == "file_name"):

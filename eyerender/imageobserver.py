@@ -118,7 +118,7 @@ class ImageObserver:
                 camera = scene.rig.cameras[0]
                 if image.shape != (camera.resolution_px[1], camera.resolution_px[0]):
                     raise InputError(
-                        f"is {image.shape[1]} x {image.shape[0]} px; the scene's sensor is not", source=str(path)
+                        f"is {image.shape[1]} x {image.shape[0]} px, but the scene's sensor is not", source=str(path)
                     )
                 lights, reasons = _lights(found, np.zeros(2), scene, camera, np.full(3, np.nan))
             parts.append(_observation(found, lights, reasons, np.zeros(2), Index(frame=np.array([k]))))
@@ -179,7 +179,7 @@ def _scene_of_samples(folder: ImageFolder) -> Scene:
             first = Scene(spec, EyeSpec.from_mapping(_parsed(eye, source), source=source), spec.rig.build())
         seen.add(key)
         if len(seen) > 1:
-            raise InputError("the rig differs from image to image; nothing can be calibrated", source=str(folder.path))
+            raise InputError("the rig differs from image to image, so no calibration is possible", source=str(folder.path))
     if first is None:
         raise InputError("holds no images", source=str(folder.path))
     return first

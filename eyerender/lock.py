@@ -98,7 +98,7 @@ def _take(
         except OSError as error:
             if error.errno not in _UNSUPPORTED:
                 os.close(file)
-                raise InputError("another run is at work in this folder", source=str(folder)) from None
+                raise InputError("another run is using this folder", source=str(folder)) from None
             warn("this file system has no locks: do not start two runs on one folder")
         if _is_at(file, path):
             stack.callback(os.close, file)

@@ -59,7 +59,7 @@ def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
         if not busy:
             return
         if not overwrite:
-            raise InputError("is not empty; give another folder or --overwrite", source=str(path))
+            raise InputError("is not empty; choose another folder or give --overwrite", source=str(path))
         known = _listed(folder)
         if known is None:
             raise InputError("was not made by this package, so it is not overwritten", source=str(path))

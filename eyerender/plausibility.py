@@ -153,7 +153,11 @@ def rig_warnings(rig: RigGeometry, calibrated: RigGeometry, source: str) -> list
     path = next(_differences(rig.to_mapping(), calibrated.to_mapping(), "rig"), None)
     if path is None:
         return []
-    return [InputWarning("other-rig", "differs from the rig of the calibration; calibrate on this one", source, path)]
+    return [
+        InputWarning(
+            "other-rig", "differs from the rig of the calibration; calibrate again with this rig", source, path
+        )
+    ]
 
 
 def _differences(one: Any, other: Any, path: str) -> Iterator[str]:
@@ -210,7 +214,7 @@ def _in_view(camera: PinholeCamera, window: Window, apex: Floats) -> bool:
     return bool(np.any(front & inside))
 
 
-_METRES = "lengths are in mm, was it meant in metres?"
+_METRES = "lengths are in mm; did you mean metres?"
 
 
 def _values(node: Any, keys: Sequence[str], path: str = "") -> Iterator[tuple[str, Any]]:

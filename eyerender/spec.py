@@ -225,7 +225,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
             key = (key_node.tag, str(key_node.value))
             if key in seen:
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"key {shown(key_node.value)} stands twice", key_node.start_mark
+                    None, None, f"key {shown(key_node.value)} appears twice", key_node.start_mark
                 )
             seen.add(key)
         return super().construct_mapping(node, deep)

@@ -237,7 +237,7 @@ def test_leftovers_of_a_killed_run_do_not_block_the_next(tmp_path):
 
 def test_taken_places_are_refused(tmp_path):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="is not empty; give another folder or --overwrite"):
+    with pytest.raises(InputError, match="is not empty; choose another folder or give --overwrite"):
         refuse_non_empty(tmp_path, overwrite=False)
     with pytest.raises(InputError, match="exists and is not a folder"):
         refuse_non_empty(tmp_path / "file", overwrite=True)
@@ -248,9 +248,9 @@ def test_a_second_writer_is_refused_and_the_first_goes_on(tmp_path, overwrite):
     out = tmp_path / "out"
     with staged(out, overwrite=overwrite) as stage:
         for _ in range(2):
-            with pytest.raises(InputError, match="another run is at work in this folder"):
+            with pytest.raises(InputError, match="another run is using this folder"):
                 staged(out, overwrite=overwrite).__enter__()
-        with pytest.raises(InputError, match="another run is at work"), run_lock(out, (1, 2), print):
+        with pytest.raises(InputError, match="another run is using"), run_lock(out, (1, 2), print):
             pass
         fill(stage)
     assert names(out) == ["dataset.json", "images", "images/a.png", "metadata.jsonl"]
@@ -258,9 +258,9 @@ def test_a_second_writer_is_refused_and_the_first_goes_on(tmp_path, overwrite):
 
 def test_render_and_study_take_the_lock(tmp_path):
     with writer_lock(tmp_path):
-        with pytest.raises(InputError, match="another run is at work"):
+        with pytest.raises(InputError, match="another run is using"):
             render_folder(load_scene("quickstart"), tmp_path)
-        with pytest.raises(InputError, match="another run is at work"):
+        with pytest.raises(InputError, match="another run is using"):
             study.run_study("blignaut2014", tmp_path, eyes=["E1"])
     assert names(tmp_path) == []
 
@@ -279,7 +279,7 @@ def test_a_lock_whose_file_was_removed_holds_nobody(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", late)
     with writer_lock(tmp_path):
         assert len(calls) == 2
-        with pytest.raises(InputError, match="another run is at work"), writer_lock(tmp_path):
+        with pytest.raises(InputError, match="another run is using"), writer_lock(tmp_path):
             pass
 
 

@@ -130,7 +130,7 @@ def test_a_scene_in_metres_is_told_before_it_fails(tmp_path, capsys):
     (tmp_path / "metres.yaml").write_text(yaml.safe_dump(data))
     assert run(["features", str(tmp_path / "metres.yaml")]) in (0, 2)
     lines = capsys.readouterr().err.splitlines()
-    told = [line for line in lines if line.startswith("warning: ") and "was it meant in metres?" in line]
+    told = [line for line in lines if line.startswith("warning: ") and "did you mean metres?" in line]
     assert len(told) == 6
 
 

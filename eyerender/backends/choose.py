@@ -89,7 +89,7 @@ def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> 
         if cuda.ok:
             return _start("cuda", cuda.detail, threads)
         if name == "cuda":
-            raise BackendError(f"cuda does not render here: {cuda.detail}; {cuda.fix}")
+            raise BackendError(f"cuda cannot render here: {cuda.detail}; {cuda.fix}")
     library = ensure_llvm()
     path = str(library.path) if library.path else None
     return _start("llvm", cpu_name(), threads, llvm=library.version, library=path)

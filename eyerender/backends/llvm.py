@@ -116,8 +116,8 @@ def _activate() -> LibLlvm:
             return LibLlvm.probed(examined.path, examined.verdict)
         if before is not None:
             os.environ[ENVIRONMENT] = before
-        raise BackendError(f"Dr.Jit does not load {examined.path}, though it did in a process of its own")
-    raise BackendError(f"no libLLVM here renders (the llvm backend needs one); {llvm_fix()}")
+        raise BackendError(f"Dr.Jit cannot load {examined.path}, although a separate process could")
+    raise BackendError(f"no libLLVM here can render, and the llvm backend needs one; {llvm_fix()}")
 
 
 def _loaded() -> LibLlvm:
@@ -131,7 +131,7 @@ def _loaded() -> LibLlvm:
     verdict = probe(VARIANT, path)
     if not verdict.ok:
         raise BackendError(
-            f"mitsuba was imported earlier and loaded {path or 'a libLLVM'} (LLVM {version}), which does not render "
+            f"mitsuba was imported earlier and loaded {path or 'a libLLVM'} (LLVM {version}), which cannot render "
             f"({verdict.detail}); {_too_late()}"
         )
     return LibLlvm(path, version)

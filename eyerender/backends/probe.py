@@ -181,7 +181,7 @@ def _work(variant: str) -> str:
     total = dr.sum(dr.if_stmt((x, y), y > 8, lambda x, y: dr.maximum(y, 0) ** 2, lambda x, y: y * y))[0]
     expected = sum(min(i, 31.5) ** 2 for i in range(64))
     if not math.isclose(total, expected, rel_tol=1e-3):
-        raise ArithmeticError(f"wrong arithmetic: {total} for {expected}")
+        raise ArithmeticError(f"wrong arithmetic: {total} instead of {expected}")
 
     # A unit sphere seen and lit from distance 5: on the axis the radiance is albedo / pi * I / d^2 = 0.5 / pi.
     scene = mi.load_dict(
@@ -200,7 +200,7 @@ def _work(variant: str) -> str:
     )
     radiance = dr.mean(mi.render(scene, spp=4).array)[0]
     if not math.isclose(radiance, 0.5 / math.pi, rel_tol=0.02):
-        raise ArithmeticError(f"wrong picture: {radiance} for {0.5 / math.pi}")
+        raise ArithmeticError(f"wrong picture: {radiance} instead of {0.5 / math.pi}")
     if variant.startswith("llvm"):
         return "LLVM " + ".".join(map(str, dr.detail.llvm_version()))
     return _gpu_name()

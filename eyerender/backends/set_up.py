@@ -39,10 +39,10 @@ def setup_llvm(*, say: Say = _silent) -> LibLlvm:
     if found is not None:
         return found
     if not has_archive():
-        raise BackendError(f"no libLLVM here renders; {llvm_command()}")
+        raise BackendError(f"no libLLVM here can render; {llvm_command()}")
     store = llvm_store()
     if store is None:
-        raise BackendError("there is no home folder to unpack a libLLVM into; set XDG_CACHE_HOME to a writable folder")
+        raise BackendError("there is no home folder for unpacking a libLLVM; set XDG_CACHE_HOME to a writable folder")
     try:
         store.mkdir(parents=True, exist_ok=True)
         with _locked(store / "lock", say):
@@ -60,19 +60,19 @@ def _fetch(store: Path, say: Say) -> LibLlvm:
         say("looking for libLLVM in the package archive")
         packages = apt.llvm_packages()
         if not packages:
-            raise BackendError(f"the package archive offers no libLLVM that fits{apt.complaint}; {llvm_command()}")
+            raise BackendError(f"the package archive has no suitable libLLVM{apt.complaint}; {llvm_command()}")
         refused = ""
         runtime = [debian for debian, _ in RUNTIME.values()]
         for package in packages:
-            say(f"fetching {package} and what it needs (about 50 MB)")
+            say(f"fetching {package} and its dependencies (about 50 MB)")
             tree = Path(scratch) / package
             if not apt.unpack([package, *runtime], tree):
-                raise BackendError(f"{package} cannot be fetched{apt.complaint}; try again, or {llvm_command()}")
+                raise BackendError(f"{package} cannot be downloaded{apt.complaint}; try again, or {llvm_command()}")
             library = _library_in(tree)
             verdict = run_probe(VARIANT, library) if library else None
             if library is not None and verdict is not None and verdict.ok:
                 return _keep(tree, library, store)
-            refused = f"{package} does not render" + (f" ({verdict.detail})" if verdict else "")
+            refused = f"{package} cannot render" + (f" ({verdict.detail})" if verdict else "")
         raise BackendError(f"{refused}; {llvm_command()}")
 
 
@@ -85,7 +85,7 @@ def _keep(tree: Path, library: Path, store: Path) -> LibLlvm:
     kept = (place / library.relative_to(tree.resolve())).resolve()
     verdict = probe(VARIANT, kept, refresh=True)
     if not verdict.ok:
-        raise BackendError(f"{kept} does not render ({verdict.detail})")
+        raise BackendError(f"{kept} cannot render ({verdict.detail})")
     return LibLlvm.probed(kept, verdict)
 
 
@@ -118,7 +118,7 @@ def main(arguments: Sequence[str]) -> int:
         # Slow steps are announced even with --quiet, because a first run takes half a minute.
         library = setup_llvm(say=say)
     except BackendError as error:
-        print(f"eyerender: {'warning: rendering on the processor is not possible: ' * quiet}{error}", file=sys.stderr)
+        print(f"eyerender: {'warning: rendering on the CPU is not possible: ' * quiet}{error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         return 130

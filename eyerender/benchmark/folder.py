@@ -87,7 +87,7 @@ def load_labelled(folder: str | Path) -> list[LabelledImage]:
         count = len(entry.records)
         if count != 1:
             raise InputError(
-                f"holds {count} eyes; the bench takes images of one", source=str(path / METADATA), path=f"line {k + 1}"
+                f"shows {count} eyes; the benchmark needs images of one eye", source=str(path / METADATA), path=f"line {k + 1}"
             )
         # There is one record per image, so an image's row in the truth is its number.
         out.append(_rendered(entry, truth, k, scene_rig))
@@ -221,7 +221,7 @@ def _load_ideal(folder: Path) -> list[LabelledImage]:
         except InputError:
             raise
         except (ValueError, KeyError, TypeError, IndexError, AttributeError):
-            raise InputError("is no image record", source=source, path=f"line {k + 1}") from None
+            raise InputError("is not an image record", source=source, path=f"line {k + 1}") from None
     if not out:
         raise InputError("holds no images", source=source)
     return out

@@ -189,7 +189,7 @@ def _object(line: str) -> dict[str, Any]:
     try:
         data = json.loads(line)
     except (ValueError, RecursionError):
-        raise InputError(f"printed what is no JSON: {shown(line.strip())}") from None
+        raise InputError(f"printed a line that is not JSON: {shown(line.strip())}") from None
     if not isinstance(data, dict):
-        raise InputError("printed JSON that is no object")
+        raise InputError("printed JSON that is not an object")
     return data

@@ -58,10 +58,12 @@ def resolve(given: str) -> ExtractorCommand:
     try:
         argv = shlex.split(spec)
     except ValueError as error:
-        raise InputError(f"{given!r} is no command line ({error})", source="--extractor") from None
+        raise InputError(f"{given!r} is not a valid command line ({error})", source="--extractor") from None
     if not argv or shutil.which(argv[0]) is None:
         known = ", ".join(sorted(installed))
-        raise InputError(f"{given!r} is no extractor ({known}), module:callable or command", source="--extractor")
+        raise InputError(
+            f"{given!r} is neither an extractor ({known}) nor a module:callable nor a command", source="--extractor"
+        )
     return ExtractorCommand(name or Path(argv[0]).name, given, tuple(argv))
 
 

@@ -85,11 +85,11 @@ def bench_extractors(
     else:
         chosen = [resolve(given) if isinstance(given, str) else given for given in extractors]
     if not chosen:
-        raise InputError("none to run", source="--extractor")
+        raise InputError("there is no extractor to run", source="--extractor")
     titles = [e.name for e in chosen]
     for name in titles:
         if titles.count(name) > 1:
-            raise InputError(f"two are called {name!r}; give one another name: NAME=...", source="--extractor")
+            raise InputError(f"two extractors are called {name!r}; rename one with NAME=...", source="--extractor")
     _refuse(output, overwrite)
     images = load_labelled(folder)
     edges = [_edge(image) for image in images]

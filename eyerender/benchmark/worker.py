@@ -75,7 +75,7 @@ def _plain(value: object) -> Any:
     """Convert NumPy's numbers and arrays to JSON types."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
-    raise TypeError(f"the record holds a {type(value).__name__}, which JSON does not know")
+    raise TypeError(f"the record holds a {type(value).__name__}, which JSON cannot represent")
 
 
 if __name__ == "__main__":

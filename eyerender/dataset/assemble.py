@@ -61,7 +61,7 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
             file.write(line)
         found = statistics.to_mapping()
         if found["images"] == 0:
-            raise EyerenderError(f"{folder}: no sample of this spec can be made; {FAILURES} says why")
+            raise EyerenderError(f"{folder}: no sample of this spec can be made; see {FAILURES} for the reasons")
     sums = {name: sum_of(folder / name) for name in (METADATA, FAILURES)}
     write_json(folder / CROISSANT, croissant(plan, sums[METADATA]["sha256"]))
     write_text(folder / CARD, data_card(plan, found))
@@ -102,7 +102,7 @@ def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> I
     if sums is None and not quick:
         yield from _differs_from_shards(folder)
     elif sums is not None and not (is_sums(sums) and METADATA in sums):
-        yield f"{DATASET}: checksums: are not as this version writes them"
+        yield f"{DATASET}: checksums: do not have the format of this version"
     else:
         yield from compare_sums(folder, sums or {}, quick=quick)
 
@@ -142,7 +142,7 @@ def _lines(folder: Path, shards: Iterable[int], take: Callable[[dict[str, Any]],
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise InputError(
-            f"the lines of a shard are not as this version writes them ({reason})", source=str(folder)
+            f"the lines of a shard do not have the format of this version ({reason})", source=str(folder)
         ) from None
 
 

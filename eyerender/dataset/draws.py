@@ -29,7 +29,9 @@ Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
 
 class _Draw(Spec):
-    per: Unit | None = Field(default=None, description="drawn for each sample or once a subject; default: by the path")
+    per: Unit | None = Field(
+        default=None, description="drawn once per sample or once per subject; default: depends on the path"
+    )
 
 
 class _RangeDraw(_Draw):
@@ -83,9 +85,9 @@ class ChoiceDraw(_Draw):
     def _check(self) -> Self:
         if self.weights is not None:
             if len(self.weights) != len(self.values):
-                raise ValueError("weights: one for each value")
+                raise ValueError("weights: give one for each value")
             if not sum(self.weights) > 0:
-                raise ValueError("weights: one must be > 0")
+                raise ValueError("weights: at least one must be > 0")
         return self
 
 

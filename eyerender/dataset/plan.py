@@ -144,11 +144,11 @@ class Plan:
         sums: dict[str, str] = {}
         eye_part = spec.scene.get("eye", {})
         if is_draw(eye_part):
-            raise InputError("give its values draws of their own, not the whole eye", source=source, path="scene.eye")
+            raise InputError("draw single values of the eye, not the whole eye", source=source, path="scene.eye")
         names = possible(eye_part.get("model", "E2")) if isinstance(eye_part, Mapping) else ["E2"]
         for name in names:
             if not isinstance(name, str):
-                raise InputError(f"must be names of eyes, not {name!r}", source=source, path="scene.eye.model")
+                raise InputError(f"must be the name of an eye, not {name!r}", source=source, path="scene.eye.model")
             file = str(base / name) if base is not None and name not in catalogue_names() else name
             try:
                 if name not in catalogue_names() and os.path.isfile(file):
@@ -165,7 +165,7 @@ class Plan:
         plan = cls(spec, eyes, dict(sorted(sums.items())), folder, source)
         for name in spec.eye_parameters:
             if name not in eyes:
-                raise InputError("no sample looks with this eye", source=source, path=f"eye_parameters.{name}")
+                raise InputError("no sample uses this eye", source=source, path=f"eye_parameters.{name}")
             for path in spec.eye_parameters[name]:
                 _set(_copy(eyes[name]), path, 0.0, f"eye_parameters.{name}", source)
         _ = plan.scene_template, plan.eye_template
@@ -281,7 +281,7 @@ class Plan:
         """
         spec = self.spec
         if not 0 <= sample < spec.count:
-            raise InputError(f"there are samples 0 to {spec.count - 1}", source=str(sample))
+            raise InputError(f"must be 0 to {spec.count - 1}", source=str(sample))
         subject, sequence = self.subject_of(sample)
         subject_attempt = self.identity(subject)[0]
         turn = Turn(sample, subject, sequence, attempt, subject_attempt)
@@ -341,7 +341,7 @@ def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
     """Parts of a spec with another eye model in place of its own."""
     part = spec.scene.get("eye", {})
     if not isinstance(part, Mapping) or is_draw(part):
-        raise InputError("the spec draws its whole eye; name the model there", source="--eye")
+        raise InputError("the spec draws the whole eye; choose the model in the spec", source="--eye")
     load_eye(eye)
     # A path in a command is relative to the current folder, a name in a spec to the folder of the spec.
     model = eye if eye in catalogue_names() else str(Path(eye).resolve())

@@ -95,7 +95,7 @@ class LocalPool:
                         if shard != NO_SHARD:
                             pending.appendleft(shard)
                     elif shard == NO_SHARD:
-                        raise EyerenderError(f"workers do not start: {reason}")
+                        raise EyerenderError(f"workers cannot start: {reason}")
                     else:
                         lost[shard] = reason
                         if len(lost) >= HOPELESS and not self._made:

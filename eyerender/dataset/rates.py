@@ -30,14 +30,18 @@ class Rate(Spec):
     """Time and size of the samples of a spec."""
 
     format: Literal["eyerender/rate/1"] = "eyerender/rate/1"
-    how: Literal["run", "measured"] = Field(description="by a run, or by a few samples that were made to measure it")
+    how: Literal["run", "measured"] = Field(
+        description="whether a run measured it, or a few samples made for this purpose"
+    )
     time: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z$")]
     backend: Annotated[str, Field(max_length=20)]
-    samples: Annotated[int, Field(ge=1, le=10**9)] = Field(description="how many it was measured with")
-    seconds: Positive = Field(description="of one worker for a sample")
-    subject_seconds: _Count = Field(description="of one worker more for a subject's first sample; 0: contained above")
-    images: _Count = Field(description="a sample")
-    bytes: _Count = Field(description="a sample, metadata included")
+    samples: Annotated[int, Field(ge=1, le=10**9)] = Field(description="number of measured samples")
+    seconds: Positive = Field(description="time of one worker for a sample")
+    subject_seconds: _Count = Field(
+        description="additional time for the first sample of a subject; 0: included in `seconds`"
+    )
+    images: _Count = Field(description="images per sample")
+    bytes: _Count = Field(description="bytes per sample, including metadata")
 
 
 def now() -> str:

@@ -165,7 +165,7 @@ def _generate(plan: Plan, path: str | Path, options: Options, progress: Progress
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
     except KeyboardInterrupt:
-        say(f"{len(finished(folder))} of {plan.spec.shard_count} shards are finished; start again on {path} to go on")
+        say(f"{len(finished(folder))} of {plan.spec.shard_count} shards are finished; start again on {path} to resume")
         raise
     finally:
         if created and folder.is_dir() and all(p.name.startswith(LOCK) for p in folder.iterdir()):
@@ -227,7 +227,7 @@ class _Run:
             remove_leftovers(self.folder, mine, done)
             problem = next(damage(self.folder, self.plan.digest), None)
             if problem is not None and ((self.folder / DATASET).exists() or not todo):
-                self.repaired(f"the dataset is put together again: {problem}")
+                self.repaired(f"the dataset is assembled again: {problem}")
         if todo:
             remove_file(self.folder / DATASET)  # a folder that has one is complete
         self.total = sum(len(spec.shard_samples(s)) for s in todo)
@@ -243,7 +243,7 @@ class _Run:
                 shard, reason = next(iter(lost.items()))
                 raise EyerenderError(
                     f"{len(lost)} of {len(todo)} shards could not be made; shard {shard}: {reason}; "
-                    "the others are kept, start again to try these"
+                    "the others are kept; start again to retry these"
                 )
         missing = self._missing()
         statistics = None
@@ -380,7 +380,9 @@ class _Run:
         backend = made_by["backend"]
         key = json.dumps([backend["name"], backend.get("llvm"), backend.get("device"), made_by.get("cpu")])
         if self.seen and key not in self.seen and not old:
-            self.say("warning: different backends or processors make shards of this dataset; rounding may differ")
+            self.say(
+                "warning: different backends or processors make the shards of this dataset, so rounding may differ"
+            )
             self._log("warning", reason="mixed backends or processors", backend=backend)
         self.seen.add(key)
 

@@ -23,7 +23,7 @@ from .shard import KINDS, SHARDS, finished, read_done, run_versions
 RUN_SCHEMA = "eyerender/run/1"
 LOG = "log.jsonl"
 _OWN = {RUN, LOG, SHARDS, *KINDS, METADATA, FAILURES, CARD, CROISSANT, DATASET}
-_ELSE = "give another folder or --overwrite"
+_ELSE = "choose another folder or give --overwrite"
 _SHOWN = 4
 
 
@@ -43,7 +43,7 @@ def refuse_taken(folder: Path) -> None:
     if link is not None:
         raise InputError(f"{link}: is a symbolic link; {_ELSE}", source=str(folder))
     if taken:
-        raise InputError("is not empty; give another folder or --overwrite", source=str(folder))
+        raise InputError("is not empty; choose another folder or give --overwrite", source=str(folder))
 
 
 def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
@@ -73,7 +73,7 @@ def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
         # The other shards belong to another plan; resuming detects that and makes them again.
         _refuse_another(folder, {**mine, "versions": same[0]["versions"]}, mine, plan.files)
         write_json(path, mine)
-        repaired(f"{RUN} is written again: {reason}")
+        repaired(f"{RUN} is rewritten: {reason}")
         return True
     names = {p.name for p in folder.iterdir() if not p.name.startswith(LOCK)}
     clear(folder, known=True)

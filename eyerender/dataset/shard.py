@@ -199,7 +199,7 @@ def read_done(folder: Path, shard: int) -> dict[str, Any]:
         raise InputError(f"must have the schema {SHARD_SCHEMA!r}", source=str(path))
     for key, fits in _DONE_KEYS.items():
         if not fits(data.get(key)):
-            raise InputError("is missing or not as this version writes it", source=str(path), path=key)
+            raise InputError("is missing, or not in the format of this version", source=str(path), path=key)
     return data
 
 
@@ -223,7 +223,7 @@ def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool =
         return
     places = tuple(f"{kind}/{name}/" for kind in (*KINDS, SHARDS))
     if f"{SHARDS}/{name}/{LINES}" not in done["files"] or not all(n.startswith(places) for n in done["files"]):
-        yield f"{SHARDS}/{name}/{DONE}: files: are not those of this shard"
+        yield f"{SHARDS}/{name}/{DONE}: files: do not belong to this shard"
         return
     yield from compare_sums(folder, done["files"], quick=quick)
 

@@ -23,9 +23,13 @@ _SPLIT = re.compile(r"[a-z][a-z0-9]*")
 class LabelsSpec(Spec):
     """Labels in addition to those that every image has."""
 
-    boundary_points: Annotated[int, Field(ge=6, le=360)] = Field(default=30, description="of the pupil, in the record")
-    amodal_masks: bool = Field(default=False, description="also masks of the eye as if nothing stood before it")
-    noiseless: bool = Field(default=False, description="also each image without the sensor's noise, of one rendering")
+    boundary_points: Annotated[int, Field(ge=6, le=360)] = Field(
+        default=30, description="boundary points of the pupil in the record"
+    )
+    amodal_masks: bool = Field(default=False, description="also write masks of the eye without anything in front of it")
+    noiseless: bool = Field(
+        default=False, description="also write each image without sensor noise, from the same rendering"
+    )
 
     @property
     def pictures(self) -> tuple[str, ...]:
@@ -40,13 +44,14 @@ class DatasetSpec(FileSpec):
     kind: Literal["dataset"]
     name: Annotated[str, Field(min_length=1, max_length=100)]
     description: str = ""
-    count: Annotated[int, Field(ge=1, le=MAX_COUNT)] = Field(description="samples")
+    count: Annotated[int, Field(ge=1, le=MAX_COUNT)] = Field(description="number of samples")
     planned: Annotated[int, Field(ge=1, le=MAX_COUNT)] | None = Field(
-        default=None, description="samples of the whole plan, of which the first `count` are made; default: all"
+        default=None,
+        description="number of samples of the whole plan, of which the first `count` are made; default: count",
     )
     shard_size: Annotated[int, Field(ge=1, le=100_000)] = Field(default=64, description="samples in a shard")
     subjects: Annotated[int, Field(ge=1, le=MAX_COUNT)] | None = Field(
-        default=None, description="identities; each has a run of consecutive samples; default: one a sample"
+        default=None, description="number of identities; each has a run of consecutive samples; default: one per sample"
     )
     splits: dict[str, Positive] = Field(
         default={"train": 1.0}, description="name -> share of the subjects; shares are scaled to 1"
@@ -58,10 +63,10 @@ class DatasetSpec(FileSpec):
     )
     labels: LabelsSpec = LabelsSpec()
     require: Literal["pupil", "nothing"] = Field(
-        default="pupil", description="pupil: an image whose window does not hold the apparent pupil is drawn again"
+        default="pupil", description="pupil: draw a sample again if its window does not contain the apparent pupil"
     )
     attempts: Annotated[int, Field(ge=1, le=1000)] = Field(
-        default=20, description="how often a sample that cannot be made is drawn before it is given up"
+        default=20, description="number of draws before a sample that cannot be made is given up"
     )
 
     @model_validator(mode="after")
@@ -71,10 +76,10 @@ class DatasetSpec(FileSpec):
         if self.subjects is not None and self.subjects > self.planned_count:
             raise ValueError("subjects: must be <= count")
         if not self.splits:
-            raise ValueError("splits: needs at least one")
+            raise ValueError("splits: give at least one")
         for name in self.splits:
             if not _SPLIT.fullmatch(name):
-                raise ValueError(f"splits.{name}: a name is lower-case letters and digits")
+                raise ValueError(f"splits.{name}: a name must consist of lower-case letters and digits")
         return self
 
     @classmethod
@@ -87,7 +92,7 @@ class DatasetSpec(FileSpec):
         if data.get("kind") != DATASET_KIND:
             if "rig" in data:
                 raise InputError(NOT_A_DATASET, source=source)
-            raise InputError(f"is no dataset; write 'kind: {DATASET_KIND}'", source=source, path="kind")
+            raise InputError(f"is not a dataset; write 'kind: {DATASET_KIND}'", source=source, path="kind")
 
     @property
     def planned_count(self) -> int:

@@ -196,9 +196,9 @@ def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
     identity = _under(bare, IDENTITY) and not _under(bare, PASSING)
     unit: Unit = draw.per or ("subject" if identity else "sample")
     if unit == "sample" and _under(bare, FIXED_IDENTITY):
-        raise InputError("a subject's eye is drawn once a subject", source=source, path=f"{shown}.per")
+        raise InputError("the eye must be drawn once per subject", source=source, path=f"{shown}.per")
     if isinstance(draw, SequenceDraw) and unit == "subject":
-        raise InputError("a sequence runs over the frames of a subject", source=source, path=shown)
+        raise InputError("a sequence runs over the frames of a subject, so it cannot be drawn once per subject", source=source, path=shown)
     return PlacedDraw(draw, unit)
 
 

@@ -74,7 +74,7 @@ def validate(
                 elif quick:
                     _find_files(entry)
             except WRONG as error:
-                problems.add(f"{where}: has not the labels it should have ({type(error).__name__}: {error})")
+                problems.add(f"{where}: lacks expected labels ({type(error).__name__}: {error})")
             except InputError as error:
                 problems.add(str(error))
             step(k + 1, total, "images")

@@ -16,21 +16,23 @@ class ExtractionSettings(Spec):
     """
 
     method: Literal["fast", "refined"] = Field(
-        default="refined", description="fast: edges and an algebraic fit; refined: a maximum-likelihood fit as well"
+        default="refined", description="fast: edges and an algebraic fit; refined: also a maximum-likelihood fit"
     )
-    polarity: Literal["dark", "bright"] = Field(default="dark", description="pupil darker or brighter than the iris")
-    radius_min_px: Positive = Field(default=7.0, description="smallest semi-axis b looked for")
-    radius_max_px: Positive = Field(default=160.0, description="largest semi-axis a looked for")
-    aspect_min: Annotated[float, Field(gt=0, le=1)] = Field(default=0.3, description="smallest b / a accepted")
+    polarity: Literal["dark", "bright"] = Field(
+        default="dark", description="whether the pupil is darker or brighter than the iris"
+    )
+    radius_min_px: Positive = Field(default=7.0, description="smallest semi-axis b to search for")
+    radius_max_px: Positive = Field(default=160.0, description="largest semi-axis a to search for")
+    aspect_min: Annotated[float, Field(gt=0, le=1)] = Field(default=0.3, description="smallest accepted b / a")
     min_support: Annotated[float, Field(gt=0, le=1)] = Field(
-        default=0.2, description="smallest share of the pupil's outline that must be seen"
+        default=0.2, description="smallest visible share of the pupil boundary"
     )
     min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.5, description="pupils less likely than this to be right (IoU > 0.9) are reported as missing"
+        default=0.5, description="pupils with a lower probability of being right (IoU > 0.9) are reported as missing"
     )
-    max_glints: Annotated[int, Field(ge=0, le=64)] = Field(default=16, description="most glints reported")
+    max_glints: Annotated[int, Field(ge=0, le=64)] = Field(default=16, description="largest number of reported glints")
     glint_reach: Positive = Field(
-        default=4.0, description="how far from the pupil's centre glints are looked for, in semi-axes a"
+        default=4.0, description="search radius for glints around the pupil centre, in semi-axes a"
     )
 
     @model_validator(mode="after")

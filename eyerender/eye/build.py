@@ -210,14 +210,14 @@ def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Floats]
     """
     for name, shape in (("front", lens.front.shape), ("back", lens.back.shape)):
         if not isinstance(shape, SphereSpec | ConicSpec | BiconicSpec):
-            raise InputError("a gradient lens is made of spheres, conics or biconics", path=f"lens.{name}.shape")
+            raise InputError("a gradient lens must be made of spheres, conics or biconics", path=f"lens.{name}.shape")
         if lens.shells is None and lens.layers is None and isinstance(shape, BiconicSpec):
-            raise InputError("give a number: a gradient between biconics is traced as shells", path="lens.shells")
+            raise InputError("give a number: a gradient lens of biconics is traced as shells", path="lens.shells")
     if lens.shells is not None and lens.layers is not None:
         raise InputError("give either 'shells' or 'layers'", path="lens.layers")
     for k, (outer, inner) in enumerate(pairwise(lens.layers or ()), start=1):
         if inner.size > outer.size:
-            raise InputError("must be <= that of the layer around it", path=f"lens.layers.{k}.size")
+            raise InputError("must be <= the size of the layer around it", path=f"lens.layers.{k}.size")
     front, back = surface_of(lens.front), surface_of(lens.back)
     if lens.centre_mm is None:
         centre = front.origin_mm + lens.centre_fraction * (back.origin_mm - front.origin_mm)

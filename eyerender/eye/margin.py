@@ -37,7 +37,7 @@ class PupilMargin(Spec):
     With a `seed` or a `contour` the outline is that about a circle, else it stays the eye file's.
     """
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(default=None, description="which outline is drawn")
+    seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(default=None, description="selects the drawn outline")
     noncircularity: Annotated[float, Field(ge=0, le=0.1)] | None = Field(
         default=None,
         description=f"rms of the drawn outline's radius over its mean, less 1; default {NONCIRCULARITY} (Wyatt 1995)",
@@ -45,7 +45,7 @@ class PupilMargin(Spec):
     contour: ContourSpec | None = Field(default=None, description="a measured outline instead of a drawn one")
     shift_mm_per_mm: tuple[Shift, Shift] = Field(
         default=SHIFT_MM_PER_MM,
-        description="nasal and up, for each mm of diameter over the eye file's own; default Yang et al. (2002)",
+        description="shift, nasal and up, per mm of diameter above the eye file's own; default Yang et al. (2002)",
     )
 
     @field_validator("contour")

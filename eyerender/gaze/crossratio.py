@@ -90,6 +90,6 @@ class CrossRatio:
 
     def _corners_mm(self, rig: RigGeometry) -> Floats:
         if len(set(self.corners)) != 4 or self.at_camera in self.corners:
-            raise InputError("the cross ratio needs four corner lights and another one at the camera")
+            raise InputError("the cross ratio needs four corner lights and one more light at the camera")
         chosen_lights(rig, (*self.corners, self.at_camera), 5)
         return np.array([rig.lights[k].position_mm for k in self.corners])

@@ -157,7 +157,8 @@ class GuestrinEizenman:
             if len(np.unique(np.round(targets[rows], 6), axis=0)) < need:
                 name = EYES[int(eye)] if eye >= 0 else "unknown"
                 raise InputError(
-                    f"{name} eye: {len(rows)} usable calibration targets; {count} parameters need {need} different ones"
+                    f"{name} eye: {len(rows)} usable calibration targets, "
+                    f"but {count} parameters need {need} distinct ones"
                 )
             out[int(eye)] = _Model(self, rays, rows, targets[rows], screen, float(nasal_sign(np.array(eye))))
         return out

@@ -59,7 +59,7 @@ class Homography:
             rows = usable & (observations.index.eye == eye)
             name = EYES[int(eye)] if eye >= 0 else "unknown"
             if rows.sum() < 4:
-                raise InputError(f"{name} eye: {rows.sum()} usable calibration targets, a homography needs 4")
+                raise InputError(f"{name} eye: {rows.sum()} usable calibration targets, but a homography needs 4")
             H, ok = homography(s[rows], wanted[rows], conditioned=self.conditioned)
             if not ok:
                 raise InputError(f"{name} eye: the calibration targets do not determine a homography")

@@ -71,9 +71,9 @@ def chosen_lights(rig: RigGeometry, lights: Sequence[int] | None, least: int) ->
     """
     wanted = tuple(range(len(rig.lights))) if lights is None else tuple(lights)
     if len(set(wanted)) != len(wanted) or any(not 0 <= k < len(rig.lights) for k in wanted):
-        raise InputError(f"lights {list(wanted)} are not different lights of a rig that has {len(rig.lights)}")
+        raise InputError(f"lights {list(wanted)} are not distinct lights of the rig, which has {len(rig.lights)}")
     if len(wanted) < least:
-        raise InputError(f"this estimator needs {least} lights, the rig has {len(wanted)}")
+        raise InputError(f"this estimator needs {least} lights, but the rig has {len(wanted)}")
     return wanted
 
 

@@ -54,7 +54,7 @@ class Recalibration:
             name = EYES[int(eye)] if eye >= 0 else "unknown"
             if rows.sum() < TERMS:
                 raise InputError(
-                    f"{name} eye: {rows.sum()} usable calibration targets, the correction has {TERMS} terms"
+                    f"{name} eye: {rows.sum()} usable calibration targets, but the correction has {TERMS} terms"
                 )
             # The columns are scaled so that the rank does not depend on the unit.
             design = monomials(measured[rows])

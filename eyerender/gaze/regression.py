@@ -37,10 +37,10 @@ def _terms(text: str) -> Terms:
                 rest = rest[1 + len(digits) :]
                 i, j = (power, j) if letter == "x" else (i, power)
         if rest not in ("", "1") or (rest == "1" and (i or j)):
-            raise InputError(f"{term!r} is no term such as x, y2, x2y or 1")
+            raise InputError(f"{term!r} is not a term; write terms such as x, y2, x2y or 1")
         out.append((i, j))
     if len(set(out)) != len(out):
-        raise InputError(f"{text!r} holds a term twice")
+        raise InputError(f"{text!r} contains a term twice")
     return tuple(out)
 
 
@@ -100,7 +100,7 @@ class Regression:
         """Exponents of the terms of x and of y."""
         if isinstance(self.function, str):
             if self.function not in FUNCTIONS:
-                raise InputError(f"{self.function!r} is no function of Table 2 (R1 to R12)")
+                raise InputError(f"{self.function!r} is not a regression function (R1 to R12)")
             x, y = FUNCTIONS[self.function]
         else:
             x, y = self.function

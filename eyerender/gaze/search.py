@@ -47,7 +47,7 @@ class FreeParameters:
         self.scale = _SCALE[free]
         self.evaluations = 0
         if not ((self.first[free] >= self.low) & (self.first[free] <= self.high)).all():
-            raise InputError("the calibration's start lies outside its bounds")
+            raise InputError("the start of the calibration lies outside the bounds")
 
     def full(self, x: Floats) -> Floats:
         """All five parameters (m, 5) for free ones (m, k)."""

@@ -47,7 +47,7 @@ class EstimatorSpec(Spec):
 
     name: Name
     function: str = "R3"
-    terms: tuple[str, str] | None = Field(default=None, description="terms of x and y, in place of `function`")
+    terms: tuple[str, str] | None = Field(default=None, description="terms of x and y, instead of `function`")
     normalised: bool = True
     method: Literal["A", "B"] = "A"
     free_index: bool = False
@@ -122,7 +122,7 @@ def fit_estimator(
     except InputError as error:
         raise InputError(error.reason, source=error.source or source, path=error.path) from None
     except np.linalg.LinAlgError:
-        raise InputError("the records determine no calibration", source=source) from None
+        raise InputError("the records do not determine a calibration", source=source) from None
     gaze = predictions(fitted, used, rig)
     errors = [g["error_deg"] for g in gaze["gaze"] if g["error_deg"] is not None]
     return fitted, {
@@ -330,7 +330,7 @@ def _state(estimator: GazeEstimator) -> dict[str, Any]:
         correction = estimator.correction
         found = {e: {"coefficients": A.tolist()} for e, A in correction.coefficients.items()} if correction else {}
     else:
-        raise InputError(f"a {type(estimator).__name__} cannot be written to a file")
+        raise InputError(f"{type(estimator).__name__} cannot be written to a file")
     return {(EYES[e] if e >= 0 else "unknown"): v for e, v in found.items()}
 
 

@@ -66,7 +66,7 @@ class ShihWuLiu:
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Optic axes from the centre of corneal curvature, one row per observation."""
         if len(set(self.cameras)) != 2 or not all(0 <= k < len(rig.cameras) for k in self.cameras):
-            raise InputError(f"this estimator needs two cameras, the rig has {len(rig.cameras)}")
+            raise InputError(f"this estimator needs two cameras, but the rig has {len(rig.cameras)}")
         rays = feature_rays(observations, rig, self.lights, least=2)
         lines, good = line_to_centre(rays.origin_mm, rays.glints, rays.light_mm)
         own: Objects = rays.reason.copy()

@@ -60,7 +60,7 @@ def leave_one_target_out(estimator: GazeEstimator, observations: Observations, r
         raise InputError("there are no targets to compare the gaze with; use a scene with 'targets' instead of 'poses'")
     if len(np.unique(observations.index.fixation)) < 2:
         raise InputError(
-            "there is only one fixation, and a calibration needs several targets in one scene, "
+            "there is only one fixation, but a calibration needs several targets in one scene, "
             "such as 'targets: {grid: [3, 3]}'"
         )
     points = np.full((len(observations), 3), np.nan)

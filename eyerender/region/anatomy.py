@@ -52,10 +52,12 @@ class Fissure(Spec):
 class Lid(Spec):
     """Shape and movement of the lids."""
 
-    margin_mm: float = _number(1.9, 1.4, 2.5, "of the upper margin; the lower is thinner (Zhu, and rows of lashes)")
+    margin_mm: float = _number(
+        1.9, 1.4, 2.5, "thickness of the upper margin; the lower is thinner (Zhu, and rows of lashes)"
+    )
     margin_tilt_deg: float = _number(-4.0, -8.0, 20.0, "how far the upper margin opens outwards (chosen)")
     thickness_mm: float = _number(2.6, 2.0, 3.4, "skin to globe above the margin (chosen)")
-    film_mm: float = _number(0.02, 0.005, 0.05, "between the margin's inner edge and the globe (chosen)")
+    film_mm: float = _number(0.02, 0.005, 0.05, "thickness of the tear film between inner lid edge and globe (chosen)")
     upper_follows: float = _number(0.9, 0.6, 1.0, "turn of the upper lid per turn of the eye (Becker)")
     lower_follows: float = _number(0.35, 0.1, 0.6, "turn of the lower lid per turn of the eye (chosen)")
     crease_mm: float = _number(8.0, 5.0, 11.0, "crease above the margin of the closed lid (Cartwright; others 8 to 10)")
@@ -68,17 +70,23 @@ class Lid(Spec):
 class Lashes(Spec):
     """Lashes of both lids."""
 
-    upper_count: Annotated[int, Field(ge=0, le=180)] = Field(default=120, description="of the upper lid (textbooks)")
-    lower_count: Annotated[int, Field(ge=0, le=110)] = Field(default=58, description="of the lower lid (chosen)")
-    upper_length_mm: float = _number(8.5, 5.0, 12.0, "longest of the upper lid (textbooks)")
-    lower_length_mm: float = _number(5.0, 3.0, 8.0, "longest of the lower lid (chosen)")
-    diameter_mm: float = _number(0.085, 0.05, 0.12, "at the root (chosen)")
+    upper_count: Annotated[int, Field(ge=0, le=180)] = Field(
+        default=120, description="number on the upper lid (textbooks)"
+    )
+    lower_count: Annotated[int, Field(ge=0, le=110)] = Field(default=58, description="number on the lower lid (chosen)")
+    upper_length_mm: float = _number(8.5, 5.0, 12.0, "longest lash of the upper lid (textbooks)")
+    lower_length_mm: float = _number(5.0, 3.0, 8.0, "longest lash of the lower lid (chosen)")
+    diameter_mm: float = _number(0.085, 0.05, 0.12, "diameter at the root (chosen)")
     upper_curl_deg: float = _number(80.0, 20.0, 120.0, "turn of an upper lash from root to tip (chosen)")
     lower_curl_deg: float = _number(45.0, 10.0, 80.0, "turn of a lower lash from root to tip (chosen)")
-    upper_droop_deg: float = _number(38.0, 22.0, 60.0, "upper lashes start that far below the lid's normal (chosen)")
-    clumping: Share = Field(default=0.55, description="how far tips of neighbours lean together (chosen)")
+    upper_droop_deg: float = _number(
+        38.0, 22.0, 60.0, "angle of upper lashes at the root below the lid's normal (chosen)"
+    )
+    clumping: Share = Field(default=0.55, description="how far the tips of neighbours lean together (chosen)")
     spread_deg: float = _number(11.0, 2.0, 20.0, "standard deviation of direction (chosen)")
-    albedo: float = _number(0.05, 0.02, 0.5, "at 850 nm; melanin absorbs little there, hair is still dark (chosen)")
+    albedo: float = _number(
+        0.05, 0.02, 0.5, "albedo at 850 nm; melanin absorbs little there, but hair is still dark (chosen)"
+    )
 
 
 class Brow(Spec):
@@ -89,8 +97,8 @@ class Brow(Spec):
     height_mm: float = _number(15.5, 10.0, 24.0, "lower border above the pupil (chosen)")
     thickness_mm: float = _number(8.5, 3.0, 12.0, "height of the band at its head (chosen)")
     arch_mm: float = _number(3.5, 0.0, 8.0, "rise from head to arch (chosen)")
-    diameter_mm: float = _number(0.075, 0.05, 0.14, "at the root (chosen)")
-    albedo: float = _number(0.18, 0.02, 0.6, "at 850 nm (chosen)")
+    diameter_mm: float = _number(0.075, 0.05, 0.14, "diameter at the root (chosen)")
+    albedo: float = _number(0.18, 0.02, 0.6, "albedo at 850 nm (chosen)")
 
 
 class Face(Spec):
@@ -105,20 +113,22 @@ class Face(Spec):
 class Skin(Spec):
     """Appearance of the surfaces at 850 nm."""
 
-    albedo: float = _number(0.55, 0.30, 0.75, "of the skin (chosen; forearms: Cooksey, Allen, Tsai 2017)")
+    albedo: float = _number(0.55, 0.30, 0.75, "albedo of the skin (chosen; forearms: Cooksey, Allen, Tsai 2017)")
     mottling: Share = Field(default=0.5, description="unevenness of the albedo (chosen)")
     relief_mm: float = _number(0.032, 0.0, 0.12, "depth of the skin's fine furrows (some tens of micrometres; chosen)")
     wrinkles: Share = Field(default=0.35, description="lines on and below the lids (chosen)")
     pores: Share = Field(default=0.5, description="depth of the pores beyond the lids (chosen)")
-    veins: Share = Field(default=0.35, description="of the veins that show through the lids' thin skin (chosen)")
-    sheen: Share = Field(default=0.5, description="strength of the oily skin's rough mirror (chosen)")
-    wet_albedo: float = _number(0.40, 0.25, 0.55, "of the margins and the caruncle (chosen)")
+    veins: Share = Field(
+        default=0.35, description="strength of the veins that show through the thin skin of the lids (chosen)"
+    )
+    sheen: Share = Field(default=0.5, description="strength of the rough specular reflection of oily skin (chosen)")
+    wet_albedo: float = _number(0.40, 0.25, 0.55, "albedo of the lid margins and the caruncle (chosen)")
 
 
 class TearFilm(Spec):
     """The tear meniscus along both margins."""
 
-    height_mm: float = _number(0.21, 0.0, 0.6, "on the globe (Doughty)")
+    height_mm: float = _number(0.21, 0.0, 0.6, "height on the globe (Doughty)")
 
 
 class Region(Spec):
@@ -132,14 +142,16 @@ class Region(Spec):
     skin: Skin = Skin()
     tears: TearFilm = TearFilm()
     blink: Share = Field(default=0.0, description="closure of the lids, 0 open to 1 shut")
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="which hairs, which skin")
-    head: Head | None = Field(default=None, description="a head mesh of one's own in place of all of this")
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="selects the hairs and the skin")
+    head: Head | None = Field(default=None, description="your own head mesh instead of all of this")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         for name in ("blink", "fissure", "lids", "face") if self.head is not None else ():
             if getattr(self, name) != type(self).model_fields[name].default:
-                raise ValueError(f"{name}: a head mesh keeps still and has its own shape")
+                raise ValueError(
+                    f"{name}: cannot be combined with a head mesh, which does not move and has its own shape"
+                )
         return self
 
     @classmethod

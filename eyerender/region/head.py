@@ -77,7 +77,7 @@ def load_head(spec: Head) -> HeadMesh:
             finite; the size does not fit the unit.
     """
     if spec.manifest:
-        raise InputError("is a manifest; resolve it first", source=spec.files[0])
+        raise InputError("is a manifest; call resolve on it first", source=spec.files[0])
     return _loaded(spec, file_states(spec))
 
 
@@ -99,7 +99,7 @@ def _all_objects(spec: Head) -> dict[str, list[trimesh.Trimesh]]:
     """The meshes of all files by their names; raises `InputError` where a check sum does not fit."""
     for file, wanted in zip(spec.files, spec.sums, strict=False):
         if file_digest(Path(file)) != wanted:
-            raise InputError("is not the file that sha256 belongs to", source=file)
+            raise InputError("does not have the given sha256", source=file)
     objects: dict[str, list[trimesh.Trimesh]] = {}
     for file in spec.files:
         for name, mesh in _objects(Path(file)).items():
@@ -128,15 +128,15 @@ def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
         vertex_ends.append(count)
         face_ends.append(triangles)
     if not faces:
-        raise InputError("names no object of the mesh", source=source, path="parts")
+        raise InputError("does not name any object of the mesh", source=source, path="parts")
     joined = np.concatenate(vertices)
     size = float(np.linalg.norm(np.ptp(joined, axis=0)))
     if not _SMALLEST_MM <= size <= _LARGEST_MM:
-        raise InputError(f"{spec.unit} makes the mesh {size:.1f} mm large", source=source, path="unit")
+        raise InputError(f"with unit {spec.unit}, the mesh is {size:.1f} mm large", source=source, path="unit")
     eyes = [np.full(3, np.nan) if e is None else scale * axes @ np.array(e) for e in (spec.right_eye, spec.left_eye)]
     for name, eye in zip(("right_eye", "left_eye"), eyes, strict=True):
         if np.all(np.isfinite(eye)) and (gap := float(np.min(np.linalg.norm(joined - eye, axis=1)))) > _NEAR_MM:
-            raise InputError(f"lies {gap:.1f} mm from the nearest vertex", source=source, path=name)
+            raise InputError(f"is {gap:.1f} mm away from the nearest vertex", source=source, path=name)
     return HeadMesh(
         frozen(joined),
         frozen(np.concatenate(normals)),
@@ -289,7 +289,7 @@ def _axes(spec: Head, source: str) -> Floats:
     forward, up = np.array(spec.forward), np.array(spec.up)
     left = np.cross(up, forward)
     if np.linalg.norm(left) <= 1e-6 * np.linalg.norm(up) * np.linalg.norm(forward):
-        raise InputError("must not lie along forward, nor be zero", source=source, path="up")
+        raise InputError("must not be zero or parallel to forward", source=source, path="up")
     forward, left = forward / np.linalg.norm(forward), left / np.linalg.norm(left)
     return np.stack([forward, left, np.cross(forward, left)])
 

@@ -34,7 +34,7 @@ class HeadParts(Spec):
     lashes: Names = ()
     brow: Names = ()
     tears: Names = ()
-    head: Names = Field(default=(), description="hair, glasses' frames and other things: 'occluded by head'")
+    head: Names = Field(default=(), description="hair, frames of glasses and other things: 'occluded by head'")
 
 
 class Head(Spec):
@@ -43,17 +43,17 @@ class Head(Spec):
     file: Name | Annotated[tuple[Name, ...], Field(min_length=1)] = Field(
         description="an .obj or .ply file, several of them, or a .json manifest that holds all of these keys"
     )
-    unit: Literal["mm", "cm", "m"] | None = Field(default=None, description="of the files' coordinates")
-    licence: Name | None = Field(default=None, description="under which the mesh is used")
-    sha256: Sum | tuple[Sum, ...] | None = Field(default=None, description="of the files, in their order")
+    unit: Literal["mm", "cm", "m"] | None = Field(default=None, description="unit of the files' coordinates")
+    licence: Name | None = Field(default=None, description="licence under which the mesh is used")
+    sha256: Sum | tuple[Sum, ...] | None = Field(default=None, description="SHA-256 of the files, in the same order")
     parts: HeadParts | None = Field(default=None, description="default: everything is skin")
-    forward: Vec3 = Field(default=(0.0, 0.0, 1.0), description="where the face looks, in the files' axes")
+    forward: Vec3 = Field(default=(0.0, 0.0, 1.0), description="direction of the face, in the files' axes")
     up: Vec3 = Field(default=(0.0, 1.0, 0.0), description="the vertical, in the files' axes")
     right_eye: Vec3 | None = Field(default=None, description="centre of the globe, in the files' coordinates")
-    left_eye: Vec3 | None = Field(default=None, description="likewise; the eye not given is the other's mirror image")
-    texture: Name | None = Field(default=None, description="picture of the skin over its texture coordinates")
+    left_eye: Vec3 | None = Field(default=None, description="likewise; an eye that is not given mirrors the other one")
+    texture: Name | None = Field(default=None, description="picture of the skin, in its texture coordinates")
     tolerance_mm: NonNegative = Field(
-        default=0.3, description="how deep the mesh may reach into the cornea in any pose; deeper is refused"
+        default=0.3, description="largest depth of the mesh in the cornea in any pose; a deeper mesh is refused"
     )
 
     @property
@@ -71,7 +71,7 @@ class Head(Spec):
         if self.manifest:
             for name, field in type(self).model_fields.items():
                 if name != "file" and getattr(self, name) != field.default:
-                    raise ValueError(f"{name}: stands in the manifest, not here")
+                    raise ValueError(f"{name}: belongs in the manifest, not here")
             return self
         for name in ("unit", "licence"):
             if getattr(self, name) is None:
@@ -79,7 +79,7 @@ class Head(Spec):
         if self.right_eye is None and self.left_eye is None:
             raise ValueError("right_eye: missing; give it or left_eye")
         if self.sha256 is not None and len(self.sums) != len(self.files):
-            raise ValueError("sha256: needs one for each file")
+            raise ValueError("sha256: give one for each file")
         return self
 
     @property
@@ -120,9 +120,9 @@ def _manifest(path: Path, state: tuple[int, int]) -> Head:
     source = str(path)
     data = read_json(path)
     if data.get("schema") != SCHEMA:
-        raise InputError(f"is no manifest of a head; its schema must be {SCHEMA}", source=source)
+        raise InputError(f"is not a manifest of a head mesh; its schema must be {SCHEMA}", source=source)
     if "sha256" not in data:
-        raise InputError("missing; a manifest holds the check sums of its files", source=source, path="sha256")
+        raise InputError("missing; a manifest needs the checksums of its files", source=source, path="sha256")
     spec = Head.from_mapping({k: v for k, v in data.items() if k != "schema"}, source=source)
     if spec.manifest:
         raise InputError("names another manifest", source=source, path="file")

@@ -90,7 +90,7 @@ def read_map(path: str | Path, channel: str = "red") -> Floats:
     values: Floats = np.asarray(_channel(data, channel), dtype=np.float64)
     height, width = values.shape
     if width != 2 * height or height < 4:
-        raise InputError(f"is {width} x {height}; a map over all directions is twice as wide as high", source=source)
+        raise InputError(f"is {width} x {height}; a map of all directions must be twice as wide as high", source=source)
     if not np.all(np.isfinite(values)) or np.min(values) < 0:
         raise InputError("holds values that are negative or not finite", source=source)
     return values
@@ -204,7 +204,7 @@ class Maps:
             if len(self._kept) >= _KEPT:
                 self._kept.pop(next(iter(self._kept)))
             if spec.sha256 is not None and file_digest(path) != spec.sha256:
-                raise InputError("is not the file that sha256 belongs to", source=spec.file)
+                raise InputError("does not have the given sha256", source=spec.file)
             self._kept[key] = self._sent(surrounding(read_map(path, spec.channel)))
         return self._kept[key]
 

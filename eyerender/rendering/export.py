@@ -50,7 +50,7 @@ def export_scene(
     """
     K = job.camera.K
     if abs(K[0, 0] - K[1, 1]) > 1e-6 * K[0, 0]:
-        raise InputError("the camera's pixels are not square; Mitsuba's perspective sensor cannot show it")
+        raise InputError("the camera's pixels are not square, which Mitsuba's perspective sensor does not support")
     folder = Path(folder)
     (folder / "meshes").mkdir(parents=True, exist_ok=True)
     root = ET.Element("scene", version="3.0.0")

@@ -211,7 +211,7 @@ def _shape(surface: Surface) -> Floats:
         raise InputError(f"a surface of kind {surface.kind} cannot be rendered")
     A, b = np.asarray(surface.matrix), np.asarray(surface.vector)
     if np.any(np.diag(np.diag(A)) != A) or b[1] != 0 or b[2] != 0:
-        raise InputError("a quadric cannot be rendered whose axes are not those of its frame")
+        raise InputError("a quadric whose axes differ from those of its frame cannot be rendered")
     return np.array([*np.diag(A), b[0], float(surface.constant)])
 
 

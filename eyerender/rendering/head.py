@@ -70,8 +70,8 @@ class HeadScene(RegionScene):
             # Another pose may be valid, so this one is not recorded as shown.
             self._shown = None
             raise InputError(
-                f"reaches {depth[deepest]:.2f} mm into the cornea as the eye looks (tolerance_mm is "
-                f"{head.tolerance_mm:g}); it keeps still, and its own eyeball must not be among its parts",
+                f"reaches {depth[deepest]:.2f} mm into the cornea at this gaze (tolerance_mm is "
+                f"{head.tolerance_mm:g}); the mesh does not move, and its parts must not include its own eyeball",
                 source=head.files[0],
             )
 

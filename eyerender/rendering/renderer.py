@@ -108,7 +108,7 @@ class Renderer:
         blurred = picture * defocus.vignette(job.lens, job.camera, job.window)
         irradiance = frozen(blurred * exposure.radiance_to_irradiance(job.sensor), np.float32)
         if not np.all(np.isfinite(irradiance)):
-            raise InputError("numbers of the scene are too extreme: its image is not finite")
+            raise InputError("the numbers of the scene are too extreme: its image is not finite")
         # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
         dn = exposure.expose(job.sensor, irradiance.astype(float), job.wavelength_nm, job.seed)
         margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None

@@ -73,7 +73,7 @@ class Stage:
             self._surround.show(job.look)
             return self._surround
         if self._surround.obstructed:
-            raise InputError("obstacles and an eye region do not go together")
+            raise InputError("obstacles cannot be combined with an eye region")
         globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
         key = RegionScene.key(job.region, globe)
         if key not in self._regions:

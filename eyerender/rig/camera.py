@@ -45,7 +45,7 @@ class CameraCalibration(Spec):
         if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or K[2, 2] != 1 or K[0, 0] <= 0 or K[1, 1] <= 0:
             raise ValueError("K must be upper triangular with positive focal lengths and K[2][2] = 1")
         if K[0, 1] != 0:
-            raise ValueError("K has a skew term, which OpenCV's camera model does not know")
+            raise ValueError("K has a skew term, which OpenCV's camera model does not support")
         return self
 
 
@@ -56,9 +56,9 @@ class Camera(Spec):
     resolution_px: tuple[Pixels, Pixels] = Field(description="sensor width and height")
     position_mm: Vec3 | None = Field(default=None, description="nodal point in the world")
     look_at_mm: Vec3 | None = Field(default=None, description="world point on the optical axis")
-    pan_deg: Number | None = Field(default=None, description="to the subject's left of -x")
-    tilt_deg: Number | None = Field(default=None, description="upwards from -x")
-    roll_deg: Number = Field(default=0.0, description="the image's content turns counter-clockwise for positive roll")
+    pan_deg: Number | None = Field(default=None, description="angle of the optical axis from -x to the subject's left")
+    tilt_deg: Number | None = Field(default=None, description="angle of the optical axis upwards from -x")
+    roll_deg: Number = Field(default=0.0, description="positive roll turns the image content counter-clockwise")
     focal_length_px: Positive | None = None
     focal_length_mm: Positive | None = None
     sensor_mm: tuple[Positive, Positive] | None = Field(default=None, description="sensor width and height")
@@ -84,7 +84,7 @@ class Camera(Spec):
         }
         if self.calibration is not None:
             if placed or self.roll_deg != 0 or any(self.distortion):
-                raise ValueError("calibration gives place, direction and lens; leave out the other keys")
+                raise ValueError("a calibration gives position, direction and lens; remove the other keys")
             return self
         if self.position_mm is None:
             raise ValueError("give position_mm (or a calibration)")

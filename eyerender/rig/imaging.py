@@ -16,24 +16,25 @@ class Lens(Spec):
         default=None, description="distance of the plane in focus from the nodal point; default: the eye is in focus"
     )
     vignetting: Annotated[float, Field(ge=0, le=0.9)] = Field(
-        default=0.0, description="loss of light in the sensor's corner beyond cos^4; it grows with the radius squared"
+        default=0.0,
+        description="loss of light in the corner of the sensor beyond cos^4; the loss grows with the squared radius",
     )
 
 
 class Motion(Spec):
     """Motion during the exposure, at constant speed and centred on its middle."""
 
-    eye_deg_s: Vec2 = Field(default=(0.0, 0.0), description="turn of the eye: azimuth and elevation per second")
+    eye_deg_s: Vec2 = Field(default=(0.0, 0.0), description="angular velocity of the eye: azimuth and elevation")
     head_mm_s: Vec3 = Field(default=(0.0, 0.0, 0.0), description="velocity of the head in the world")
-    steps: Annotated[int, Field(ge=2, le=64)] = Field(default=8, description="moments that are averaged")
+    steps: Annotated[int, Field(ge=2, le=64)] = Field(default=8, description="number of averaged moments")
 
 
 class Panel(Spec):
     """A rectangle that emits evenly to its front, like a screen or a window; the cornea reflects it."""
 
     centre_mm: Vec3
-    size_mm: tuple[Positive, Positive] = Field(description="width (level) and height")
-    radiance_w_m2_sr: NonNegative = Field(description="within the camera's filter")
+    size_mm: tuple[Positive, Positive] = Field(description="width (horizontal) and height")
+    radiance_w_m2_sr: NonNegative = Field(description="radiance within the camera's filter")
 
 
 class RadianceMap(Spec):
@@ -47,26 +48,30 @@ class RadianceMap(Spec):
         description="a linear picture, .hdr, .exr, .pfm or .npy (relative to the scene)"
     )
     scale_w_m2_sr: NonNegative = Field(
-        default=1.0, description="radiance of the value 1, within the camera's filter; varies the map's strength"
+        default=1.0, description="radiance of the value 1, within the camera's filter; scales the map"
     )
     channel: Literal["red", "green", "blue", "luminance"] = Field(
-        default="red", description="what of a colour picture stands for the near infrared; red is nearest to it"
+        default="red", description="channel of a colour picture that stands for the near infrared; red is nearest to it"
     )
     azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
-        default=0.0, description="where the map's middle lies, from straight ahead (+x) to the subject's left"
+        default=0.0, description="azimuth of the map's middle, from straight ahead (+x) to the subject's left"
     )
-    elevation_deg: Annotated[float, Field(ge=-90, le=90)] = Field(default=0.0, description="of the map's middle, up")
+    elevation_deg: Annotated[float, Field(ge=-90, le=90)] = Field(
+        default=0.0, description="elevation of the map's middle"
+    )
     roll_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
-        default=0.0, description="turn about the middle, clockwise as the subject sees it"
+        default=0.0, description="rotation about the middle, clockwise for the subject"
     )
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = Field(
-        default=None, description="of the file; another file is refused"
+        default=None, description="SHA-256 of the file; a different file is refused"
     )
 
 
 class Ambient(Spec):
     """Light other than that of the lamps: even light from all sides, surroundings, and panels that face the head."""
 
-    irradiance_w_m2: NonNegative = Field(default=0.0, description="on a matte surface, within the camera's filter")
+    irradiance_w_m2: NonNegative = Field(
+        default=0.0, description="even light from all sides: irradiance of a matte surface, within the camera's filter"
+    )
     panels: Annotated[tuple[Panel, ...], Field(max_length=16)] = ()
-    map: RadianceMap | None = Field(default=None, description="an HDR picture of what surrounds the head")
+    map: RadianceMap | None = Field(default=None, description="an HDR picture of the surroundings of the head")

@@ -23,10 +23,12 @@ MAX_LIGHTS = 1000
 class LedRing(Spec):
     """LEDs evenly spaced on a circle about a camera's axis, in the plane of its nodal point."""
 
-    camera: Annotated[int, Field(ge=0)] = Field(default=0, description="which camera the ring surrounds")
+    camera: Annotated[int, Field(ge=0)] = Field(default=0, description="the camera that the ring surrounds")
     radius_mm: Positive = Field(description="radius of the circle")
     count: Annotated[int, Field(ge=1, le=MAX_LIGHTS)]
-    phase_deg: Number = Field(default=0.0, description="of the first LED, from the image's right towards its bottom")
+    phase_deg: Number = Field(
+        default=0.0, description="angle of the first LED, from the right of the image towards its bottom"
+    )
 
 
 class Led(Spec):
@@ -35,8 +37,8 @@ class Led(Spec):
     position_mm: Vec3 | None = None
     ring: LedRing | None = None
     radius_mm: NonNegative = Field(default=0.0, description="radius of the emitting disc; 0 is a point")
-    inner_radius_mm: NonNegative = Field(default=0.0, description="of the hole of a ring-shaped emitter")
-    aim_mm: Vec3 = Field(default=(0, 0, 0), description="world point its axis goes through")
+    inner_radius_mm: NonNegative = Field(default=0.0, description="radius of the hole of a ring-shaped emitter")
+    aim_mm: Vec3 = Field(default=(0, 0, 0), description="world point on its axis")
     intensity_mw_sr: Positive = Field(default=20.0, description="radiant intensity on the axis")
     lobe_exponent: NonNegative = Field(default=1.0, description="m of cos^m; 1 is Lambertian, 0 isotropic")
 

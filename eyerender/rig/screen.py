@@ -17,7 +17,7 @@ class Screen(Spec):
 
     centre_mm: Vec3
     size_mm: tuple[Positive, Positive] = Field(description="width and height")
-    tilt_deg: float = Field(default=0.0, gt=-90, lt=90, description="its face turned upwards from facing -x")
+    tilt_deg: float = Field(default=0.0, gt=-90, lt=90, description="upward tilt of the face, from facing -x")
 
     def build(self) -> ScreenPlane:
         """Build the numeric screen."""

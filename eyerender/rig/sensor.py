@@ -28,7 +28,7 @@ class Sensor(Spec):
     pixel_pitch_um: Positive = Field(default=2.8, description="side of a square pixel")
     exposure_ms: Positive = Field(default=15.0, description="exposure time")
     lens_transmission: Annotated[float, Field(gt=0, le=1)] = Field(
-        default=0.9, description="of lens and filter at the wavelength"
+        default=0.9, description="transmittance of lens and filter at the wavelength"
     )
     quantum_efficiency: Annotated[float, Field(gt=0, le=1)] = Field(
         default=0.35, description="electrons per photon at the wavelength"
@@ -39,11 +39,11 @@ class Sensor(Spec):
         default=None, description="system gain K; default: full scale at 98 % of the full well"
     )
     black_level_dn: NonNegative | None = Field(default=None, description="default: 1/256 of full scale")
-    bit_depth: Literal[8, 10, 12, 16] = Field(default=16, description="of the stored numbers")
+    bit_depth: Literal[8, 10, 12, 16] = Field(default=16, description="bits of the stored numbers")
     psf_sigma_px: Annotated[float, Field(ge=0, le=20)] = Field(
         default=0.7, description="standard deviation of the Gaussian point-spread function, pixel area not included"
     )
-    noise: bool = Field(default=True, description="shot and read noise; false gives the expected value, rounded")
+    noise: bool = Field(default=True, description="shot and read noise; false stores the rounded expected value")
 
     @property
     def full_scale_dn(self) -> int:

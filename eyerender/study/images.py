@@ -79,7 +79,7 @@ class StudyImages:
         from ..imageobserver import ImageObserver
 
         if not self.holds(scene):
-            raise InputError("its images are not in the study's dataset", source=scene.name)
+            raise InputError("the images of this scene are not in the study's dataset", source=scene.name)
         return ImageObserver().observe_entries(self.of(scene), scene.index(), scene)
 
 

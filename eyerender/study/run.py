@@ -87,14 +87,14 @@ def run_study(
         BackendError: there is nothing to render the images with.
     """
     if name not in STUDIES:
-        raise InputError(f"{name!r} is no study; there are {', '.join(STUDIES)}")
+        raise InputError(f"{name!r} is not a study; choose from {', '.join(STUDIES)}")
     if not eyes or len(set(eyes)) != len(eyes):
         raise InputError("name each eye once", source="--eyes")
     for eye in eyes:
         load_eye(eye)
     observer = observer or ("both" if name == "observers" else "analytic")
     if name == "conditions" and observer != "analytic":
-        raise InputError("the study 'conditions' has the analytic observer only", source="--observer")
+        raise InputError("the study 'conditions' supports the analytic observer only", source="--observer")
     if name == "observers" and observer != "both":
         raise InputError("the study 'observers' compares both observers", source="--observer")
     if workers is not None and workers < 1:

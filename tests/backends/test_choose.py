@@ -16,7 +16,7 @@ from eyerender.backends.doctor import backend_states, doctor_report
 from eyerender.backends.llvm import find_llvm
 from eyerender.errors import BackendError, InputError
 
-needs_llvm = pytest.mark.skipif(find_llvm() is None, reason="no libLLVM here renders")
+needs_llvm = pytest.mark.skipif(find_llvm() is None, reason="no libLLVM here can render")
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,7 @@ def test_process_without_a_library_ends_with_one_line_and_no_abort(tmp_path: Pat
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr.startswith("3: no libLLVM here renders")
+    assert done.stderr.startswith("3: no libLLVM here can render")
     assert done.stderr.count("\n") == 1
 
 

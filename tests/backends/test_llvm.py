@@ -35,7 +35,7 @@ def good() -> Path:
     """A libLLVM that renders."""
     found = find_llvm()
     if found is None or found.path is None:
-        pytest.skip("no libLLVM here renders")
+        pytest.skip("no libLLVM here can render")
     return found.path
 
 
@@ -277,7 +277,7 @@ def test_importing_the_room_loads_no_mitsuba() -> None:
 def test_without_an_archive_the_command_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("eyerender.backends.llvm.candidates", lambda: iter(()))
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(BackendError, match="no libLLVM here renders") as caught:
+    with pytest.raises(BackendError, match="no libLLVM here can render") as caught:
         setup_llvm()
     assert llvm_command() in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -361,7 +361,7 @@ def test_archive_without_a_fitting_library_leaves_nothing(
     monkeypatch.setattr("eyerender.backends.set_up.RUNTIME", {})
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     said: list[str] = []
-    with pytest.raises(BackendError, match="libllvm99 does not render"):
+    with pytest.raises(BackendError, match="libllvm99 cannot render"):
         setup_llvm(say=said.append)
     assert [p.name for p in (tmp_path / "cache" / "eyerender" / "llvm").iterdir()] == ["lock"]
     assert len(said) == 3

@@ -34,7 +34,7 @@ def test_what_is_given_may_have_a_name_of_its_own():
     command = resolve(f"{sys.executable} x.py --path 'a b' k=v")
     assert command.argv == (sys.executable, "x.py", "--path", "a b", "k=v")
     assert resolve(f"label={sys.executable} x.py").name == "label"
-    with pytest.raises(InputError, match=r"is no extractor \(.*own-fast"):
+    with pytest.raises(InputError, match=r"is neither an extractor \(.*own-fast"):
         resolve("own_fast")
 
 

@@ -64,9 +64,9 @@ def test_missing_and_errors_are_results():
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("Segmentation fault", "printed what is no JSON: 'Segmentation fault'"),
-        ("[" * 100_000, "printed what is no JSON"),
-        ("[1, 2]", "no object"),
+        ("Segmentation fault", "printed a line that is not JSON: 'Segmentation fault'"),
+        ("[" * 100_000, "printed a line that is not JSON"),
+        ("[1, 2]", "not an object"),
         (reply(GOOD).replace('"id": 3', '"id": 4'), "id: must be 3, not 4"),
         ('{"id": 3}', "record: must hold the pupil"),
         (reply({"status": "found"}), "pupil.status: must be 'ok' or 'missing', not 'found'"),
@@ -112,7 +112,7 @@ def test_random_bytes_are_never_an_answer():
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("Loading model ...", "no JSON"),
+        ("Loading model ...", "not JSON"),
         ('{"schema": "eyerender/extractor/9", "name": "x"}', "this version speaks 'eyerender/extractor/1'"),
         ('{"schema": "eyerender/extractor/1"}', "name: must be a name"),
         ('{"schema": "eyerender/extractor/1", "name": "x", "reports": ["iris"]}', "reports: must name 'pupil'"),

@@ -219,7 +219,7 @@ def test_a_rendered_folder_s_labels_and_hints_are_in_image_coordinates(rendered)
 def test_images_of_two_eyes_and_damaged_folders_are_refused(drawn, tmp_path):
     (tmp_path / "dataset.json").write_text((drawn / "dataset.json").read_text())
     (tmp_path / "metadata.jsonl").write_text("{}\n")
-    with pytest.raises(InputError, match="line 1: is no image record"):
+    with pytest.raises(InputError, match="line 1: is not an image record"):
         load_labelled(tmp_path)
     (tmp_path / "metadata.jsonl").write_text((drawn / "metadata.jsonl").read_text())
     with pytest.raises(InputError, match="no such file"):

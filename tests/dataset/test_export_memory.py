@@ -104,7 +104,7 @@ def test_samples_come_in_order_whatever_the_order_of_lines(folders, tmp_path):
     [
         (lambda line: line.update(labels=None), "line 3: cannot be exported, for it is not as this version writes it"),
         (lambda line: line.update(sample=None), "line 3.sample"),
-        (lambda line: line.update(file_name="other/00000000-right.png"), "two images have the same name"),
+        (lambda line: line.update(file_name="other/00000000-right.png"), "two images have the same file name"),
         (lambda line: line.update(bit_depth=20), "line 3.bit_depth: must be 1 to 16"),
     ],
     ids=["labels", "sample", "name", "depth"],

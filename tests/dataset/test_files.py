@@ -151,7 +151,7 @@ def test_files_that_cannot_be_read_are_refused_before_anything_is_written(
     ("name", "content", "words"),
     [
         ("rooms/day.npy", b"hello", "day.npy: is not a readable map"),
-        ("heads/bar.ply", b"hello", "bar.ply: is not the file that sha256 belongs to"),
+        ("heads/bar.ply", b"hello", "bar.ply: does not have the given sha256"),
     ],
 )
 def test_files_that_hold_something_else_leave_nothing(tmp_path, capsys, monkeypatch, name, content, words):

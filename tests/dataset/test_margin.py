@@ -63,5 +63,5 @@ def test_its_numbers_may_be_draws():
     [{"seed": SEED | {"per": "sample"}}, {"draw": "choice", "values": [{"seed": 1}, {"seed": 2}], "per": "sample"}],
 )
 def test_a_subject_has_one_margin(margin):
-    with pytest.raises(InputError, match="a subject's eye is drawn once a subject"):
+    with pytest.raises(InputError, match="the eye must be drawn once per subject"):
         plan_with(margin)

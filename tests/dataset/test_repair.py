@@ -150,7 +150,7 @@ def test_folders_that_may_be_someone_elses_are_left_alone(tmp_path, names):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("")
     before = tree(tmp_path)
-    with pytest.raises(InputError, match="is not empty; give another folder or --overwrite"):
+    with pytest.raises(InputError, match="is not empty; choose another folder or give --overwrite"):
         make(tmp_path, plan())
     assert tree(tmp_path) == before
 
@@ -166,8 +166,8 @@ def test_a_run_file_of_something_else_is_refused(tmp_path):
     [
         ({"schema": "eyerender/shard/9"}, "must have the schema"),
         ({"files": None}, "files: is missing"),
-        ({"files": {}}, "files: are not those of this shard"),
-        ({"files": {"../run.json": {"bytes": 1, "sha256": ""}}}, "files: are not those of this shard"),
+        ({"files": {}}, "files: do not belong to this shard"),
+        ({"files": {"../run.json": {"bytes": 1, "sha256": ""}}}, "files: do not belong to this shard"),
         ({"files": {"images/00001/a.png": {"bytes": "1", "sha256": ""}}}, "files: is missing or not as"),
         ({"samples": [1]}, "samples: is missing"),
         ({"backend": {"name": 1}}, "backend: is missing"),

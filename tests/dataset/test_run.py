@@ -161,11 +161,11 @@ def test_overwrite_replaces_and_other_folders_are_left_alone(tmp_path):
 def test_two_runs_exclude_each_other(tmp_path):
     with run_lock(tmp_path, (1, 1), print):
         for part in ((1, 1), (1, 2)):
-            with pytest.raises(InputError, match="another run is at work"):
+            with pytest.raises(InputError, match="another run is using"):
                 make(tmp_path, plan(), part=part)
     with run_lock(tmp_path, (1, 2), print), run_lock(tmp_path, (2, 2), print):
         for part in ((1, 1), (2, 2), (3, 3)):
-            with pytest.raises(InputError, match="another run is at work"):
+            with pytest.raises(InputError, match="another run is using"):
                 make(tmp_path, plan(), part=part)
 
 

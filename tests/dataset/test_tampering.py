@@ -17,7 +17,7 @@ from eyerender.scenespec import SceneSpec
 
 pytestmark = pytest.mark.render
 
-SHARD, AGAIN = "is not what its shard has", "computed again"
+SHARD, AGAIN = "differs from its shard", "computed again"
 
 
 def lines_of(path):
@@ -206,7 +206,7 @@ def test_lost_and_new_lines_are_found(copy):
     write_lines(path, [extra, *lines[1:7], *lines[8:], {**lines[3], "file_name": "images/00001/x.png"}])
     found = validate(copy, quick=True)["problems"]
     assert any("not in metadata.jsonl" in p and lines[7]["file_name"] in p for p in found)
-    assert any("no shard has its line" in p and "x.png" in p for p in found)
+    assert any("this line is in no shard" in p and "x.png" in p for p in found)
 
 
 def test_order_of_lines_and_keys_and_whole_numbers_do_not_matter(copy):
@@ -237,7 +237,7 @@ def test_a_changed_spec_is_found(copy):
     dataset["spec"]["scene"]["rig"]["cameras"][0]["focal_length_px"] = 2500.0
     path.write_text(json.dumps(dataset))
     found = validate(copy, quick=True)["problems"]
-    assert "dataset.json: its digest is not that of its spec, eyes and files" in found
+    assert "dataset.json: its digest does not match its spec, eyes and files" in found
     # With digests that agree every line still tells of another camera.
     dataset["digest"] = Plan.from_mapping(dataset, copy).digest
     path.write_text(json.dumps(dataset))
@@ -400,7 +400,7 @@ def test_a_changed_scene_of_a_rendered_folder_is_found(rendered, tmp_path):
     dataset["spec"]["rig"]["cameras"][0]["focal_length_px"] = 2500.0
     path.write_text(json.dumps(dataset))
     found = validate(folder, quick=True)["problems"]
-    assert "dataset.json: its digest is not that of its scene, its eye and its files" in found
+    assert "dataset.json: its digest does not match its scene, its eye and its files" in found
     dataset["spec"]["eye"]["model"] = "gone.yaml"
     path.write_text(json.dumps(dataset))
     report = validate(folder, quick=True)

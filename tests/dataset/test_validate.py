@@ -92,13 +92,13 @@ def test_a_moved_mask_is_found(copy):
     write_png(path, np.roll(mask, 3, axis=1))
     found = problems(copy)
     assert any("the mask of its pupil leaves its outline" in p for p in found)
-    assert any("is not that of its mask" in p for p in found)
+    assert any("does not match its mask" in p for p in found)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda line: line["records"][0]["pupil"].update(angle_rad=4.0), "no ellipse in the record's convention"),
+        (lambda line: line["records"][0]["pupil"].update(angle_rad=4.0), "not an ellipse in the record's convention"),
         (lambda line: line["records"][0].pop("pose"), "pose.azimuth_deg: missing"),
         (lambda line: line["labels"].pop("iris"), "has other keys than line 1"),
         (lambda line: line.update(split="elsewhere"), "is in two splits"),

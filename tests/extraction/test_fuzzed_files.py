@@ -208,5 +208,5 @@ def test_images_of_a_file_are_not_counted(tmp_path):
     """A TIFF of many small images takes a time that grows with the square of their number to count."""
     frames = [Image.new("L", (16, 16), k) for k in range(3)]
     frames[0].save(tmp_path / "many.tif", save_all=True, append_images=frames[1:])
-    with pytest.raises(InputError, match="holds several images; a file of one is read"):
+    with pytest.raises(InputError, match="holds several images; give a file with one"):
         read_image(tmp_path / "many.tif")

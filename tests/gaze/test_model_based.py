@@ -184,13 +184,13 @@ def test_a_gaze_away_from_the_screen_has_a_status(scene):
 
 def test_refusals(scene):
     seen, _, _ = one_camera(scene)
-    with pytest.raises(InputError, match="right eye: 1 usable calibration targets; 4 parameters need 2"):
+    with pytest.raises(InputError, match="right eye: 1 usable calibration targets, but 4 parameters need 2"):
         GuestrinEizenman().fit(seen.take(np.arange(2)), world())
     with pytest.raises(InputError, match="needs 2 lights, the rig has 1"):
         GuestrinEizenman().fit(seen, world(lights=1))
-    with pytest.raises(InputError, match="not different lights"):
+    with pytest.raises(InputError, match="not distinct lights"):
         GuestrinEizenman(lights=(0, 7)).fit(seen, world())
-    with pytest.raises(InputError, match="outside its bounds"):
+    with pytest.raises(InputError, match="outside the bounds"):
         GuestrinEizenman(start=EyeParameters(12.0)).fit(seen, world())
     with pytest.raises(InputError, match="call fit first"):
         GuestrinEizenman().predict(seen, world())
@@ -252,7 +252,7 @@ def test_two_cameras_statuses(scene):
     )
     axes = ShihWuLiu().optic_axes(broken, world(cameras=2))
     assert axes.reason[:2].tolist() == ["no glint of light 0"] * 2
-    with pytest.raises(InputError, match="needs two cameras, the rig has 1"):
+    with pytest.raises(InputError, match="needs two cameras, but the rig has 1"):
         ShihWuLiu().predict(one_camera(scene)[0], world(cameras=1))
 
 

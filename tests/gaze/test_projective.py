@@ -111,13 +111,13 @@ def test_a_gaze_point_at_infinity_is_a_status():
 
 def test_refusals():
     seen = data()
-    with pytest.raises(InputError, match="3 usable calibration targets, a homography needs 4"):
+    with pytest.raises(InputError, match="3 usable calibration targets, but a homography needs 4"):
         Homography().fit(seen.take(np.arange(3)), WORLD)
     line = np.array(seen.index.target_mm)
     line[:, 2] = 0.0
     with pytest.raises(InputError, match="do not determine a homography"):
         Homography().fit(seen.with_targets(line), WORLD)
-    with pytest.raises(InputError, match="not different lights"):
+    with pytest.raises(InputError, match="not distinct lights"):
         Homography().fit(seen, rig([CAMERA], LIGHTS[:2], (650, 0, 0)))
     both = data(eyes=(0, 1))
     only = Homography().fit(seen, WORLD).predict(both, WORLD)
@@ -155,7 +155,7 @@ def test_cross_ratio_refusals_and_statuses():
     seen = cross_ratio_data([2, 2, 2, 2])
     with pytest.raises(InputError, match="no usable calibration target at the corner light 3"):
         CrossRatio().fit(seen.take(np.arange(3)), WORLD)
-    with pytest.raises(InputError, match="another one at the camera"):
+    with pytest.raises(InputError, match="one more light at the camera"):
         CrossRatio(at_camera=2).fit(seen, WORLD)
     with pytest.raises(InputError, match="call fit first"):
         CrossRatio().predict(seen, WORLD)

@@ -176,7 +176,7 @@ def test_a_rig_other_than_the_calibrations_is_told(guestrin, tmp_path, monkeypat
         argv = ["gaze", "predict", name, "-c", "c.json", *more]
         assert run([*argv, "--json", "-"]) == 0
         out, err = capsys.readouterr()
-        words = f"{path}: differs from the rig of the calibration; calibrate on this one"
+        words = f"{path}: differs from the rig of the calibration; calibrate again with this rig"
         assert err == f"warning: {words}\n"
         assert [w["code"] for w in json.loads(out)["warnings"]] == ["other-rig"]
         assert run([*argv, "--strict"]) == 2
@@ -262,7 +262,7 @@ def test_bad_input(guestrin, tmp_path, monkeypatch, capsys, argv, words):
     [
         ("schema", [10**200] * 3, "schema: is [10000000000"),
         ("estimator.name", "magic", "estimator.name: must be"),
-        ("estimator.function", "R13", "estimator: 'R13' is no function"),
+        ("estimator.function", "R13", "estimator: 'R13' is not a regression function"),
         ("eyes", [], "eyes: must hold a calibration for each eye"),
         ("eyes.third", {}, "eyes: must hold a calibration for each eye"),
         ("eyes.right", 3, "eyes.right: must be a mapping"),
@@ -323,7 +323,7 @@ def test_a_rig_that_cannot_be_is_refused(guestrin, path, value, words):
     ("text", "words"),
     [
         ("[" * 200_000, "nested too deeply"),
-        ('{"records": [], "rig": NaN}', "NaN is no number"),
+        ('{"records": [], "rig": NaN}', "NaN is not a number"),
         ('{"frame": 1' + "0" * 5000 + "}", "an integer of 5001 digits"),
         ('{"frame": 1e999}', "is too large"),
         ("[]", "must be a JSON object"),

@@ -110,7 +110,7 @@ def test_each_part_has_its_look(tmp_path):
 
 def test_an_eye_far_from_the_mesh_is_refused(tmp_path):
     shell(tmp_path / "shell.ply")
-    with pytest.raises(InputError, match=r"left_eye: lies .* mm from the nearest vertex"):
+    with pytest.raises(InputError, match=r"left_eye: is .* mm away from the nearest vertex"):
         load_head(spec_of(tmp_path, left_eye=[72.0, 20.0, -310.0]))
 
 

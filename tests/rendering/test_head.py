@@ -236,7 +236,7 @@ def test_ply_files_and_a_manifest_give_the_same_picture(renderer, folder, monkey
     before = written.digest()
     (folder / "mine" / "bar.ply").write_bytes((folder / "mine" / "face.ply").read_bytes())
     assert written.digest() != before
-    with pytest.raises(InputError, match="not the file that sha256 belongs to"):
+    with pytest.raises(InputError, match="does not have the given sha256"):
         only(written, renderer)
 
 
@@ -321,21 +321,21 @@ def test_a_mesh_in_the_cornea_is_refused_with_its_depth(renderer, folder):
 
 
 REFUSED = [
-    ({"sha256": "0" * 64}, "is not the file that sha256 belongs to"),
+    ({"sha256": "0" * 64}, "does not have the given sha256"),
     ({"parts": {"skin": ["nose"]}}, "parts.skin: no object 'nose'; there are ball, bar, face"),
     ({"unit": "inch"}, "unit"),
-    ({"unit": "m"}, "unit: m makes the mesh 17000"),
+    ({"unit": "m"}, "unit: with unit m, the mesh is 17000"),
     ({"unit": None}, "unit: missing"),
     ({"licence": None}, "licence: missing"),
-    ({"right_eye": [30.0, 0.0, 0.0]}, "right_eye: lies "),
+    ({"right_eye": [30.0, 0.0, 0.0]}, "right_eye: is "),
     ({"right_eye": None}, "right_eye: missing"),
-    ({"up": [0.0, 0.0, 2.0]}, "up: must not lie along forward"),
+    ({"up": [0.0, 0.0, 2.0]}, "up: must not be zero or parallel"),
     ({"file": "none.obj"}, "none.obj: no such file"),
     ({"file": "text.ply"}, "text.ply: is not a readable mesh"),
     ({"file": "empty.obj"}, "empty.obj: "),
     ({"file": "hole.obj"}, "not finite"),
     ({"file": "head.stl"}, "head.stl: must end with .obj or .ply"),
-    ({"file": "other.json"}, "unit: stands in the manifest"),
+    ({"file": "other.json"}, "unit: belongs in the manifest"),
 ]
 
 
@@ -358,7 +358,7 @@ def test_mistakes_end_in_one_line(renderer, folder, change, words, capsys, monke
 def test_a_head_does_not_blink(folder):
     data = scene_data(head_of())
     data["region"]["blink"] = 0.5
-    with pytest.raises(InputError, match=r"region.*blink.*keeps still"):
+    with pytest.raises(InputError, match=r"region.*blink.*does not move"):
         SceneSpec.from_mapping(data)
 
 

@@ -99,7 +99,7 @@ def test_protocol_and_eye_are_chosen_on_the_command_line(tmp_path, capsys):
 
 
 BAD = [
-    (["study", "newton1687", "-o", "out"], 2, "'newton1687' is no study; there are guestrin2006"),
+    (["study", "newton1687", "-o", "out"], 2, "'newton1687' is not a study; choose from guestrin2006"),
     (["study", "guestrin2006"], 2, "--output"),
     (["study"], 2, "NAME"),
     (["study", "guestrin2006", "-o", "out", "--eyes", "E9"], 2, "E9"),

@@ -76,7 +76,7 @@ def export(
         raise InputError(f"the layout {format} holds 8 bits; {', '.join(_SIXTEEN_BITS)} can hold 16", source="--bits")
     folder = ImageFolder.load(path)
     if folder.dataset.get("kind") != "dataset":
-        raise InputError("is no generated dataset (no kind: dataset)", source=str(Path(path) / DATASET))
+        raise InputError("is not a generated dataset (its kind is not 'dataset')", source=str(Path(path) / DATASET))
     for problem in verify_dataset(folder.path):
         raise InputError(f"{problem}; start generate again on the folder to repair it", source=str(path))
     total = len(folder.entries)

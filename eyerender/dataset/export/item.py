@@ -191,7 +191,7 @@ class Items:
             self.lights = max(self.lights, len(entry.line["labels"]["glints"]))
             self.file_name_bytes = max(self.file_name_bytes, len(entry.name.encode()))
         if len(np.unique(names)) < len(names):
-            raise InputError("two images have the same name", source=str(self.folder.path / METADATA))
+            raise InputError("two images have the same file name", source=str(self.folder.path / METADATA))
         self.order = np.argsort(samples, kind="stable")
         self.images_by_split = dict(sorted(splits.items()))
 

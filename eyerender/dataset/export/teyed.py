@@ -80,7 +80,7 @@ class _Video:
         self.split, self.frames = first.split, 0
         (h, w), notes = first.image.shape, out / "ANNOTATIONS"
         if (out / "VIDEOS" / name).exists():
-            raise ValueError(f"the samples of subject {first.line['subject']} do not follow each other")
+            raise ValueError(f"the samples of subject {first.line['subject']} are not consecutive")
         with ExitStack() as stack:
             places = (out / "VIDEOS" / name, notes / f"{name}pupil_seg_2D.mp4", notes / f"{name}iris_seg_2D.mp4")
             self._pictures = [stack.enter_context(LosslessVideo(place, w, h)) for place in places]

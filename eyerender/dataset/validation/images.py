@@ -52,11 +52,11 @@ def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> I
     image, stored = read_image(entry.path)
     w, h = entry.window[2:]
     if image.shape != (h, w):
-        yield f"is {_size(image)} px, its window is {w} x {h}"
+        yield f"is {_size(image)} px, but its window is {w} x {h}"
         return
     depth = int(line.get("bit_depth") or stored)
     if depth > stored and not (stored == 16 and depth <= 16):
-        yield f"is stored with {stored} bits, its bit depth is {depth}"
+        yield f"is stored with {stored} bits, but its bit depth is {depth}"
     full = float(2**depth - 1)
     if float(image.max()) > full:
         yield f"has values above {full:g}"
@@ -100,7 +100,7 @@ def _visible(line: dict[str, Any], mask: Mask, window: Window) -> Iterator[str]:
         if isinstance(own, dict):
             again = moments_ellipse(inside, window)
             if any(again[key] != own["visible"][key] for key in again):
-                yield f"the visible ellipse of its {name} is not that of its mask"
+                yield f"the visible ellipse of its {name} does not match its mask"
 
 
 def _outlines(
@@ -130,12 +130,12 @@ def _outlines(
             yield from _compare(f"{what} of its iris", picture >= IRIS, (picture == SCLERA) | other, iris, window)
     if whole is not None:
         if np.any((mask != SKIN) & (mask != whole)):
-            yield "its mask shows what its amodal mask does not have there"
+            yield "its mask shows a part that its amodal mask lacks there"
         for name, part, share in zip(("pupil", "iris"), (PUPIL, IRIS), shares, strict=True):
             there = np.count_nonzero(whole == part)
             seen = np.count_nonzero((whole == part) & (mask == part))
             if share is not None and (not there or abs(share - seen / there) > 1e-9):
-                yield f"the visible fraction of its {name} is not that of its masks"
+                yield f"the visible fraction of its {name} does not match its masks"
 
 
 def _compare(name: str, shown: Bools, not_shown: Bools, outline: Outline, window: Window) -> Iterator[str]:

@@ -108,7 +108,7 @@ class Lines:
         order = np.argsort(self._names, kind="stable")
         again = order[1:][self._names[order[1:]] == self._names[order[:-1]]]
         for k in np.sort(again):
-            problems.add(f"{METADATA} line {k + 1}: its file name stands twice")
+            problems.add(f"{METADATA} line {k + 1}: its file name appears twice")
         for k in self._moved():
             problems.add(f"{METADATA} line {k + 1}: subject {self._subjects[k]} is in two splits")
 
@@ -145,13 +145,13 @@ def check_records(batch: list[dict[str, Any]]) -> list[list[str]]:
         ellipse = np.isfinite(pupil.centre_px).all(axis=1) & (a >= b) & (b > 0)
         ellipse &= (pupil.angle_rad >= 0) & (pupil.angle_rad < np.pi)
     for i in np.flatnonzero(ok & ~ellipse):
-        problems[rows[i]].append("its pupil is no ellipse in the record's convention")
+        problems[rows[i]].append("its pupil is not an ellipse in the record's convention")
     for i in np.flatnonzero(~ok):
         if not pupil.reason[i]:
             problems[rows[i]].append(f"its pupil is {Status(pupil.status[i]).label} without a reason")
     placed = np.isfinite(found.glints.xy_px).all(axis=2)
     for i in np.flatnonzero((found.glints.ok & ~placed).any(axis=1)):
-        problems[rows[i]].append("a glint has no place")
+        problems[rows[i]].append("a glint has no position")
     return problems
 
 
@@ -164,11 +164,11 @@ def _agree(line: dict[str, Any]) -> Iterator[str]:
     # Labels need the whole outline, so a partial pupil is missing there.
     record_pupil = {**pupil, "status": "missing" if pupil["status"] == "partial" else pupil["status"]}
     if any(own[key] != record_pupil[key] for key in keys):
-        yield "the pupil of its labels is not that of its record"
+        yield "the pupil of its labels differs from that of its record"
     places = {glint["light"]: glint["xy_px"] for glint in record["glints"] if glint["status"] == "ok"}
     for glint in labels["glints"]:
         if glint["xy_px"] != places.get(glint["light"]):
-            yield f"the glint of light {glint['light']} of its labels is not that of its record"
+            yield f"the glint of light {glint['light']} of its labels differs from that of its record"
 
 
 def _other_keys(line: dict[str, Any], first: dict[str, Any]) -> Iterator[str]:

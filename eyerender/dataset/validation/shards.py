@@ -51,7 +51,7 @@ def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: P
     missing = len(asked) - sum(shard in asked for shard in there)
     problems.extend(f"{SHARDS}/{shard_name(s)}: missing" for s in islice((s for s in asked if s not in known), SHOWN))
     problems.count += max(missing - SHOWN, 0)
-    problems.extend(f"{SHARDS}/{shard_name(s)}: dataset.json asks for no such shard" for s in there if s not in asked)
+    problems.extend(f"{SHARDS}/{shard_name(s)}: dataset.json has no such shard" for s in there if s not in asked)
 
 
 def compare_lines(folder: Path, problems: Problems) -> None:
@@ -73,9 +73,9 @@ def compare_lines(folder: Path, problems: Problems) -> None:
     for number, other in pairs[:SHOWN].tolist():
         line = first[0].get(number, {})
         said = next(differences(first[1].get(other, {}), line, 0.0), "it has other keys")
-        problems.add(f"{METADATA} line {number + 1}: {line.get('file_name')} is not what its shard has: {said}")
+        problems.add(f"{METADATA} line {number + 1}: {line.get('file_name')} differs from its shard: {said}")
     problems.count += max(len(pairs) - SHOWN, 0)
-    for files, found, others, words in ((mine, a, b, "no shard has its line"), (theirs, b, a, f"not in {METADATA}")):
+    for files, found, others, words in ((mine, a, b, "this line is in no shard"), (theirs, b, a, f"not in {METADATA}")):
         alone = np.sort(found["number"][~np.isin(found["name"], others["name"])])
         where = METADATA if files is mine else f"{SHARDS}/*/{LINES}"
         for number, line in _objects(files, alone[:SHOWN]):

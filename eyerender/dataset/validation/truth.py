@@ -77,7 +77,7 @@ class DatasetTruth:
             plan = Plan.from_mapping(dataset, Path())
             text = json.dumps({k: dataset[k] for k in plan.to_mapping()}, sort_keys=True, separators=(",", ":"))
             if hashlib.sha256(text.encode()).hexdigest() != dataset["digest"]:
-                problems.add(f"{DATASET}: its digest is not that of its spec, eyes and files")
+                problems.add(f"{DATASET}: its digest does not match its spec, eyes and files")
             return cls(plan, frames_of(plan), _other_results(dataset))
         except InputError as error:
             problems.add(f"{DATASET}: its plan cannot be used: {error}")
@@ -102,7 +102,7 @@ class DatasetTruth:
         found = self._last
         frames, observations = found.frames, found.observations
         if frames is None or observations is None:
-            return Again((f"sample {number} is given up by the plan",))
+            return Again((f"the plan gives up sample {number}",))
         row = _row(observations, record["frame"] - number * self.frames, record["eye"])
         if row is None:
             return Again((f"sample {number} has no such image",))
@@ -147,7 +147,7 @@ class SceneTruth:
             made_by = dataset.get("versions")
             if isinstance(made_by, dict) and made_by.get("eyerender") != versions()["eyerender"]:
                 raise NoTruth("another version of the package made it")
-            problems.add(f"{DATASET}: its digest is not that of its scene, its eye and its files")
+            problems.add(f"{DATASET}: its digest does not match its scene, its eye and its files")
         return cls(frames, trace(frames))
 
     def whose(self, line: dict[str, Any]) -> dict[str, Any]:
@@ -236,7 +236,7 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
         if spot is None:
             continue
         if not lit.any():
-            yield f"the spot of light {glint['light']} is at {spot}, its cornea mirrors nothing to the camera"
+            yield f"the spot of light {glint['light']} is at {spot}, but its cornea reflects nothing to the camera"
             continue
         low, high = image.xy_px[lit].min(axis=0), image.xy_px[lit].max(axis=0)
         if glint["visible_share"] >= 1.0:
