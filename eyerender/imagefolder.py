@@ -138,7 +138,7 @@ class ImageEntry:
         image = read_image(path)[0]
         width, height = self.window[2:]
         if image.shape != (height, width):
-            reason = f"is {image.shape[1]} x {image.shape[0]} px, its window is {width} x {height}"
+            reason = f"is {image.shape[1]} x {image.shape[0]} px, but its window is {width} x {height}"
             raise InputError(reason, source=str(path))
         return image
 
@@ -222,7 +222,9 @@ class ImageFolder:
         if (folder / RUN).is_file() and not (folder / DATASET).is_file():
             raise InputError("holds an unfinished run; start generate again on the folder", source=str(path))
         if not (folder / METADATA).exists():
-            raise InputError(f"holds no {METADATA}, so it is not a folder of images written by this package", source=str(path))
+            raise InputError(
+                f"holds no {METADATA}, so it is not a folder of images written by this package", source=str(path)
+            )
         dataset = read_json(folder / DATASET, follow=False)
         if dataset.get("schema") != DATASET_SCHEMA:
             raise InputError(

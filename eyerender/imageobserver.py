@@ -179,7 +179,9 @@ def _scene_of_samples(folder: ImageFolder) -> Scene:
             first = Scene(spec, EyeSpec.from_mapping(_parsed(eye, source), source=source), spec.rig.build())
         seen.add(key)
         if len(seen) > 1:
-            raise InputError("the rig differs from image to image, so no calibration is possible", source=str(folder.path))
+            raise InputError(
+                "the rig differs from image to image, so no calibration is possible", source=str(folder.path)
+            )
     if first is None:
         raise InputError("holds no images", source=str(folder.path))
     return first

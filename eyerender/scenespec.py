@@ -26,10 +26,12 @@ MAX_OBSERVATIONS = 200_000
 class Eye(Spec):
     """Which eye looks, and how."""
 
-    model: str = Field(default="E2", description="a name of the catalogue, or an eye file (relative to the scene)")
-    pupil_diameter_mm: Positive | None = Field(default=None, description="of the anatomical pupil; default: the eye's")
+    model: str = Field(default="E2", description="a catalogue name, or an eye file (relative to the scene)")
+    pupil_diameter_mm: Positive | None = Field(
+        default=None, description="diameter of the anatomical pupil; default: the eye file's"
+    )
     line_of_sight: Literal["chief_ray", "entrance_window"] = "chief_ray"
-    margin: PupilMargin | None = Field(default=None, description="of the pupil; default: the eye's")
+    margin: PupilMargin | None = Field(default=None, description="boundary of the pupil; default: the eye file's")
 
 
 class Subject(Spec):
@@ -42,7 +44,7 @@ class Subject(Spec):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if len(set(self.eyes)) != len(self.eyes):
-            raise ValueError("eyes: each eye once")
+            raise ValueError("eyes: name each eye only once")
         return self
 
 
@@ -51,7 +53,7 @@ class Targets(Spec):
 
     grid: tuple[Count, Count] | None = Field(default=None, description="columns and rows")
     screen_mm: Annotated[tuple[Vec2, ...], Field(min_length=1)] | None = Field(
-        default=None, description="points to the subject's right of and above the screen's centre"
+        default=None, description="points on the screen, measured to the subject's right and up from its centre"
     )
     world_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] | None = None
 

@@ -87,7 +87,9 @@ def load_labelled(folder: str | Path) -> list[LabelledImage]:
         count = len(entry.records)
         if count != 1:
             raise InputError(
-                f"shows {count} eyes; the benchmark needs images of one eye", source=str(path / METADATA), path=f"line {k + 1}"
+                f"shows {count} eyes; the benchmark needs images of one eye",
+                source=str(path / METADATA),
+                path=f"line {k + 1}",
             )
         # There is one record per image, so an image's row in the truth is its number.
         out.append(_rendered(entry, truth, k, scene_rig))

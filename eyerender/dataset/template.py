@@ -198,7 +198,11 @@ def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
     if unit == "sample" and _under(bare, FIXED_IDENTITY):
         raise InputError("the eye must be drawn once per subject", source=source, path=f"{shown}.per")
     if isinstance(draw, SequenceDraw) and unit == "subject":
-        raise InputError("a sequence runs over the frames of a subject, so it cannot be drawn once per subject", source=source, path=shown)
+        raise InputError(
+            "a sequence runs over the frames of a subject, so it cannot be drawn once per subject",
+            source=source,
+            path=shown,
+        )
     return PlacedDraw(draw, unit)
 
 

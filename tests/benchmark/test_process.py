@@ -56,7 +56,7 @@ CASES = {
     "blind": ("say(GREETING)\nfor line in sys.stdin: ok(json.loads(line))", "none", "blind"),
     "dies at start": ("sys.exit('no licence')", "error", "ended with exit code 1: no licence"),
     "no greeting": ("time.sleep(3600)", "error", "no greeting within 0.5 s"),
-    "talks first": ("print('Loading ...', flush=True); time.sleep(3600)", "error", "greeting: printed a line that is not"),
+    "talks first": ("print('Loading ...', flush=True); time.sleep(3600)", "error", "greeting: printed a line"),
     "other version": ("say({**GREETING, 'schema': 'eyerender/extractor/2'})", "error", "greeting: schema: is"),
     "crashes": ("say(GREETING); sys.stdin.readline(); os.abort()", "error", "was killed by SIGABRT"),
     "raises": ("say(GREETING); sys.stdin.readline(); 1 / 0", "error", "exit code 1: ZeroDivisionError: division"),
@@ -83,7 +83,7 @@ CASES = {
     "deep": ("say(GREETING)\nfor line in sys.stdin: print('[' * 100000, flush=True)", "error", "not JSON: '[[[["),
     "huge": ("say(GREETING)\nfor line in sys.stdin: print('1' * 5000, flush=True)", "error", "not JSON: '1111"),
     "closes its output": ("say(GREETING); os.close(1); time.sleep(3600)", "error", "closed its output"),
-    "binary": ("say(GREETING); os.write(1, bytes(range(255, 127, -1)) + b'\\n'); time.sleep(3600)", "error", "not JSON"),
+    "binary": ("say(GREETING); os.write(1, bytes(range(255, 127, -1)) + b'\\n'); time.sleep(999)", "error", "not JSON"),
 }  # fmt: skip
 
 
