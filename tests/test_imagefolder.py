@@ -315,8 +315,8 @@ def test_entries_read_their_own_pictures(pictures):
 @pytest.mark.parametrize(
     ("name", "data", "read", "words"),
     [
-        ("images/a.png", np.zeros((5, 6), np.uint16), "image", "a.png: is 6 x 5 px, its window is 5 x 6"),
-        ("m.png", np.zeros((5, 6), np.uint8), "mask", "m.png: is 6 x 5 px, its window is 5 x 6"),
+        ("images/a.png", np.zeros((5, 6), np.uint16), "image", "a.png: is 6 x 5 px, but its window is 5 x 6"),
+        ("m.png", np.zeros((5, 6), np.uint8), "mask", "m.png: is 6 x 5 px, but its window is 5 x 6"),
         ("m.png", np.zeros((6, 5), np.uint16), "mask", "m.png: holds uint16 values; a mask has 8 bits"),
         ("w.png", np.zeros((6, 5), np.uint16), "amodal_mask", "w.png: holds uint16 values"),
         ("q.png", None, "noiseless", "line 1.noiseless_file_name: 'q.png': no such file"),

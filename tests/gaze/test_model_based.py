@@ -186,7 +186,7 @@ def test_refusals(scene):
     seen, _, _ = one_camera(scene)
     with pytest.raises(InputError, match="right eye: 1 usable calibration targets, but 4 parameters need 2"):
         GuestrinEizenman().fit(seen.take(np.arange(2)), world())
-    with pytest.raises(InputError, match="needs 2 lights, the rig has 1"):
+    with pytest.raises(InputError, match="needs 2 lights, but the rig has 1"):
         GuestrinEizenman().fit(seen, world(lights=1))
     with pytest.raises(InputError, match="not distinct lights"):
         GuestrinEizenman(lights=(0, 7)).fit(seen, world())

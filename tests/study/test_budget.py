@@ -72,6 +72,6 @@ def test_the_report_says_what_the_summary_holds(tmp_path):
     page = (tmp_path / "report.html").read_text()
     assert "What the gaze error is made of" in page
     algorithm, eye = budget["terms"]
-    assert f"the algorithm's own error is {algorithm['deg']:.3f} deg" in page
+    assert f"the error of the algorithm itself is {algorithm['deg']:.3f} deg" in page
     assert f"eye model {eye['deg']:+.3f} deg" in page
     assert f"{eye['deg']:+.4f} ± {(eye['high_deg'] - eye['low_deg']) / 2:.4f}" in page
