@@ -114,7 +114,7 @@ def test_everything_is_synced_before_dataset_json_takes_its_place(tmp_path, monk
     [
         ("metadata.jsonl", None, "holds no metadata.jsonl"),
         ("metadata.jsonl", "", "holds no images"),
-        ("metadata.jsonl", "{}\n", "line 1.schema: is None, no image record"),
+        ("metadata.jsonl", "{}\n", "line 1.schema: is None, not an image record"),
         (
             "metadata.jsonl",
             json.dumps({"schema": "eyerender/image/1", **line(), "file_name": "../x"}),
