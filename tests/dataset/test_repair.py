@@ -168,7 +168,7 @@ def test_a_run_file_of_something_else_is_refused(tmp_path):
         ({"files": None}, "files: is missing"),
         ({"files": {}}, "files: do not belong to this shard"),
         ({"files": {"../run.json": {"bytes": 1, "sha256": ""}}}, "files: do not belong to this shard"),
-        ({"files": {"images/00001/a.png": {"bytes": "1", "sha256": ""}}}, "files: is missing or not as"),
+        ({"files": {"images/00001/a.png": {"bytes": "1", "sha256": ""}}}, "files: is missing, or not in the format"),
         ({"samples": [1]}, "samples: is missing"),
         ({"backend": {"name": 1}}, "backend: is missing"),
         ({"shard": 3}, "is of another shard"),

@@ -230,7 +230,7 @@ def test_only_deaths_one_after_the_other_end_a_run(tmp_path):
     assert Troubled(tmp_path, (1, 2, 4, 5)).run([0, 1], listener) == {}
     assert listener.made == [0, 1]
     assert listener.retries == [(-1, "the worker was ended by SIGKILL")] * 4
-    with pytest.raises(EyerenderError, match="workers do not start: the worker was ended by SIGKILL"):
+    with pytest.raises(EyerenderError, match="workers cannot start: the worker was ended by SIGKILL"):
         Troubled(tmp_path, (1, 2, 3)).run([0], listener)
 
 

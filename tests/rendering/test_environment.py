@@ -256,7 +256,7 @@ def test_files_that_are_no_maps_are_refused(renderer, tmp_path):
     for name, words in (
         ("cut.hdr", "not a readable map"),
         ("text.exr", "not a readable map"),
-        ("square.npy", "8 x 8; a map over all directions is twice as wide"),
+        ("square.npy", "8 x 8; a map of all directions must be twice as wide"),
         ("negative.npy", "negative"),
         ("hole.npy", "not finite"),
         ("none.exr", "no such file"),
