@@ -1,6 +1,6 @@
 """Near-infrared eye images through refractive corneas, with exact labels.
 
-The public names below are all there is to import; they load their modules on first use, so `import eyerender` loads
+The public names below are the whole interface. They load their modules on first use, so `import eyerender` loads
 neither Mitsuba nor OpenCV.
 """
 

@@ -1,4 +1,4 @@
-"""`python -m eyerender`, the same as the console script."""
+"""Entry of `python -m eyerender`, the same as the console script."""
 
 from .cli import main
 

@@ -1,7 +1,7 @@
 """Arrays: the names of their types, and values made of them with read-only storage, equality and hash.
 
-A computed result is a frozen, slotted dataclass whose arrays nobody can write to. `ArrayValue` gives such a class the
-equality and the hash that the dataclass machinery cannot (arrays compare element by element).
+A computed result is a frozen, slotted dataclass with read-only arrays. `ArrayValue` gives such a class the equality and
+the hash that the dataclass machinery cannot provide (arrays compare element by element).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FloatLike = Floats | float
 
 
 def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
-    """A read-only array with a memory of its own (`values` itself when it already is one)."""
+    """Make a read-only array with memory of its own (`values` itself if it already is one)."""
     array = np.asarray(values, dtype=dtype)
     if array.flags.writeable:
         array = array.copy()
@@ -104,7 +104,7 @@ def _same(a: Any, b: Any) -> bool:
 
 def _key(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        # -0.0 equals 0.0 and any NaN equals any other, so neither may reach the bytes.
+        # -0.0 equals 0.0, and all NaN are equal, so these differences must not reach the bytes.
         if value.dtype.kind == "f":
             value = np.where(np.isnan(value), np.nan, value + 0.0)
         data = tuple(value.ravel().tolist()) if value.dtype == object else value.tobytes()

@@ -24,23 +24,25 @@ if TYPE_CHECKING:
     from .rendering.frame import RenderJob
     from .rendering.renderer import RenderedWindow, Renderer
 
-# Of one image: a day's work of a fast processor.
+# For one image, this is a day's work of a fast processor.
 MAX_SAMPLES = 10**12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyeImage:
-    """A rendered picture of one eye: a window of a camera's sensor.
+    """A rendered image of one eye: a window of a camera's sensor.
 
     Attributes:
         frame: the one row of `Frames` that it shows.
-        row: which row that was of the frames that were rendered.
+        row: index of that row among the rendered frames.
         window: (x0, y0, width, height) of the window in full-sensor pixels.
         counts: what the sensor stores, (height, width) uint8 or uint16 DN.
         irradiance: on the sensor before noise and quantisation, (height, width) mW/mm^2.
-        parts: what is seen at each pixel's centre, (height, width) uint8 (docs/formats.md).
-        eye: the eye's model, which stands in the world by x_world = M x + t.
-        rendered: everything that the renderer gave.
+        parts: part of the eye at each pixel's centre, (height, width) uint8 (docs/formats.md).
+        eye: the eye's model, placed in the world by x_world = M x + t.
+        M: (3, 3) rotation of that motion.
+        t: (3,) translation of that motion, mm.
+        rendered: the renderer's complete result.
     """
 
     frame: Frames
@@ -56,18 +58,18 @@ class EyeImage:
 
     @property
     def name(self) -> str:
-        """The name of the image's files: the number of the frame and the eye."""
+        """Name of the image's files: the number of the frame and the eye."""
         index = self.frame.index
         return f"{index.frame[0]:06d}_{EYES[index.eye[0]]}"
 
     @property
     def scene(self) -> Scene:
-        """The scene that was rendered."""
+        """Scene that was rendered."""
         return self.frame.scene
 
     @property
     def camera(self) -> int:
-        """Which camera took the picture."""
+        """Index of the camera."""
         return int(self.frame.index.camera[0])
 
 
@@ -79,14 +81,14 @@ def render_windows(
     renderer: Renderer | None = None,
     progress: Progress | None = None,
 ) -> Iterator[EyeImage]:
-    """Render every row of `frames` in a window of its own, in order.
+    """Render every row of `frames` in its own window, in order.
 
     Args:
         frames: n rows, one eye in one frame each.
-        backend: what renders, unless there is a renderer.
-        threads: how many processor threads render; None takes all.
-        renderer: one that was made before (see `make_renderer`).
-        progress: hears (done, n, "") after each image.
+        backend: the backend, if no renderer is given.
+        threads: number of processor threads for rendering; None: all.
+        renderer: an existing renderer (see `make_renderer`).
+        progress: called with (done, n, "") after each image.
 
     Raises:
         InputError: the scene's windows cannot be rendered.
@@ -117,7 +119,7 @@ def render_windows(
 
 
 def render_job(frames: Frames, row: int) -> RenderJob:
-    """What the renderer is asked for one row: the eye in its pose, the rig, the window, the seed."""
+    """Job of the renderer for one row: the eye in its pose, the rig, the window, the seed."""
     from .rendering.frame import RenderJob
 
     scene, index = frames.scene, frames.index
@@ -143,7 +145,7 @@ def render_job(frames: Frames, row: int) -> RenderJob:
 
 
 def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:
-    """The same window at even moments of the exposure, the eye and the head moving; none where nothing moves."""
+    """The same window at evenly spaced moments of the exposure, with moving eye and head; empty where nothing moves."""
     scene, pose = frames.scene, frames.pose
     motion = scene.spec.motion
     if motion is None:
@@ -161,7 +163,11 @@ def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...
 
 
 def check_windows(scene: Scene) -> None:
-    """Raise `InputError` for a scene whose eyes cannot be rendered."""
+    """Check that the eyes of a scene can be rendered.
+
+    Raises:
+        InputError: they cannot.
+    """
     if scene.spec.image.window_px is None and len(scene.spec.subject.eyes) > 1:
         raise InputError("missing; a scene with both eyes needs a window for each eye", path="image.window_px")
     spp = scene.spec.image.spp
@@ -180,23 +186,27 @@ def check_windows(scene: Scene) -> None:
 
 
 def make_renderer(backend: BackendChoice = "auto", threads: int | None = None) -> Renderer:
-    """A renderer on a backend that works; raises `BackendError`, which says how to fix it, if there is none."""
+    """Make a renderer on a backend that works.
+
+    Raises:
+        BackendError: there is none; the message says how to fix it.
+    """
     from .backends.choose import choose_backend
 
     chosen = choose_backend(backend, threads)
-    # Only now: importing the renderer imports mitsuba, which must find its backend ready.
+    # Importing the renderer imports mitsuba, which requires a backend that is set up.
     from .rendering.renderer import Renderer
 
     return Renderer(chosen)
 
 
 def image_seed(seed: int, frame: int, eye: int) -> int:
-    """The seed of one image: a pure function of the scene's seed and of which image it is."""
+    """Seed of one image: a pure function of the scene's seed, the frame and the eye."""
     return int(np.random.SeedSequence([seed, frame, eye]).generate_state(1, np.uint64)[0])
 
 
 def noiseless(image: EyeImage) -> NDArray[Any]:
-    """The counts of an image without the sensor's noise: what `sensor.noise: false` gives."""
+    """Counts of an image without the sensor's noise, as with `sensor.noise: false`."""
     from .rig.exposure import expose
 
     spec = image.scene.spec
@@ -205,12 +215,12 @@ def noiseless(image: EyeImage) -> NDArray[Any]:
 
 
 def _stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
-    """Counts in the type that they are written with."""
+    """Convert counts to the type in which they are written."""
     return dn.astype(np.uint8) if scene.spec.sensor.bit_depth == 8 else dn
 
 
 def eye_motion(frames: Frames, row: int) -> tuple[Floats, Floats]:
-    """How the eye of one row stands in the world, as a rigid motion x_world = M x + t: M (3, 3), t (3,) mm."""
+    """Rigid motion x_world = M x + t of the eye of one row: M (3, 3), t (3,) mm."""
     index, pose = frames.index, frames.pose
     one = slice(row, row + 1)
     poses = Poses(pose.azimuth_rad[one], pose.elevation_rad[one], pose.torsion_rad[one])

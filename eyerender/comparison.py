@@ -1,4 +1,4 @@
-"""The two observers side by side: errors of image-derived features against the analytic ones, and the gaze of both."""
+"""Comparison of the two observers: errors of image-derived features against the analytic ones, and the gaze of both."""
 
 from __future__ import annotations
 
@@ -22,8 +22,14 @@ SCHEMA = "eyerender/compare/1"
 class FeatureErrors(ArrayValue):
     """Image-derived minus analytic features, NaN where one of the two has none.
 
-    `centre_px` (n, 2), `semi_axes_px` (n, 2), `glint_px` (n, m, 2) by the analytic glint's entry; the flags count what
-    the analytic observer sees on the sensor and what of it was found.
+    Attributes:
+        centre_px: (n, 2).
+        semi_axes_px: (n, 2).
+        glint_px: (n, m, 2), in the order of the analytic glints.
+        pupil_expected: (n,) whether the analytic observer sees the pupil on the sensor.
+        pupil_found: (n,) whether it was also found in the image.
+        glint_expected: (n, m) the same for glints.
+        glint_found: (n, m).
     """
 
     centre_px: Floats
@@ -47,9 +53,9 @@ class FeatureErrors(ArrayValue):
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Analytic and image-derived observations of the same frames, their errors and both gaze errors.
+    """Analytic and image-derived observations of the same frames, with feature errors and gaze errors of both.
 
-    The gaze errors are None where the scene gives none; `gaze_reason` says why.
+    The gaze errors are None where the scene allows none; `gaze_reason` is then the reason.
     """
 
     truth: Observations
@@ -61,7 +67,7 @@ class Comparison:
     gaze_reason: str | None
 
     def to_mapping(self) -> dict[str, Any]:
-        """The JSON of `compare` (schema eyerender/compare/1)."""
+        """Convert to the JSON of `compare` (schema eyerender/compare/1)."""
         return {
             "schema": SCHEMA,
             "features": self.features.summary(),
@@ -105,7 +111,11 @@ class Comparison:
 
 
 def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
-    """Errors of `found` against `truth`, row by row; `InputError` unless both are of the same frames and eyes."""
+    """Errors of `found` against `truth`, row by row.
+
+    Raises:
+        InputError: the two are not of the same frames and eyes.
+    """
     same = len(truth) == len(found) and np.array_equal(truth.index.frame, found.index.frame)
     if not same or not np.array_equal(truth.index.eye, found.index.eye):
         raise InputError("the two sets of observations have different frames or eyes")
@@ -135,14 +145,17 @@ def compare(
     """Compare two observers' reports of the same frames, in features and in gaze.
 
     Args:
-        truth: what is compared with, such as the analytic observer's report.
-        found: of the same frames and eyes, row by row, such as the image observer's report.
+        truth: the reference, such as the analytic observer's report.
+        found: report of the same frames and eyes, row by row, such as that of the image observer.
         rig: the rig of both.
-        estimator: how gaze is estimated from each; every target in turn by a calibration on the others.
-        name: of the estimator, for the result; default: its class, and a regression's function.
+        estimator: gaze estimator for both; every target is estimated by a calibration on the others.
+        name: name of the estimator in the result; default: its class, and a regression's function.
+
+    Returns:
+        The comparison. Where gaze cannot be estimated it contains the reason.
 
     Raises:
-        InputError: the two are not of the same frames and eyes. Where gaze cannot be estimated the result says why.
+        InputError: the two are not of the same frames and eyes.
     """
     if not name:
         name = f"regression {estimator.function}" if isinstance(estimator, Regression) else type(estimator).__name__

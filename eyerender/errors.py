@@ -1,8 +1,8 @@
-"""The hierarchy of expected errors, and the policy on them.
+"""The hierarchy of expected errors, and the policy for them.
 
-A user's mistake raises `InputError`; the command line prints it as one line and ends with its exit code. Whatever a
-computation can expect to meet (a ray that misses, a pupil that is not found) is no error: it is a status with a reason
-in the result. Any other exception is a defect of this package.
+A user's mistake raises `InputError`; the command line prints it as one line and exits with its code. What a computation
+can expect (a ray that misses, a pupil that is not found) is not an error but a status with a reason in the result. Any
+other exception is a defect of this package.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from typing import NoReturn
 
-# A message may quote a file that somebody else made. Longer parts lose their middle.
+# A message may quote a file that somebody else made. Longer parts are shortened in the middle.
 MAX_MESSAGE, MAX_SOURCE, MAX_PATH, MAX_REASON = 2000, 600, 200, 400
 
 
 class EyerenderError(Exception):
-    """Base of every error this package raises on purpose: the run failed (disk, worker, backend).
+    """Base of every error that this package raises on purpose: the run failed (disk, worker, backend).
 
-    The message is one line of printable characters of a limited length, whatever it quotes.
+    The message is one line of printable characters with a limited length, whatever it quotes.
     """
 
     exit_code = 1
@@ -28,9 +28,9 @@ class EyerenderError(Exception):
 
 
 class InputError(EyerenderError):
-    """What the user gave cannot be used.
+    """The user's input cannot be used.
 
-    `source` is the file or argument it stands in, `path` the dotted path of the key inside (either may be empty).
+    `source` is the file or argument, `path` the dotted path of the key in it (either may be empty).
     """
 
     exit_code = 2
@@ -49,9 +49,9 @@ Refuse = Callable[[str, str], NoReturn]
 
 @dataclass(frozen=True, slots=True)
 class InputWarning:
-    """What the user gave can be used, but was probably not meant.
+    """The user's input can be used, but is probably a mistake.
 
-    `code` is a word for programs, `source` and `path` are as of `InputError`.
+    `code` is a word for programs; `source` and `path` are as in `InputError`.
     """
 
     code: str
@@ -63,19 +63,19 @@ class InputWarning:
         return str(self.error())
 
     def error(self) -> InputError:
-        """The same as an error, for who wants none of it."""
+        """Convert to an error, for callers that treat warnings as errors."""
         return InputError(self.reason, source=self.source, path=self.path)
 
     def at(self, source: str) -> InputWarning:
-        """The same in a source."""
+        """Copy with a source."""
         return replace(self, source=source)
 
     def to_mapping(self) -> dict[str, str]:
-        """As JSON has it."""
+        """Convert to a mapping for JSON."""
         return asdict(self)
 
 
-# What hears of warnings while there is still time to stop: it may raise.
+# Receives warnings while there is still time to stop; it may raise.
 Warn = Callable[[Iterable[InputWarning]], None]
 
 
@@ -86,7 +86,7 @@ class BackendError(EyerenderError):
 
 
 def one_line(text: str, limit: int) -> str:
-    """A text as one line of printable characters, its middle left out where it is longer than `limit`.
+    """Convert a text to one line of printable characters; the middle is left out if it is longer than `limit`.
 
     Control characters (terminals obey some of them) become question marks.
     """

@@ -1,8 +1,8 @@
-"""Files: durable, atomic writes; reads that trust nothing; JSON without surprises.
+"""Files: durable, atomic writes; reads that trust nothing; strict JSON.
 
-A file is published by writing it under a temporary name beside its place, syncing it, renaming it and syncing the
-folder. After a power cut its place then holds the old content or the new one, never a part of either. Whatever is read
-may come from somebody else: it must be a regular file within a size limit.
+A file is published in four steps: it is written under a temporary name beside its place, synced, renamed, and the
+folder is synced. After a power cut its place then holds the old content or the new one, never a part of either. Files
+may come from other people, so only regular files within a size limit are read.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ from .errors import EyerenderError, InputError
 
 # Text files that people write: scenes, specs, eye files, calibrations.
 MAX_TEXT_BYTES = 16 * 2**20
-# A file that this package or a user's own scene names: an image, a map, a mesh.
+# Files that this package or a user's own scene names: images, maps, meshes.
 MAX_FILE_BYTES = 2**31
 PART = ".part"
-# What a number too large for a float, or an integer that takes long, has: many digits, or three in its exponent.
+# Patterns of a number that is too large for a float, or of an integer that takes long to parse: many digits, or three
+# in its exponent.
 _TO_ZEROS = bytes.maketrans(b"123456789E", b"000000000e")
 _LONG = (b"0" * 200, b"e000", b"e+000")
 _PLAIN = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
@@ -37,12 +38,12 @@ _PLAIN = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
 
 @contextmanager
 def written(path: str | Path, *, sync: bool = True) -> Iterator[BinaryIO]:
-    """A new file to write into; it takes its place when the block ends well, and leaves nothing when it does not.
+    """Open a new file for writing; it takes its place if the block succeeds, and leaves nothing if it fails.
 
     Args:
         path: the file to write; an old one is replaced.
-        sync: make it durable before the block's end: the file is synced before the rename, its folder after it.
-            Without it a power cut may leave an empty file, so use it only for what is synced later as a whole.
+        sync: make it durable before the block's end: the file is synced before the rename, its folder after it. Without
+            it a power cut may leave an empty file, so use it only for what is synced later as a whole.
 
     Raises:
         EyerenderError: the disk is full or not writable.
@@ -51,7 +52,7 @@ def written(path: str | Path, *, sync: bool = True) -> Iterator[BinaryIO]:
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
     made = False
     try:
-        # Exclusive: a link or a file that somebody put there is not followed and not overwritten.
+        # Exclusive mode does not follow or overwrite a link or a file that somebody put there.
         with open(part, "xb") as file:
             made = True
             yield file
@@ -71,30 +72,38 @@ def written(path: str | Path, *, sync: bool = True) -> Iterator[BinaryIO]:
 
 
 def write_bytes(path: str | Path, data: bytes, *, sync: bool = True) -> None:
-    """Write a file, complete or not at all; raises as `written` does."""
+    """Write a file, completely or not at all; raises as `written` does."""
     with written(path, sync=sync) as file:
         file.write(data)
 
 
 def write_text(path: str | Path, text: str, *, sync: bool = True) -> None:
-    """Write UTF-8 text, complete or not at all; raises as `written` does."""
+    """Write UTF-8 text, completely or not at all; raises as `written` does."""
     write_bytes(path, text.encode(), sync=sync)
 
 
 def write_json(path: str | Path, data: Any, *, sync: bool = True) -> None:
-    """Write JSON, complete or not at all; raises as `written` does, and `ValueError` for NaN and infinity."""
+    """Write JSON, completely or not at all; raises as `written` does, and `ValueError` for NaN and infinity."""
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n", sync=sync)
 
 
 def sync_file(path: str | Path) -> None:
-    """Make a file's content durable; raises `OSError`."""
+    """Make a file's content durable.
+
+    Raises:
+        OSError: it cannot be synced.
+    """
     _sync(path, os.O_RDONLY)
 
 
 def sync_folder(path: str | Path) -> None:
-    """Make the names in a folder durable; raises `OSError`.
+    """Make the names in a folder durable.
 
-    Does nothing where folders cannot be opened (Windows) or where the file system syncs no folders (some network ones).
+    Nothing happens where folders cannot be opened (Windows) or the file system does not sync folders (some network
+    ones).
+
+    Raises:
+        OSError: it cannot be synced.
     """
     if hasattr(os, "O_DIRECTORY"):
         try:
@@ -105,7 +114,11 @@ def sync_folder(path: str | Path) -> None:
 
 
 def make_folder(path: str | Path) -> bool:
-    """Make a folder, and what is missing above it, durable; returns whether it is new; raises `OSError`."""
+    """Make a folder and its missing parents, durably; returns whether it is new.
+
+    Raises:
+        OSError: it cannot be made.
+    """
     path = Path(path)
     missing = [p for p in (path, *path.parents) if not p.exists()]
     path.mkdir(parents=True, exist_ok=True)
@@ -115,7 +128,11 @@ def make_folder(path: str | Path) -> bool:
 
 
 def remove_file(path: str | Path) -> None:
-    """Remove a file, durably, where there is one; raises `OSError`."""
+    """Remove a file durably, if there is one.
+
+    Raises:
+        OSError: it cannot be removed.
+    """
     path = Path(path)
     try:
         path.unlink()
@@ -125,23 +142,30 @@ def remove_file(path: str | Path) -> None:
 
 
 def remove_parts(path: str | Path) -> None:
-    """Remove the temporary files that killed writers of a file left beside it; raises `OSError`."""
+    """Remove the temporary files that killed writers of a file left beside it.
+
+    Raises:
+        OSError: one cannot be removed.
+    """
     path = Path(path)
     for part in path.parent.glob(f".{glob.escape(path.name)}.*{PART}"):
         part.unlink(missing_ok=True)
 
 
 def sync_tree(path: str | Path) -> None:
-    """Make a folder durable with all that is in it; links are not followed; raises `OSError`.
+    """Make a folder durable with everything in it; links are not followed.
 
-    Files are synced by several threads, because a file system writes one journal entry for all that wait: 0.4 ms a file
+    Several threads sync files, because a file system writes one journal entry for all that wait: 0.4 ms per file
     instead of 4 on ext4.
+
+    Raises:
+        OSError: a file cannot be synced.
     """
     with ThreadPoolExecutor(8) as threads:
         for place, _, names in os.walk(path, topdown=False):
             paths = (os.path.join(place, name) for name in names)
             files = (file for file in paths if stat.S_ISREG(os.lstat(file).st_mode))
-            # Some at a time: what waits for a thread takes some KB.
+            # Files are taken in batches, because each one that waits for a thread takes some KB.
             while batch := list(islice(files, 1024)):
                 for _ in threads.map(sync_file, batch):
                     pass
@@ -150,7 +174,7 @@ def sync_tree(path: str | Path) -> None:
 
 @contextmanager
 def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> Iterator[BufferedReader]:
-    """A regular file, open for reading.
+    """Open a regular file for reading.
 
     Args:
         path: the file.
@@ -180,7 +204,7 @@ def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True
 
 
 def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> bytes:
-    """The content of a regular file; raises `InputError` as `opened` does."""
+    """Read a regular file; raises `InputError` as `opened` does."""
     source = str(path)
     with opened(path, limit=limit, follow=follow) as file:
         try:
@@ -193,7 +217,7 @@ def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = 
 
 
 def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = True) -> str:
-    """The content of a UTF-8 text file; raises `InputError` as `read_bytes` does, and for other encodings."""
+    """Read a UTF-8 text file; raises `InputError` as `read_bytes` does, and for other encodings."""
     try:
         return read_bytes(path, limit=limit, follow=follow).decode()
     except UnicodeDecodeError:
@@ -201,10 +225,15 @@ def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = T
 
 
 def parse_json(text: str | bytes, *, source: str = "", path: str = "") -> Any:
-    """A JSON value: finite numbers only, integers of at most 300 digits; raises `InputError`."""
+    """Parse a JSON value: finite numbers only, integers of at most 300 digits.
+
+    Raises:
+        InputError: it is not valid.
+    """
     try:
         data, text = (text, text.decode()) if isinstance(text, bytes) else (text.encode(errors="replace"), text)
-        # Asking at each number takes longer than all the rest; it is done only where one is long enough to matter.
+        # A check of each number takes longer than everything else, so it is made only if a number is long enough to
+        # matter.
         zeros = data.translate(_TO_ZEROS)
         hooks: dict[str, Any] = {}
         if any(long in zeros for long in _LONG):
@@ -222,7 +251,11 @@ def parse_json(text: str | bytes, *, source: str = "", path: str = "") -> Any:
 
 
 def read_json(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = True) -> dict[str, Any]:
-    """A JSON file that holds an object; raises `InputError`."""
+    """Read a JSON file that holds an object.
+
+    Raises:
+        InputError: it cannot be read, or is not an object.
+    """
     data = parse_json(read_bytes(path, limit=limit, follow=follow), source=str(path))
     if not isinstance(data, dict):
         raise InputError("must be a JSON object", source=str(path))
@@ -230,16 +263,16 @@ def read_json(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = T
 
 
 def inside(folder: Path, name: object, *, source: str = "", path: str = "") -> Path:
-    """The regular file `name` of a folder that somebody else may have made.
+    """Path of the regular file `name` in a folder that somebody else may have made.
 
-    The name must be relative, of plain parts (no `..`, no control characters), and no part of it may be a link.
+    The name must be relative, with plain parts (no `..`, no control characters), and no part of it may be a link.
 
     Raises:
-        InputError: the name leads out of the folder, or is no regular file there.
+        InputError: the name leads out of the folder, or is not a regular file there.
     """
     if not is_plain(name):
         raise InputError(f"must be a path inside the folder, not {shown(name)}", source=source, path=path)
-    # Text, not paths: folders of a million images are gone through.
+    # This uses text instead of paths for speed, because folders may have a million images.
     place = str(folder)
     parts = str(name).split("/")
     for k, part in enumerate(parts):
@@ -263,7 +296,7 @@ def is_plain(name: object) -> bool:
 
 
 def shown(value: object, limit: int = 80) -> str:
-    """A value from a file as it may stand in a message: one line of printable characters, not too long."""
+    """Format a value from a file for a message: one line of printable characters, not too long."""
     text = repr(value) if not isinstance(value, int) or abs(value) < 10**limit else "a huge number"
     text = "".join(c if c.isprintable() else "?" for c in text)
     return text if len(text) <= limit else text[: limit - 3] + "..."

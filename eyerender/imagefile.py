@@ -1,6 +1,6 @@
 """Reading and writing image files: 16- and 8-bit greyscale PNG; greyscale of the usual formats is read.
 
-Pixel values are linear sensor counts; nothing here scales or gamma-encodes them, except `preview`, which is for people.
+Pixel values are linear sensor counts. Nothing here scales or gamma-encodes them, except `preview`, which is for people.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from .arrays import Bytes
 from .errors import InputError
 from .files import opened, written
 
-# The largest window that can be rendered; this bounds what a hostile file can make us allocate.
+# Size of the largest window that can be rendered; it limits the memory that a hostile file can make us allocate.
 MAX_PIXELS = 8192 * 8192
-# More than such an image takes in any of the formats; the file's descriptive data come on top.
+# More than such an image takes in any of the formats, in addition to the file's descriptive data.
 MAX_IMAGE_BYTES = 2**30
-# Pillow knows many more, some of which start other programs.
+# Pillow supports many more formats, some of which start other programs.
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "GIF", "WEBP", "JPEG2000")
 
 
 def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> None:
-    """Write (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour; complete or not at all.
+    """Write (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour, completely or not at all.
 
     Images are mostly written into a folder that is synced as a whole before it is published; `sync` makes a single one
     durable.
@@ -38,28 +38,28 @@ def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> N
 
 
 def encode_png(target: Path | BinaryIO, image: NDArray[Any]) -> None:
-    """Write an image as `write_png` has it, to a file or a buffer."""
-    # Noise does not compress, and writing must not cost more than rendering: run lengths alone are faster and, for
+    """Write an image like `write_png`, to a file or a buffer."""
+    # Noise does not compress, and writing must not cost more than rendering. Run lengths alone are faster and, for
     # noise and for masks, smaller than zlib's search for repetitions.
     Image.fromarray(np.ascontiguousarray(image)).save(target, format="PNG", compress_level=1, compress_type=zlib.Z_RLE)
 
 
 def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
-    """A greyscale image and its bit depth (8 or 16).
+    """Read a greyscale image and its bit depth (8 or 16).
 
     Returns:
         (h, w) uint8 or uint16, or float32 for a float TIFF; bit depth (32 for float).
 
     Raises:
-        InputError: missing, no regular file, unreadable, empty, too large, with real colour or transparency, or with
-            several frames.
+        InputError: the file is missing, not regular, unreadable, empty or too large, or the image has real colour,
+            transparency or several frames.
     """
     source = str(path)
     try:
         with opened(path, limit=MAX_IMAGE_BYTES) as data:
             if os.fstat(data.fileno()).st_size == 0:
                 raise InputError("is empty", source=source)
-            # What Pillow warns of, it either reads all the same or fails at with an error.
+            # Where Pillow warns, it either reads the image nevertheless or fails with an error.
             with warnings.catch_warnings(action="ignore"), Image.open(data, formats=FORMATS) as file:
                 return _decoded(file, source)
     except InputError:
@@ -67,14 +67,14 @@ def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
     except MemoryError:
         raise InputError("needs more memory than is available", source=source) from None
     except Exception:
-        # A damaged file makes Pillow's decoders raise whatever their arithmetic comes upon.
+        # For a damaged file Pillow's decoders may raise any exception.
         raise InputError("is not a readable image", source=source) from None
 
 
 def _decoded(file: Image.Image, source: str) -> tuple[NDArray[Any], int]:
     if file.width * file.height > MAX_PIXELS:
         raise InputError(f"is too large ({file.width} x {file.height} pixels)", source=source)
-    # Counting them would go through the whole file.
+    # Counting the frames would read the whole file.
     if getattr(file, "is_animated", False):
         raise InputError("holds several images; give a file with one", source=source)
     mode = file.mode
@@ -99,13 +99,13 @@ def _decoded(file: Image.Image, source: str) -> tuple[NDArray[Any], int]:
 
 
 def _same_channels(file: Image.Image) -> Bytes | None:
-    """The one grey channel of a colour file whose channels are all equal; None for real colour."""
+    """Grey channel of a colour file whose channels are all equal; None for real colour."""
     rgb = np.asarray(file.convert("RGB"))
     equal = np.array_equal(rgb[..., 0], rgb[..., 1]) and np.array_equal(rgb[..., 0], rgb[..., 2])
     return np.ascontiguousarray(rgb[..., 0]) if equal else None
 
 
 def preview(image: NDArray[Any], full_scale: float, gamma: float = 2.2) -> Bytes:
-    """An 8-bit, gamma-encoded copy for people to look at; never to measure in."""
+    """Make an 8-bit, gamma-encoded copy for viewing, not for measurements."""
     linear = np.clip(np.asarray(image, dtype=float) / full_scale, 0, 1)
     return np.asarray(np.round(255 * linear ** (1 / gamma)), dtype=np.uint8)

@@ -25,9 +25,9 @@ from .rig.camera import Window
 IMAGE_SCHEMA = "eyerender/image/1"
 DATASET_SCHEMA = "eyerender/dataset/1"
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
-RUN = "run.json"  # of a folder that `generate` fills, from its start
+RUN = "run.json"  # in a folder that `generate` fills, from its start
 STAGE = ".partial-"
-_BATCH = 1024  # lines whose records are held at a time
+_BATCH = 1024  # number of lines whose records are in memory at a time
 _MAX_PX = 2**31
 
 CONVENTIONS = {
@@ -40,15 +40,15 @@ CONVENTIONS = {
 }
 
 
-# The keys of a line that name files of the folder.
+# Keys of a line that name files of the folder.
 FILE_KEYS = ("file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name")
 
 
 @dataclass(frozen=True, slots=True)
 class ImageEntry:
-    """One image of a folder: its files, the window (x0, y0, width, height) it shows, its line of metadata.
+    """One image of a folder: its files, its window (x0, y0, width, height) and its line of metadata.
 
-    `number` counts the lines of metadata from 1, 0 where it is not known.
+    `number` counts the lines of metadata from 1; it is 0 where it is unknown.
     """
 
     folder: Path
@@ -57,12 +57,12 @@ class ImageEntry:
 
     @property
     def name(self) -> str:
-        """The image's file, relative to the folder; for messages."""
+        """File of the image, relative to the folder, for messages."""
         return str(self.line["file_name"])
 
     @property
     def path(self) -> Path:
-        """The image file; raises `InputError` as `file` does."""
+        """Path of the image file; raises `InputError` as `file` does."""
         found = self.file("file_name")
         if found is None:
             raise InputError("missing", source=str(self.folder / METADATA), path=self._where("file_name"))
@@ -70,14 +70,14 @@ class ImageEntry:
 
     @property
     def mask_path(self) -> Path | None:
-        """The mask file, where there is one; raises `InputError` as `file` does."""
+        """Path of the mask file, if there is one; raises `InputError` as `file` does."""
         return self.file("mask_file_name")
 
     def file(self, key: str) -> Path | None:
-        """The file that one of `FILE_KEYS` names, None where the line names none.
+        """Path of the file that one of `FILE_KEYS` names, None where the line names none.
 
         Raises:
-            InputError: it leads out of the folder, is missing, or is no regular file (a link, a pipe, a folder).
+            InputError: it leads out of the folder, is missing, or is not a regular file (a link, a pipe, a folder).
         """
         name = self.line.get(key)
         if name is None:
@@ -86,47 +86,51 @@ class ImageEntry:
 
     @property
     def window(self) -> Window:
-        """x0, y0, width, height in full-sensor pixels."""
+        """Window x0, y0, width, height in full-sensor pixels."""
         w = self.line["window_px"]
         return w["x0"], w["y0"], w["width"], w["height"]
 
     def image(self) -> NDArray[Any]:
-        """The sensor's counts, (h, w) uint8 or uint16, as `window` shows them; float32 where the file holds floats.
+        """Read the sensor's counts in the window, (h, w) uint8 or uint16; float32 where the file holds floats.
 
         Raises:
-            InputError: as `file` does; the file is no greyscale image, or has another size than the window.
+            InputError: as for `file`; the file is not a greyscale image, or its size differs from the window's.
         """
         return self._picture(self.path)
 
     def mask(self) -> Bytes | None:
-        """The part of the eye at each pixel, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil.
+        """Read the part of the eye at each pixel, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil.
 
         Returns:
-            None where the line names no mask.
+            The mask, None where the line names none.
 
         Raises:
-            InputError: as `image` does; the file does not hold 8 bits.
+            InputError: as for `image`; the file does not have 8 bits.
         """
         return self._parts("mask_file_name")
 
     def amodal_mask(self) -> Bytes | None:
-        """The mask as if nothing stood before the eye; as `mask`."""
+        """Read the mask of the eye without occluders; like `mask`."""
         return self._parts("amodal_mask_file_name")
 
     def noiseless(self) -> NDArray[Any] | None:
-        """The counts without the sensor's noise, as `image`; None where the line names no such file."""
+        """Read the counts without the sensor's noise, like `image`; None where the line names no such file."""
         path = self.file("noiseless_file_name")
         return None if path is None else self._picture(path)
 
     @property
     def records(self) -> list[dict[str, Any]]:
-        """The analytic observer's record of each eye in the image, as JSON has it; `truth` gives them as arrays."""
+        """Records of the analytic observer for each eye in the image, as in the JSON; see `truth` for arrays."""
         found: list[dict[str, Any]] = self.line["records"]
         return found
 
     @property
     def labels(self) -> dict[str, Any]:
-        """The labels of the image (docs/formats.md), empty where it has none; raises `InputError` for no mapping."""
+        """Labels of the image (docs/formats.md), empty where it has none.
+
+        Raises:
+            InputError: they are not a mapping.
+        """
         found = self.line.get("labels")
         if found is None:
             return {}
@@ -152,7 +156,11 @@ class ImageEntry:
         return mask
 
     def truth(self) -> Observations:
-        """The analytic observer's records of this image; raises `InputError` naming line and key."""
+        """Records of the analytic observer for this image.
+
+        Raises:
+            InputError: naming line and key.
+        """
         try:
             return Observations.from_records(self.records)
         except InputError as error:
@@ -165,9 +173,9 @@ class ImageEntry:
 
 @dataclass(frozen=True, slots=True)
 class Entries(Sequence[ImageEntry]):
-    """The images of a folder. Each line of metadata is read and checked when its entry is asked for, and not kept.
+    """The images of a folder. Each line of metadata is read and checked when its entry is requested, and not kept.
 
-    Asking for entries one after the other by iterating is faster than by index. A slice is another such sequence.
+    Iteration is faster than access by index. A slice is another such sequence.
 
     Raises:
         InputError: on access; the line is wrong (the message names line and key), or the file has changed.
@@ -199,9 +207,9 @@ class Entries(Sequence[ImageEntry]):
 
 @dataclass(frozen=True, slots=True)
 class ImageFolder:
-    """A complete folder of images; going through it gives an `ImageEntry` for each.
+    """A complete folder of images; iteration yields an `ImageEntry` for each.
 
-    The lines of metadata are read when their entries are asked for, and never all held.
+    The lines of metadata are read when their entries are requested, and never all kept.
     """
 
     path: Path
@@ -213,8 +221,8 @@ class ImageFolder:
         """Open a folder: read dataset.json, find the lines of metadata.jsonl and check the first one.
 
         Raises:
-            InputError: naming the file, and the line and key where there is one. A wrong line further on is found when
-                it is read.
+            InputError: naming the file, and the line and key where there is one. A later wrong line is reported when it
+                is read.
         """
         folder = Path(path)
         if not os.path.isdir(folder):
@@ -246,7 +254,11 @@ class ImageFolder:
         return iter(self.entries)
 
     def truth(self) -> Observations:
-        """The analytic observer's records of every image, in order; raises `InputError` for a wrong record."""
+        """Records of the analytic observer for every image, in order.
+
+        Raises:
+            InputError: a record is wrong.
+        """
         parts = []
         for start in range(0, len(self.entries), _BATCH):
             batch = list(self.entries[start : start + _BATCH])
@@ -254,15 +266,19 @@ class ImageFolder:
                 parts.append(Observations.from_records([r for entry in batch for r in entry.records]))
             except InputError:
                 for entry in batch:
-                    entry.truth()  # says which line is wrong
+                    entry.truth()  # this names the wrong line
                 raise
         found = concatenate(parts)
-        # Positions of the head are counted over all images.
+        # Head positions are counted over all images.
         return replace(found, index=replace(found.index, head=count_heads(found.index.head_mm)))
 
 
 def _check_line(line: dict[str, Any], source: str, where: str) -> None:
-    """Raise `InputError` for a line whose files, names or window cannot be used; what else it holds is not checked."""
+    """Check the files, names and window of a line; the rest of it is not checked.
+
+    Raises:
+        InputError: they cannot be used.
+    """
 
     def refuse(key: str, reason: str) -> NoReturn:
         raise InputError(reason, source=source, path=f"{where}.{key}")
@@ -286,7 +302,7 @@ def _check_line(line: dict[str, Any], source: str, where: str) -> None:
 
 
 def _check_names(line: dict[str, Any], refuse: Refuse) -> None:
-    """What becomes a part of the names of exported files."""
+    """Check what becomes a part of the names of exported files."""
     for key in ("sample", "subject"):
         if key in line and not _is_count(line[key], 2**63):
             refuse(key, "must be a whole number >= 0")
@@ -327,7 +343,7 @@ def same_run(path: str | Path, digest: str) -> bool:
 
 
 def write_dataset(folder: Path, lines: list[dict[str, Any]], *, spec: dict[str, Any], digest: str, **more: Any) -> None:
-    """Write metadata.jsonl and, last, dataset.json, which marks the folder complete."""
+    """Write metadata.jsonl and then dataset.json, which marks the folder complete."""
     with open(folder / METADATA, "w", encoding="utf-8") as file:
         for line in lines:
             file.write(json.dumps({"schema": IMAGE_SCHEMA, **line}, allow_nan=False) + "\n")
@@ -351,7 +367,7 @@ A change of the code that changes them raises it. A run that was begun with anot
 
 
 def versions() -> dict[str, str]:
-    """The versions a result depends on."""
+    """Versions on which a result depends."""
     out = {"python": platform.python_version(), "results": str(RESULTS)}
     for name in ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless"):
         try:

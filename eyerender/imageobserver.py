@@ -1,4 +1,4 @@
-"""The image observer: features recovered from pixels, reported as the analytic observer reports its own."""
+"""The image observer, which reports features found in pixels in the same form as the analytic observer."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from .rig.rig import RigLike
 from .scene import Frames, Scene
 from .scenespec import SceneSpec
 
-# How far the reflections of a real eye lie from those of a typical one that is placed by its pupil.
+# Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
 _PLACE_MM = 1.5
 _BATCH = 256
 
 
 @dataclass(frozen=True, slots=True)
 class ImageObserver:
-    """Pixels: the pupil ellipse and the glints as OpenCV recovers them; it never sees the truth.
+    """The observer of pixels: the pupil ellipse and the glints that the extractor finds; it never uses the truth.
 
     Args:
-        settings: of the extraction; the range of pupil sizes is narrowed where the rig is known.
+        settings: settings of the extractor; where the rig is known, the range of pupil sizes is narrowed.
         gamma: encoding gamma of the images; 1 is linear.
-        backend: what renders the frames.
-        threads: how many processor threads render; None takes all.
-        progress: hears (done, all, "") after each image.
+        backend: backend that renders the frames.
+        threads: number of processor threads for rendering; None: all.
+        progress: called with (done, all, "") after each image.
     """
 
     settings: ExtractionSettings = field(default_factory=ExtractionSettings)
@@ -53,12 +53,12 @@ class ImageObserver:
     progress: Progress | None = None
 
     def observe(self, frames: Frames, rig: RigLike | None = None) -> Observations:
-        """Render every (frame, eye) and extract its features; `rig` replaces the one the frames were made for."""
+        """Render every (frame, eye) and extract its features; `rig` replaces that of the frames."""
         images = render_windows(frames.seen_by(rig), backend=self.backend, threads=self.threads, progress=self.progress)
         return self.observe_images(images)
 
     def observe_images(self, images: Iterable[EyeImage]) -> Observations:
-        """Extract the features of rendered images, one row for each."""
+        """Extract the features of rendered images, one row each."""
         return concatenate(
             [
                 self._observe_rows(
@@ -74,7 +74,7 @@ class ImageObserver:
         )
 
     def observe_folder(self, folder: ImageFolder, scene: Scene, *, progress: Progress | None = None) -> Observations:
-        """Extract the features of a folder's images, row by row as its records."""
+        """Extract the features of a folder's images, in the order of its records."""
         return self.observe_entries(folder.entries, folder.truth().index, scene, progress=progress)
 
     def observe_entries(
@@ -82,7 +82,7 @@ class ImageObserver:
     ) -> Observations:
         """Extract the features of some images of a scene; `index` has a row for each of their records."""
         parts: list[Observations] = []
-        few: list[Observations] = []  # observations of one row take ten times the memory of joined ones
+        few: list[Observations] = []  # observations of one row each take ten times the memory of joined ones
         row = 0
         for k, entry in enumerate(entries):
             image = entry.image()
@@ -102,7 +102,7 @@ class ImageObserver:
     ) -> Observations:
         """Extract the features of any greyscale images, or of one folder that this package wrote.
 
-        Each image shows one eye and counts as a frame; with a scene its glints are identified by light.
+        Each image shows one eye and counts as a frame; with a scene its glints are assigned to lights.
         """
         if len(paths) == 1 and os.path.isdir(paths[0]):
             folder = ImageFolder.load(paths[0])
@@ -114,7 +114,8 @@ class ImageObserver:
             lights = [-1] * len(found.glints)
             reasons: Sequence[str | None] = [None] * len(found.glints)
             if scene is not None:
-                # Which part of the sensor a loose image shows is not known: only a whole one can be placed.
+                # The part of the sensor that a single image shows is unknown, so only a whole sensor image can be
+                # placed.
                 camera = scene.rig.cameras[0]
                 if image.shape != (camera.resolution_px[1], camera.resolution_px[0]):
                     raise InputError(
@@ -129,7 +130,7 @@ class ImageObserver:
     def _observe_rows(
         self, image: NDArray[Any], depth: int, origin: tuple[int, int], index: Index, rows: Ints, scene: Scene
     ) -> Observations:
-        """The eyes that one image shows; where there are two, each in the part of the image where it must be."""
+        """Extract the eyes of one image; if there are two, each is searched in its own part of the image."""
         parts = []
         for row in rows:
             camera = scene.rig.cameras[int(index.camera[row])]
@@ -138,7 +139,7 @@ class ImageObserver:
             cut, corner = image, np.array(origin)
             if len(rows) > 1:
                 cut, corner = _around(image, corner, camera.project(eye_mm)[0], 16.0 * px_per_mm)
-            # Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens.
+            # Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens them.
             settings = self.settings.model_copy(
                 update={
                     "radius_min_px": max(0.6 * px_per_mm, 3.0),
@@ -152,7 +153,7 @@ class ImageObserver:
 
 
 def scene_of(folder: ImageFolder) -> Scene:
-    """The scene that a folder of images was rendered from."""
+    """Scene from which a folder of images was rendered."""
     source = str(folder.path / DATASET)
     spec = folder.dataset.get("spec")
     if not isinstance(spec, dict):
@@ -163,7 +164,7 @@ def scene_of(folder: ImageFolder) -> Scene:
 
 
 def _scene_of_samples(folder: ImageFolder) -> Scene:
-    """The scene of a generated dataset's first sample, whose cameras and places of lights all others must share."""
+    """Scene of a generated dataset's first sample, whose cameras and light positions all others must share."""
     first: Scene | None = None
     seen: set[str] = set()
     for entry in folder:
@@ -194,7 +195,7 @@ def _parsed(text: Any, source: str) -> Any:
 
 
 def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: float) -> tuple[NDArray[Any], Floats]:
-    """The part of an image within `half_px` of a full-sensor point, and its own first pixel on the sensor."""
+    """Part of an image within `half_px` of a full-sensor point, and its own first pixel on the sensor."""
     h, w = image.shape
     x0, y0 = np.clip(np.floor(centre_px - corner - half_px), 0, [w - 16, h - 16]).astype(int)
     x1, y1 = np.clip(np.ceil(centre_px - corner + half_px), [x0 + 16, y0 + 16], [w, h]).astype(int)
@@ -204,7 +205,7 @@ def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: flo
 def _lights(
     found: Extraction, corner: Floats, scene: Scene, camera: PinholeCamera, eye_mm: Floats
 ) -> tuple[list[int], Sequence[str | None]]:
-    """The light of each glint (-1: none) and why it has none, from the rig and a rough position of the eye."""
+    """Light of each glint (-1: none) and the reason why it has none, from the rig and a rough position of the eye."""
     if not found.glints or found.pupil.ellipse is None:
         return [-1] * len(found.glints), ["no pupil to place the reflections by"] * len(found.glints)
     spots = np.array([g.xy_px for g in found.glints]) + corner
@@ -218,7 +219,7 @@ def _lights(
 def _observation(
     found: Extraction, lights: Sequence[int], reasons: Sequence[str | None], corner: Floats, index: Index
 ) -> Observations:
-    """What was extracted from one image as a batch of one; `corner` moves it to full-sensor pixels."""
+    """Convert the extraction of one image to a batch of one; `corner` shifts it to full-sensor pixels."""
     pupil, glints = found.pupil, found.glints
     m = len(glints)
     known: dict[str, Any] = {"status": [pupil.status], "reason": [pupil.reason]}
@@ -230,7 +231,7 @@ def _observation(
         known["covariance"] = [pupil.covariance]
     spreads = [np.full((2, 2), np.nan) if g.covariance is None else g.covariance for g in glints]
     why = [g.reason or reason for g, reason in zip(glints, reasons, strict=True)]
-    # What was measured in an image lies in the image.
+    # What was measured in an image is in the image.
     return Observations(
         index=index,
         pose=PoseTruth(azimuth_rad=np.array([np.nan])),

@@ -1,4 +1,4 @@
-"""Files of one JSON object a line, read without holding them: a few bytes a line tell where it stands."""
+"""Files of one JSON object per line, read without keeping them: a few bytes per line store its offset."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from .files import opened, parse_json
 
 # A line of metadata takes about 10 KB; one with a long list of targets takes more.
 MAX_LINE_BYTES = 4 * 2**20
-MAX_BYTES = 2**50  # only a line is ever held
+MAX_BYTES = 2**50  # only one line is in memory at a time
 _CHUNK = 2**20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JsonLines:
-    """A file of JSON lines. `starts` (n + 1,) are the offsets of its n lines in bytes, and its end."""
+    """A file of JSON lines; `starts` (n + 1,) are the byte offsets of its n lines and its end."""
 
     path: Path
     starts: Ints
@@ -30,17 +30,17 @@ class JsonLines:
 
     @classmethod
     def index(cls, path: Path, *, limit: int = MAX_LINE_BYTES) -> JsonLines:
-        """Find the lines of a file in one pass over it, 8 bytes of memory a line.
+        """Find the lines of a file in one pass, with 8 bytes of memory per line.
 
         Args:
             path: a regular file, not a link.
             limit: the longest line, in bytes.
 
         Raises:
-            InputError: the file cannot be read, or one of its lines is longer or blank.
+            InputError: the file cannot be read, or one of its lines is too long or blank.
         """
         parts = [np.zeros(1, dtype=np.int64)]
-        count = start = offset = 0  # lines that have ended, where the present one starts, bytes read
+        count = start = offset = 0  # number of complete lines, start of the current one, bytes read
         with opened(path, limit=MAX_BYTES, follow=False) as file:
             state = _state(file)
             while chunk := file.read(_CHUNK):
@@ -56,7 +56,7 @@ class JsonLines:
                 if len(ends):
                     parts.append(ends)
                     count, start = count + len(ends), int(ends[-1])
-        if offset > start:  # the last line has no end of its own
+        if offset > start:  # the last line has no line end
             parts.append(np.array([offset], dtype=np.int64))
         starts = np.concatenate(parts)
         starts.setflags(write=False)
@@ -66,10 +66,10 @@ class JsonLines:
         return len(self.starts) - 1
 
     def read(self, rows: range) -> Iterator[dict[str, Any]]:
-        """The objects of some lines, counted from 0.
+        """Read the objects of some lines, counted from 0.
 
         Raises:
-            InputError: a line is no JSON object, or the file has changed since it was indexed.
+            InputError: a line is not a JSON object, or the file has changed since it was indexed.
         """
         if not len(rows):
             return

@@ -1,9 +1,9 @@
-"""The labels of an image: what ray optics knows, and what the picture shows.
+"""Labels of an image: what ray optics predicts, and what the image shows.
 
-They hold ellipses, glints, points and lines in space, and matrices.
+They contain ellipses, glints, points and lines in space, and matrices.
 
-`amodal` ellipses are those of the outline as if nothing stood before the eye: the pupil's seen through the cornea, the
-iris' at the circle of the limbus where the cornea is half clear. A `visible` ellipse has the second moments of the
+`amodal` ellipses are those of the outline without occluders: that of the pupil seen through the cornea, and that of the
+iris at the circle of the limbus where the cornea is half clear. A `visible` ellipse has the second moments of the
 visible pixels (of pupil, or of iris and pupil together): semi-axes 2 sqrt(eigenvalues of covariance + 1/12).
 """
 
@@ -32,9 +32,10 @@ IRIS, PUPIL = 2, 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyeInWindow:
-    """An eye as a window shows it, without the picture: row `row` of frames, its `camera` and `window`.
+    """An eye in a window, without the image: row `row` of frames, its `camera` and `window`.
 
-    The window is (x0, y0, width, height) in full-sensor pixels. The eye's frame lies in the world by x_world = M x + t.
+    The window is (x0, y0, width, height) in full-sensor pixels. The eye's frame is placed in the world by x_world = M x
+    + t.
     """
 
     row: int
@@ -46,7 +47,7 @@ class EyeInWindow:
 
     @classmethod
     def of(cls, frames: Frames, row: int) -> EyeInWindow:
-        """Row `row` of frames in its window."""
+        """Make it for row `row` of frames."""
         index, scene = frames.index, frames.scene
         camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
         M, t = eye_motion(frames, row)
@@ -54,11 +55,11 @@ class EyeInWindow:
 
 
 def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
-    """What the picture shows of pupil, iris, glints and lids: the labels of a rendered folder.
+    """What the image shows of pupil, iris, glints and lids: the labels of a rendered folder.
 
     Args:
         image: a rendered image, row `image.row` of `truth`.
-        truth: what the analytic observer sees in the frames that were rendered.
+        truth: observations of the rendered frames by the analytic observer.
     """
     done, row = image.rendered, image.row
     assert done.labels is not None
@@ -78,7 +79,7 @@ def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
 
 
 def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
-    """All labels of an image, the same keys for every image; the arguments are those of `seen_labels`."""
+    """All labels of an image, with the same keys for every image; the arguments are those of `seen_labels`."""
     part, window, seen = image.parts, image.window, seen_labels(image, truth)
     known = known_labels(image.scene, truth, image)
     return {
@@ -147,10 +148,10 @@ def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:
 def visible_arcs_deg(
     part: Bytes, pupil: int, points_px: Floats, origin_px: tuple[int, int], reach_px: float = 1.5
 ) -> list[list[float]]:
-    """Arcs [from, to] (degrees about the outline's centre, image x towards y) of the pupil's outline that are visible.
+    """Visible arcs [from, to] of the pupil's outline, in degrees about its centre (image x towards y).
 
-    A point of the outline (k, 2) counts as visible where a pixel of the pupil lies within `reach_px` of it; points off
-    the window do not. A whole outline is [[0, 360]].
+    A point of the outline (k, 2) counts as visible where a pixel of the pupil lies within `reach_px` of it. Points
+    outside the window do not. A whole outline is [[0, 360]].
     """
     height, width = part.shape
     x, y = points_px[:, 0] - origin_px[0], points_px[:, 1] - origin_px[1]

@@ -1,9 +1,9 @@
-"""Who may write to a folder: one writer, or several runs over disjoint parts of its shards.
+"""Locks of folders, for one writer, or for several runs over disjoint parts of its shards.
 
-Locks are the kernel's (flock), held by an open file: a process that dies in any way lets go of them.
+Locks are the kernel's (flock), held by an open file: a process that dies in any way releases them.
 
 Why not filelock: its kernel locks are exclusive only, and runs over parts of a folder share the folder's lock. Its
-read-write locks are a SQLite database, or files that outlive a dead process until they expire. What else it does here
+read-write locks are a SQLite database, or files that outlive a dead process until they expire. The rest of its features
 would replace one call of flock.
 """
 
@@ -30,7 +30,7 @@ _UNSUPPORTED = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
 
 @contextmanager
 def writer_lock(folder: Path, warn: Say = lambda _text: None) -> Iterator[None]:
-    """Hold a whole folder while the block runs, and leave no file of the lock behind.
+    """Hold a whole folder while the block runs; the file of the lock is removed afterwards.
 
     Raises:
         InputError: another writer holds it.
@@ -41,7 +41,7 @@ def writer_lock(folder: Path, warn: Say = lambda _text: None) -> Iterator[None]:
         try:
             yield
         finally:
-            # It is removed while it is held: `_take` does not accept a lock on a file that is gone.
+            # The file is removed while the lock is held: `_take` does not accept a lock on a removed file.
             with contextlib.suppress(OSError):
                 (folder / LOCK).unlink()
 
@@ -61,7 +61,7 @@ def run_lock(folder: Path, part: tuple[int, int], warn: Say) -> Iterator[None]:
         if not whole:
             for other in folder.glob(f"{LOCK}-*-of-*"):
                 if not other.name.endswith(f"-of-{n}"):
-                    # Parts of another division overlap with ours: nobody may hold one.
+                    # Parts of another division overlap with ours, so none of them may be held.
                     with contextlib.ExitStack() as brief:
                         _take(brief, other, shared=True, folder=folder, warn=warn)
             _take(stack, folder / f"{LOCK}-{k}-of-{n}", shared=False, folder=folder, warn=warn)
@@ -70,7 +70,7 @@ def run_lock(folder: Path, part: tuple[int, int], warn: Say) -> Iterator[None]:
 
 @contextmanager
 def final_lock(folder: Path, warn: Say) -> Iterator[None]:
-    """Hold the right to put the finished dataset together, waiting for it."""
+    """Wait for and hold the right to assemble the finished dataset."""
     with contextlib.ExitStack() as stack:
         _take(stack, folder / f"{LOCK}-final", shared=False, folder=folder, warn=warn, wait=True)
         yield
@@ -103,11 +103,11 @@ def _take(
         if _is_at(file, path):
             stack.callback(os.close, file)
             return
-        os.close(file)  # its last holder removed it in the meantime
+        os.close(file)  # its last holder has removed it in the meantime
 
 
 def _is_at(file: int, path: Path) -> bool:
-    """Whether an open file is still the one of a name."""
+    """Whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(file), os.lstat(path))
     except OSError:

@@ -1,9 +1,9 @@
-"""Observations: what an observer reports of every (frame, eye), as structs of arrays; and their record.
+"""Observations: an observer's report of every (frame, eye), as structs of arrays; and their record.
 
-Both observers report this type and gaze estimators take nothing else. A frame is one exposure of one camera and may
-hold both eyes; an observation belongs to (frame, eye). Where a status is not OK the numbers beside it are NaN in memory
-and null in the record; the reason says why. A pupil of which only arcs are seen has a status of its own, PARTIAL. In a
-record a status is a word: "ok", "partial", or "missing" for all others.
+Both observers report this type, and gaze estimators take nothing else. A frame is one exposure of one camera and may
+contain both eyes; an observation belongs to (frame, eye). Where a status is not OK the numbers beside it are NaN in
+memory and null in the record, and there is a reason. A pupil of which only arcs are visible has a status of its own,
+PARTIAL. In a record a status is a word: "ok", "partial", or "missing" for all others.
 """
 
 from __future__ import annotations
@@ -25,21 +25,29 @@ RECORD = 2
 SCHEMAS = {1: "eyerender/record/1", 2: "eyerender/record/2"}
 EYES = ("right", "left")
 
-# Boundary points of one pupil (ten a degree) and of all pupils of a batch, which take 25 bytes each.
+# Largest numbers of boundary points of one pupil (ten per degree) and of all pupils of a batch, which take 25 bytes
+# each.
 MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
-# Glints of all observations of a batch, which have a status and a reason each.
+# Largest number of glints of all observations of a batch, which have a status and a reason each.
 MAX_GLINTS = 5_000_000
-# In a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
+# Limits in a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
 _MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Index(Columns):
-    """Which observation is which; all arrays (n,).
+    """Identity of each observation; all arrays (n,) or (n, 3).
 
-    `eye` is 0 for the right and 1 for the left eye; `fixation`, `camera`, `head` count from 0 in the scene's order and
-    are -1 where unknown. `target_mm` (n, 3) is NaN where there is no target; `eye_position_mm` (n, 3) is the apex of
-    the unrotated eye in the world, without `head_mm` (n, 3).
+    Attributes:
+        frame: number of the frame.
+        fixation: counted from 0 in the scene's order, as are the next two; -1 where unknown.
+        camera: index of the camera.
+        head: index of the head position.
+        eye: 0 for the right and 1 for the left eye, -1 where unknown.
+        eye_model: name of the eye model.
+        target_mm: (n, 3) NaN where there is no target.
+        head_mm: (n, 3) head position.
+        eye_position_mm: (n, 3) apex of the unrotated eye in the world, without `head_mm`.
     """
 
     frame: Ints
@@ -58,7 +66,7 @@ class Index(Columns):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PoseTruth(Columns):
-    """The eye's pose, arrays (n,) in radians, NaN where unknown; `residual_mm` of the fixation at the fovea."""
+    """Pose of the eye, arrays (n,) in radians, NaN where unknown; `residual_mm` of the fixation at the fovea."""
 
     azimuth_rad: Floats
     elevation_rad: Floats = column()
@@ -70,16 +78,22 @@ class PoseTruth(Columns):
 class PupilFeatures(Columns):
     """The apparent pupil in full-sensor pixels, arrays with a leading axis n.
 
-    `status` (n,) are `Status`; `reason` (n,) says in words why it is not OK, with details where there are any.
+    Where the status is PARTIAL, centre, axes and angle are NaN, `points_px` holds the visible points with NaN in place
+    of the others, and `arc_ellipse` is the ellipse of the visible points.
 
-    `centre_px` (n, 2), `semi_axes_px` (n, 2) with a >= b and `angle_rad` (n,) of a in [0, pi) are the direct
-    least-squares ellipse of the boundary; `points_px` (n, k, 2) the boundary itself; `anatomical_centre_px` (n, 2) the
-    image of the stop's centre; `covariance` (n, 5, 5) over (cx, cy, a, b, angle).
-
-    `arcs_deg` (n, m, 2) are the arcs of the true boundary that are seen, from and to in degrees of the stop's
-    parameter, NaN where there is no further one. Where the status is PARTIAL, `points_px` holds the points that are
-    seen, NaN in place of the others, and `arc_ellipse` (n, 5) the ellipse (cx, cy, a, b px, angle rad) of those, NaN
-    where they do not determine one; centre, axes and angle above are NaN.
+    Attributes:
+        status: (n,) of `Status`.
+        reason: (n,) why it is not OK, in words, with details where there are any.
+        in_image: (n,) whether the pupil is on the sensor.
+        centre_px: (n, 2) centre of the direct least-squares ellipse of the boundary.
+        semi_axes_px: (n, 2) a >= b of that ellipse.
+        angle_rad: (n,) angle of a, in [0, pi).
+        anatomical_centre_px: (n, 2) image of the stop's centre.
+        points_px: (n, k, 2) the boundary itself.
+        covariance: (n, 5, 5) over (cx, cy, a, b, angle).
+        arcs_deg: (n, m, 2) visible arcs of the true boundary, from and to in degrees of the stop's parameter; NaN where
+            there are fewer than m.
+        arc_ellipse: (n, 5) (cx, cy, a, b px, angle rad); NaN where the visible points do not determine it.
     """
 
     status: Statuses
@@ -96,16 +110,16 @@ class PupilFeatures(Columns):
 
     @property
     def ok(self) -> Bools:
-        """Where the pupil was found, (n,); the whole of it."""
+        """Whether the whole pupil was found, (n,)."""
         return np.asarray(self.status == Status.OK)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class GlintFeatures(Columns):
-    """Glints in full-sensor pixels, arrays with leading axes (n, m); `light` is -1 where it is not known.
+    """Glints in full-sensor pixels, arrays with leading axes (n, m); `light` is -1 where it is unknown.
 
-    `status` (n, m) are `Status`, with a `reason` in words where it is not OK. Rows with fewer than m glints are filled
-    up with status NONE.
+    `status` (n, m) are `Status`, with a `reason` in words where it is not OK. Rows with fewer than m glints are padded
+    with status NONE.
     """
 
     LEADING = 2
@@ -119,11 +133,11 @@ class GlintFeatures(Columns):
 
     @property
     def ok(self) -> Bools:
-        """Where a glint was found, (n, m)."""
+        """Whether a glint was found, (n, m)."""
         return np.asarray(self.status == Status.OK)
 
     def of_light(self, light: int) -> tuple[Floats, Bools]:
-        """Place (n, 2) of one light's glint, and where it was found (n,)."""
+        """Place (n, 2) of one light's glint, and whether it was found (n,)."""
         n, m = self.light.shape
         if m == 0:
             return np.full((n, 2), np.nan), np.zeros(n, dtype=bool)
@@ -135,7 +149,7 @@ class GlintFeatures(Columns):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Observations(ArrayValue):
-    """A batch of observations, in frame order and within a frame right eye first."""
+    """A batch of observations, in frame order and with the right eye first within a frame."""
 
     index: Index
     pose: PoseTruth
@@ -146,7 +160,7 @@ class Observations(ArrayValue):
         return len(self.index)
 
     def take(self, rows: Any) -> Observations:
-        """The observations of some rows (indices, a slice or a mask)."""
+        """Select rows (indices, a slice or a mask)."""
         return Observations(
             index=self.index.take(rows),
             pose=self.pose.take(rows),
@@ -155,14 +169,15 @@ class Observations(ArrayValue):
         )
 
     def with_targets(self, target_mm: ArrayLike) -> Observations:
-        """The same observations of other targets: (n, 3) or (3,) mm in the world, NaN where there is none."""
+        """Replace the targets by (n, 3) or (3,) mm in the world, NaN where there is none."""
         targets = np.broadcast_to(np.asarray(target_mm, dtype=float), (len(self), 3))
         return replace(self, index=replace(self.index, target_mm=frozen(targets)))
 
     def records(self, version: int = RECORD) -> Iterator[dict[str, Any]]:
-        """One record (docs/formats.md) an observation; every key always present, null where it does not apply.
+        """Yield one record (docs/formats.md) per observation; every key is present, null where it does not apply.
 
-        version : of the record; in version 1 a partial pupil is a missing one.
+        Args:
+            version: version of the record; in version 1 a partial pupil is a missing one.
         """
         for i in range(len(self)):
             yield self._record(i, version)
@@ -216,7 +231,11 @@ class Observations(ArrayValue):
 
     @classmethod
     def from_records(cls, records: Sequence[dict[str, Any]], *, source: str = "") -> Observations:
-        """Read records of any version back; raises `InputError` naming the record and the key."""
+        """Read records of any version.
+
+        Raises:
+            InputError: naming the record and the key.
+        """
         rows = list(records)
         for k, record in enumerate(rows):
             if not isinstance(record, dict):
@@ -276,7 +295,7 @@ class Observations(ArrayValue):
 
 
 class _Reader:
-    """Columns out of records, with the record and key named where one is wrong."""
+    """Reads columns from records, and names the record and key where one is wrong."""
 
     def __init__(self, records: list[dict[str, Any]], source: str) -> None:
         self.records = records
@@ -354,7 +373,7 @@ class _Reader:
         return frozen(out)
 
     def second(self, path: str) -> list[Any]:
-        """The values of a key that records have from version 2 on; None in those of version 1."""
+        """Values of a key that records have from version 2 on; None in those of version 1."""
         newer = [k for k, record in enumerate(self.records) if record["schema"] != SCHEMAS[1]]
         out: list[Any] = [None] * len(self.records)
         for k in newer:
@@ -423,7 +442,7 @@ class _Reader:
 
 
 def _arcs_of(pupil: PupilFeatures, i: int) -> dict[str, Any]:
-    """What version 2 of the record adds."""
+    """Additional keys of version 2 of the record."""
     ellipse = _numbers(pupil.arc_ellipse[i])
     parts = None if ellipse is None else (ellipse[:2], ellipse[2:4], ellipse[4])
     return {
@@ -436,7 +455,7 @@ _ELLIPSE_KEYS = ("centre_px", "semi_axes_px", "angle_rad")
 
 
 def _glint_problem(g: Any) -> str | None:
-    """What is wrong with an entry of a record's glints; None where nothing is."""
+    """Describe what is wrong with an entry of a record's glints; None where nothing is."""
     if not isinstance(g, dict):
         return "must be an object"
     for key in ("light", "status", "reason", "in_image", "xy_px", "covariance"):
@@ -464,7 +483,7 @@ def _is_count(value: Any) -> bool:
 
 
 def _array(value: Any) -> Floats | None:
-    """Plain numbers, of a size that can be squared, as an array; None for anything else."""
+    """Convert plain numbers, of a size that can be squared, to an array; None for anything else."""
     try:
         found = np.asarray(value)
     except (ValueError, OverflowError):  # rows of unequal length
@@ -475,27 +494,27 @@ def _array(value: Any) -> Floats | None:
 
 
 def _check_width(rows: int, width: int, limit: int, what: str, source: str = "") -> None:
-    """Rows are filled up to the widest: one wide record among many must not take all the memory."""
+    """Limit the width to which rows are padded: one wide record among many must not take all the memory."""
     if rows * width > limit:
         raise InputError(f"{rows} records of up to {width} {what} are more than {limit} {what}", source=source)
 
 
 def count_heads(head_mm: Floats) -> Ints:
-    """Counts of head positions (n, 3) from 0: equal positions are the same one, in order of appearance.
+    """Number head positions (n, 3) from 0: equal positions have one number, in order of appearance.
 
-    Records hold no such count.
+    Records do not contain this number.
     """
     heads: dict[bytes, int] = {}
     return frozen([heads.setdefault((np.round(h, 9) + 0.0).tobytes(), len(heads)) for h in head_mm], np.int64)
 
 
 def version_of(record: dict[str, Any]) -> int:
-    """The version of a record; raises `KeyError` or `ValueError` where it is none."""
+    """Version of a record; raises `KeyError` or `ValueError` where it is not a record."""
     return {schema: version for version, schema in SCHEMAS.items()}[str(record["schema"])]
 
 
 def concatenate(parts: Iterable[Observations]) -> Observations:
-    """One batch of several, in order; glints and boundary points are filled up to the widest."""
+    """Join batches, in order; glints and boundary points are padded to the widest."""
     batches = list(parts)
     if len(batches) == 1:
         return batches[0]

@@ -1,11 +1,11 @@
-"""Folders that a command fills: who writes, what may be replaced, and how a result takes its place.
+"""Folders that a command fills: who writes, what may be replaced, and how a result is published.
 
 A folder is staged and put in place when it is complete, so a run that is interrupted or runs out of disk leaves nothing
 that looks like a result.
 
-`--overwrite` replaces what this package made and nothing else. A folder shows that it was made here by dataset.json,
-run.json, study.json or results.json with our schema, or by the marker file, which lists what was written. Files that
-neither have a known name nor stand in that list are somebody else's; then nothing is replaced at all.
+`--overwrite` replaces what this package made and nothing else. A folder is recognised by dataset.json, run.json,
+study.json or results.json with our schema, or by the marker file, which lists what was written. Files that neither have
+a known name nor are in that list belong to somebody else; then nothing is replaced at all.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .lock import LOCK, writer_lock
 
 FOLDER_SCHEMA = "eyerender/folder/1"
 MARKER = ".eyerender.json"
-# The files that say what a folder is, and how their schemas begin; a finished shard's done.json says so too.
+# Files that identify a folder, and how their schemas begin; a finished shard's done.json identifies it too.
 _SIGNS = {
     MARKER: FOLDER_SCHEMA,
     DATASET: "eyerender/dataset/",
@@ -41,15 +41,18 @@ _FILES = re.compile(
     r"(images|masks|amodal_masks|noiseless)/([0-9]+/)?[^/]+\.(png|exr)|shards/[0-9]+/(lines\.jsonl|done\.json))"
     r"|(study|summary|findings|results)\.json|(summary|findings|waterfall|results)\.csv|\.eyerender\.json"
 )
-# The names of files that are being written, with the name they will have.
+# Names of files that are being written, with their final names.
 _PARTS = re.compile(r"(?P<folder>(?:.*/)?)(?:\.(?P<hidden>[^/]+)\.[0-9a-f]{8}|(?P<plain>[^/]+))\.part")
 _STAGES = re.compile(rf"{re.escape(STAGE)}([0-9]+|[0-9]+-[0-9a-f]+)")
 
 
 def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
-    """Raise `InputError` where an output folder holds something that is not to be replaced.
+    """Check that an output folder may be used.
 
-    With `overwrite`, that is any folder which this package did not make, or in which there is anything else.
+    With `overwrite`, a folder is refused if this package did not make it or if it contains anything else.
+
+    Raises:
+        InputError: it holds something that must not be replaced.
     """
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
@@ -71,10 +74,12 @@ def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
 def clear(folder: Path, *, known: bool = False) -> None:
     """Remove what this package made in a folder, and what killed runs left; locks stay.
 
-    `known`: the caller knows that the folder is a run's, even if the files that should say so are damaged.
+    dataset.json is removed first, so that no half of a dataset looks complete. The marker is removed last, so that an
+    interrupted removal can be repeated. Nothing is removed if something else is found.
 
-    dataset.json goes first, so that no half of a dataset looks whole, and the marker last, so that a clearing that was
-    stopped can be done again. Nothing is removed where something else is found.
+    Args:
+        folder: the folder.
+        known: the caller knows that the folder is a run's, even if the files that should identify it are damaged.
 
     Raises:
         InputError: as `refuse_non_empty` with `overwrite`.
@@ -92,14 +97,14 @@ def clear(folder: Path, *, known: bool = False) -> None:
 
 @contextmanager
 def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A folder to write into, inside `path`, whose content takes its place only when the block ends well.
+    """Yield a folder to write into, inside `path`; its content takes its place only if the block succeeds.
 
-    `dataset.json` moves last, so a folder that has one is complete, also after a power cut: everything is synced before
-    it moves. A folder that nothing else shows to be ours gets the marker. What an earlier, killed run left staged is
+    `dataset.json` moves last, so a folder that has one is complete, even after a power cut: everything is synced before
+    it moves. A folder that no other file identifies as ours gets the marker. What an earlier, killed run left is
     removed.
 
     Raises:
-        InputError: the place is taken, or another writer is at work in it.
+        InputError: the place is taken, or another writer uses it.
         EyerenderError: the disk is full or not writable; nothing is left behind.
     """
     final = Path(path)
@@ -126,11 +131,11 @@ def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 def _publish(stage: Path, final: Path) -> None:
-    """Put a staged folder's content in the place of what its folder held."""
+    """Replace the content of a folder by that of a staged folder."""
     sync_tree(stage)
     new = _names(stage)
     old = _listed(final) or set()
-    # From here on the folder can be recognised at every instant.
+    # From here on the folder can be recognised at every moment.
     _mark(final, old | new)
     _empty(final, old, keep=stage.name)
     for entry in sorted(stage.iterdir(), key=lambda p: p.name == DATASET):
@@ -138,7 +143,7 @@ def _publish(stage: Path, final: Path) -> None:
             sync_folder(final)
         os.rename(entry, final / entry.name)
     sync_folder(final)
-    if not new.isdisjoint(_SIGNS):  # its own files say what it is
+    if not new.isdisjoint(_SIGNS):  # its own files identify it
         (final / MARKER).unlink()
     else:
         _mark(final, new)
@@ -149,7 +154,7 @@ def _mark(folder: Path, names: Set[str]) -> None:
 
 
 def _listed(folder: Path) -> set[str] | None:
-    """What a folder's marker lists; nothing where another file shows that it is ours, None where none does.
+    """Entries of a folder's marker; empty where another file identifies the folder as ours, None where none does.
 
     Names of folders end with a slash.
     """
@@ -172,9 +177,9 @@ def _read_sign(path: Path, schema: str) -> dict[str, Any] | None:
 
 
 def _made_here(folder: Path, listed: Set[str], *, strict: bool) -> Iterator[tuple[str, bool]]:
-    """Name and whether it is a folder of all that this package made; a folder comes after what it holds.
+    """Name of everything that this package made, and whether it is a folder; a folder comes after its content.
 
-    With `strict` anything else raises `InputError`, otherwise it is left out.
+    With `strict` anything else raises `InputError`; otherwise it is left out.
     """
 
     def walk(prefix: str) -> Iterator[tuple[str, bool]]:
@@ -203,7 +208,7 @@ def _made_here(folder: Path, listed: Set[str], *, strict: bool) -> Iterator[tupl
 
 
 def _is_ours(name: str, is_folder: bool, listed: Set[str]) -> bool:
-    """Whether a file or folder of a folder has a name that this package gives, or is listed as made by it."""
+    """Whether a file or folder has a name that this package gives, or is listed as made by it."""
     if is_folder:
         return f"{name}/" in listed or _FOLDERS.fullmatch(name) is not None
     part = _PARTS.fullmatch(name)
@@ -218,7 +223,7 @@ def _refuse_others(folder: Path, listed: Set[str]) -> None:
 
 
 def _empty(folder: Path, listed: Set[str], keep: str = "") -> None:
-    """Remove what this package made but for the marker, and stages but for `keep`."""
+    """Remove what this package made except for the marker, and stages except for `keep`."""
     remove_file(folder / DATASET)
     for name, is_folder in _made_here(folder, listed, strict=False):
         if is_folder:
@@ -237,7 +242,7 @@ def _remove_stages(folder: Path, keep: str = "") -> None:
 
 
 def _names(folder: Path) -> set[str]:
-    """All that is in a folder, relative to it; names of folders end with a slash."""
+    """Everything in a folder, relative to it; names of folders end with a slash."""
     out = set()
     for place, folders, files in os.walk(folder):
         prefix = "" if Path(place) == folder else f"{Path(place).relative_to(folder).as_posix()}/"

@@ -1,4 +1,4 @@
-"""What a person probably did not mean: values that can be computed with but make no sense.
+"""Probable mistakes: values that can be computed with but make no sense.
 
 Every function is pure and returns warnings. A scene collects its own (`Scene.warnings`), and a dataset's plan those of
 some of its samples (`Plan.warnings`). The command line prints them, or refuses them with `--strict`.
@@ -19,9 +19,9 @@ from .rig.rig import RigGeometry
 from .rig.screen import ScreenPlane
 from .rig.sensor import Sensor
 
-# Human pupils are about 2 to 8 mm wide (Watson and Yellott 2012, J. Vision 12(10):12); drugs add a little.
+# Human pupils are about 2 to 8 mm wide (Watson and Yellott 2012, J. Vision 12(10):12); drugs extend the range slightly.
 PUPIL_MM = (1.0, 9.0)
-# Lengths of a scene below which they were probably written in metres: 2 mm is a screen or an interpupillary distance
+# Lengths of a scene below these values were probably written in metres: 2 mm is a screen or an interpupillary distance
 # of 2 m, 0.02 mm an LED of 20 mm.
 _LEAST_MM = {
     "rig.screen.size_mm": 2.0,
@@ -32,27 +32,28 @@ _LEAST_MM = {
     "rig.cameras.*.sensor_mm": 0.2,
     "rig.lights.*.radius_mm": 0.02,
 }
-# The same for places: this near to the world's origin, the bridge of the nose, nothing can stand.
+# The same for places: nothing can be this close to the world's origin, the bridge of the nose.
 _LEAST_DISTANCE_MM = 2.0
-# A globe and a head about the corneal apex and the head's position. Both are smaller than real ones, so that what is
-# fixed to a face (a headset's lamps, a frame of glasses) is not taken for a part of it.
+# A globe and a head about the corneal apex and the head's position. Both are smaller than real ones, so that things
+# fixed to a face (a headset's lamps, a frame of glasses) do not count as a part of it.
 _GLOBE_CENTRE_MM, _GLOBE_RADIUS_MM = np.array([-12.0, 0.0, 0.0]), 13.0
 _HEAD_CENTRE_MM, _HEAD_SEMI_AXES_MM = np.array([-100.0, 0.0, 0.0]), np.array([85.0, 70.0, 115.0])
-# How far behind a screen's surface something counts as behind it: frames of screens are uneven.
+# Depth from which something counts as behind a screen's surface: frames of screens are uneven.
 _BEHIND_MM = 1.0
-# What of an eye must be in view: the corneal apex or a point of the limbus, to within what its turning moves.
+# Points of an eye that may be in view: the corneal apex and points of the limbus, within what rotation of the eye
+# moves.
 _LIMBUS_MM = np.array([[0, 0, 0], [-3, 6, 0], [-3, -6, 0], [-3, 0, 6], [-3, 0, -6]], dtype=float)
-# A camera that is further than this from an eye's axis sees no cornea, wherever the eye turns.
+# A camera that is farther than this from an eye's axis sees no cornea, whatever the pose of the eye.
 _FURTHEST_RAD = np.radians(140.0)
 
-# How far a target may lie off the screen's plane: screens are not flat to less.
+# Largest distance of a target from the screen's plane: screens are not flat to less.
 _OFF_PLANE_MM = 1.0
-# An image is called saturated where more than this share of its pixels is.
+# An image counts as saturated if more than this share of its pixels is.
 SATURATED_SHARE = 0.2
 
 
 def pupil_warnings(diameter_mm: float, path: str) -> list[InputWarning]:
-    """A pupil that no human eye has; `path` is where its diameter stands."""
+    """Warn of a pupil size that no human eye has; `path` is the key of its diameter."""
     low, high = PUPIL_MM
     if low <= diameter_mm <= high:
         return []
@@ -60,12 +61,12 @@ def pupil_warnings(diameter_mm: float, path: str) -> list[InputWarning]:
 
 
 def length_warnings(scene: Mapping[str, Any]) -> list[InputWarning]:
-    """Lengths of a scene's mapping that were probably written in metres."""
+    """Warn of lengths of a scene's mapping that were probably written in metres."""
     found = []
     for pattern, least in _LEAST_MM.items():
         for path, value in _values(scene, pattern.split(".")):
             sizes = value if isinstance(value, list | tuple) else [value]
-            # A lamp of no size is a point.
+            # A lamp of size 0 is a point.
             if any(0 < size < least for size in sizes):
                 found.append(InputWarning("metres", f"is {_shown(sizes, ' x ')} mm; {_METRES}", path=path))
     return found
@@ -78,13 +79,13 @@ def place_warnings(
     camera_paths: Sequence[str],
     light_paths: Sequence[str],
 ) -> list[InputWarning]:
-    """Cameras and lamps where none can stand: in a face, in a head, behind the screen; and a screen in a face.
+    """Warn of impossible places: cameras and lamps in a face, in a head or behind the screen, and a screen in a face.
 
     Args:
         rig: the rig.
-        eyes_mm: corneal apexes (3,) in the world by what a message calls them.
-        heads_mm: head positions (3,) in the world by what a message calls them.
-        camera_paths: where each camera of the rig stands in the input.
+        eyes_mm: corneal apexes (3,) in the world by their name in a message.
+        heads_mm: head positions (3,) in the world by their name in a message.
+        camera_paths: path of each camera of the rig in the input.
         light_paths: the same for the lamps; lamps of one ring share a path and get one warning.
     """
     places = [
@@ -105,12 +106,12 @@ def place_warnings(
 def view_warnings(
     rig: RigGeometry, views: Mapping[int, Iterable[tuple[Window, Floats]]], camera_paths: Sequence[str]
 ) -> list[InputWarning]:
-    """Cameras whose images show no eye at any head position.
+    """Warn of cameras whose images show no eye at any head position.
 
     Args:
         rig: the rig.
         views: camera -> the windows (x0, y0, width, height) that are made, each with the corneal apex (3,) it is for.
-        camera_paths: where each camera of the rig stands in the input.
+        camera_paths: path of each camera of the rig in the input.
     """
     blind = [c for c, camera in enumerate(rig.cameras) if not any(_in_view(camera, w, eye) for w, eye in views[c])]
     everywhere = "; nothing of any eye is in view" if len(blind) == len(rig.cameras) else ""
@@ -123,7 +124,7 @@ def is_saturated(dn: NDArray[Any], sensor: Sensor) -> bool:
 
 
 def saturation_warnings(saturated: int, images: int, source: str) -> list[InputWarning]:
-    """Images, `saturated` of `images`, that show little but white."""
+    """Warn of images, `saturated` of `images`, that are mostly white."""
     if not saturated:
         return []
     reason = (
@@ -134,7 +135,7 @@ def saturation_warnings(saturated: int, images: int, source: str) -> list[InputW
 
 
 def target_warnings(targets_mm: Floats, screen: ScreenPlane | None, source: str) -> list[InputWarning]:
-    """Targets (n, 3) in the world that do not lie on the screen, on which estimators put every gaze point."""
+    """Warn of targets (n, 3) in the world that are not on the screen, where estimators place every gaze point."""
     if screen is None or not len(targets_mm):
         return []
     off = np.abs((targets_mm - screen.centre_mm) @ screen.normal)
@@ -149,7 +150,7 @@ def target_warnings(targets_mm: Floats, screen: ScreenPlane | None, source: str)
 
 
 def rig_warnings(rig: RigGeometry, calibrated: RigGeometry, source: str) -> list[InputWarning]:
-    """A rig that is not the one an estimator was calibrated on."""
+    """Warn of a rig that differs from the one of the estimator's calibration."""
     path = next(_differences(rig.to_mapping(), calibrated.to_mapping(), "rig"), None)
     if path is None:
         return []
@@ -161,7 +162,7 @@ def rig_warnings(rig: RigGeometry, calibrated: RigGeometry, source: str) -> list
 
 
 def _differences(one: Any, other: Any, path: str) -> Iterator[str]:
-    """Where two values of the same kind differ by more than rounding does."""
+    """Paths at which two values of the same kind differ by more than rounding."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for key in one:
             yield from _differences(one[key], other.get(key), f"{path}.{key}")
@@ -182,7 +183,7 @@ def _misplaced(
     eyes_mm: Mapping[str, Floats],
     heads_mm: Mapping[str, Floats],
 ) -> tuple[str, str] | None:
-    """The code and the reason of a warning about one place, if there is one."""
+    """Code and reason of a warning about one place, if there is one."""
     if np.linalg.norm(place) < _LEAST_DISTANCE_MM:
         return "metres", f"the {what} is at ({_shown(place)}) mm, in the face; {_METRES}"
     for name, eye in eyes_mm.items():
@@ -202,7 +203,7 @@ def _misplaced(
 
 
 def _in_view(camera: PinholeCamera, window: Window, apex: Floats) -> bool:
-    """Whether a window shows anything of an eye's front."""
+    """Whether a window shows any part of an eye's front."""
     towards = camera.nodal_point_mm - apex
     if towards[0] < np.cos(_FURTHEST_RAD) * np.linalg.norm(towards):
         return False
@@ -218,7 +219,7 @@ _METRES = "lengths are in mm; did you mean metres?"
 
 
 def _values(node: Any, keys: Sequence[str], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value at a dotted path of a mapping in which `*` stands for each entry of a list, with its own path."""
+    """Every value at a dotted path of a mapping, with its own path; `*` stands for each entry of a list."""
     if not keys:
         if node is not None:
             yield path, node

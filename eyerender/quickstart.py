@@ -1,4 +1,4 @@
-"""The main job: fixate, render, extract, calibrate on both kinds of features, compare, report."""
+"""The complete job: fixate, render, extract, calibrate on both kinds of features, compare, report."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def run_quickstart(
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> Comparison:
-    """Do the main job in a folder and write `report.html` there.
+    """Do the complete job in a folder and write `report.html` there.
 
-    Images of the same scene, seed and versions that the folder already holds are used again. `warn` hears of what was
-    probably not meant, and may raise: of the scene before anything is done, of saturated images before they are put in
-    place (or used again).
+    Existing images of the same scene, seed and versions in the folder are used again. `warn` is called for probable
+    mistakes and may raise: for those of the scene before anything is done, and for saturated images before they are put
+    in place (or used again).
 
     Raises:
         InputError: the folder holds something else and `overwrite` is not given.
@@ -92,12 +92,12 @@ def compare_folder(
 
     Args:
         path: a folder that `render`, `quickstart` or `generate` wrote.
-        estimator: how gaze is estimated from both; default: `er.gaze.Regression("R3")`.
-        name: of the estimator, for the result; default: as `compare` has it.
+        estimator: gaze estimator for both; default: `er.gaze.Regression("R3")`.
+        name: name of the estimator in the result; default: as for `compare`.
         progress: called with images done, images in all and "".
 
     Raises:
-        InputError: it is no such folder, or holds an image or a record that cannot be read.
+        InputError: it is not such a folder, or contains an image or a record that cannot be read.
     """
     images = ImageFolder.load(path)
     return _compared(images, scene_of(images), estimator or Regression(), name, progress)

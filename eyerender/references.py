@@ -1,7 +1,7 @@
-"""A user's own code by reference: `module:name`.
+"""References to a user's own code: `module:name`.
 
 Loading a reference runs the module. A reference is therefore loaded only where the user gave it (on the command line,
-in Python, as an entry point), never because it stands in a file.
+in Python, as an entry point), never because a file contains it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def is_reference(text: str) -> bool:
 
 
 def load_reference(reference: str, *, source: str = "") -> Any:
-    """The object behind `module:name`; the module is looked for where Python looks, then in the current folder.
+    """Load the object of `module:name`; the module is searched where Python searches, then in the current folder.
 
     Raises:
         InputError: it has another form, there is no such module or name, or the module cannot be imported.

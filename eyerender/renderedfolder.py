@@ -30,10 +30,10 @@ def render_folder(
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> dict[str, Any]:
-    """Render a scene into a folder of labelled images (docs/formats.md); complete or not at all.
+    """Render a scene into a folder of labelled images (docs/formats.md), completely or not at all.
 
-    `warn` hears of saturated images before the folder is put in place; if it raises, nothing is written. What can be
-    said of the scene beforehand is in `Scene.warnings`.
+    `warn` is called for saturated images before the folder is put in place; if it raises, nothing is written. Warnings
+    that need no rendering are in `Scene.warnings`.
 
     Returns:
         What was written: schema eyerender/render/1, path, number of images, warnings of both kinds.

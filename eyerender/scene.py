@@ -1,4 +1,4 @@
-"""A scene: one subject, one rig, what is looked at; and the frames with poses that come of it.
+"""A scene (one subject, one rig, and what is looked at), and its frames with poses.
 
 Frames are ordered by head position, then fixation, then camera; within a frame the right eye comes first.
 """
@@ -35,10 +35,10 @@ from .status import Status
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames(ArrayValue):
-    """The frames of a scene with the pose of each eye: what every observer starts from.
+    """The frames of a scene with the pose of each eye: the input of every observer.
 
-    A row is one eye in one frame (an exposure of one camera). `index` (n) says which eye, camera and target it is and
-    `pose` (n) how the eye stands.
+    A row is one eye in one frame (an exposure of one camera). `index` (n) gives its eye, camera and target, and `pose`
+    (n) the pose of the eye.
     """
 
     scene: Scene
@@ -49,11 +49,11 @@ class Frames(ArrayValue):
         return len(self.index)
 
     def take(self, rows: Any) -> Frames:
-        """Some of the rows (indices, a slice or a mask)."""
+        """Select rows (indices, a slice or a mask)."""
         return Frames(self.scene, self.index.take(rows), self.pose.take(rows))
 
     def seen_by(self, rig: RigLike | None) -> Frames:
-        """The same eyes before another rig, which has the same number of cameras; None changes nothing.
+        """Place the same eyes in front of another rig with the same number of cameras; None changes nothing.
 
         Raises:
             InputError: the rig has another number of cameras.
@@ -72,8 +72,8 @@ class Frames(ArrayValue):
 class Scene:
     """A scene ready to be observed: the spec, the eye's spec and the numeric rig.
 
-    `base` is what files of its pictures (an HDR map, a head mesh) are relative to, by default the current folder;
-    `source` is what messages call the scene's file.
+    `base` is the folder to which files of its images (an HDR map, a head mesh) are relative, by default the current
+    folder. `source` is the name of the scene's file in messages.
     """
 
     spec: SceneSpec
@@ -84,10 +84,16 @@ class Scene:
 
     @classmethod
     def of(cls, spec: SceneSpec, *, base: Path | None = None, eye: str | None = None, source: str = "") -> Scene:
-        """Compile a spec. `base` is the folder that its files are relative to, `eye` replaces the scene's model.
+        """Compile a spec.
+
+        Args:
+            spec: the spec.
+            base: folder to which its files are relative.
+            eye: replaces the scene's eye model.
+            source: name of the scene's file in messages.
 
         Raises:
-            InputError: an eye that cannot be, or, where a `base` is given, a file that is not there.
+            InputError: an eye is not possible or, where a `base` is given, a file does not exist.
         """
         name = eye if eye is not None else spec.eye.model
         if eye is None and base is not None and name.endswith((".yaml", ".yml")):
@@ -107,7 +113,7 @@ class Scene:
 
     @property
     def name(self) -> str:
-        """The scene's name."""
+        """Name of the scene."""
         return self.spec.name
 
     @property
@@ -116,9 +122,9 @@ class Scene:
         return float(2 * self.eye("right").stop.semi_axes_mm[0])
 
     def warnings(self) -> list[InputWarning]:
-        """What of the scene was probably not meant: a pupil of 0.4 mm, lengths in metres, a lamp in the head, ...
+        """Probable mistakes in the scene: a pupil of 0.4 mm, lengths in metres, a lamp in the head, ...
 
-        Nothing is traced or rendered for it. An empty list does not say that the scene is a good one.
+        Nothing is traced or rendered for this. An empty list does not mean that the scene is good.
         """
         spec, rig = self.spec, self.rig
         positions = [np.array(head) for head in spec.subject.head_positions_mm]
@@ -151,13 +157,13 @@ class Scene:
         return [warning.at(self.source) for warning in found]
 
     def digest(self) -> str:
-        """SHA-256 of everything the scene's images depend on, the eye file's content included."""
+        """SHA-256 of everything on which the scene's images depend, including the content of the eye file."""
         parts = [self.spec.digest(), self.eye_spec.digest(), *(file_digest(file) for file in self.files)]
         return hashlib.sha256("".join(parts).encode()).hexdigest()
 
     @property
     def ambient(self) -> Ambient:
-        """The ambient light, its map's file as an absolute path."""
+        """Ambient light, with the file of its map as an absolute path."""
         ambient = self.spec.ambient
         if ambient.map is None:
             return ambient
@@ -166,7 +172,7 @@ class Scene:
 
     @property
     def region(self) -> Region | None:
-        """The eye region, a head mesh's files as absolute paths."""
+        """Eye region, with the files of a head mesh as absolute paths."""
         region = self.spec.region
         if region is None or region.head is None:
             return region
@@ -174,7 +180,7 @@ class Scene:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files besides the eye's that pictures depend on."""
+        """Files on which images depend, besides the eye's."""
         ambient, region = self.ambient, self.region
         named = [] if ambient.map is None else [ambient.map.file]
         if self.spec.region is not None and self.spec.region.head is not None and self.spec.region.head.manifest:
@@ -184,11 +190,11 @@ class Scene:
         return tuple(Path(name) for name in named)
 
     def located(self) -> SceneSpec:
-        """The spec with its files as absolute paths, a head's manifest read: it means the same in every folder."""
+        """Spec with its files as absolute paths and a head's manifest read, which means the same in every folder."""
         return self.spec.model_copy(update={"ambient": self.ambient, "region": self.region})
 
     def eye(self, side: Literal["right", "left"] | str) -> EyeModel:
-        """The numeric eye of one side at the scene's wavelength, with its pupil's size and margin."""
+        """Numeric eye of one side at the scene's wavelength, with the scene's pupil size and margin."""
         eye = self.spec.eye
         same = _Same(self.eye_spec)
         return _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
@@ -212,7 +218,7 @@ class Scene:
         return screen.world(np.array(targets.screen_mm, dtype=float))
 
     def index(self) -> Index:
-        """Which (frame, eye) the scene has, in order; n rows."""
+        """Index of all (frame, eye) of the scene, in order; n rows."""
         spec = self.spec
         targets = self.targets_mm
         fixations = len(targets) if targets is not None else len(spec.poses or ())
@@ -242,10 +248,10 @@ class Scene:
         )
 
     def frames(self) -> Frames:
-        """Every (frame, eye) of the scene with its pose: the one given, or the one that fixates the target.
+        """Make every (frame, eye) of the scene with its pose: the given one, or the one that fixates the target.
 
         Raises:
-            InputError: a target that no pose of an eye fixates; the message says which, and why.
+            InputError: no pose of an eye fixates a target; the message names it and the reason.
         """
         index = self.index()
         if self.spec.poses is None:
@@ -261,7 +267,7 @@ class Scene:
         return Frames(self, index, pose)
 
     def _fixating(self, index: Index) -> PoseTruth:
-        # Cameras see the same pose: solve once for each head position, fixation and eye.
+        # All cameras see the same pose, so each head position, fixation and eye is solved once.
         keys = np.stack([index.head, index.fixation, index.eye], axis=-1)
         _, rows, back = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         found = fixations(
@@ -289,10 +295,10 @@ class Scene:
         )
 
     def windows(self) -> dict[tuple[int, int, int], Window]:
-        """The rendered window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.
+        """Rendered window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.
 
-        A window is centred on the image of the unrotated eye's apex, so it does not move with the gaze; it is kept on
-        the sensor. Without `image.window_px` it is the whole sensor.
+        A window is centred on the image of the unrotated eye's apex, so it does not move with the gaze, and it is kept
+        on the sensor. Without `image.window_px` it is the whole sensor.
         """
         out = {}
         for c, camera in enumerate(self.rig.cameras):
@@ -303,7 +309,7 @@ class Scene:
                     if self.spec.image.window_px is None:
                         continue
                     (u, v), front = camera.project(self.eye_position_mm(side) + np.array(head))
-                    front = front and np.isfinite(u) and np.isfinite(v)  # beside the camera distortion can overflow
+                    front = front and np.isfinite(u) and np.isfinite(v)  # distortion can overflow beside the camera
                     ww, wh = self.spec.image.window_px
                     x0 = int(np.floor((u if front else (w - 1) / 2) - (ww - 1) / 2 + 0.5))
                     y0 = int(np.floor((v if front else (h - 1) / 2) - (wh - 1) / 2 + 0.5))
@@ -311,13 +317,13 @@ class Scene:
         return out
 
     def rig_mapping(self) -> dict[str, Any]:
-        """The rig as `features --json` writes it (docs/formats.md)."""
+        """Rig as `features --json` writes it (docs/formats.md)."""
         return self.rig.to_mapping()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Same:
-    """A spec that equals itself only: comparing the object costs nothing, comparing its content a millisecond."""
+    """A spec that equals only itself: comparing the object costs nothing, comparing its content a millisecond."""
 
     spec: EyeSpec
 
@@ -332,24 +338,24 @@ class _Same:
 def _built_eye(
     eye: _Same, left: bool, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMargin | None
 ) -> EyeModel:
-    """A numeric eye; observers, renderer and labels ask for the same one again and again."""
+    """Numeric eye, cached because observers, renderer and labels request the same one repeatedly."""
     spec = eye.spec if margin is None else margin.applied(eye.spec)
     return spec.build(eye="left" if left else "right", wavelength_nm=wavelength_nm, pupil_diameter_mm=pupil_diameter_mm)
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Name -> file of the scenes that come with the package."""
+    """Map the names of the scenes that come with the package to their files."""
     return {name: path for name, path in shipped_files().items() if not is_shipped_dataset(path)}
 
 
 @cache
 def is_shipped_dataset(path: Path) -> bool:
-    """The same as `is_dataset` for a shipped file; it stays as it is, and parsing them all takes a while."""
+    """Whether a shipped file is a dataset, cached because the file never changes and parsing all of them is slow."""
     return is_dataset(path)
 
 
 def shipped_files() -> dict[str, Path]:
-    """Name -> file of the scenes and dataset specs that come with the package."""
+    """Map the names of the scenes and dataset specs that come with the package to their files."""
     package = Path(__file__).resolve().parent
     for folder in (package / "data" / "scenes", package.parent / "scenes"):
         if folder.is_dir():
@@ -358,7 +364,7 @@ def shipped_files() -> dict[str, Path]:
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether a YAML file says that it is no scene but the spec of a dataset (`kind: dataset`)."""
+    """Whether a YAML file declares itself the spec of a dataset (`kind: dataset`) instead of a scene."""
     try:
         return read_yaml(path).get("kind") == DATASET_KIND
     except InputError:
@@ -366,7 +372,7 @@ def is_dataset(path: Path) -> bool:
 
 
 def refuse_folder(path: Path, wanted: str) -> None:
-    """Raise `InputError` where a folder was given instead of a file, and say which file of it may have been meant."""
+    """Raise an `InputError` for a folder given instead of a file, which names the file that was probably meant."""
     if not os.path.isdir(path):
         return
     hint = ""
@@ -378,7 +384,7 @@ def refuse_folder(path: Path, wanted: str) -> None:
 
 
 def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = None, seed: int | None = None) -> Scene:
-    """A scene from a file, or by the bare name of a shipped one.
+    """Load a scene from a file, or by the bare name of a shipped one.
 
     Args:
         scene: path of a YAML file, or a shipped scene's name.

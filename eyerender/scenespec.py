@@ -1,4 +1,4 @@
-"""What a scene file says: the eye, the subject, the rig, what is looked at, and how pictures are taken."""
+"""The content of a scene file: the eye, the subject, the rig, what is looked at, and how images are taken."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from .spec import FileSpec, Positive, Spec, Vec2, Vec3
 
 DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
-# An observation is one eye in one frame. Analysing this many takes about 1 GB of memory, their records some 2 GB.
+# An observation is one eye in one frame. The analysis of this many takes about 1 GB of memory, and their records some 2
+# GB.
 MAX_OBSERVATIONS = 200_000
 
 
 class Eye(Spec):
-    """Which eye looks, and how."""
+    """The eye model and its settings."""
 
     model: str = Field(default="E2", description="a catalogue name, or an eye file (relative to the scene)")
     pupil_diameter_mm: Positive | None = Field(
@@ -35,7 +36,7 @@ class Eye(Spec):
 
 
 class Subject(Spec):
-    """Which eyes are there, how far apart, and where the head stands."""
+    """The eyes of the subject, their distance, and the head positions."""
 
     eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = ("right", "left")
     ipd_mm: Positive = Field(default=63.0, description="interpupillary distance")
@@ -49,7 +50,7 @@ class Subject(Spec):
 
 
 class Targets(Spec):
-    """What is fixated: a grid out to the screen's edges, points on the screen, or points in the world."""
+    """Fixation targets: a grid up to the screen's edges, points on the screen, or points in the world."""
 
     grid: tuple[Count, Count] | None = Field(default=None, description="columns and rows")
     screen_mm: Annotated[tuple[Vec2, ...], Field(min_length=1)] | None = Field(
@@ -65,14 +66,14 @@ class Targets(Spec):
 
 
 class EyeDirection(Spec):
-    """An eye's direction without a target: of the optic axis; torsion follows Listing's law."""
+    """Direction of an eye's optic axis, without a target; torsion follows Listing's law."""
 
     azimuth_deg: Annotated[float, Field(gt=-90, lt=90)]
     elevation_deg: Annotated[float, Field(gt=-90, lt=90)]
 
 
 class Picture(Spec):
-    """What part of the sensor is rendered, and how finely."""
+    """The part of the sensor that is rendered, and the number of samples."""
 
     window_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = Field(
         default=None, description="width and height of one window per eye, centred on it; default: the whole sensor"
@@ -125,7 +126,11 @@ class SceneSpec(FileSpec):
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
-        """Raise `InputError` where a mapping is a dataset's or an eye's, and say what to do with it."""
+        """Refuse a mapping of a dataset or an eye, with a hint how to use it.
+
+        Raises:
+            InputError: the mapping is of another kind.
+        """
         if data.get("kind") == DATASET_KIND:
             raise InputError(NOT_A_SCENE, source=source)
         if "cornea" in data:
@@ -155,5 +160,9 @@ class SceneSpec(FileSpec):
             )
 
     def with_spp(self, spp: int) -> Self:
-        """A copy with other samples per pixel; raises an `InputError` that names the option --spp."""
+        """Copy with other samples per pixel.
+
+        Raises:
+            InputError: naming the option --spp.
+        """
         return self.replaced("--spp", {"image": {**self.to_mapping()["image"], "spp": spp}})

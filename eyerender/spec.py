@@ -1,4 +1,4 @@
-"""The strict, frozen base of everything a person writes: load, dump, digest, JSON Schema.
+"""The strict, frozen base of all authored records: load, dump, digest, JSON Schema.
 
 A file carries the version of its format (`format: 1`). Unknown keys, wrong types and non-finite numbers are refused
 with the dotted path of the key (`lights.1.radius_mm: must be > 0`). YAML is loaded by the safe loader; nothing in a
@@ -21,14 +21,14 @@ from .errors import InputError
 from .files import opened, read_text, shown
 
 FORMAT = 1
-# Of a YAML file. The nodes count as written out: an alias counts as much as what it stands for. A scene with a list of
-# 20,000 targets holds 80,000; reading 100,000 takes some five seconds.
+# Limits of a YAML file. Nodes are counted as expanded: an alias counts as much as the value it stands for. A scene with
+# a list of 20,000 targets has 80,000 nodes; reading 100,000 takes some five seconds.
 MAX_YAML_BYTES, MAX_YAML_NODES, MAX_YAML_DEPTH = 2 * 2**20, 100_000, 64
-# Python needs time with the square of an integer's digits.
+# Python's time grows with the square of an integer's digits.
 _LONGEST_NUMBER = 300
 
-# Lengths are in mm, and a light at 1,000 km is infinitely far away for every purpose here. Fourth powers of numbers
-# within these limits still fit into single precision, which the renderer computes in.
+# Lengths are in mm, and a light at 1,000 km is infinitely far away for all purposes here. Fourth powers of numbers
+# within these limits still fit into single precision, in which the renderer computes.
 LARGEST, SMALLEST = 1e9, 1e-9
 
 
@@ -52,11 +52,15 @@ class Spec(BaseModel):
 
     @classmethod
     def from_mapping(cls, data: object, *, source: str = "") -> Self:
-        """Validate a plain mapping; raises `InputError` naming `source` and the path of the first bad key."""
+        """Validate a plain mapping.
+
+        Raises:
+            InputError: naming `source` and the path of the first wrong key.
+        """
         if not isinstance(data, Mapping):
             raise InputError("must be a mapping of keys to values", source=source)
         try:
-            # Through JSON, because pydantic's strict mode takes a list for a tuple there and nowhere else.
+            # The data are passed as JSON, because only there does pydantic's strict mode accept a list for a tuple.
             return cls.model_validate_json(json.dumps(data))
         except RecursionError:
             raise InputError("is nested too deeply", source=source) from None
@@ -67,14 +71,14 @@ class Spec(BaseModel):
             raise InputError(reason, source=source, path=path) from None
 
     def to_mapping(self) -> dict[str, Any]:
-        """The plain mapping that `from_mapping` reads back as an equal object."""
+        """Convert to the plain mapping that `from_mapping` reads as an equal object."""
         return self.model_dump(mode="json", exclude_none=True)
 
     def replaced(self, option: str, changes: Mapping[str, Any]) -> Self:
-        """A copy with other top-level values that a command-line option gave; a None removes a key.
+        """Copy with other top-level values from a command-line option; a None removes a key.
 
         Raises:
-            InputError: they do not fit. It names the option, because the file itself was read without a fault.
+            InputError: they do not fit. It names the option, because the file itself was read without an error.
         """
         data = {key: value for key, value in {**self.to_mapping(), **changes}.items() if value is not None}
         try:
@@ -95,7 +99,7 @@ class Spec(BaseModel):
 
 
 class FileSpec(Spec):
-    """A spec that is a YAML file of its own and says in which version of its format."""
+    """A spec that is a YAML file of its own and states the version of its format."""
 
     FORMATS: ClassVar[tuple[int, ...]] = (FORMAT,)
     """The versions that `load` reads; the last one is written."""
@@ -104,7 +108,11 @@ class FileSpec(Spec):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a YAML file; raises `InputError` with one line for anything that is wrong with it."""
+        """Read a YAML file.
+
+        Raises:
+            InputError: one line for anything that is wrong with it.
+        """
         data = read_yaml(path)
         cls.refuse_other_kinds(data, source=str(path))
         if "format" not in data:
@@ -118,26 +126,38 @@ class FileSpec(Spec):
 
     @classmethod
     def from_mapping(cls, data: object, *, source: str = "") -> Self:
-        """Validate a plain mapping; raises `InputError`, which says so where it is a file of another kind."""
+        """Validate a plain mapping.
+
+        Raises:
+            InputError: naming the wrong key; it also says so if the file is of another kind.
+        """
         if isinstance(data, Mapping):
             cls.refuse_other_kinds(data, source=source)
         return super().from_mapping(data, source=source)
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
-        """Raise `InputError` where a mapping is of another kind of file, whose formats have numbers of their own."""
+        """Refuse a mapping of another kind of file, whose formats have other version numbers.
+
+        Raises:
+            InputError: the mapping is of another kind.
+        """
 
     def dump(self, path: str | Path) -> None:
-        """Write as YAML that `load` reads back as an equal object."""
+        """Write YAML that `load` reads as an equal object."""
         Path(path).write_text(self.to_yaml(), encoding="utf-8")
 
     def to_yaml(self) -> str:
-        """The YAML text of this spec."""
+        """YAML text of this spec."""
         return yaml.safe_dump(self.to_mapping(), sort_keys=False, allow_unicode=True, width=100)
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """A YAML file as a mapping, safely loaded; raises `InputError`."""
+    """Read a YAML file as a mapping, safely.
+
+    Raises:
+        InputError: it cannot be read.
+    """
     source = str(path)
     text = read_text(path, limit=MAX_YAML_BYTES)
     try:
@@ -155,7 +175,11 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a regular file's bytes; raises `InputError` where it cannot be read."""
+    """SHA-256 of a regular file's bytes.
+
+    Raises:
+        InputError: it cannot be read.
+    """
     with opened(path) as file:
         try:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -164,24 +188,24 @@ def file_digest(path: Path) -> str:
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """The safe loader, but a key written twice is an error instead of a silent override, and so is what grows large.
+    """The safe loader, with errors for duplicate keys (instead of a silent override) and for too large content.
 
-    Aliases are counted at the size of what they stand for, because whatever goes through the data later meets all of
-    it (ten lines can stand for a thousand million nodes).
+    Aliases count with the size of what they stand for, because later code processes all of it (ten lines can stand for
+    a thousand million nodes).
     """
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self._nodes = 0
         self._depth = 0
-        self._sizes: dict[str, int] = {}  # nodes of each anchored node that is complete
+        self._sizes: dict[str, int] = {}  # number of nodes of each complete anchored node
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         anchor: Any = event.anchor
         is_alias = isinstance(event, yaml.AliasEvent)
         if is_alias:
-            # What is not complete yet would hold itself; the safe loader itself reports an anchor that is not there.
+            # An incomplete node would contain itself; the safe loader itself reports a missing anchor.
             if anchor in self.anchors and anchor not in self._sizes:
                 raise yaml.composer.ComposerError(None, None, f"{shown(anchor)} holds itself", event.start_mark)
             self._nodes += self._sizes.get(anchor, 0)
@@ -210,8 +234,8 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         except yaml.YAMLError:
             raise
         except Exception as error:
-            # The safe loader's constructors raise what int(), date() and others make of a scalar that their tag or
-            # pattern does not fit.
+            # The safe loader's constructors raise whatever int(), date() and others raise for a scalar that does not
+            # fit its tag or pattern.
             what = f"is no {node.tag.rpartition(':')[2]}"
             if isinstance(error, ValueError):
                 what += f" ({error})"
@@ -219,7 +243,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         if not isinstance(node, yaml.MappingNode):
-            return super().construct_mapping(node, deep)  # which says what it wants
+            return super().construct_mapping(node, deep)  # which reports what it expects
         seen = set()
         for key_node, _ in node.value:
             key = (key_node.tag, str(key_node.value))
@@ -232,7 +256,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
 
 
 _NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
-# YAML 1.1 reads 1e-3 as text; everybody means the number.
+# YAML 1.1 reads 1e-3 as text, but everybody means the number.
 _UniqueKeyLoader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
     re.compile(r"^[-+]?(?:[0-9][0-9_]*)(?:\.[0-9_]*)?[eE][-+]?[0-9]+$"),
@@ -241,9 +265,9 @@ _UniqueKeyLoader.add_implicit_resolver(
 
 
 def _first_problem(error: ValidationError) -> tuple[str, str]:
-    """(dotted path, reason) of the first problem."""
+    """Dotted path and reason of the first problem."""
     problems = error.errors(include_url=False)
-    # The one deepest in the data tells most: what stands above it is often only its consequence.
+    # The deepest problem in the data is the most informative; those above it are often only its consequences.
     first = max(problems, key=lambda p: (len(p["loc"]), p["type"] != "missing"))
     path = ".".join(str(part) for part in first["loc"] if not _is_branch(part))
     context = first.get("ctx", {})

@@ -1,8 +1,8 @@
-"""Status: what became of a ray, a fixation, a feature or an estimate, with the reason in words.
+"""Status: the outcome of a ray, a fixation, a feature or an estimate, with the reason in words.
 
-A computation that can expect to fail says so with a status, never with an exception. A batch holds its statuses as an
-array of int8 (`arrays.Statuses`): `status == Status.OK` selects what was found, `Status(status[i])` names one and
-`Status(status[i]).reason` puts it into words. Records hold a word instead, `Status(status[i]).label`.
+A computation that can expect to fail reports that with a status, never with an exception. A batch holds its statuses as
+an array of int8 (`arrays.Statuses`): `status == Status.OK` selects the valid ones, `Status(status[i])` names one, and
+`Status(status[i]).reason` gives its reason in words. Records hold a word instead, `Status(status[i]).label`.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from .arrays import Bools, Statuses
 
 
 class Status(IntEnum):
-    """What became of a ray, of the search for one, of a fixation, of a feature or of an estimate.
+    """Outcome of a ray, of the search for one, of a fixation, of a feature or of an estimate.
 
-    Only OK stands beside numbers that hold for the whole. NONE marks an entry that is not there: it fills up rows with
-    fewer entries than others.
+    Numbers hold for the whole only where the status is OK. NONE marks an entry that does not exist; it pads rows that
+    have fewer entries than others.
     """
 
     NONE = -1
@@ -44,17 +44,17 @@ class Status(IntEnum):
 
     @property
     def reason(self) -> str | None:
-        """The status in words; None where nothing is wrong."""
+        """Reason in words; None where nothing is wrong."""
         return _REASONS.get(self)
 
     @property
     def label(self) -> str:
-        """The word for it in a record: "ok", "partial" or "missing"; "" for no entry at all."""
+        """Word in a record: "ok", "partial" or "missing"; "" for no entry at all."""
         return _LABELS.get(self, "missing")
 
     @classmethod
     def of_record(cls, label: str, reason: str | None = None) -> Status:
-        """The status that a record's word and reason stand for; NOT_FOUND where the reason is none of those here.
+        """Status for a record's word and reason; NOT_FOUND where the reason is unknown here.
 
         A reason may be followed by details in parentheses.
         """
@@ -88,5 +88,5 @@ _OF_REASON = {reason: status for status, reason in _REASONS.items() if status.la
 
 
 def mark(status: Statuses, where: Bools, value: Status) -> None:
-    """Set `value` where nothing has gone wrong before (in place: `status` belongs to the caller)."""
+    """Set `value` where no failure is recorded yet, in place in the caller's `status`."""
     status[(status == Status.OK) & where] = value

@@ -1,7 +1,7 @@
 """Features of eyes in cameras by ray optics: the apparent pupil, the glints, further Purkinje images.
 
-A batch is n (frame, eye) pairs: eyes, their poses and positions, the camera that sees each. Work is cut into chunks
-whose arrays stay in the cache, so memory beyond the result is bounded.
+A batch is n (frame, eye) pairs: eyes, their poses and positions, and the camera that sees each. Work is divided into
+chunks whose arrays stay in the cache, so memory beyond the result is bounded.
 """
 
 from __future__ import annotations
@@ -28,13 +28,22 @@ from .rays import glint_exits, pupil_exits
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Features(ArrayValue):
-    """What cameras see of n eyes; pixels are full-sensor, NaN where the status is not OK.
+    """Features of n eyes in their cameras; pixels are full-sensor, NaN where the status is not OK.
 
-    points_px (n, k, 2), point_status (n, k), point_residual_mm (n, k): the pupil's boundary. centre_px (n, 2),
-    semi_axes_px (n, 2), angle_rad (n,), ellipse_residual_px (n,): its direct least-squares ellipse and how far (rms)
-    the boundary is from one. anatomical_centre_px (n, 2): the image of the stop's centre. glints_px (n, m, p, 2),
-    glint_status, glint_residual_mm (n, m, p): for each of m lights the Purkinje images asked for, the first is the
-    glint. point_in_image (n, k), glint_in_image (n, m, p).
+    Attributes:
+        points_px: (n, k, 2) the pupil's boundary.
+        point_status: (n, k).
+        point_residual_mm: (n, k).
+        centre_px: (n, 2) centre of its direct least-squares ellipse.
+        semi_axes_px: (n, 2).
+        angle_rad: (n,).
+        ellipse_residual_px: (n,) deviation (rms) of the boundary from the ellipse.
+        anatomical_centre_px: (n, 2) image of the stop's centre.
+        point_in_image: (n, k).
+        glints_px: (n, m, p, 2) for each of m lights the requested Purkinje images; the first one is the glint.
+        glint_status: (n, m, p).
+        glint_residual_mm: (n, m, p).
+        glint_in_image: (n, m, p).
     """
 
     points_px: Floats
@@ -53,19 +62,19 @@ class Features(ArrayValue):
 
     @property
     def pupil_status(self) -> Statuses:
-        """The first boundary point's status that is not OK, or OK, (n,)."""
+        """Status (n,) of the first boundary point that is not OK, else OK."""
         first = np.argmax(self.point_status != Status.OK, axis=1)
         return np.asarray(self.point_status[np.arange(len(first)), first])
 
     @property
     def seen_in_image(self) -> Bools:
-        """Whether all boundary points that are seen lie in the image, and there are some, (n,)."""
+        """Whether there are visible boundary points and all of them lie in the image, (n,)."""
         seen = self.point_status == Status.OK
         return np.asarray((self.point_in_image | ~seen).all(axis=1) & seen.any(axis=1))
 
     @property
     def pupil_in_image(self) -> Bools:
-        """Whether all boundary points are seen and lie in the image, (n,)."""
+        """Whether all boundary points are visible and lie in the image, (n,)."""
         return np.asarray(self.point_in_image.all(axis=1))
 
     def __len__(self) -> int:
@@ -84,11 +93,18 @@ def features(
     boundary_points: int = 30,
     purkinje: Sequence[int] = (1,),
 ) -> Features:
-    """Features of n eyes.
+    """Compute the features of n eyes.
 
-    eyes, eye_index (n,) : which eye each row is. poses : of n. position_mm (n, 3) : the unrotated apex in the world,
-    the head's displacement included. cameras, camera_index (n,). lights_mm (m, 3) in the world. boundary_points : >= 6.
-    purkinje : orders of the images wanted of each light; one that an eye lacks has status MISSED.
+    Args:
+        eyes: different eyes.
+        eye_index: (n,) the eye of each row.
+        poses: n poses.
+        position_mm: (n, 3) unrotated apex in the world, including the head's displacement.
+        cameras: different cameras.
+        camera_index: (n,) the camera of each row.
+        lights_mm: (m, 3) in the world.
+        boundary_points: number of boundary points, >= 6.
+        purkinje: orders of the requested images of each light; one that an eye lacks has status MISSED.
     """
     _check_options(len(np.atleast_1d(eye_index)), boundary_points, purkinje)
     which = np.asarray(eye_index, dtype=np.intp)
@@ -145,7 +161,11 @@ def features(
 
 
 def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> None:
-    """Raise `InputError` for options that `features` of so many eyes cannot take."""
+    """Check the options of `features` for so many eyes.
+
+    Raises:
+        InputError: they are out of range.
+    """
     if boundary_points < 6:
         raise InputError("must be >= 6", path="boundary_points")
     if boundary_points > MAX_BOUNDARY_POINTS:
@@ -161,7 +181,7 @@ def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """One camera's view of a chunk of turned eyes: x_cam = R x_eye + t for each, and the camera in the eye frame."""
+    """View of one camera on a chunk of turned eyes: x_cam = R x_eye + t for each, and the camera in the eye frame."""
 
     rotation: Floats
     translation: Floats
@@ -180,7 +200,7 @@ class _View:
         return cls(rotation, translation, (at[0], at[1], at[2]), (turn, whole), camera)
 
     def rows(self, part: slice) -> _View:
-        """The view of some of the eyes."""
+        """View of some of the eyes."""
         x, y, z = self.camera_mm
         turn, shift = self.motion
         return _View(
@@ -192,13 +212,13 @@ class _View:
         )
 
     def into_eye(self, points_mm: Floats) -> Xyz:
-        """World points (m, 3) in each eye's frame: three arrays (n, m)."""
+        """Transform world points (m, 3) into each eye's frame: three arrays (n, m)."""
         turn, shift = self.motion
         inside = np.einsum("nmi,nij->jnm", points_mm - shift[:, None, :], turn)
         return inside[0], inside[1], inside[2]
 
     def project(self, points: Xyz, status: Statuses) -> tuple[Floats, Statuses]:
-        """Pixels (n, k, 2) of points of the eye frame; NaN where the status says there is none."""
+        """Project points of the eye frame to pixels (n, k, 2); NaN where the status says there is none."""
         r, t = self.rotation[:, :, :, None], self.translation[:, :, None]
         x, y, z = points
         depth = r[:, 2, 0] * x + r[:, 2, 1] * y + r[:, 2, 2] * z + t[:, 2]

@@ -26,27 +26,30 @@ ARC_GAP_DEG = 120.0
 
 @dataclass(frozen=True, slots=True)
 class AnalyticObserver:
-    """Ray optics: the apparent pupil and the glints as they exactly are.
+    """The observer by ray optics: the exact apparent pupil and glints.
 
     Args:
-        boundary_points: how many points of the pupil boundary are traced.
+        boundary_points: number of traced points of each pupil boundary.
     """
 
     boundary_points: int = 30
 
     def observe(self, frames: Frames, rig: RigLike | None = None) -> Observations:
-        """Trace every (frame, eye); `rig` replaces the one that the frames were made for."""
+        """Trace every (frame, eye); `rig` replaces that of the frames."""
         return self.observe_in_detail(frames, rig)[0]
 
     def observe_in_detail(
         self, frames: Frames, rig: RigLike | None = None, *, purkinje: Sequence[int] = (1,)
     ) -> tuple[Observations, Features]:
-        """Trace with all details: residuals, how far the pupil is from an ellipse, Purkinje images.
+        """Trace with all details: residuals, deviation of the pupil from an ellipse, Purkinje images.
 
         Args:
             frames: n of them.
-            rig: replaces the one that the frames were made for.
+            rig: replaces the rig of the frames.
             purkinje: which images, from 1 (the glint) to 4.
+
+        Returns:
+            The observations, and the features that a record has no place for.
 
         Raises:
             InputError: the eye has no surface for one of the Purkinje images.
@@ -75,15 +78,15 @@ class AnalyticObserver:
 
 
 def trace(frames: Frames | Scene, rig: RigLike | None = None, *, boundary_points: int = 30) -> Observations:
-    """The apparent pupils and glints of frames, or of all frames of a scene, by ray optics.
+    """Compute the apparent pupils and glints of frames, or of all frames of a scene, by ray optics.
 
     Args:
         frames: what to observe.
-        rig: replaces the one that the frames were made for.
-        boundary_points: how many points of each pupil boundary are traced.
+        rig: replaces the rig of the frames.
+        boundary_points: number of traced points of each pupil boundary.
 
     Raises:
-        InputError: a target of the scene that no pose of an eye fixates; the message says which, and why.
+        InputError: no pose of an eye fixates a target of the scene; the message names it and the reason.
     """
     frames = frames.frames() if isinstance(frames, Scene) else frames
     return AnalyticObserver(boundary_points).observe(frames, rig)
@@ -156,7 +159,7 @@ def pupil_features(seen: Features) -> PupilFeatures:
 
 
 def seen_arcs_deg(found: Bools) -> list[tuple[float, float]]:
-    """Runs of points (k,), evenly spaced around the margin, that are seen: (from, to) in degrees of its parameter.
+    """Visible runs of points (k,) that are evenly spaced around the margin: (from, to) in degrees of its parameter.
 
     `from` lies in [0, 360) and `to` is not below it; an arc over the first point ends beyond 360.
     """
@@ -165,14 +168,14 @@ def seen_arcs_deg(found: Bools) -> list[tuple[float, float]]:
         return [(0.0, 360.0)]
     starts = np.flatnonzero(found & ~np.roll(found, 1))
     ends = np.flatnonzero(found & ~np.roll(found, -1))
-    # The end that belongs to a start is the next one around.
+    # The end of a start is the next one around.
     after = [int(ends[ends >= start][0]) if (ends >= start).any() else int(ends[0]) + count for start in starts]
     step = 360.0 / count
     return [(float(start * step), float(end * step)) for start, end in zip(starts, after, strict=True)]
 
 
 def _arc_ellipse(points_px: Floats, arcs: Sequence[tuple[float, float]]) -> Floats:
-    """(cx, cy, a, b, angle) of the ellipse of the points that are seen; NaN where they do not determine it."""
+    """Ellipse (cx, cy, a, b, angle) of the visible points; NaN where they do not determine it."""
     gaps = [following[0] - arc[1] for arc, following in pairwise([*arcs, (arcs[0][0] + 360.0, 0.0)])]
     if len(points_px) < ARC_POINTS or max(gaps) > ARC_GAP_DEG + 1e-9:
         return np.full(5, np.nan)
@@ -183,7 +186,7 @@ def _arc_ellipse(points_px: Floats, arcs: Sequence[tuple[float, float]]) -> Floa
 
 
 def glint_features(seen: Features) -> GlintFeatures:
-    """The glints (first Purkinje images) of a batch."""
+    """Glints (first Purkinje images) of a batch."""
     status = seen.glint_status[:, :, 0]
     reasons = np.full(status.shape, None, dtype=object)
     for i, j in np.argwhere(status != Status.OK):

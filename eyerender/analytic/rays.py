@@ -1,4 +1,4 @@
-"""The rays behind the features: from the stop's margin and from the lights to a camera, in the eye frame."""
+"""Rays of the features: from the stop's margin and from the lights to a camera, in the eye frame."""
 
 from __future__ import annotations
 
@@ -18,22 +18,30 @@ _RIM_POINTS = 36
 
 
 def pupil_exits(eye: EyeModel, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
-    """Where the rays from `count` points of the stop's margin, and last from its centre, leave the cornea.
+    """Find where the rays from `count` points of the stop's margin, and last from its centre, leave the cornea.
 
-    camera_mm : nodal points (n,) in the eye frame. Returns exit points as three arrays (n, count + 1), residuals,
-    status. A camera may stand behind the plane of the iris: the cornea bends light round to it. A ray that would have
-    to pass the iris is BEHIND_IRIS, one that meets the eyeball on its way to the camera BEHIND_SCLERA.
+    A camera may be behind the plane of the iris, because the cornea bends light round to it. The status is BEHIND_IRIS
+    for a ray that would have to pass the iris, and BEHIND_SCLERA for one that meets the eyeball on its way to the
+    camera.
+
+    Args:
+        eye: the eyes.
+        count: number of points of the margin.
+        camera_mm: (n,) nodal points in the eye frame.
+
+    Returns:
+        Exit points as three arrays (n, count + 1), residuals and status.
     """
     points = np.concatenate([eye.stop.boundary(count), eye.stop.centre_mm[..., None, :]], axis=-2)
     target, viewpoint = components(points), (camera_mm[0][:, None], camera_mm[1][:, None], camera_mm[2][:, None])
     if points.ndim == 2:
         target = (target[0][None], target[1][None], target[2][None])
     height, distance = eye.stop.height_mm(camera_mm), np.sqrt(dot(camera_mm, camera_mm))
-    # Farther to the front no ray to the camera can meet the iris or the sclera.
+    # From farther to the front no ray to the camera can meet the iris or the sclera.
     aside = height < _ASIDE * distance
     hidden = aside & _sees_no_cornea(eye, camera_mm) if aside.any() else aside
     if hidden.any():
-        # Nothing is to be found there: those rows look from straight ahead instead, and are struck out afterwards.
+        # These rows have no solution. They are computed for a camera straight ahead instead, and removed afterwards.
         ahead = (_AHEAD_MM, 0.0, 0.0)
         x, y, z = (np.where(hidden[:, None], ahead[i], viewpoint[i]) for i in range(3))
         viewpoint = (x, y, z)
@@ -84,10 +92,10 @@ def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tu
 
 
 def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> Bools:
-    """Whether the camera stands behind the tangent planes of the whole cornea, (n,); in doubt it does not.
+    """Whether the camera is behind the tangent planes of the whole cornea, (n,); False in doubt.
 
-    Of a convex cap its rim faces farthest to the back: points of the limbus are asked, and a tenth of the distance is
-    allowed for what lies between them.
+    The rim of a convex cap faces farthest to the back, so points of the limbus are tested. A tenth of the distance is
+    allowed for the points between them.
     """
     surface = eye.front[0]
     angle = 2.0 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
@@ -102,7 +110,7 @@ def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> Bools:
 
 
 def _meets_sclera(eye: EyeModel, exits: Xyz, way: Xyz) -> Bools:
-    """Whether the rays from the exits back along `way` (unit, from the camera) enter the ball of the sclera."""
+    """Whether the rays from the exits back along `way` (unit, from the camera) enter the sphere of the sclera."""
     gap = shift(exits, eye.sclera.centre_mm, -1.0)
     along = -dot(gap, way)
     radius = fit(np.asarray(eye.sclera.radius_mm, dtype=np.float64), gap[0].ndim)

@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code."""
+    """Run one command and return the exit code."""
     # Importing them registers their commands.
     from . import (  # noqa: F401
         benchmark,
@@ -68,7 +68,7 @@ def run(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except BrokenPipeError:
-        # The reader has gone (`| head`): nothing is wrong, and the interpreter must not complain at exit.
+        # The reader has gone (`| head`). This is no error, and the interpreter must not complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (Exception, KeyboardInterrupt) as error:
@@ -82,7 +82,7 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _reported(error: BaseException) -> int | None:
-    """Print an expected error as one line; returns the exit code, None (and prints nothing) for any other error."""
+    """Print an expected error as one line and return the exit code; for other errors print nothing and return None."""
     if isinstance(error, CycloptsError):
         return _fail(" ".join(str(error).split()), InputError.exit_code)
     if isinstance(error, EyerenderError):
@@ -105,7 +105,7 @@ def _fail(message: str, code: int) -> int:
 
 
 def _terminate_like_interrupt() -> dict[int, Any]:
-    """Let SIGTERM and SIGHUP unwind as Ctrl-C does, so nothing half-written stays behind; remember that one came."""
+    """Let SIGTERM and SIGHUP unwind as Ctrl-C does, so that nothing half-written remains, and remember the signal."""
     _interrupted.clear()
 
     def handler(_number: int, _frame: FrameType | None) -> None:
@@ -115,7 +115,7 @@ def _terminate_like_interrupt() -> dict[int, Any]:
     previous = {}
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
-        # A shell or nohup that ignores a signal for us means it.
+        # If a shell or nohup ignores a signal for us, that is intended.
         if number is not None and signal.getsignal(number) != signal.SIG_IGN:
             try:
                 previous[number] = signal.signal(number, handler)

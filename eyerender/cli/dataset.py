@@ -270,7 +270,7 @@ def _estimate_text(found: dict[str, Any]) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """As people say it, in seconds up to days."""
+    """Format a time for people, in seconds up to days."""
     if seconds < 3600:
         minutes, rest = divmod(round(seconds), 60)
         return f"{minutes} min {rest} s"
@@ -278,7 +278,7 @@ def _duration(seconds: float) -> str:
 
 
 def _size(count: int) -> str:
-    """As people say it, in MB up to TB."""
+    """Format a size for people, in MB up to TB."""
     unit, name = next(u for u in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if count >= u[0] or u[0] == 1e6)
     return f"{count / unit:.1f} {name}"
 

@@ -38,7 +38,7 @@ def features(
         record: Version of the records in the JSON, 1 or 2. Version 1 reports a partly visible pupil as missing.
         purkinje: Add these Purkinje images (1 to 4) and the deviation of the pupil from an ellipse to the JSON.
     """
-    # Not through `observers`, which would load OpenCV for nothing.
+    # `observers` would load OpenCV, which is not needed here.
     from ..analytic.observer import AnalyticObserver, purkinje_records
     from ..scene import load_scene
 
@@ -136,7 +136,7 @@ def _check_record(version: int) -> None:
 
 
 def _feature_table(observed: Observations, names: list[str] | None = None) -> str:
-    """One line an observation."""
+    """One line per observation."""
     index, pupil, glints = observed.index, observed.pupil, observed.glints
     lines = [f"{'frame':>5} {'eye':<5} {'pupil centre px':>21} {'semi-axes px':>17} {'angle deg':>9}  glints px"]
     for i in range(len(observed)):

@@ -1,4 +1,4 @@
-"""Options that mean the same in several commands, with their help."""
+"""Options with the same meaning in several commands, with their help."""
 
 from __future__ import annotations
 
@@ -24,6 +24,10 @@ Result = Annotated[
 
 
 def positive(name: str, value: float | None) -> None:
-    """Raise `InputError` where a count that was given is below 1."""
+    """Check that a given count is at least 1.
+
+    Raises:
+        InputError: it is below 1.
+    """
     if value is not None and value < 1:
         raise InputError(f"must be >= 1, not {value}", source=name)

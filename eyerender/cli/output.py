@@ -1,4 +1,4 @@
-"""Where results and progress go: results to stdout (or a JSON file), progress and logs to stderr."""
+"""Output of results and progress: results to stdout (or a JSON file), progress and logs to stderr."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from ..files import write_json
 
 
 def say(text: str) -> None:
-    """A line of log, on stderr."""
+    """Print a line of log on stderr."""
     print(text, file=sys.stderr, flush=True)
 
 
 class Heed:
-    """The warnings of a command: one line each on stderr and a list in the JSON; with `strict` errors instead."""
+    """Warnings of a command: one line each on stderr and a list in the JSON; with `strict` errors instead."""
 
     def __init__(self, strict: bool) -> None:
         self.strict = strict
         self.found: list[InputWarning] = []
 
     def __call__(self, warnings: Iterable[InputWarning]) -> None:
-        """Tell warnings, each once; raises the first as an `InputError` where the command is strict."""
+        """Print each warning once; raises the first as an `InputError` where the command is strict."""
         new = [warning for warning in dict.fromkeys(warnings) if warning not in self.found]
         if new and self.strict:
             more = f"; {len(new) - 1} more" if len(new) > 1 else ""
@@ -38,9 +38,10 @@ class Heed:
 
 
 def emit(data: dict[str, Any], text: str, target: str | None, heed: Heed | None = None) -> None:
-    """The result: `text` on stdout; with a JSON target the data there instead ('-' is stdout) or beside it (a file).
+    """Print the result: `text` on stdout, or the data of a JSON target.
 
-    The data get a list `warnings` where the command heeds any.
+    The JSON target is stdout ('-') or a file; with a file, the text is printed as well. The data get a list `warnings`
+    if the command collects any.
     """
     if heed is not None:
         data = {**data, "warnings": [warning.to_mapping() for warning in heed.found]}
@@ -60,7 +61,7 @@ class Steps:
         self.what = what
 
     def __call__(self, done: int, total: int, note: str = "") -> None:
-        """`done` of `total` are done."""
+        """Show that `done` of `total` are done."""
         self._advance(done, total, note)
 
 
