@@ -67,7 +67,7 @@ def fit(
 
     if (terms_x is None) != (terms_y is None):
         raise InputError("give both --terms-x and --terms-y", source="--terms-x")
-    spec = choose_estimator(
+    chosen = choose_estimator(
         estimator,
         function=function,
         terms=[terms_x, terms_y] if terms_x is not None else None,
@@ -77,11 +77,11 @@ def fit(
         index=index,
         recalibration=recalibration,
     )
-    chosen = _chosen(fixations)
+    targets = _chosen(fixations)
     heed = Heed(strict)
     observations, rig = load_observations(records, _scene(scene, heed))
-    fitted, summary = fit_estimator(spec, observations, rig, chosen, source=str(records), warn=heed)
-    save_estimator(output, spec, fitted, rig)
+    fitted, summary = fit_estimator(chosen, observations, rig, targets, source=str(records), warn=heed)
+    save_estimator(output, fitted, rig)
     summary = {**summary, "path": str(output)}
     mean = summary["calibration_error_deg"]["mean_deg"]
     text = f"{estimator}: calibrated on {summary['calibration_observations']} observations, written to {output}"

@@ -122,7 +122,7 @@ def compare(
     from ..gaze.store import choose_estimator
     from ..quickstart import compare_folder
 
-    chosen = choose_estimator(estimator, function=function).build()
+    chosen = choose_estimator(estimator, function=function)
     name = f"regression {function}" if estimator == "regression" else estimator
     with progress("extracting") as steps:
         result = compare_folder(folder, estimator=chosen, name=name, progress=steps)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .recalibration import Recalibration
     from .records import load_observations
     from .regression import Regression
+    from .store import load_estimator, save_estimator
     from .twocamera import ShihWuLiu
     from .validation import GazeErrors, gaze_errors, leave_one_target_out
 
@@ -50,7 +51,9 @@ _HOMES = {
     "binocular_average": "estimate",
     "gaze_errors": "validation",
     "leave_one_target_out": "validation",
+    "load_estimator": "store",
     "load_observations": "records",
+    "save_estimator": "store",
 }
 
 __all__ = [
@@ -72,7 +75,9 @@ __all__ = [
     "binocular_average",
     "gaze_errors",
     "leave_one_target_out",
+    "load_estimator",
     "load_observations",
+    "save_estimator",
 ]
 
 

@@ -34,10 +34,6 @@ class OwnEstimator:
         """
         return cls(reference, _instance(_class(reference, source), reference))
 
-    def build(self) -> Self:
-        """The estimator, as of `EstimatorSpec`."""
-        return self
-
     def to_mapping(self) -> dict[str, Any]:
         """Which class it is, as the files of calibrations say it."""
         return {"reference": self.reference}

@@ -16,7 +16,7 @@ from ..files import read_json, shown, write_json
 from ..observation import EYES, Observations
 from ..plausibility import target_warnings
 from ..references import is_reference
-from ..rig.rig import RigGeometry
+from ..rig.rig import RigGeometry, RigLike
 from ..spec import Positive, Spec
 from ..status import Status
 from .crossratio import CrossRatio
@@ -42,6 +42,9 @@ Name = Literal["regression", "homography", "cross-ratio", "hennessey", "shih-wu-
 NAMES: tuple[str, ...] = get_args(Name)
 
 
+_BUILT_IN = (Regression, Homography, CrossRatio, GuestrinEizenman, Hennessey, ShihWuLiu)
+
+
 class EstimatorSpec(Spec):
     """Name and options of an estimator; options of other estimators are ignored."""
 
@@ -53,6 +56,40 @@ class EstimatorSpec(Spec):
     free_index: bool = False
     index: float | None = Field(default=None, ge=1.0, le=2.0)
     recalibration: Literal["angle", "screen", "none"] = "angle"
+
+    @classmethod
+    def of(cls, estimator: GazeEstimator) -> EstimatorSpec:
+        """The name and options of one of the package's estimators, calibrated or not.
+
+        Raises:
+            InputError: it is no estimator of the package, or has options that a file does not hold.
+        """
+        options: dict[str, Any] = {}
+        if type(estimator) is Regression:
+            key = "function" if isinstance(estimator.function, str) else "terms"
+            options = {"name": "regression", key: estimator.function, "normalised": estimator.normalised}
+            bare: GazeEstimator = replace(estimator, fits={})
+        elif type(estimator) is Homography:
+            options, bare = {"name": "homography"}, replace(estimator, homographies={})
+        elif type(estimator) is CrossRatio:
+            options, bare = {"name": "cross-ratio"}, replace(estimator, alphas={})
+        elif type(estimator) is GuestrinEizenman:
+            method = "B" if estimator.centre == "plane" else "A"
+            options = {"name": "guestrin-eizenman", "method": method, "free_index": estimator.free_index}
+            options["index"] = None if estimator.start == MEAN_EYE else estimator.start.index
+            bare = replace(estimator, calibrations={})
+        elif isinstance(estimator, Hennessey | ShihWuLiu):
+            options = {"recalibration": estimator.recalibration, "name": "shih-wu-liu"}
+            if isinstance(estimator, Hennessey):
+                index = None if estimator.parameters == MEAN_EYE else estimator.parameters.index
+                options |= {"name": "hennessey", "index": index}
+            bare = replace(estimator, correction=None)
+        else:
+            raise InputError(f"a {type(estimator).__name__} is no estimator of this package")
+        spec = cls.from_mapping(options)
+        if spec.build() != bare:
+            raise InputError(f"a {type(estimator).__name__} with these options cannot be written to a file")
+        return spec
 
     def build(self) -> GazeEstimator:
         """Build the estimator, not calibrated."""
@@ -73,8 +110,8 @@ class EstimatorSpec(Spec):
         return GuestrinEizenman(centre=centre, start=eye, free_index=self.free_index)
 
 
-def choose_estimator(given: str, *, source: str = "--estimator", **options: Any) -> EstimatorSpec | OwnEstimator:
-    """The estimator of a name (see `NAMES`) with its options, or a user's own class by `module:Class`.
+def choose_estimator(given: str, *, source: str = "--estimator", **options: Any) -> GazeEstimator:
+    """The estimator of a name (see `NAMES`) with its options, or a user's own class by `module:Class`; not calibrated.
 
     Raises:
         InputError: there is no such estimator, or an option is wrong.
@@ -83,11 +120,16 @@ def choose_estimator(given: str, *, source: str = "--estimator", **options: Any)
         return OwnEstimator.load(given, source=source)
     if given not in NAMES:
         raise InputError(f"must be one of {', '.join(NAMES)}, or module:Class, not {shown(given)}", source=source)
-    return EstimatorSpec.from_mapping({"name": given, **options})
+    return EstimatorSpec.from_mapping({"name": given, **options}).build()
+
+
+def _described(estimator: GazeEstimator) -> dict[str, Any]:
+    """Which estimator it is, as files say it."""
+    return estimator.to_mapping() if isinstance(estimator, OwnEstimator) else EstimatorSpec.of(estimator).to_mapping()
 
 
 def fit_estimator(
-    spec: EstimatorSpec | OwnEstimator,
+    estimator: GazeEstimator,
     observations: Observations,
     rig: RigGeometry,
     fixations: Sequence[int] | None = None,
@@ -111,14 +153,14 @@ def fit_estimator(
         rows &= np.isin(index.fixation, fixations)
     if not rows.any():
         raise InputError("a calibration needs records with target_mm", source=source)
-    if isinstance(spec, OwnEstimator):
-        spec.check_storable()
+    if isinstance(estimator, OwnEstimator):
+        estimator.check_storable()
     used = observations.take(rows)
     if warn is not None:
         warn(target_warnings(used.index.target_mm, rig.screen, source))
     try:
         with np.errstate(all="ignore"):
-            fitted = spec.build().fit(used, rig)
+            fitted = estimator.fit(used, rig)
     except InputError as error:
         raise InputError(error.reason, source=error.source or source, path=error.path) from None
     except np.linalg.LinAlgError:
@@ -127,7 +169,7 @@ def fit_estimator(
     errors = [g["error_deg"] for g in gaze["gaze"] if g["error_deg"] is not None]
     return fitted, {
         "schema": FIT_SCHEMA,
-        "estimator": spec.to_mapping(),
+        "estimator": _described(estimator),
         "calibration_observations": len(used),
         "calibration_error_deg": {
             "mean_deg": float(np.mean(errors)) if errors else None,
@@ -177,16 +219,27 @@ def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGe
     return {"schema": PREDICT_SCHEMA, "gaze": single, "binocular": binocular}
 
 
-def save_estimator(
-    path: str | Path, spec: EstimatorSpec | OwnEstimator, estimator: GazeEstimator, rig: RigGeometry | None = None
-) -> None:
-    """Write a calibration as JSON, with the rig of the calibration where that is known."""
+def save_estimator(path: str | Path, estimator: GazeEstimator, rig: RigLike | None = None) -> None:
+    """Write a calibrated estimator as JSON, with the rig that it was calibrated on where that is known.
+
+    A user's own class follows `StoredEstimator` and can be imported, for the file names it as `module:Class`.
+
+    Raises:
+        InputError: the estimator has options that a file does not hold, or is of a class that cannot be stored.
+        EyerenderError: the file cannot be written.
+    """
+    if not isinstance(estimator, (OwnEstimator, *_BUILT_IN)):
+        kind = type(estimator)
+        estimator = OwnEstimator(f"{kind.__module__}:{kind.__qualname__}", estimator)
+    described = _described(estimator)
+    if isinstance(estimator, OwnEstimator) and not is_reference(estimator.reference):
+        raise InputError("cannot be imported again; define the class in a module", source=estimator.reference)
     write_json(
         path,
         {
             "schema": CALIBRATION_SCHEMA,
-            "estimator": spec.to_mapping(),
-            "rig": None if rig is None else rig.to_mapping(),
+            "estimator": described,
+            "rig": None if rig is None else rig.build().to_mapping(),
             **({"state": estimator.state()} if isinstance(estimator, OwnEstimator) else {"eyes": _state(estimator)}),
         },
     )

@@ -14,7 +14,7 @@ from hypothesis import given
 
 from eyerender.analytic.observer import trace
 from eyerender.gaze.records import load_observations, rig_from_mapping
-from eyerender.gaze.store import EstimatorSpec, fit_estimator, load_estimator, predictions, save_estimator
+from eyerender.gaze.store import choose_estimator, fit_estimator, load_estimator, predictions, save_estimator
 from eyerender.observation import Observations
 from eyerender.scene import Scene, load_scene
 from eyerender.scenespec import SceneSpec
@@ -49,9 +49,9 @@ def features(name: str = "regression") -> dict[str, Any]:
 def calibration(name: str) -> dict[str, Any]:
     """The file of an estimator's calibration."""
     seen, rig = Observations.from_records(features(name)["records"]), rig_from_mapping(features(name)["rig"])
-    spec = EstimatorSpec.from_mapping({"name": name, "function": "R2"})
+    estimator = choose_estimator(name, function="R2")
     with tempfile.TemporaryDirectory() as folder:
-        save_estimator(Path(folder) / "c.json", spec, fit_estimator(spec, seen, rig)[0])
+        save_estimator(Path(folder) / "c.json", fit_estimator(estimator, seen, rig)[0])
         found: dict[str, Any] = json.loads((Path(folder) / "c.json").read_text(encoding="utf-8"))
     return found
 
@@ -67,10 +67,10 @@ def test_the_unharmed_files_are_used(tmp_path, name):
 
 def use_records(path: Any, name: str) -> None:
     seen, rig = load_observations(path)
-    spec = EstimatorSpec.from_mapping({"name": name, "function": "R2"})
-    fitted, summary = fit_estimator(spec, seen, rig)
+    estimator = choose_estimator(name, function="R2")
+    fitted, summary = fit_estimator(estimator, seen, rig)
     strict_json([summary, predictions(fitted, seen, rig)])
-    save_estimator(path.with_name("out.json"), spec, fitted)
+    save_estimator(path.with_name("out.json"), fitted)
     load_estimator(path.with_name("out.json"))
 
 

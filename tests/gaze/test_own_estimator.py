@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -107,7 +109,7 @@ def function():
 def place(tmp_path, monkeypatch, features):
     """A current folder with a module of estimators, `mine_<unique>`, and a file of records; gives the module's name."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "path", [*sys.path, ""])
     name = f"mine_{abs(hash(str(tmp_path)))}"
     (tmp_path / f"{name}.py").write_text(OWN)
     (tmp_path / "features.json").write_text(features)
@@ -210,5 +212,20 @@ def test_the_api_takes_it_as_it_is(place):
     chosen = choose_estimator(f"{place}:Unstored")
     assert isinstance(chosen, OwnEstimator)
     seen, rig = er.gaze.load_observations("features.json")
-    errors = er.gaze.leave_one_target_out(chosen.estimator, seen, rig)
+    errors = er.gaze.leave_one_target_out(chosen, seen, rig)
     np.testing.assert_array_equal(errors.point_mm, np.zeros_like(errors.point_mm))
+
+
+def test_the_api_stores_a_class_of_a_module_and_no_other(place, tmp_path):
+    seen, rig = er.gaze.load_observations("features.json")
+    classes: Any = importlib.import_module(place)
+    mean = classes.Mean()
+    er.gaze.save_estimator("c.json", mean.fit(seen, rig), rig)
+    again = er.gaze.load_estimator("c.json", f"{place}:Mean")
+    assert again.predict(seen, rig) == mean.fit(seen, rig).predict(seen, rig)
+
+    with pytest.raises(er.InputError, match="cannot be imported again; define the class in a module"):
+        er.gaze.save_estimator("d.json", type("<local>", (classes.Mean,), {})(), rig)
+    with pytest.raises(er.InputError, match="has no to_mapping and from_mapping"):
+        er.gaze.save_estimator("d.json", classes.Unstored(), rig)
+    assert not (tmp_path / "d.json").exists()

@@ -95,3 +95,34 @@ def test_points_without_a_finite_estimate_have_a_reason():
     gaze = er.gaze.GazePoints.of([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0]])
     assert gaze.status.tolist() == [Status.OK, Status.NO_ESTIMATE]
     assert gaze.reason.tolist() == [None, "the estimate is not finite"]
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        er.gaze.Regression("R2", normalised=False),
+        er.gaze.Regression(("x + y + 1", "y + 1")),
+        er.gaze.Hennessey(er.gaze.EyeParameters(index=1.36), "screen"),
+        er.gaze.GuestrinEizenman(centre="plane", start=er.gaze.EyeParameters(index=1.36)),
+        er.gaze.GuestrinEizenman(free_index=True),
+    ],
+    ids=str,
+)
+def test_a_calibration_with_options_survives_its_file(scene, tmp_path, estimator):
+    seen, rig = trace(scene), scene.spec.rig
+    fitted = estimator.fit(seen, rig)
+    er.gaze.save_estimator(tmp_path / "c.json", fitted, rig)
+    again = er.gaze.load_estimator(tmp_path / "c.json")
+    assert type(again) is type(fitted)
+    assert again.predict(seen, rig) == fitted.predict(seen, rig)
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [er.gaze.Regression("R2", light=1), er.gaze.Hennessey(lights=(0, 1)), er.gaze.Homography(lights=(3, 2, 1, 0))],
+    ids=lambda e: type(e).__name__,
+)
+def test_options_that_a_file_does_not_hold_are_refused(tmp_path, estimator):
+    with pytest.raises(er.InputError, match="with these options cannot be written to a file"):
+        er.gaze.save_estimator(tmp_path / "c.json", estimator)
+    assert not (tmp_path / "c.json").exists()

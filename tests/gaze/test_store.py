@@ -13,7 +13,7 @@ from eyerender.errors import InputError
 from eyerender.gaze.records import load_observations, rig_from_mapping
 from eyerender.gaze.regression import EyeFit, Regression
 from eyerender.gaze.store import (
-    EstimatorSpec,
+    choose_estimator,
     fit_estimator,
     load_calibration,
     load_estimator,
@@ -56,8 +56,8 @@ def test_fit_and_predict_on_the_command_line(guestrin, tmp_path, capsys, name):
     assert len(data["gaze"]) == 90
     assert len(data["binocular"]) == 45
     seen, rig = load_observations(guestrin)
-    spec = EstimatorSpec.from_mapping({"name": name})
-    fitted, summary = fit_estimator(spec, seen, rig, list(range(9)))
+    estimator = choose_estimator(name)
+    fitted, summary = fit_estimator(estimator, seen, rig, list(range(9)))
     direct = fitted.predict(seen, rig)
     np.testing.assert_array_equal([g["point_mm"] for g in data["gaze"]], direct.point_mm)
     assert summary["calibration_error_deg"]["mean_deg"] < 1.0
@@ -101,8 +101,8 @@ def test_calibrations_survive_their_file(tmp_path, name, vectors):
 
             scene = Scene.of(SceneSpec.from_mapping(spec))
         seen, rig = trace(scene), scene.rig
-    fitted, _ = fit_estimator(EstimatorSpec.from_mapping({"name": name}), seen, rig)
-    save_estimator(tmp_path / "c.json", EstimatorSpec.from_mapping({"name": name}), fitted)
+    fitted, _ = fit_estimator(choose_estimator(name), seen, rig)
+    save_estimator(tmp_path / "c.json", fitted)
     again = load_estimator(tmp_path / "c.json")
     np.testing.assert_array_equal(again.predict(seen, rig).point_mm, fitted.predict(seen, rig).point_mm)
 
@@ -117,7 +117,7 @@ def test_two_cameras_on_an_aspheric_eye(tmp_path):
     spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
     scene = Scene.of(SceneSpec.from_mapping(spec), eye="E1")
     seen = trace(scene)
-    _, summary = fit_estimator(EstimatorSpec.from_mapping({"name": "shih-wu-liu"}), seen, scene.rig)
+    _, summary = fit_estimator(choose_estimator("shih-wu-liu"), seen, scene.rig)
     assert summary["calibration_error_deg"]["n"] == 36
     assert summary["calibration_error_deg"]["mean_deg"] < 0.05
 
@@ -185,9 +185,9 @@ def test_a_rig_other_than_the_calibrations_is_told(guestrin, tmp_path, monkeypat
 
 def test_calibrations_without_a_rig_are_still_read(guestrin, tmp_path, capsys):
     seen, rig = load_observations(guestrin)
-    spec = EstimatorSpec.from_mapping({"name": "regression"})
-    fitted, _ = fit_estimator(spec, seen, rig)
-    save_estimator(tmp_path / "c.json", spec, fitted, rig)
+    estimator = choose_estimator("regression")
+    fitted, _ = fit_estimator(estimator, seen, rig)
+    save_estimator(tmp_path / "c.json", fitted, rig)
     data = json.loads((tmp_path / "c.json").read_text())
     assert data["schema"] == "eyerender/gaze-calibration/3"
     assert data["rig"] == json.loads(guestrin.read_text())["rig"]
@@ -275,8 +275,8 @@ def test_bad_input(guestrin, tmp_path, monkeypatch, capsys, argv, words):
 )
 def test_a_calibration_of_another_shape_is_refused(guestrin, tmp_path, path, value, words):
     seen, rig = load_observations(guestrin)
-    spec = EstimatorSpec.from_mapping({"name": "regression"})
-    save_estimator(tmp_path / "c.json", spec, fit_estimator(spec, seen, rig)[0])
+    estimator = choose_estimator("regression")
+    save_estimator(tmp_path / "c.json", fit_estimator(estimator, seen, rig)[0])
     data = json.loads((tmp_path / "c.json").read_text())
     *parents, last = path.split(".")
     node = data
@@ -356,7 +356,7 @@ def test_rig_without_screen_or_lights():
 
 def test_predictions_without_targets_have_no_errors(guestrin):
     seen, rig = load_observations(guestrin)
-    fitted, _ = fit_estimator(EstimatorSpec.from_mapping({"name": "guestrin-eizenman"}), seen, rig)
+    fitted, _ = fit_estimator(choose_estimator("guestrin-eizenman"), seen, rig)
     from dataclasses import replace
 
     from eyerender.arrays import frozen
@@ -365,4 +365,4 @@ def test_predictions_without_targets_have_no_errors(guestrin):
     data = predictions(fitted, blind, rig)
     assert all(g["status"] == "ok" and g["error_deg"] is None and g["target_mm"] is None for g in data["gaze"])
     with pytest.raises(InputError, match="needs records with target_mm"):
-        fit_estimator(EstimatorSpec.from_mapping({"name": "regression"}), blind, rig)
+        fit_estimator(choose_estimator("regression"), blind, rig)
