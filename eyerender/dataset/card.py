@@ -10,23 +10,23 @@ from .reading import IMAGEFOLDER, WHOLE
 from .shard import run_versions
 
 _LABELS = """\
-- `records`: the analytic observer's record: pose, target, apparent pupil (ellipse and boundary points), glints.
-- `labels.pupil`, `labels.iris`: `amodal` ellipse of the outline as if nothing stood before the eye, `visible` ellipse
-  with the second moments of the visible pixels, and the visible share of the amodal pixels; the pupil's
-  `visible_arcs_deg` of its outline.
-- `labels.glints`: for each light the reflection's place by ray optics (`xy_px`), the energy-weighted place in the image
-  (`spot_xy_px`), whether it is visible, which share of the lamp's image is, and what hides it (`hidden_by`).
-- `labels.lid_margins_px`: landmarks along the lids, where the scene has lids.
+- `records`: the record of the analytic observer: pose, target, apparent pupil (ellipse and boundary points), glints.
+- `labels.pupil`, `labels.iris`: the `amodal` ellipse of the outline without anything in front of the eye, the `visible`
+  ellipse with the second moments of the visible pixels, and the visible share of the amodal pixels; for the pupil also
+  the visible arcs of its outline, `visible_arcs_deg`.
+- `labels.glints`: for each light the position of the reflection by ray optics (`xy_px`), the energy-weighted position in the
+  image (`spot_xy_px`), whether it is visible, the visible share of the lamp's image, and the occluder (`hidden_by`).
+- `labels.lid_margins_px`: landmarks along the lid margins, if the scene has lids.
 - `labels.space`: centres of rotation, globe, corneal curvature and pupil, corneal apex, optic axis, line of sight and
-  target, in the world's and in the camera's frame (mm; unit vectors).
+  target, in the world frame and the camera frame (mm; unit vectors).
 - `labels.pose`: x_world = rotation x_eye + translation. `labels.camera`: K, R, t, distortion (OpenCV). `lights_mm`.
 - `mask_file_name`: {mask}.{more}
-- `parameters`: every drawn value by its path in the spec (`draws`), the whole scene and eye as JSON text.
-- `subject`, `split`, `sample`, `sequence_index` (place in the subject's sequence of frames), `window_px`."""
+- `parameters`: every drawn value by its path in the spec (`draws`), and the whole scene and eye as JSON text.
+- `subject`, `split`, `sample`, `sequence_index` (index in the subject's sequence of frames), `window_px`."""
 
 _MORE = {
-    "amodal_masks": "\n- `amodal_mask_file_name`: the same as if nothing stood before the eye.",
-    "noiseless": "\n- `noiseless_file_name`: the same rendering exposed without the sensor's noise.",
+    "amodal_masks": "\n- `amodal_mask_file_name`: the same without anything in front of the eye.",
+    "noiseless": "\n- `noiseless_file_name`: the same rendering exposed without sensor noise.",
 }
 
 
@@ -43,33 +43,34 @@ def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
     drawn = ""
     if spec.subject_count > RANKED_SUBJECTS and len(spec.splits) > 1:
         drawn = (
-            " The splits' sizes are those of a random draw of each subject, so near their shares and not exactly them."
+            " Each subject was drawn into a split at random, so the sizes of the splits are only close to their shares."
         )
     size = statistics["pupil_semi_axis_px"]
-    pupils = "" if size is None else f" The pupil's long semi-axis is {size[0]:.1f} to {size[2]:.1f} px."
+    pupils = "" if size is None else f" The long semi-axis of the pupil is {size[0]:.1f} to {size[2]:.1f} px."
     return f"""# {spec.name}
 
 {spec.description or "Rendered near-infrared images of eyes."}
 
 {statistics["images"]} synthetic near-infrared images of eyes, rendered through refracting corneas, with exact labels.
-No person was recorded. Subjects are drawn eyes; a subject is in one split only.{drawn}{pupils}
+No person was recorded. Subjects are eyes with drawn parameters, and each subject is in one split only.{drawn}{pupils}
 
 | split | subjects | images |
 |---|---|---|
 {by_split}
 
-Values are {CONVENTIONS["values"]}. Of {statistics["samples"]} samples {statistics["samples_given_up"]} could not be
-made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jsonl` says why).
+Values are {CONVENTIONS["values"]}. Of {statistics["samples"]} samples, {statistics["samples_given_up"]} could not be
+made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jsonl` gives the reasons).
 
 ## Labels
-`metadata.jsonl` has one line an image, with the same keys in every line; the column `split` says which split it is in.
-`datasets.load_dataset("imagefolder", data_dir=..., split="train", filters=[("split", "==", "test")])` reads a split of
-the folder as it is (the loader itself calls all images `train`), without `filters` all of it.
+`metadata.jsonl` has one line per image, with the same keys in every line. The column `split` names the split of an image.
+`datasets.load_dataset("imagefolder", data_dir=..., split="train", filters=[("split", "==", "test")])` reads one split of
+the folder (the loader itself calls all images `train`); without `filters` it reads all images.
 
 {_LABELS.format(mask=CONVENTIONS["mask"], more="".join(_MORE.get(kind, "") for kind in spec.labels.pictures))}
 
 ## Reading the images
-PNG of `bit_depth` bits, 16 unless the spec says otherwise, linear: a pupil has counts of about 1 % of the full scale.
+The images are linear PNG files of `bit_depth` bits, 16 unless the spec says otherwise. A pupil has counts of about 1 % of
+the full scale.
 {WHOLE}
 {IMAGEFOLDER}
 ## Conventions
@@ -78,8 +79,8 @@ PNG of `bit_depth` bits, 16 unless the spec says otherwise, linear: a pupil has 
 - Ellipses: {CONVENTIONS["ellipse"]}.
 
 ## What to know before training on it
-Lids and lashes are as the scene has them; skin, iris and sclera textures are procedural, their albedos at 850 nm
-chosen, not measured. What a network learns here should be tested on recorded images.
+Lids and lashes are those of the scene. The textures of skin, iris and sclera are procedural, and their albedos at 850 nm
+were chosen, not measured. Test a network trained on this dataset on recorded images.
 
 ## Made by
 {versions}. The spec is in `dataset.json`; sample i is a pure function of the spec and i.

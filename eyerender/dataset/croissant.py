@@ -13,9 +13,9 @@ _FIELDS = (
     ("file_name", _TEXT, "The image, relative to the dataset's folder"),
     ("mask_file_name", _TEXT, "The mask: 0 background or skin, 1 sclera, 2 iris, 3 pupil"),
     ("sample", _INTEGER, "Which sample of the spec"),
-    ("subject", _INTEGER, "Whose eye; a subject is in one split only"),
+    ("subject", _INTEGER, "Subject; each subject is in one split only"),
     ("split", _TEXT, "Which split"),
-    ("sequence_index", _INTEGER, "Place in the subject's sequence of frames"),
+    ("sequence_index", _INTEGER, "Index in the subject's sequence of frames"),
     ("bit_depth", _INTEGER, "Of the image's values"),
 )
 _CONTEXT: dict[str, Any] = {
@@ -72,7 +72,7 @@ def croissant(plan: Plan, metadata_sha256: str) -> dict[str, Any]:
                 "@type": "cr:FileObject",
                 "@id": METADATA,
                 "name": METADATA,
-                "description": "One line an image: labels and parameters.",
+                "description": "One line per image: labels and parameters.",
                 "contentUrl": METADATA,
                 "encodingFormat": "application/jsonlines",
                 "sha256": metadata_sha256,

@@ -43,31 +43,31 @@ def bench_page(data: Row, rows: Sequence[Row]) -> Page:
         most = max(best, key=lambda e: e["summary"]["rates"]["right"])
         cards.append(Card(_percent(most["summary"]["rates"]["right"]), f"most pupils right: {most['name']}"))
     lead = [
-        "Every extractor looked at the same images, in a process of its own, and was told the same: the image, its bit "
-        "depth and, where the folder knows the rig, the rig and the range of likely pupil sizes; never the truth.",
-        "A pupil is right when its ellipse overlaps the true one with an intersection over union above 0.9; wrong when "
-        "it is another ellipse; none when the extractor said that there is none; error when it gave no usable answer. "
-        "Errors are those of the right ones.",
+        "Every extractor ran in its own process, on the same images and with the same information: the image, its bit "
+        "depth and, if the folder has a rig, the rig and the range of likely pupil sizes, but never the truth.",
+        "A pupil is right if the intersection over union of its ellipse and the true one is above 0.9, and wrong for "
+        "another ellipse. None means that the extractor reported no pupil, and error that it gave no usable answer. "
+        "The errors are those of the right pupils.",
     ]
     sections = [
         Section("Results", tables=(_pupil_table(entries), _rate_table(entries), _glint_table(entries))),
         Section("Errors", figures=_error_figures(data, rows)),
         Section(
-            "Broken down",
+            "Breakdown",
             [
-                "Median centre error of the right ones, and the share of pupils that are right, over what varies in "
-                "this folder. Noise, blur and contrast are the folder's own figures where it has them, else measured "
-                "along the true outline."
+                "The figures show the median centre error of the right pupils, and the share of right pupils, against "
+                "every quantity that varies in this folder. Noise, blur and contrast are the folder's own figures if "
+                "it states them; otherwise they are measured along the true outline."
             ],
             [f for name in data["factors"] for f in _factor_figure(data, name)],
             [_factor_table(data, name) for name in data["factors"] if _has(entries, name)],
         ),
-        Section("What went wrong", tables=(_failure_table(entries),)),
+        Section("Failures", tables=(_failure_table(entries),)),
         Section("How this was made", _how(data), tables=(_convention_table(entries),)),
     ]
     if data["not_run"]:
         table = Table(("extractor", "why"), [(e["name"], e["reason"]) for e in data["not_run"]], "Not run", wide=(1,))
-        sections[3] = Section("What went wrong", tables=(_failure_table(entries), table))
+        sections[3] = Section("Failures", tables=(_failure_table(entries), table))
     return Page(f"{data['folder']}: extractors compared", lead, cards, sections)
 
 
@@ -179,17 +179,17 @@ def _error_figures(data: Row, rows: Sequence[Row]) -> list[Figure]:
     entries = data["extractors"]
     names = [e["name"] for e in entries]
     out = [
-        Figure(outcome_figure(entries), "What became of each image that shows a pupil."),
+        Figure(outcome_figure(entries), "Outcome for every image that shows a pupil."),
         Figure(
             cumulative_figure(data, rows),
-            "Share of the images with a pupil whose centre is found to better than a given error; a curve that ends "
-            "below 1 lost the rest. Further left and up is better.",
+            "Share of the images with a pupil whose centre error is below a given value. A curve that ends below 1 lost "
+            "the other pupils. Further left and up is better.",
         ),
     ]
     for k in range(0, len(names), _PANELS):
         some = names[k : k + _PANELS]
         caption = (
-            "Centre errors, found minus true, of the right ones; the cross is their mean, the bias. Scales differ."
+            "Centre errors, found minus true, of the right pupils. The cross is their mean, the bias. Scales differ."
         )
         out.append(Figure(vector_figure(some, names, rows), caption if k + _PANELS >= len(names) else ""))
     return out
@@ -223,10 +223,10 @@ def _pupil_table(entries: Sequence[Row]) -> Table:
             )
         )  # fmt: skip
     caption = (
-        "Pupil, in px, of the right ones. Efficiency: the Cramér-Rao bound over the error, median of their ratio; "
+        "Errors of the right pupils, in px. Efficiency: Cramér-Rao bound divided by the error, median of the ratio; "
         "1 reaches the bound. Boundary: mean distance of the true outline, median over the images. CPU: median "
-        "milliseconds an image on one core, the image already read; in brackets the round trip, where an extractor "
-        "does not tell its own."
+        "milliseconds per image on one core, without reading the image; in brackets the round trip, if an extractor "
+        "does not report its own time."
     )
     return Table(header, rows, caption)
 
@@ -240,7 +240,7 @@ def _rate_table(entries: Sequence[Row]) -> Table:
         worst = s["centre_px_of_all_found"]
         rows.append((e["name"], *rates, absent, _px(worst["p95"]), _px(worst["worst"])))
     header = ("extractor", "right", "wrong", "none", "error", "pupil where none is", "all found: 95 %", "worst")
-    return Table(header, rows, "Rates, and the centre errors (px) with the wrong ones counted.")
+    return Table(header, rows, "Rates, and the centre errors (px) including wrong pupils.")
 
 
 def _glint_table(entries: Sequence[Row]) -> Table:
@@ -261,8 +261,8 @@ def _glint_table(entries: Sequence[Row]) -> Table:
     return Table(
         header,
         rows,
-        "Glints: a reported one within 2 px of a true one is that one; errors in px. Swaps: matches that were given a "
-        "wrong light, of those given one. A dash: the extractor does not look for glints.",
+        "Glints: a reported glint matches a true one within 2 px. Errors are in px. Swaps: matches with the wrong "
+        "light, of the matches with a light. A dash means that the extractor does not look for glints.",
     )
 
 
@@ -296,7 +296,7 @@ def _failure_table(entries: Sequence[Row]) -> Table:
         for e in entries
         for f in e["failures"]
     ]  # fmt: skip
-    caption = "Every reason an image has no right pupil." if rows else "Every extractor found every pupil right."
+    caption = "Every reason why an image has no right pupil." if rows else "Every extractor found every pupil right."
     return Table(("extractor", "outcome", "images", "reason", "first image"), rows, caption, wide=(3,))
 
 
@@ -310,19 +310,22 @@ def _convention_table(entries: Sequence[Row]) -> Table:
         )  # fmt: skip
         rows.append((e["name"], e["given"], e["says"] or "-", words))
     return Table(
-        ("extractor", "given as", "calls itself", "declares"), rows, "Conventions, converted before judging.", wide=(3,)
+        ("extractor", "given as", "calls itself", "declares"),
+        rows,
+        "Declared conventions; answers are converted before they are compared.",
+        wide=(3,),
     )
 
 
 def _how(data: Row) -> list[str]:
     versions = ", ".join(f"{name} {v}" for name, v in data["versions"].items())
     return [
-        f"{data['machine']['processor']}; {data['machine']['system']}; one thread an extractor, one extractor at a "
-        f"time, {data['timeout_s']:g} s allowed for an image. {versions}.",
-        "Cramér-Rao bound of the centre, per axis: (s / step) sqrt(2 sigma_b / (sqrt(pi) sqrt(a b))), s the noise, "
-        "step from pupil to iris, sigma_b the edge's blur, pixel included; the median distance is 1.177 times it. It "
-        "holds for an outline that is seen whole. In rendered images the true outline is no exact ellipse and the "
-        "renderer has noise of its own, so the bound is not what limits there.",
+        f"{data['machine']['processor']}; {data['machine']['system']}; one thread per extractor, one extractor at "
+        f"a time, at most {data['timeout_s']:g} s per image. {versions}.",
+        "Cramér-Rao bound of the centre, per axis: (s / step) sqrt(2 sigma_b / (sqrt(pi) sqrt(a b))). Here s is "
+        "the noise, step the grey-level step from pupil to iris, and sigma_b the blur of the edge, including the pixel. "
+        "The median distance is 1.177 times the bound. It holds for a fully visible outline. In rendered images, the "
+        "true outline is not exactly an ellipse and the renderer adds noise, so the bound is not the limit there.",
     ]
 
 

@@ -150,7 +150,13 @@ def test_an_export_says_how_its_images_are_encoded(tiny, tmp_path, capsys):
     for format in FORMATS:
         done = export(tiny, format, tmp_path / format, gain=1.5)
         card = (tmp_path / format / "README.md").read_text()
-        for words in (done["image"]["formula"], done["image"]["inverse"], "gain of 1.5", "8 bits", "It was given."):
+        for words in (
+            done["image"]["formula"],
+            done["image"]["inverse"],
+            "gain of 1.5",
+            "8 bits",
+            "It was set explicitly.",
+        ):
             assert words in card
 
 

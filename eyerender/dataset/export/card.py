@@ -9,10 +9,10 @@ from .encoding import LARGEST_GAIN, LEVEL, SAMPLED, SHARE, Encoding
 
 _GAINS = {
     "measured": f"""\
-It was measured on {SAMPLED} images spread evenly over the dataset (all, where there are fewer): it takes {SHARE:.1%} of
+It was measured on {SAMPLED} images spread evenly over the dataset (on all images if there are fewer). It maps {SHARE:.1%} of
 their pixels to at most {LEVEL:g} of the full scale, and lies within 1 to {LARGEST_GAIN:g}. Glints may be clipped.""",
-    "given": "It was given.",
-    "none": "The images' brightness is as in the dataset.",
+    "given": "It was set explicitly.",
+    "none": "The brightness of the images is that of the dataset.",
 }
 
 
@@ -27,7 +27,7 @@ def export_card(name: str, done: dict[str, Any], layout: str, encoding: Encoding
     return f"""# {name}: {done["format"]}
 
 {done["images"]} synthetic near-infrared images of eyes with exact labels, exported from the dataset "{name}".
-The dataset's own README.md says how they were made and what the labels mean.
+README.md of the dataset explains how they were made and what the labels mean.
 
 | split | images |
 |---|---|
@@ -37,14 +37,13 @@ The dataset's own README.md says how they were made and what the labels mean.
 {layout.strip()}
 
 ## Values of the images
-{encoding.bits} bits, encoding `{encoding.curve}`, one exposure gain of {encoding.gain:g} for all images.
+The images have {encoding.bits} bits, encoding `{encoding.curve}`, and one exposure gain of {encoding.gain:g} for all images.
 {_GAINS[encoding.gain_from]}
 Images of two exports have the same scale only if their gains are the same (`--gain`).
 
     {image["formula"]}
     {image["inverse"]}
 
-`s` is the linear share of the full scale that the sensor's counts in the dataset had: s = count / (2^bits - 1) with
-{depths} bits there. The inverse is exact to half a code, except where the image was clipped at {2**encoding.bits - 1}.
-`export.json` holds the same for programs.
+`s` is the count of the sensor as a share of the full scale: s = count / (2^bits - 1), with {depths} bits in the dataset. The inverse is exact to half a code, except where the image was clipped at {2**encoding.bits - 1}.
+`export.json` holds the same values for programs.
 {read}"""
