@@ -11,11 +11,12 @@ from .shard import run_versions
 
 _LABELS = """\
 - `records`: the record of the analytic observer: pose, target, apparent pupil (ellipse and boundary points), glints.
-- `labels.pupil`, `labels.iris`: the `amodal` ellipse of the outline without anything in front of the eye, the `visible`
-  ellipse with the second moments of the visible pixels, and the visible share of the amodal pixels; for the pupil also
-  the visible arcs of its outline, `visible_arcs_deg`.
-- `labels.glints`: for each light the position of the reflection by ray optics (`xy_px`), the energy-weighted position in the
-  image (`spot_xy_px`), whether it is visible, the visible share of the lamp's image, and the occluder (`hidden_by`).
+- `labels.pupil`, `labels.iris`: the `amodal` ellipse of the outline without anything in front of the eye, the
+  `visible` ellipse with the second moments of the visible pixels, and the visible share of the amodal pixels. The
+  pupil also has the visible arcs of its outline, `visible_arcs_deg`.
+- `labels.glints`: for each light the position of the reflection by ray optics (`xy_px`), the energy-weighted position
+  in the image (`spot_xy_px`), whether it is visible, the visible share of the lamp's image, and the occluder
+  (`hidden_by`).
 - `labels.lid_margins_px`: landmarks along the lid margins, if the scene has lids.
 - `labels.space`: centres of rotation, globe, corneal curvature and pupil, corneal apex, optic axis, line of sight and
   target, in the world frame and the camera frame (mm; unit vectors).
@@ -62,15 +63,15 @@ Values are {CONVENTIONS["values"]}. Of {statistics["samples"]} samples, {statist
 made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jsonl` gives the reasons).
 
 ## Labels
-`metadata.jsonl` has one line per image, with the same keys in every line. The column `split` names the split of an image.
-`datasets.load_dataset("imagefolder", data_dir=..., split="train", filters=[("split", "==", "test")])` reads one split of
-the folder (the loader itself calls all images `train`); without `filters` it reads all images.
+`metadata.jsonl` has one line per image, with the same keys in every line. The column `split` names the image's split.
+`datasets.load_dataset("imagefolder", data_dir=..., split="train", filters=[("split", "==", "test")])` reads one split
+of the folder (the loader itself calls all images `train`); without `filters` it reads all images.
 
 {_LABELS.format(mask=CONVENTIONS["mask"], more="".join(_MORE.get(kind, "") for kind in spec.labels.pictures))}
 
 ## Reading the images
-The images are linear PNG files of `bit_depth` bits, 16 unless the spec says otherwise. A pupil has counts of about 1 % of
-the full scale.
+The images are linear PNG files of `bit_depth` bits, 16 unless the spec says otherwise. A pupil has counts of about
+1 % of the full scale.
 {WHOLE}
 {IMAGEFOLDER}
 ## Conventions
@@ -79,7 +80,7 @@ the full scale.
 - Ellipses: {CONVENTIONS["ellipse"]}.
 
 ## What to know before training on it
-Lids and lashes are those of the scene. The textures of skin, iris and sclera are procedural, and their albedos at 850 nm
+Lids and lashes are those of the scene. The textures of skin, iris and sclera are procedural. Their albedos at 850 nm
 were chosen, not measured. Test a network trained on this dataset on recorded images.
 
 ## Made by

@@ -182,8 +182,8 @@ def _error_figures(data: Row, rows: Sequence[Row]) -> list[Figure]:
         Figure(outcome_figure(entries), "Outcome for every image that shows a pupil."),
         Figure(
             cumulative_figure(data, rows),
-            "Share of the images with a pupil whose centre error is below a given value. A curve that ends below 1 lost "
-            "the other pupils. Further left and up is better.",
+            "Share of the images with a pupil whose centre error is below a given value. A curve that ends below 1 "
+            "lost the other pupils. Further left and up is better.",
         ),
     ]
     for k in range(0, len(names), _PANELS):
@@ -323,9 +323,10 @@ def _how(data: Row) -> list[str]:
         f"{data['machine']['processor']}; {data['machine']['system']}; one thread per extractor, one extractor at "
         f"a time, at most {data['timeout_s']:g} s per image. {versions}.",
         "Cramér-Rao bound of the centre, per axis: (s / step) sqrt(2 sigma_b / (sqrt(pi) sqrt(a b))). Here s is "
-        "the noise, step the grey-level step from pupil to iris, and sigma_b the blur of the edge, including the pixel. "
-        "The median distance is 1.177 times the bound. It holds for a fully visible outline. In rendered images, the "
-        "true outline is not exactly an ellipse and the renderer adds noise, so the bound is not the limit there.",
+        "the noise, step the grey-level step from pupil to iris, and sigma_b the blur of the edge, including the "
+        "pixel. The median distance is 1.177 times the bound. It holds for a fully visible outline. In rendered "
+        "images, the true outline is not exactly an ellipse and the renderer adds noise, so other errors "
+        "dominate.",
     ]
 
 

@@ -9,8 +9,9 @@ from .encoding import LARGEST_GAIN, LEVEL, SAMPLED, SHARE, Encoding
 
 _GAINS = {
     "measured": f"""\
-It was measured on {SAMPLED} images spread evenly over the dataset (on all images if there are fewer). It maps {SHARE:.1%} of
-their pixels to at most {LEVEL:g} of the full scale, and lies within 1 to {LARGEST_GAIN:g}. Glints may be clipped.""",
+It was measured on {SAMPLED} images spread evenly over the dataset (on all images if there are fewer). It maps
+{SHARE:.1%} of their pixels to at most {LEVEL:g} of the full scale, and lies within 1 to {LARGEST_GAIN:g}.
+Glints may be clipped.""",
     "given": "It was set explicitly.",
     "none": "The brightness of the images is that of the dataset.",
 }
@@ -37,13 +38,14 @@ README.md of the dataset explains how they were made and what the labels mean.
 {layout.strip()}
 
 ## Values of the images
-The images have {encoding.bits} bits, encoding `{encoding.curve}`, and one exposure gain of {encoding.gain:g} for all images.
+The images have {encoding.bits} bits, encoding `{encoding.curve}`, and one exposure gain of {encoding.gain:g}.
 {_GAINS[encoding.gain_from]}
 Images of two exports have the same scale only if their gains are the same (`--gain`).
 
     {image["formula"]}
     {image["inverse"]}
 
-`s` is the count of the sensor as a share of the full scale: s = count / (2^bits - 1), with {depths} bits in the dataset. The inverse is exact to half a code, except where the image was clipped at {2**encoding.bits - 1}.
+`s` is the count of the sensor as a share of the full scale: s = count / (2^bits - 1), with {depths} bits in the
+dataset. The inverse is exact to half a code, except where the image was clipped at {2**encoding.bits - 1}.
 `export.json` holds the same values for programs.
 {read}"""
