@@ -113,9 +113,9 @@ def test_wrong_lines_are_found(copy, change, words):
 
 def test_what_is_no_finished_dataset_is_refused(copy, tmp_path):
     (copy / "dataset.json").unlink()
-    with pytest.raises(InputError, match="not finished"):
+    with pytest.raises(InputError, match="unfinished"):
         validate(copy)
-    with pytest.raises(InputError, match="not finished"):
+    with pytest.raises(InputError, match="unfinished"):
         export(copy, "csv", tmp_path / "out")
     with pytest.raises(InputError, match="no such folder"):
         validate(tmp_path / "nowhere")
