@@ -99,7 +99,7 @@ def test_blinks_pass_and_lids_stay_also_inside_a_choice():
 
 
 def test_an_eye_drawn_as_a_whole_is_refused():
-    with pytest.raises(InputError, match="draws of their own"):
+    with pytest.raises(InputError, match="draw single values of the eye"):
         plan(scene__eye={"draw": "choice", "values": [{"model": "E1"}, {"model": "E2"}]}, eye_parameters={})
 
 

@@ -278,7 +278,7 @@ def test_an_interrupted_run_says_so_and_can_go_on(tiny, tmp_path, number):
     _, err = process.communicate()
     assert process.returncode == 130
     assert err.splitlines()[-1] == "interrupted"
-    assert re.fullmatch(r"2 of 8 shards are finished; start again on .* to go on", err.splitlines()[-2])
+    assert re.fullmatch(r"2 of 8 shards are finished; start again on .* to resume", err.splitlines()[-2])
     assert "Traceback" not in err
     assert not list(folder.glob(".partial-*"))
     assert make(folder, plan())["complete"]
