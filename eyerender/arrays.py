@@ -52,8 +52,8 @@ class ArrayValue:
 class Columns(ArrayValue):
     """Mixin for frozen, slotted dataclasses (`eq=False, kw_only=True`) of arrays with common leading axes.
 
-    A field's annotation, one of the names above, gives its dtype and `column` its further axes. Any array-like is
-    taken and copied unless it is read-only. A column that is left out is unknown: NaN, -1, False or None.
+    A field's annotation, one of the names above, gives its dtype, and `column` gives its further axes. Any array-like
+    value is accepted and copied unless it is read-only. A column that is left out is unknown: NaN, -1, False or None.
     """
 
     __slots__ = ()
@@ -77,12 +77,12 @@ class Columns(ArrayValue):
             object.__setattr__(self, column.name, array)
 
     def take(self, rows: Any) -> Self:
-        """Some rows (indices, a slice or a mask) of every column."""
+        """Select rows (indices, a slice or a mask) of every column."""
         return dataclasses.replace(self, **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})  # type: ignore[type-var,arg-type]
 
 
 def column(*axes: int) -> Any:
-    """A field of `Columns` that may be left out, with its axes after the leading ones; 0 stands for any length."""
+    """Declare an optional field of `Columns` with its axes after the leading ones; 0 stands for any length."""
     return dataclasses.field(default=None, metadata={"axes": axes})
 
 

@@ -1,4 +1,4 @@
-"""Frames rendered in memory, a window of the sensor for each eye."""
+"""Rendering of frames in memory, with a window of the sensor for each eye."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ class Comparison:
         }
 
     def to_text(self) -> str:
-        """The comparison as a few lines of text."""
+        """Format the comparison as a few lines of text."""
         data = self.to_mapping()
         f, gaze = data["features"], data["gaze"]
         lines = [

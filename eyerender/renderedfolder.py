@@ -1,4 +1,4 @@
-"""A scene in a folder: rendered as labelled images, or exported for the stock renderer."""
+"""Folders made from a scene: labelled images, or an export for the stock renderer."""
 
 from __future__ import annotations
 
@@ -96,14 +96,14 @@ def export_scene(
     spp: int = 64,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Write one frame as PLY meshes and a Mitsuba XML file, which the stock `mitsuba` command renders as it is.
+    """Write one frame as PLY meshes and a Mitsuba XML file, which the stock `mitsuba` command renders directly.
 
     Args:
         scene: the scene.
-        path: the folder to write; complete or not at all.
+        path: the folder to write, completely or not at all.
         frame: the frame, counted from 0.
         side: the eye, right or left; by default the first one that the frame shows.
-        spp: samples per pixel that the file asks for.
+        spp: samples per pixel requested in the file.
         overwrite: replace what the folder holds.
 
     Returns:

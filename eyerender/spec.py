@@ -46,7 +46,7 @@ NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 
 
 class Spec(BaseModel):
-    """Base of every authored record: frozen, strict, unknown keys and non-finite numbers refused."""
+    """Base of every authored record: frozen and strict; unknown keys and non-finite numbers are refused."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 

@@ -122,7 +122,7 @@ def _start(
 
 
 def cuda_state(*, refresh: bool = False) -> BackendState:
-    """Whether an NVIDIA GPU renders here; `refresh` tries again where an earlier trial failed."""
+    """Whether an NVIDIA GPU renders here; `refresh` repeats a trial that failed earlier."""
     driver = _cuda_driver()
     if driver is None:
         return BackendState("cuda", False, "no NVIDIA driver on this machine", CUDA_FIX)

@@ -1,8 +1,8 @@
-"""Pupil Labs' 2D detector behind the protocol; runs in an environment of its own and knows nothing of this package.
+"""Pupil Labs' 2D detector behind the protocol; it runs in its own environment and does not import this package.
 
     .../bin/python pupil_labs.py
 
-Needs pupil-detectors, numpy and Pillow. The detector takes 8-bit images; deeper ones are scaled down.
+It needs pupil-detectors, numpy and Pillow. The detector takes 8-bit images; deeper ones are scaled down.
 """
 
 from __future__ import annotations

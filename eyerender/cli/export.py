@@ -1,4 +1,4 @@
-"""Commands that hand a scene to other programs: export-scene."""
+"""Commands that export a scene to other programs: export-scene."""
 
 from __future__ import annotations
 

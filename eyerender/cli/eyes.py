@@ -1,4 +1,4 @@
-"""Commands about eyes and scenes as such: eyes, view."""
+"""Commands that show eyes and scenes: eyes, view."""
 
 from __future__ import annotations
 

@@ -35,18 +35,18 @@ def estimate(
     measure: bool = False,
     warn: Warn | None = None,
 ) -> dict[str, Any]:
-    """Time and disk that `generate` would take: seconds = (samples t + subjects t_subject) / workers.
+    """Time and disk that `generate` would need: seconds = (samples t + subjects t_subject) / workers.
 
     The rate is the last one of this spec on this machine, for any seed and number of samples.
 
     Args:
-        spec: as of `generate`.
-        eye: as of `generate`.
-        seed: as of `generate`.
-        count: as of `generate`.
-        workers: as of `generate`.
-        backend: as of `generate`.
-        threads: as of `generate`.
+        spec: as for `generate`.
+        eye: as for `generate`.
+        seed: as for `generate`.
+        count: as for `generate`.
+        workers: as for `generate`.
+        backend: as for `generate`.
+        threads: as for `generate`.
         measure: make two samples of each of a few subjects to measure the rate.
         warn: called with warnings about the spec; it may raise.
 

@@ -117,7 +117,7 @@ class LocalPool:
         return sum(w.shard is not None for w in self._workers)
 
     def _hand_out(self, pending: deque[int]) -> None:
-        """Start as many workers as there is work for, and give a shard to each that is ready and idle."""
+        """Start as many workers as there is work for, and give a shard to each idle one."""
         while pending and len(self._workers) < min(self.size, self._busy() + len(pending)):
             self._start()
         for worker in self._workers:

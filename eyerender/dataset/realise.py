@@ -48,15 +48,15 @@ class Realised:
 
     @property
     def scene(self) -> Scene | None:
-        """The sample's scene."""
+        """Scene of the sample."""
         return None if self.frames is None else self.frames.scene
 
     def warnings(self) -> list[InputWarning]:
-        """What was probably not meant in the scene (see `Scene.warnings`)."""
+        """Probable mistakes in the scene (see `Scene.warnings`)."""
         return [] if self.scene is None else [warning.at(self.source) for warning in self.scene.warnings()]
 
     def to_mapping(self) -> dict[str, Any]:
-        """The sample as `sample --json` writes it: schema eyerender/sample/1."""
+        """Convert to the mapping that `sample --json` writes: schema eyerender/sample/1."""
         drawn = {} if self.sample is None else self.sample.to_mapping()
         rejections = [f"{r.of}, attempt {r.attempt}: {r.reason}" for r in self.rejections]
         return {"schema": "eyerender/sample/1", **drawn, "rejections": rejections}
@@ -85,13 +85,13 @@ class Realised:
 def sample(
     spec: str | Path | DatasetSpec | Plan, index: int, *, eye: str | None = None, seed: int | None = None
 ) -> Realised:
-    """Sample `index` of a dataset, as `generate` makes it: what was drawn, its scene and what ray optics see.
+    """Make sample `index` of a dataset as `generate` does: the drawn values, the scene and the analytic observations.
 
     Args:
-        spec: as of `generate`.
-        index: of the sample, counted from 0.
-        eye: as of `generate`.
-        seed: as of `generate`.
+        spec: as for `generate`.
+        index: index of the sample, counted from 0.
+        eye: as for `generate`.
+        seed: as for `generate`.
 
     Raises:
         InputError: there is no such sample, or it was given up.

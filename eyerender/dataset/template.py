@@ -190,7 +190,7 @@ def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, pr
 
 
 def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
-    """The draw at a path, which messages call `shown`."""
+    """Parse the draw at a path, which messages call `shown`."""
     draw = parse_draw(node, source=source, path=shown)
     bare = _CHOSEN.sub("", path)  # a place has the same meaning inside a choice
     identity = _under(bare, IDENTITY) and not _under(bare, PASSING)
@@ -207,7 +207,7 @@ def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
 
 
 def _values_of(draw: Draw) -> tuple[Any, ...]:
-    """The values that a draw lists, in which there may be draws again."""
+    """Values that a draw lists, which may contain draws again."""
     if isinstance(draw, FixedDraw):
         return (draw.value,)
     if isinstance(draw, ChoiceDraw | SequenceDraw | GridDraw):

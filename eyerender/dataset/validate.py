@@ -95,7 +95,7 @@ def validate(
 
 
 def _check(entry: ImageEntry, truth: DatasetTruth | SceneTruth | None, tally: Tally, *, quick: bool) -> Iterator[str]:
-    """What is wrong with a line, as far as `truth` tells (None: it is not computed again), and with its pictures."""
+    """List what is wrong with a line and its images; `truth` is None where the line is not computed again."""
     again = Again(()) if truth is None else truth.again(entry.line)
     yield from again.problems
     if quick:
@@ -105,7 +105,11 @@ def _check(entry: ImageEntry, truth: DatasetTruth | SceneTruth | None, tally: Ta
 
 
 def _find_files(entry: ImageEntry) -> None:
-    """Raise `InputError` for the first file of a line that is missing or lies outside the folder."""
+    """Check that the files of a line exist inside the folder.
+
+    Raises:
+        InputError: naming the first one that does not.
+    """
     for key in FILE_KEYS:
         entry.file(key)
 

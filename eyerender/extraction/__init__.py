@@ -1,4 +1,4 @@
-"""From a near-infrared image to the pupil ellipse and the glints."""
+"""Extraction of the pupil ellipse and the glints from a near-infrared image."""
 
 from __future__ import annotations
 

@@ -133,7 +133,10 @@ def chunks(group: tuple[EyeModel, Indices | None], rows: Indices, size: int) -> 
 
 
 def slices(count: int, size: int) -> list[slice]:
-    """Equal pieces of at most `size`: a short rest would cost the interpreter as much as a full piece."""
+    """Divide into equal pieces of at most `size`.
+
+    A short last piece would cost the interpreter as much as a full one.
+    """
     pieces = max(1, -(-count // size))
     edges = [count * k // pieces for k in range(pieces + 1)]
     return [slice(low, high) for low, high in pairwise(edges)]

@@ -78,7 +78,10 @@ def fixations(
     position_mm: npt.ArrayLike,
     line_of_sight: LineOfSightKind = "chief_ray",
 ) -> Fixations:
-    """Poses of n eyes (`eyes[eye_index]`, apexes at `position_mm` in the world, head included) that fixate targets."""
+    """Find the poses of n eyes that fixate targets.
+
+    The eyes are `eyes[eye_index]`, with apexes at `position_mm` in the world, head included.
+    """
     which = np.asarray(eye_index, dtype=np.intp)
     seen = np.asarray(target_mm, dtype=np.float64) - np.asarray(position_mm, dtype=np.float64)
     n = len(which)

@@ -1,4 +1,4 @@
-"""A gradient lens as shells of constant index."""
+"""Approximation of a gradient lens by shells of constant index."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ ShapeSpec = Annotated[
 
 
 class MediumSpec(Spec):
-    """A constant `index`, or `cauchy` = (c0, c1, c2, c3): n = c0 + c1/l^2 + c2/l^4 + c3/l^6, l in nm."""
+    """A medium: a constant `index`, or `cauchy` = (c0, c1, c2, c3), n = c0 + c1/l^2 + c2/l^4 + c3/l^6, l in nm."""
 
     index: float | None = Field(default=None, ge=1.0, le=LARGEST_INDEX)
     cauchy: tuple[Coefficient, Coefficient, Coefficient, Coefficient] | None = None

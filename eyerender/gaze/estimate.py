@@ -23,7 +23,7 @@ from ..status import Status
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GazePoints(ArrayValue):
-    """Estimated gaze points (n, 3) mm in the world, NaN where `status` (n,) is not OK; the reason says why."""
+    """Estimated gaze points (n, 3) mm in the world, NaN where `status` (n,) is not OK; `reason` explains why."""
 
     point_mm: Floats
     status: Statuses
@@ -31,7 +31,7 @@ class GazePoints(ArrayValue):
 
     @classmethod
     def of(cls, point_mm: ArrayLike, reason: Objects | None = None) -> GazePoints:
-        """Gaze points (n, 3) mm whose status follows from the reasons (n,), None where there is an estimate.
+        """Make gaze points (n, 3) mm whose status follows from the reasons (n,), None where there is an estimate.
 
         A point that is not finite is missing, whatever its reason.
         """
@@ -53,7 +53,7 @@ class GazePoints(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GazeRays(ArrayValue):
-    """Rays of gaze: origin (n, 3) mm and unit direction (n, 3), NaN where `reason` (n,) says why there is none."""
+    """Rays of gaze: origin (n, 3) mm and unit direction (n, 3), NaN where there is a `reason` (n,)."""
 
     origin_mm: Floats
     direction: Floats
@@ -70,10 +70,10 @@ class GazeRays(ArrayValue):
 
 @runtime_checkable
 class GazeEstimator(Protocol):
-    """What a gaze estimator does. A user's own class that does it works wherever the package's own estimators do.
+    """Interface of gaze estimators. A user's own class with this interface can be used like the package's own.
 
-    An estimator is a value: `fit` leaves it as it is and returns a fitted copy. The rig may be an authored `Rig` or a
-    computed `RigGeometry`; `rig.build()` gives the latter for both.
+    An estimator is a value: `fit` does not change it and returns a fitted copy. The rig may be an authored `Rig` or a
+    computed `RigGeometry`; `rig.build()` converts both to the latter.
     """
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
@@ -97,12 +97,12 @@ class StoredEstimator(GazeEstimator, Protocol):
     """
 
     def to_mapping(self) -> dict[str, Any]:
-        """What the calibration found, as JSON holds it: mappings, lists, texts, finite numbers, booleans and None."""
+        """Calibration as JSON values: mappings, lists, texts, finite numbers, booleans and None."""
         ...
 
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any]) -> Self:
-        """The calibrated estimator; raises `InputError` or `ValueError` for data that it did not write."""
+        """Make the calibrated estimator; raises `InputError` or `ValueError` for data that it did not write."""
         ...
 
 

@@ -90,7 +90,7 @@ class GuestrinEizenman:
         return GazePoints.of(screen.world(on_screen), reason)
 
     def visual_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
-        """Visual axes: from the centre of corneal curvature, in the direction of gaze."""
+        """Visual axes from the centre of corneal curvature, in the direction of gaze."""
         optic = self.optic_axes(observations, rig)
         direction = np.full((len(observations), 3), np.nan)
         for eye, calibration in self.calibrations.items():
@@ -101,7 +101,7 @@ class GuestrinEizenman:
         return GazeRays.of(optic.origin_mm, direction, optic.reason)
 
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
-        """Optic axes: from the centre of corneal curvature through the pupil centre."""
+        """Optic axes from the centre of corneal curvature through the pupil centre."""
         if not self.calibrations:
             raise InputError("the estimator is not calibrated; call fit first")
         rays = feature_rays(observations, rig, self.lights, least=2)

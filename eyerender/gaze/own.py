@@ -1,4 +1,4 @@
-"""A user's own estimator class behind `module:Class`, with its mistakes told in one line."""
+"""A user's own estimator class, given as `module:Class`, with one-line errors for its mistakes."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from .estimate import GazeEstimator, GazePoints, StoredEstimator
 
 @dataclass(frozen=True, slots=True)
 class OwnEstimator:
-    """An estimator of a user's own class, which follows `GazeEstimator`.
+    """An estimator of a user's own class with the interface `GazeEstimator`.
 
-    Whatever its methods raise becomes an `InputError` that names the class; their results are checked.
+    Every exception of its methods becomes an `InputError` that names the class. Their results are checked.
     """
 
     reference: str
@@ -27,7 +27,7 @@ class OwnEstimator:
 
     @classmethod
     def load(cls, reference: str, *, source: str = "") -> Self:
-        """Import `module:Class` and make one without arguments.
+        """Import `module:Class` and make an object of it without arguments.
 
         Raises:
             InputError: there is no such class, it needs arguments, or it has no `fit` and `predict`.
@@ -35,11 +35,11 @@ class OwnEstimator:
         return cls(reference, _instance(_class(reference, source), reference))
 
     def to_mapping(self) -> dict[str, Any]:
-        """Which class it is, as the files of calibrations say it."""
+        """Name of the class, as in calibration files."""
         return {"reference": self.reference}
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """As of `GazeEstimator`."""
+        """Calibrate; see `GazeEstimator.fit`."""
         with _calling(self.reference, "fit"):
             fitted = self.estimator.fit(observations, rig)
         if not isinstance(fitted, GazeEstimator):
@@ -47,7 +47,7 @@ class OwnEstimator:
         return replace(self, estimator=fitted)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
-        """As of `GazeEstimator`."""
+        """Estimate gaze points; see `GazeEstimator.predict`."""
         with _calling(self.reference, "predict"):
             gaze = self.estimator.predict(observations, rig)
         if not isinstance(gaze, GazePoints):
@@ -58,7 +58,11 @@ class OwnEstimator:
         return gaze
 
     def check_storable(self) -> None:
-        """Raise `InputError` where a calibration cannot be written, before there is one."""
+        """Check, before a calibration, that it could be written to a file.
+
+        Raises:
+            InputError: it could not.
+        """
         if not isinstance(self.estimator, StoredEstimator):
             reason = (
                 "has no to_mapping and from_mapping, so its calibration cannot be stored (see er.gaze.StoredEstimator)"
@@ -66,7 +70,11 @@ class OwnEstimator:
             raise InputError(reason, source=self.reference)
 
     def state(self) -> dict[str, Any]:
-        """What the calibration found, as JSON holds it; raises `InputError` where it cannot be stored."""
+        """Calibration as JSON values.
+
+        Raises:
+            InputError: it cannot be stored.
+        """
         self.check_storable()
         assert isinstance(self.estimator, StoredEstimator)
         with _calling(self.reference, "to_mapping"):
@@ -77,7 +85,11 @@ class OwnEstimator:
         return state
 
     def restored(self, state: Any) -> Self:
-        """The estimator with the calibration that a file holds; raises `InputError`."""
+        """Restore the estimator from the calibration of a file.
+
+        Raises:
+            InputError: the class refuses it.
+        """
         self.check_storable()
         assert isinstance(self.estimator, StoredEstimator)
         if not isinstance(state, dict):
@@ -109,7 +121,7 @@ def _instance(kind: type[Any], reference: str) -> GazeEstimator:
 
 @contextmanager
 def _calling(reference: str, what: str) -> Iterator[None]:
-    """Run a user's code; whatever it raises becomes one line."""
+    """Run a user's code and convert its exceptions to one-line errors."""
     try:
         yield
     except EyerenderError:

@@ -1,4 +1,4 @@
-"""Eye parameters of the model-based estimators, and how they were calibrated."""
+"""Eye parameters of the model-based estimators, and the results of their calibration."""
 
 from __future__ import annotations
 

@@ -59,10 +59,10 @@ class EstimatorSpec(Spec):
 
     @classmethod
     def of(cls, estimator: GazeEstimator) -> EstimatorSpec:
-        """The name and options of one of the package's estimators, calibrated or not.
+        """Name and options of one of the package's estimators, calibrated or not.
 
         Raises:
-            InputError: it is no estimator of the package, or has options that a file does not hold.
+            InputError: it is not an estimator of the package, or has options that a file cannot store.
         """
         options: dict[str, Any] = {}
         if type(estimator) is Regression:
@@ -111,7 +111,7 @@ class EstimatorSpec(Spec):
 
 
 def choose_estimator(given: str, *, source: str = "--estimator", **options: Any) -> GazeEstimator:
-    """The estimator of a name (see `NAMES`) with its options, or a user's own class by `module:Class`; not calibrated.
+    """Make an uncalibrated estimator from its name (see `NAMES`) and options, or from a class by `module:Class`.
 
     Raises:
         InputError: there is no such estimator, or an option is wrong.
@@ -124,7 +124,7 @@ def choose_estimator(given: str, *, source: str = "--estimator", **options: Any)
 
 
 def _described(estimator: GazeEstimator) -> dict[str, Any]:
-    """Which estimator it is, as files say it."""
+    """Name and options of an estimator, as in files."""
     return estimator.to_mapping() if isinstance(estimator, OwnEstimator) else EstimatorSpec.of(estimator).to_mapping()
 
 
@@ -220,12 +220,12 @@ def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGe
 
 
 def save_estimator(path: str | Path, estimator: GazeEstimator, rig: RigLike | None = None) -> None:
-    """Write a calibrated estimator as JSON, with the rig that it was calibrated on where that is known.
+    """Write a calibrated estimator as JSON, with the rig of its calibration where that is known.
 
-    A user's own class follows `StoredEstimator` and can be imported, for the file names it as `module:Class`.
+    A user's own class must follow `StoredEstimator` and be importable, because the file names it as `module:Class`.
 
     Raises:
-        InputError: the estimator has options that a file does not hold, or is of a class that cannot be stored.
+        InputError: the estimator has options that a file cannot store, or its class cannot be stored.
         EyerenderError: the file cannot be written.
     """
     if not isinstance(estimator, (OwnEstimator, *_BUILT_IN)):
@@ -289,7 +289,11 @@ def load_calibration(path: str | Path, own: str | None = None) -> tuple[GazeEsti
 
 
 def _own_calibration(data: dict[str, Any], reference: object, own: str | None, source: str) -> OwnEstimator:
-    """The calibration of a user's own class; raises `InputError` unless `own` is the class that the file names."""
+    """Read the calibration of a user's own class.
+
+    Raises:
+        InputError: `own` is not the class that the file names.
+    """
     at = "estimator.reference"
     if own is None:
         made_by = f"was made by {shown(reference)}, which no file can have loaded"

@@ -16,7 +16,7 @@ MIRROR.setflags(write=False)
 
 
 def read_only(array: npt.ArrayLike) -> Floats:
-    """A float64 copy that cannot be written to."""
+    """Make a read-only float64 copy."""
     copy = np.array(array, dtype=np.float64)
     copy.setflags(write=False)
     return copy

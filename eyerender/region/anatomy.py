@@ -1,7 +1,7 @@
-"""The anatomy of the eye region as a person writes it: lids, lashes, brow, face, tears and skin.
+"""Specification of the anatomy of the eye region: lids, lashes, brow, face, tears and skin.
 
-Every length is in mm, every angle in degrees. Defaults are those of a European adult; ranges hold the spread of adults.
-Sources, by the name used in the descriptions; "chosen" marks what was set by eye or for want of a source:
+Every length is in mm, every angle in degrees. Defaults are those of a European adult; ranges cover the spread of
+adults. Sources, by the name used in the descriptions; "chosen" marks values that were set by eye or lack a source:
 
 - Read: Read, Collins, Carney, Iskander 2006, Optom Vis Sci 83, 738 (fissure of young adults by vertical gaze: 9.7 (1.2)
   mm high straight ahead, 6.4 (1.1) mm at 40 degrees down).
@@ -17,7 +17,7 @@ Sources, by the name used in the descriptions; "chosen" marks what was set by ey
 - Doughty: Doughty, Laiquzzaman, Oblak, Button 2002, Cont Lens Anterior Eye 25, 57 (published means of the meniscus'
   height: 0.215 mm, 0.16 to 0.35 mm).
 - textbooks: numbers and lengths of lashes as anatomies and reviews repeat them (90 to 160 above, 75 to 80 below; 8 to
-  12 mm and 6 to 8 mm long), for which no first source was at hand.
+  12 mm and 6 to 8 mm long), for which no original source was found.
 """
 
 from __future__ import annotations

@@ -96,7 +96,11 @@ def file_states(spec: Head) -> tuple[tuple[int, int], ...]:
 
 
 def _all_objects(spec: Head) -> dict[str, list[trimesh.Trimesh]]:
-    """The meshes of all files by their names; raises `InputError` where a check sum does not fit."""
+    """Meshes of all files by their names.
+
+    Raises:
+        InputError: a checksum is wrong.
+    """
     for file, wanted in zip(spec.files, spec.sums, strict=False):
         if file_digest(Path(file)) != wanted:
             raise InputError("does not have the given sha256", source=file)

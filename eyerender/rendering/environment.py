@@ -97,7 +97,10 @@ def read_map(path: str | Path, channel: str = "red") -> Floats:
 
 
 def _channel(data: NDArray[Any], channel: str) -> NDArray[Any]:
-    """One channel (h, w) of a map (h, w) or (h, w, channels); maps of fewer than three have only one that counts."""
+    """Select one channel (h, w) of a map (h, w) or (h, w, channels).
+
+    Maps with fewer than three channels have no colours, and their first channel is used.
+    """
     if data.ndim == 2:
         return data
     if data.shape[2] < 3:

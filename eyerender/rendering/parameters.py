@@ -111,13 +111,20 @@ class ImageParameters:
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """All parameters of a frame, eye frame and scene's frame in mm.
+    """All parameters of a frame; eye frame and scene's frame are in mm.
 
     Attributes:
         surfaces: the refracting surfaces in front of the iris, from outside inwards.
         inner_index: index of refraction of the medium before the iris.
-        pupil_albedo: what the pupil reflects back.
-        globe_reach: radius (mm) of the sphere about the sclera's centre that holds the cornea too.
+        stop: the aperture stop.
+        iris: the iris.
+        limbus: the limbus.
+        sclera: the sclera.
+        image: the stop's Gaussian image.
+        pose: the pose of the eye.
+        camera: the camera.
+        pupil_albedo: share of the light that the pupil reflects back.
+        globe_reach: radius (mm) of the sphere about the sclera's centre that contains the cornea too.
         backdrop_x: the surround's plane, x in the scene's frame (mm).
         ambient_irradiance: even light from all sides, mW/mm^2.
     """

@@ -106,7 +106,7 @@ HARMONICS = 32  # largest number for the pupil's boundary
 class PupilBoundary:
     """The pupil's boundary: relative radius r(f) = 1 + Re sum_k z_k e^(i k f), f the angle in the stop's plane.
 
-    `waves` (n, 2) are the z_k = c_k - i s_k, k from 1, as pairs. An ellipse has none, and costs nothing.
+    `waves` (n, 2) are the z_k = c_k - i s_k, k from 1, as pairs. An ellipse has none and costs nothing.
     """
 
     def __init__(self, waves: np.ndarray[Any, np.dtype[np.float64]]) -> None:

@@ -46,10 +46,10 @@ class Rig(Spec):
 
 
 class RigLike(Protocol):
-    """A rig as `Rig` authors it or as `RigGeometry` holds it; what takes one begins with `rig = rig.build()`."""
+    """An authored `Rig` or a computed `RigGeometry`; functions that accept one begin with `rig = rig.build()`."""
 
     def build(self) -> RigGeometry:
-        """The numeric rig."""
+        """Build the numeric rig."""
         ...
 
 
@@ -62,7 +62,7 @@ class RigGeometry(ArrayValue):
     screen: ScreenPlane | None
 
     def build(self) -> RigGeometry:
-        """This rig, which is numeric already."""
+        """Return this rig, which is already numeric."""
         return self
 
     def to_mapping(self) -> dict[str, Any]:

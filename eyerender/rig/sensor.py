@@ -4,7 +4,7 @@
     mu_e = eta E A t lambda / (h c)                          photo-electrons of a pixel
     DN = clip(black + K (min(mu_e + shot, full well) + read))  rounded to whole numbers, 0 .. 2^bits - 1
 
-`exposure_ms` and the gain K belong to the scene: no image is ever brought to a range of its own.
+`exposure_ms` and the gain K belong to the scene; images are never normalised one by one.
 Source: EMVA Standard 1288 (release 4.0, 2021), linear model, equations 3-8.
 """
 

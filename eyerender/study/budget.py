@@ -46,7 +46,7 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """The terms of one eye model's error with one estimator; they add up to `total_deg`."""
+    """Terms of one eye model's error with one estimator; they add up to `total_deg`."""
 
     protocol: str
     estimator: str

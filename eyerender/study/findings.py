@@ -114,7 +114,7 @@ def guestrin(
 
 
 def blignaut(outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str) -> list[Finding]:
-    """B1 to B5, by eye model."""
+    """Findings B1 to B5, by eye model."""
     sets = list(lit.CALIBRATION_SETS)
     found = {m: {c: best(o, c) for c in sets} for m, o in outcomes.items()}
     error = {m: {c: (b.mean_deg if b else None) or np.nan for c, b in f.items()} for m, f in found.items()}

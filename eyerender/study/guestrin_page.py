@@ -93,7 +93,7 @@ def _about_e5(parts: Sequence[GuestrinPart]) -> dict[str, str] | None:
 
 
 def _interval(values: np.ndarray) -> tuple[float, float]:
-    """95 % confidence interval of a mean."""
+    """Confidence interval (95 %) of a mean."""
     n = len(values)
     half = float(student.ppf(0.975, n - 1) * values.std(ddof=1) / np.sqrt(n))
     return float(values.mean()) - half, float(values.mean()) + half

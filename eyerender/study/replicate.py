@@ -56,7 +56,7 @@ class BlignautPart:
 
 
 class _Scenes:
-    """Scenes and observations of one eye model and study, each made once."""
+    """Scenes and observations of one eye model and study, each made only once."""
 
     def __init__(self, module: Any, eye: str, observing: Observing) -> None:
         self.module, self.eye, self.observing = module, eye, observing

@@ -1,8 +1,8 @@
 """Lossless videos: FFV1 (RFC 9043) in MP4, written by OpenCV's FFmpeg, which OpenCV and FFmpeg read.
 
-OpenCV is a dependency already, and its FFmpeg is under the LGPL; the wheels of PyAV and imageio-ffmpeg hold x264, which
-is under the GPL. OpenCV's writer has two habits that this module makes up for: it cuts the last column or row of frames
-whose width or height is odd, and it says nothing when a write fails.
+OpenCV is a dependency already, and its FFmpeg is under the LGPL; the wheels of PyAV and imageio-ffmpeg contain x264,
+which is under the GPL. OpenCV's writer has two faults that this module corrects: it cuts off the last column or row of
+frames whose width or height is odd, and it does not report a failed write.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class LosslessVideo:
     Where a side is odd, its last column or row is repeated once, so that it becomes even.
 
     Raises:
-        OSError: OpenCV cannot write the file; `close` finds out whether all frames are in it.
+        OSError: OpenCV cannot write the file; `close` checks whether all frames are in it.
     """
 
     def __init__(self, path: Path, width: int, height: int) -> None:
@@ -38,15 +38,15 @@ class LosslessVideo:
             raise OSError(f"OpenCV cannot write an FFV1 video of {width} x {height} pixels to {path.name}")
 
     def add(self, image: Bytes) -> None:
-        """One more frame."""
+        """Add a frame."""
         height, width = image.shape
         self._writer.write(np.pad(image, ((0, height % 2), (0, width % 2)), mode="edge"))
         self.frames += 1
 
     def close(self) -> None:
-        """Write the index, and read back how many frames it has."""
+        """Write the index, and read back the number of frames."""
         self._writer.release()
-        # FFmpeg writes nothing more after a write that failed, so that the index, which comes last, is missing then.
+        # FFmpeg writes nothing after a failed write, so the index, which comes last, is missing then.
         if int(cv2.VideoCapture(self._path, cv2.CAP_FFMPEG).get(cv2.CAP_PROP_FRAME_COUNT)) != self.frames:
             raise OSError("a video could not be written whole; the disk may be full")
 

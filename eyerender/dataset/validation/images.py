@@ -75,7 +75,7 @@ def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> I
 
 
 def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats | None) -> Iterator[str]:
-    """The masks of visible parts and, where there is one, of whole parts."""
+    """Masks of visible parts and, if there is one, of whole parts."""
     w, h = entry.window[2:]
     for name, picture in (("mask", mask), ("amodal mask", whole)):
         if picture is None:

@@ -71,14 +71,14 @@ def give_edges(fitted: FittedSpots, blur_px: float, widest_px: float, limits: Li
 
 
 def _unexplained(fit: SpotFit, noise_dn: float, most: float) -> Bools:
-    """(n,) which spots have a residual that is too large for a single glint, but at most `most` of their height."""
+    """Spots (n,) whose residual is too large for a single glint, but at most `most` of their height."""
     least = np.maximum(UNEXPLAINED * noise_dn, UNLIKE_BELL * fit.amplitude_dn)
     most_dn = most * np.minimum(fit.amplitude_dn, DN)
     return np.asarray(fit.converged & (fit.residual_dn > least) & (fit.residual_dn < most_dn))
 
 
 def _best_edge(fitted: FittedSpots, blur_px: float) -> tuple[Floats, Floats]:
-    """The straight edge that explains most of each spot's residual, among 12 directions and 9 offsets.
+    """Find the straight edge that explains most of each spot's residual, among 12 directions and 9 offsets.
 
     The part of an edge that the parameters of the spot and its background can explain is removed first.
 
@@ -176,7 +176,7 @@ def split_blends(
 
 
 def _long_axis(moments: Floats) -> tuple[Floats, float] | None:
-    """(2,) one standard deviation along a patch's longer axis, and the standard deviation across it; None if round.
+    """One standard deviation (2,) along a patch's longer axis, and the standard deviation across it; None if round.
 
     `moments` (2, 2) are the patch's second moments, px^2.
     """

@@ -14,11 +14,11 @@ from ..preprocessing import Image, Prepared, as_image
 from ..settings import ExtractionSettings
 from .prescreening import bell_shaped
 
-SMOOTH_PX = 0.7  # standard deviation of the Gaussian that the image is smoothed with first
+SMOOTH_PX = 0.7  # standard deviation of the Gaussian that smooths the image first
 MAX_SIGMA_PX = 8.0  # widest spot
 # The mean of the 2 x 2 pixels around a sharp peak reaches at least this share of its height.
 LEAST_OF_BLOCK = 0.5
-# A glint stands above its brightest surroundings by at least this share of what it stands above the darkest.
+# A glint's height above its brightest surroundings is at least this share of its height above the darkest ones.
 RING_SHARE = 0.4
 MOST_PEAKS = 80  # maxima that are examined, brightest first
 
@@ -95,7 +95,7 @@ def detect_spots(
 
 
 def _sampled(smooth: Image, xy: Floats, x: Floats, y: Floats) -> Singles:
-    """(n, k) levels of the pixels nearest to the peaks xy (n, 2) plus the offsets x and y, (n, k) each."""
+    """Levels (n, k) of the pixels nearest to the peaks xy (n, 2) plus the offsets x and y, (n, k) each."""
     height, width = smooth.shape
     column = np.rint(np.minimum(np.maximum(xy[:, :1] + x, 0.0), width - 1.0)).astype(np.intp)
     row = np.rint(np.minimum(np.maximum(xy[:, 1:] + y, 0.0), height - 1.0)).astype(np.intp)
@@ -103,7 +103,7 @@ def _sampled(smooth: Image, xy: Floats, x: Floats, y: Floats) -> Singles:
 
 
 def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
-    """(n,) height of each peak above the brightest tenth of a ring around it. Pixels of other spots are left out.
+    """Height (n,) of each peak above the brightest tenth of a ring around it. Pixels of other spots are left out.
 
     Skin, lashes and the gaps between lashes have many peaks, with equally bright ones beside them.
     """
@@ -178,13 +178,13 @@ def _no_spots() -> Spots:
 
 
 def _opening(half: Image, size: int) -> Image:
-    """The level around spots: a square morphological opening of `size` px. Half resolution is enough for it."""
+    """Level around spots: a square morphological opening of `size` px. Half resolution is enough for it."""
     side = 2 * (size // 4) + 1
     return as_image(cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)))
 
 
 def _maxima(smooth: Image, half: Image, opened: Image, threshold: float) -> tuple[Indices, Singles]:
-    """Flat indices (n,) of local maxima that exceed the opened level by the threshold, and by how much they do (n,)."""
+    """Find local maxima that exceed the opened level by the threshold: flat indices (n,), and heights above it (n,)."""
     blocks = np.flatnonzero(half - opened > LEAST_OF_BLOCK * threshold)
     width, columns = smooth.shape[1], half.shape[1]
     row, column = np.divmod(blocks, columns)

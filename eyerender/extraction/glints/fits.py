@@ -41,11 +41,11 @@ class SpotFit:
     converged: Bools
 
     def taken(self, index: Indices) -> SpotFit:
-        """The spots with these indices."""
+        """Select the spots with these indices."""
         return SpotFit(*(getattr(self, one.name)[index] for one in fields(self)))
 
     def replaced(self, index: Indices, other: SpotFit) -> SpotFit:
-        """A copy in which `other` replaces the spots with these indices."""
+        """Copy in which `other` replaces the spots with these indices."""
         parts = []
         for one in fields(self):
             values = getattr(self, one.name).copy()
@@ -55,12 +55,12 @@ class SpotFit:
 
 
 def joined(parts: list[SpotFit]) -> SpotFit:
-    """Several batches as one."""
+    """Join several batches."""
     return SpotFit(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)))
 
 
 def no_spots() -> SpotFit:
-    """An empty batch."""
+    """Return an empty batch."""
     return SpotFit(
         np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2)), np.zeros(0), np.zeros(0),
         np.zeros((0, 2, 2)), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool),

@@ -30,7 +30,14 @@ NEARLY_STILL_PX = 0.02  # a spot that moves less has settled, even if its neighb
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedSpots:
-    """A fit and its data: P pixels, theta (n, PARAMETERS), rest (P,): the image minus B and the other spots' light."""
+    """A fit and its data.
+
+    Attributes:
+        fit: the fit.
+        pixels: P pixels of the windows.
+        theta: (n, PARAMETERS) parameters.
+        rest: (P,) the image minus B and the other spots' light.
+    """
 
     fit: SpotFit
     pixels: SpotPixels
@@ -98,14 +105,14 @@ def fit_spots(
 
 
 def no_fit() -> FittedSpots:
-    """The fit of no spots."""
+    """Return the fit of no spots."""
     none, index, pairs = np.zeros(0), np.zeros(1, dtype=np.intp), np.zeros((0, 2))
     pixels = SpotPixels(pairs, none, index, index[:0], none, np.zeros((3, 0)), none, none, none > 0.0, False)
     return FittedSpots(no_spots(), pixels, np.zeros((0, PARAMETERS)), none)
 
 
 def _distance(start: Floats) -> Floats:
-    """(n, n) distances between spots; infinite on the diagonal."""
+    """Distances (n, n) between spots; infinite on the diagonal."""
     gap = start[:, None] - start
     out: Floats = np.sqrt((gap * gap).sum(axis=-1))
     np.fill_diagonal(out, np.inf)
@@ -113,7 +120,7 @@ def _distance(start: Floats) -> Floats:
 
 
 def _start(pixels: SpotPixels, start: Floats, width: Floats, height: Floats, touching: Bools) -> Floats:
-    """(n, PARAMETERS) start of the fit, without the background's level."""
+    """Start (n, PARAMETERS) of the fit, without the background's level."""
     theta = np.zeros((width.size, PARAMETERS))
     theta[:, :2] = start
     theta[:, 2] = np.log(1.3 * np.maximum(height, 1.0))
@@ -146,13 +153,13 @@ def _start(pixels: SpotPixels, start: Floats, width: Floats, height: Floats, tou
 
 
 def _ring_level(pixels: SpotPixels, rest: Floats) -> Floats:
-    """(n,) mean level along the edges of the windows."""
+    """Mean level (n,) along the edges of the windows."""
     ring = pixels.dx * pixels.dx + pixels.dy * pixels.dy > ((pixels.radius - 1.0) ** 2)[pixels.spot]
     return pixels.total(rest * ring) / np.maximum(pixels.total(ring), 1.0)
 
 
 def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blur_px: float | None = None) -> SpotFit:
-    """The fit at the end of a descent; `rest` (P,) is the image minus B and the other spots' light."""
+    """Convert the end of a descent to a fit; `rest` (P,) is the image minus B and the other spots' light."""
     theta, noise = ended.theta, limits.noise_dn
     k = theta.shape[1]
     penalty = prior(limits, blur_px is not None)

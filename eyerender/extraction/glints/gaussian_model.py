@@ -38,7 +38,7 @@ _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Limits:
-    """What a fit of spots knows of the image.
+    """Properties of the image that limit a fit of spots.
 
     Attributes:
         noise_dn: standard deviation of a pixel's noise.
@@ -53,7 +53,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Descent:
-    """Where a descent ended.
+    """Result of a descent.
 
     Attributes:
         theta: (n, K) parameters.
@@ -73,20 +73,20 @@ class Descent:
 
 
 def lost(theta: Floats, start: Floats) -> Bools:
-    """(n,) which spots have grown or moved more than a glint can."""
+    """Whether spots (n,) have grown or moved more than a glint can."""
     wide = theta[:, 3:5].max(axis=1) > math.log(LOST_PX)
     away = theta[:, :2] - start
     return np.asarray(wide | ((away * away).sum(axis=1) > LOST_PX**2))
 
 
 def promising(theta: Floats, gram: Floats, used: Floats, noise: float) -> Bools:
-    """(n,) which spots the fit explains roughly (see ROUGH and ROUGH_SHARE)."""
+    """Whether the fit roughly explains spots (n,) (see ROUGH and ROUGH_SHARE)."""
     misfit = noise * np.sqrt(gram[:, -1, -1] / np.maximum(used, 1.0))
     return np.asarray(misfit < np.maximum(ROUGH * noise, ROUGH_SHARE * np.exp(theta[:, 2])))
 
 
 def slopes(pixels: SpotPixels, grid: Grid, theta: Floats, rest: Floats, blur_px: float | None = None) -> Floats:
-    """(K + 1, P) derivatives of the model at every pixel and, in the last row, the residual.
+    """Derivatives (K + 1, P) of the model at every pixel and, in the last row, the residual.
 
     Args:
         pixels: P pixels of n spots.

@@ -22,7 +22,7 @@ LONGEST = 2.5  # largest elongation of the bright patch; glints, and two that to
 
 
 def about(xy: Floats, reach: Floats, shape: tuple[int, ...]) -> tuple[Indices, Singles, Bools]:
-    """The pixels around n peak pixels xy (n, 2) up to `reach` (n,) px.
+    """Find the pixels around n peak pixels xy (n, 2) up to `reach` (n,) px.
 
     Returns:
         Flat index (n, k), offset (2, k), and whether the pixel lies in the image and within reach (n, k). A pixel
@@ -46,7 +46,7 @@ def about(xy: Floats, reach: Floats, shape: tuple[int, ...]) -> tuple[Indices, S
 
 @lru_cache(maxsize=32)
 def _disc(radius: int) -> tuple[Indices, Indices, Indices, Singles]:
-    """dx, dy, squared distance (k,) of the pixels within a radius, and (2, k) dx and dy."""
+    """Offsets dx and dy, squared distance (k,) of the pixels within a radius, and dx and dy as (2, k)."""
     step = np.arange(-radius, radius + 1)
     away2 = (step * step)[:, None] + step * step
     row, column = np.nonzero(away2 <= radius**2)
@@ -63,10 +63,10 @@ def bell_shaped(
     clip_dn: float,
     which: Bools | None = None,
 ) -> Bools:
-    """(m,) whether the pixels around each spot form a bell. Skin, lashes and the gaps between lashes do not.
+    """Whether the pixels around each spot form a bell (m,). Skin, lashes and the gaps between lashes do not.
 
-    Fits the level within 2.2 sigma + 1 px of the peak by linear least squares. Pixels nearer to another spot are left
-    out. The model is
+    The level within 2.2 sigma + 1 px of the peak is fitted by linear least squares. Pixels nearer to another spot are
+    left out. The model is
 
         c + p dx + q dy + g (h + u dx + v dy + w r^2 / sigma^2),  g = exp(-r^2 / (2 sigma^2)),
 
@@ -123,7 +123,10 @@ def bell_shaped(
 
 
 def _elongation(patch: Singles, tall: Floats, offset: Singles) -> Floats:
-    """(m,) standard deviation along over that across, of the part of each patch (m, k) above a third of the height."""
+    """Ratio (m,) of the standard deviations along and across each patch (m, k).
+
+    Only the part above a third of the height counts.
+    """
     weight = np.maximum(patch - (patch.max(axis=1) - 0.65 * tall).astype(np.float32)[:, None], np.float32(0.0))
     dx, dy = offset
     terms = np.stack([np.ones_like(dx), dx, dy, dx * dx, dx * dy, dy * dy], axis=1)

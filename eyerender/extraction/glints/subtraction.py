@@ -18,7 +18,7 @@ WELL_FITTED, BRIGHT, FAINT = 3.0, 3.0, 0.2
 
 
 def well_fitted(prepared: Prepared, fit: SpotFit) -> Bools:
-    """(n,) which spots have a fit good enough to subtract their light."""
+    """Whether spots (n,) have a fit good enough to subtract their light."""
     return np.asarray(fit.converged & (fit.residual_dn < WELL_FITTED * prepared.noise_dn))
 
 

@@ -47,7 +47,7 @@ class Candidate:
 def find_candidates(
     prepared: Prepared, settings: ExtractionSettings, most: int = 4, *, without_lines: bool = False
 ) -> list[Candidate]:
-    """Up to `most` candidates, best first; empty if nothing dark and round stands out.
+    """Find up to `most` candidates, best first; the list is empty if nothing dark and round stands out.
 
     Args:
         prepared: the image.
@@ -107,7 +107,7 @@ def _levels(small: Image) -> Floats:
 
 
 def _sweep(small: Image, levels: Floats, factor: int, settings: ExtractionSettings) -> Floats:
-    """(n, 6) blobs that could be a pupil: ellipse (x, y, a, b, angle) in reduced pixels, and its filled share."""
+    """Find blobs (n, 6) that could be a pupil: ellipse (x, y, a, b, angle) in reduced pixels, and filled share."""
     height, width = small.shape
     least = max(0.5 * settings.radius_min_px, settings.radius_min_px - 2.0 * factor) / factor
     most = 1.3 * settings.radius_max_px / factor
@@ -145,7 +145,7 @@ def _on_border(contour: NDArray[Any], width: int, height: int) -> float:
 def _blob_ellipse(
     m: dict[str, float], least: float, most: float, settings: ExtractionSettings
 ) -> tuple[float, ...] | None:
-    """The ellipse with the second moments of a filled contour, and its filled share; None if it is not elliptical."""
+    """Ellipse with the second moments of a filled contour, and its filled share; None if it is not elliptical."""
     area = m["m00"]
     if area < math.pi * least**2 * 0.5:
         return None
@@ -207,7 +207,7 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -
 
 
 def _sample(small: Image, centre: Floats, axes: Floats, angle: Floats) -> Image:
-    """(n, ANGLES) levels along n ellipses at the nearest pixels; outside the frame its border is repeated."""
+    """Levels (n, ANGLES) along n ellipses at the nearest pixels; outside the frame its border is repeated."""
     points = np.rint(points_on_ellipse(centre, axes, angle, ANGLES)).astype(np.intp)
     column = np.minimum(np.maximum(points[..., 0], 0), small.shape[1] - 1)
     row = np.minimum(np.maximum(points[..., 1], 0), small.shape[0] - 1)

@@ -25,13 +25,13 @@ CANDIDATES = 3  # of each search
 
 
 def fallback_search(work: Prepared, refused: Found, settings: ExtractionSettings) -> Found | None:
-    """The most likely boundary among all candidates, judged by its edges alone; None if none is likely enough.
+    """Find the most likely boundary among all candidates, judged by its edges alone; None if none is likely enough.
 
     A lid that crosses the pupil gives the dark region a straight side, so an ellipse through its whole outline is
     rejected. A lid shadow or lashes that touch the pupil merge with it into one region. The fallback therefore tries
-    the candidates of both searches (with and without dark lines), each with its whole outline and with the stretch left
-    out that lies inside the ellipse through the rest. A boundary that contains the rejected one, or that has a dark
-    core, is an iris.
+    the candidates of both searches (with and without dark lines), each with its whole outline and without the stretch
+    that lies inside the ellipse through the rest. A boundary that contains the rejected one, or that has a dark core,
+    is an iris.
     """
     choice = settings.model_copy(update={"method": "fast", "min_confidence": FALLBACK_CONFIDENCE})
     best: Found | None = None
@@ -61,7 +61,7 @@ def _holds(outer: BoundaryFit, inner: BoundaryFit) -> bool:
 
 
 def _boundaries(work: Prepared, settings: ExtractionSettings) -> Iterator[Found]:
-    """The distinct boundaries of all candidates."""
+    """Distinct boundaries of all candidates."""
     tried: list[Ellipse] = []
     seen: list[BoundaryFit] = []
     for without_lines in (False, True):

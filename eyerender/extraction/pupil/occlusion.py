@@ -19,7 +19,7 @@ FARTHEST = 3.5  # largest displacement of a sector, in standard deviations of wh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visible:
-    """What of a boundary the model explains.
+    """The part of a boundary that the model explains.
 
     Attributes:
         use: (n,) pixels that are not outliers.

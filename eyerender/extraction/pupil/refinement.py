@@ -51,7 +51,7 @@ class PixelFit:
 def refine(
     linear: Image, start: EdgeModel, sectors: Bools, masked: Bools, noise_dn: float, before: PixelFit | None = None
 ) -> PixelFit | str:
-    """Fit the pixel model; returns the fit, or the reason why it failed.
+    """Fit the pixel model, or give the reason why the fit failed.
 
     The Fourier order of the outer level is the one with the least BIC, predicted by one linear step. Pixels and sectors
     that the model cannot explain (lids, lashes, reflections) are left out and the rest is fitted again. If the boundary
@@ -207,7 +207,7 @@ def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen
 
 
 def _through(start: Ellipse, displaced: Floats) -> tuple[Ellipse, Floats]:
-    """The ellipse that fits an uneven boundary best, as a direct fit to the traced boundary would.
+    """Ellipse that fits an uneven boundary best, as a direct fit to the traced boundary would.
 
     Also returns the derivatives (5, SECTORS) of its centre and shape by the sectors' displacements from `start`.
     """

@@ -34,7 +34,7 @@ class Found:
 
     @cached_property
     def model(self) -> EdgeModel:
-        """The pixel model, as far as the edges determine it."""
+        """Pixel model, as far as the edges determine it."""
         candidate = self.candidate
         sigma = math.sqrt(max(self.edges.sigma_px**2 - self.edges.filter_px**2, 0.25))
         outer = np.array([candidate.inside_dn + candidate.step_dn])
@@ -42,7 +42,7 @@ class Found:
 
     @cached_property
     def covariance(self) -> Floats:
-        """(5, 5) covariance of centre, semi-axes and angle, from the scatter of the edge points."""
+        """Covariance (5, 5) of centre, semi-axes and angle, from the scatter of the edge points."""
         return edge_covariance(self.boundary.ellipse, self.boundary.points_px, self.boundary.residual_px)
 
     @cached_property
@@ -52,7 +52,7 @@ class Found:
 
     @cached_property
     def sectors(self) -> Bools:
-        """(SECTORS,) sectors with an edge point, and gaps of up to two sectors between them."""
+        """Sectors (SECTORS,) with an edge point, and gaps of up to two sectors between them."""
         hit = np.bincount(sector_of(Place.of(self.boundary.ellipse, *self.edges.points_px[self.boundary.inliers].T)),
                           minlength=SECTORS) > 0  # fmt: skip
         grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
@@ -66,7 +66,7 @@ class Found:
 
 
 def search(work: Prepared, settings: ExtractionSettings) -> Found | PupilResult:
-    """The best candidate, judged by its edges; if there is none, the search repeats without dark lines."""
+    """Find the best candidate, judged by its edges; if there is none, the search repeats without dark lines."""
     found = _searched(work, settings, without_lines=False)
     if isinstance(found, Found) or work.inverted:
         return found
@@ -85,7 +85,7 @@ def _searched(work: Prepared, settings: ExtractionSettings, *, without_lines: bo
 
 
 def _first_good(work: Prepared, candidates: list[Candidate], settings: ExtractionSettings) -> tuple[Found | None, str]:
-    """The first candidate whose boundary is well visible, else the most visible one; and why the first one failed."""
+    """First candidate whose boundary is well visible, else the most visible one; and why the first one failed."""
     poor: list[Found] = []
     reason = ""
     for candidate in candidates:
@@ -108,7 +108,7 @@ def _holds(outer: Found, inner: Found) -> bool:
 
 
 def _without_core(work: Prepared, found: Found, settings: ExtractionSettings) -> Found | PupilResult:
-    """The boundary itself if its interior is even; the boundary inside it if it has a darker core, as an iris has."""
+    """Boundary itself if its interior is even; the boundary inside it if it has a darker core, as an iris has."""
     for _ in range(2):
         if not found.has_core:
             return found
@@ -121,7 +121,7 @@ def _without_core(work: Prepared, found: Found, settings: ExtractionSettings) ->
 
 
 def boundary_about(work: Prepared, candidate: Candidate, settings: ExtractionSettings) -> Found | str:
-    """The boundary around a candidate, or the reason why none was found."""
+    """Find the boundary around a candidate, or give the reason why there is none."""
     bright = candidate.inside_dn + 4.0 * candidate.step_dn
     b = float(candidate.ellipse.semi_axes_px[1])
     sigma = filter_sigma(candidate.step_dn, work.noise_dn, b)
