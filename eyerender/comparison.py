@@ -18,7 +18,7 @@ from .rig.rig import RigLike
 SCHEMA = "eyerender/compare/1"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FeatureErrors(ArrayValue):
     """Image-derived minus analytic features, NaN where one of the two has none.
 
@@ -129,13 +129,13 @@ def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
         rows, columns = np.nonzero((truth.glints.light == light) & expected)
         glint[rows, columns] = np.where(seen[rows, None], place[rows], np.nan) - truth.glints.xy_px[rows, columns]
     return FeatureErrors(
-        frozen(np.where(both[:, None], found.pupil.centre_px - truth.pupil.centre_px, np.nan)),
-        frozen(np.where(both[:, None], found.pupil.semi_axes_px - truth.pupil.semi_axes_px, np.nan)),
-        frozen(glint),
-        frozen(pupil_expected, bool),
-        frozen(both, bool),
-        frozen(expected, bool),
-        frozen(np.isfinite(glint).all(axis=-1), bool),
+        centre_px=frozen(np.where(both[:, None], found.pupil.centre_px - truth.pupil.centre_px, np.nan)),
+        semi_axes_px=frozen(np.where(both[:, None], found.pupil.semi_axes_px - truth.pupil.semi_axes_px, np.nan)),
+        glint_px=frozen(glint),
+        pupil_expected=frozen(pupil_expected, bool),
+        pupil_found=frozen(both, bool),
+        glint_expected=frozen(expected, bool),
+        glint_found=frozen(np.isfinite(glint).all(axis=-1), bool),
     )
 
 

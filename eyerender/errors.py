@@ -47,7 +47,7 @@ Refuse = Callable[[str, str], NoReturn]
 """Raises `InputError` for a path in some input, with a reason."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class InputWarning:
     """The user's input can be used, but is probably a mistake.
 

@@ -57,7 +57,11 @@ def pupil_warnings(diameter_mm: float, path: str) -> list[InputWarning]:
     low, high = PUPIL_MM
     if low <= diameter_mm <= high:
         return []
-    return [InputWarning("pupil", f"is {diameter_mm:g} mm; human pupils are {low:g} to {high:g} mm wide", path=path)]
+    return [
+        InputWarning(
+            code="pupil", reason=f"is {diameter_mm:g} mm; human pupils are {low:g} to {high:g} mm wide", path=path
+        )
+    ]
 
 
 def length_warnings(scene: Mapping[str, Any]) -> list[InputWarning]:
@@ -68,7 +72,7 @@ def length_warnings(scene: Mapping[str, Any]) -> list[InputWarning]:
             sizes = value if isinstance(value, list | tuple) else [value]
             # A lamp of size 0 is a point.
             if any(0 < size < least for size in sizes):
-                found.append(InputWarning("metres", f"is {_shown(sizes, ' x ')} mm; {_METRES}", path=path))
+                found.append(InputWarning(code="metres", reason=f"is {_shown(sizes, ' x ')} mm; {_METRES}", path=path))
     return found
 
 
@@ -96,10 +100,12 @@ def place_warnings(
     for path, what, place in places:
         code, reason = _misplaced(place, what, rig.screen, eyes_mm, heads_mm) or (None, None)
         if code is not None and reason is not None:
-            found.setdefault(path, InputWarning(code, reason, path=path))
+            found.setdefault(path, InputWarning(code=code, reason=reason, path=path))
     if rig.screen is not None and np.linalg.norm(rig.screen.centre_mm) < _LEAST_DISTANCE_MM:
         path = "rig.screen.centre_mm"
-        found[path] = InputWarning("metres", f"is ({_shown(rig.screen.centre_mm)}) mm; {_METRES}", path=path)
+        found[path] = InputWarning(
+            code="metres", reason=f"is ({_shown(rig.screen.centre_mm)}) mm; {_METRES}", path=path
+        )
     return list(found.values())
 
 
@@ -115,7 +121,7 @@ def view_warnings(
     """
     blind = [c for c, camera in enumerate(rig.cameras) if not any(_in_view(camera, w, eye) for w, eye in views[c])]
     everywhere = "; nothing of any eye is in view" if len(blind) == len(rig.cameras) else ""
-    return [InputWarning("out-of-view", f"sees no eye{everywhere}", path=camera_paths[c]) for c in blind]
+    return [InputWarning(code="out-of-view", reason=f"sees no eye{everywhere}", path=camera_paths[c]) for c in blind]
 
 
 def is_saturated(dn: NDArray[Any], sensor: Sensor) -> bool:
@@ -131,7 +137,7 @@ def saturation_warnings(saturated: int, images: int, source: str) -> list[InputW
         f"in {saturated} of {images} images more than {SATURATED_SHARE:.0%} of the pixels are saturated; "
         "lower sensor.exposure_ms or the lights' intensity_mw_sr"
     )
-    return [InputWarning("saturated", reason, source)]
+    return [InputWarning(code="saturated", reason=reason, source=source)]
 
 
 def target_warnings(targets_mm: Floats, screen: ScreenPlane | None, source: str) -> list[InputWarning]:
@@ -146,7 +152,7 @@ def target_warnings(targets_mm: Floats, screen: ScreenPlane | None, source: str)
         f"{count} of {len(off)} targets lie off the plane of the rig's screen, by up to {off.max():.4g} mm; "
         "gaze points are always on that plane"
     )
-    return [InputWarning("off-screen-plane", reason, source, "target_mm")]
+    return [InputWarning(code="off-screen-plane", reason=reason, source=source, path="target_mm")]
 
 
 def rig_warnings(rig: RigGeometry, calibrated: RigGeometry, source: str) -> list[InputWarning]:
@@ -156,7 +162,10 @@ def rig_warnings(rig: RigGeometry, calibrated: RigGeometry, source: str) -> list
         return []
     return [
         InputWarning(
-            "other-rig", "differs from the rig of the calibration; calibrate again with this rig", source, path
+            code="other-rig",
+            reason="differs from the rig of the calibration; calibrate again with this rig",
+            source=source,
+            path=path,
         )
     ]
 

@@ -92,7 +92,15 @@ class Bench:
         for side in (1, -1):
             a = np.radians(65.0)
             place = 300 * np.array([np.cos(a), side * np.sin(a), 0.0])
-            lights.append(Lamp(frozen(place), frozen(-place / 300), 100.0, 1000.0, 1.0))
+            lights.append(
+                Lamp(
+                    position_mm=frozen(place),
+                    axis=frozen(-place / 300),
+                    radius_mm=100.0,
+                    intensity_mw_sr=1000.0,
+                    lobe_exponent=1.0,
+                )
+            )
         black = rigs.BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
         rig = rigs.LampRig(camera, tuple(lights))
         job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
@@ -147,7 +155,13 @@ class Bench:
         for model in ("E4", "E5"):
             eye = rigs.eye_of(model)
             for where, place in (("remote", (500.0, 0.0, -150.0)), ("head-mounted", (30.0, -6.0, -14.0))):
-                lamp = Lamp(frozen(place), frozen([-1.0, 0, 0]), 0.0, 100.0, 0.0)
+                lamp = Lamp(
+                    position_mm=frozen(place),
+                    axis=frozen([-1.0, 0, 0]),
+                    radius_mm=0.0,
+                    intensity_mw_sr=100.0,
+                    lobe_exponent=0.0,
+                )
                 rig = rigs.LampRig(rigs.remote_rig().camera, (lamp,))
                 plain = rigs.PLAIN.model_copy(update={"limbus_width_mm": 0.0})
                 job = rigs.job_of(eye, rig, (0, 0, 16, 16), look=plain)

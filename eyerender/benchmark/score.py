@@ -20,7 +20,7 @@ RIGHT_IOU = 0.9
 MATCH_PX = 2.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GlintScore:
     """Scores of an image's glints.
 
@@ -120,7 +120,7 @@ def score_glints(image: LabelledImage, reply: Reply) -> GlintScore:
     """Match reported to true glints one to one within 2 px: as many as possible, then the nearest."""
     true, reported = image.glints, reply.glints
     if not true or not reported:
-        return GlintScore(len(true), len(reported))
+        return GlintScore(true=len(true), reported=len(reported))
     places = np.array([g.xy_px for g in true])
     spots = np.array([xy for xy, _ in reported])
     offset = spots[None] - places[:, None]
@@ -130,11 +130,11 @@ def score_glints(image: LabelledImage, reply: Reply) -> GlintScore:
     lights = [(true[i].light, reported[j][1]) for i, j in pairs]
     named = [(a, b) for a, b in lights if b is not None]
     return GlintScore(
-        len(true),
-        len(reported),
-        tuple((float(offset[i, j, 0]), float(offset[i, j, 1])) for i, j in pairs),
-        len(named),
-        sum(a != b for a, b in named),
+        true=len(true),
+        reported=len(reported),
+        errors_px=tuple((float(offset[i, j, 0]), float(offset[i, j, 1])) for i, j in pairs),
+        named=len(named),
+        swapped=sum(a != b for a, b in named),
     )
 
 

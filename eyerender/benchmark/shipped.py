@@ -110,11 +110,11 @@ def _lights(found: Extraction, rig: Mapping[str, Any] | None) -> list[int | None
     assigned = identify(
         camera.ideal(spots),
         camera.ideal(found.pupil.ellipse.centre_px),
-        camera.K,
-        camera.R,
-        camera.t,
-        rig["lights_mm"],
-        rig["eye_mm"],
+        K=camera.K,
+        R=camera.R,
+        t_mm=camera.t,
+        lights_mm=rig["lights_mm"],
+        eye_mm=rig["eye_mm"],
         position_sd_mm=_PLACE_MM,
     )
     return [int(k) if k >= 0 else None for k in assigned.light]

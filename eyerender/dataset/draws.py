@@ -184,7 +184,7 @@ def random_value(draw: Draw, u: float) -> Any:
     if isinstance(draw, IntegerDraw):
         return min(draw.low + int(u * (draw.high - draw.low + 1)), draw.high)
     if isinstance(draw, NormalDraw):
-        return truncated_normal(u, draw.mean, draw.sd, draw.low, draw.high)
+        return truncated_normal(u, mean=draw.mean, sd=draw.sd, low=draw.low, high=draw.high)
     if isinstance(draw, ChoiceDraw):
         weights = draw.weights or (1.0,) * len(draw.values)
         level, total = u * math.fsum(weights), 0.0
@@ -196,12 +196,12 @@ def random_value(draw: Draw, u: float) -> Any:
     raise TypeError(type(draw).__name__)
 
 
-def truncated_normal(u: float, mean: float, sd: float, low: float, high: float) -> float:
+def truncated_normal(u: float, *, mean: float, sd: float, low: float, high: float) -> float:
     """Quantile of the truncated normal, Phi^-1(Phi(a) + u (Phi(b) - Phi(a))), in logarithms for accurate tails."""
     a, b = (low - mean) / sd, (high - mean) / sd
     if a > 0:
         # The upper tail is computed by symmetry, because Phi is indistinguishable from 1 there.
-        return -truncated_normal(1 - u, -mean, sd, -high, -low)
+        return -truncated_normal(1 - u, mean=-mean, sd=sd, low=-high, high=-low)
     log_a, log_b = float(log_ndtr(a)), float(log_ndtr(b))
     # log(Phi(a) + u (Phi(b) - Phi(a))) = log Phi(b) + log(r + u (1 - r)),  r = Phi(a) / Phi(b)
     r = math.exp(log_a - log_b)

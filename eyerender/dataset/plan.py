@@ -209,7 +209,9 @@ class Plan:
                 continue  # it is drawn again, or reported when it is made
             for w in warnings:
                 path, reason = f"scene.{w.path}", f"{w.reason} (sample {sample})"
-                found.setdefault((w.code, path), InputWarning(w.code, reason, self.source, path))
+                found.setdefault(
+                    (w.code, path), InputWarning(code=w.code, reason=reason, source=self.source, path=path)
+                )
         return list(found.values())
 
     def check_files(self) -> None:
@@ -284,7 +286,7 @@ class Plan:
             raise InputError(f"must be 0 to {spec.count - 1}", source=str(sample))
         subject, sequence = self.subject_of(sample)
         subject_attempt = self.identity(subject)[0]
-        turn = Turn(sample, subject, sequence, attempt, subject_attempt)
+        turn = Turn(sample=sample, subject=subject, sequence=sequence, attempt=attempt, subject_attempt=subject_attempt)
         tree, drawn = self.scene_template.values(turn)
         tree.setdefault("format", 1)
         tree.setdefault("name", f"{spec.name} {sample}")
@@ -308,7 +310,7 @@ class Plan:
     def _identify(self, subject: int) -> tuple[int, tuple[str, ...]]:
         reasons: list[str] = []
         for attempt in range(self.spec.attempts):
-            turn = Turn(0, subject, 0, 0, attempt)
+            turn = Turn(sample=0, subject=subject, sequence=0, attempt=0, subject_attempt=attempt)
             tree, _ = self.scene_template.values(turn)
             try:
                 eye, _, modified = self._eye_of(tree, turn)

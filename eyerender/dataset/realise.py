@@ -171,11 +171,11 @@ def _require_pupils(scene: Scene, found: Observations) -> None:
     for row, (x0, y0, w, h) in enumerate(windows_of(scene, found)):
         if not found.pupil.ok[row]:
             raise InputError(f"no apparent pupil: {found.pupil.reason[row]}")
-        inside = _inside(found.pupil.points_px[row], x0, y0, w, h)
+        inside = _inside(found.pupil.points_px[row], x0=x0, y0=y0, w=w, h=h)
         if not inside.all():
             raise InputError("the apparent pupil leaves the window")
 
 
-def _inside(xy: Floats, x0: int, y0: int, w: int, h: int) -> Bools:
+def _inside(xy: Floats, *, x0: int, y0: int, w: int, h: int) -> Bools:
     x, y = xy[:, 0], xy[:, 1]
     return np.asarray((x >= x0 - 0.5) & (x <= x0 + w - 0.5) & (y >= y0 - 0.5) & (y <= y0 + h - 0.5))

@@ -76,7 +76,7 @@ def shard_name(shard: int) -> str:
     return f"{shard:05d}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Staged:
     """A shard that is written but not in place: its folder, and a summary for the log."""
 
@@ -143,7 +143,15 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
     except BaseException:
         shutil.rmtree(stage, ignore_errors=True)
         raise
-    return Staged(shard, str(stage), count, len(rejections), len(given_up), seconds, size)
+    return Staged(
+        shard=shard,
+        stage=str(stage),
+        images=count,
+        rejected=len(rejections),
+        given_up=len(given_up),
+        seconds=seconds,
+        bytes=size,
+    )
 
 
 def _write_image(stage: Path, shard: int, image: MadeImage) -> dict[str, str]:

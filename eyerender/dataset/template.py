@@ -48,7 +48,7 @@ class PlacedDraw:
     unit: Unit
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Turn:
     """The sample that is drawn: its index, its subject and place in the subject's sequence, and both attempts."""
 

@@ -127,7 +127,7 @@ def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:
     """
     point, direction = eye.chief_ray.point_mm, eye.chief_ray.direction
     azimuth, elevation, miss, ahead = _turn_line(eye, components(target_mm), _split(point), _split(direction))
-    status = _status(target_mm, azimuth, elevation, miss)
+    status = _status(target_mm, azimuth=azimuth, elevation=elevation, residual=miss)
     status[(status == Status.OK) & ~(ahead > 0.0)] = Status.TARGET_TOO_NEAR
     poses = Poses.listing(azimuth, elevation)
     return Fixations(
@@ -233,7 +233,9 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
         slope = slope + np.where(learn, surprise[:, :, None] * step[:, None, :] / square[:, None, None], 0.0)
         miss = new
     residual = np.linalg.norm(miss, axis=-1)
-    status = np.where(ok, _status(target_mm, angles[:, 0], angles[:, 1], residual), start.status).astype(np.int8)
+    status = np.where(
+        ok, _status(target_mm, azimuth=angles[:, 0], elevation=angles[:, 1], residual=residual), start.status
+    ).astype(np.int8)
     status[ok & lost] = Status.NO_LINE_OF_SIGHT
     return Fixations(Poses.listing(angles[:, 0], angles[:, 1]), residual, status, entry, way)
 
@@ -290,7 +292,7 @@ def _to_the_axis(point: Floats, way: Floats) -> Floats:
         return np.asarray(np.sum(way[:, 1:] * point[:, 1:], axis=-1) / np.sum(way[:, 1:] ** 2, axis=-1))
 
 
-def _status(target_mm: Floats, azimuth: Floats, elevation: Floats, residual: Floats) -> Statuses:
+def _status(target_mm: Floats, *, azimuth: Floats, elevation: Floats, residual: Floats) -> Statuses:
     status = np.full(residual.shape, int(Status.OK), dtype=np.int8)
     status[~(residual <= RESIDUAL_LIMIT_MM)] = Status.NOT_CONVERGED
     turned = ~((np.abs(azimuth) <= REACH_RAD) & (np.abs(elevation) <= REACH_RAD))

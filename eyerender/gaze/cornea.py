@@ -44,7 +44,7 @@ class CorneaCentres(ArrayValue):
 
 
 def from_all_glints(
-    origin_mm: Floats, glints: Floats, light_mm: Floats, radius_mm: Floats, start_mm: Floats | None = None
+    origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats, start_mm: Floats | None = None
 ) -> CorneaCentres:
     """Method A: the k that minimise sum_{i<j} |c_i(k_i) - c_j(k_j)|^2; the centre is the mean of the c_i.
 
@@ -61,9 +61,13 @@ def from_all_glints(
     m = glints.shape[-2]
     radius = _radii(radius_mm, glints.shape[:-2])
     origin = origin_mm[..., None, :]
-    k = _coarse(origin, glints, light_mm, radius) if start_mm is None else np.array(start_mm, dtype=float)
+    k = (
+        _coarse(origin, glints=glints, light_mm=light_mm, radius=radius)
+        if start_mm is None
+        else np.array(start_mm, dtype=float)
+    )
     k = np.broadcast_to(k, (*radius.shape, m)).copy()
-    c, slope = _mirror_centres(origin, glints, light_mm, radius, k)
+    c, slope = _mirror_centres(origin, glints=glints, light_mm=light_mm, radius=radius, k=k)
     deviation = c - c.mean(axis=-2, keepdims=True)
     cost = (deviation * deviation).sum(axis=(-1, -2))
     one = np.eye(m)
@@ -77,7 +81,7 @@ def from_all_glints(
         )
         step = _solved(system, (slope * deviation).sum(axis=-1))
         trial = k - step
-        c_new, slope_new = _mirror_centres(origin, glints, light_mm, radius, trial)
+        c_new, slope_new = _mirror_centres(origin, glints=glints, light_mm=light_mm, radius=radius, k=trial)
         deviation_new = c_new - c_new.mean(axis=-2, keepdims=True)
         cost_new = (deviation_new * deviation_new).sum(axis=(-1, -2))
         settled = np.abs(step).max(axis=-1) / np.abs(k).max(axis=-1)
@@ -118,7 +122,7 @@ def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple
 
 
 def from_plane(
-    origin_mm: Floats, glints: Floats, light_mm: Floats, radius_mm: Floats, mirror: int = 0
+    origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats, mirror: int = 0
 ) -> CorneaCentres:
     """Method B: c = O + k_c b, with k_c from the mirror condition of the one glint `mirror`.
 
@@ -134,7 +138,9 @@ def from_plane(
     k = 80.0 * radius
     origin = origin_mm[..., None, :]
     for step in range(_ITERATIONS):
-        c, slope = _mirror_centres(origin, u[..., None, :], light[None, :], radius, k[..., None])
+        c, slope = _mirror_centres(
+            origin, glints=u[..., None, :], light_mm=light[None, :], radius=radius, k=k[..., None]
+        )
         value = ((c[..., 0, :] - origin_mm) * e).sum(axis=-1)
         # The first step treats the normal as constant, which works from any distance. Newton's steps follow.
         rate = side if step == 0 else (slope[..., 0, :] * e).sum(axis=-1)
@@ -143,7 +149,7 @@ def from_plane(
         k = np.where(k - change > 0, k - change, 0.5 * k)
         if bool(np.all((np.abs(change) <= 1e-13 * np.abs(k)) | ~np.isfinite(change))):
             break
-    c, _ = _mirror_centres(origin, u[..., None, :], light[None, :], radius, k[..., None])
+    c, _ = _mirror_centres(origin, glints=u[..., None, :], light_mm=light[None, :], radius=radius, k=k[..., None])
     off = c[..., 0, :] - origin_mm
     k_c = (off * b).sum(axis=-1)
     residual = np.abs((off * e).sum(axis=-1))
@@ -155,7 +161,7 @@ def from_plane(
 
 
 def optic_axis(
-    origin_mm: Floats, pupil: Floats, centre_mm: Floats, radius_mm: Floats, distance_mm: Floats, index: Floats
+    origin_mm: Floats, *, pupil: Floats, centre_mm: Floats, radius_mm: Floats, distance_mm: Floats, index: Floats
 ) -> tuple[Floats, Bools, Bools]:
     """The optic axis w (..., 3): from the cornea's centre through the pupil centre.
 
@@ -176,12 +182,12 @@ def optic_axis(
         nearest point, so that a search for parameters sees no step.
     """
     R, K, n = (np.asarray(v, dtype=float)[..., None] for v in (radius_mm, distance_mm, index))
-    r, meets = _near_intersection(origin_mm, pupil, centre_mm, R)
+    r, meets = _near_intersection(origin_mm, ray=pupil, centre=centre_mm, radius=R)
     normal = (r - centre_mm) / np.sqrt(((r - centre_mm) ** 2).sum(axis=-1, keepdims=True))
     cosine = -(pupil * normal).sum(axis=-1, keepdims=True)
     eta = 1.0 / n
     t = eta * pupil + (eta * cosine - np.sqrt(np.maximum(1 - eta**2 * (1 - cosine**2), 0.0))) * normal
-    p, inside = _near_intersection(r, t, centre_mm, K)
+    p, inside = _near_intersection(r, ray=t, centre=centre_mm, radius=K)
     return unit(p - centre_mm), meets, inside
 
 
@@ -190,7 +196,7 @@ def _radii(radius_mm: Floats, shape: tuple[int, ...]) -> Floats:
     return np.broadcast_to(radius, np.broadcast_shapes(radius.shape, shape))
 
 
-def _near_intersection(origin: Floats, ray: Floats, centre: Floats, radius: Floats) -> tuple[Floats, Bools]:
+def _near_intersection(origin: Floats, *, ray: Floats, centre: Floats, radius: Floats) -> tuple[Floats, Bools]:
     """Where unit rays first meet spheres, and whether they do; the nearest point of the ray where they do not."""
     m = origin - centre
     b = (m * ray).sum(axis=-1, keepdims=True)
@@ -199,7 +205,7 @@ def _near_intersection(origin: Floats, ray: Floats, centre: Floats, radius: Floa
 
 
 def _mirror_centres(
-    origin: Floats, glints: Floats, light_mm: Floats, radius: Floats, k: Floats
+    origin: Floats, *, glints: Floats, light_mm: Floats, radius: Floats, k: Floats
 ) -> tuple[Floats, Floats]:
     """Centres c_i(k_i) and their derivatives dc_i/dk_i, both (..., m, 3)."""
     q = origin + k[..., None] * glints
@@ -215,12 +221,16 @@ def _mirror_centres(
     return q - R * normal, glints - R * n_slope
 
 
-def _coarse(origin: Floats, glints: Floats, light_mm: Floats, radius: Floats) -> Floats:
+def _coarse(origin: Floats, *, glints: Floats, light_mm: Floats, radius: Floats) -> Floats:
     """Starting distances (..., m): all equal, with the value of a coarse grid whose centres disagree least."""
     m = glints.shape[-2]
     k = _START.reshape(-1, *([1] * radius.ndim)) * radius
     c, _ = _mirror_centres(
-        origin, glints, light_mm, np.broadcast_to(radius, k.shape), np.repeat(k[..., None], m, axis=-1)
+        origin,
+        glints=glints,
+        light_mm=light_mm,
+        radius=np.broadcast_to(radius, k.shape),
+        k=np.repeat(k[..., None], m, axis=-1),
     )
     spread = ((c - c.mean(axis=-2, keepdims=True)) ** 2).sum(axis=(-1, -2))
     best = np.argmin(np.where(np.isfinite(spread), spread, np.inf), axis=0)

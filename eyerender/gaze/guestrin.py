@@ -117,7 +117,12 @@ class GuestrinEizenman:
             R, K, index, _, _ = calibration.parameters.vector()
             found = self._centres(rays, rows, np.full(len(rows), R))
             w, meets, inside = optic_axis(
-                rays.origin_mm[rows], rays.pupil[rows], found.centre_mm, *(np.full(len(rows), v) for v in (R, K, index))
+                rays.origin_mm[rows],
+                pupil=rays.pupil[rows],
+                centre_mm=found.centre_mm,
+                radius_mm=np.full(len(rows), R),
+                distance_mm=np.full(len(rows), K),
+                index=np.full(len(rows), index),
             )
             reason[rows] = _why(found, meets, inside)
             centre[rows], axis[rows] = found.centre_mm, w
@@ -126,8 +131,8 @@ class GuestrinEizenman:
     def _centres(self, rays: FeatureRays, rows: Any, radius: Floats) -> CorneaCentres:
         origin, glints = rays.origin_mm[rows], rays.glints[rows]
         if self.centre == "plane":
-            return from_plane(origin, glints, rays.light_mm, radius)
-        return from_all_glints(origin, glints, rays.light_mm, radius)
+            return from_plane(origin, glints=glints, light_mm=rays.light_mm, radius_mm=radius)
+        return from_all_glints(origin, glints=glints, light_mm=rays.light_mm, radius_mm=radius)
 
     def turned(self, w: Floats, alpha: ArrayLike, beta: ArrayLike) -> Floats:
         """Visual axes (..., 3) of optic axes w (..., 3); alpha towards +y and beta upwards, in radians."""
@@ -197,7 +202,7 @@ class _Model:
         x = (np.sqrt(parameters[:, 0]) - self.middle) / self.half
         centre = (chebvander(x, _DEGREE) @ self._series).reshape(*shape, 3)
         R, K, index = (np.broadcast_to(parameters[:, k, None], shape) for k in range(3))
-        w, _, _ = optic_axis(self.origin, self.pupil, centre, R, K, index)
+        w, _, _ = optic_axis(self.origin, pupil=self.pupil, centre_mm=centre, radius_mm=R, distance_mm=K, index=index)
         alpha, beta = np.radians(parameters[:, 3, None]) * self.sign, np.radians(parameters[:, 4, None])
         # Both are in the screen's axes: right, up, and towards the eye.
         v, c = self.estimator.turned(w, alpha, beta) @ self.axes, (centre - self.screen.centre_mm) @ self.axes

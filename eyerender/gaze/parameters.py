@@ -12,7 +12,7 @@ from ..arrays import Floats
 from ..errors import InputError
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EyeParameters:
     """Parameters of the model eye.
 
@@ -39,7 +39,7 @@ class EyeParameters:
     @classmethod
     def of(cls, values: Sequence[float] | Floats) -> EyeParameters:
         """Make parameters from five numbers in the order of the fields."""
-        return cls(*(float(v) for v in values))
+        return cls(**{f.name: float(v) for f, v in zip(fields(cls), values, strict=True)})
 
     def to_mapping(self) -> dict[str, float]:
         """Convert to a mapping for JSON."""
@@ -50,7 +50,10 @@ MEAN_EYE = EyeParameters()
 NAMES = tuple(f.name for f in fields(EyeParameters))
 
 
-_LOWER, _UPPER = EyeParameters(6.5, 3.0, 1.30, -10.0, -6.0), EyeParameters(9.5, 6.0, 1.45, 10.0, 6.0)
+_LOWER, _UPPER = (
+    EyeParameters(cornea_radius_mm=6.5, pupil_distance_mm=3.0, index=1.30, alpha_deg=-10.0, beta_deg=-6.0),
+    EyeParameters(cornea_radius_mm=9.5, pupil_distance_mm=6.0, index=1.45, alpha_deg=10.0, beta_deg=6.0),
+)
 
 
 @dataclass(frozen=True, slots=True)

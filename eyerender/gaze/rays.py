@@ -17,7 +17,7 @@ from ..rig.rig import RigGeometry
 from ..rig.screen import ScreenPlane
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FeatureRays(ArrayValue):
     """Rays of observations.
 
@@ -60,7 +60,13 @@ def feature_rays(
         pupil[rows] = rig.cameras[k].rays(observations.pupil.centre_px[rows])
         glints[rows] = rig.cameras[k].rays(places[rows])
     light_mm = np.array([rig.lights[j].position_mm for j in wanted], dtype=float).reshape(m, 3)
-    return FeatureRays(frozen(origin), frozen(pupil), frozen(glints), frozen(light_mm), frozen(reason, object))
+    return FeatureRays(
+        origin_mm=frozen(origin),
+        pupil=frozen(pupil),
+        glints=frozen(glints),
+        light_mm=frozen(light_mm),
+        reason=frozen(reason, object),
+    )
 
 
 def chosen_lights(rig: RigGeometry, lights: Sequence[int] | None, least: int) -> tuple[int, ...]:

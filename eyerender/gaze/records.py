@@ -92,7 +92,14 @@ def rig_from_mapping(data: Any, *, source: str = "") -> RigGeometry:
     if not isinstance(places, list) or len(places) > MAX_LIGHTS:
         raise InputError(f"must be a list of at most {MAX_LIGHTS} points", source=source, path="rig.lights_mm")
     lights = tuple(
-        Lamp(array(p, (3,), f"rig.lights_mm.{k}"), frozen([1.0, 0.0, 0.0]), 0.0, 1.0, 0.0) for k, p in enumerate(places)
+        Lamp(
+            position_mm=array(p, (3,), f"rig.lights_mm.{k}"),
+            axis=frozen([1.0, 0.0, 0.0]),
+            radius_mm=0.0,
+            intensity_mw_sr=1.0,
+            lobe_exponent=0.0,
+        )
+        for k, p in enumerate(places)
     )
     return RigGeometry(cameras, lights, _screen(data.get("screen"), array, source))
 

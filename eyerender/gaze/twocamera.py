@@ -75,7 +75,7 @@ class ShihWuLiu:
         n = len(observations)
         centre, axis = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
         reason = np.full(n, "the other camera has no observation of this fixation", dtype=object)
-        c, c_ok = _closest(rays.origin_mm[first], lines[first], rays.origin_mm[second], lines[second])
+        c, c_ok = _closest(rays.origin_mm[first], b1=lines[first], o2=rays.origin_mm[second], b2=lines[second])
         d, d_ok = _normal_to_both(rays, first, second, c)
         for rows in (first, second):
             centre[rows], axis[rows], reason[rows] = c, d, None
@@ -100,7 +100,7 @@ class ShihWuLiu:
         return np.array([a[k] for k in both], dtype=np.int64), np.array([b[k] for k in both], dtype=np.int64)
 
 
-def _closest(o1: Floats, b1: Floats, o2: Floats, b2: Floats) -> tuple[Floats, Bools]:
+def _closest(o1: Floats, *, b1: Floats, o2: Floats, b2: Floats) -> tuple[Floats, Bools]:
     """Middle of the closest approach of two lines (n, 3), and whether they are not parallel (n,)."""
     w = o2 - o1
     cosine = (b1 * b2).sum(axis=-1)

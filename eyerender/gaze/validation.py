@@ -13,7 +13,7 @@ from ..rig.rig import RigLike
 from .estimate import GazeEstimator, GazePoints, angular_error_deg, binocular_average
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class GazeErrors(ArrayValue):
     """Binocular gaze errors by frame.
 
@@ -79,4 +79,10 @@ def gaze_errors(observations: Observations, gaze: GazePoints) -> GazeErrors:
     frames, both = binocular_average(observations, gaze)
     index = frames.index
     error = angular_error_deg(both.point_mm, index.target_mm, index.head_mm)
-    return GazeErrors(index.frame.astype(float), both.point_mm, index.target_mm, error, both.reason)
+    return GazeErrors(
+        frame=index.frame.astype(float),
+        point_mm=both.point_mm,
+        target_mm=index.target_mm,
+        error_deg=error,
+        reason=both.reason,
+    )

@@ -39,7 +39,7 @@ determinant falls as the square root of what is left of t: to about 0.01 at the 
 """
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PurkinjePoints(ArrayValue):
     """Where light from a source is reflected to a viewpoint inside the eye.
 
@@ -131,19 +131,19 @@ def purkinje_points(
     frame = np.repeat(np.arange(full[0]), int(np.prod(full[1:], dtype=np.intp)))
     outer = surfaces[0].take(frame)
     apex, axis = apex_of(outer), outer.rotation[..., :, 0]
-    route = _Route(apex, axis, viewpoint.reshape(-1, 3) - apex, source.reshape(-1, 3) - apex)
+    route = _Route(apex=apex, axis=axis, viewpoint=viewpoint.reshape(-1, 3) - apex, source=source.reshape(-1, 3) - apex)
     found = _followed(tuple(taken(c, frame) for c in path), n_outside, route)
     return PurkinjePoints(
-        found.points_mm.reshape(*shape, 3),
-        found.exit_points_mm.reshape(*shape, 3),
-        found.directions.reshape(*shape, 3),
-        found.course_mm.reshape(-1, *shape, 3),
-        found.residual_mm.reshape(shape),
-        found.status.reshape(shape),
+        points_mm=found.points_mm.reshape(*shape, 3),
+        exit_points_mm=found.exit_points_mm.reshape(*shape, 3),
+        directions=found.directions.reshape(*shape, 3),
+        course_mm=found.course_mm.reshape(-1, *shape, 3),
+        residual_mm=found.residual_mm.reshape(shape),
+        status=found.status.reshape(shape),
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Route:
     """Path along which viewpoints and sources move from the axis to their places.
 
@@ -216,4 +216,11 @@ def _followed(path: Sequence[Crossing], n_outside: float, route: _Route) -> Purk
     none = (status != Status.OK)[:, None]
     point, exits, way = (np.where(none, np.nan, value) for value in (point, exits, -way))
     course = np.where(none, np.nan, traced.points_mm[1:])
-    return PurkinjePoints(point, exits, way, course, np.where(none[:, 0], np.nan, residual), status)
+    return PurkinjePoints(
+        points_mm=point,
+        exit_points_mm=exits,
+        directions=way,
+        course_mm=course,
+        residual_mm=np.where(none[:, 0], np.nan, residual),
+        status=status,
+    )

@@ -44,7 +44,7 @@ _GUARDED_STEPS = 60
 _RETREATS = 12
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Connection:
     """The connecting rays, one array per coordinate.
 
@@ -82,7 +82,7 @@ class Corrected(NamedTuple):
     status: Statuses
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Shot:
     first: Xyz
     last: Xyz
@@ -113,7 +113,16 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
         shot = _shoot(path, n_start, source, direction, target)
     settled = (shot.status == Status.OK) & _settled(shot, 100.0)
     if not settled.all():
-        direction, shot = _rescue(path, n_start, source, target, _spread(aim, shape), direction, shot, ~settled)
+        direction, shot = _rescue(
+            path,
+            n_start,
+            source=source,
+            target=target,
+            aim=_spread(aim, shape),
+            direction=direction,
+            shot=shot,
+            left=~settled,
+        )
     status = shot.status.copy()
     mark(status, ~(shot.residual_mm <= RESIDUAL_LIMIT_MM), Status.NOT_CONVERGED)
     for crossing, point in zip((path[0], path[-1]), (shot.first, shot.last), strict=True):
@@ -121,16 +130,25 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
             mark(status, ~inside_rim(crossing, point), crossing.beyond_rim)
     tube = np.abs(shot.determinant)
     if shape:
-        return Connection(direction, shot.first, shot.last, shot.turning, shot.end, shot.residual_mm, tube, status)
+        return Connection(
+            start=direction,
+            first=shot.first,
+            last=shot.last,
+            turning=shot.turning,
+            end=shot.end,
+            residual_mm=shot.residual_mm,
+            tube_mm2_sr=tube,
+            status=status,
+        )
     return Connection(
-        _single(direction),
-        _single(shot.first),
-        _single(shot.last),
-        _single(shot.turning),
-        _single(shot.end),
-        shot.residual_mm.reshape(()),
-        tube.reshape(()),
-        status.reshape(()),
+        start=_single(direction),
+        first=_single(shot.first),
+        last=_single(shot.last),
+        turning=_single(shot.turning),
+        end=_single(shot.end),
+        residual_mm=shot.residual_mm.reshape(()),
+        tube_mm2_sr=tube.reshape(()),
+        status=status.reshape(()),
     )
 
 
@@ -257,7 +275,18 @@ def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction:
     mark(status, ~np.isfinite(residual), Status.MISSED)
     # The target must lie ahead in the last medium, else the ray would have to run backwards to it.
     mark(status, along < -BEHIND_MM, Status.MISSED)
-    return _Shot(first or point, point, turning or point, way, along, miss, residual, (a1, a2), determinant, status)
+    return _Shot(
+        first=first or point,
+        last=point,
+        turning=turning or point,
+        end=way,
+        along=along,
+        miss=miss,
+        residual_mm=residual,
+        tubes=(a1, a2),
+        determinant=determinant,
+        status=status,
+    )
 
 
 def _stepped(direction: Xyz, shot: _Shot, fraction: Floats | float) -> Xyz:
@@ -277,6 +306,7 @@ def _stepped(direction: Xyz, shot: _Shot, fraction: Floats | float) -> Xyz:
 def _rescue(
     path: Sequence[Crossing],
     n_start: FloatLike,
+    *,
     source: Xyz,
     target: Xyz,
     aim: Xyz,
@@ -366,16 +396,16 @@ def _merge(mask: Bools, new: _Shot, old: _Shot) -> _Shot:
         return _choose(~mask, b, a)
 
     return _Shot(
-        both(new.first, old.first),
-        both(new.last, old.last),
-        both(new.turning, old.turning),
-        both(new.end, old.end),
-        np.where(mask, new.along, old.along),
-        both(new.miss, old.miss),
-        np.where(mask, new.residual_mm, old.residual_mm),
-        (both(new.tubes[0], old.tubes[0]), both(new.tubes[1], old.tubes[1])),
-        np.where(mask, new.determinant, old.determinant),
-        np.where(mask, new.status, old.status),
+        first=both(new.first, old.first),
+        last=both(new.last, old.last),
+        turning=both(new.turning, old.turning),
+        end=both(new.end, old.end),
+        along=np.where(mask, new.along, old.along),
+        miss=both(new.miss, old.miss),
+        residual_mm=np.where(mask, new.residual_mm, old.residual_mm),
+        tubes=(both(new.tubes[0], old.tubes[0]), both(new.tubes[1], old.tubes[1])),
+        determinant=np.where(mask, new.determinant, old.determinant),
+        status=np.where(mask, new.status, old.status),
     )
 
 
@@ -386,16 +416,16 @@ def _merge_at(shot: _Shot, few: _Shot, index: tuple[Indices, ...]) -> _Shot:
         return out
 
     return _Shot(
-        _put(shot.first, few.first, index),
-        _put(shot.last, few.last, index),
-        _put(shot.turning, few.turning, index),
-        _put(shot.end, few.end, index),
-        place(shot.along, few.along),
-        _put(shot.miss, few.miss, index),
-        place(shot.residual_mm, few.residual_mm),
-        (_put(shot.tubes[0], few.tubes[0], index), _put(shot.tubes[1], few.tubes[1], index)),
-        place(shot.determinant, few.determinant),
-        np.asarray(place(shot.status, few.status)),  # type: ignore[arg-type]
+        first=_put(shot.first, few.first, index),
+        last=_put(shot.last, few.last, index),
+        turning=_put(shot.turning, few.turning, index),
+        end=_put(shot.end, few.end, index),
+        along=place(shot.along, few.along),
+        miss=_put(shot.miss, few.miss, index),
+        residual_mm=place(shot.residual_mm, few.residual_mm),
+        tubes=(_put(shot.tubes[0], few.tubes[0], index), _put(shot.tubes[1], few.tubes[1], index)),
+        determinant=place(shot.determinant, few.determinant),
+        status=np.asarray(place(shot.status, few.status)),  # type: ignore[arg-type]
     )
 
 

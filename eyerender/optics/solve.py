@@ -29,7 +29,7 @@ SURE_MM = 1e-11
 """A path that its traced ray confirms to this is taken as found; rounding stays well below."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ApparentPoints(ArrayValue):
     """Where the rays from object points to a viewpoint leave the outermost surface.
 
@@ -106,7 +106,13 @@ def apparent_points(
     rays = refracted_rays(
         surfaces, indices, components(object_points_mm), components(viewpoint_mm), rim_mm=rim_mm, n_outside=n_outside
     )
-    return ApparentPoints(join(rays.exit), -join(rays.way), -join(rays.end), rays.residual_mm, rays.status)
+    return ApparentPoints(
+        exit_points_mm=join(rays.exit),
+        directions=-join(rays.way),
+        inner_directions=-join(rays.end),
+        residual_mm=rays.residual_mm,
+        status=rays.status,
+    )
 
 
 def mirror_points(
@@ -144,7 +150,13 @@ def refracted_rays(
     ladder = [n_outside, *(_spread_index(n, ndim) for n in indices)]
     points = stationary_path(graphs, ladder, outer, inner, _paraxial_start(graphs, ladder, outer, inner)).points
     first = points[0] if plain else shift(turn(rotation, points[0]), origin, 1.0)
-    return _launched(path, n_outside, viewpoint, target, _confirmed(path, n_outside, viewpoint, target, first, target))
+    return _launched(
+        path,
+        n_outside,
+        viewpoint,
+        target,
+        _confirmed(path, n_outside, viewpoint=viewpoint, target=target, first=first, aim=target),
+    )
 
 
 def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: FloatLike = np.inf) -> Rays:
@@ -158,7 +170,15 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Floa
     outer, other, start = (turn_back(rotation, shift(p, origin, -1.0)) for p in (viewpoint, source, guess))
     points = stationary_path(graphs, [1.0, 1.0], outer, other, [(start[1], start[2])]).points
     hopeless = _far_beyond(path[0], guess)
-    return _confirmed(path, 1.0, viewpoint, source, shift(turn(rotation, points[0]), origin, 1.0), guess, hopeless)
+    return _confirmed(
+        path,
+        1.0,
+        viewpoint=viewpoint,
+        target=source,
+        first=shift(turn(rotation, points[0]), origin, 1.0),
+        aim=guess,
+        hopeless=hopeless,
+    )
 
 
 def _far_beyond(crossing: Crossing, guess: Xyz) -> Bools:
@@ -175,6 +195,7 @@ def _far_beyond(crossing: Crossing, guess: Xyz) -> Bools:
 def _confirmed(
     path: Sequence[Crossing],
     n_start: FloatLike,
+    *,
     viewpoint: Xyz,
     target: Xyz,
     first: Xyz,

@@ -28,7 +28,7 @@ LATERAL, _MEDIAL, _VERTICAL = np.radians(58.0), np.radians(51.0), np.radians(62.
 _GAP_MM = 0.01
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Contour(ArrayValue):
     """Inner edge of the lids, per column.
 
@@ -89,7 +89,9 @@ def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
     away = unit(flat - normal * np.sum(flat * normal, axis=-1, keepdims=True))
     along_lid = unit(np.cross(away, normal) * upper[:, None])
     along_lid = along_lid * np.where(along_lid[:, 1:2] < 0, -1.0, 1.0)
-    return Contour(angle, a, upper, point, normal, away, along_lid, openness)
+    return Contour(
+        angle=angle, along=a, upper=upper, point=point, normal=normal, away=away, along_lid=along_lid, openness=openness
+    )
 
 
 def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floats, float]:

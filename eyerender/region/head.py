@@ -42,7 +42,7 @@ _PICTURES = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "WEBP")
 _HAIR_GLOSS = 0.12
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class HeadMesh(ArrayValue):
     """A head about its own origin, mm, +x where the face looks, +y to its left, +z up.
 
@@ -142,14 +142,14 @@ def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
         if np.all(np.isfinite(eye)) and (gap := float(np.min(np.linalg.norm(joined - eye, axis=1)))) > _NEAR_MM:
             raise InputError(f"is {gap:.1f} mm away from the nearest vertex", source=source, path=name)
     return HeadMesh(
-        frozen(joined),
-        frozen(np.concatenate(normals)),
-        frozen(np.concatenate(faces), np.int64),
-        frozen(np.concatenate(uv)),
-        frozen(vertex_ends, np.int64),
-        frozen(face_ends, np.int64),
-        frozen(eyes[0]),
-        frozen(eyes[1]),
+        vertices=frozen(joined),
+        normals=frozen(np.concatenate(normals)),
+        faces=frozen(np.concatenate(faces), np.int64),
+        uv=frozen(np.concatenate(uv)),
+        vertex_ends=frozen(vertex_ends, np.int64),
+        face_ends=frozen(face_ends, np.int64),
+        right_eye=frozen(eyes[0]),
+        left_eye=frozen(eyes[1]),
     )
 
 
@@ -165,7 +165,15 @@ def placed(head: HeadMesh, globe: Globe, texture: int = 0) -> RegionMesh:
     faces = head.faces[:, ::-1] if flipped else head.faces
     layout = RegionLayout(frozen(faces, np.int64), frozen(_map_uv(head, texture)), head.vertex_ends, head.face_ends)
     nothing = frozen(np.zeros((0, 3)))
-    return RegionMesh(frozen(vertices), frozen(head.normals * mirror), layout, nothing, nothing, nothing, ())
+    return RegionMesh(
+        vertices=frozen(vertices),
+        normals=frozen(head.normals * mirror),
+        layout=layout,
+        upper_margin=nothing,
+        lower_margin=nothing,
+        border=nothing,
+        strands=(),
+    )
 
 
 def head_map(spec: Region, head: HeadMesh) -> Singles:

@@ -37,7 +37,7 @@ class RegionLayout(ArrayValue):
     face_ends: Ints
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RegionMesh(ArrayValue):
     """A posed region in the scene's frame (mm).
 
@@ -100,7 +100,15 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
         vertices, normals, curves = vertices * mirror, normals * mirror, [c * mirror for c in curves]
     upper, lower, border, *strands = (frozen(c) for c in curves)
     layout = _layout(len(lash.points), len(hair.points), globe.mirrored)
-    return RegionMesh(frozen(vertices), frozen(normals), layout, upper, lower, border, tuple(strands))
+    return RegionMesh(
+        vertices=frozen(vertices),
+        normals=frozen(normals),
+        layout=layout,
+        upper_margin=upper,
+        lower_margin=lower,
+        border=border,
+        strands=tuple(strands),
+    )
 
 
 def _closed(grid: Floats) -> Floats:

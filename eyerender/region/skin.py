@@ -70,18 +70,20 @@ def skin_map(spec: Region) -> Singles:
     near = lid * (1 - step(rows, ROWS - 18, ROWS - 8))
     seed = spec.seed
     level = _along_lids(y, z)
-    cells = _cells(spec, y, z, level, near)
+    cells = _cells(spec, y=y, z=z, level=level, near=near)
     out_mm = ndimage.map_coordinates(_from_line(rest), place, order=1)
     creases = _creases(spec, y, out_mm, upper)
     pores = _pores(spec, y, z, near)
-    height = (_relief(spec, y, z, level, cells) - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases) * lid
+    height = (
+        _relief(spec, y=y, z=z, level=level, cells=cells) - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases
+    ) * lid
     within = 1 - step(rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
     # The fold of the plica darkens the conjunctiva towards the caruncle.
     flesh = step(np.cos(turn), 0.60, 0.85) * within * step(rows, 0.0, 2.2)
     height = height + 0.02 * flesh * _field(seed + 6, y, z, (18, 45), (18, 45))
     # Furrows are darker because little light leaves them.
     open_ = 1 + 0.13 * (cells - 0.5) - 0.16 * pores - 0.32 * spec.skin.wrinkles * creases
-    albedo = _albedo(spec, y, z, rows, upper, near, open_, flesh)
+    albedo = _albedo(spec, y=y, z=z, rows=rows, upper=upper, near=near, open_=open_, flesh=flesh)
     wet = (0.78 - 0.21 * flesh) * (1 - step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN - 1.0))
     # Oil forms films of varying thickness. It shines in points where the skin is smooth and swollen, in short streaks
     # along the lids.
@@ -106,7 +108,7 @@ def _field(seed: int, y: Floats, z: Floats, across: tuple[float, float], up: tup
     return sampled(band(seed, _TILE, across, up), y, z, _TILE_MM * 2)
 
 
-def _cells(spec: Region, y: Floats, z: Floats, level: Floats, near: Floats) -> Floats:
+def _cells(spec: Region, *, y: Floats, z: Floats, level: Floats, near: Floats) -> Floats:
     """Plateaus (about 1) separated by furrows (0).
 
     The fields are wide on the face, and narrow and drawn out across on the lids. Both contain finer ones.
@@ -125,7 +127,7 @@ def _along_lids(y: Floats, z: Floats) -> Floats:
     return np.asarray(z + 0.017 * np.minimum(y * y, 480.0) * np.tanh(z / 4.0))
 
 
-def _relief(spec: Region, y: Floats, z: Floats, level: Floats, cells: Floats) -> Floats:
+def _relief(spec: Region, *, y: Floats, z: Floats, level: Floats, cells: Floats) -> Floats:
     """Height (mm) of the relief: cells separated by furrows, and lines.
 
     The lines run along the lids and, at the temple, away from the canthus.
@@ -234,7 +236,7 @@ def _veins(seed: int, y: Floats, z: Floats) -> Floats:
 
 
 def _albedo(
-    spec: Region, y: Floats, z: Floats, rows: Floats, upper: Floats, near: Floats, open_: Floats, flesh: Floats
+    spec: Region, *, y: Floats, z: Floats, rows: Floats, upper: Floats, near: Floats, open_: Floats, flesh: Floats
 ) -> Floats:
     skin, seed = spec.skin, spec.seed
     slow = _field(seed + 21, y, z, (0, 4), (0, 4))

@@ -110,7 +110,7 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     tone = tone - 0.06 * np.exp(-(((s - collarette - 0.055) / 0.03) ** 2))
 
     texture = tone * (1.0 + 1.3 * fibres)
-    texture = texture * _furrows(rng, s, turn) * _crypts(rng, s, turn, collarette, warp)
+    texture = texture * _furrows(rng, s, turn) * _crypts(rng, s=s, turn=turn, collarette=collarette, warp=warp)
     # The ruff is the pigment epithelium turned over the margin, a dark beaded seam.
     beads = 0.018 * (1 + 0.35 * _noise(rng, (1, angular), (0, 1), (30, 75), True))
     texture = texture * (1 - 0.45 * np.exp(-((s / np.maximum(beads, 0.006)) ** 2)))
@@ -134,7 +134,7 @@ def _furrows(rng: np.random.Generator, s: Floats, turn: Floats) -> Floats:
     return out
 
 
-def _crypts(rng: np.random.Generator, s: Floats, turn: Floats, collarette: Floats, warp: Floats) -> Floats:
+def _crypts(rng: np.random.Generator, *, s: Floats, turn: Floats, collarette: Floats, warp: Floats) -> Floats:
     """Fuchs' crypts: lens-shaped gaps in the front layer between trabeculae.
 
     They form a lattice along the collarette that is deep in some sectors and closed in others, with a few single crypts

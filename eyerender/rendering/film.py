@@ -74,9 +74,9 @@ def mean_radiance(
     for first in range(0, spp // size, each):
         count = min(each, spp // size - first)
         if plain is not None:
-            seen, failures = _groups(shown, window, plain, spp, seed, first, count, size)
+            seen, failures = _groups(shown, window, plain, spp=spp, seed=seed, first=first, count=count, size=size)
         else:
-            seen, failures = _singles(integrator, shown, window, spp, seed, first, count)
+            seen, failures = _singles(integrator, shown, window, spp=spp, seed=seed, first=first, count=count)
         total += seen
         failed += failures
     return (total / spp).reshape(height, width), failed
@@ -88,7 +88,7 @@ def _samples(u: mi.Int32, v: mi.Int32, spp: int, seed: int) -> Samples:
 
 
 def _singles(
-    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, spp: int, seed: int, first: int, count: int
+    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, *, spp: int, seed: int, first: int, count: int
 ) -> tuple[Floats, int]:
     """Sum over `count` samples of each pixel, one per lane."""
     index = dr.arange(mi.UInt32, window[2] * window[3] * count)
@@ -107,7 +107,7 @@ def _singles(
 
 
 def _groups(
-    shown: Exposed, window: Window, plain: tuple[Bools, int], spp: int, seed: int, first: int, count: int, size: int
+    shown: Exposed, window: Window, plain: tuple[Bools, int], *, spp: int, seed: int, first: int, count: int, size: int
 ) -> tuple[Floats, int]:
     """Sum over `count` groups of each pixel, one group per lane; sample j of group g is number g size + j."""
     pixels = window[2] * window[3]

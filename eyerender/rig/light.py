@@ -67,18 +67,18 @@ class Led(Spec):
         aim = np.array(self.aim_mm, dtype=float)
         return tuple(
             Lamp(
-                frozen(p),
-                frozen((aim - p) / np.linalg.norm(aim - p)),
-                self.radius_mm,
-                self.intensity_mw_sr,
-                self.lobe_exponent,
-                self.inner_radius_mm,
+                position_mm=frozen(p),
+                axis=frozen((aim - p) / np.linalg.norm(aim - p)),
+                radius_mm=self.radius_mm,
+                intensity_mw_sr=self.intensity_mw_sr,
+                lobe_exponent=self.lobe_exponent,
+                inner_radius_mm=self.inner_radius_mm,
             )
             for p in places
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Lamp(ArrayValue):
     """An LED in the world.
 

@@ -44,7 +44,7 @@ class Term:
     high_deg: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Budget:
     """Terms of one eye model's error with one estimator; they add up to `total_deg`."""
 
@@ -85,14 +85,14 @@ def budgets(parts: Sequence[Part]) -> list[Budget]:
         steps = {observer: found for observer, found in own.items() if found is not None}
         if first is None or "analytic" not in steps or any(len(v) != len(first) for v in steps.values()):
             continue
-        budget = _budget(protocol, name, model, reference, first, steps)
+        budget = _budget(protocol, name=name, model=model, reference=reference, first=first, steps=steps)
         if budget is not None:
             out.append(budget)
     return out
 
 
 def _budget(
-    protocol: str, name: str, model: str, reference: str, first: Floats, steps: Mapping[str, Floats]
+    protocol: str, *, name: str, model: str, reference: str, first: Floats, steps: Mapping[str, Floats]
 ) -> Budget | None:
     rows = np.isfinite(first) & np.all([np.isfinite(v) for v in steps.values()], axis=0)
     n = int(rows.sum())
@@ -105,7 +105,15 @@ def _budget(
         if observer != "analytic" or model != reference:
             terms.append(Term(_name(observer, steps), *paired(after - before)))
         before = after
-    return Budget(protocol, name, model, reference, n, tuple(terms), float(before.mean()))
+    return Budget(
+        protocol=protocol,
+        estimator=name,
+        eye_model=model,
+        reference=reference,
+        n=n,
+        terms=tuple(terms),
+        total_deg=float(before.mean()),
+    )
 
 
 def _name(observer: str, steps: Mapping[str, Floats]) -> str:

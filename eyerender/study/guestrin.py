@@ -27,66 +27,77 @@ STARTS, SEED = 20, 2006
 
 DEPARTURES = (
     Departure(
-        "eyes", "one eye", "the participant's eyes", "the right eye only", "both eyes, reported per eye and pooled"
+        id="eyes",
+        title="one eye",
+        paper="the participant's eyes",
+        software="the right eye only",
+        corrected="both eyes, reported per eye and pooled",
     ),
     Departure(
-        "lights",
-        "lights",
-        "(615, IPD/2 +- 208.5, 0) mm",
-        "(650, IPD/2 +- 188.5, 0) mm, in the screen's plane",
-        "(615, +-208.5, 0) mm as in Table 4",
+        id="lights",
+        title="lights",
+        paper="(615, IPD/2 +- 208.5, 0) mm",
+        software="(650, IPD/2 +- 188.5, 0) mm, in the screen's plane",
+        corrected="(615, +-208.5, 0) mm as in Table 4",
     ),
     Departure(
-        "heads",
-        "head positions",
-        "30 cm to each side, 40 cm forward and back",
-        "30 mm up and down, 40 mm to each side, in the screen's plane",
-        "30 mm to each side, 40 mm forward and back",
+        id="heads",
+        title="head positions",
+        paper="30 cm to each side, 40 cm forward and back",
+        software="30 mm up and down, 40 mm to each side, in the screen's plane",
+        corrected="30 mm to each side, 40 mm forward and back",
     ),
     Departure(
-        "plane",
-        "screen plane",
-        "x = 650 mm",
-        "gaze met with x = 651 mm, compared with targets at 650 mm",
-        "x = 650 mm",
+        id="plane",
+        title="screen plane",
+        paper="x = 650 mm",
+        software="gaze met with x = 651 mm, compared with targets at 650 mm",
+        corrected="x = 650 mm",
     ),
     Departure(
-        "error",
-        "measure of the error",
-        "average angular error",
-        "atan(distance / 650 mm), wherever the head stands",
-        "the angle at the eye",
+        id="error",
+        title="measure of the error",
+        paper="average angular error",
+        software="atan(distance / 650 mm), wherever the head stands",
+        corrected="the angle at the eye",
     ),
     Departure(
-        "centre",
-        "centre of corneal curvature",
-        "the algorithm of [28], from both glints",
-        "on the line common to both planes, mirror condition of light 1 only",
-        "from both glints (method A)",
-    ),
-    Departure("index", "index behind the cornea", "calibrated", "fixed at 1.376", "fixed at 1.3375, and calibrated"),
-    Departure(
-        "visual_axis",
-        "visual axis",
-        "offset by the angle alpha",
-        "the optic axis turned by a rotation fixed in the world (beta about y, then alpha about z)",
-        "azimuth + alpha, elevation + beta",
+        id="centre",
+        title="centre of corneal curvature",
+        paper="the algorithm of [28], from both glints",
+        software="on the line common to both planes, mirror condition of light 1 only",
+        corrected="from both glints (method A)",
     ),
     Departure(
-        "objective",
-        "calibration",
-        "the values that minimise the error at H1",
-        "sum of errors; R 3..20 mm, K 2..15 mm, alpha -10..10 deg, beta -5..5 deg",
-        "least squares; R 6.5..9.5 mm, K 3..6 mm, alpha -10..10 deg, beta -6..6 deg, n 1.30..1.45",
+        id="index",
+        title="index behind the cornea",
+        paper="calibrated",
+        software="fixed at 1.376",
+        corrected="fixed at 1.3375, and calibrated",
+    ),
+    Departure(
+        id="visual_axis",
+        title="visual axis",
+        paper="offset by the angle alpha",
+        software="the optic axis turned by a rotation fixed in the world (beta about y, then alpha about z)",
+        corrected="azimuth + alpha, elevation + beta",
+    ),
+    Departure(
+        id="objective",
+        title="calibration",
+        paper="the values that minimise the error at H1",
+        software="sum of errors; R 3..20 mm, K 2..15 mm, alpha -10..10 deg, beta -5..5 deg",
+        corrected="least squares; R 6.5..9.5 mm, K 3..6 mm, alpha -10..10 deg, beta -6..6 deg, n 1.30..1.45",
     ),
 )
 PUBLISHED = frozenset(d.id for d in DEPARTURES)
 CORRECTED: frozenset[str] = frozenset()
 
-SOFTWARE_START = EyeParameters(7.8, 4.2, 1.376, 5.0, 1.5)
+SOFTWARE_START = EyeParameters(cornea_radius_mm=7.8, pupil_distance_mm=4.2, index=1.376, alpha_deg=5.0, beta_deg=1.5)
 # The index is fixed in the software, so its bounds never act.
 SOFTWARE_BOUNDS = ParameterBounds(
-    EyeParameters(3.0, 2.0, 1.30, -10.0, -5.0), EyeParameters(20.0, 15.0, 1.45, 10.0, 5.0)
+    EyeParameters(cornea_radius_mm=3.0, pupil_distance_mm=2.0, index=1.30, alpha_deg=-10.0, beta_deg=-5.0),
+    EyeParameters(cornea_radius_mm=20.0, pupil_distance_mm=15.0, index=1.45, alpha_deg=10.0, beta_deg=5.0),
 )
 
 

@@ -77,19 +77,21 @@ def features(
     moved = ~truth.pupil.in_image[:, None]
     centre = np.where(moved, found.pupil.centre_px - truth.pupil.centre_px, errors.centre_px)
     axes = np.where(moved, found.pupil.semi_axes_px - truth.pupil.semi_axes_px, errors.semi_axes_px)
-    out = [_difference(protocol, observer, eye_model, "pupil centre", centre, mm_per_px)]
-    out.append(_difference(protocol, observer, eye_model, "pupil semi-axes (a, b)", axes, mm_per_px))
+    compared = [("pupil centre", centre, mm_per_px), ("pupil semi-axes (a, b)", axes, mm_per_px)]
     every = []
     for light in range(len(rig.lights)):
         (a, seen), (b, got) = found.glints.of_light(light), truth.glints.of_light(light)
         vectors = np.where((seen & got)[:, None], a - b, np.nan)
         # A glint that ray optics does not have either is not missing.
         every.append((vectors[got], mm_per_px[got]))
-        out.append(_difference(protocol, observer, eye_model, f"glint of light {light}", *every[-1]))
+        compared.append((f"glint of light {light}", *every[-1]))
     if len(every) > 1:
-        together = (np.concatenate(part) for part in zip(*every, strict=True))
-        out.append(_difference(protocol, observer, eye_model, ALL_GLINTS, *together))
-    return out
+        vectors, scales = (np.concatenate(part) for part in zip(*every, strict=True))
+        compared.append((ALL_GLINTS, vectors, scales))
+    return [
+        _difference(protocol, observer=observer, eye_model=eye_model, feature=feature, vectors=vectors, mm_per_px=scale)
+        for feature, vectors, scale in compared
+    ]
 
 
 def gaze(
@@ -108,7 +110,7 @@ def gaze(
 
 
 def _difference(
-    protocol: str, observer: str, eye_model: str, feature: str, vectors: Floats, mm_per_px: Floats
+    protocol: str, *, observer: str, eye_model: str, feature: str, vectors: Floats, mm_per_px: Floats
 ) -> FeatureDifference:
     good = np.isfinite(vectors).all(axis=1)
     v = vectors[good]

@@ -58,7 +58,7 @@ class Finding:
     detail: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Departure:
     """A difference between the authors' software and the paper's text."""
 
@@ -69,7 +69,7 @@ class Departure:
     corrected: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Erratum:
     """A misprint of a table or the text, the value used instead, and the effect of the misprint."""
 

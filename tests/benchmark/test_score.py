@@ -71,7 +71,7 @@ def test_glints_are_matched_one_to_one_and_swaps_are_counted():
     assert (got.named, got.swapped) == (2, 2)
     right = score_glints(IMAGE, found(PUPIL, [((50.0, 30.0), 2), ((45.0, 40.0), None)]))
     assert (right.named, right.swapped, len(right.errors_px)) == (1, 0, 2)
-    assert score_glints(IMAGE, found(PUPIL)) == GlintScore(3, 0)
+    assert score_glints(IMAGE, found(PUPIL)) == GlintScore(true=3, reported=0)
 
 
 def test_rates_are_over_the_images_that_show_a_pupil():

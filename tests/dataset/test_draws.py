@@ -27,7 +27,7 @@ def template(tree, seed=0):
 
 def column(tree, n, path, seed=0, **turn):
     made = template(tree, seed)
-    return [made.values(Turn(i, i, 0, 0, 0))[1][path] for i in range(n)]
+    return [made.values(Turn(sample=i, subject=i, sequence=0, attempt=0, subject_attempt=0))[1][path] for i in range(n)]
 
 
 def test_unit_numbers_are_uniform_and_uncorrelated():
@@ -43,7 +43,7 @@ def test_truncated_normal_is_scipys(bounds):
     low, high = bounds
     for u in (1e-6, 0.03, 0.5, 0.9, 1 - 1e-6):
         expected = truncnorm.ppf(u, low - 4.0, high - 4.0, loc=4.0, scale=1.0)
-        assert truncated_normal(u, 4.0, 1.0, low, high) == pytest.approx(expected, rel=1e-6)
+        assert truncated_normal(u, mean=4.0, sd=1.0, low=low, high=high) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,10 @@ def test_grids_form_their_full_product():
         "a": {"draw": "grid", "values": ["x", "y"]},
     }
     made = template(tree)
-    seen = [tuple(made.values(Turn(i, 0, 0, 0, 0))[1].values()) for i in range(12)]
+    seen = [
+        tuple(made.values(Turn(sample=i, subject=0, sequence=0, attempt=0, subject_attempt=0))[1].values())
+        for i in range(12)
+    ]
     assert seen[:6] == [("x", 0.0), ("x", 0.5), ("x", 1.0), ("y", 0.0), ("y", 0.5), ("y", 1.0)]
     assert seen[6:] == seen[:6]
 
@@ -92,14 +95,16 @@ def test_sobol_draws_are_one_joint_sequence():
 
 def test_a_sequence_follows_the_frames_of_its_subject():
     made = template({"x": {"draw": "sequence", "values": [[1, 2], [3, 4], [5, 6]]}})
-    assert [made.values(Turn(7, 1, k, 0, 0))[0]["x"] for k in range(4)] == [[1, 2], [3, 4], [5, 6], [1, 2]]
+    assert [
+        made.values(Turn(sample=7, subject=1, sequence=k, attempt=0, subject_attempt=0))[0]["x"] for k in range(4)
+    ] == [[1, 2], [3, 4], [5, 6], [1, 2]]
 
 
 def test_choices_hold_whole_parts_with_draws_of_their_own():
     node = {"draw": "choice", "values": [{"u": {"draw": "uniform", "low": 0, "high": 1}}, {"v": 3}]}
     made = template({"x": node})
     for i in range(20):
-        tree, drawn = made.values(Turn(i, i, 0, 0, 0))
+        tree, drawn = made.values(Turn(sample=i, subject=i, sequence=0, attempt=0, subject_attempt=0))
         assert drawn["x"] in (0, 1)
         if drawn["x"] == 0:
             assert tree["x"] == {"u": drawn["x#0.u"]}

@@ -39,7 +39,7 @@ def test_level_of_a_blurred_ellipse():
     x, y = np.meshgrid(axis, axis)
     mask = (Place.of(ellipse, x.ravel(), y.ravel()).distance.reshape(x.shape) > 0.0).astype(float)
     blurred = ndimage.gaussian_filter(mask, sigma * fine).reshape(64, fine, 64, fine).mean(axis=(1, 3))
-    model = EdgeModel(ellipse, 20.0, np.array([75.0]), np.sqrt(sigma**2 + 1.0 / 12.0))
+    model = EdgeModel(ellipse=ellipse, inner_dn=20.0, outer=np.array([75.0]), sigma_px=np.sqrt(sigma**2 + 1.0 / 12.0))
     columns, rows = np.meshgrid(np.arange(64.0), np.arange(64.0))
     # Second order in blur times curvature: (1.2 * 0.11)^2 / 8 of 55 DN, and the mask's jagged edge.
     assert np.abs(model.level(columns, rows) - (20.0 + 55.0 * blurred)).max() < 0.35
@@ -63,10 +63,10 @@ def test_jacobian_is_the_models_slope(b):
     outer = np.array([75.0, 6.0, -4.0, 3.0, 2.0])
     ellipse = Ellipse(np.array([40.2, 38.7]), np.array([21.0, b]), 0.8)
     model = EdgeModel(
-        ellipse,
-        20.0,
-        outer,
-        1.3,
+        ellipse=ellipse,
+        inner_dn=20.0,
+        outer=outer,
+        sigma_px=1.3,
         slope=-1.2,
         kurtosis=0.7,
         lean=(0.4, -0.9),
@@ -92,7 +92,7 @@ def test_covariance_of_the_axes_follows_the_shape_matrix():
     covariance = np.diag([0.02, 0.03, 0.05, 0.04, 0.06]) ** 2
     rng = np.random.default_rng(6)
     draws = rng.multivariate_normal(np.zeros(5), covariance, 4000)
-    model = EdgeModel(ellipse, 0.0, np.array([1.0]), 1.0)
+    model = EdgeModel(ellipse=ellipse, inner_dn=0.0, outer=np.array([1.0]), sigma_px=1.0)
     ellipses = [moved(model, np.concatenate([d, np.zeros(FIXED - 5)])).ellipse for d in draws]
     sample = np.array([[*e.centre_px, *e.semi_axes_px, e.angle_rad] for e in ellipses])
     stated = np.sqrt(np.diag(to_axes(covariance, ellipse)))
@@ -115,7 +115,15 @@ def test_refined_maximum_is_the_least_squares_one():
     likely = 4.0 / np.array([*first, 0.15 * 55.0 / e.semi_axes_px[1], 1.0, *lean])
 
     def residual(p):
-        level = EdgeModel(Ellipse(p[:2], p[2:4], p[4]), p[5], p[6:9], p[9], p[10], p[11], p[12:]).level(x, y)
+        level = EdgeModel(
+            ellipse=Ellipse(p[:2], p[2:4], p[4]),
+            inner_dn=p[5],
+            outer=p[6:9],
+            sigma_px=p[9],
+            slope=p[10],
+            kurtosis=p[11],
+            lean=p[12:],
+        ).level(x, y)
         return np.concatenate([level - data, likely * p[[7, 8, 10, 11, 12, 13]]])
 
     start = np.array([*e.centre_px, *e.semi_axes_px, e.angle_rad, 20.0, 75.0, 0.0, 0.0, 1.1, 0.0, 0.0, 0.0, 0.0])

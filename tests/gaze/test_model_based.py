@@ -19,7 +19,7 @@ from eyerender.rig.camera import Camera
 from eyerender.status import Status
 from tests.support.gaze import observations, rig
 
-EYE = EyeParameters(7.9, 4.3, 1.3375, 5.2, 1.8)
+EYE = EyeParameters(cornea_radius_mm=7.9, pupil_distance_mm=4.3, index=1.3375, alpha_deg=5.2, beta_deg=1.8)
 LIGHTS = np.array([[615.0, 208.5, 0.0], [615.0, -208.5, 0.0], [640.0, 30.0, 180.0], [600.0, -90.0, -190.0]])
 SCREEN = (650.0, 0.0, 0.0)
 
@@ -119,7 +119,13 @@ def test_centre_axis_and_gaze_point(scene, method, lights):
     np.testing.assert_allclose(gaze.point_mm, seen.index.target_mm, atol=5e-3)
 
 
-@pytest.mark.parametrize("start", [EyeParameters(), EyeParameters(8.6, 5.0, 1.3375, -3.0, -4.0)])
+@pytest.mark.parametrize(
+    "start",
+    [
+        EyeParameters(),
+        EyeParameters(cornea_radius_mm=8.6, pupil_distance_mm=5.0, index=1.3375, alpha_deg=-3.0, beta_deg=-4.0),
+    ],
+)
 def test_calibration_recovers_the_eye_on_either_side(scene, start):
     seen, _, _ = one_camera(scene)
     fitted = GuestrinEizenman(start=start).fit(seen, world())
@@ -191,13 +197,13 @@ def test_refusals(scene):
     with pytest.raises(InputError, match="not distinct lights"):
         GuestrinEizenman(lights=(0, 7)).fit(seen, world())
     with pytest.raises(InputError, match="outside the bounds"):
-        GuestrinEizenman(start=EyeParameters(12.0)).fit(seen, world())
+        GuestrinEizenman(start=EyeParameters(cornea_radius_mm=12.0)).fit(seen, world())
     with pytest.raises(InputError, match="call fit first"):
         GuestrinEizenman().predict(seen, world())
     with pytest.raises(InputError, match="needs a screen"):
         GuestrinEizenman().fit(seen, replace(world(), screen=None))
     with pytest.raises(InputError, match="less than its upper bound"):
-        ParameterBounds(lower=EyeParameters(9.0), upper=EyeParameters(8.0))
+        ParameterBounds(lower=EyeParameters(cornea_radius_mm=9.0), upper=EyeParameters(cornea_radius_mm=8.0))
 
 
 def test_random_starts_end_at_one_minimum_and_are_seeded(scene):
@@ -214,7 +220,7 @@ def test_random_starts_end_at_one_minimum_and_are_seeded(scene):
 
 def test_two_cameras_need_no_eye_parameter(scene):
     seen, centre, axis = scene
-    other = EyeParameters(7.9, 4.3, 1.3375, 0.0, 0.0)
+    other = EyeParameters(cornea_radius_mm=7.9, pupil_distance_mm=4.3, index=1.3375, alpha_deg=0.0, beta_deg=0.0)
     assert other != EYE
     axes = ShihWuLiu().optic_axes(seen, world(cameras=2))
     assert all(r is None for r in axes.reason)
@@ -259,7 +265,7 @@ def test_two_cameras_statuses(scene):
 def test_hennessey_takes_up_a_wrong_eye(scene):
     seen, _, _ = one_camera(scene)
     targets = seen.index.target_mm
-    wrong = Hennessey(EyeParameters(7.5, 4.6, 1.36))
+    wrong = Hennessey(EyeParameters(cornea_radius_mm=7.5, pupil_distance_mm=4.6, index=1.36))
     before = replace(wrong, recalibration="none").predict(seen, world()).point_mm - targets
     for kind in ("angle", "screen"):
         fitted = replace(wrong, recalibration=kind).fit(seen, world())
@@ -280,8 +286,9 @@ def test_centres_are_batches_over_parameters():
     glints = np.array([[unit(shortest_path(O[0], L, c, 7.9, 1, 1) - O[0]) for L in LIGHTS[:2]]])
     radius = np.array([[7.0], [7.9], [8.8]])
     for method in (from_all_glints, from_plane):
-        many = method(np.repeat(O[None], 3, axis=0), np.repeat(glints[None], 3, axis=0), LIGHTS[:2], radius)
+        repeated = np.repeat(glints[None], 3, axis=0)
+        many = method(np.repeat(O[None], 3, axis=0), glints=repeated, light_mm=LIGHTS[:2], radius_mm=radius)
         for k in range(3):
-            one = method(O, glints, LIGHTS[:2], radius[k])
+            one = method(O, glints=glints, light_mm=LIGHTS[:2], radius_mm=radius[k])
             np.testing.assert_allclose(many.centre_mm[k], one.centre_mm, atol=1e-6)
         assert many.ok.all()

@@ -26,7 +26,9 @@ BIQUADRATIC = "x + y + xy + x2 + y2 + 1"
 
 def hennessey_eye(data, **options):
     eye = data["eye_unrotated"]
-    parameters = EyeParameters(eye["r_cornea"], eye["dist_cornea_to_pupil"], eye["n_cornea"])
+    parameters = EyeParameters(
+        cornea_radius_mm=eye["r_cornea"], pupil_distance_mm=eye["dist_cornea_to_pupil"], index=eye["n_cornea"]
+    )
     return Hennessey(parameters, **options)
 
 
@@ -116,7 +118,13 @@ def guestrin():
     )
     eye = data["eye"]
     # alpha is towards the vectors' +x, the user's right; here towards the nose of a right eye, the user's left.
-    true = EyeParameters(eye["R"], eye["K"], eye["n1"], -np.degrees(eye["alpha"]), np.degrees(eye["beta"]))
+    true = EyeParameters(
+        cornea_radius_mm=eye["R"],
+        pupil_distance_mm=eye["K"],
+        index=eye["n1"],
+        alpha_deg=-np.degrees(eye["alpha"]),
+        beta_deg=np.degrees(eye["beta"]),
+    )
     return data, world, seen, true
 
 
@@ -139,9 +147,9 @@ def test_guestrin_eizenman_intermediate_quantities():
     rays = feature_rays(seen, world, None, least=2)
     R = np.full(len(seen), true.cornea_radius_mm)
     kq = np.array([f["kq"] for f in data["frames"]])
-    a = from_all_glints(rays.origin_mm, rays.glints, rays.light_mm, R)
+    a = from_all_glints(rays.origin_mm, glints=rays.glints, light_mm=rays.light_mm, radius_mm=R)
     np.testing.assert_allclose(a.distance_mm, kq, rtol=1e-9)
-    b = from_plane(rays.origin_mm, rays.glints, rays.light_mm, R)
+    b = from_plane(rays.origin_mm, glints=rays.glints, light_mm=rays.light_mm, radius_mm=R)
     np.testing.assert_allclose(b.distance_mm[:, 0], kq[:, 0], rtol=1e-9)
     line, ok = line_to_centre(rays.origin_mm, rays.glints, rays.light_mm)
     assert ok.all()
@@ -153,8 +161,17 @@ def test_guestrin_eizenman_calibrations(case):
     data, world, seen, _ = guestrin()
     record = data["calibrations"][case]
     R, K, alpha, beta = record["x0"]
-    start = EyeParameters(R, K, record["assumed_n"], -np.degrees(alpha), np.degrees(beta))
-    wide = ParameterBounds(EyeParameters(3, 2, 1.3, -20, -20), EyeParameters(20, 15, 1.45, 20, 20))
+    start = EyeParameters(
+        cornea_radius_mm=R,
+        pupil_distance_mm=K,
+        index=record["assumed_n"],
+        alpha_deg=-np.degrees(alpha),
+        beta_deg=np.degrees(beta),
+    )
+    wide = ParameterBounds(
+        EyeParameters(cornea_radius_mm=3, pupil_distance_mm=2, index=1.3, alpha_deg=-20, beta_deg=-20),
+        EyeParameters(cornea_radius_mm=20, pupil_distance_mm=15, index=1.45, alpha_deg=20, beta_deg=20),
+    )
     fitted = GuestrinEizenman(start=start, bounds=wide).fit(seen, world)
     found = fitted.calibrations[0]
     assert found.converged

@@ -18,7 +18,18 @@ def test_irradiance_of_iris_rings_against_a_forward_light_tracer(renderer, model
     # 640 k rays leave some .02 % of counting error at the rings' borders; single precision and Newton's tolerance are
     # below.
     eye = eye_of(model)
-    rig = LampRig(remote_rig().camera, (Lamp(frozen(lamp), frozen([-1.0, 0, 0]), 0.0, 100.0, 0.0),))
+    rig = LampRig(
+        remote_rig().camera,
+        (
+            Lamp(
+                position_mm=frozen(lamp),
+                axis=frozen([-1.0, 0, 0]),
+                radius_mm=0.0,
+                intensity_mw_sr=100.0,
+                lobe_exponent=0.0,
+            ),
+        ),
+    )
     job = job_of(eye, rig, (0, 0, 16, 16), look=PLAIN.model_copy(update={"limbus_width_mm": 0.0}))
     expected = flux_on_rings(eye, np.array(lamp), 100.0)
     # A tilted stop's rings are cut by cylinders about the eye's axis, so its area is larger by 1 / cos(tilt).
@@ -31,7 +42,18 @@ def test_points_without_a_path_lie_in_the_shadow(renderer):
     # An oblique lamp leaves the far side of the iris dark; a search over the whole cornea finds no way there either.
     eye = eye_of("E2")
     lamp = np.array([19.8, 16.4, -30.5])
-    rig = LampRig(remote_rig().camera, (Lamp(frozen(lamp), frozen([-1.0, 0, 0]), 0.0, 100.0, 0.0),))
+    rig = LampRig(
+        remote_rig().camera,
+        (
+            Lamp(
+                position_mm=frozen(lamp),
+                axis=frozen([-1.0, 0, 0]),
+                radius_mm=0.0,
+                intensity_mw_sr=100.0,
+                lobe_exponent=0.0,
+            ),
+        ),
+    )
     job = job_of(eye, rig, (0, 0, 16, 16), look=PLAIN.model_copy(update={"limbus_width_mm": 0.0}))
     points = ring_points(eye, 4.6, 5.5, 400)
     lit = renderer.iris_irradiance(job, points) > 0

@@ -67,7 +67,10 @@ def test_iris_under_large_lamps_against_path(renderer, tmp_path):
     ).build()
     a = np.radians(65.0)
     places = [300 * np.array([np.cos(a), side * np.sin(a), 0.0]) for side in (1, -1)]
-    lights = tuple(Lamp(frozen(p), frozen(-p / 300), 100.0, 1000.0, 1.0) for p in places)
+    lights = tuple(
+        Lamp(position_mm=frozen(p), axis=frozen(-p / 300), radius_mm=100.0, intensity_mw_sr=1000.0, lobe_exponent=1.0)
+        for p in places
+    )
     look = BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
     job = job_of(eye, LampRig(camera, lights), (0, 0, n, n), look=look)
     mine = renderer.radiance(job, spp=512) / cos4(job)

@@ -17,7 +17,7 @@ from eyerender.gaze.regression import Regression, monomials, pupil_glint_vectors
 from eyerender.scene import load_scene
 from eyerender.study.authors_estimators import AuthorsGuestrinEizenman, MinimumNormRegression
 
-EYE = EyeParameters(7.9, 4.3, 1.3375, 5.2, 1.8)
+EYE = EyeParameters(cornea_radius_mm=7.9, pupil_distance_mm=4.3, index=1.3375, alpha_deg=5.2, beta_deg=1.8)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,13 @@ def test_sum_of_errors_is_minimised(seen):
     assert found.objective == "sum_of_errors"
 
     def cost(v):
-        gaze = estimator.with_parameters({0: EyeParameters(v[0], v[1], 1.3375, v[2], v[3])}).predict(rows, rig)
+        gaze = estimator.with_parameters(
+            {
+                0: EyeParameters(
+                    cornea_radius_mm=v[0], pupil_distance_mm=v[1], index=1.3375, alpha_deg=v[2], beta_deg=v[3]
+                )
+            }
+        ).predict(rows, rig)
         return np.degrees(np.arctan(np.linalg.norm(gaze.point_mm - targets, axis=1) / 650.0)).sum()
 
     best = found.parameters.vector()[[0, 1, 3, 4]]

@@ -59,7 +59,10 @@ def observations(pupil, glints, targets=None, *, eye=None, camera=None, fixation
 
 
 def rig(cameras, lights, screen_centre, size=(400.0, 300.0)):
-    lamps = tuple(Lamp(frozen(p), frozen([1.0, 0, 0]), 0.0, 1.0, 1.0) for p in np.asarray(lights, dtype=float))
+    lamps = tuple(
+        Lamp(position_mm=frozen(p), axis=frozen([1.0, 0, 0]), radius_mm=0.0, intensity_mw_sr=1.0, lobe_exponent=1.0)
+        for p in np.asarray(lights, dtype=float)
+    )
     screen = ScreenPlane(frozen(screen_centre), frozen([0.0, -1.0, 0.0]), frozen([0.0, 0.0, 1.0]), size)
     return RigGeometry(tuple(cameras), lamps, screen)
 

@@ -13,7 +13,7 @@ from ...arrays import Bools, Floats, Indices
 _ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SpotFit:
     """A batch of fitted spots.
 
@@ -42,29 +42,36 @@ class SpotFit:
 
     def taken(self, index: Indices) -> SpotFit:
         """Select the spots with these indices."""
-        return SpotFit(*(getattr(self, one.name)[index] for one in fields(self)))
+        return SpotFit(**{one.name: getattr(self, one.name)[index] for one in fields(self)})
 
     def replaced(self, index: Indices, other: SpotFit) -> SpotFit:
         """Copy in which `other` replaces the spots with these indices."""
-        parts = []
+        parts = {}
         for one in fields(self):
             values = getattr(self, one.name).copy()
             values[index] = getattr(other, one.name)
-            parts.append(values)
-        return SpotFit(*parts)
+            parts[one.name] = values
+        return SpotFit(**parts)
 
 
 def joined(parts: list[SpotFit]) -> SpotFit:
     """Join several batches."""
-    return SpotFit(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)))
+    return SpotFit(**{one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)})
 
 
 def no_spots() -> SpotFit:
     """Return an empty batch."""
     return SpotFit(
-        np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2)), np.zeros(0), np.zeros(0),
-        np.zeros((0, 2, 2)), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool),
-    )  # fmt: skip
+        xy_px=np.zeros((0, 2)),
+        covariance=np.zeros((0, 2, 2)),
+        amplitude_dn=np.zeros(0),
+        sigma_px=np.zeros((0, 2)),
+        background_dn=np.zeros(0),
+        residual_dn=np.zeros(0),
+        moments_px2=np.zeros((0, 2, 2)),
+        clipped=np.zeros(0, dtype=np.intp),
+        converged=np.zeros(0, dtype=bool),
+    )
 
 
 def profile(x: Floats, centre: float, sigma: float) -> Floats:

@@ -100,14 +100,25 @@ def fit_spots(
         live = np.flatnonzero(~gone & ~done & (turn + 1 < turns))
         if live.size == 0:
             break
-    ended = Descent(theta, gram, used, settled & ~gone, moved, falling)
+    ended = Descent(theta=theta, gram=gram, used=used, settled=settled & ~gone, moved=moved, falling=falling)
     return FittedSpots(report(pixels, ended, rest - light, limits), pixels, theta, rest - light)
 
 
 def no_fit() -> FittedSpots:
     """Return the fit of no spots."""
     none, index, pairs = np.zeros(0), np.zeros(1, dtype=np.intp), np.zeros((0, 2))
-    pixels = SpotPixels(pairs, none, index, index[:0], none, np.zeros((3, 0)), none, none, none > 0.0, False)
+    pixels = SpotPixels(
+        centre=pairs,
+        radius=none,
+        first=index,
+        spot=index[:0],
+        middle_dn=none,
+        plane=np.zeros((3, 0)),
+        data=none,
+        known=none,
+        clip=none > 0.0,
+        clipped=False,
+    )
     return FittedSpots(no_spots(), pixels, np.zeros((0, PARAMETERS)), none)
 
 
@@ -174,15 +185,15 @@ def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blu
         level += height * ndtr((at[:, 0] * np.cos(turn) + at[:, 1] * np.sin(turn) - offset) / blur_px)
     misfit, sigma = np.sqrt(data_cost / np.maximum(ended.used, 1.0)) * noise, np.exp(theta[:, 3:5])
     return SpotFit(
-        theta[:, :2].copy(),
-        np.asarray(inverse[:, :2, :2] * scale[:, None, None], dtype=np.float64),
-        np.exp(theta[:, 2]),
-        sigma,
-        level + pixels.middle_dn,
-        misfit,
-        _moments(pixels, rest, level, misfit > UNEXPLAINED * noise, sigma),
-        pixels.total(pixels.clip).astype(np.intp),
-        ended.settled & np.isfinite(theta).all(axis=1) & (ended.used >= 12),
+        xy_px=theta[:, :2].copy(),
+        covariance=np.asarray(inverse[:, :2, :2] * scale[:, None, None], dtype=np.float64),
+        amplitude_dn=np.exp(theta[:, 2]),
+        sigma_px=sigma,
+        background_dn=level + pixels.middle_dn,
+        residual_dn=misfit,
+        moments_px2=_moments(pixels, rest, level, misfit > UNEXPLAINED * noise, sigma),
+        clipped=pixels.total(pixels.clip).astype(np.intp),
+        converged=ended.settled & np.isfinite(theta).all(axis=1) & (ended.used >= 12),
     )
 
 

@@ -51,7 +51,7 @@ class Limits:
     slope_dn: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Descent:
     """Result of a descent.
 
@@ -233,4 +233,4 @@ def descend(
         if turn + 1 == steps // 2:
             middle, cost = theta[:, :2].copy(), gram[:, k, k].copy()
     moved = np.abs(theta[:, :2] - middle).max(axis=1)
-    return Descent(theta, gram, used, over, moved, gram[:, k, k] < 0.5 * cost)
+    return Descent(theta=theta, gram=gram, used=used, settled=over, moved=moved, falling=gram[:, k, k] < 0.5 * cost)

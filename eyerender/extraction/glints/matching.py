@@ -69,7 +69,7 @@ def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLik
     return np.asarray(centre + radius_mm * normal)
 
 
-def project(points_mm: ArrayLike, K: ArrayLike, R: ArrayLike, t_mm: ArrayLike) -> Floats:
+def project(points_mm: ArrayLike, *, K: ArrayLike, R: ArrayLike, t_mm: ArrayLike) -> Floats:
     """Project world points (n, 3) to pixels (n, 2) by K (R X + t), OpenCV's pinhole model without distortion."""
     camera = np.asarray(points_mm, dtype=np.float64) @ np.asarray(R, dtype=np.float64).T + np.asarray(
         t_mm, dtype=np.float64
@@ -80,12 +80,12 @@ def project(points_mm: ArrayLike, K: ArrayLike, R: ArrayLike, t_mm: ArrayLike) -
 
 def predict_glints(
     pupil_px: ArrayLike,
+    *,
     K: ArrayLike,
     R: ArrayLike,
     t_mm: ArrayLike,
     lights_mm: ArrayLike,
     eye_mm: ArrayLike,
-    *,
     radius_mm: float = CORNEA_RADIUS_MM,
 ) -> tuple[Floats, float]:
     """Predict where the glints should be.
@@ -131,7 +131,7 @@ def predict_glints(
     depth = float((R3 @ cornea + t3)[2])
     scale = float(math.sqrt(abs(K3[0, 0] * K3[1, 1]))) / max(depth, 1e-6)
     points = mirror_in_sphere(cornea, radius_mm, camera, lights_mm)
-    return project(points, K3, R3, t3), scale
+    return project(points, K=K3, R=R3, t_mm=t3), scale
 
 
 def assign_lights(
@@ -169,11 +169,17 @@ def assign_lights(
     middle = lights.mean(axis=0)
     reach = tolerance_px + slack * np.hypot(*(lights - middle).T)
     found: list[tuple[float, tuple[int, ...], Floats, float]] = []
-    for shift, scale in _promising(glints, lights, middle, reach, scale_range, shift_sd_px):
-        match = _match(glints, lights, middle, reach, shift, scale)
-        shift, scale = _refitted(glints, lights, middle, match, shift, scale, scale_range)
-        match = _match(glints, lights, middle, reach, shift, scale)
-        merit = _merit(glints, lights, middle, reach, match, shift, scale, shift_sd_px)
+    for shift, scale in _promising(
+        glints, lights=lights, middle=middle, reach=reach, scale_range=scale_range, sd=shift_sd_px
+    ):
+        match = _match(glints, lights=lights, middle=middle, reach=reach, shift=shift, scale=scale)
+        shift, scale = _refitted(
+            glints, lights=lights, middle=middle, match=match, shift=shift, scale=scale, span=scale_range
+        )
+        match = _match(glints, lights=lights, middle=middle, reach=reach, shift=shift, scale=scale)
+        merit = _merit(
+            glints, lights=lights, middle=middle, reach=reach, match=match, shift=shift, scale=scale, sd=shift_sd_px
+        )
         found.append((merit, tuple(int(k) for k in match), shift, scale))
     found.sort(key=lambda item: -item[0])
     merit, names, shift, scale = found[0]
@@ -195,12 +201,12 @@ def assign_lights(
 def identify(
     glints_px: ArrayLike,
     pupil_px: ArrayLike,
+    *,
     K: ArrayLike,
     R: ArrayLike,
     t_mm: ArrayLike,
     lights_mm: ArrayLike,
     eye_mm: ArrayLike,
-    *,
     position_sd_mm: float = 1.0,
 ) -> Assignment:
     """Predict the glints, then assign them to the lights; all pixels are those of the full sensor.
@@ -219,7 +225,7 @@ def identify(
     lights = np.asarray(lights_mm, dtype=np.float64).reshape(-1, 3)
     if lights.shape[0] == 0:
         return assign_lights(glints_px, np.zeros((0, 2)), shift_sd_px=1.0)
-    predicted, scale = predict_glints(pupil_px, K, R, t_mm, lights, eye_mm)
+    predicted, scale = predict_glints(pupil_px, K=K, R=R, t_mm=t_mm, lights_mm=lights, eye_mm=eye_mm)
     return assign_lights(glints_px, predicted, shift_sd_px=max(position_sd_mm * scale, 2.0))
 
 
@@ -232,7 +238,7 @@ def _placed(lights: Floats, middle: Floats, shift: Floats, scale: float) -> Floa
 
 
 def _promising(
-    glints: Floats, lights: Floats, middle: Floats, reach: Floats, scale_range: tuple[float, float], sd: float
+    glints: Floats, *, lights: Floats, middle: Floats, reach: Floats, scale_range: tuple[float, float], sd: float
 ) -> list[tuple[Floats, float]]:
     """Find the (shift, scale) pairs for which a one-to-one match is worth trying.
 
@@ -260,7 +266,7 @@ def _promising(
     return [(shift[i], float(scale[i])) for i in best]
 
 
-def _match(glints: Floats, lights: Floats, middle: Floats, reach: Floats, shift: Floats, scale: float) -> Indices:
+def _match(glints: Floats, *, lights: Floats, middle: Floats, reach: Floats, shift: Floats, scale: float) -> Indices:
     """Light (m,) of every glint, one to one, with the least sum of squared misfits within reach; -1 for none."""
     offset = glints[:, None, :] - _placed(lights, middle, shift, scale)[None]
     misfit = np.hypot(offset[..., 0], offset[..., 1]) / reach[None, :]
@@ -274,6 +280,7 @@ def _match(glints: Floats, lights: Floats, middle: Floats, reach: Floats, shift:
 
 def _refitted(
     glints: Floats,
+    *,
     lights: Floats,
     middle: Floats,
     match: Indices,
@@ -295,6 +302,7 @@ def _refitted(
 
 def _merit(
     glints: Floats,
+    *,
     lights: Floats,
     middle: Floats,
     reach: Floats,

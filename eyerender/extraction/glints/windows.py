@@ -26,7 +26,7 @@ def window_radius(width: Floats) -> Floats:
     return 2.7 * width + 1.2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SpotPixels:
     """Windows of n spots: P pixels, one spot after the other.
 
@@ -87,10 +87,17 @@ class SpotPixels:
         if self.clipped:
             clip = clip[rows]
         return SpotPixels(
-            self.centre[spots], self.radius[spots], _starts(count), np.arange(spots.size).repeat(count),
-            self.middle_dn[spots], self.plane[:, rows], self.data[rows], self.known[rows], clip[: rows.size],
-            self.clipped and bool(clip.any()),
-        )  # fmt: skip
+            centre=self.centre[spots],
+            radius=self.radius[spots],
+            first=_starts(count),
+            spot=np.arange(spots.size).repeat(count),
+            middle_dn=self.middle_dn[spots],
+            plane=self.plane[:, rows],
+            data=self.data[rows],
+            known=self.known[rows],
+            clip=clip[: rows.size],
+            clipped=self.clipped and bool(clip.any()),
+        )
 
     def total(self, values: NDArray[np.generic]) -> Floats:
         """Sum (n,) of a value (P,) over each spot's pixels."""
@@ -149,7 +156,16 @@ def cut(
     first, clip = _starts(np.bincount(spot, minlength=width.size)), data >= clip_dn
     plane = np.stack([np.ones_like(dx), dx, dy])
     return SpotPixels(
-        centre, radius, first, spot, level[data.size :], plane, data, level[: data.size], clip, bool(clip.any())
+        centre=centre,
+        radius=radius,
+        first=first,
+        spot=spot,
+        middle_dn=level[data.size :],
+        plane=plane,
+        data=data,
+        known=level[: data.size],
+        clip=clip,
+        clipped=bool(clip.any()),
     )
 
 

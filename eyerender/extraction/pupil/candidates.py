@@ -25,7 +25,7 @@ ANGLES = 48  # samples around a blob
 DARKER = 0.6
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Candidate:
     """A dark blob.
 
@@ -199,8 +199,8 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -
     kept.sort(key=lambda i: -final[i])
     return [
         Candidate(
-            Ellipse((centre[i] + 0.5) * factor - 0.5, axes[i] * factor, float(angle[i])),
-            float(inside[i]), float(typical[i]), float(enclosed[i]), final[i],
+            ellipse=Ellipse((centre[i] + 0.5) * factor - 0.5, axes[i] * factor, float(angle[i])),
+            inside_dn=float(inside[i]), step_dn=float(typical[i]), enclosed=float(enclosed[i]), score=final[i],
         )
         for i in kept[:most]
     ]  # fmt: skip
@@ -275,7 +275,13 @@ def find_inside(prepared: Prepared, ellipse: Ellipse, settings: ExtractionSettin
     inner = Prepared(smooth, prepared.clip_dn, noise, prepared.inverted)
     found = find_candidates(inner, settings)
     moved = [
-        Candidate(c.ellipse.shifted((x0, y0)), c.inside_dn, c.step_dn, c.enclosed, c.score)
+        Candidate(
+            ellipse=c.ellipse.shifted((x0, y0)),
+            inside_dn=c.inside_dn,
+            step_dn=c.step_dn,
+            enclosed=c.enclosed,
+            score=c.score,
+        )
         for c in found
         if c.ellipse.area_px2 < 0.75 * ellipse.area_px2
     ]

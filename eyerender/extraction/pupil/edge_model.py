@@ -29,7 +29,7 @@ SECTORS = 48  # equal steps of the ellipse's parameter u
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EdgeModel:
     """The pupil's edge as a blurred step across an ellipse.
 
@@ -148,7 +148,7 @@ class Place:
         return Place(distance, c, s, nx, ny, a * b / height**3, *turned)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Profile:
     """The blurred step and ramp across the boundary, all (n,).
 
@@ -183,13 +183,13 @@ class Profile:
         # The derivative of -(z^3 - 3 z) phi is He_4 phi.
         bend = density * (1.0 + (kurtosis / 24.0) * (z2 * (z2 - 6.0) + 3.0))
         return Profile(
-            step + half * sigma * density + kurtosis * tails,
-            bend / sigma - half * z * density,
-            half * (1.0 + z2) * density - z * bend / sigma,
-            tails,
-            distance * step + sigma * density,
-            step,
-            density,
+            edge=step + half * sigma * density + kurtosis * tails,
+            edge_by_distance=bend / sigma - half * z * density,
+            edge_by_sigma=half * (1.0 + z2) * density - z * bend / sigma,
+            edge_by_kurtosis=tails,
+            ramp=distance * step + sigma * density,
+            ramp_by_distance=step,
+            ramp_by_sigma=density,
         )
 
 

@@ -113,7 +113,7 @@ def filter_sigma(step_dn: float, noise_dn: float, b: float) -> float:
     return float(np.clip(9.0 * noise_dn / max(step_dn, 1e-6), 1.0, max(1.0, min(2.5, b / 6.0))))
 
 
-def edge_noise_px(step_dn: float, noise_dn: float, sigma_filter: float, sigma_total: float) -> float:
+def edge_noise_px(step_dn: float, *, noise_dn: float, sigma_filter: float, sigma_total: float) -> float:
     """Standard deviation of one edge point along its normal, px.
 
     sigma_x = n'' / |g''|. The noise's second derivative along the normal after filtering is noise sqrt(3 / (16 pi)) /

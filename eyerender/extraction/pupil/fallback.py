@@ -72,7 +72,12 @@ def _boundaries(work: Prepared, settings: ExtractionSettings) -> Iterator[Found]
             found = boundary_about(work, candidate, settings)
             if isinstance(found, str):
                 continue
-            expected = edge_noise_px(candidate.step_dn, work.noise_dn, found.edges.filter_px, found.edges.sigma_px)
+            expected = edge_noise_px(
+                candidate.step_dn,
+                noise_dn=work.noise_dn,
+                sigma_filter=found.edges.filter_px,
+                sigma_total=found.edges.sigma_px,
+            )
             for boundary in (
                 found.boundary,
                 *boundaries_without_stretch(found.edges, found.boundary, settings, expected),

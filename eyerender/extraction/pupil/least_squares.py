@@ -111,7 +111,7 @@ class Rows:
         return Rows(pixels.level - level, jacobian_, slope)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Normal:
     """Normal equations with the sectors' displacements eliminated.
 
@@ -142,13 +142,27 @@ class Normal:
         matrix, vector, cost = gram(slopes), project(slopes, residual), float(np.sum(residual * residual))
         if math.isinf(prior.displacement):
             none = np.zeros(displaced.size)
-            return Normal(matrix, vector, cost, np.zeros((vector.size, none.size)), none, none)
+            return Normal(
+                matrix=matrix,
+                vector=vector,
+                cost=cost,
+                across=np.zeros((vector.size, none.size)),
+                along=none,
+                inverse=none,
+            )
         along = pixels.sums(rows.slope * residual) - prior.displacement * displaced
         across = pixels.sums(slopes * rows.slope)
         inverse = 1.0 / (pixels.sums(rows.slope * rows.slope) + prior.displacement)
         taken = across * inverse
         cost += prior.displacement * float(displaced @ displaced)
-        return Normal(matrix - taken @ across.T, vector - taken @ along, cost, across, along, inverse)
+        return Normal(
+            matrix=matrix - taken @ across.T,
+            vector=vector - taken @ along,
+            cost=cost,
+            across=across,
+            along=along,
+            inverse=inverse,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,7 +221,15 @@ def moved(model: EdgeModel, step: Floats) -> EdgeModel:
     blur = min(max(model.sigma_px + sigma, 0.5 * model.sigma_px, 0.3), max(2.0 * model.sigma_px, 0.3))
     tails = min(max(model.kurtosis + kurtosis, KURTOSIS_LIMITS[0]), KURTOSIS_LIMITS[1])
     lean = (model.lean[0] + lean_x, model.lean[1] + lean_y)
-    return EdgeModel(ellipse, model.inner_dn + inner, model.outer + step[11:], blur, model.slope + slope, tails, lean)
+    return EdgeModel(
+        ellipse=ellipse,
+        inner_dn=model.inner_dn + inner,
+        outer=model.outer + step[11:],
+        sigma_px=blur,
+        slope=model.slope + slope,
+        kurtosis=tails,
+        lean=lean,
+    )
 
 
 def gauss_newton(

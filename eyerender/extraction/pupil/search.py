@@ -38,7 +38,7 @@ class Found:
         candidate = self.candidate
         sigma = math.sqrt(max(self.edges.sigma_px**2 - self.edges.filter_px**2, 0.25))
         outer = np.array([candidate.inside_dn + candidate.step_dn])
-        return EdgeModel(self.boundary.ellipse, candidate.inside_dn, outer, sigma)
+        return EdgeModel(ellipse=self.boundary.ellipse, inner_dn=candidate.inside_dn, outer=outer, sigma_px=sigma)
 
     @cached_property
     def covariance(self) -> Floats:
@@ -130,7 +130,7 @@ def boundary_about(work: Prepared, candidate: Candidate, settings: ExtractionSet
     if blur > 1.7 * sigma:  # a filter much sharper than the image only adds noise
         sigma = min(blur, max(1.0, 0.2 * b))
         edges = find_edges(work.linear, candidate, work.noise_dn, bright, sigma, band=0.4)
-    expected = edge_noise_px(candidate.step_dn, work.noise_dn, sigma, edges.sigma_px)
+    expected = edge_noise_px(candidate.step_dn, noise_dn=work.noise_dn, sigma_filter=sigma, sigma_total=edges.sigma_px)
     boundary = fit_boundary(edges, candidate, settings, expected)
     if isinstance(boundary, str):
         return boundary

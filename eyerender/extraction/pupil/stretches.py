@@ -16,7 +16,7 @@ STARTS = 24  # positions around the outline at which a stretch begins
 CUT_POINTS = 40  # points that a fit uses of those that remain
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Cuts:
     """Ellipses through the edge points of a boundary, each without one stretch of them.
 
@@ -59,7 +59,14 @@ class Cuts:
         enough = (left >= least) & (left < n - 3)
         first, count, left, widths = first[enough], count[enough], left[enough], widths[enough]
         if left.size == 0:
-            return Cuts(np.zeros((0, 5)), np.zeros(0), np.zeros(0), first, count, points)
+            return Cuts(
+                fits=np.zeros((0, 5)),
+                width=np.zeros(0),
+                residual_px=np.zeros(0),
+                first=first,
+                count=count,
+                points=points,
+            )
         # The points that are kept follow the stretch.
         share = np.arange(CUT_POINTS) / CUT_POINTS
         taken = points[(first[:, None] + count[:, None] + (share * left[:, None]).astype(np.intp)) % n]
@@ -70,7 +77,9 @@ class Cuts:
         fits = np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[alike]
         distance = _distances(taken[alike], fits)
         residual = np.sqrt(np.einsum("mn,mn->m", distance, distance) / CUT_POINTS)
-        return Cuts(fits, widths[alike], residual, first[alike], count[alike], points)
+        return Cuts(
+            fits=fits, width=widths[alike], residual_px=residual, first=first[alike], count=count[alike], points=points
+        )
 
     def inside(self, which: Bools, depth_px: Callable[[float], float]) -> Iterator[Ellipse]:
         """Yield different ellipses of `which` whose left-out stretch lies inside them.
