@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from . import gaze
-    from .analytic.observer import AnalyticObserver
+    from .analytic.observer import AnalyticObserver, trace
     from .benchmark.protocol import Extractor
     from .benchmark.run import bench_extractors
-    from .capture import render_windows
+    from .capture import EyeImage, render_windows
     from .comparison import Comparison, compare
     from .dataset.estimate import estimate
     from .dataset.export import export
@@ -26,79 +26,163 @@ if TYPE_CHECKING:
     from .errors import BackendError, EyerenderError, InputError
     from .extraction import ExtractionSettings, extract
     from .eye.catalogue import load_eye
+    from .eye.margin import PupilMargin
     from .eye.model import EyeModel
     from .eye.spec import EyeSpec
     from .imagefolder import ImageFolder
-    from .imageobserver import ImageObserver
+    from .imageobserver import ImageObserver, detect
+    from .images import LabelledImage, export_scene, render, render_folder
     from .observation import Observations
     from .quickstart import compare_folder, run_quickstart
-    from .renderedfolder import export_scene, render_folder
+    from .region.anatomy import Brow, Face, Fissure, Lashes, Lid, Region, Skin, TearFilm
+    from .region.headspec import Head, HeadParts
+    from .region.look import Look
     from .report.comparison import write_report
-    from .rig.rig import RigGeometry
-    from .scene import Scene, load_scene, shipped_scenes
-    from .scenespec import SceneSpec
+    from .rig.camera import Camera, CameraCalibration, PinholeCamera
+    from .rig.imaging import Ambient, Lens, Motion, Panel, RadianceMap
+    from .rig.light import Led, LedRing
+    from .rig.rig import Rig, RigGeometry
+    from .rig.screen import Screen
+    from .rig.sensor import Sensor
+    from .scene import Frame, Frames, Scene, load_scene, shipped_scenes
+    from .scene.observer import Observer
+    from .scene.spec import Eye, EyeDirection, Picture, SceneSpec, Subject, Targets
     from .status import Status
 
 _HOMES = {
+    "Ambient": "rig.imaging",
     "AnalyticObserver": "analytic.observer",
     "BackendError": "errors",
+    "Brow": "region.anatomy",
+    "Camera": "rig.camera",
+    "CameraCalibration": "rig.camera",
     "Comparison": "comparison",
     "DatasetSpec": "dataset.spec",
     "ExtractionSettings": "extraction",
     "Extractor": "benchmark.protocol",
+    "Eye": "scene.spec",
+    "EyeDirection": "scene.spec",
+    "EyeImage": "capture",
     "EyeModel": "eye.model",
     "EyeSpec": "eye.spec",
     "EyerenderError": "errors",
+    "Face": "region.anatomy",
+    "Fissure": "region.anatomy",
+    "Frame": "scene",
+    "Frames": "scene",
+    "Head": "region.headspec",
+    "HeadParts": "region.headspec",
     "ImageFolder": "imagefolder",
     "ImageObserver": "imageobserver",
     "InputError": "errors",
+    "LabelledImage": "images",
+    "Lashes": "region.anatomy",
+    "Led": "rig.light",
+    "LedRing": "rig.light",
+    "Lens": "rig.imaging",
+    "Lid": "region.anatomy",
+    "Look": "region.look",
+    "Motion": "rig.imaging",
     "Observations": "observation",
+    "Observer": "scene.observer",
+    "Panel": "rig.imaging",
+    "Picture": "scene.spec",
+    "PinholeCamera": "rig.camera",
+    "PupilMargin": "eye.margin",
+    "RadianceMap": "rig.imaging",
+    "Region": "region.anatomy",
+    "Rig": "rig.rig",
     "RigGeometry": "rig.rig",
     "Scene": "scene",
-    "SceneSpec": "scenespec",
+    "SceneSpec": "scene.spec",
+    "Screen": "rig.screen",
+    "Sensor": "rig.sensor",
+    "Skin": "region.anatomy",
     "Status": "status",
+    "Subject": "scene.spec",
+    "Targets": "scene.spec",
+    "TearFilm": "region.anatomy",
     "bench_extractors": "benchmark.run",
     "compare": "comparison",
     "compare_folder": "quickstart",
+    "detect": "imageobserver",
     "estimate": "dataset.estimate",
     "export": "dataset.export",
-    "export_scene": "renderedfolder",
+    "export_scene": "images",
     "extract": "extraction",
     "generate": "dataset.run",
     "load_eye": "eye.catalogue",
     "load_scene": "scene",
     "preview": "dataset.sheet",
-    "render_folder": "renderedfolder",
+    "render": "images",
+    "render_folder": "images",
     "render_windows": "capture",
     "run_quickstart": "quickstart",
     "sample": "dataset.realise",
     "shipped_scenes": "scene",
+    "trace": "analytic.observer",
     "validate": "dataset.validate",
     "write_report": "report.comparison",
 }
 
 __all__ = [
+    "Ambient",
     "AnalyticObserver",
     "BackendError",
+    "Brow",
+    "Camera",
+    "CameraCalibration",
     "Comparison",
     "DatasetSpec",
     "ExtractionSettings",
     "Extractor",
+    "Eye",
+    "EyeDirection",
+    "EyeImage",
     "EyeModel",
     "EyeSpec",
     "EyerenderError",
+    "Face",
+    "Fissure",
+    "Frame",
+    "Frames",
+    "Head",
+    "HeadParts",
     "ImageFolder",
     "ImageObserver",
     "InputError",
+    "LabelledImage",
+    "Lashes",
+    "Led",
+    "LedRing",
+    "Lens",
+    "Lid",
+    "Look",
+    "Motion",
     "Observations",
+    "Observer",
+    "Panel",
+    "Picture",
+    "PinholeCamera",
+    "PupilMargin",
+    "RadianceMap",
+    "Region",
+    "Rig",
     "RigGeometry",
     "Scene",
     "SceneSpec",
+    "Screen",
+    "Sensor",
+    "Skin",
     "Status",
+    "Subject",
+    "Targets",
+    "TearFilm",
     "__version__",
     "bench_extractors",
     "compare",
     "compare_folder",
+    "detect",
     "estimate",
     "export",
     "export_scene",
@@ -108,11 +192,13 @@ __all__ = [
     "load_eye",
     "load_scene",
     "preview",
+    "render",
     "render_folder",
     "render_windows",
     "run_quickstart",
     "sample",
     "shipped_scenes",
+    "trace",
     "validate",
     "write_report",
 ]

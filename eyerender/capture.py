@@ -168,8 +168,6 @@ def check_windows(scene: Scene) -> None:
     Raises:
         InputError: they cannot.
     """
-    if scene.spec.image.window_px is None and len(scene.spec.subject.eyes) > 1:
-        raise InputError("missing; a scene with both eyes needs a window for each eye", path="image.window_px")
     spp = scene.spec.image.spp
     for i, camera in enumerate(scene.rig.cameras):
         width, height = scene.spec.image.window_px or camera.resolution_px

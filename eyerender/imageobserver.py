@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from .progress import Progress
 from .rig.camera import PinholeCamera
 from .rig.rig import RigLike
 from .scene import Frames, Scene
-from .scenespec import SceneSpec
+from .scene.spec import SceneSpec
 
 # Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
 _PLACE_MM = 1.5
@@ -152,6 +152,21 @@ class ImageObserver:
         return concatenate(parts)
 
 
+def detect(
+    images: EyeImage | Iterable[EyeImage], rig: RigLike | None = None, *, settings: ExtractionSettings | None = None
+) -> Observations:
+    """Recover pupils and glints from rendered images, one row for each.
+
+    Args:
+        images: what `render` gave; the truth that they carry is not used.
+        rig: replaces the one that was rendered, to identify the glints by.
+        settings: of the extraction.
+    """
+    several = [images] if isinstance(images, EyeImage) else images
+    told = (replace(image, frame=image.frame.seen_by(rig)) for image in several)
+    return ImageObserver(settings or ExtractionSettings()).observe_images(told)
+
+
 def scene_of(folder: ImageFolder) -> Scene:
     """Scene from which a folder of images was rendered."""
     source = str(folder.path / DATASET)
@@ -177,7 +192,7 @@ def _scene_of_samples(folder: ImageFolder) -> Scene:
             raise InputError("has no parameters", source=source) from None
         if first is None:
             spec = SceneSpec.from_mapping(parse_json(text), source=source)
-            first = Scene(spec, EyeSpec.from_mapping(_parsed(eye, source), source=source), spec.rig.build())
+            first = Scene.compiled(spec, EyeSpec.from_mapping(_parsed(eye, source), source=source))
         seen.add(key)
         if len(seen) > 1:
             raise InputError(

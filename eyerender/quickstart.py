@@ -12,9 +12,9 @@ from .gaze.estimate import GazeEstimator
 from .gaze.regression import Regression
 from .imagefolder import ImageFolder, same_run
 from .imageobserver import ImageObserver, scene_of
+from .images import render_folder
 from .plausibility import saturation_warnings
 from .progress import Progress
-from .renderedfolder import render_folder
 from .report.comparison import Timing, write_report
 from .scene import Scene, load_scene
 

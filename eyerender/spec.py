@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
+import numpy as np
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -50,6 +51,27 @@ class Spec(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 
+    POSITIONAL: ClassVar[tuple[str, ...]] = ()
+    """The fields that the constructor also takes without their names, in this order."""
+
+    def __init__(self, *values: Any, **fields: Any) -> None:
+        """Build a record from Python values; lists and NumPy arrays may stand for tuples, mappings for records.
+
+        Args:
+            values: the first of the fields named in `POSITIONAL`.
+            fields: the others, by name.
+
+        Raises:
+            InputError: a value does not fit; the message is the one that a YAML file with this value gets.
+        """
+        named = dict(zip(self.POSITIONAL, values, strict=False))
+        if len(named) < len(values) or named.keys() & fields.keys():
+            raise TypeError(f"{type(self).__name__} takes {', '.join(self.POSITIONAL) or 'no values'} without a name")
+        self._validated({**named, **fields}, into=self)
+
+    # Pydantic then builds nested records without calling this constructor for each of them.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
     @classmethod
     def from_mapping(cls, data: object, *, source: str = "") -> Self:
         """Validate a plain mapping.
@@ -59,9 +81,15 @@ class Spec(BaseModel):
         """
         if not isinstance(data, Mapping):
             raise InputError("must be a mapping of keys to values", source=source)
+        return cls._validated(data, source=source)
+
+    @classmethod
+    def _validated(cls, data: Mapping[str, Any], *, into: Self | None = None, source: str = "") -> Self:
         try:
             # The data are passed as JSON, because only there does pydantic's strict mode accept a list for a tuple.
-            return cls.model_validate_json(json.dumps(data))
+            text = json.dumps(cls.arranged(data), default=_plain)
+            made: Self = cls.__pydantic_validator__.validate_json(text, self_instance=into)
+            return made
         except RecursionError:
             raise InputError("is nested too deeply", source=source) from None
         except (TypeError, ValueError) as error:
@@ -69,6 +97,11 @@ class Spec(BaseModel):
                 raise InputError(f"holds a value that is no number, text or list ({error})", source=source) from None
             path, reason = _first_problem(error)
             raise InputError(reason, source=source, path=path) from None
+
+    @classmethod
+    def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The mapping in the order of a file, where Python code may put values elsewhere."""
+        return data
 
     def to_mapping(self) -> dict[str, Any]:
         """Convert to the plain mapping that `from_mapping` reads as an equal object."""
@@ -292,6 +325,15 @@ def _first_problem(error: ValidationError) -> tuple[str, str]:
     if isinstance(value, str | int | float | bool):
         message += f", not {shown(value)}"
     return path, message
+
+
+def _plain(value: Any) -> Any:
+    """A value of Python code as JSON has it."""
+    if isinstance(value, Spec):
+        return value.to_mapping()
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is not allowed")
 
 
 def _is_branch(part: object) -> bool:

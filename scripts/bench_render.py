@@ -339,7 +339,7 @@ class Bench:
         from eyerender.eye.pose import Poses, rigid_motion
         from eyerender.region.anatomy import Region
         from eyerender.scene import Scene
-        from eyerender.scenespec import SceneSpec
+        from eyerender.scene.spec import SceneSpec
 
         rigs, region = self.rigs, Region(seed=11)
         rig = rigs.remote_rig()

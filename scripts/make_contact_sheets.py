@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw
 from eyerender.capture import make_renderer, render_windows
 from eyerender.region.anatomy import Region
 from eyerender.scene import Scene, load_scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 PRESETS = ("desktop_tracker", "headset", "webcam", "stress")
 CELL = (400, 300)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from eyerender.capture import render_windows
 from eyerender.geometry.ellipse import Ellipse, signed_distance
 from eyerender.labels import PUPIL
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from make_ideal_images import Drawing
 
 Array = NDArray[np.float64]
@@ -95,7 +95,7 @@ def with_edge_glint(scene: Scene, seed: int) -> Scene:
     def lamps(places: list[Array]) -> Scene:
         moved = [first.model_copy(update={"position_mm": tuple(place.tolist())}) for place in places]
         rig = spec.rig.model_copy(update={"lights": (*moved, *others)})
-        return replace(scene, spec=spec.model_copy(update={"rig": rig}), rig=rig.build())
+        return scene.replaced(spec.model_copy(update={"rig": rig}))
 
     def place(bearing: float, reach: float) -> Array:
         across = math.cos(bearing) * camera.R[0] + math.sin(bearing) * camera.R[1]

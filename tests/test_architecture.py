@@ -33,7 +33,6 @@ FLOORS = {
     "rig": 3,
     "plausibility": 4,
     "scene": 4,
-    "scenespec": 4,
     "observation": 4,
     "imagefile": 4,
     "imagefolder": 4,
@@ -45,7 +44,7 @@ FLOORS = {
     "capture": 6,
     "imageobserver": 6,
     "labels": 6,
-    "renderedfolder": 6,
+    "images": 6,
     "comparison": 6,
     "report": 7,
     "dataset": 7,
@@ -72,13 +71,12 @@ ORDER = [
     "imagefolder",
     "outfolder",
     "plausibility",
-    "scenespec",
     "scene",
     "comparison",
     "capture",
     "imageobserver",
     "labels",
-    "renderedfolder",
+    "images",
 ]
 
 
@@ -206,11 +204,16 @@ def test_import_is_light():
 
 def test_public_names_are_pinned():
     assert eyerender.__all__ == [
-        "AnalyticObserver", "BackendError", "Comparison", "DatasetSpec", "ExtractionSettings", "Extractor",
-        "EyeModel", "EyeSpec", "EyerenderError", "ImageFolder", "ImageObserver", "InputError", "Observations",
-        "RigGeometry", "Scene", "SceneSpec", "Status", "__version__", "bench_extractors", "compare", "compare_folder",
-        "estimate", "export", "export_scene", "extract", "gaze", "generate", "load_eye", "load_scene", "preview",
-        "render_folder", "render_windows", "run_quickstart", "sample", "shipped_scenes", "validate", "write_report",
+        "Ambient", "AnalyticObserver", "BackendError", "Brow", "Camera", "CameraCalibration", "Comparison",
+        "DatasetSpec", "ExtractionSettings", "Extractor", "Eye", "EyeDirection", "EyeImage", "EyeModel", "EyeSpec",
+        "EyerenderError", "Face", "Fissure", "Frame", "Frames", "Head", "HeadParts", "ImageFolder", "ImageObserver",
+        "InputError", "LabelledImage", "Lashes", "Led", "LedRing", "Lens", "Lid", "Look", "Motion", "Observations",
+        "Observer", "Panel", "Picture", "PinholeCamera", "PupilMargin", "RadianceMap", "Region", "Rig",
+        "RigGeometry", "Scene", "SceneSpec", "Screen", "Sensor", "Skin", "Status", "Subject", "Targets", "TearFilm",
+        "__version__", "bench_extractors", "compare", "compare_folder", "detect", "estimate", "export",
+        "export_scene", "extract", "gaze", "generate", "load_eye", "load_scene", "preview", "render",
+        "render_folder", "render_windows", "run_quickstart", "sample", "shipped_scenes", "trace", "validate",
+        "write_report",
     ]  # fmt: skip
     for name in eyerender.__all__:
         assert getattr(eyerender, name) is not None

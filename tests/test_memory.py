@@ -19,7 +19,7 @@ from eyerender.imagefile import write_png
 from eyerender.imagefolder import write_dataset
 from eyerender.outfolder import staged
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="tells peaks of memory in /proc only")
 WIDTH, HEIGHT = 96, 72

@@ -16,9 +16,9 @@ from eyerender.dataset import assemble, croissant, runfile, shard
 from eyerender.errors import EyerenderError, InputError
 from eyerender.imagefile import write_png
 from eyerender.imagefolder import write_dataset
+from eyerender.images import render_folder
 from eyerender.lock import LOCK, run_lock, writer_lock
 from eyerender.outfolder import MARKER, clear, refuse_non_empty, staged
-from eyerender.renderedfolder import render_folder
 from eyerender.scene import load_scene
 from eyerender.study import run as study
 

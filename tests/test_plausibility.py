@@ -14,11 +14,11 @@ from eyerender.cli.app import run
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import shipped_datasets
 from eyerender.errors import InputError
+from eyerender.images import render_folder
 from eyerender.plausibility import is_saturated
-from eyerender.renderedfolder import render_folder
 from eyerender.rig.sensor import Sensor
 from eyerender.scene import Scene, load_scene, shipped_scenes
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 BASE = yaml.safe_load(shipped_scenes()["guestrin2006"].read_text(encoding="utf-8"))
 DATASET = yaml.safe_load(shipped_datasets()["dataset_quick"].read_text(encoding="utf-8"))

@@ -13,7 +13,7 @@ from eyerender.dataset.spec import DatasetSpec, find_dataset
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.scene import load_scene, shipped_scenes
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from eyerender.spec import file_digest, read_yaml
 
 

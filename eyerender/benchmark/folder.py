@@ -24,7 +24,7 @@ from ..observation import Observations
 from ..rig.camera import PinholeCamera
 from ..rig.rig import RigGeometry
 from ..scene import Scene
-from ..scenespec import SceneSpec
+from ..scene.spec import SceneSpec
 
 IDEAL_SCHEMA = "eyerender/ideal-images/1"
 # Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens them.

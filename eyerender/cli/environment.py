@@ -60,7 +60,7 @@ def schema(name: Literal["scene", "eye", "dataset"] = "scene", /) -> int:
         name: The kind of file.
     """
     if name == "scene":
-        from ..scenespec import SceneSpec
+        from ..scene.spec import SceneSpec
 
         text = SceneSpec.json_schema()
     elif name == "dataset":

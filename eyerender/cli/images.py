@@ -36,7 +36,7 @@ def render(
         spp: Replace the scene's samples per pixel.
         exr: Also write the noise-free linear irradiance as EXR.
     """
-    from ..renderedfolder import render_folder
+    from ..images import render_folder
     from ..scene import load_scene
 
     positive("--threads", threads)

@@ -23,7 +23,7 @@ from ..errors import InputError, InputWarning
 from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
 from ..scene import Scene
-from ..scenespec import SceneSpec
+from ..scene.spec import SceneSpec
 from .draws import is_draw, unit_number
 from .files import check_files, sum_of_file, sums_of_files
 from .spec import DatasetSpec, find_dataset
@@ -63,7 +63,7 @@ class Sample:
             InputError: the drawn values do not fit together.
         """
         spec = SceneSpec.from_mapping(self.scene, source=f"sample {self.turn.sample}")
-        scene = Scene(spec, _eye(json.dumps(self.eye, sort_keys=True)), spec.rig.build(), self.base)
+        scene = Scene.compiled(spec, _eye(json.dumps(self.eye, sort_keys=True)), base=self.base)
         scene.eye("right")
         return scene
 

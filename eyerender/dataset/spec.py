@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from ..errors import InputError
 from ..scene import is_shipped_dataset, refuse_folder, shipped_files
-from ..scenespec import DATASET_KIND, NOT_A_DATASET
+from ..scene.spec import DATASET_KIND, NOT_A_DATASET
 from ..spec import FileSpec, Positive, Spec
 
 # Largest number of samples of a run; a Sobol sequence has no more points.

@@ -9,7 +9,7 @@ subject, with +z up in the image.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -65,6 +65,31 @@ class Camera(Spec):
     principal_point_px: Vec2 | None = Field(default=None, description="default: the centre of the sensor")
     distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description="k1, k2, p1, p2, k3 (OpenCV)")
     calibration: CameraCalibration | None = None
+
+    @classmethod
+    def looking_at(
+        cls,
+        point_mm: ArrayLike,
+        *,
+        position_mm: ArrayLike,
+        size_px: tuple[int, int],
+        focal_length_px: float | None = None,
+        **fields: Any,
+    ) -> Self:
+        """A camera at a place, turned to a point.
+
+        Args:
+            point_mm: (3,) world point on the optical axis.
+            position_mm: (3,) nodal point in the world.
+            size_px: width and height of the sensor (`resolution_px`).
+            focal_length_px: focal length in pixels; else give `focal_length_mm` and `sensor_mm`.
+            fields: further fields of the camera.
+
+        Raises:
+            InputError: a value does not fit.
+        """
+        placed = {"look_at_mm": point_mm, "position_mm": position_mm, "resolution_px": size_px}
+        return cls.from_mapping({**placed, "focal_length_px": focal_length_px, **fields})
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -6,7 +6,7 @@ Radiant intensity in direction w: I(w) = I0 max(0, cos(angle to the axis))^m (m 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -33,6 +33,11 @@ class LedRing(Spec):
 
 class Led(Spec):
     """One LED at `position_mm`, or a `ring` of equal LEDs."""
+
+    POSITIONAL: ClassVar[tuple[str, ...]] = ("position_mm",)
+    if TYPE_CHECKING:
+
+        def __init__(self, position_mm: Any = None, **fields: Any) -> None: ...
 
     position_mm: Vec3 | None = None
     ring: LedRing | None = None

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, Protocol, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from ..arrays import ArrayValue
+from ..errors import InputError
 from ..spec import Spec
 from .camera import Camera, PinholeCamera
 from .light import MAX_LIGHTS, Lamp, Led
@@ -37,6 +39,33 @@ class Rig(Spec):
     def light_count(self) -> int:
         """Number of lights, counting each LED of a ring."""
         return sum(1 if light.ring is None else light.ring.count for light in self.lights)
+
+    def with_light(self, number: int, **changes: Any) -> Self:
+        """Change one light of the rig.
+
+        An LED of a ring becomes an LED of its own, and so do the others of that ring, where they are.
+
+        Args:
+            number: which light, from 0, each LED of a ring counted.
+            changes: new values of the fields of `Led`; `moved_mm` (3,) is added to the LED's place instead.
+
+        Raises:
+            InputError: there is no such light, or a value does not fit.
+        """
+        if not 0 <= number < self.light_count:
+            raise InputError(f"there is no light {number}, only {self.light_count}", path="lights")
+        geometry, leds = self.build(), []
+        for led in self.lights:
+            if led.ring is None:
+                leds.append(led.to_mapping())
+                continue
+            same = {key: value for key, value in led.to_mapping().items() if key != "ring"}
+            places = [light.position_mm for light in geometry.lights[len(leds) : len(leds) + led.ring.count]]
+            leds += [{**same, "position_mm": place.tolist()} for place in places]
+        moved = np.asarray(changes.pop("moved_mm", (0.0, 0.0, 0.0)), dtype=float)
+        leds[number] = {**leds[number], **changes}
+        leds[number]["position_mm"] = np.asarray(leds[number]["position_mm"], dtype=float) + moved
+        return type(self).from_mapping({"cameras": self.cameras, "lights": leds, "screen": self.screen})
 
     def build(self) -> RigGeometry:
         """Build the numeric rig."""

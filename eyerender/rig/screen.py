@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,9 +16,18 @@ from ..spec import Positive, Spec, Vec3
 class Screen(Spec):
     """A screen, given by its centre and size."""
 
+    POSITIONAL: ClassVar[tuple[str, ...]] = ("centre_mm", "size_mm")
+    if TYPE_CHECKING:
+
+        def __init__(self, centre_mm: Any = None, size_mm: Any = None, **fields: Any) -> None: ...
+
     centre_mm: Vec3
     size_mm: tuple[Positive, Positive] = Field(description="width and height")
     tilt_deg: float = Field(default=0.0, gt=-90, lt=90, description="upward tilt of the face, from facing -x")
+
+    def grid(self, columns: int, rows: int) -> Floats:
+        """World points (columns * rows, 3) of a grid out to the screen's edges, as `ScreenPlane.grid` orders them."""
+        return self.build().grid(columns, rows)
 
     def build(self) -> ScreenPlane:
         """Build the numeric screen."""

@@ -15,7 +15,7 @@ from ..gaze.regression import FUNCTIONS, Regression
 from ..observation import Observations
 from ..rig.rig import RigGeometry
 from ..scene import Scene, load_scene
-from ..scenespec import SceneSpec
+from ..scene.spec import SceneSpec
 from .authors_estimators import MinimumNormRegression
 from .literature import CALIBRATION_SETS
 from .results import Departure, Row, mean_row

@@ -23,7 +23,7 @@ from ..gaze.quality import quality
 from ..gaze.regression import Regression
 from ..observation import Observations
 from ..scene import Scene
-from ..scenespec import SceneSpec
+from ..scene.spec import SceneSpec
 from . import blignaut, guestrin
 from .literature import CALIBRATION_SETS
 from .results import Row, mean_row
@@ -146,7 +146,7 @@ def conditions_part(eye: str) -> ConditionsPart:
             values: dict[str, Any] = {"base": base[name], "at_plus": None, "at_minus": None}
             entry[name] = {**values, "per_step": None, "reason": None}
             try:
-                up, down = (_mean(replace(_scene(name, eye), eye_spec=spec)) for spec in (more, less))
+                up, down = (_mean(_scene(name, eye).replaced(eye_spec=spec)) for spec in (more, less))
             except InputError as error:
                 # A changed eye may let no ray through. That is a result for this parameter, not for the others.
                 entry[name]["reason"] = str(error)
@@ -170,7 +170,7 @@ def _changed(scene: Scene, changes: dict[str, dict[str, Any]]) -> Scene:
     for group, values in changes.items():
         data[group] = values if group == "targets" else {**data[group], **values}
     spec = SceneSpec.from_mapping(data)
-    return replace(scene, spec=spec, rig=spec.rig.build())
+    return scene.replaced(spec)
 
 
 def _calibrated(scene: Scene) -> tuple[_Tracker, Observations]:

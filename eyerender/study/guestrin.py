@@ -17,7 +17,7 @@ from ..gaze.parameters import Calibration, EyeParameters, ParameterBounds
 from ..observation import EYES, Observations
 from ..rig.rig import RigGeometry
 from ..scene import Scene, load_scene
-from ..scenespec import SceneSpec
+from ..scene.spec import SceneSpec
 from .authors_estimators import AuthorsGuestrinEizenman
 from .results import Departure, Row, mean_row
 

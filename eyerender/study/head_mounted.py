@@ -22,7 +22,7 @@ from ..gaze.estimate import angular_error_deg
 from ..observation import Observations
 from ..rig.rig import RigGeometry
 from ..scene import Scene, load_scene
-from ..scenespec import SceneSpec
+from ..scene.spec import SceneSpec
 from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
 from .observing import Observing
 from .results import Finding, Row, mean_row

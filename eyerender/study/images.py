@@ -27,7 +27,7 @@ from ..jsonlines import JsonLines
 from ..observation import EYES, Observations
 from ..progress import Progress, Say
 from ..scene import Scene
-from ..scenespec import SceneSpec
+from ..scene.spec import SceneSpec
 
 _SHARD_IMAGES = 27  # two or three seconds of work, the largest loss by a kill
 _PATIENCE_S = 60.0  # per image, after which a silent worker counts as dead
@@ -93,7 +93,7 @@ def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = 
         for side in sorted(scene.spec.subject.eyes, key=EYES.index):
             rows = index.eye == EYES.index(side)
             data["subject"]["eyes"] = [side]
-            one = replace(scene, spec=SceneSpec.from_mapping(data))
+            one = scene.replaced(SceneSpec.from_mapping(data))
             if head is not None:
                 rows = rows & (index.head == head)
                 one = facing_scene(one, heads[head], side)
@@ -114,7 +114,7 @@ def facing_scene(scene: Scene, head_mm: tuple[float, float, float], side: str) -
             camera.pop(key, None)
         camera["look_at_mm"] = [float(v) for v in apex]
     spec = SceneSpec.from_mapping(data)
-    return replace(scene, spec=spec, rig=spec.rig.build())
+    return scene.replaced(spec)
 
 
 def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) -> StudyImages:
@@ -239,7 +239,7 @@ def _begun(folder: Path, plan: Any) -> bool:
 def without_noise(scene: Scene) -> Scene:
     """Replace the sensor of a scene by one without noise."""
     sensor = scene.spec.sensor.model_copy(update={"noise": False})
-    return replace(scene, spec=scene.spec.model_copy(update={"sensor": sensor}))
+    return scene.replaced(scene.spec.model_copy(update={"sensor": sensor}))
 
 
 def _exposures(line: Mapping[str, Any]) -> list[tuple[str, str]]:

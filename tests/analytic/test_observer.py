@@ -12,7 +12,7 @@ from eyerender.analytic.observer import trace
 from eyerender.errors import InputError
 from eyerender.eye.fixation import fixations
 from eyerender.scene import Scene, load_scene, shipped_scenes
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 
 @pytest.mark.parametrize("name", sorted(shipped_scenes()))

@@ -17,7 +17,7 @@ from eyerender.gaze.regression import pupil_glint_vectors
 from eyerender.observation import Observations
 from eyerender.rig.camera import PinholeCamera
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from eyerender.status import Status
 from tests.support.exhaustive import exhaustive
 

@@ -6,9 +6,9 @@ import pytest
 
 import make_ideal_images as ideal
 from eyerender.errors import BackendError
-from eyerender.renderedfolder import render_folder
+from eyerender.images import render_folder
 from eyerender.scene import Scene, shipped_scenes
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 
 @pytest.fixture(scope="session")

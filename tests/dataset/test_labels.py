@@ -12,7 +12,7 @@ from eyerender.geometry.ellipse import Ellipse, points_on_ellipse, signed_distan
 from eyerender.imagefile import read_image
 from eyerender.imagefolder import ImageFolder
 from eyerender.labels import moments_ellipse
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 pytestmark = pytest.mark.render
 

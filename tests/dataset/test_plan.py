@@ -17,7 +17,7 @@ from eyerender.dataset.realise import frames_of, realise
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from tests.support.dataset_specs import plan, write
 
 

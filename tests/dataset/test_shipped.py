@@ -8,9 +8,9 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
-from eyerender.renderedfolder import render_folder
+from eyerender.images import render_folder
 from eyerender.scene import Scene, load_scene, shipped_scenes
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from tests.support.dataset_specs import make
 
 pytestmark = pytest.mark.render

@@ -11,9 +11,9 @@ import pytest
 
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.validate import SAMPLE, sampled, validate
-from eyerender.renderedfolder import render_folder
+from eyerender.images import render_folder
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 pytestmark = pytest.mark.render
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from eyerender.eye.catalogue import load_eye
 from eyerender.eye.margin import HARMONICS, PupilMargin, drawn_contour
 from eyerender.eye.spec import ConicSpec, EyeSpec, Side
 from eyerender.scene import Scene, load_scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 PRESETS = ("desktop_tracker", "headset", "webcam", "stress")
 BARE = ("guestrin2006", "blignaut2014", "head_mounted", "quickstart")
@@ -148,13 +147,13 @@ def test_numbers_take_the_place_of_those_of_the_eye_file():
     data = load_eye("E2").to_mapping()
     data["stop"] |= {"ellipticity": 0.1, "axis_deg": 30.0, "shift_mm_per_mm": [0.2, 0.1], "contour": {"sines": [0.02]}}
     eye = EyeSpec.from_mapping(data)
-    scene = replace(scene_with({}, 5.0), eye_spec=eye)
+    scene = scene_with({}, 5.0).replaced(eye_spec=eye)
     own = eye.build(pupil_diameter_mm=5.0).stop
     moved = scene.eye("right").stop
     assert np.allclose(moved.boundary(40) - moved.centre_mm, own.boundary(40) - own.centre_mm, atol=1e-14)
     assert moved.centre_mm - own.centre_mm == pytest.approx([0.0, -0.26, -0.1])
     given = {"contour": {"cosines": [0.0, 0.03]}, "shift_mm_per_mm": [0.0, 0.0]}
-    stop = replace(scene_with(given, 5.0), eye_spec=eye).eye("right").stop
+    stop = scene_with(given, 5.0).replaced(eye_spec=eye).eye("right").stop
     angle = 2 * np.pi * np.arange(360) / 360
     assert np.allclose(radii_mm(stop, 360), 2.5 * (1 + 0.03 * np.cos(2 * angle)), atol=1e-13)
     assert stop.centre_mm == pytest.approx(data["stop"]["position_mm"])

@@ -17,7 +17,7 @@ from eyerender.gaze.records import load_observations, rig_from_mapping
 from eyerender.gaze.store import choose_estimator, fit_estimator, load_estimator, predictions, save_estimator
 from eyerender.observation import Observations
 from eyerender.scene import Scene, load_scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
 NAMES = ("regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman")

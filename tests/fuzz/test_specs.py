@@ -18,7 +18,7 @@ from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.eye.catalogue import FOLDER, catalogue_names, load_eye
 from eyerender.eye.spec import EyeSpec
 from eyerender.scene import Scene, load_scene, shipped_scenes
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
 FEW = 8  # observations: more cost time and show nothing new
@@ -83,7 +83,7 @@ def check_eye(data: Any) -> None:
         scene["subject"]["head_positions_mm"] = [[0.0, 0.0, 0.0]]
         scene.setdefault("eye", {}).pop("pupil_diameter_mm", None)
         compiled = SceneSpec.from_mapping(scene)
-        use_scene(Scene(compiled, spec, compiled.rig.build()))
+        use_scene(Scene.compiled(compiled, spec))
 
     proper(use)
 

@@ -97,7 +97,7 @@ def test_calibrations_survive_their_file(tmp_path, name, vectors):
             spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})
             spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
             from eyerender.scene import Scene
-            from eyerender.scenespec import SceneSpec
+            from eyerender.scene.spec import SceneSpec
 
             scene = Scene.of(SceneSpec.from_mapping(spec))
         seen, rig = trace(scene), scene.rig
@@ -110,7 +110,7 @@ def test_calibrations_survive_their_file(tmp_path, name, vectors):
 def test_two_cameras_on_an_aspheric_eye(tmp_path):
     """Two cameras need no eye parameters, but a spherical cornea: E1 comes out to some thousandths of a degree."""
     from eyerender.scene import Scene
-    from eyerender.scenespec import SceneSpec
+    from eyerender.scene.spec import SceneSpec
 
     spec = load_scene("guestrin2006", eye="E1").spec.to_mapping()
     spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})

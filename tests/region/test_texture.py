@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
+from eyerender.errors import InputError
 from eyerender.region.look import Look
 from eyerender.region.texture import iris_texture, sclera_texture, skin_texture
 
@@ -46,7 +46,7 @@ def test_the_iris_closes_around_the_pupil():
 
 
 def test_a_look_refuses_impossible_albedos():
-    with pytest.raises(ValidationError):
+    with pytest.raises(InputError):
         Look(iris_albedo=1.2)
-    with pytest.raises(ValidationError):
+    with pytest.raises(InputError):
         Look(limbus_width_mm=-1.0)

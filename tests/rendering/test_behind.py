@@ -17,7 +17,7 @@ from eyerender.region.globe import Globe
 from eyerender.region.mesh import region_mesh
 from eyerender.rendering.occlusion import lid_margins_px
 from eyerender.scene import Scene, shipped_scenes
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 
 def quickstart(**changes):

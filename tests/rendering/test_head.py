@@ -18,7 +18,7 @@ from eyerender.capture import make_renderer, render_job, render_windows
 from eyerender.cli.app import run
 from eyerender.errors import InputError
 from eyerender.scene import Scene, load_scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from tests.support.labels import labels_of
 from tests.support.paths import SCRIPTS
 

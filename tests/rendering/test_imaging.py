@@ -11,7 +11,7 @@ from eyerender.rig.defocus import confusion_px, defocused, disc, vignette
 from eyerender.rig.imaging import Lens
 from eyerender.rig.sensor import Sensor
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 pytestmark = pytest.mark.render
 

@@ -10,7 +10,7 @@ import pytest
 
 from eyerender.capture import make_renderer, render_windows
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 pytestmark = pytest.mark.render
 

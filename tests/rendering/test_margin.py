@@ -97,7 +97,7 @@ def test_other_margins_compile_nothing(renderer):
 def drawn_scene(rig_name, side, seed, pupil_mm=4.0):
     """A study's scene of one eye with a drawn margin: a single direction, noise-free, the iris even."""
     from eyerender.scene import Scene, load_scene
-    from eyerender.scenespec import SceneSpec
+    from eyerender.scene.spec import SceneSpec
 
     data = load_scene(rig_name).spec.to_mapping()
     data["eye"] = {"model": "E2", "pupil_diameter_mm": pupil_mm, "margin": {"seed": seed}}
@@ -126,7 +126,7 @@ def test_both_observers_have_the_margin_of_a_scene(renderer, side):
     share = 1 - black / grey
     assert contour_error(share, polygon, job.window) < 0.02
     bare = scene.spec.model_copy(update={"eye": scene.spec.eye.model_copy(update={"margin": None})})
-    plain = trace(replace(scene, spec=bare), boundary_points=720).pupil.points_px[0]
+    plain = trace(scene.replaced(bare), boundary_points=720).pupil.points_px[0]
     assert contour_error(share, plain, job.window) > 0.2
 
 

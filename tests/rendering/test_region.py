@@ -13,7 +13,7 @@ from eyerender.labels import visible_arcs_deg
 from eyerender.region.anatomy import Region
 from eyerender.rendering.occlusion import glint_reason
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from tests.support.labels import labels_of
 
 pytestmark = pytest.mark.render

@@ -13,7 +13,7 @@ from eyerender.gaze.regression import FUNCTIONS
 from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import trace
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from eyerender.study import blignaut, guestrin
 from eyerender.study import literature as lit
 from eyerender.study.findings import t_tests

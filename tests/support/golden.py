@@ -16,7 +16,7 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
 from eyerender.imagefolder import RESULTS
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from tests.support.paths import DATA
 
 STORED = DATA / f"results_{RESULTS}.json"

@@ -27,7 +27,7 @@ from ...rendering.frame import globe_of
 from ...rendering.glints import GlintScene
 from ...rendering.occlusion import lid_margins_px
 from ...scene import Frames, Scene
-from ...scenespec import SceneSpec
+from ...scene.spec import SceneSpec
 from ..line import image_line, image_name
 from ..plan import Plan
 from ..realise import Realised, frames_of, realise

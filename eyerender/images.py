@@ -1,22 +1,102 @@
-"""Folders made from a scene: labelled images, or an export for the stock renderer."""
+"""Labelled images: frames rendered in memory, a scene rendered into a folder or exported for the stock renderer."""
 
 from __future__ import annotations
 
+import io
+from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 from .analytic.observer import trace
 from .backends.choose import BackendChoice
-from .capture import check_windows, render_job, render_windows
+from .capture import EyeImage, check_windows, make_renderer, render_job, render_windows
 from .errors import InputError, Warn
-from .imagefile import write_png
+from .imagefile import encode_png, preview, write_png
 from .imagefolder import write_dataset
-from .labels import seen_labels
+from .labels import image_labels, seen_labels
 from .observation import EYES
 from .outfolder import MARKER, refuse_non_empty, staged
 from .plausibility import is_saturated, saturation_warnings
 from .progress import Progress
-from .scene import Scene
+from .rig.rig import RigLike
+from .scene import Frame, Frames, Scene
+
+PICTURE_FIELDS = frozenset({"image", "sensor", "look", "region", "lens", "motion", "ambient", "seed"})
+"""The fields of a scene that change its pictures alone."""
+
+# A renderer keeps what it compiled and built; one for each way of rendering is enough for a notebook.
+_renderer = lru_cache(maxsize=1)(make_renderer)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledImage(EyeImage):
+    """A rendered picture of one eye with its labels.
+
+    Attributes:
+        labels: what a dataset holds for each image (docs/formats.md): pupil, iris, glints, lids, points in space.
+    """
+
+    labels: dict[str, Any]
+
+    def _repr_png_(self) -> bytes:
+        """The picture as notebooks show it, brightened for people to look at."""
+        buffer = io.BytesIO()
+        encode_png(buffer, preview(self.counts, self.scene.spec.sensor.full_scale_dn))
+        return buffer.getvalue()
+
+
+@overload
+def render(
+    frames: Frame, rig: RigLike | None = None, *, spp: int | None = None, backend: BackendChoice = "auto",
+    threads: int | None = None, progress: Progress | None = None, **picture: Any,
+) -> LabelledImage: ...  # fmt: skip
+@overload
+def render(
+    frames: Frames | Scene, rig: RigLike | None = None, *, spp: int | None = None, backend: BackendChoice = "auto",
+    threads: int | None = None, progress: Progress | None = None, **picture: Any,
+) -> list[LabelledImage]: ...  # fmt: skip
+def render(
+    frames: Frames | Scene,
+    rig: RigLike | None = None,
+    *,
+    spp: int | None = None,
+    backend: BackendChoice = "auto",
+    threads: int | None = None,
+    progress: Progress | None = None,
+    **picture: Any,
+) -> LabelledImage | list[LabelledImage]:
+    """Render frames in memory, each eye in a window of its own.
+
+    Args:
+        frames: one frame (`frames[0]`), several, or a scene, which stands for all of its frames.
+        rig: replaces the one that the frames were made for.
+        spp: samples per pixel.
+        backend: what renders.
+        threads: how many processor threads render; None takes all.
+        progress: hears (done, all, "") after each image.
+        picture: fields of the scene that change its pictures alone: `image`, `sensor`, `look`, `region`, `lens`,
+            `motion`, `ambient`, `seed`.
+
+    Returns:
+        One image for one frame, else a list with an image for each row.
+
+    Raises:
+        InputError: a value does not fit, or a window cannot be rendered.
+        BackendError: no backend renders; the message says how to fix it.
+    """
+    frames = frames.frames() if isinstance(frames, Scene) else frames
+    for name in picture.keys() - PICTURE_FIELDS:
+        raise InputError(f"changes more than the picture; allowed are {', '.join(sorted(PICTURE_FIELDS))}", path=name)
+    if picture or spp is not None:
+        frames = frames.of_scene(frames.scene.with_(spp=spp, **picture))
+    frames = frames.seen_by(rig)
+    truth = trace(frames)
+    out = []
+    for image in render_windows(frames, renderer=_renderer(backend, threads), progress=progress):
+        parts = {field.name: getattr(image, field.name) for field in fields(image)}
+        out.append(LabelledImage(**parts, labels=image_labels(image, truth)))
+    return out[0] if isinstance(frames, Frame) else out
 
 
 def render_folder(

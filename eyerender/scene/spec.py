@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic.json_schema import SkipJsonSchema
 
-from .errors import InputError
-from .eye.margin import PupilMargin
-from .observation import MAX_GLINTS
-from .region.anatomy import Region
-from .region.look import Look
-from .rig.imaging import Ambient, Lens, Motion
-from .rig.rig import Rig
-from .rig.sensor import Sensor
-from .spec import FileSpec, Positive, Spec, Vec2, Vec3
+from ..errors import InputError
+from ..eye.catalogue import load_eye
+from ..eye.margin import PupilMargin
+from ..eye.model import EyeModel
+from ..eye.spec import EyeSpec, Side
+from ..observation import MAX_GLINTS
+from ..region.anatomy import Region
+from ..region.look import Look
+from ..rig.imaging import Ambient, Lens, Motion
+from ..rig.rig import Rig
+from ..rig.sensor import Sensor
+from ..spec import FileSpec, Positive, Spec, Vec2, Vec3
+
+if TYPE_CHECKING:
+    from .scene import Frames
 
 DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
@@ -24,19 +34,69 @@ Count = Annotated[int, Field(ge=1, le=1000)]
 MAX_OBSERVATIONS = 200_000
 
 
+def _model_tag(value: Any) -> str:
+    return "EyeSpec" if isinstance(value, Mapping | EyeSpec) else "name"
+
+
+Model = Annotated[Annotated[str, Tag("name")] | Annotated[EyeSpec, Tag("EyeSpec")], Discriminator(_model_tag)]
+
+
 class Eye(Spec):
     """The eye model and its settings."""
 
-    model: str = Field(default="E2", description="a catalogue name, or an eye file (relative to the scene)")
+    POSITIONAL: ClassVar[tuple[str, ...]] = ("model",)
+    if TYPE_CHECKING:
+
+        def __init__(self, model: Any = "E2", **fields: Any) -> None: ...
+
+    model: Model = Field(
+        default="E2", description="a catalogue name, an eye file (relative to the scene), or the keys of an eye file"
+    )
     pupil_diameter_mm: Positive | None = Field(
         default=None, description="diameter of the anatomical pupil; default: the eye file's"
     )
     line_of_sight: Literal["chief_ray", "entrance_window"] = "chief_ray"
     margin: PupilMargin | None = Field(default=None, description="boundary of the pupil; default: the eye file's")
 
+    @classmethod
+    def load(cls, model: str | EyeSpec, **fields: Any) -> Self:
+        """An eye that is known to be possible.
+
+        Args:
+            model: a name of the catalogue ("E1" to "E5"), an eye file, or the eye's own record.
+            fields: further fields of `Eye`, such as `pupil_diameter_mm`.
+
+        Raises:
+            InputError: there is no such eye, or a value does not fit.
+        """
+        eye = cls(model, **fields)
+        eye.build()
+        return eye
+
+    def spec(self, base: Path | None = None) -> EyeSpec:
+        """The eye's surfaces and media; `base` is the folder that an eye file's name is relative to."""
+        if isinstance(self.model, EyeSpec):
+            return self.model
+        inside = base is not None and self.model.endswith((".yaml", ".yml"))
+        return load_eye(str(base / self.model) if base is not None and inside else self.model)
+
+    def build(self, side: Side = "right", *, wavelength_nm: float = 850.0) -> EyeModel:
+        """The numeric eye of one side."""
+        spec = self.spec() if self.margin is None else self.margin.applied(self.spec())
+        return spec.build(eye=side, wavelength_nm=wavelength_nm, pupil_diameter_mm=self.pupil_diameter_mm)
+
 
 class Subject(Spec):
     """The eyes of the subject, their distance, and the head positions."""
+
+    POSITIONAL: ClassVar[tuple[str, ...]] = ("eye",)
+    if TYPE_CHECKING:
+
+        def __init__(self, eye: Any = None, **fields: Any) -> None: ...
+
+    eye: SkipJsonSchema[Eye | None] = Field(
+        default=None, description="the eye model, for Python code; a scene file gives it under its own key 'eye'"
+    )
 
     eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = ("right", "left")
     ipd_mm: Positive = Field(default=63.0, description="interpupillary distance")
@@ -47,6 +107,39 @@ class Subject(Spec):
         if len(set(self.eyes)) != len(self.eyes):
             raise ValueError("eyes: name each eye only once")
         return self
+
+    def fixating(self, targets_mm: ArrayLike, rig: Rig, **scene: Any) -> Frames:
+        """The frames in which the subject fixates targets, one after the other.
+
+        Args:
+            targets_mm: (n, 3) or (3,) world points.
+            rig: what observes the eyes.
+            scene: further fields of `Scene`: `region`, `look`, `sensor`, `seed`, ...
+
+        Raises:
+            InputError: a value does not fit, or a target that no pose of an eye fixates.
+        """
+        from .scene import Scene
+
+        targets = {"world_mm": np.asarray(targets_mm, dtype=float).reshape(-1, 3)}
+        return Scene(self, rig, targets=targets, **scene).frames()
+
+    def looking(self, directions_deg: ArrayLike, rig: Rig, **scene: Any) -> Frames:
+        """The frames in which the optic axes of the eyes have directions, one after the other.
+
+        Args:
+            directions_deg: (n, 2) or (2,) azimuth (positive to the subject's left) and elevation (positive up).
+            rig: what observes the eyes.
+            scene: further fields of `Scene`.
+
+        Raises:
+            InputError: a value does not fit.
+        """
+        from .scene import Scene
+
+        angles = np.asarray(directions_deg, dtype=float).reshape(-1, 2)
+        poses = [EyeDirection(azimuth_deg=azimuth, elevation_deg=elevation) for azimuth, elevation in angles]
+        return Scene(self, rig, poses=poses, **scene).frames()
 
 
 class Targets(Spec):
@@ -123,6 +216,19 @@ class SceneSpec(FileSpec):
                 if any(w > r for w, r in zip(self.image.window_px, camera.resolution_px, strict=True)):
                     raise ValueError(f"image.window_px: is larger than the sensor of rig.cameras.{i}")
         return self
+
+    @classmethod
+    def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The mapping with the subject's eye under the scene's own key."""
+        subject = data.get("subject")
+        if isinstance(subject, Spec):
+            subject = subject.to_mapping()
+        if not isinstance(subject, Mapping) or subject.get("eye") is None:
+            return data
+        if "eye" in data:
+            raise InputError("is given twice, for the scene and for its subject", path="eye")
+        rest = {key: value for key, value in subject.items() if key != "eye"}
+        return {**data, "eye": subject["eye"], "subject": rest}
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:

@@ -6,31 +6,36 @@ Frames are ordered by head position, then fixation, then camera; within a frame 
 from __future__ import annotations
 
 import hashlib
+import math
 import os
-from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from .arrays import ArrayValue, Floats
-from .errors import InputError, InputWarning
-from .eye.catalogue import load_eye
-from .eye.fixation import fixations
-from .eye.margin import PupilMargin
-from .eye.model import EyeModel
-from .eye.pose import listing_torsion
-from .eye.spec import EyeSpec
-from .observation import EYES, Index, PoseTruth
-from .plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
-from .region.anatomy import Region
-from .rig.camera import Window
-from .rig.imaging import Ambient
-from .rig.rig import RigGeometry, RigLike
-from .scenespec import DATASET_KIND, NOT_A_SCENE, SceneSpec
-from .spec import file_digest, read_yaml
-from .status import Status
+from ..arrays import ArrayValue, Bools, Floats, Indices
+from ..errors import InputError, InputWarning
+from ..eye.fixation import fixations
+from ..eye.margin import PupilMargin
+from ..eye.model import EyeModel
+from ..eye.pose import listing_torsion
+from ..eye.spec import EyeSpec
+from ..observation import EYES, Index, PoseTruth
+from ..plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
+from ..region.anatomy import Region
+from ..rig.camera import PinholeCamera, Window
+from ..rig.imaging import Ambient
+from ..rig.rig import Rig, RigGeometry, RigLike
+from ..spec import Spec, file_digest
+from ..status import Status
+from .spec import SceneSpec, Subject
+
+EYE_WINDOW_MM = (32.0, 24.0)
+"""What a window shows about each of two eyes, where a scene says nothing else: both lids and the corners."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,11 +53,25 @@ class Frames(ArrayValue):
     def __len__(self) -> int:
         return len(self.index)
 
+    @overload
+    def __getitem__(self, row: int) -> Frame: ...
+    @overload
+    def __getitem__(self, row: slice | Indices | Bools) -> Frames: ...
+    def __getitem__(self, row: int | slice | Indices | Bools) -> Frames:
+        """One row as a `Frame`, or some of them (a slice, indices or a mask)."""
+        if not isinstance(row, int | np.integer):
+            return self.take(row)
+        number = range(len(self))[row]  # an index beyond the end is an IndexError, as in a list
+        return Frame(self.scene, self.index.take([number]), self.pose.take([number]))
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[row] for row in range(len(self)))
+
     def take(self, rows: Any) -> Frames:
         """Select rows (indices, a slice or a mask)."""
         return Frames(self.scene, self.index.take(rows), self.pose.take(rows))
 
-    def seen_by(self, rig: RigLike | None) -> Frames:
+    def seen_by(self, rig: RigLike | None) -> Self:
         """Place the same eyes in front of another rig with the same number of cameras; None changes nothing.
 
         Raises:
@@ -65,22 +84,85 @@ class Frames(ArrayValue):
                 f"are {len(built.cameras)}, but the frames were made for {len(self.scene.rig.cameras)}",
                 path="rig.cameras",
             )
-        return replace(self, scene=replace(self.scene, rig=built))
+        return self.of_scene(self.scene.replaced(rig=built))
+
+    def of_scene(self, scene: Scene) -> Self:
+        """The same eyes in the same poses, in a scene with another rig or other pictures."""
+        return replace(self, scene=scene)
 
 
-@dataclass(frozen=True, slots=True)
+class Frame(Frames):
+    """One row of `Frames`: one eye in one frame."""
+
+    __slots__ = ()
+
+
+@dataclass(frozen=True, slots=True, init=False)
 class Scene:
-    """A scene ready to be observed: the spec, the eye's spec and the numeric rig.
+    """A scene ready to be observed: what the scene's file says, the eye's spec and the numeric rig.
 
-    `base` is the folder to which files of its images (an HDR map, a head mesh) are relative, by default the current
-    folder. `source` is the name of the scene's file in messages.
+    Attributes:
+        spec: what a scene file says.
+        eye_spec: what the eye file says.
+        rig: the numeric rig.
+        base: what files of its pictures (an HDR map, a head mesh) are relative to, by default the current folder.
+        source: what messages call the scene's file.
     """
 
     spec: SceneSpec
     eye_spec: EyeSpec
     rig: RigGeometry
-    base: Path | None = None
-    source: str = ""
+    base: Path | None = field(compare=False)
+    source: str = field(compare=False)
+
+    def __init__(self, subject: Subject | None = None, rig: Rig | None = None, *, name: str = "scene", **fields: Any):
+        """Build a scene from objects.
+
+        Args:
+            subject: who looks, with the eye model.
+            rig: cameras, lights and screen.
+            name: what reports call the scene.
+            fields: the other fields of `SceneSpec`: `targets` or `poses`, `region`, `look`, `sensor`, `lens`,
+                `ambient`, `motion`, `image`, `wavelength_nm`, `seed`, `description`.
+
+        Raises:
+            InputError: a value does not fit, or an eye that cannot be.
+        """
+        given = {key: value for key, value in {"subject": subject, "rig": rig, **fields}.items() if value is not None}
+        made = Scene.of(SceneSpec(name=name, **given))
+        self._set(made.spec, made.eye_spec, made.rig, made.base, made.source)
+
+    def _set(self, spec: SceneSpec, eye_spec: EyeSpec, rig: RigGeometry, base: Path | None, source: str) -> None:
+        parts = {"spec": spec, "eye_spec": eye_spec, "rig": rig, "base": base, "source": source}
+        for key, value in parts.items():
+            object.__setattr__(self, key, value)
+
+    @classmethod
+    def compiled(
+        cls,
+        spec: SceneSpec,
+        eye_spec: EyeSpec,
+        *,
+        rig: RigGeometry | None = None,
+        base: Path | None = None,
+        source: str = "",
+    ) -> Scene:
+        """A scene of parts that are known to fit; without a `rig`, that of the spec."""
+        scene = object.__new__(cls)
+        scene._set(spec, eye_spec, spec.rig.build() if rig is None else rig, base, source)
+        return scene
+
+    def replaced(
+        self, spec: SceneSpec | None = None, *, eye_spec: EyeSpec | None = None, rig: RigGeometry | None = None
+    ) -> Scene:
+        """The scene with another spec (and its rig), another eye or another rig."""
+        return Scene.compiled(
+            spec or self.spec,
+            eye_spec or self.eye_spec,
+            rig=rig or (self.rig if spec is None else None),
+            base=self.base,
+            source=self.source,
+        )
 
     @classmethod
     def of(cls, spec: SceneSpec, *, base: Path | None = None, eye: str | None = None, source: str = "") -> Scene:
@@ -95,13 +177,9 @@ class Scene:
         Raises:
             InputError: an eye is not possible or, where a `base` is given, a file does not exist.
         """
-        name = eye if eye is not None else spec.eye.model
-        if eye is None and base is not None and name.endswith((".yaml", ".yml")):
-            name = str(base / name)
         if eye is not None:
             spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": eye})})
-        eye_spec = load_eye(name)
-        scene = cls(spec, eye_spec, spec.rig.build(), base, source)
+        scene = cls.compiled(spec, spec.eye.spec(base if eye is None else None), base=base, source=source)
         try:
             scene.eye("right")
             for file in scene.files if base is not None else ():
@@ -110,6 +188,47 @@ class Scene:
         except InputError as error:
             raise InputError(error.reason, source=error.source or source, path=error.path) from None
         return scene
+
+    def with_(
+        self,
+        changes: Mapping[str, Any] | None = None,
+        *,
+        pupil_diameter_mm: float | None = None,
+        gaze_deg: ArrayLike | None = None,
+        target_mm: ArrayLike | None = None,
+        spp: int | None = None,
+        **fields: Any,
+    ) -> Scene:
+        """The scene with other values.
+
+        Args:
+            changes: values by the path that error messages name, such as `{"rig.lights.1.radius_mm": 2.5}`; a None
+                takes a key away.
+            pupil_diameter_mm: of the anatomical pupil.
+            gaze_deg: azimuth and elevation of the optic axis, (2,) or (n, 2), instead of the targets.
+            target_mm: world points that are fixated, (3,) or (n, 3), instead of the targets.
+            spp: samples per pixel.
+            fields: whole fields of `SceneSpec`, such as `rig`, `region`, `look`, `sensor` or `seed`.
+
+        Raises:
+            InputError: a value does not fit, or an eye that cannot be.
+        """
+        data = {**self.spec.to_mapping(), **fields}
+        if gaze_deg is not None or target_mm is not None:
+            data["targets"] = data["poses"] = None
+        if gaze_deg is not None:
+            angles = np.asarray(gaze_deg, dtype=float).reshape(-1, 2)
+            data["poses"] = [{"azimuth_deg": azimuth, "elevation_deg": elevation} for azimuth, elevation in angles]
+        if target_mm is not None:
+            data["targets"] = {"world_mm": np.asarray(target_mm, dtype=float).reshape(-1, 3)}
+        paths = dict(changes or {})
+        if pupil_diameter_mm is not None:
+            paths["eye.pupil_diameter_mm"] = pupil_diameter_mm
+        if spp is not None:
+            paths["image.spp"] = spp
+        for path, value in paths.items():
+            _put(data, path, value)
+        return Scene.of(SceneSpec.from_mapping(data), base=self.base, source=self.source)
 
     @property
     def name(self) -> str:
@@ -297,28 +416,53 @@ class Scene:
     def windows(self) -> dict[tuple[int, int, int], Window]:
         """Rendered window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.
 
-        A window is centred on the image of the unrotated eye's apex, so it does not move with the gaze, and it is kept
-        on the sensor. Without `image.window_px` it is the whole sensor.
+        A window is centred on the image of the unrotated eye's apex, so it does not move with the gaze; it is kept on
+        the sensor. Without `image.window_px` it is the whole sensor for one eye, and `EYE_WINDOW_MM` for two.
         """
         out = {}
         for c, camera in enumerate(self.rig.cameras):
             w, h = camera.resolution_px
+            ww, wh = self._window_px(camera)
             for k, head in enumerate(self.spec.subject.head_positions_mm):
                 for side in self.spec.subject.eyes:
-                    out[c, k, EYES.index(side)] = (0, 0, w, h)
-                    if self.spec.image.window_px is None:
-                        continue
                     (u, v), front = camera.project(self.eye_position_mm(side) + np.array(head))
-                    front = front and np.isfinite(u) and np.isfinite(v)  # distortion can overflow beside the camera
-                    ww, wh = self.spec.image.window_px
+                    front = front and np.isfinite(u) and np.isfinite(v)  # beside the camera distortion can overflow
                     x0 = int(np.floor((u if front else (w - 1) / 2) - (ww - 1) / 2 + 0.5))
                     y0 = int(np.floor((v if front else (h - 1) / 2) - (wh - 1) / 2 + 0.5))
                     out[c, k, EYES.index(side)] = (min(max(x0, 0), w - ww), min(max(y0, 0), h - wh), ww, wh)
         return out
 
+    def _window_px(self, camera: PinholeCamera) -> tuple[int, int]:
+        """Width and height of a camera's windows."""
+        if self.spec.image.window_px is not None:
+            return self.spec.image.window_px
+        w, h = camera.resolution_px
+        if len(self.spec.subject.eyes) == 1:
+            return w, h
+        scale = max(camera.scale_at(self.eye_position_mm(side)) for side in self.spec.subject.eyes)
+        width, height = (16 * math.ceil(side_mm * scale / 16) for side_mm in EYE_WINDOW_MM)
+        return min(width, w), min(height, h)
+
     def rig_mapping(self) -> dict[str, Any]:
         """Rig as `features --json` writes it (docs/formats.md)."""
         return self.rig.to_mapping()
+
+
+def _put(data: dict[str, Any], path: str, value: Any) -> None:
+    """Set the value at a dotted path of a mapping, making the mappings on the way."""
+    keys = path.split(".")
+    here: Any = data
+    try:
+        for key in keys[:-1]:
+            if isinstance(here, list):
+                here = here[int(key)]
+            else:
+                if isinstance(here.get(key), Spec):
+                    here[key] = here[key].to_mapping()
+                here = here.setdefault(key, {})
+        here[int(keys[-1]) if isinstance(here, list) else keys[-1]] = value
+    except (AttributeError, IndexError, TypeError, ValueError):
+        raise InputError("there is no such key", path=path) from None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -341,73 +485,3 @@ def _built_eye(
     """Numeric eye, cached because observers, renderer and labels request the same one repeatedly."""
     spec = eye.spec if margin is None else margin.applied(eye.spec)
     return spec.build(eye="left" if left else "right", wavelength_nm=wavelength_nm, pupil_diameter_mm=pupil_diameter_mm)
-
-
-def shipped_scenes() -> dict[str, Path]:
-    """Map the names of the scenes that come with the package to their files."""
-    return {name: path for name, path in shipped_files().items() if not is_shipped_dataset(path)}
-
-
-@cache
-def is_shipped_dataset(path: Path) -> bool:
-    """Whether a shipped file is a dataset, cached because the file never changes and parsing all of them is slow."""
-    return is_dataset(path)
-
-
-def shipped_files() -> dict[str, Path]:
-    """Map the names of the scenes and dataset specs that come with the package to their files."""
-    package = Path(__file__).resolve().parent
-    for folder in (package / "data" / "scenes", package.parent / "scenes"):
-        if folder.is_dir():
-            return {p.stem: p for p in sorted(folder.glob("*.yaml"))}
-    return {}
-
-
-def is_dataset(path: Path) -> bool:
-    """Whether a YAML file declares itself the spec of a dataset (`kind: dataset`) instead of a scene."""
-    try:
-        return read_yaml(path).get("kind") == DATASET_KIND
-    except InputError:
-        return False
-
-
-def refuse_folder(path: Path, wanted: str) -> None:
-    """Raise an `InputError` for a folder given instead of a file, which names the file that was probably meant."""
-    if not os.path.isdir(path):
-        return
-    hint = ""
-    if (path / "scene.yaml").is_file():
-        hint = f"; give {path / 'scene.yaml'}"
-    elif (path / "images").is_dir():
-        hint = f"; the images that were made are in {path / 'images'}"
-    raise InputError(f"is a folder; give {wanted}{hint}", source=str(path))
-
-
-def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = None, seed: int | None = None) -> Scene:
-    """Load a scene from a file, or by the bare name of a shipped one.
-
-    Args:
-        scene: path of a YAML file, or a shipped scene's name.
-        eye: replaces the scene's eye model (a catalogue name or an eye file).
-        spp: replaces the samples per pixel.
-        seed: replaces the seed.
-
-    Raises:
-        InputError: one line that names the file and the key, or the option whose value does not fit.
-    """
-    path = Path(scene)
-    shipped = shipped_scenes()
-    if not os.path.isfile(path):
-        if str(scene) in shipped:
-            path = shipped[str(scene)]
-        elif str(scene) in shipped_files():
-            raise InputError(NOT_A_SCENE, source=str(scene))
-        elif path.suffix not in (".yaml", ".yml") and not os.path.exists(path):
-            raise InputError(f"no such scene file; shipped scenes: {', '.join(shipped)}", source=str(scene))
-    refuse_folder(path, "a scene file, or the name of a shipped scene")
-    spec = SceneSpec.load(path)
-    if spp is not None:
-        spec = spec.with_spp(spp)
-    if seed is not None:
-        spec = spec.replaced("--seed", {"seed": seed})
-    return Scene.of(spec, base=path.parent, eye=eye, source=str(path))

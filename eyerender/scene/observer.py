@@ -1,0 +1,17 @@
+"""What every observer does."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from ..observation import Observations
+from ..rig.rig import RigLike
+from .scene import Frames
+
+
+class Observer(Protocol):
+    """Whatever reports the pupils and glints of frames: `AnalyticObserver`, `ImageObserver`, or a class of your own."""
+
+    def observe(self, frames: Frames, rig: RigLike | None = None) -> Observations:
+        """Report one observation for each row of `frames`; `rig` replaces the one that they were made for."""
+        ...

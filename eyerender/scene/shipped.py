@@ -1,0 +1,82 @@
+"""Scene files: those that come with the package, and loading one by path or by name."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+
+from ..errors import InputError
+from ..spec import read_yaml
+from .scene import Scene
+from .spec import DATASET_KIND, NOT_A_SCENE, SceneSpec
+
+
+def shipped_scenes() -> dict[str, Path]:
+    """Map the names of the scenes that come with the package to their files."""
+    return {name: path for name, path in shipped_files().items() if not is_shipped_dataset(path)}
+
+
+@cache
+def is_shipped_dataset(path: Path) -> bool:
+    """Whether a shipped file is a dataset, cached because the file never changes and parsing all of them is slow."""
+    return is_dataset(path)
+
+
+def shipped_files() -> dict[str, Path]:
+    """Map the names of the scenes and dataset specs that come with the package to their files."""
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "data" / "scenes", package.parent / "scenes"):
+        if folder.is_dir():
+            return {p.stem: p for p in sorted(folder.glob("*.yaml"))}
+    return {}
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a YAML file declares itself the spec of a dataset (`kind: dataset`) instead of a scene."""
+    try:
+        return read_yaml(path).get("kind") == DATASET_KIND
+    except InputError:
+        return False
+
+
+def refuse_folder(path: Path, wanted: str) -> None:
+    """Raise an `InputError` for a folder given instead of a file, which names the file that was probably meant."""
+    if not os.path.isdir(path):
+        return
+    hint = ""
+    if (path / "scene.yaml").is_file():
+        hint = f"; give {path / 'scene.yaml'}"
+    elif (path / "images").is_dir():
+        hint = f"; the images that were made are in {path / 'images'}"
+    raise InputError(f"is a folder; give {wanted}{hint}", source=str(path))
+
+
+def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = None, seed: int | None = None) -> Scene:
+    """Load a scene from a file, or by the bare name of a shipped one.
+
+    Args:
+        scene: path of a YAML file, or a shipped scene's name.
+        eye: replaces the scene's eye model (a catalogue name or an eye file).
+        spp: replaces the samples per pixel.
+        seed: replaces the seed.
+
+    Raises:
+        InputError: one line that names the file and the key, or the option whose value does not fit.
+    """
+    path = Path(scene)
+    shipped = shipped_scenes()
+    if not os.path.isfile(path):
+        if str(scene) in shipped:
+            path = shipped[str(scene)]
+        elif str(scene) in shipped_files():
+            raise InputError(NOT_A_SCENE, source=str(scene))
+        elif path.suffix not in (".yaml", ".yml") and not os.path.exists(path):
+            raise InputError(f"no such scene file; shipped scenes: {', '.join(shipped)}", source=str(scene))
+    refuse_folder(path, "a scene file, or the name of a shipped scene")
+    spec = SceneSpec.load(path)
+    if spp is not None:
+        spec = spec.with_spp(spp)
+    if seed is not None:
+        spec = spec.replaced("--seed", {"seed": seed})
+    return Scene.of(spec, base=path.parent, eye=eye, source=str(path))

@@ -1,0 +1,197 @@
+"""Scenes built from objects: the same scenes, and the same mistakes, as from YAML."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import eyerender as er
+from eyerender.spec import Spec
+
+ROOT = Path(__file__).parents[1]
+
+RIG = er.Rig.from_mapping(
+    {
+        "cameras": [{"position_mm": [600, 0, -150], "look_at_mm": [0, 0, 0], "resolution_px": [640, 480],
+                     "focal_length_px": 4000}],
+        "lights": [{"position_mm": [600, 120, 0]}, {"position_mm": [600, -120, 0]}],
+        "screen": {"centre_mm": [650, 0, 0], "size_mm": [377, 301]},
+    }
+)  # fmt: skip
+
+
+def rebuilt(value):
+    """The same value made by constructors, with lists for tuples."""
+    if isinstance(value, Spec):
+        return type(value)(**{name: rebuilt(getattr(value, name)) for name in type(value).model_fields})
+    return [rebuilt(v) for v in value] if isinstance(value, tuple) else value
+
+
+@pytest.mark.parametrize("name", sorted(er.shipped_scenes()))
+def test_objects_give_the_scene_of_the_file(name):
+    loaded = er.load_scene(name)
+    made = rebuilt(loaded.spec)
+    assert made == loaded.spec
+    assert made.digest() == loaded.spec.digest()
+    parts = {key: getattr(made, key) for key in type(made).model_fields if key not in ("subject", "rig", "eye")}
+    scene = er.Scene(er.Subject(made.eye, **rebuilt_fields(made.subject)), made.rig, **parts)
+    assert scene.spec == loaded.spec
+    assert scene == loaded
+
+
+def rebuilt_fields(subject):
+    return {key: rebuilt(getattr(subject, key)) for key in ("eyes", "ipd_mm", "head_positions_mm")}
+
+
+def test_arrays_and_positions_without_names():
+    assert er.Led(np.array([1.0, 2, 3])) == er.Led(position_mm=(1, 2, 3)) == er.Led([1, 2, 3])
+    assert er.Screen([650, 0, 0], (377, 301)) == RIG.screen
+    camera = er.Camera.looking_at((0, 0, 0), position_mm=(600, 0, -150), focal_length_px=4000, size_px=(640, 480))
+    assert camera == RIG.cameras[0]
+    with pytest.raises(TypeError, match="takes position_mm without a name"):
+        er.Led((1, 2, 3), (4, 5, 6))  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match="no values without a name"):
+        er.Sensor(12)  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize(
+    ("make", "data"),
+    [
+        (er.Led, {"position_mm": [1, 2]}),
+        (er.Led, {"position_mm": [1, 2, 3], "radius_mm": -1}),
+        (er.Led, {"position_mm": [1, 2, 3], "radius": 1}),
+        (er.Led, {"position_mm": [float("nan"), 2, 3]}),
+        (er.Sensor, {"bit_depth": "12"}),
+        (er.Rig, {"cameras": [], "lights": []}),
+        (er.Subject, {"eyes": ["left", "left"]}),
+        (er.Targets, {}),
+        (er.SceneSpec, {"name": "x", "rig": {"cameras": [{"resolution_px": [640, 480]}], "lights": []}}),
+    ],
+)
+def test_a_mistake_is_the_same_line_as_in_yaml(make, data):
+    with pytest.raises(er.InputError) as from_yaml:
+        make.from_mapping(yaml.safe_load(yaml.safe_dump(data)))
+    with pytest.raises(er.InputError) as from_python:
+        make(**data)
+    assert str(from_python.value) == str(from_yaml.value)
+    assert "\n" not in str(from_python.value)
+
+
+def test_what_is_no_value_at_all_is_refused():
+    with pytest.raises(er.InputError, match="object is not allowed"):
+        er.Led(object())
+
+
+def test_an_eye_can_be_given_as_its_own_record():
+    spec = er.load_eye("E2")
+    inline, named = (
+        er.Scene(er.Subject(er.Eye.load(model)), RIG, targets=er.Targets(grid=(2, 1))) for model in (spec, "E2")
+    )
+    assert inline.eye_spec == named.eye_spec
+    np.testing.assert_array_equal(er.trace(inline).pupil.points_px, er.trace(named).pupil.points_px)
+    again = er.SceneSpec.from_mapping(yaml.safe_load(inline.spec.to_yaml()))
+    assert again == inline.spec
+    with pytest.raises(er.InputError, match="E9: no such eye"):
+        er.Eye.load("E9")
+    with pytest.raises(er.InputError, match="wider than the iris"):
+        er.Eye.load("E1", pupil_diameter_mm=40.0)
+    with pytest.raises(er.InputError, match="given twice"):
+        er.SceneSpec(
+            name="x", eye=er.Eye("E1"), subject=er.Subject(er.Eye("E2")), rig=RIG, targets=er.Targets(grid=(1, 1))
+        )
+
+
+def test_with_changes_what_it_names_and_nothing_else():
+    scene = er.load_scene("quickstart")
+    changed = scene.with_({"rig.lights.0.radius_mm": 2.5}, pupil_diameter_mm=3, gaze_deg=(5, -3), seed=7)
+    assert changed.pupil_diameter_mm == pytest.approx(3)
+    assert changed.spec.poses == (er.EyeDirection(azimuth_deg=5, elevation_deg=-3),)
+    assert changed.spec.targets is None
+    assert changed.spec.rig.lights[0].radius_mm == 2.5
+    assert changed.spec.seed == 7
+    radius = scene.spec.rig.lights[0].radius_mm
+    back = changed.with_({"rig.lights.0.radius_mm": radius, "poses": None},
+                         targets=scene.spec.targets, eye=scene.spec.eye, seed=scene.spec.seed)  # fmt: skip
+    assert back.spec == scene.spec
+    np.testing.assert_allclose(np.degrees(changed.frames().pose.azimuth_rad), 5)
+    lines = {
+        "rig.lights.9.radius_mm": "rig.lights.9.radius_mm: there is no such key",
+        "rig.foo": "rig.foo: unknown key",
+        "seed.x": "seed.x: there is no such key",
+    }
+    for wrong, line in lines.items():
+        with pytest.raises(er.InputError, match=re.escape(line)):
+            scene.with_({wrong: 1})
+
+
+def test_one_led_of_a_ring_can_be_moved():
+    ring = er.LedRing(radius_mm=20, count=6)
+    rig = er.Rig(cameras=RIG.cameras, lights=(er.Led((600, 0, 100)), er.Led(ring=ring, radius_mm=1.5)))
+    moved = rig.with_light(3, moved_mm=(0, 0, 2), intensity_mw_sr=5)
+    before, after = rig.build().lights, moved.build().lights
+    assert len(after) == len(before) == moved.light_count
+    for k, (a, b) in enumerate(zip(before, after, strict=True)):
+        if k == 3:
+            np.testing.assert_allclose(b.position_mm, a.position_mm + np.array([0, 0, 2]), rtol=0, atol=1e-12)
+            assert (b.radius_mm, b.intensity_mw_sr) == (1.5, 5)
+        else:
+            assert a == b
+    with pytest.raises(er.InputError, match="there is no light 7, only 7"):
+        rig.with_light(7, radius_mm=1)
+
+
+def test_frames_are_a_sequence_of_one_eye_in_one_frame():
+    frames = er.Subject(er.Eye("E1")).fixating(RIG.screen.grid(3, 3), RIG)
+    assert len(frames) == 18
+    assert isinstance(frames[0], er.Frame)
+    assert len(list(frames)) == 18
+    assert int(frames[-1].index.fixation[0]) == 8
+    assert len(frames[frames.index.eye == 1]) == 9
+    with pytest.raises(IndexError):
+        frames[18]
+    looking = er.Subject(er.Eye("E1"), eyes=["left"]).looking([(5, -3), (0, 0)], RIG)
+    np.testing.assert_allclose(np.degrees(looking.pose.azimuth_rad), [5, 0])
+
+
+def test_another_rig_sees_the_same_eyes():
+    frames = er.Subject(er.Eye("E1")).fixating(RIG.screen.grid(2, 2), RIG)
+    other = RIG.with_light(0, moved_mm=(0, 10, 0))
+    seen, direct = er.trace(frames, other), er.trace(er.Subject(er.Eye("E1")).fixating(RIG.screen.grid(2, 2), other))
+    assert seen == direct
+    with pytest.raises(er.InputError, match="are 2, but the frames were made for 1"):
+        er.trace(frames, er.Rig(cameras=RIG.cameras * 2, lights=RIG.lights))
+
+
+@pytest.mark.render
+def test_the_short_example_of_the_documentation():
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    example = re.search(r"```python\n(import eyerender as er\n.*?)```", page, re.S).group(1)
+    assert len(example.strip().splitlines()) <= 15
+    names: dict = {}
+    exec(example, names)
+    image, truth, found, gaze = (names[key] for key in ("image", "truth", "found", "gaze"))
+    assert image.counts.shape == image.irradiance.shape == image.parts.shape
+    assert image.labels["pupil"]["visible_fraction"] == 1.0
+    assert image._repr_png_().startswith(b"\x89PNG")
+    assert found.pupil.ok.all()
+    assert np.abs(found.pupil.centre_px - truth.pupil.centre_px).max() < 0.5
+    wanted = truth.index.target_mm
+    assert np.median(np.linalg.norm(gaze.point_mm - wanted, axis=1)) < 5  # mm on a screen 650 mm away
+    with pytest.raises(er.InputError, match="eye: changes more than the picture"):
+        er.render(names["frames"][0], rig=names["rig"], eye=er.Eye("E1"))
+
+
+@pytest.mark.render
+def test_a_picture_in_memory_is_the_one_in_the_folder(tmp_path):
+    scene = er.load_scene("quickstart").with_(spp=2)
+    frames = scene.frames()
+    er.render_folder(scene, tmp_path / "out")
+    entry = er.ImageFolder.load(tmp_path / "out").entries[3]
+    image = er.render(frames[3])
+    np.testing.assert_array_equal(entry.image(), image.counts)
+    np.testing.assert_array_equal(entry.mask(), image.parts)
+    assert er.render(frames[3:5], look=er.Look(iris_albedo=0.5))[0].irradiance.mean() > image.irradiance.mean()
