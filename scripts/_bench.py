@@ -1,4 +1,4 @@
-"""What the benches share: options, rows against their bars, the table, the report in JSON, the exit status."""
+"""Code that the benches share: options, rows with their limits, the table, the JSON report, the exit status."""
 
 from __future__ import annotations
 

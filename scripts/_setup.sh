@@ -1,8 +1,9 @@
 # Sourced by scripts/eyerender and scripts/test: brings this checkout's environment, .venv, up to date.
 #
-# Needs a Python >= 3.11 with pip (22.3 or newer); asks neither ensurepip nor root. What is up to date is known from a
-# stamp: a hash of pyproject.toml, constraints.txt, the interpreter and the checkout's place. A set-up that fails leaves
-# no stamp. Everything said goes to stderr. EYERENDER_PYTHON names the interpreter to build .venv with.
+# It needs a Python >= 3.11 with pip (22.3 or newer), but neither ensurepip nor root. A stamp tells whether the
+# environment is up to date: a hash of pyproject.toml, constraints.txt, the interpreter and the path of the checkout.
+# A failed set-up leaves no stamp. All messages go to stderr. EYERENDER_PYTHON names the interpreter that builds
+# .venv.
 
 script=$0
 while [ -h "$script" ]; do

@@ -3,12 +3,12 @@
 
     bench_extraction.py [--quick] [--json F] [--seed 10000] [--count N] [--only ideal|confidence|rendered]
 
-Images come from make_ideal_images.py, 40 a row (`--quick`: 10), seeds from 10,000 on; development used those below. The
-bound is the Cramer-Rao bound of a blurred step: per axis (s / step) sqrt(2 sigma_b / (sqrt(pi) R)) with
-sigma_b^2 = blur^2 + 1/12 and R = sqrt(a b); its radial median is 1.177 of it. Without added noise s is that of
-rounding, 1/sqrt(12). The same rows follow on images of the package's own renderer (rendered_eyes.py), 40 an eye model:
-on an even iris with the bars of the ideal images, with the iris' texture, and in the lids. Exit 1 when a `must` is
-missed.
+Images come from make_ideal_images.py, 40 per row (`--quick`: 10), with seeds from 10,000 on; development used the
+seeds below. The bound is the Cramer-Rao bound of a blurred step: per axis (s / step) sqrt(2 sigma_b / (sqrt(pi) R))
+with sigma_b^2 = blur^2 + 1/12 and R = sqrt(a b); the radial median is 1.177 times the bound. Without added noise, s
+is the rounding noise, 1/sqrt(12). The same rows follow on rendered images (rendered_eyes.py), 40 per eye model: with
+an even iris and the limits of the ideal images, with a textured iris, and with lids. The exit code is 1 if a `must`
+is missed.
 """
 
 from __future__ import annotations

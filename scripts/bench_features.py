@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Bench of the analytic features: time a frame and eye, how it grows, memory, residuals.
+"""Bench of the analytic features: time per frame and eye, its growth, memory, residuals.
 
     bench_features.py [--quick] [--json F]
 
-The Blignaut scene: both eyes, random targets on its screen, fixation by chief ray, 30 boundary points with their
-ellipse, the stop's centre and a glint. The clock is the process' CPU time, the best of several runs, so that other work
-on the machine counts as little as may be; no product of matrices here is large enough to be spread over cores. Exit 1
-when a `must` is missed.
+The bench uses the Blignaut scene: both eyes, random targets on its screen, fixation by chief ray, 30 boundary points
+with their ellipse, the centre of the stop and a glint. Times are CPU times of the process, the best of several runs,
+so other work on the machine has little influence. No matrix product here is large enough to be spread over cores. The
+exit code is 1 if a `must` is missed.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Bench of dataset runs: rate, what is not rendering, syncing, scaling over workers, memory, disk, killed runs.
+"""Bench of dataset runs: rate, time outside rendering, syncing, scaling over workers, memory, disk, killed runs.
 
     bench_generate.py [--quick] [--json F] [--backend llvm|cuda]
 
-Images are 640 x 480 px at 4 samples a pixel, E2, two LEDs, with labels and files. Rates are taken after every worker
-has made its first samples, so that starting and compiling are not in them; what is not rendering is CPU time of the
-worker's own thread, so that other work on the machine counts as little as may be. --quick makes fewer images and kills.
-Exit 1 when a `must` is missed.
+Images are 640 x 480 px at 4 samples per pixel, with E2, two LEDs, labels and files. Rates are measured after every
+worker has made its first samples, so they exclude starting and compiling. The time outside rendering is CPU time of
+the worker's own thread, so other work on the machine has little influence. --quick makes fewer images and kills. The
+exit code is 1 if a `must` is missed.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Bench of the renderer: physics against oracles of another kind, cost against stock Mitsuba, memory, determinism.
+"""Bench of the renderer: physics against independent oracles, cost against stock Mitsuba, memory, determinism.
 
     bench_render.py [--quick] [--json F] [--backend llvm|cuda] [--threads N]
 
-Bars are ratios or counts; seconds are reported. CPU time is the process' own, so that other work on the machine counts
-as little as may be. --quick takes fewer samples and poses: the bars stay, but the oracle's own standard error is then
-reported without one. Exit 1 when a `must` is missed.
+Limits apply to ratios and counts; seconds are only reported. Times are CPU times of the process, so other work on the
+machine has little influence. --quick takes fewer samples and poses with the same limits, but the standard error of the
+oracle then has no limit. The exit code is 1 if a `must` is missed.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The bench's rows on images of the package's own renderer, by rig and eye model, drawn by several processes.
+"""Rows of the extraction bench on rendered images, by rig and eye model, rendered by several processes.
 
-Drawing is what costs: a close photograph takes one to two seconds of CPU at 64 samples a pixel. Those rows that go down
-to no noise are developed from one photograph at 64; the others, which all have noise of 2 DN, take 16, where the
-sampling lattice is 0.2 DN off at the textured rim and 0.4 DN at the even one (root mean square, against 256 samples),
-which makes noise of 2 DN 2 % larger at most.
+Rendering dominates the cost: a close photograph takes one to two seconds of CPU time at 64 samples per pixel. Rows
+that include images without noise are developed from one photograph with 64 samples. The other rows all have noise of
+2 DN and use 16 samples. There, the sampling lattice is off by 0.2 DN at a textured pupil boundary and 0.4 DN at an
+even one (root mean square, against 256 samples), which makes noise of 2 DN at most 2 % larger.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Bench of the studies: time, how well the published figures come out, whether calibrations find one minimum.
+"""Bench of the studies: time, agreement with the published figures, and whether calibrations find one minimum.
 
     bench_studies.py [--quick] [--images] [--json F]
 
-Runs guestrin2006, blignaut2014 and conditions with E1 to E5 (quick: E1 and E2, without conditions) as the command does,
-with a process for every processor; with --images also both replications with rendered images, the sensor's noise on and
-off, at the scenes' samples per pixel: minutes. Seconds are those of the clock, imports of the processes included; their
-`must` is meant for two quiet cores. Exit 1 when a `must` is missed.
+The bench runs guestrin2006, blignaut2014 and conditions with E1 to E5 (--quick: E1 and E2, without conditions) as the
+command does, with one process per processor. --images adds both replications with rendered images, with and without
+sensor noise, at the scenes' samples per pixel; this takes minutes. Times are clock times and include the imports of the
+processes. Their `must` is meant for two idle cores. The exit code is 1 if a `must` is missed.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Describe a head mesh for `region.head`: write its manifest, with check sums, and tell what its objects are.
+"""Describe a head mesh for `region.head`: write its manifest with checksums, and list its objects.
 
 python scripts/describe_head.py head.obj --unit cm --licence CC-BY-4.0 --right-eye -3.1 2 9.4 --left-eye 3.1 2 9.4 \\
     --part skin=Face --part lashes=LashesUpper,LashesLower [--forward 0 0 1] [--up 0 1 0] [--texture skin.png]
-python scripts/describe_head.py --example DIR      writes the package's own eye region as such a mesh, to begin with
+python scripts/describe_head.py --example DIR      writes the package's own eye region as an example mesh
 
-The manifest goes beside the (first) mesh; the scene then says `region: {head: {file: .../manifest.json}}`.
+The manifest is written beside the (first) mesh. The scene then needs `region: {head: {file: .../manifest.json}}`.
 """
 
 from __future__ import annotations

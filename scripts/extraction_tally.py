@@ -1,4 +1,4 @@
-"""What a row of images gave: errors of every image against its label, bounds, distances, times; and the bars."""
+"""Results of a row of images: errors of every image against its label, bounds, distances, times; and the limits."""
 
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
 
     fit_confidence.py [--count 8000] [--processes 2]
 
-Development seeds only (below 10,000): `count` mixed images and a tenth as many without an eye. Takes about a quarter
-of an hour.
+It uses development seeds only (below 10,000): `count` mixed images and a tenth as many without an eye. It takes about a
+quarter of an hour.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Contact sheets of the presets: every row varies one thing, for people to look at closely.
+"""Contact sheets of the presets for visual inspection: every row varies one quantity.
 
     python scripts/make_contact_sheets.py -o DIR [--preset NAME ...] [--spp N] [--gamma G] [--quick]
 
-Rows of a sheet: gaze (azimuth -25 to 25, then elevation -25 to 25 degrees), blink 0 to 1, pupil 2 to 8 mm, iris and
-skin from dark to pale, and subjects drawn at random. Pictures are stretched to the full range of grey; near-infrared
-cameras are linear, and the default gamma of 1.4 lifts the shadows a little.
+The rows of a sheet are: gaze (azimuth -25 to 25, then elevation -25 to 25 degrees), blink 0 to 1, pupil 2 to 8 mm,
+iris and skin from dark to pale, and subjects drawn at random. Pictures are stretched to the full range of grey.
+Near-infrared cameras are linear; the default gamma of 1.4 brightens the shadows slightly.
 """
 
 from __future__ import annotations

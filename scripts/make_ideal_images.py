@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Draw ideal labelled eye images by supersampling, for developing and judging pupil and glint extractors.
+"""Draw ideal labelled eye images by supersampling, for developing and testing pupil and glint extractors.
 
     make_ideal_images.py DIR --condition noise2 --count 40 --seed 10000
 
-Every image is a pure function of (condition, seed). The scene is a set of sharp-edged regions; each pixel is sampled 16
-times in x and in y (regions on a 4 x 4 grid of cells, every cell that an outline crosses again 4 x 4; glints 16 x 16
-directly), blurred by a Gaussian on the fine grid, averaged, given noise, quantised. No code is shared with any
-extractor. Seeds below 10,000 are for development, the others for reports.
+Every image is a pure function of (condition, seed). The scene is a set of sharp-edged regions; each pixel is sampled
+16 times in x and in y (regions on a 4 x 4 grid of cells, and every cell that an outline crosses again 4 x 4; glints
+directly 16 x 16). The fine grid is blurred by a Gaussian and averaged; then noise is added and the values are
+quantised. No code is shared with any extractor. Seeds below 10,000 are for development, the others for reports.
 
-The folder: `metadata.jsonl` (a record an image), `images/`, `dataset.json`.
+The folder holds `metadata.jsonl` (one record per image), `images/` and `dataset.json`.
 """
 
 from __future__ import annotations

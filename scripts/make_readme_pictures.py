@@ -1,4 +1,4 @@
-"""Render the pictures of the README: a head-mounted and a remote view, with both observers' features drawn in.
+"""Render the pictures of the README: a head-mounted and a remote view, with the features of both observers.
 
 python scripts/make_readme_pictures.py [FOLDER]      (default: docs/images)
 """

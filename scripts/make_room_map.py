@@ -1,9 +1,9 @@
-"""Paint the map of an office for `ambient.map`: a room with windows, a screen, a lamp and a desk about the head.
+"""Paint the map of an office for `ambient.map`: a room with windows, a screen, a lamp and a desk around the head.
 
 python scripts/make_room_map.py room.exr [--rows 512]
 
-Values are chosen, in W/m^2/sr within a filter of some 50 nm about 850 nm: an overcast sky 1.5, walls in its light a few
-hundredths, the screen nearly nothing, since displays emit no near infrared.
+The values were chosen, in W/m^2/sr within a filter of about 50 nm around 850 nm: 1.5 for an overcast sky, a few
+hundredths for walls in its light, and nearly nothing for the screen, because displays emit no near infrared.
 """
 
 from __future__ import annotations

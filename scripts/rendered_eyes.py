@@ -1,8 +1,8 @@
-"""Labelled images of the package's own renderer for judging the extractor: the catalogue's eyes before two rigs.
+"""Labelled rendered images for testing the extractor: the eyes of the catalogue in front of two rigs.
 
-A photograph is a pure function of (eye model, rig, seed, look): random small gazes, pupil sizes and positions of the
-head, the last for the phase of the outline on the pixels. Exposure and black level put the pupil at 20 DN of 255, the
-iris at 75; the point-spread function is 1 px wide, as in the ideal images; noise is added by `developed`.
+A photograph is a pure function of (eye model, rig, seed, look): small gaze angles, pupil sizes and head positions
+are random; the head position varies the phase of the outline on the pixels. Exposure and black level place the pupil at
+20 DN of 255 and the iris at 75. The point-spread function is 1 px wide, as in the ideal images. `developed` adds noise.
 """
 
 from __future__ import annotations

@@ -3,9 +3,10 @@
 #
 #     setup_pupil_detectors.sh [--force]
 #
-# It is one of its own because the package brings the full opencv-python, which would break the headless one that
-# eyerender uses. It goes to $XDG_CACHE_HOME/eyerender/pupil-detectors (else ~/.cache/...), about 350 MB. Needs a
-# Python 3.9 or newer with pip (22.3 or newer); EYERENDER_PYTHON names one. The last line of stdout is the interpreter.
+# The environment is separate because the package needs the full opencv-python, which would break the headless one
+# that eyerender uses. It goes to $XDG_CACHE_HOME/eyerender/pupil-detectors (else ~/.cache/...) and takes about 350 MB.
+# It needs Python 3.9 or newer with pip (22.3 or newer); EYERENDER_PYTHON names one. The last line of stdout is the
+# interpreter.
 set -eu
 
 version=2.0.2

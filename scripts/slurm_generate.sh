@@ -1,12 +1,12 @@
 #!/bin/sh
-# A dataset as a SLURM array: every task makes its part of the shards in one shared folder; the last to finish puts the
-# dataset together. A task that was killed or ran out of time may be submitted again: finished shards are kept.
+# Makes a dataset as a SLURM array. Every task makes its part of the shards in one shared folder; the last one to finish
+# assembles the dataset. A task that was killed or ran out of time can be submitted again: finished shards are kept.
 #
 #     sbatch --array=1-32 scripts/slurm_generate.sh SPEC DIR [OPTIONS OF eyerender generate]
 #
-# The folder must be on a file system that all nodes share. Set EYERENDER to the command where it is not on PATH, for
-# example EYERENDER="apptainer exec image.sif eyerender". On GPU nodes add --gres=gpu:1 and --backend cuda. To submit some
-# tasks alone again, say of how many they are: EYERENDER_PARTS=32 sbatch --array=7,9 (tasks counted from 1).
+# The folder must be on a file system that all nodes share. Set EYERENDER to the command if it is not on PATH, for
+# example EYERENDER="apptainer exec image.sif eyerender". On GPU nodes add --gres=gpu:1 and --backend cuda. To submit
+# only some tasks again, give the total number: EYERENDER_PARTS=32 sbatch --array=7,9 (tasks are counted from 1).
 #
 #SBATCH --job-name=eyerender
 #SBATCH --cpus-per-task=8
