@@ -112,8 +112,16 @@ def render_folder(
 ) -> dict[str, Any]:
     """Render a scene into a folder of labelled images (docs/formats.md), completely or not at all.
 
-    `warn` is called for saturated images before the folder is put in place; if it raises, nothing is written. Warnings
-    that need no rendering are in `Scene.warnings`.
+    Args:
+        scene: the scene.
+        path: the folder to write.
+        backend: the render backend.
+        threads: total number of processor threads; None: all.
+        overwrite: replace what the folder holds.
+        exr: also write the noise-free linear irradiance as EXR.
+        progress: called with (images done, images in all, "").
+        warn: called for saturated images before the folder is put in place; if it raises, nothing is written. Warnings
+            that need no rendering are in `Scene.warnings`.
 
     Returns:
         What was written: schema eyerender/render/1, path, number of images, warnings of both kinds.

@@ -150,8 +150,15 @@ def visible_arcs_deg(
 ) -> list[list[float]]:
     """Visible arcs [from, to] of the pupil's outline, in degrees about its centre (image x towards y).
 
-    A point of the outline (k, 2) counts as visible where a pixel of the pupil lies within `reach_px` of it. Points
-    outside the window do not. A whole outline is [[0, 360]].
+    A point of the outline counts as visible where a pixel of the pupil lies within reach. Points outside the window do
+    not. A whole outline is [[0, 360]].
+
+    Args:
+        part: (h, w) part of the eye at each pixel of the window.
+        pupil: the value that means pupil.
+        points_px: (k, 2) points of the outline in full-sensor pixels.
+        origin_px: first pixel of the window on the full sensor.
+        reach_px: largest distance of a pixel of the pupil.
     """
     height, width = part.shape
     x, y = points_px[:, 0] - origin_px[0], points_px[:, 1] - origin_px[1]

@@ -34,9 +34,18 @@ def run_quickstart(
 ) -> Comparison:
     """Do the complete job in a folder and write `report.html` there.
 
-    Existing images of the same scene, seed and versions in the folder are used again. `warn` is called for probable
-    mistakes and may raise: for those of the scene before anything is done, and for saturated images before they are put
-    in place (or used again).
+    Existing images of the same scene, seed and versions in the folder are used again.
+
+    Args:
+        folder: the folder.
+        scene: a scene file, or the name of a shipped scene.
+        eye: replaces the scene's eye model.
+        backend: the render backend.
+        threads: total number of processor threads; None: all.
+        overwrite: replace what the folder holds.
+        progress: called with (done, total, note).
+        warn: called for probable mistakes, and may raise: for those of the scene before anything is done, and for
+            saturated images before they are put in place (or used again).
 
     Raises:
         InputError: the folder holds something else and `overwrite` is not given.

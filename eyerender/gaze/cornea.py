@@ -124,11 +124,17 @@ def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple
 def from_plane(
     origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats, mirror: int = 0
 ) -> CorneaCentres:
-    """Method B: c = O + k_c b, with k_c from the mirror condition of the one glint `mirror`.
+    """Method B: c = O + k_c b, with k_c from the mirror condition of one glint.
 
     In the plane of camera, light and glint, with e the unit vector normal to b: (c(k) - O) . e = k u.e - R n(k).e = 0.
-    Newton's method solves it for the distance k of the mirror point. The other arguments are those of
-    `from_all_glints`.
+    Newton's method solves it for the distance k of the mirror point.
+
+    Args:
+        origin_mm: (..., 3) nodal points.
+        glints: (..., m, 3) unit rays, m >= 2.
+        light_mm: (m, 3) lights.
+        radius_mm: (...) corneal radius.
+        mirror: index of the glint whose mirror condition is used.
     """
     b, ok = line_to_centre(origin_mm, glints, light_mm)
     radius = _radii(radius_mm, b.shape[:-1])

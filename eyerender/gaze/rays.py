@@ -39,7 +39,13 @@ class FeatureRays(ArrayValue):
 def feature_rays(
     observations: Observations, rig: RigGeometry, lights: Sequence[int] | None, *, least: int
 ) -> FeatureRays:
-    """Compute rays to the pupil centre and to the glints of `lights` (None: all of the rig's).
+    """Compute rays to the pupil centre and to the glints.
+
+    Args:
+        observations: n observations.
+        rig: their rig.
+        lights: lights of the glints; None: all of the rig's.
+        least: smallest number of lights that is accepted.
 
     Raises:
         InputError: the rig has fewer than `least` lights, or not those that are named.

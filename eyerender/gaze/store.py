@@ -139,7 +139,13 @@ def fit_estimator(
 ) -> tuple[GazeEstimator, dict[str, Any]]:
     """Calibrate an estimator and summarise it (schema eyerender/gaze-fit/1).
 
-    `warn` is called for targets off the screen before anything is calibrated; it may raise.
+    Args:
+        estimator: the estimator, not calibrated.
+        observations: observations of known targets.
+        rig: their rig.
+        fixations: fixations for the calibration, counted from 0; None: all.
+        source: name of the observations in messages.
+        warn: called for targets off the screen before anything is calibrated; it may raise.
 
     Raises:
         InputError: there are no targets, a fixation is unknown, or the estimator itself refuses.

@@ -27,7 +27,11 @@ def reflect(direction: Xyz, normal: Xyz) -> Xyz:
 def refract(direction: Xyz, normal: Xyz, n_before: FloatLike, n_after: FloatLike) -> tuple[Xyz, Bools]:
     """Snell's law: w = eta d + (eta c - c2) N, eta = n_before / n_after, c = -d.N, c2 = sqrt(1 - eta^2 (1 - c^2)).
 
-    N may point to either side; the side against d is used.
+    Args:
+        direction: unit directions d of travel.
+        normal: unit normals N to either side; the side against d is used.
+        n_before: index before the interface.
+        n_after: index behind it.
 
     Returns:
         w, and whether light passes. At total reflection it does not, and w is the grazing direction.

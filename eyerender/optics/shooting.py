@@ -97,10 +97,17 @@ class _Shot:
 
 
 def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz) -> Connection:
-    """Find the rays from `source` through `path` to `target` (arrays that broadcast), first aimed at `aim`.
+    """Find the rays from a source through a path to a target.
 
     Undamped Newton is tried for all rays. The rays that it does not find go through a guarded search, in which steps
     are halved until the miss shrinks. It starts from `aim`, and then from points between it and the target.
+
+    Args:
+        path: the crossings, in order.
+        n_start: index of the medium at the source.
+        source: points where the rays start.
+        target: points that they must meet; source and target broadcast.
+        aim: points at which the rays are aimed first.
     """
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *target, *aim)))
     source, target = _spread(source, shape), _spread(target, shape)
@@ -155,9 +162,17 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
 def correct(
     path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz, steps: int = _FAST_STEPS
 ) -> Corrected:
-    """Refine rays (m,) whose aim is already close, with at most `steps` undamped steps and no other attempt.
+    """Refine rays (m,) whose aim is already close, without any other attempt.
 
     The surfaces must be met, but their rims are not checked.
+
+    Args:
+        path: the crossings, in order.
+        n_start: index of the medium at the source.
+        source: (m,) points where the rays start.
+        target: (m,) points that they must meet.
+        aim: (m,) points at which they are aimed first.
+        steps: largest number of undamped Newton steps.
     """
     direction = _unit(_minus(aim, source))
     shot = _shoot(path, n_start, source, direction, target)
@@ -185,7 +200,15 @@ class RayTube(NamedTuple):
 
 
 def ray_tube(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction: Xyz, target: Xyz) -> RayTube:
-    """Tube of rays that leave `source` along unit directions, where they pass `target` (see the module)."""
+    """Tube of rays around a known ray (see the module).
+
+    Args:
+        path: the crossings, in order.
+        n_start: index of the medium at the source.
+        source: points where the rays start.
+        direction: unit directions of the rays at the source.
+        target: points that the rays pass.
+    """
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *direction, *target)))
     shot = _shoot(path, n_start, _spread(source, shape), _spread(direction, shape), _spread(target, shape))
     return RayTube(np.abs(shot.determinant), shot.end)

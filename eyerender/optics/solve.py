@@ -118,7 +118,14 @@ def apparent_points(
 def mirror_points(
     surface: Surface, source_mm: npt.ArrayLike, viewpoint_mm: npt.ArrayLike, *, rim_mm: FloatLike = np.inf
 ) -> MirrorPoints:
-    """Reflection of a source (..., 3) to a viewpoint (..., 3) at the outside of `surface`: the first Purkinje image."""
+    """Reflection of a source to a viewpoint at the outside of a surface: the first Purkinje image.
+
+    Args:
+        surface: the mirror.
+        source_mm: (..., 3) sources.
+        viewpoint_mm: (..., 3) viewpoints; they broadcast against the sources.
+        rim_mm: rim radius of the surface (the limbus).
+    """
     rays = mirrored_rays(surface, components(source_mm), components(viewpoint_mm), rim_mm=rim_mm)
     return MirrorPoints(join(rays.exit), -join(rays.way), rays.residual_mm, rays.status)
 

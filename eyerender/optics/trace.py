@@ -73,7 +73,14 @@ def outward_path(
 
 
 def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> Traced:
-    """Trace rays (origins and unit directions (..., 3)) through `path`, starting in a medium of index `n_start`."""
+    """Trace rays through a path.
+
+    Args:
+        path: the crossings, in order.
+        n_start: index of the medium in which the rays start.
+        origins_mm: (..., 3) origins.
+        directions: (..., 3) unit directions.
+    """
     point, direction = components(origins_mm), components(directions)
     ndim = max(point[0].ndim, direction[0].ndim)
     shape = np.broadcast_shapes(point[0].shape, direction[0].shape)

@@ -27,10 +27,16 @@ MAX_CONFUSION_PX = 400
 
 
 def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: float) -> float:
-    """Diameter (px) of the circle of confusion of a point at a depth along the axis.
+    """Diameter (px) of the circle of confusion of a point.
+
+    Args:
+        lens: the lens, which gives the distance in focus.
+        camera: the camera.
+        sensor: the sensor, which gives aperture and pixel pitch.
+        depth_mm: depth of the point along the optical axis.
 
     Raises:
-        InputError: it exceeds 400 px.
+        InputError: the diameter exceeds 400 px.
     """
     if lens.focus_mm is None:
         return 0.0

@@ -35,6 +35,15 @@ def expose(sensor: Sensor, irradiance: Floats, wavelength_nm: float, seed: int) 
     The noise of a pixel is a pure function of `seed`, its place and its mean. Scenes that differ little therefore have
     the same noise where they agree. A rounding difference in the last digit of an irradiance, as between processors,
     does not change the noise of other pixels.
+
+    Args:
+        sensor: the sensor.
+        irradiance: (h, w) irradiance of the sensor, W/m^2.
+        wavelength_nm: wavelength of the light.
+        seed: seed of the noise.
+
+    Returns:
+        (h, w) digital numbers.
     """
     mean = electrons(sensor, irradiance, wavelength_nm)
     if sensor.noise:

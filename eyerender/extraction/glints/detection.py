@@ -52,7 +52,15 @@ class Spots:
 def detect_spots(
     prepared: Prepared, ellipse: Ellipse, step_dn: float, blur_px: float, settings: ExtractionSettings
 ) -> Spots:
-    """Find local maxima that stand out from their surroundings (white top-hat) within `settings.glint_reach`."""
+    """Find local maxima that stand out from their surroundings (white top-hat).
+
+    Args:
+        prepared: the image.
+        ellipse: the pupil, around which spots are searched.
+        step_dn: step from pupil to iris, DN.
+        blur_px: blur of the pupil's edge.
+        settings: settings; `glint_reach` limits the search.
+    """
     linear = prepared.linear
     reach = float(ellipse.semi_axes_px[0]) * settings.glint_reach + 8.0
     cx, cy = ellipse.centre_px

@@ -40,10 +40,16 @@ def affected_pixels(prepared: Prepared, spots: Spots, which: Bools | None = None
 
 
 def subtract_spots(prepared: Prepared, fit: SpotFit, which: Bools, about: Ellipse) -> tuple[Image, Bools]:
-    """Subtract the light of `which` spots from the image where it reaches the ellipse `about`.
+    """Subtract the light of spots from the image where it reaches an ellipse.
 
     A fit describes the flanks of a spot far better than the circle of `affected_pixels`. It is not relied on where the
     light exceeds three standard deviations of the noise.
+
+    Args:
+        prepared: the image.
+        fit: the spots' fits.
+        which: (n,) spots to subtract.
+        about: the ellipse, the pupil boundary.
 
     Returns:
         The image (h, w) without that light, and the mask (h, w) of pixels where the light is too bright.

@@ -54,7 +54,14 @@ UNEVEN = 0.01
 def fit_boundary(
     edges: EdgePoints, candidate: Candidate, settings: ExtractionSettings, expected_noise_px: float
 ) -> BoundaryFit | str:
-    """Fit the boundary of the pupil to `edges`, or give the reason why there is none."""
+    """Fit the boundary of the pupil, or give the reason why there is none.
+
+    Args:
+        edges: edge points around the candidate.
+        candidate: the dark blob.
+        settings: sizes and shapes that are accepted.
+        expected_noise_px: standard deviation of an edge point along its normal.
+    """
     if edges.points_px.shape[0] < 8:
         return f"only {edges.points_px.shape[0]} edge points around the darkest blob"
     uneven = UNEVEN * float(np.sqrt(np.prod(candidate.ellipse.semi_axes_px)))
