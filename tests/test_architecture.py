@@ -174,7 +174,7 @@ def test_what_reproduces_a_papers_software_stays_in_the_studies():
 
 def aliases():
     """(name, definition) of every type alias at the top of a module."""
-    kinds = {"NDArray", "Callable", "Literal", "tuple", "list", "dict"}
+    kinds = {"NDArray", "Callable", "Literal", "Annotated", "tuple", "list", "dict"}
     for path in modules():
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.Assign) and isinstance(node.value, (ast.Subscript, ast.BinOp)):

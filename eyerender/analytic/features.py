@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, Floats, Statuses
+from ..arrays import ArrayValue, Bools, Floats, Indices, Statuses
 from ..errors import InputError
 from ..eye.batch import CHUNK_POINTS, chunks, groups, slices, take_eyes
 from ..eye.model import EyeModel
@@ -235,5 +235,5 @@ class _View:
         return pixels, status
 
 
-def _pose_rows(poses: Poses, rows: npt.NDArray[np.intp]) -> Poses:
+def _pose_rows(poses: Poses, rows: Indices) -> Poses:
     return Poses(poses.azimuth_rad[rows], poses.elevation_rad[rows], poses.torsion_rad[rows])

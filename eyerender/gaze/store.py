@@ -38,8 +38,8 @@ FIT_SCHEMA = "eyerender/gaze-fit/1"
 PREDICT_SCHEMA = "eyerender/gaze/1"
 
 
-Name = Literal["regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman"]
-NAMES: tuple[str, ...] = get_args(Name)
+EstimatorName = Literal["regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman"]
+NAMES: tuple[str, ...] = get_args(EstimatorName)
 
 
 _BUILT_IN = (Regression, Homography, CrossRatio, GuestrinEizenman, Hennessey, ShihWuLiu)
@@ -48,7 +48,7 @@ _BUILT_IN = (Regression, Homography, CrossRatio, GuestrinEizenman, Hennessey, Sh
 class EstimatorSpec(Spec):
     """Name and options of an estimator; options of other estimators are ignored."""
 
-    name: Name
+    name: EstimatorName
     function: str = "R3"
     terms: tuple[str, str] | None = Field(default=None, description="terms of x and y, instead of `function`")
     normalised: bool = True

@@ -25,6 +25,7 @@ from ..optics.purkinje import purkinje_path, purkinje_points
 from ..optics.shooting import ray_tube
 from ..optics.trace import Crossing, Traced, trace
 from ..rig.light import Lamp
+from ..status import Status
 from .glints import GlintScene, Image, Nodes, disc_points, distortion_determinant
 
 
@@ -41,10 +42,10 @@ def purkinje_images(
         points = disc_points(lamp, node)
         sources = (points - t) @ M
         found = purkinje_points(surfaces, indices, rims, passing, sources, eyepoint, gradient)
-        ok = np.asarray(found.status) == 0
+        ok = np.asarray(found.status) == Status.OK
         out = np.where(ok[:, None], -np.asarray(found.directions), np.array([-1.0, 0.0, 0.0]))
         traced = trace(path, 1.0, np.broadcast_to(eyepoint, out.shape), out)
-        ok &= np.asarray(traced.status) == 0
+        ok &= np.asarray(traced.status) == Status.OK
         if order > 2:
             ok &= _through_pupil(eye, traced.points_mm, len(eye.front))
         rays = ray_tube(path, 1.0, components(eyepoint), components(out), components(sources))
