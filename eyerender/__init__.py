@@ -46,7 +46,8 @@ if TYPE_CHECKING:
     from .rig.sensor import Sensor
     from .scene import Frame, Frames, Scene, load_scene, shipped_scenes
     from .scene.observer import Observer
-    from .scene.spec import Eye, EyeDirection, Picture, SceneSpec, Subject, Targets
+    from .scene.spec import Eye, EyeDirection, Picture, SceneSpec, Targets
+    from .scene.subject import Subject
     from .status import Status
 
 _HOMES = {
@@ -99,7 +100,7 @@ _HOMES = {
     "Sensor": "rig.sensor",
     "Skin": "region.anatomy",
     "Status": "status",
-    "Subject": "scene.spec",
+    "Subject": "scene.subject",
     "Targets": "scene.spec",
     "TearFilm": "region.anatomy",
     "bench_extractors": "benchmark.run",

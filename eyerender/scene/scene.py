@@ -32,7 +32,7 @@ from ..rig.imaging import Ambient
 from ..rig.rig import Rig, RigGeometry, RigLike
 from ..spec import Spec, file_digest
 from ..status import Status
-from .spec import SceneSpec, Subject
+from .spec import SceneSpec, SubjectSpec
 
 EYE_WINDOW_MM = (32.0, 24.0)
 """What a window shows about each of two eyes, where a scene says nothing else: both lids and the corners."""
@@ -115,7 +115,9 @@ class Scene:
     base: Path | None = field(compare=False)
     source: str = field(compare=False)
 
-    def __init__(self, subject: Subject | None = None, rig: Rig | None = None, *, name: str = "scene", **fields: Any):
+    def __init__(
+        self, subject: SubjectSpec | None = None, rig: Rig | None = None, *, name: str = "scene", **fields: Any
+    ):
         """Build a scene from objects.
 
         Args:

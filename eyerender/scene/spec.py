@@ -6,10 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-import numpy as np
-from numpy.typing import ArrayLike
 from pydantic import Discriminator, Field, Tag, model_validator
-from pydantic.json_schema import SkipJsonSchema
 
 from ..errors import InputError
 from ..eye.catalogue import load_eye
@@ -23,9 +20,6 @@ from ..rig.imaging import Ambient, Lens, Motion
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
 from ..spec import FileSpec, Positive, Spec, Vec2, Vec3
-
-if TYPE_CHECKING:
-    from .scene import Frames
 
 DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
@@ -86,17 +80,8 @@ class Eye(Spec):
         return spec.build(eye=side, wavelength_nm=wavelength_nm, pupil_diameter_mm=self.pupil_diameter_mm)
 
 
-class Subject(Spec):
+class SubjectSpec(Spec):
     """The eyes of the subject, their distance, and the head positions."""
-
-    POSITIONAL: ClassVar[tuple[str, ...]] = ("eye",)
-    if TYPE_CHECKING:
-
-        def __init__(self, eye: Any = None, **fields: Any) -> None: ...
-
-    eye: SkipJsonSchema[Eye | None] = Field(
-        default=None, description="the eye model, for Python code; a scene file gives it under its own key 'eye'"
-    )
 
     eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = ("right", "left")
     ipd_mm: Positive = Field(default=63.0, description="interpupillary distance")
@@ -107,39 +92,6 @@ class Subject(Spec):
         if len(set(self.eyes)) != len(self.eyes):
             raise ValueError("eyes: name each eye only once")
         return self
-
-    def fixating(self, targets_mm: ArrayLike, rig: Rig, **scene: Any) -> Frames:
-        """The frames in which the subject fixates targets, one after the other.
-
-        Args:
-            targets_mm: (n, 3) or (3,) world points.
-            rig: what observes the eyes.
-            scene: further fields of `Scene`: `region`, `look`, `sensor`, `seed`, ...
-
-        Raises:
-            InputError: a value does not fit, or a target that no pose of an eye fixates.
-        """
-        from .scene import Scene
-
-        targets = {"world_mm": np.asarray(targets_mm, dtype=float).reshape(-1, 3)}
-        return Scene(self, rig, targets=targets, **scene).frames()
-
-    def looking(self, directions_deg: ArrayLike, rig: Rig, **scene: Any) -> Frames:
-        """The frames in which the optic axes of the eyes have directions, one after the other.
-
-        Args:
-            directions_deg: (n, 2) or (2,) azimuth (positive to the subject's left) and elevation (positive up).
-            rig: what observes the eyes.
-            scene: further fields of `Scene`.
-
-        Raises:
-            InputError: a value does not fit.
-        """
-        from .scene import Scene
-
-        angles = np.asarray(directions_deg, dtype=float).reshape(-1, 2)
-        poses = [EyeDirection(azimuth_deg=azimuth, elevation_deg=elevation) for azimuth, elevation in angles]
-        return Scene(self, rig, poses=poses, **scene).frames()
 
 
 class Targets(Spec):
@@ -190,7 +142,7 @@ class SceneSpec(FileSpec):
     name: Annotated[str, Field(min_length=1)]
     description: str = ""
     eye: Eye = Eye()
-    subject: Subject = Subject()
+    subject: SubjectSpec = SubjectSpec()
     rig: Rig
     targets: Targets | None = None
     poses: Annotated[tuple[EyeDirection, ...], Field(min_length=1)] | None = None
@@ -221,14 +173,11 @@ class SceneSpec(FileSpec):
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
         """The mapping with the subject's eye under the scene's own key."""
         subject = data.get("subject")
-        if isinstance(subject, Spec):
-            subject = subject.to_mapping()
-        if not isinstance(subject, Mapping) or subject.get("eye") is None:
+        if not isinstance(subject, Spec) or "eye" not in (rest := subject.to_mapping()):
             return data
         if "eye" in data:
             raise InputError("is given twice, for the scene and for its subject", path="eye")
-        rest = {key: value for key, value in subject.items() if key != "eye"}
-        return {**data, "eye": subject["eye"], "subject": rest}
+        return {**data, "eye": rest.pop("eye"), "subject": rest}
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:

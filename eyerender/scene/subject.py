@@ -1,0 +1,52 @@
+"""A subject in Python code: eyes that look at something, and the frames that come of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..rig.rig import Rig
+from .scene import Frames, Scene
+from .spec import Eye, EyeDirection, SubjectSpec
+
+
+class Subject(SubjectSpec):
+    """The subject with its eye model. A scene file gives the eye under a key of its own."""
+
+    POSITIONAL: ClassVar[tuple[str, ...]] = ("eye",)
+    if TYPE_CHECKING:
+
+        def __init__(self, eye: Any = None, **fields: Any) -> None: ...
+
+    eye: Eye = Eye()
+
+    def fixating(self, targets_mm: ArrayLike, rig: Rig, **scene: Any) -> Frames:
+        """The frames in which the subject fixates targets, one after the other.
+
+        Args:
+            targets_mm: (n, 3) or (3,) world points.
+            rig: what observes the eyes.
+            scene: further fields of `Scene`: `region`, `look`, `sensor`, `seed`, ...
+
+        Raises:
+            InputError: a value does not fit, or a target that no pose of an eye fixates.
+        """
+        targets = {"world_mm": np.asarray(targets_mm, dtype=float).reshape(-1, 3)}
+        return Scene(self, rig, targets=targets, **scene).frames()
+
+    def looking(self, directions_deg: ArrayLike, rig: Rig, **scene: Any) -> Frames:
+        """The frames in which the optic axes of the eyes have directions, one after the other.
+
+        Args:
+            directions_deg: (n, 2) or (2,) azimuth (positive to the subject's left) and elevation (positive up).
+            rig: what observes the eyes.
+            scene: further fields of `Scene`.
+
+        Raises:
+            InputError: a value does not fit.
+        """
+        angles = np.asarray(directions_deg, dtype=float).reshape(-1, 2)
+        poses = [EyeDirection(azimuth_deg=azimuth, elevation_deg=elevation) for azimuth, elevation in angles]
+        return Scene(self, rig, poses=poses, **scene).frames()
