@@ -13,6 +13,7 @@ done
 root=$(CDPATH='' cd -- "$(dirname -- "$script")/.." && pwd -P) || exit 1
 venv=$root/.venv
 log=$venv/setup.log
+constraints=$root/constraints.txt
 ticker=
 
 say() { printf 'eyerender: %s\n' "$*" >&2; }
@@ -97,10 +98,12 @@ stop_ticker() {
 # The build backends are installed first and used without isolation: they are pinned too, and fetched once. Setuptools is
 # for the one package of the tests (jsonpath-rw) that has no wheel.
 install() {
-    case $1 in *test*) backends="hatchling editables setuptools" ;; *) backends="hatchling editables" ;; esac
+    wanted=$1
+    shift
+    case $wanted in *test*) backends="hatchling editables setuptools" ;; *) backends="hatchling editables" ;; esac
     # shellcheck disable=SC2086
-    pip install --no-input --progress-bar off -c "$root/constraints.txt" $backends &&
-        pip install --no-input --progress-bar off -c "$root/constraints.txt" --no-build-isolation -e "$1"
+    pip install --no-input --progress-bar off -c "$constraints" "$@" $backends &&
+        pip install --no-input --progress-bar off -c "$constraints" "$@" --no-build-isolation -e "$wanted"
 }
 
 failure() {

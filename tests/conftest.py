@@ -10,8 +10,11 @@ from __future__ import annotations
 import os
 import signal
 
+import pytest
+
 from eyerender.backends.choose import choose_backend
 from eyerender.errors import BackendError
+from tests.support.quick import Quick, Recorder, listed
 
 # A shell that starts the suite in the background ignores Ctrl-C for it, and the processes that tests interrupt would
 # inherit that.
@@ -23,3 +26,23 @@ try:
 except BackendError:
     if os.environ.get("CI"):
         raise
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Register the options of scripts/test that are pytest's too."""
+    parser.addoption("--fast", action="store_true", help="leave out what tests/data/not_quick.txt lists")
+    parser.addoption("--record", action="store_true", help="write tests/data/not_quick.txt")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Measure the tests where that is asked for."""
+    if config.getoption("--record"):
+        config.pluginmanager.register(Recorder())
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what is not quick where only quick tests are asked for."""
+    if config.getoption("--fast"):
+        is_quick = Quick(listed())
+        config.hook.pytest_deselected(items=[item for item in items if not is_quick(item)])
+        items[:] = [item for item in items if is_quick(item)]

@@ -27,6 +27,7 @@ def test_analytic_results_are_those_of_the_version(stored):
         np.testing.assert_allclose(found[name], stored["analytic"][name], 0, 1e-7, err_msg=f"{name}: {CHANGED}")
 
 
+@pytest.mark.fast
 def test_rendered_results_are_those_of_the_version(stored):
     found = golden.images()
     for name, pictures in stored["images"].items():

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
@@ -13,7 +14,14 @@ import pytest
 
 from tests.support.paths import ROOT
 
-SCRIPTS = ("scripts/_setup.sh", "scripts/eyerender", "scripts/test", "scripts/prove-bare", ".ci/run")
+SCRIPTS = (
+    "scripts/_setup.sh",
+    "scripts/eyerender",
+    "scripts/test",
+    "scripts/test-dependencies",
+    "scripts/prove-bare",
+    ".ci/run",
+)
 
 pytestmark = pytest.mark.skipif(not (ROOT / "scripts" / "_setup.sh").is_file(), reason="not a checkout")
 
@@ -113,6 +121,26 @@ def test_python_that_is_too_old_is_told(checkout: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "Python 3.11 or newer" in done.stderr
+    assert not (checkout / ".venv").exists()
+
+
+def test_dependencies_are_oldest_or_newest(checkout: Path) -> None:
+    done = run(checkout, "./scripts/test-dependencies latest")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "eyerender: error: usage: scripts/test-dependencies oldest|newest [PYTEST ARGS]\n"
+    assert not list(checkout.glob(".venv*"))
+
+
+def test_oldest_dependencies_are_the_lower_bounds(checkout: Path) -> None:
+    """The set-up ends for want of an index, after it has written what it wants."""
+    done = run(checkout, "./scripts/test-dependencies oldest", PIP_NO_INDEX="1", PIP_CONFIG_FILE="/dev/null")
+    assert done.returncode == 1
+    wanted = (checkout / ".venv-oldest" / "constraints.txt").read_text().splitlines()
+    project = tomllib.loads((checkout / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    names = [re.split("[<>=]", line)[0] for line in [*project["dependencies"], *extras["ray"], *extras["ellseg"]]]
+    assert [line.partition("==")[0] for line in wanted] == names
+    assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[0-9.]+", line) for line in wanted)
     assert not (checkout / ".venv").exists()
 
 
