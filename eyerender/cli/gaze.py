@@ -109,7 +109,7 @@ def predict(
     Args:
         records: Records as `features` or `extract` write them (JSON), or one record per line (JSONL).
         calibration: The calibration file.
-        estimator: Your own class, module:Class, if the calibration is one of it. Reading a file imports no code.
+        estimator: Your own class as module:Class, if it made the calibration. The file alone never imports code.
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
     """
     from ..gaze.records import load_observations
