@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.spec import EyeSpec
 from eyerender.region.anatomy import Region
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from tests.support.fuzzing import budget
 from tests.support.scenes import mappings, number
 

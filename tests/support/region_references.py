@@ -15,7 +15,7 @@ from scipy import stats
 from eyerender.capture import make_renderer, render_job
 from eyerender.imagefolder import RESULTS
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 from tests.support.paths import DATA
 
 if TYPE_CHECKING:

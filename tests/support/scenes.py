@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from eyerender.scene import Scene
-from eyerender.scenespec import SceneSpec
+from eyerender.scene.spec import SceneSpec
 
 MODELS = ("E1", "E2", "E3", "E4", "E5", "E5-published")
 RESOLUTION_PX = (1600, 1200)
