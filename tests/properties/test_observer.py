@@ -136,7 +136,7 @@ def test_the_unit_of_length_means_nothing(data, factor):
     large["eye"]["pupil_diameter_mm"] *= factor
     there = scene_of(large)
     eye = EyeSpec.from_mapping(scaled(here.eye_spec.to_mapping(), factor))
-    again = trace(Scene.compiled(there.spec, eye, there.rig), boundary_points=8)
+    again = trace(Scene.compiled(there.spec, eye), boundary_points=8)
     # The fovea of an eye is found to 1e-8 rad, which moves the gaze.
     assert_same_features(trace(here, boundary_points=8), again, atol=1e-5, rtol=1e-7)
 
