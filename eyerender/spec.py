@@ -46,6 +46,14 @@ Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 
 
+class KeyProblem(ValueError):
+    """What a validator raises for a key inside its record."""
+
+    def __init__(self, path: str, reason: str) -> None:
+        super().__init__(reason)
+        self.path = path
+
+
 class Spec(BaseModel):
     """Base of every authored record: frozen and strict; unknown keys and non-finite numbers are refused."""
 
@@ -90,6 +98,8 @@ class Spec(BaseModel):
             text = json.dumps(cls.arranged(data), default=_plain)
             made: Self = cls.__pydantic_validator__.validate_json(text, self_instance=into)
             return made
+        except InputError as error:
+            raise InputError(error.reason, source=error.source or source, path=error.path) from None
         except RecursionError:
             raise InputError("is nested too deeply", source=source) from None
         except (TypeError, ValueError) as error:
@@ -318,7 +328,9 @@ def _first_problem(error: ValidationError) -> tuple[str, str]:
     if kind == "finite_number":
         return path, "must be a finite number"
     if kind == "value_error":
-        return path, str(context.get("error", first["msg"]))
+        cause = context.get("error", first["msg"])
+        inner = cause.path if isinstance(cause, KeyProblem) else ""
+        return ".".join(filter(None, (path, inner))), str(cause)
     message = first["msg"]
     message = message.replace("Input should be", "must be")
     value = first.get("input")

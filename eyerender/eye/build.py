@@ -20,13 +20,12 @@ from ..optics.gradient import GradientMedium
 from ..optics.media import CauchyMedium, ConstantMedium, Medium
 from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
 from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
-from .shells import SHELLS, Layers, even_layers, lens_shells, passing_shells
-from .spec import (
+from .parts import (
     LARGEST_INDEX,
     BiconicSpec,
     ConicSpec,
     EllipsoidSpec,
-    EyeSpec,
+    EyeParts,
     GradientLensSpec,
     MediumSpec,
     PlacedSpec,
@@ -36,9 +35,10 @@ from .spec import (
     SphereSpec,
     SurfaceLensSpec,
 )
+from .shells import SHELLS, Layers, even_layers, lens_shells, passing_shells
 
 
-def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm: float | None) -> EyeModel:
+def build_eye(spec: EyeParts, side: Side, wavelength_nm: float, pupil_diameter_mm: float | None) -> EyeModel:
     """Build the numeric eye.
 
     Args:
@@ -68,7 +68,7 @@ def build_eye(spec: EyeSpec, side: Side, wavelength_nm: float, pupil_diameter_mm
     return eye if side == "right" else mirrored_eye(eye)
 
 
-def bare_eye(spec: EyeSpec, wavelength_nm: float, stop: Stop) -> EyeModel:
+def bare_eye(spec: EyeParts, wavelength_nm: float, stop: Stop) -> EyeModel:
     """The right eye without its landmarks (fovea, node and chief ray are zeros), which is enough for tracing."""
     front = tuple(surface_of(s) for s in spec.cornea)
     front_indices = tuple(index_at(s.medium, wavelength_nm, f"cornea.{k}.medium") for k, s in enumerate(spec.cornea))
@@ -165,7 +165,7 @@ def index_at(spec: MediumSpec, wavelength_nm: float, path: str) -> float:
     return index
 
 
-def stop_of(spec: EyeSpec, diameter_mm: float) -> Stop:
+def stop_of(spec: EyeParts, diameter_mm: float) -> Stop:
     """Stop of the right eye at a diameter."""
     stop = spec.stop
     change = diameter_mm - stop.diameter_mm
@@ -190,7 +190,7 @@ def stop_reach_mm(stop: Stop) -> float:
     return float(np.max(np.linalg.norm(stop.boundary(360) - stop.centre_mm, axis=-1)))
 
 
-def sclera_of(spec: EyeSpec, cornea: Surface) -> Sphere:
+def sclera_of(spec: EyeParts, cornea: Surface) -> Sphere:
     """Sclera: the sphere through the limbus circle, centred on the cornea's axis unless the file gives the centre."""
     radius = spec.sclera.radius_mm
     if spec.sclera.centre_mm is not None:
@@ -303,7 +303,7 @@ class _Key:
 
     __slots__ = ("digest", "spec")
 
-    def __init__(self, spec: EyeSpec) -> None:
+    def __init__(self, spec: EyeParts) -> None:
         self.spec, self.digest = spec, spec.digest()
 
     def __hash__(self) -> int:

@@ -10,11 +10,12 @@ import numpy as np
 from ..arrays import Bools, Floats
 from ..errors import InputError, Refuse
 from ..geometry.surfaces import Surface, components
+from .build import gradient_geometry, stop_of, stop_reach_mm
 from .model import Stop
-from .spec import (
+from .parts import (
     BiconicSpec,
     ConicSpec,
-    EyeSpec,
+    EyeParts,
     GradientLensSpec,
     MediumSpec,
     PlacedSpec,
@@ -28,13 +29,12 @@ _BULGE_MM = 0.5
 _FAR_MM = 60.0
 
 
-def check_eye(spec: EyeSpec, *, source: str = "") -> None:
+def check_eye(spec: EyeParts, *, source: str = "") -> None:
     """Check the geometry of an eye file.
 
     Raises:
         InputError: with the path of the first wrong key.
     """
-    from .build import gradient_geometry, stop_of, stop_reach_mm
 
     def refuse(path: str, reason: str) -> NoReturn:
         raise InputError(reason, source=source, path=path)
@@ -62,7 +62,7 @@ def check_eye(spec: EyeSpec, *, source: str = "") -> None:
             refuse(error.path, error.reason)
 
 
-def _check_widths(spec: EyeSpec, refuse: Refuse, pupil_radius_mm: float) -> None:
+def _check_widths(spec: EyeParts, refuse: Refuse, pupil_radius_mm: float) -> None:
     """Check that the pupil lies within the iris, the iris within the cornea, and the cornea within the sclera."""
     if pupil_radius_mm >= spec.limbus_radius_mm:
         refuse("stop.diameter_mm", f"the pupil is wider than the cornea ({2 * spec.limbus_radius_mm:g} mm)")
@@ -74,7 +74,7 @@ def _check_widths(spec: EyeSpec, refuse: Refuse, pupil_radius_mm: float) -> None
         refuse("sclera.radius_mm", f"must be > limbus_radius_mm ({spec.limbus_radius_mm:g})")
 
 
-def _check_cornea(spec: EyeSpec, refuse: Refuse, stop: Stop) -> None:
+def _check_cornea(spec: EyeParts, refuse: Refuse, stop: Stop) -> None:
     """Check that the cornea's surfaces reach the limbus and follow each other, before the plane of the iris."""
     from .build import surface_of
 
@@ -94,7 +94,7 @@ def _check_cornea(spec: EyeSpec, refuse: Refuse, stop: Stop) -> None:
             refuse(f"{path}.position_mm", f"crosses {path_before} {_where(wide, crossing)}")
 
 
-def _check_inside(spec: EyeSpec, refuse: Refuse, stop: Stop, pupil_radius_mm: float) -> None:
+def _check_inside(spec: EyeParts, refuse: Refuse, stop: Stop, pupil_radius_mm: float) -> None:
     """Check that inner cornea, stop, lens and retina follow each other within the pupil."""
     from .build import surface_of
 
@@ -143,7 +143,7 @@ def _where(grid: Floats, mask: Bools) -> str:
     return f"{np.min(np.linalg.norm(grid[mask], axis=1)):.3g} mm from the axis"
 
 
-def _placed(spec: EyeSpec) -> list[tuple[str, PlacedSpec]]:
+def _placed(spec: EyeParts) -> list[tuple[str, PlacedSpec]]:
     found: list[tuple[str, PlacedSpec]] = [(f"cornea.{k}", s) for k, s in enumerate(spec.cornea)]
     if isinstance(spec.lens, SurfaceLensSpec):
         found += [(f"lens.surfaces.{k}", s) for k, s in enumerate(spec.lens.surfaces)]
@@ -152,7 +152,7 @@ def _placed(spec: EyeSpec) -> list[tuple[str, PlacedSpec]]:
     return [*found, ("retina", spec.retina)]
 
 
-def _media(spec: EyeSpec) -> list[tuple[str, MediumSpec]]:
+def _media(spec: EyeParts) -> list[tuple[str, MediumSpec]]:
     found = [(f"cornea.{k}.medium", s.medium) for k, s in enumerate(spec.cornea)]
     if isinstance(spec.lens, SurfaceLensSpec):
         found += [(f"lens.surfaces.{k}.medium", s.medium) for k, s in enumerate(spec.lens.surfaces)]

@@ -23,7 +23,7 @@ from ..geometry.transforms import rotation_x, rotation_y, rotation_z, tilt_rotat
 from ..spec import LARGEST
 
 
-def upgraded(data: Mapping[str, Any], *, source: str = "") -> dict[str, Any]:
+def upgraded(data: Mapping[str, Any]) -> dict[str, Any]:
     """Convert the mapping of an eye file of format 1 to format 2.
 
     Wrong values are left as they are, and the check of format 2 names them.
@@ -31,13 +31,6 @@ def upgraded(data: Mapping[str, Any], *, source: str = "") -> dict[str, Any]:
     Raises:
         InputError: one of the three keys has a value that format 1 did not have, or that does not fit.
     """
-    try:
-        return _eye(data)
-    except InputError as error:
-        raise InputError(error.reason, source=source, path=error.path) from None
-
-
-def _eye(data: Mapping[str, Any]) -> dict[str, Any]:
     out = {**data, "format": 2}
     if isinstance(out.get("cornea"), list):
         out["cornea"] = [_placed(surface, f"cornea.{k}") for k, surface in enumerate(out["cornea"])]

@@ -21,7 +21,8 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from ..spec import Spec
-from .spec import ContourSpec, EyeSpec
+from .parts import ContourSpec
+from .spec import EyeSpec
 
 NONCIRCULARITY = 0.0166
 SHIFT_MM_PER_MM = (-0.06, 0.0)

@@ -12,9 +12,9 @@ from ..arrays import ArrayValue, Bools, FloatLike, Floats
 from ..geometry.surfaces import Surface, Xyz, components, fit, shift, turn_back
 from ..geometry.transforms import read_only
 from ..optics.gradient import GradientMedium
-from .spec import EyeSpec, Side
+from .parts import Side
 
-__all__ = ["EyeModel", "EyeSpec", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
+__all__ = ["EyeModel", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
 
 
 def _no_contour() -> Floats:

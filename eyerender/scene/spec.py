@@ -12,7 +12,8 @@ from ..errors import InputError
 from ..eye.catalogue import load_eye
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
-from ..eye.spec import EyeSpec, Side
+from ..eye.parts import Side
+from ..eye.spec import EyeSpec
 from ..observation import MAX_GLINTS
 from ..region.anatomy import Region
 from ..region.look import Look

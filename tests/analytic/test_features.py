@@ -9,8 +9,8 @@ from eyerender.analytic.features import features
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.fixation import fixations
-from eyerender.eye.model import EyeSpec
 from eyerender.eye.pose import Poses, Turning, into_eye, rigid_motion
+from eyerender.eye.spec import EyeSpec
 from eyerender.geometry.surfaces import components, join
 from eyerender.geometry.transforms import normalize, tilt_rotation
 from eyerender.optics.purkinje import purkinje_points

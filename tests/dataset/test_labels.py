@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from eyerender.eye.spec import ConicSpec, EyeSpec
+from eyerender.eye.parts import ConicSpec
+from eyerender.eye.spec import EyeSpec
 from eyerender.geometry.ellipse import Ellipse, points_on_ellipse, signed_distance
 from eyerender.imagefile import read_image
 from eyerender.imagefolder import ImageFolder

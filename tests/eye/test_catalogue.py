@@ -11,9 +11,9 @@ import yaml
 
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import FOLDER, catalogue_files, catalogue_names, load_eye
-from eyerender.eye.model import EyeSpec
+from eyerender.eye.parts import GradientLensSpec
 from eyerender.eye.shells import shelled
-from eyerender.eye.spec import GradientLensSpec
+from eyerender.eye.spec import EyeSpec
 from eyerender.geometry.surfaces_biconic import Biconic
 from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.optics.trace import trace

@@ -12,7 +12,7 @@ import pytest
 from eyerender.errors import InputError
 from eyerender.eye.batch import stack_eyes, take_eyes
 from eyerender.eye.catalogue import load_eye
-from eyerender.eye.model import EyeSpec
+from eyerender.eye.spec import EyeSpec
 
 
 def changed(name, path, value):

@@ -11,8 +11,8 @@ from eyerender.eye.batch import stack_eyes
 from eyerender.eye.catalogue import catalogue_names, load_eye
 from eyerender.eye.fixation import RESIDUAL_LIMIT_MM, entrance_window_centre, fixate
 from eyerender.eye.landmarks import field_direction, nodal_rays, path_to_retina
-from eyerender.eye.model import EyeSpec
 from eyerender.eye.pose import Poses, Turning, into_eye, rigid_motion
+from eyerender.eye.spec import EyeSpec
 from eyerender.geometry.surfaces import components, join
 from eyerender.optics.trace import trace
 from eyerender.status import Status

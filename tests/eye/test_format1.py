@@ -11,8 +11,8 @@ import yaml
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.format1 import upgraded
-from eyerender.eye.model import EyeSpec
-from eyerender.eye.spec import GradientLensSpec
+from eyerender.eye.parts import GradientLensSpec
+from eyerender.eye.spec import EyeSpec
 from eyerender.geometry.surfaces_quadric import Quadric, centre_of
 from eyerender.geometry.transforms import rotation_x, rotation_y, rotation_z, tilt_rotation
 

@@ -11,7 +11,8 @@ from eyerender.analytic.observer import trace
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.margin import HARMONICS, PupilMargin, drawn_contour
-from eyerender.eye.spec import ConicSpec, EyeSpec, Side
+from eyerender.eye.parts import ConicSpec, Side
+from eyerender.eye.spec import EyeSpec
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec
 

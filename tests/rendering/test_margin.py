@@ -9,7 +9,7 @@ import pytest
 from matplotlib.path import Path
 
 from eyerender.eye.catalogue import load_eye
-from eyerender.eye.spec import ContourSpec
+from eyerender.eye.parts import ContourSpec
 from eyerender.rendering.frame import boundary_waves
 from tests.support.render_oracles import contour_error, outline
 from tests.support.render_rigs import PLAIN, RIGS, head_rig, job_of, remote_rig

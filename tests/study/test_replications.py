@@ -8,7 +8,7 @@ import pytest
 from eyerender.analytic.observer import trace as observe
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.landmarks import field_direction, path_to_retina
-from eyerender.eye.model import EyeSpec
+from eyerender.eye.spec import EyeSpec
 from eyerender.gaze.regression import FUNCTIONS
 from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import trace
