@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import shipped_datasets
 from eyerender.errors import InputError

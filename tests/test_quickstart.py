@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.imagefile import read_image
 from eyerender.imagefolder import ImageFolder
 from eyerender.scene import load_scene

@@ -1,5 +1,5 @@
 """The command line: `eyerender COMMAND`."""
 
-from .app import main
+from .main import main
 
 __all__ = ["main"]

@@ -1,21 +1,8 @@
-"""The application and its error policy: one line on stderr, an exit code, no traceback without --debug."""
+"""The application, which every command registers with."""
 
 from __future__ import annotations
 
-import os
-import signal
-import sys
-import threading
-from collections.abc import Sequence
-from types import FrameType
-from typing import Any
-
-from cyclopts import App, CycloptsError, Parameter
-
-from ..errors import MAX_MESSAGE, EyerenderError, InputError, one_line
-
-INTERRUPTED = 130
-_interrupted = threading.Event()
+from cyclopts import App, Parameter
 
 app = App(
     name="eyerender",
@@ -37,88 +24,3 @@ def _version() -> str:
 
 
 app.version = _version
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Run one command and exit with its code."""
-    sys.exit(run(argv))
-
-
-def run(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit code."""
-    # Importing them registers their commands.
-    from . import (  # noqa: F401
-        benchmark,
-        dataset,
-        environment,
-        export,
-        eyes,
-        gaze,
-        images,
-        observe,
-        study,
-    )
-
-    tokens = list(sys.argv[1:] if argv is None else argv)
-    debug = "--debug" in tokens
-    tokens = [t for t in tokens if t != "--debug"]
-    previous = _terminate_like_interrupt()
-    try:
-        code = app(tokens, exit_on_error=False, print_error=False)
-        sys.stdout.flush()
-        return code if isinstance(code, int) else 0
-    except BrokenPipeError:
-        # The reader has gone (`| head`). This is no error, and the interpreter must not complain at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except (Exception, KeyboardInterrupt) as error:
-        code = None if debug else _reported(error)
-        if code is None:
-            raise
-        return code
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-def _reported(error: BaseException) -> int | None:
-    """Print an expected error as one line and return the exit code; for other errors print nothing and return None."""
-    if isinstance(error, CycloptsError):
-        return _fail(" ".join(str(error).split()), InputError.exit_code)
-    if isinstance(error, EyerenderError):
-        return _fail(str(error), error.exit_code)
-    if isinstance(error, MemoryError):
-        return _fail("out of memory", 1)
-    if isinstance(error, OSError):
-        name = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{name}{error.strerror or error}", 1)
-    # Libraries that call back into Python can turn the interrupt into an error of their own.
-    if isinstance(error, KeyboardInterrupt) or _interrupted.is_set():
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
-    return None
-
-
-def _fail(message: str, code: int) -> int:
-    print(f"error: {one_line(message, MAX_MESSAGE)}", file=sys.stderr)
-    return code
-
-
-def _terminate_like_interrupt() -> dict[int, Any]:
-    """Let SIGTERM and SIGHUP unwind as Ctrl-C does, so that nothing half-written remains, and remember the signal."""
-    _interrupted.clear()
-
-    def handler(_number: int, _frame: FrameType | None) -> None:
-        _interrupted.set()
-        raise KeyboardInterrupt
-
-    previous = {}
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)
-        # If a shell or nohup ignores a signal for us, that is intended.
-        if number is not None and signal.getsignal(number) != signal.SIG_IGN:
-            try:
-                previous[number] = signal.signal(number, handler)
-            except ValueError:  # not the main thread
-                return {}
-    return previous

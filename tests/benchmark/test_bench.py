@@ -17,7 +17,7 @@ import pytest
 from eyerender.benchmark.pupil_labs import eight_bits, pupil_of
 from eyerender.benchmark.registry import defaults, names, resolve
 from eyerender.benchmark.shipped import PUPIL_LABS_PYTHON, pupil_labs_python
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.extraction.baseline import contour_pupil
 from eyerender.imagefile import write_png

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.dataset.spec import shipped_datasets
 from eyerender.eye.catalogue import load_eye
 from eyerender.imagefile import write_png

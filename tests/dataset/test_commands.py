@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.imagefolder import ImageFolder
 from eyerender.imageobserver import scene_of
 from tests.support.dataset_specs import write

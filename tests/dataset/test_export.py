@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 from scipy.io import loadmat
 
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.dataset.columns import type_first
 from eyerender.dataset.export import FORMATS, export
 from eyerender.dataset.export.coco import run_lengths

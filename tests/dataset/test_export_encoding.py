@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.dataset.export import FORMATS, Encoding, export
 from eyerender.dataset.export.encoding import measured_gain
 from eyerender.errors import InputError

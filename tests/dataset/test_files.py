@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.dataset.cluster import ShardActor
 from eyerender.dataset.files import sums_of_files
 from eyerender.dataset.maker import Maker

@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.dataset.assemble import damage, verify_dataset
 from eyerender.dataset.runfile import begin, refuse_taken
 from eyerender.dataset.shard import verify

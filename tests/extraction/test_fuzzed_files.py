@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 import make_ideal_images as ideal
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.geometry.ellipse import Ellipse, iou
 from eyerender.imagefile import read_image

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.gaze.own import OwnEstimator
 from eyerender.gaze.store import choose_estimator, load_calibration, predictions
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.gaze.records import load_observations, rig_from_mapping
 from eyerender.gaze.regression import EyeFit, Regression

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from eyerender.capture import check_windows
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.imagefolder import ImageFolder

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.rig.imaging import Ambient, Panel, RadianceMap
 from tests.support.render_oracles import mirror_pixel

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from eyerender.analytic.observer import trace
 from eyerender.capture import make_renderer, render_job, render_windows
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec

@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.eye.catalogue import load_eye
 from eyerender.report.eye_section import eye_section
 from eyerender.report.scene_view import scene_view

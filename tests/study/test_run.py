@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
-from eyerender.cli.app import run
+from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.scene import load_scene
 from eyerender.study import guestrin, head_mounted, observers_compared
