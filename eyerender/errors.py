@@ -13,6 +13,8 @@ from typing import NoReturn
 
 # A message may quote a file that somebody else made. Longer parts are shortened in the middle.
 MAX_MESSAGE, MAX_SOURCE, MAX_PATH, MAX_REASON = 2000, 600, 200, 400
+# Errors of one input that are reported together. More do not help, and a file may have millions.
+MAX_ERRORS = 20
 
 
 class EyerenderError(Exception):
@@ -30,17 +32,73 @@ class EyerenderError(Exception):
 class InputError(EyerenderError):
     """The user's input cannot be used.
 
-    `source` is the file or argument, `path` the dotted path of the key in it (either may be empty).
+    Attributes:
+        reason: what is wrong, in words.
+        source: the file or argument; may be empty.
+        path: the dotted path of the key in it; may be empty.
+        others: further errors of the same input, at most `MAX_ERRORS` - 1; `str()` shows the first error only.
+        unlisted: number of errors beyond those.
     """
 
     exit_code = 2
 
-    def __init__(self, reason: str, *, source: str = "", path: str = "") -> None:
+    def __init__(
+        self, reason: str, *, source: str = "", path: str = "", others: Iterable[InputError] = (), unlisted: int = 0
+    ) -> None:
         self.reason = one_line(reason, MAX_REASON)
         self.source = source
         self.path = one_line(path, MAX_PATH)
+        self.others = tuple(others)
+        self.unlisted = unlisted
         shown = one_line(source, MAX_SOURCE)
         super().__init__(": ".join(part for part in (shown, self.path, self.reason) if part))
+
+    def placed(self, *, source: str = "", under: str = "") -> InputError:
+        """Copy of the error and the others, with `source` where they have none, and with paths below `under`."""
+        return InputError(
+            self.reason,
+            source=self.source or source,
+            path=".".join(part for part in (under, self.path) if part),
+            others=[other.placed(source=source, under=under) for other in self.others],
+            unlisted=self.unlisted,
+        )
+
+
+class Problems:
+    """Collects the errors of one input, to raise them together."""
+
+    def __init__(self, source: str = "") -> None:
+        self.source = source
+        self._listed: list[InputError] = []
+        self._count = 0
+
+    def add(self, reason: str, path: str = "") -> None:
+        """Note an error; only the first `MAX_ERRORS` are kept, the others are counted."""
+        self._count += 1
+        if len(self._listed) < MAX_ERRORS:
+            self._listed.append(InputError(reason, source=self.source, path=path))
+
+    def include(self, error: InputError) -> None:
+        """Note an error that was raised, with its others."""
+        for one in (error, *error.others):
+            self.add(one.reason, one.path)
+        self._count += error.unlisted
+
+    def check(self) -> None:
+        """Raise what was noted, if anything was.
+
+        Raises:
+            InputError: the first error, which carries the others.
+        """
+        if self._listed:
+            first, *others = self._listed
+            raise InputError(
+                first.reason,
+                source=first.source,
+                path=first.path,
+                others=others,
+                unlisted=self._count - len(self._listed),
+            )
 
 
 Refuse = Callable[[str, str], NoReturn]

@@ -17,8 +17,9 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
-from .errors import InputError
+from .errors import InputError, Problems
 from .files import opened, read_text, shown
 
 FORMAT = 1
@@ -99,14 +100,17 @@ class Spec(BaseModel):
             made: Self = cls.__pydantic_validator__.validate_json(text, self_instance=into)
             return made
         except InputError as error:
-            raise InputError(error.reason, source=error.source or source, path=error.path) from None
+            raise error.placed(source=source) from None
         except RecursionError:
             raise InputError("is nested too deeply", source=source) from None
         except (TypeError, ValueError) as error:
             if not isinstance(error, ValidationError):
                 raise InputError(f"holds a value that is no number, text or list ({error})", source=source) from None
-            path, reason = _first_problem(error)
-            raise InputError(reason, source=source, path=path) from None
+            problems = Problems(source)
+            for path, reason in _problems(error):
+                problems.add(reason, path)
+            problems.check()
+            raise
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -307,33 +311,49 @@ _UniqueKeyLoader.add_implicit_resolver(
 )
 
 
-def _first_problem(error: ValidationError) -> tuple[str, str]:
-    """Dotted path and reason of the first problem."""
+def _problems(error: ValidationError) -> list[tuple[str, str]]:
+    """Dotted paths and reasons of the problems, the most informative one first.
+
+    A problem above a deeper one, or at the same place, is often only its consequence, because each branch of a union
+    complains. It is left out.
+    """
     problems = error.errors(include_url=False)
-    # The deepest problem in the data is the most informative; those above it are often only its consequences.
-    first = max(problems, key=lambda p: (len(p["loc"]), p["type"] != "missing"))
-    path = ".".join(str(part) for part in first["loc"] if not _is_branch(part))
-    context = first.get("ctx", {})
-    kind = first["type"]
+    places = [tuple(part for part in p["loc"] if not _is_branch(part)) for p in problems]
+    deepest = max(problems, key=lambda p: (len(p["loc"]), p["type"] != "missing"))
+    first = problems.index(deepest)
+    taken: set[tuple[int | str, ...]] = set()
+    kept = []
+    above = {place[:k] for place in places for k in range(len(place))}
+    for k in sorted(range(len(problems)), key=lambda k: k != first):
+        if k == first or (places[k] not in taken and places[k] not in above):
+            taken.add(places[k])
+            kept.append(_described(problems[k], ".".join(map(str, places[k]))))
+    return kept
+
+
+def _described(problem: ErrorDetails, path: str) -> tuple[str, str]:
+    """Dotted path and reason of one problem at a path."""
+    context = problem.get("ctx", {})
+    kind = problem["type"]
     if kind == "extra_forbidden":
         return path, "unknown key"
     if kind == "missing":
         return path, "missing"
     if kind in ("greater_than", "less_than", "greater_than_equal", "less_than_equal"):
         sign = {"greater_than": ">", "less_than": "<", "greater_than_equal": ">=", "less_than_equal": "<="}[kind]
-        return path, f"must be {sign} {next(iter(context.values())):g}, not {shown(first['input'])}"
+        return path, f"must be {sign} {next(iter(context.values())):g}, not {shown(problem['input'])}"
     if kind in ("too_short", "too_long"):
         bound = context.get("min_length", context.get("max_length"))
         return path, f"needs at {'least' if kind == 'too_short' else 'most'} {bound} entries"
     if kind == "finite_number":
         return path, "must be a finite number"
     if kind == "value_error":
-        cause = context.get("error", first["msg"])
+        cause = context.get("error", problem["msg"])
         inner = cause.path if isinstance(cause, KeyProblem) else ""
         return ".".join(filter(None, (path, inner))), str(cause)
-    message = first["msg"]
+    message = problem["msg"]
     message = message.replace("Input should be", "must be")
-    value = first.get("input")
+    value = problem.get("input")
     if isinstance(value, str | int | float | bool):
         message += f", not {shown(value)}"
     return path, message

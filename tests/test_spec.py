@@ -9,7 +9,10 @@ import socket
 import pytest
 import yaml
 
-from eyerender.dataset.spec import DatasetSpec, find_dataset
+from eyerender.cli.main import run
+from eyerender.dataset.plan import Plan
+from eyerender.dataset.realise import frames_of
+from eyerender.dataset.spec import DatasetSpec, find_dataset, shipped_datasets
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.scene import load_scene, shipped_scenes
@@ -138,6 +141,68 @@ def test_bad_files_are_refused(tmp_path, text, words):
     with pytest.raises(InputError, match=words) as caught:
         SceneSpec.load(file)
     assert "\n" not in str(caught.value)
+
+
+def test_all_errors_of_a_file_are_reported_together(tmp_path, capsys):
+    data = quickstart()
+    data["colour"] = 1
+    data["subject"]["ipd_mm"] = -63
+    data["rig"]["lights"][0]["radius_mm"] = -1
+    del data["rig"]["cameras"][0]["resolution_px"]
+    file = tmp_path / "bad.yaml"
+    file.write_text(yaml.safe_dump(data), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        SceneSpec.load(file)
+    error = caught.value
+    assert error.others
+    assert all(str(one).startswith(f"{file}: ") and not one.others for one in error.others)
+    assert {one.path for one in (error, *error.others)} == {
+        "colour", "subject.ipd_mm", "rig.lights.0.radius_mm", "rig.cameras.0.resolution_px",
+    }  # fmt: skip
+    assert pickle.loads(pickle.dumps(error)).others[0].path == error.others[0].path
+    assert run(["features", str(file)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines() == [f"error: {one}" for one in (error, *error.others)]
+
+
+def test_an_error_above_a_deeper_one_is_not_reported():
+    """The rig is wrong only because its camera is; the scene has no error of its own."""
+    data = quickstart()
+    data["eye"]["model"] = {"format": 2, "name": 3}
+    data["rig"]["cameras"][0]["resolution_px"] = [1600.5, 1200]
+    with pytest.raises(InputError) as caught:
+        SceneSpec.from_mapping(data)
+    paths = [one.path for one in (caught.value, *caught.value.others)]
+    assert len(set(paths)) == len(paths)
+    assert "rig.cameras.0.resolution_px.0" in paths
+    assert "eye.model.cornea" in paths
+    assert not {"rig", "rig.cameras.0", "eye", "eye.model"} & set(paths)
+
+
+def test_at_most_twenty_errors_are_listed(tmp_path, capsys):
+    data = quickstart()
+    data["rig"]["lights"] = [{"position_mm": [0, 0, "x"]} for _ in range(30)]
+    file = tmp_path / "many.yaml"
+    file.write_text(yaml.safe_dump(data), encoding="utf-8")
+    assert run(["features", str(file)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 21
+    assert all(line.startswith(f"error: {file}: rig.lights.") for line in lines[:20])
+    assert lines[20] == "and 10 more"
+
+
+def test_all_errors_of_a_dataset_are_reported_together(tmp_path):
+    data = yaml.safe_load(shipped_datasets()["dataset_quick"].read_text(encoding="utf-8"))
+    drawn = {**data, "scene": {**data["scene"], "seed": {"draw": "gamma"}, "wavelength_nm": {"draw": "uniform"}}}
+    with pytest.raises(InputError) as caught:
+        Plan.of(DatasetSpec.from_mapping(drawn), source="d.yaml")
+    paths = {one.path for one in (caught.value, *caught.value.others)}
+    assert {"scene.seed.draw", "scene.wavelength_nm.low"} <= paths
+    keys = {**data, "scene": {**data["scene"], "colour": 1, "shape": 2}}
+    with pytest.raises(InputError, match=r"sample 0 cannot be made .*: colour: unknown key") as caught:
+        frames_of(Plan.of(DatasetSpec.from_mapping(keys), source="d.yaml"))
+    assert [str(one) for one in caught.value.others] == ["d.yaml: scene.shape: unknown key"]
 
 
 LEVELS = list(zip("abcdefghi", "bcdefghij", strict=True))

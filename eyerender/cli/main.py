@@ -1,4 +1,4 @@
-"""Running a command, and the error policy: one line on stderr, an exit code, no traceback without --debug."""
+"""Running a command, and the error policy: lines on stderr, an exit code, no traceback without --debug."""
 
 from __future__ import annotations
 
@@ -55,6 +55,12 @@ def _reported(error: BaseException) -> int | None:
     """Print an expected error as one line and return the exit code; for other errors print nothing and return None."""
     if isinstance(error, CycloptsError):
         return _fail(" ".join(str(error).split()), InputError.exit_code)
+    if isinstance(error, InputError):
+        for one in (error, *error.others):
+            _fail(str(one), error.exit_code)
+        if error.unlisted:
+            print(f"and {error.unlisted} more", file=sys.stderr)
+        return error.exit_code
     if isinstance(error, EyerenderError):
         return _fail(str(error), error.exit_code)
     if isinstance(error, MemoryError):

@@ -167,8 +167,7 @@ def parse_draw(node: dict[str, Any], *, source: str, path: str) -> Draw:
     try:
         return kind.from_mapping(node)
     except InputError as error:
-        where = ".".join(part for part in (path, error.path) if part)
-        raise InputError(error.reason, source=source, path=where) from None
+        raise error.placed(source=source, under=path) from None
 
 
 def unit_number(seed: int, path: str, unit: str, number: int, attempt: int) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from ..arrays import Floats
-from ..errors import InputError
+from ..errors import InputError, Problems
 from .draws import (
     ChoiceDraw,
     Draw,
@@ -75,7 +75,9 @@ class Template:
             InputError: with the path of the draw (after `prefix`).
         """
         draws: dict[str, PlacedDraw] = {}
-        _collect(tree, "", draws, source, prefix)
+        problems = Problems(source)
+        _collect(tree, "", draws, problems, prefix)
+        problems.check()
         # Draws are sorted by name, so that the order of keys in a file has no effect.
         return cls(tree, dict(sorted(draws.items())), seed)
 
@@ -174,19 +176,23 @@ def sobol_block(seed: int, unit: str, dimensions: int, block: int) -> Floats:
         return np.asarray(engine.random(_BLOCK))
 
 
-def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], source: str, prefix: str) -> None:
+def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], problems: Problems, prefix: str) -> None:
     if is_draw(node):
-        placed = draws[path] = _placed(node, path, source, _join(prefix, path))
+        try:
+            placed = draws[path] = _placed(node, path, problems.source, _join(prefix, path))
+        except InputError as error:
+            problems.include(error)
+            return
         if len(draws) > MAX_DRAWS:
-            raise InputError(f"holds more than {MAX_DRAWS} draws", source=source, path=prefix)
+            raise InputError(f"holds more than {MAX_DRAWS} draws", source=problems.source, path=prefix)
         for k, value in enumerate(_values_of(placed.draw)):
-            _collect(value, f"{path}#{k}", draws, source, prefix)
+            _collect(value, f"{path}#{k}", draws, problems, prefix)
     elif isinstance(node, Mapping):
         for key, value in node.items():
-            _collect(value, _join(path, key), draws, source, prefix)
+            _collect(value, _join(path, key), draws, problems, prefix)
     elif isinstance(node, list | tuple):
         for k, value in enumerate(node):
-            _collect(value, _join(path, k), draws, source, prefix)
+            _collect(value, _join(path, k), draws, problems, prefix)
 
 
 def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:

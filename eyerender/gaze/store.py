@@ -168,7 +168,7 @@ def fit_estimator(
         with np.errstate(all="ignore"):
             fitted = estimator.fit(used, rig)
     except InputError as error:
-        raise InputError(error.reason, source=error.source or source, path=error.path) from None
+        raise error.placed(source=source) from None
     except np.linalg.LinAlgError:
         raise InputError("the records do not determine a calibration", source=source) from None
     gaze = predictions(fitted, used, rig)
@@ -279,8 +279,7 @@ def load_calibration(path: str | Path, own: str | None = None) -> tuple[GazeEsti
         spec = EstimatorSpec.from_mapping(said)
         estimator = spec.build()
     except InputError as error:
-        path_of = ".".join(part for part in ("estimator", error.path) if part)
-        raise InputError(error.reason, source=source, path=path_of) from None
+        raise error.placed(source=source, under="estimator") from None
     eyes = data.get("eyes")
     if not isinstance(eyes, dict) or not set(eyes) <= {*EYES, "unknown"}:
         raise InputError("must hold a calibration for each eye", source=source, path="eyes")
@@ -289,8 +288,7 @@ def load_calibration(path: str | Path, own: str | None = None) -> tuple[GazeEsti
         try:
             found_eyes[EYES.index(name) if name in EYES else -1] = _checked(estimator, state)
         except InputError as error:
-            path_of = ".".join(part for part in ("eyes", name, error.path) if part)
-            raise InputError(error.reason, source=source, path=path_of) from None
+            raise error.placed(source=source, under=f"eyes.{name}") from None
     return _restored(estimator, found_eyes), rig
 
 
@@ -310,7 +308,7 @@ def _own_calibration(data: dict[str, Any], reference: object, own: str | None, s
     try:
         return estimator.restored(data.get("state"))
     except InputError as error:
-        raise InputError(error.reason, source=source, path=error.path) from error
+        raise error.placed(source=source) from error
 
 
 class _RegressionState(Spec):

@@ -188,7 +188,7 @@ class Scene:
                 if not os.path.isfile(file):
                     raise InputError("no such file", source=str(file))
         except InputError as error:
-            raise InputError(error.reason, source=error.source or source, path=error.path) from None
+            raise error.placed(source=source) from None
         return scene
 
     def with_(
