@@ -157,11 +157,11 @@ def frames_of(plan: Plan) -> int:
     first = realise(plan, 0)
     if first.observations is None:
         last = first.rejections[-1] if first.rejections else Rejection(0, 0, "no reason known")
-        others: tuple[InputError, ...] = ()
+        others: list[InputError] = []
         try:
             plan.draw(0, last.attempt).build()
         except InputError as error:
-            others = error.placed(source=plan.source, under="scene").others
+            others = [InputError(o.reason, source=plan.source, path=f"scene.{o.path}") for o in error.others]
         reason = f"sample 0 cannot be made ({len(first.rejections)} attempts): {last.reason}"
         raise InputError(reason, source=plan.source, others=others)
     return int(first.observations.index.frame.max()) + 1
