@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
-from typing import NoReturn
+from typing import Any, NoReturn
 
 # A message may quote a file that somebody else made. Longer parts are shortened in the middle.
 MAX_MESSAGE, MAX_SOURCE, MAX_PATH, MAX_REASON = 2000, 600, 200, 400
@@ -83,6 +83,14 @@ class Problems:
         for one in (error, *error.others):
             self.add(one.reason, one.path)
         self._count += error.unlisted
+
+    def attempt(self, call: Callable[[], Any]) -> Any:
+        """Result of a call; None, and a note, where it raises `InputError`."""
+        try:
+            return call()
+        except InputError as error:
+            self.include(error)
+            return None
 
     def check(self) -> None:
         """Raise what was noted, if anything was.

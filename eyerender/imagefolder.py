@@ -162,10 +162,10 @@ class ImageEntry:
             InputError: naming line and key.
         """
         try:
-            return Observations.from_records(self.records)
+            return Observations.from_records(self.records, complete=True)
         except InputError as error:
-            source, path = str(self.folder / METADATA), self._where(error.path or "records")
-            raise InputError(error.reason, source=source, path=path) from None
+            source, line = str(self.folder / METADATA), f"line {self.number}" if self.number else ""
+            raise error.placed(source=source, under=line) from None
 
     def _where(self, key: str) -> str:
         return f"line {self.number}.{key}" if self.number else key
@@ -263,7 +263,7 @@ class ImageFolder:
         for start in range(0, len(self.entries), _BATCH):
             batch = list(self.entries[start : start + _BATCH])
             try:
-                parts.append(Observations.from_records([r for entry in batch for r in entry.records]))
+                parts.append(Observations.from_records([r for entry in batch for r in entry.records], complete=True))
             except InputError:
                 for entry in batch:
                     entry.truth()  # this names the wrong line

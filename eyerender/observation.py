@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import ArrayValue, Bools, Columns, Floats, Ints, Objects, Statuses, column, frozen
-from .errors import InputError
+from .errors import InputError, Problems
 from .files import shown
 from .status import Status
 
@@ -231,38 +231,43 @@ class Observations(ArrayValue):
         }
 
     @classmethod
-    def from_records(cls, records: Sequence[dict[str, Any]], *, source: str = "") -> Observations:
+    def from_records(
+        cls, records: Sequence[dict[str, Any]], *, source: str = "", complete: bool = False
+    ) -> Observations:
         """Read records of any version.
 
+        A key that is left out counts as null. A feature with a place and without a status is 'ok'. Without a `frame`
+        in any record, every record is a frame of its own.
+
+        Args:
+            records: the records.
+            source: name of their file in messages.
+            complete: whether every key must be there, as this package writes them.
+
         Raises:
-            InputError: naming the record and the key.
+            InputError: naming the records and the keys.
         """
         rows = list(records)
-        for k, record in enumerate(rows):
-            if not isinstance(record, dict):
-                raise InputError("must be a record", source=source, path=f"records.{k}")
-            if record.get("schema") not in SCHEMAS.values():
-                raise InputError(
-                    f"is {shown(record.get('schema'))}; this version reads {' and '.join(map(repr, SCHEMAS.values()))}",
-                    source=source,
-                    path=f"records.{k}.schema",
-                )
-        reader = _Reader(rows, source)
+        reader = _Reader(rows, source, complete)
         eye = reader.texts("eye")
         for k, name in enumerate(eye):
             if name is not None and name not in EYES:
-                raise InputError("must be 'right' or 'left'", source=source, path=f"records.{k}.eye")
+                reader.refuse(k, "eye", "must be 'right' or 'left'")
+                eye[k] = None
         head = reader.array("head_mm", (3,))
         reason = reader.texts("pupil.reason")
-        status, centre = reader.statuses("pupil.status", reason), reader.array("pupil.centre_px", (2,))
-        semi_axes = reader.array("pupil.semi_axes_px", (2,))
-        for row in np.flatnonzero(
-            (status == Status.OK) & ~(np.isfinite(centre).all(axis=1) & (semi_axes > 0).all(axis=1))
-        ):
-            reader.refuse(row, "pupil", "is 'ok', but has no centre or semi-axes")
-        return cls(
+        centre, semi_axes = reader.array("pupil.centre_px", (2,)), reader.array("pupil.semi_axes_px", (2,))
+        placed = np.asarray(np.isfinite(centre).all(axis=1))
+        status = reader.statuses("pupil.status", reason, placed)
+        for row in np.flatnonzero(status == Status.OK).tolist():
+            centre_given, axes_given = (
+                rows[row].get("pupil", {}).get(key) is not None for key in ("centre_px", "semi_axes_px")
+            )
+            if not centre_given or (semi_axes[row] <= 0).any() or (complete and not axes_given):
+                reader.refuse(row, "pupil", "is 'ok', but has no centre or semi-axes")
+        found = cls(
             index=Index(
-                frame=reader.counts("frame"),
+                frame=reader.frames(),
                 fixation=reader.counts("fixation"),
                 camera=reader.counts("camera"),
                 head=count_heads(head),
@@ -293,43 +298,70 @@ class Observations(ArrayValue):
             ),
             glints=reader.glints(),
         )
+        reader.problems.check()
+        return found
 
 
 class _Reader:
-    """Reads columns from records, and names the record and key where one is wrong."""
+    """Reads columns from records, and notes the record and key of everything that is wrong.
 
-    def __init__(self, records: list[dict[str, Any]], source: str) -> None:
+    Raises:
+        InputError: something is no record at all.
+    """
+
+    def __init__(self, records: list[dict[str, Any]], source: str, complete: bool) -> None:
         self.records = records
-        self.source = source
+        self.complete = complete
+        self.problems = Problems(source)
+        for k, record in enumerate(records):
+            if not isinstance(record, dict):
+                self.problems.add("must be a record", f"records.{k}")
+            elif "schema" not in record:
+                self.refuse(k, "schema", f"missing; write {SCHEMAS[RECORD]!r}")
+            elif record["schema"] not in SCHEMAS.values():
+                known = " and ".join(map(repr, SCHEMAS.values()))
+                self.refuse(k, "schema", f"is {shown(record['schema'])}; this version reads {known}")
+            else:
+                for part in ("pose", "pupil"):
+                    if not isinstance(record.get(part, {}), dict):
+                        self.refuse(k, part, "must be an object")
+        self.problems.check()
 
     def values(self, path: str) -> list[Any]:
-        out = []
-        for k, record in enumerate(self.records):
-            value: Any = record
-            for key in path.split("."):
-                if not isinstance(value, dict) or key not in value:
-                    raise InputError("missing", source=self.source, path=f"records.{k}.{path}")
-                value = value[key]
-            out.append(value)
-        return out
+        """One value of each record; None where it is left out."""
+        return [self._value(k, path) for k in range(len(self.records))]
 
-    def refuse(self, k: Any, path: str, reason: str) -> NoReturn:
-        raise InputError(reason, source=self.source, path=f"records.{k}.{path}")
+    def _value(self, k: int, path: str) -> Any:
+        value: Any = self.records[k]
+        for key in path.split("."):
+            if key not in value:
+                if self.complete:
+                    self.refuse(k, path, "missing")
+                return None
+            value = value[key]
+        return value
+
+    def refuse(self, k: int, path: str, reason: str) -> None:
+        self.problems.add(reason, f"records.{k}.{path}")
 
     def texts(self, path: str) -> Objects:
         out = np.empty(len(self.records), dtype=object)
         for k, value in enumerate(self.values(path)):
-            if not (value is None or (isinstance(value, str) and len(value) <= _MAX_TEXT)):
+            if value is None or (isinstance(value, str) and len(value) <= _MAX_TEXT):
+                out[k] = value
+            else:
                 self.refuse(k, path, f"must be null or a text of at most {_MAX_TEXT} characters")
-            out[k] = value
-        return frozen(out, object)
+        return out
 
-    def statuses(self, path: str, reasons: Objects) -> Statuses:
+    def statuses(self, path: str, reasons: Objects, placed: Bools) -> Statuses:
+        """Statuses; where there is none, whether the feature is `placed` (n,) says it."""
         labels = self.texts(path)
-        for k, (label, record) in enumerate(zip(labels, self.records, strict=True)):
-            if not label:
+        for k, label in enumerate(labels):
+            if label is None and not self.complete:
+                labels[k] = "ok" if placed[k] else "missing"
+            elif not label:
                 self.refuse(k, path, "must be 'ok' or 'missing'")
-            if record["schema"] != SCHEMAS[1] and label not in ("ok", "partial", "missing"):
+            elif self.records[k]["schema"] != SCHEMAS[1] and label not in ("ok", "partial", "missing"):
                 self.refuse(k, path, "must be 'ok', 'partial' or 'missing'")
         return frozen([int(Status.of_record(*said)) for said in zip(labels, reasons, strict=True)], np.int8)
 
@@ -338,14 +370,25 @@ class _Reader:
         for k, value in enumerate(values):
             if not (value is None or isinstance(value, bool)):
                 self.refuse(k, path, "must be true, false or null")
-        return frozen([bool(v) for v in values], bool)
+        return frozen([value is True for value in values], bool)
 
     def counts(self, path: str) -> Ints:
-        values = self.values(path)
-        for k, value in enumerate(values):
-            if not (value is None or _is_count(value)):
+        out = np.full(len(self.records), -1, np.int64)
+        for k, value in enumerate(self.values(path)):
+            if value is None or _is_count(value):
+                out[k] = -1 if value is None else value
+            else:
                 self.refuse(k, path, "must be a whole number or null")
-        return frozen([-1 if v is None else v for v in values], np.int64)
+        return frozen(out, np.int64)
+
+    def frames(self) -> Ints:
+        """Numbers of the frames; a record's own number where no record has one."""
+        given = [record.get("frame") is not None for record in self.records]
+        if not self.complete and not any(given):
+            return frozen(np.arange(len(given)), np.int64)
+        for k in np.flatnonzero(~np.array(given)) if not self.complete else ():
+            self.refuse(int(k), "frame", "missing; number the frames of all records or of none")
+        return self.counts("frame")
 
     def array(self, path: str, shape: tuple[int, ...]) -> Floats:
         out = np.full((len(self.records), *shape), np.nan)
@@ -354,53 +397,38 @@ class _Reader:
                 found = _array(value)
                 if found is None or found.shape != shape:
                     self.refuse(k, path, f"must be null or {'x'.join(map(str, shape)) or 'one'} number(s)")
-                out[k] = found
+                else:
+                    out[k] = found
         return frozen(out)
 
-    def points(self, path: str) -> Floats:
-        values = self.values(path)
+    def points(self, path: str, values: list[Any] | None = None, what: str = "points") -> Floats:
+        """Lists of pairs of numbers (n, longest, 2)."""
+        values = self.values(path) if values is None else values
         for k, value in enumerate(values):
             if not (value is None or (isinstance(value, list) and len(value) <= MAX_BOUNDARY_POINTS)):
-                self.refuse(k, path, f"must be null or a list of at most {MAX_BOUNDARY_POINTS} points")
+                self.refuse(k, path, f"must be null or a list of at most {MAX_BOUNDARY_POINTS} {what}")
+                values[k] = None
         width = max((len(value) for value in values if value), default=0)
-        _check_width(len(values), width, MAX_POINTS, "boundary points", self.source)
+        _check_width(len(values), width, MAX_POINTS, "boundary points", self.problems.source)
         out = np.full((len(values), width, 2), np.nan)
         for k, value in enumerate(values):
             if value:
                 found = _array(value)
                 if found is None or found.shape != (len(value), 2):
-                    self.refuse(k, path, "must be null or a list of points")
-                out[k, : len(value)] = found
+                    self.refuse(k, path, f"must be null or a list of {what}")
+                else:
+                    out[k, : len(value)] = found
         return frozen(out)
 
     def second(self, path: str) -> list[Any]:
         """Values of a key that records have from version 2 on; None in those of version 1."""
-        newer = [k for k, record in enumerate(self.records) if record["schema"] != SCHEMAS[1]]
-        out: list[Any] = [None] * len(self.records)
-        for k in newer:
-            value: Any = self.records[k]
-            for key in path.split("."):
-                if not isinstance(value, dict) or key not in value:
-                    self.refuse(k, path, "missing")
-                value = value[key]
-            out[k] = value
-        return out
+        return [
+            None if record["schema"] == SCHEMAS[1] else self._value(k, path) for k, record in enumerate(self.records)
+        ]
 
     def arcs(self) -> Floats:
-        values = self.second("pupil.arcs_deg")
-        for k, value in enumerate(values):
-            if not (value is None or (isinstance(value, list) and len(value) <= MAX_BOUNDARY_POINTS)):
-                self.refuse(k, "pupil.arcs_deg", f"must be null or a list of at most {MAX_BOUNDARY_POINTS} arcs")
-        width = max((len(value) for value in values if value), default=0)
-        _check_width(len(values), width, MAX_POINTS, "arcs", self.source)
-        out = np.full((len(values), width, 2), np.nan)
-        for k, value in enumerate(values):
-            if value:
-                found = _array(value)
-                if found is None or found.shape != (len(value), 2):
-                    self.refuse(k, "pupil.arcs_deg", "must be null or a list of arcs [from, to]")
-                out[k, : len(value)] = found
-        return frozen(out)
+        path = "pupil.arcs_deg"
+        return self.points(path, self.second(path), "arcs [from, to]")
 
     def arc_ellipses(self) -> Floats:
         out = np.full((len(self.records), 5), np.nan)
@@ -410,26 +438,33 @@ class _Reader:
             parts = [value.get(key) for key in _ELLIPSE_KEYS] if isinstance(value, dict) else []
             arrays = [_array(part) for part in parts]
             shapes = [None if a is None else a.shape for a in arrays]
-            if shapes != [(2,), (2,), ()]:
+            if shapes == [(2,), (2,), ()]:
+                out[k] = np.concatenate([np.ravel(a) for a in arrays])  # type: ignore[arg-type]
+            else:
                 self.refuse(k, "pupil.arc_ellipse", f"must be null or an object of {', '.join(_ELLIPSE_KEYS)}")
-            out[k] = np.concatenate([np.ravel(a) for a in arrays])  # type: ignore[arg-type]
         return frozen(out)
 
     def glints(self) -> GlintFeatures:
-        rows = self.values("glints")
+        rows = [[] if entries is None and not self.complete else entries for entries in self.values("glints")]
         for k, entries in enumerate(rows):
             if not isinstance(entries, list) or len(entries) > _MAX_ENTRIES:
                 self.refuse(k, "glints", f"must be a list of at most {_MAX_ENTRIES}")
+                rows[k] = []
         n, m = len(rows), max(map(len, rows), default=0)
-        _check_width(n, m, MAX_GLINTS, "glints", self.source)
+        _check_width(n, m, MAX_GLINTS, "glints", self.problems.source)
         light, status = np.full((n, m), -1, np.int64), np.full((n, m), Status.NONE, np.int8)
         reason = np.full((n, m), None, object)
         inside, xy, covariance = np.zeros((n, m), bool), np.full((n, m, 2), np.nan), np.full((n, m, 2, 2), np.nan)
         for k, entries in enumerate(rows):
             for j, g in enumerate(entries):
+                if not self.complete and isinstance(g, dict):
+                    g = {**_NO_GLINT, **g}
+                    if g["status"] is None:
+                        g["status"] = "missing" if g["xy_px"] is None else "ok"
                 why = _glint_problem(g)
                 if why is not None:
                     self.refuse(k, f"glints.{j}", f"is no glint record: {why}")
+                    continue
                 light[k, j] = -1 if g["light"] is None else g["light"]
                 status[k, j] = int(Status.of_record(g["status"], g["reason"]))
                 reason[k, j], inside[k, j] = g["reason"], bool(g["in_image"])
@@ -453,13 +488,14 @@ def _arcs_of(pupil: PupilFeatures, i: int) -> dict[str, Any]:
 
 
 _ELLIPSE_KEYS = ("centre_px", "semi_axes_px", "angle_rad")
+_NO_GLINT = dict.fromkeys(("light", "status", "reason", "in_image", "xy_px", "covariance"))
 
 
 def _glint_problem(g: Any) -> str | None:
     """Describe what is wrong with an entry of a record's glints; None where nothing is."""
     if not isinstance(g, dict):
         return "must be an object"
-    for key in ("light", "status", "reason", "in_image", "xy_px", "covariance"):
+    for key in _NO_GLINT:
         if key not in g:
             return f"{key} is missing"
     light, status, reason, in_image = g["light"], g["status"], g["reason"], g["in_image"]

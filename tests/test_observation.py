@@ -162,7 +162,10 @@ def test_glint_of_light():
     ("change", "words"),
     [
         (lambda r: r.update(schema="other/1"), "records.0.schema: is 'other/1'"),
-        (lambda r: r.pop("pose"), "records.0.pose.azimuth_deg: missing"),
+        (lambda r: r.pop("schema"), "records.0.schema: missing; write 'eyerender/record/2'"),
+        (lambda r: r.update(frame=None), "records.0.frame: missing; number the frames of all records or of none"),
+        (lambda r: r.update(pose=3), "records.0.pose: must be an object"),
+        (lambda r: r.update(pupil=None), "records.0.pupil: must be an object"),
         (lambda r: r.update(eye="both"), "records.0.eye: must be 'right' or 'left'"),
         (lambda r: r["pupil"].update(centre_px=[1, 2, 3]), "records.0.pupil.centre_px: must be null or 2 number"),
         (lambda r: r.update(frame="x"), "records.0.frame: must be a whole number"),
@@ -176,15 +179,15 @@ def test_glint_of_light():
         (lambda r: r.update(target_mm=[1, 2, float("nan")]), "records.0.target_mm: must be null or 3 number"),
         (lambda r: r.update(head_mm=[[1], [2, 3], 4]), "records.0.head_mm: must be null or 3 number"),
         (lambda r: r["pose"].update(azimuth_deg=True), "records.0.pose.azimuth_deg: must be null or one number"),
-        (lambda r: r["pupil"].update(status=None), "records.0.pupil.status: must be 'ok' or 'missing'"),
+        (lambda r: r["pupil"].update(status=""), "records.0.pupil.status: must be 'ok' or 'missing'"),
         (lambda r: r["pupil"].update(in_image="yes"), "records.0.pupil.in_image: must be true, false or null"),
         (lambda r: r["pupil"].update(centre_px=None), "records.0.pupil: is 'ok', but has no centre"),
         (lambda r: r["pupil"].update(semi_axes_px=[3, 0]), "records.0.pupil: is 'ok', but has no centre or semi-axes"),
         (lambda r: r["pupil"].update(points_px=[[1, 2, 3]]), "records.0.pupil.points_px: must be null or a list"),
         (lambda r: r["pupil"].update(points_px=[[1, 2]] * 3601), "records.0.pupil.points_px: must be null or a list"),
-        (lambda r: r.update(glints=None), "records.0.glints: must be a list"),
+        (lambda r: r.update(glints=3), "records.0.glints: must be a list"),
         (lambda r: r.update(glints=[{}] * 1001), "records.0.glints: must be a list of at most 1000"),
-        (lambda r: r["glints"][1].pop("light"), "records.0.glints.1: is no glint record: light is missing"),
+        (lambda r: r["glints"].append(3), "records.0.glints.2: is no glint record: must be an object"),
         (lambda r: r["glints"][1].update(light=2**70), "records.0.glints.1: is no glint record: light must be"),
         (lambda r: r["glints"][1].update(status=["ok"]), "records.0.glints.1: is no glint record: status must be"),
         (lambda r: r["glints"][1].update(xy_px=None), "records.0.glints.1: is no glint record: it is 'ok', but has no"),
@@ -196,6 +199,78 @@ def test_bad_records_are_named(change, words):
     change(records[0])
     with pytest.raises(InputError, match=words):
         Observations.from_records(records)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda r: r.pop("pose"), "records.0.pose.azimuth_deg: missing"),
+        (lambda r: r.pop("frame"), "records.0.frame: missing"),
+        (lambda r: r["pupil"].pop("status"), "records.0.pupil.status: missing"),
+        (lambda r: r["pupil"].update(status=None), "records.0.pupil.status: must be 'ok' or 'missing'"),
+        (lambda r: r["pupil"].update(semi_axes_px=None), "records.0.pupil: is 'ok', but has no centre or semi-axes"),
+        (lambda r: r.update(glints=None), "records.0.glints: must be a list"),
+        (lambda r: r["glints"][1].pop("light"), "records.0.glints.1: is no glint record: light is missing"),
+    ],
+)
+def test_records_of_a_folder_have_every_key(change, words):
+    records = json.loads(json.dumps(list(observations().records())))
+    assert len(Observations.from_records(records, complete=True)) == 4
+    change(records[0])
+    with pytest.raises(InputError, match=words):
+        Observations.from_records(records, complete=True)
+
+
+def without_nulls(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: without_nulls(v) for k, v in value.items() if v is not None}
+    return [without_nulls(v) for v in value] if isinstance(value, list) else value
+
+
+def test_null_keys_may_be_left_out():
+    full = json.loads(json.dumps(list(observations().records())))
+    short = [without_nulls(record) for record in full]
+    assert sum(len(json.dumps(r)) for r in short) < sum(len(json.dumps(r)) for r in full)
+    assert Observations.from_records(short) == Observations.from_records(full)
+
+
+def test_the_least_that_a_record_may_hold():
+    schema = {"schema": "eyerender/record/2"}
+    found = Observations.from_records(
+        [
+            {**schema, "pupil": {"centre_px": [3, 4]}, "glints": [{"light": 0, "xy_px": [5, 6]}, {"light": 1}]},
+            {**schema, "target_mm": [1, 2, 3], "notes": "unknown keys are ignored"},
+        ]
+    )
+    assert found.index.frame.tolist() == [0, 1]
+    assert found.index.camera.tolist() == found.index.eye.tolist() == [-1, -1]
+    assert found.pupil.status.tolist() == [Status.OK, Status.NOT_FOUND]
+    assert found.glints.status.tolist() == [[Status.OK, Status.NOT_FOUND], [Status.NONE, Status.NONE]]
+    assert found.glints.xy_px[0, 0].tolist() == [5.0, 6.0]
+    assert found.index.target_mm[1].tolist() == [1.0, 2.0, 3.0]
+    assert np.isnan(found.pupil.semi_axes_px).all()
+
+
+def test_all_errors_of_records_are_reported_together():
+    records = json.loads(json.dumps(list(observations(n=30).records())))
+    for record in records:
+        record["eye"] = "both"
+    records[0]["pupil"]["centre_px"] = "x"
+    records[1]["glints"][0]["light"] = -3
+    with pytest.raises(InputError) as caught:
+        Observations.from_records(records, source="r.json")
+    error = caught.value
+    assert str(error) == "r.json: records.0.eye: must be 'right' or 'left'"
+    assert (len(error.others), error.unlisted) == (19, 12)
+    with pytest.raises(InputError) as caught:
+        Observations.from_records(records[:2], source="r.json")
+    paths = {one.path for one in (caught.value, *caught.value.others)}
+    assert {"records.0.eye", "records.1.eye", "records.0.pupil.centre_px", "records.1.glints.0"} <= paths
+    # What is no record at all hides the rest.
+    with pytest.raises(InputError) as caught:
+        Observations.from_records([records[0], {"schema": 7}], source="r.json")
+    assert [caught.value.path] == ["records.1.schema"]
+    assert caught.value.others == ()
 
 
 def test_columns_left_out_are_unknown():

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Floats, frozen
-from ..errors import InputError
+from ..errors import InputError, Problems
 from ..files import parse_json, read_text
 from ..observation import Observations
 from ..rig.camera import CameraCalibration, PinholeCamera
@@ -39,12 +40,14 @@ def load_observations(path: str | Path, scene: str | Scene | None = None) -> tup
     records, rig = _read(read_text(path, limit=MAX_RECORDS_BYTES), source)
     if not records:
         raise InputError("holds no records", source=source)
-    observations = Observations.from_records(records, source=source)
-    if scene is not None:
-        return observations, (scene if isinstance(scene, Scene) else load_scene(scene)).rig
-    if rig is None:
+    if scene is None and rig is None:
         raise InputError("holds no rig; give --scene", source=source)
-    return observations, rig_from_mapping(rig, source=source)
+    given = None if scene is None else (scene if isinstance(scene, Scene) else load_scene(scene)).rig
+    problems = Problems(source)
+    built = given or problems.attempt(lambda: rig_from_mapping(rig, source=source))
+    observations = problems.attempt(lambda: Observations.from_records(records, source=source))
+    problems.check()
+    return observations, built
 
 
 def _read(text: str, source: str) -> tuple[list[Any], Any]:
@@ -87,21 +90,22 @@ def rig_from_mapping(data: Any, *, source: str = "") -> RigGeometry:
         raise InputError("must hold cameras", source=source, path="rig")
     if len(data["cameras"]) > MAX_CAMERAS:
         raise InputError(f"are more than {MAX_CAMERAS}", source=source, path="rig.cameras")
-    cameras = tuple(_camera(c, array, source, f"rig.cameras.{k}") for k, c in enumerate(data["cameras"]))
     places = data.get("lights_mm") or []
     if not isinstance(places, list) or len(places) > MAX_LIGHTS:
         raise InputError(f"must be a list of at most {MAX_LIGHTS} points", source=source, path="rig.lights_mm")
-    lights = tuple(
-        Lamp(
-            position_mm=array(p, (3,), f"rig.lights_mm.{k}"),
-            axis=frozen([1.0, 0.0, 0.0]),
-            radius_mm=0.0,
-            intensity_mw_sr=1.0,
-            lobe_exponent=0.0,
-        )
-        for k, p in enumerate(places)
-    )
-    return RigGeometry(cameras, lights, _screen(data.get("screen"), array, source))
+    problems = Problems(source)
+    cameras = [
+        problems.attempt(partial(_camera, c, array, source, f"rig.cameras.{k}")) for k, c in enumerate(data["cameras"])
+    ]
+    lights = [problems.attempt(partial(_light, array, p, f"rig.lights_mm.{k}")) for k, p in enumerate(places)]
+    screen = problems.attempt(lambda: _screen(data.get("screen"), array, source))
+    problems.check()
+    return RigGeometry(tuple(cameras), tuple(lights), screen)
+
+
+def _light(array: ReadArray, place: Any, at: str) -> Lamp:
+    axis = frozen([1.0, 0.0, 0.0])
+    return Lamp(position_mm=array(place, (3,), at), axis=axis, radius_mm=0.0, intensity_mw_sr=1.0, lobe_exponent=0.0)
 
 
 def _camera(data: Any, array: ReadArray, source: str, at: str) -> PinholeCamera:

@@ -182,8 +182,9 @@ def test_a_damaged_partial_record_is_refused_by_name():
         damaged = {**line, "pupil": {**line["pupil"], key: value}}
         with pytest.raises(InputError, match=f"pupil.{key}"):
             Observations.from_records([damaged])
-    with pytest.raises(InputError, match="arcs_deg"):
-        Observations.from_records([{**line, "pupil": {k: v for k, v in line["pupil"].items() if k != "arcs_deg"}}])
+    pupil = {k: v for k, v in line["pupil"].items() if k != "arcs_deg"}
+    with pytest.raises(InputError, match=r"pupil.arcs_deg: missing"):
+        Observations.from_records([{**line, "pupil": pupil}], complete=True)
 
 
 def test_estimators_take_no_partial_pupil():

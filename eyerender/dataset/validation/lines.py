@@ -126,15 +126,15 @@ def check_records(batch: list[dict[str, Any]]) -> list[list[str]]:
     problems: list[list[str]] = [[] for _ in batch]
     try:
         rows = [k for k, line in enumerate(batch) for _ in line["records"]]
-        found = Observations.from_records([record for line in batch for record in line["records"]])
+        found = Observations.from_records([r for line in batch for r in line["records"]], complete=True)
     except (InputError, *WRONG):
         # One of them is wrong, and separate checks show which.
         if len(batch) > 1:
             return [check_records([line])[0] for line in batch]
         try:
-            Observations.from_records(batch[0]["records"])
+            Observations.from_records(batch[0]["records"], complete=True)
         except InputError as error:
-            return [[f"{error.path}: {error.reason}"]]
+            return [[str(one) for one in (error, *error.others)]]
         except WRONG as error:
             return [[f"records cannot be read ({type(error).__name__}: {error})"]]
         return problems
