@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import BackendError, EyerenderError, InputError
-from .pool import RECYCLE_IMAGES, TRIES, Events, end_of, signals_held
+from .pool import RECYCLE_IMAGES, TRIES, Events, caller_hidden, end_of, signals_held
 from .shard import Staged, cpu_family, write_shard
 from .worker import Job
 
@@ -95,7 +95,7 @@ class RayEngine:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=drive, args=(theirs, driver, list(shards)), daemon=True)
-        with signals_held():
+        with signals_held(), caller_hidden():
             process.start()
         theirs.close()
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
@@ -127,7 +128,7 @@ class LocalPool:
     def _start(self) -> None:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=work, args=(theirs, self.job), daemon=True)
-        with _environment(self.job.threads), signals_held():
+        with _environment(self.job.threads), signals_held(), caller_hidden():
             process.start()
         theirs.close()
         self._workers.append(_Worker(process, ours, f"{process.pid}", time.monotonic()))
@@ -219,6 +220,23 @@ def _environment(threads: int) -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def caller_hidden() -> Iterator[None]:
+    """Keep a spawned process from running the caller's script again.
+
+    Python imports the main module in each spawned process, so a script without `if __name__ == "__main__"` would start
+    its work again there. A worker needs nothing of that module.
+    """
+    main = vars(sys.modules["__main__"])
+    before: dict[str, Any] = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+    main.pop("__file__", None)
+    main["__spec__"] = None
+    try:
+        yield
+    finally:
+        main.update(before)
 
 
 @contextmanager

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from PIL import Image
 
 import eyerender as er
 from tests.support.dataset_specs import mapping, plan, write
+from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.render
 
@@ -116,3 +119,15 @@ def test_a_warning_may_stop_a_run(spec, tmp_path):
     with pytest.raises(er.InputError, match="the lamp is at"):
         er.generate(wrong, tmp_path / "out", warn=refuse)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_script_without_a_guard_can_generate(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"import eyerender as er\nprint('once')\n"
+        f"er.generate({str(write(tmp_path / 'tiny.yaml'))!r}, {str(tmp_path / 'out')!r}, count=1, workers=1)\n",
+        encoding="utf-8",
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=200, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["once"]
