@@ -41,9 +41,9 @@ class LabelsSpec(Spec):
 class DatasetSpec(FileSpec):
     """A dataset file; see the documentation for draws, which may replace any value of `scene`."""
 
-    kind: Literal["dataset"]
-    name: Annotated[str, Field(min_length=1, max_length=100)]
-    description: str = ""
+    kind: Literal["dataset"] = Field(description="says that the file is a dataset, not a scene")
+    name: Annotated[str, Field(min_length=1, max_length=100)] = Field(description="name of the dataset")
+    description: str = Field(default="", description="what the dataset is for, in a sentence")
     count: Annotated[int, Field(ge=1, le=MAX_COUNT)] = Field(description="number of samples")
     planned: Annotated[int, Field(ge=1, le=MAX_COUNT)] | None = Field(
         default=None,
@@ -56,12 +56,12 @@ class DatasetSpec(FileSpec):
     splits: dict[str, Positive] = Field(
         default={"train": 1.0}, description="name -> share of the subjects; shares are scaled to 1"
     )
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(default=0, description="selects all draws")
     scene: dict[str, Any] = Field(description="a scene in which any value may be a draw")
     eye_parameters: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="eye model -> dotted path in its eye file -> value or draw"
     )
-    labels: LabelsSpec = LabelsSpec()
+    labels: LabelsSpec = Field(default=LabelsSpec(), description="labels in addition to those that every image has")
     require: Literal["pupil", "nothing"] = Field(
         default="pupil", description="pupil: draw a sample again if its window does not contain the apparent pupil"
     )

@@ -46,7 +46,7 @@ class PupilMargin(Spec):
     contour: ContourSpec | None = Field(default=None, description="a measured outline instead of a drawn one")
     shift_mm_per_mm: tuple[Shift, Shift] = Field(
         default=SHIFT_MM_PER_MM,
-        description="shift, nasal and up, per mm of diameter above the eye file's own; default Yang et al. (2002)",
+        description="shift, nasal and up, per mm of diameter above the eye file's own (Yang et al. 2002)",
     )
 
     @field_validator("contour")

@@ -28,32 +28,32 @@ Facing = Literal["front", "back"]
 class SphereSpec(Spec):
     """Sphere y^2 + z^2 + 2 R s + s^2 = 0 from the apex; R > 0 opens to -x (cornea), R < 0 to +x (lens back, retina)."""
 
-    kind: Literal["sphere"]
-    radius_mm: Number
+    kind: Literal["sphere"] = Field(description="the shape")
+    radius_mm: Number = Field(description="signed radius of curvature")
 
 
 class ConicSpec(Spec):
     """Conic y^2 + z^2 + 2 R s + (1 + Q) s^2 = 0 from the apex, on the sheet through the apex."""
 
-    kind: Literal["conic"]
-    radius_mm: Number
-    conic_constant: Number
+    kind: Literal["conic"] = Field(description="the shape")
+    radius_mm: Number = Field(description="signed radius of curvature at the apex")
+    conic_constant: Number = Field(description="Q; 0 is a sphere, between -1 and 0 a prolate ellipsoid")
 
 
 class BiconicSpec(Spec):
     """Biconic: two apex radii and conic constants, for the meridians of y and z."""
 
-    kind: Literal["biconic"]
-    radii_mm: Vec2
-    conic_constants: Vec2
+    kind: Literal["biconic"] = Field(description="the shape")
+    radii_mm: Vec2 = Field(description="signed radii of curvature at the apex, in the meridians of y and z")
+    conic_constants: Vec2 = Field(description="Q in the meridians of y and z")
 
 
 class EllipsoidSpec(Spec):
     """Ellipsoid (x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about its centre; the half towards +x ('front') or -x ('back')."""
 
-    kind: Literal["ellipsoid"]
-    semi_axes_mm: tuple[Positive, Positive, Positive]
-    side: Facing = "front"
+    kind: Literal["ellipsoid"] = Field(description="the shape")
+    semi_axes_mm: tuple[Positive, Positive, Positive] = Field(description="semi-axes a, b, c along x, y and z")
+    side: Facing = Field(default="front", description="the half that is the surface")
 
 
 class QuadricSpec(Spec):
@@ -62,15 +62,17 @@ class QuadricSpec(Spec):
     The sheet is where dF/dx > 0 ('front') or < 0 ('back') with the coefficients as given.
     """
 
-    kind: Literal["quadric"]
-    coefficients: tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number, Number]
-    side: Facing = "front"
+    kind: Literal["quadric"] = Field(description="the shape")
+    coefficients: tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number, Number] = Field(
+        description="A, B, C, D, E, F, G, H, I and K of the equation, with lengths in mm"
+    )
+    side: Facing = Field(default="front", description="the sheet that is the surface")
 
 
 class PlaneSpec(Spec):
     """Plane x = 0 of its frame."""
 
-    kind: Literal["plane"]
+    kind: Literal["plane"] = Field(description="the shape")
 
 
 def _shape_tag(value: object) -> str | None:
@@ -96,8 +98,12 @@ ShapeSpec = Annotated[
 class MediumSpec(Spec):
     """A medium: a constant `index`, or `cauchy` = (c0, c1, c2, c3), n = c0 + c1/l^2 + c2/l^4 + c3/l^6, l in nm."""
 
-    index: float | None = Field(default=None, ge=1.0, le=LARGEST_INDEX)
-    cauchy: tuple[Coefficient, Coefficient, Coefficient, Coefficient] | None = None
+    index: float | None = Field(
+        default=None, ge=1.0, le=LARGEST_INDEX, description="refractive index at every wavelength"
+    )
+    cauchy: tuple[Coefficient, Coefficient, Coefficient, Coefficient] | None = Field(
+        default=None, description="c0, c1, c2 and c3 of Cauchy's formula"
+    )
 
 
 class PlacedSpec(Spec):
@@ -106,23 +112,25 @@ class PlacedSpec(Spec):
     The angles (t_x, t_y, t_z) about the axes make the rotation Rz(t_z) Ry(t_y) Rx(t_x).
     """
 
-    shape: ShapeSpec
-    position_mm: Vec3 = (0.0, 0.0, 0.0)
-    tilt_deg: Vec3 = (0.0, 0.0, 0.0)
+    shape: ShapeSpec = Field(description="the form of the surface")
+    position_mm: Vec3 = Field(default=(0.0, 0.0, 0.0), description="place of the apex in the eye")
+    tilt_deg: Vec3 = Field(default=(0.0, 0.0, 0.0), description="angles t_x, t_y and t_z about the axes")
 
 
 class SurfaceSpec(PlacedSpec):
     """A refracting surface and the medium behind it."""
 
-    name: str = ""
-    medium: MediumSpec
+    name: str = Field(default="", description="name of the surface, for reports")
+    medium: MediumSpec = Field(description="the medium behind the surface")
 
 
 class SurfaceLensSpec(Spec):
     """A lens of homogeneous media; the last medium is the vitreous."""
 
-    kind: Literal["surfaces"]
-    surfaces: tuple[SurfaceSpec, ...] = Field(min_length=1, max_length=MAX_SURFACES)
+    kind: Literal["surfaces"] = Field(description="the kind of lens")
+    surfaces: tuple[SurfaceSpec, ...] = Field(
+        min_length=1, max_length=MAX_SURFACES, description="surfaces behind the stop, from outside in"
+    )
 
 
 class LayerSpec(Spec):
@@ -132,8 +140,10 @@ class LayerSpec(Spec):
     `index_share` of the way from edge to core.
     """
 
-    size: float = Field(gt=0.0, le=1.0)
-    index_share: float = Field(ge=0.0, le=1.0)
+    size: float = Field(gt=0.0, le=1.0, description="size of the shell, as a share of the lens' outer surface")
+    index_share: float = Field(
+        ge=0.0, le=1.0, description="share of the way from the index of the edge to that of the core"
+    )
 
 
 class GradientLensSpec(Spec):
@@ -146,16 +156,28 @@ class GradientLensSpec(Spec):
     half a step farther. `layers` in place of `shells` gives each shell a size and an index of its own, from outside in.
     """
 
-    kind: Literal["gradient"]
-    front: PlacedSpec
-    back: PlacedSpec
-    edge: MediumSpec
-    core: MediumSpec
-    vitreous: MediumSpec
-    shells: int | None = Field(default=None, ge=1, le=200)
-    centre_fraction: float = Field(default=0.4, gt=0.0, lt=1.0)
-    centre_mm: Vec3 | None = None
-    layers: tuple[LayerSpec, ...] | None = Field(default=None, min_length=1, max_length=MAX_SURFACES // 2)
+    kind: Literal["gradient"] = Field(description="the kind of lens")
+    front: PlacedSpec = Field(description="front surface")
+    back: PlacedSpec = Field(description="back surface")
+    edge: MediumSpec = Field(description="medium at the outer surfaces")
+    core: MediumSpec = Field(description="medium at the centre")
+    vitreous: MediumSpec = Field(description="medium behind the lens")
+    shells: int | None = Field(
+        default=None,
+        ge=1,
+        le=200,
+        description="number of shells in each half; default: rays are traced through the gradient",
+    )
+    centre_fraction: float = Field(
+        default=0.4, gt=0.0, lt=1.0, description="place of the centre between the two apexes, counted from the front"
+    )
+    centre_mm: Vec3 | None = Field(default=None, description="place of the centre, in place of a fraction")
+    layers: tuple[LayerSpec, ...] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=MAX_SURFACES // 2,
+        description="shells with sizes and indices of their own, from outside in",
+    )
 
 
 def _lens_tag(value: object) -> str | None:
@@ -181,8 +203,8 @@ class ContourSpec(Spec):
     1995, "The form of the human pupil", Vision Res. 35, 2021-2036). The shorter list is padded with zeros.
     """
 
-    cosines: tuple[Number, ...] = Field(default=(), max_length=32)
-    sines: tuple[Number, ...] = Field(default=(), max_length=32)
+    cosines: tuple[Number, ...] = Field(default=(), max_length=32, description="c_1, c_2, ...")
+    sines: tuple[Number, ...] = Field(default=(), max_length=32, description="s_1, s_2, ...")
 
 
 class StopSpec(Spec):
@@ -193,34 +215,38 @@ class StopSpec(Spec):
     = `shift_mm_per_mm`. s_x follows from the condition that the pupil stays in its plane.
     """
 
-    diameter_mm: Positive
-    position_mm: Vec3
-    tilt_deg: Vec3 = (0.0, 0.0, 0.0)
-    ellipticity: float = Field(default=0.0, ge=0.0, lt=1.0)
-    axis_deg: Number = 0.0
-    shift_mm_per_mm: Vec2 = (0.0, 0.0)
-    contour: ContourSpec | None = None
+    diameter_mm: Positive = Field(description="diameter of the circle of equal area")
+    position_mm: Vec3 = Field(description="centre of the pupil of this diameter")
+    tilt_deg: Vec3 = Field(default=(0.0, 0.0, 0.0), description="angles t_x, t_y and t_z of its plane about the axes")
+    ellipticity: float = Field(default=0.0, ge=0.0, lt=1.0, description="1 - b/a")
+    axis_deg: Number = Field(default=0.0, description="direction of the long axis, from nasal towards up")
+    shift_mm_per_mm: Vec2 = Field(
+        default=(0.0, 0.0), description="shift of the centre, nasal and up, per mm of diameter"
+    )
+    contour: ContourSpec | None = Field(default=None, description="a margin that is not an ellipse")
 
 
 class IrisSpec(Spec):
     """The iris: the annulus in the pupil's plane out to `root_radius_mm` from the eye's axis."""
 
-    root_radius_mm: Positive
+    root_radius_mm: Positive = Field(description="outer radius, from the eye's axis")
 
 
 class ScleraSpec(Spec):
     """A sphere. Without a centre, it is the one through the limbus circle with its centre on the cornea's axis."""
 
-    radius_mm: Positive
-    centre_mm: Vec3 | None = None
+    radius_mm: Positive = Field(description="radius of the sphere")
+    centre_mm: Vec3 | None = Field(
+        default=None, description="centre; default: on the cornea's axis, so that the sphere passes through the limbus"
+    )
 
 
 class RotationSpec(Spec):
     """Centres of rotation: azimuth (about z), elevation (about y), torsion (about x)."""
 
-    azimuth_centre_mm: Vec3
-    elevation_centre_mm: Vec3
-    torsion_centre_mm: Vec3 = (0.0, 0.0, 0.0)
+    azimuth_centre_mm: Vec3 = Field(description="point on the vertical axis of rotation")
+    elevation_centre_mm: Vec3 = Field(description="point on the horizontal axis of rotation")
+    torsion_centre_mm: Vec3 = Field(default=(0.0, 0.0, 0.0), description="point on the axis of torsion")
 
 
 class FoveaSpec(Spec):
@@ -230,9 +256,9 @@ class FoveaSpec(Spec):
     incident node, from an object `distance_mm` from the corneal apex.
     """
 
-    field_deg: Vec2 = (0.0, 0.0)
-    distance_mm: Positive = 1500.0
-    position_mm: Vec3 | None = None
+    field_deg: Vec2 = Field(default=(0.0, 0.0), description="direction (h, v) of the nodal ray, nasal and up")
+    distance_mm: Positive = Field(default=1500.0, description="distance of the object from the corneal apex")
+    position_mm: Vec3 | None = Field(default=None, description="place of the fovea, in place of a direction")
 
 
 class EyeParts(FileSpec):
@@ -244,17 +270,19 @@ class EyeParts(FileSpec):
     FORMATS: ClassVar[tuple[int, ...]] = (1, 2)
 
     format: int = Field(default=2, description="version of this file format")
-    name: str
-    description: str = ""
+    name: str = Field(description="name of the model")
+    description: str = Field(default="", description="what the model is, in a sentence")
     cornea: tuple[SurfaceSpec, ...] = Field(
         min_length=1, max_length=MAX_SURFACES, description="surfaces between air and the stop"
     )
-    lens: Lens | None = None
-    retina: PlacedSpec
-    stop: StopSpec
-    limbus_radius_mm: Positive = 5.85
-    iris: IrisSpec
-    sclera: ScleraSpec = ScleraSpec(radius_mm=12.0)
-    rotation: RotationSpec
-    fovea: FoveaSpec
-    sources: dict[str, str] = Field(default_factory=dict)
+    lens: Lens | None = Field(default=None, description="the lens; without one the eye has a cornea only")
+    retina: PlacedSpec = Field(description="the surface on which the fovea lies")
+    stop: StopSpec = Field(description="the anatomical pupil")
+    limbus_radius_mm: Positive = Field(default=5.85, description="radius of the circle where cornea and sclera meet")
+    iris: IrisSpec = Field(description="the iris")
+    sclera: ScleraSpec = Field(default=ScleraSpec(radius_mm=12.0), description="the white of the eye")
+    rotation: RotationSpec = Field(description="the centres of rotation")
+    fovea: FoveaSpec = Field(description="the place of the fovea")
+    sources: dict[str, str] = Field(
+        default_factory=dict, description="dotted path, or the beginning of one -> source of its values"
+    )

@@ -134,13 +134,13 @@ class TearFilm(Spec):
 class Region(Spec):
     """The eye region of one subject. Without this key a scene shows the bare eye in front of a matte surround."""
 
-    fissure: Fissure = Fissure()
-    lids: Lid = Lid()
-    lashes: Lashes = Lashes()
-    brow: Brow = Brow()
-    face: Face = Face()
-    skin: Skin = Skin()
-    tears: TearFilm = TearFilm()
+    fissure: Fissure = Field(default=Fissure(), description="the opening between the lids")
+    lids: Lid = Field(default=Lid(), description="shape and movement of the lids")
+    lashes: Lashes = Field(default=Lashes(), description="lashes of both lids")
+    brow: Brow = Field(default=Brow(), description="the brow's hairs")
+    face: Face = Field(default=Face(), description="the face around the lids")
+    skin: Skin = Field(default=Skin(), description="appearance of the skin at 850 nm")
+    tears: TearFilm = Field(default=TearFilm(), description="the tear meniscus along both margins")
     blink: Share = Field(default=0.0, description="closure of the lids, 0 open to 1 shut")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="selects the hairs and the skin")
     head: Head | None = Field(default=None, description="your own head mesh instead of all of this")

@@ -31,9 +31,9 @@ class HeadParts(Spec):
     """
 
     skin: Names = Field(default=(), description="lids and face: 'occluded by lid'")
-    lashes: Names = ()
-    brow: Names = ()
-    tears: Names = ()
+    lashes: Names = Field(default=(), description="eyelashes")
+    brow: Names = Field(default=(), description="the brow's hairs")
+    tears: Names = Field(default=(), description="the tear meniscus along the margins of the lids")
     head: Names = Field(default=(), description="hair, frames of glasses and other things: 'occluded by head'")
 
 

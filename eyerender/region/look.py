@@ -22,23 +22,31 @@ Contrast = Annotated[float, Field(ge=0, le=1.5)]
 class Look(Spec):
     """Albedos (diffuse reflectance, 0 to 1) and textures; contrast 0 is a uniform surface, 1 the natural texture."""
 
-    iris_albedo: Albedo = Field(default=0.30, description="mean over the iris; chosen, see the module")
-    iris_contrast: Contrast = Field(default=1.0, description="contrast of fibres, collarette, crypts and furrows")
+    iris_albedo: Albedo = Field(default=0.30, description="mean over the iris (chosen)")
+    iris_contrast: Contrast = Field(
+        default=1.0, description="contrast of fibres, collarette, crypts and furrows (chosen)"
+    )
     iris_seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="selects the iris")
     pupil_albedo: Albedo = Field(
         default=0.02,
-        description="light that lens and fundus return off the axis of the light, as a diffuse albedo in the pupil",
+        description="light that lens and fundus return off the axis of the light, as a diffuse albedo in the pupil "
+        "(chosen)",
     )
-    sclera_albedo: Albedo = Field(default=0.42, description="chosen, see the module")
-    sclera_contrast: Contrast = Field(default=1.0, description="contrast of vessels and unevenness")
+    sclera_albedo: Albedo = Field(default=0.42, description="mean over the sclera (chosen)")
+    sclera_contrast: Contrast = Field(default=1.0, description="contrast of vessels and unevenness (chosen)")
     limbus_albedo: Albedo = Field(
-        default=0.20, description="albedo of the ring where the cornea merges into the sclera; chosen"
+        default=0.20, description="albedo of the ring where the cornea merges into the sclera (chosen)"
     )
     limbus_width_mm: Annotated[float, Field(ge=0, le=3)] = Field(
-        default=0.8, description="width of the transition from clear cornea to opaque sclera, inwards from the limbus"
+        default=0.8,
+        description="width of the transition from clear cornea to opaque sclera, inwards from the limbus (chosen)",
     )
-    backdrop_albedo: Albedo = Field(default=0.36, description="albedo of the matte background, darker than most skin")
-    backdrop_contrast: Contrast = Field(default=1.0, description="contrast of the unevenness of the background")
+    backdrop_albedo: Albedo = Field(
+        default=0.36, description="albedo of the matte background, darker than most skin (chosen)"
+    )
+    backdrop_contrast: Contrast = Field(
+        default=1.0, description="contrast of the unevenness of the background (chosen)"
+    )
     backdrop_distance_mm: NonNegative = Field(
-        default=10.0, description="distance of the background plane behind the apex of the unrotated eye"
+        default=10.0, description="distance of the background plane behind the apex of the unrotated eye (chosen)"
     )

@@ -52,19 +52,23 @@ class CameraCalibration(Spec):
 class Camera(Spec):
     """A camera, given by place, direction and focal length, or by `calibration`."""
 
-    name: str = "camera"
+    name: str = Field(default="camera", description="name of the camera, for records and reports")
     resolution_px: tuple[Pixels, Pixels] = Field(description="sensor width and height")
     position_mm: Vec3 | None = Field(default=None, description="nodal point in the world")
     look_at_mm: Vec3 | None = Field(default=None, description="world point on the optical axis")
     pan_deg: Number | None = Field(default=None, description="angle of the optical axis from -x to the subject's left")
     tilt_deg: Number | None = Field(default=None, description="angle of the optical axis upwards from -x")
     roll_deg: Number = Field(default=0.0, description="positive roll turns the image content counter-clockwise")
-    focal_length_px: Positive | None = None
-    focal_length_mm: Positive | None = None
+    focal_length_px: Positive | None = Field(
+        default=None, description="focal length in pixels; give this, or `focal_length_mm` and `sensor_mm`"
+    )
+    focal_length_mm: Positive | None = Field(default=None, description="focal length; `sensor_mm` belongs to it")
     sensor_mm: tuple[Positive, Positive] | None = Field(default=None, description="sensor width and height")
     principal_point_px: Vec2 | None = Field(default=None, description="default: the centre of the sensor")
     distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description="k1, k2, p1, p2, k3 (OpenCV)")
-    calibration: CameraCalibration | None = None
+    calibration: CameraCalibration | None = Field(
+        default=None, description="OpenCV's calibration, in place of position, direction and lens"
+    )
 
     @classmethod
     def looking_at(

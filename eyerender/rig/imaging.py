@@ -32,7 +32,7 @@ class Motion(Spec):
 class Panel(Spec):
     """A rectangle that emits evenly to its front, like a screen or a window; the cornea reflects it."""
 
-    centre_mm: Vec3
+    centre_mm: Vec3 = Field(description="centre in the world")
     size_mm: tuple[Positive, Positive] = Field(description="width (horizontal) and height")
     radiance_w_m2_sr: NonNegative = Field(description="radiance within the camera's filter")
 
@@ -73,5 +73,7 @@ class Ambient(Spec):
     irradiance_w_m2: NonNegative = Field(
         default=0.0, description="even light from all sides: irradiance of a matte surface, within the camera's filter"
     )
-    panels: Annotated[tuple[Panel, ...], Field(max_length=16)] = ()
+    panels: Annotated[tuple[Panel, ...], Field(max_length=16)] = Field(
+        default=(), description="rectangles that emit light, such as screens and windows"
+    )
     map: RadianceMap | None = Field(default=None, description="an HDR picture of the surroundings of the head")

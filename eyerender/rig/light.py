@@ -25,7 +25,7 @@ class LedRing(Spec):
 
     camera: Annotated[int, Field(ge=0)] = Field(default=0, description="the camera that the ring surrounds")
     radius_mm: Positive = Field(description="radius of the circle")
-    count: Annotated[int, Field(ge=1, le=MAX_LIGHTS)]
+    count: Annotated[int, Field(ge=1, le=MAX_LIGHTS)] = Field(description="number of LEDs on the circle")
     phase_deg: Number = Field(
         default=0.0, description="angle of the first LED, from the right of the image towards its bottom"
     )
@@ -39,8 +39,8 @@ class Led(Spec):
 
         def __init__(self, position_mm: Any = None, **fields: Any) -> None: ...
 
-    position_mm: Vec3 | None = None
-    ring: LedRing | None = None
+    position_mm: Vec3 | None = Field(default=None, description="place in the world; give this or `ring`")
+    ring: LedRing | None = Field(default=None, description="a circle of LEDs about a camera, in place of one LED")
     radius_mm: NonNegative = Field(default=0.0, description="radius of the emitting disc; 0 is a point")
     inner_radius_mm: NonNegative = Field(default=0.0, description="radius of the hole of a ring-shaped emitter")
     aim_mm: Vec3 = Field(default=(0, 0, 0), description="world point on its axis")

@@ -22,9 +22,13 @@ MAX_CAMERAS = 100
 class Rig(Spec):
     """The hardware in front of the subject; it does not move with the head."""
 
-    cameras: Annotated[tuple[Camera, ...], Field(min_length=1, max_length=MAX_CAMERAS)]
-    lights: Annotated[tuple[Led, ...], Field(min_length=1, max_length=MAX_LIGHTS)]
-    screen: Screen | None = None
+    cameras: Annotated[tuple[Camera, ...], Field(min_length=1, max_length=MAX_CAMERAS)] = Field(
+        description="the cameras; each takes frames of its own"
+    )
+    lights: Annotated[tuple[Led, ...], Field(min_length=1, max_length=MAX_LIGHTS)] = Field(
+        description="the infrared LEDs; all of them are on in every frame"
+    )
+    screen: Screen | None = Field(default=None, description="the screen that holds the targets")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

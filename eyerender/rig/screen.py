@@ -21,7 +21,7 @@ class Screen(Spec):
 
         def __init__(self, centre_mm: Any = None, size_mm: Any = None, **fields: Any) -> None: ...
 
-    centre_mm: Vec3
+    centre_mm: Vec3 = Field(description="centre of the screen in the world")
     size_mm: tuple[Positive, Positive] = Field(description="width and height")
     tilt_deg: float = Field(default=0.0, gt=-90, lt=90, description="upward tilt of the face, from facing -x")
 

@@ -50,7 +50,11 @@ class Eye(Spec):
     pupil_diameter_mm: Positive | None = Field(
         default=None, description="diameter of the anatomical pupil; default: the eye file's"
     )
-    line_of_sight: Literal["chief_ray", "entrance_window"] = "chief_ray"
+    line_of_sight: Literal["chief_ray", "entrance_window"] = Field(
+        default="chief_ray",
+        description="line of sight that meets the target: through the middle of the stop, or through the centre of the "
+        "entrance window (Aguirre 2019)",
+    )
     margin: PupilMargin | None = Field(default=None, description="boundary of the pupil; default: the eye file's")
 
     @classmethod
@@ -84,9 +88,13 @@ class Eye(Spec):
 class SubjectSpec(Spec):
     """The eyes of the subject, their distance, and the head positions."""
 
-    eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = ("right", "left")
+    eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = Field(
+        default=("right", "left"), description="the eyes that are observed"
+    )
     ipd_mm: Positive = Field(default=63.0, description="interpupillary distance")
-    head_positions_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] = ((0.0, 0.0, 0.0),)
+    head_positions_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] = Field(
+        default=((0.0, 0.0, 0.0),), description="displacements of the head in the world; each has frames of its own"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -102,7 +110,9 @@ class Targets(Spec):
     screen_mm: Annotated[tuple[Vec2, ...], Field(min_length=1)] | None = Field(
         default=None, description="points on the screen, measured to the subject's right and up from its centre"
     )
-    world_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] | None = None
+    world_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] | None = Field(
+        default=None, description="points in the world"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -114,8 +124,12 @@ class Targets(Spec):
 class EyeDirection(Spec):
     """Direction of an eye's optic axis, without a target; torsion follows Listing's law."""
 
-    azimuth_deg: Annotated[float, Field(gt=-90, lt=90)]
-    elevation_deg: Annotated[float, Field(gt=-90, lt=90)]
+    azimuth_deg: Annotated[float, Field(gt=-90, lt=90)] = Field(
+        description="azimuth of the optic axis, from +x to the subject's left"
+    )
+    elevation_deg: Annotated[float, Field(gt=-90, lt=90)] = Field(
+        description="elevation of the optic axis, positive upwards"
+    )
 
 
 class Picture(Spec):
@@ -140,22 +154,28 @@ NOT_A_DATASET = (
 class SceneSpec(FileSpec):
     """A scene file."""
 
-    name: Annotated[str, Field(min_length=1)]
-    description: str = ""
-    eye: Eye = Eye()
-    subject: SubjectSpec = SubjectSpec()
-    rig: Rig
-    targets: Targets | None = None
-    poses: Annotated[tuple[EyeDirection, ...], Field(min_length=1)] | None = None
-    wavelength_nm: Annotated[float, Field(ge=350, le=1100)] = 850.0
-    image: Picture = Picture()
-    sensor: Sensor = Sensor()
-    look: Look = Look()
-    region: Region | None = None
-    lens: Lens = Lens()
-    motion: Motion | None = None
-    ambient: Ambient = Ambient()
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    name: Annotated[str, Field(min_length=1)] = Field(description="name of the scene, for reports")
+    description: str = Field(default="", description="what the scene is for, in a sentence")
+    eye: Eye = Field(default=Eye(), description="the eye model and its settings")
+    subject: SubjectSpec = Field(default=SubjectSpec(), description="eyes, their distance and the head's positions")
+    rig: Rig = Field(description="cameras, lights and screen")
+    targets: Targets | None = Field(default=None, description="what the eyes fixate; give this or `poses`")
+    poses: Annotated[tuple[EyeDirection, ...], Field(min_length=1)] | None = Field(
+        default=None, description="directions of the optic axes, one frame each; give this or `targets`"
+    )
+    wavelength_nm: Annotated[float, Field(ge=350, le=1100)] = Field(
+        default=850.0, description="wavelength of the lights, at which the eye's refractive indices hold"
+    )
+    image: Picture = Field(default=Picture(), description="the part of the sensor that is rendered, and its samples")
+    sensor: Sensor = Field(default=Sensor(), description="aperture, exposure and sensor of all cameras")
+    look: Look = Field(default=Look(), description="albedos and textures of the eye")
+    region: Region | None = Field(default=None, description="lids, lashes, brow and skin; default: the bare eye")
+    lens: Lens = Field(default=Lens(), description="defocus and vignetting")
+    motion: Motion | None = Field(default=None, description="motion during the exposure; default: none")
+    ambient: Ambient = Field(default=Ambient(), description="light other than that of the lamps")
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(
+        default=0, description="selects the draws of the sampler and of the sensor noise"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:

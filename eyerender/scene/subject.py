@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from ..rig.rig import Rig
 from .scene import Frames, Scene
@@ -20,7 +21,7 @@ class Subject(SubjectSpec):
 
         def __init__(self, eye: Any = None, **fields: Any) -> None: ...
 
-    eye: Eye = Eye()
+    eye: Eye = Field(default=Eye(), description="the eye model and its settings")
 
     def fixating(self, targets_mm: ArrayLike, rig: Rig, **scene: Any) -> Frames:
         """The frames in which the subject fixates targets, one after the other.

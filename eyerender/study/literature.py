@@ -1,7 +1,7 @@
 """Published numbers: the measurements of the experiments and the results of the comparative study of eye models.
 
-"The paper" is the comparative study (ACM Transactions on Applied Perception 22(1), 2025, doi 10.1145/3703008); [28] is
-Guestrin & Eizenman, IEEE TBME 53(6), 2006, and [29] Blignaut, Journal of Eye Movement Research 7(2), 2014.
+"The paper" is the comparative study (ACM Transactions on Applied Perception 22(1), 2025, doi 10.1145/3660637); [28] is
+Guestrin & Eizenman, IEEE TBME 53(6), 2006, and [29] Blignaut, Journal of Eye Movement Research 7(1), 2014.
 """
 
 from __future__ import annotations

@@ -1,0 +1,108 @@
+"""Configuration of the documentation site; `scripts/docs` builds it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.application import Sphinx
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+sys.path.insert(0, str(ROOT))
+
+import eyerender  # noqa: E402
+from docs.tools import keys, references, validation  # noqa: E402
+
+project = "eyerender"
+author = copyright = "eyerender contributors"
+release = eyerender.__version__
+
+# References are made from the code in each build; git does not hold them.
+for tool in (keys, references, validation):
+    tool.write(HERE / "generated")
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+]
+myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "attrs_inline"]
+myst_heading_anchors = 4
+exclude_patterns = [
+    "tools",
+    "data",
+    "generated/validation_tables.md",
+    *(f"gallery/*.{kind}" for kind in ("ipynb", "py", "md5", "json", "zip")),
+]
+suppress_warnings = ["config.cache"]  # the options of the gallery hold no functions, but Sphinx does not look
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
+autodoc_default_options = {"exclude-members": "model_config, model_post_init, POSITIONAL"}
+autosummary_generate = False
+napoleon_use_rtype = False
+napoleon_attr_annotations = (
+    False  # the docstrings state shapes, and NumPy's types with a final underscore are no references
+)
+default_role = "code"
+
+html_theme = "furo"
+html_title = "eyerender"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_theme_options = {"navigation_with_keys": True}
+copybutton_prompt_text = "$ "
+
+
+# Equations become MathML, which browsers draw themselves: the site loads nothing from elsewhere.
+html_math_renderer = "mathml"
+
+
+def inline_math(translator: Any, node: Any) -> None:
+    """Write an equation inside a line."""
+    translator.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def display_math(translator: Any, node: Any) -> None:
+    """Write an equation with lines of its own."""
+    translator.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> None:
+    """Register the writer of equations."""
+    app.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))
+
+
+# Links to GitHub and to journals change without our doing; `scripts/docs --check-links` lists those that do not answer.
+linkcheck_timeout = 20
+linkcheck_retries = 2
+linkcheck_anchors = False
+
+# The gallery: each example becomes a page and a notebook. EYERENDER_DOCS_EXAMPLES=0 leaves their pictures out.
+EXAMPLES = ROOT / "examples"
+if any(EXAMPLES.glob("[0-9]*_*.py")):
+    extensions.append("sphinx_gallery.gen_gallery")
+    sphinx_gallery_conf = {
+        "examples_dirs": str(EXAMPLES),
+        "gallery_dirs": "gallery",
+        "filename_pattern": r"/\d+_\w+\.py$",
+        "plot_gallery": os.environ.get("EYERENDER_DOCS_EXAMPLES", "1") != "0",
+        "within_subsection_order": "FileNameSortKey",
+        "remove_config_comments": True,
+        "download_all_examples": False,
+        "min_reported_time": 1,
+        "abort_on_example_error": False,
+    }
+else:
+    (HERE / "gallery").mkdir(exist_ok=True)
+    (HERE / "gallery" / "index.rst").write_text("Examples\n========\n\nThere are none in this checkout.\n")

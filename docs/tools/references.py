@@ -1,0 +1,78 @@
+"""The pages of the commands and of the public names, made from the application's help and the package's `__all__`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import eyerender as er
+from eyerender.cli import main as _commands  # noqa: F401  (registers the commands)
+from eyerender.cli.app import app
+
+# A page of the API: its title, and the beginnings of the modules (below the package) whose names it holds.
+GROUPS = {
+    "api_scenes": ("Scenes, frames and subjects", ("scene", "capture", "images")),
+    "api_eyes": ("Eyes and the eye region", ("eye", "region")),
+    "api_rigs": ("Rigs: cameras, lights, screens, sensors", ("rig",)),
+    "api_observers": ("Observers, observations and comparison", ("",)),
+    "api_datasets": ("Datasets and folders of images", ("dataset", "imagefolder", "benchmark")),
+}
+
+
+def commands() -> str:
+    """The help of every command, as the application prints it."""
+    text = app.generate_docs(output_format="markdown")
+    # Cyclopts names the program as it was started, which is here "python -m sphinx" or the like.
+    text = re.sub(r"^(eyerender[\w -]*?) -m \w+", r"\1", text, flags=re.MULTILINE)
+    _, _, rest = text.partition("**Commands**:")
+    head = "# Commands\n\n`eyerender COMMAND --help` prints the same on a terminal. [Which command for which task]"
+    head += "(../which_command.md) helps to choose.\n"
+    # A code block in a language that Pygments does not know would be a warning.
+    return head + rest.replace("```console", "```sh")
+
+
+def homes() -> dict[str, str]:
+    """The page of each public name."""
+    found = {}
+    for name in er.__all__:
+        if name in ("gaze", "__version__"):
+            continue
+        home = er._HOMES[name]
+        pages = [page for page, (_, starts) in GROUPS.items() if home.split(".")[0] in starts]
+        found[name] = pages[0] if pages else "api_observers"
+    return found
+
+
+def pages() -> dict[str, str]:
+    """The pages of the commands and of the API by their names."""
+    made = {"commands": commands()}
+    where = homes()
+    for page, (title, _) in GROUPS.items():
+        made[page] = api_page(title, "eyerender", [name for name, its in where.items() if its == page])
+    made["api_gaze"] = api_page("Gaze estimators", "eyerender.gaze", er.gaze.__all__)
+    return made
+
+
+def api_page(title: str, module: str, names: list[str]) -> str:
+    """A page of names of one module: a table of all, then the docstring of each."""
+    table = "\n".join(f"   {name}" for name in names)
+    lines = [f"# {title}", "", "```{eval-rst}", f".. currentmodule:: {module}", "", ".. autosummary::", "", table, ""]
+    for name in names:
+        found = getattr(er.gaze if module.endswith("gaze") else er, name)
+        kind = "class" if isinstance(found, type) else "function"
+        if isinstance(found, type) and issubclass(found, Exception):
+            kind = "exception"
+        lines += [f".. auto{kind}:: {name}", *(["   :members:"] if kind == "class" else []), ""]
+    return "\n".join([*lines, "```", ""])
+
+
+def write(folder: Path) -> None:
+    """Write the pages."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in pages().items():
+        (folder / f"{name}.md").write_text(text, encoding="utf-8")
+
+
+def names_on(text: str) -> set[str]:
+    """The public names that a page of the API documents."""
+    return set(re.findall(r"^\.\. auto\w+:: (\w+)", text, re.MULTILINE)) - {"summary"}

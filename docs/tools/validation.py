@@ -1,0 +1,30 @@
+"""The tables of the validation page, from the files that `scripts/measure_validation.py` writes to `docs/data`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+DATA = Path(__file__).resolve().parents[1] / "data"
+
+
+def tables(data: dict[str, Any]) -> str:
+    """The tables of one file: a section for each group of rows."""
+    text = f"Measured on {data['measured']} with version {data['version']}, on {data['on']}.\n\n"
+    for title, rows in data["groups"].items():
+        text += f"## {title}\n\n| quantity | compared with | largest deviation | cases | tolerance of the test |\n"
+        text += "|---|---|---|---|---|\n"
+        for row in rows:
+            value = f"{row['value']:.2g} {row['unit']}".strip()
+            limit = "" if row["limit"] is None else f"{row['limit']:.2g} {row['unit']}".strip()
+            text += f"| {row['what']} | {row['oracle']} | {value} | {row['cases']} | {limit} |\n"
+        text += "\n"
+    return text
+
+
+def write(folder: Path) -> None:
+    """Write the tables as a page to include."""
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = [tables(json.loads(path.read_text(encoding="utf-8"))) for path in sorted(DATA.glob("*.json"))]
+    (folder / "validation_tables.md").write_text("\n".join(parts), encoding="utf-8")

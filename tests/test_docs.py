@@ -1,0 +1,121 @@
+"""The documentation site: its references are complete, its pages are reachable, and their links resolve."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import eyerender as er
+from docs.tools import keys, references, validation
+from tests.support.paths import ROOT
+
+DOCS = ROOT / "docs"
+GALLERY = "gallery/index"  # made by sphinx-gallery
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory) -> dict[str, str]:
+    """The text of every page by its name, with those that are made from the code."""
+    folder = tmp_path_factory.mktemp("docs") / "generated"
+    for tool in (keys, references, validation):
+        tool.write(folder)
+    own = {path.stem: path.read_text(encoding="utf-8") for path in DOCS.glob("*.md")}
+    made = {f"generated/{path.stem}": path.read_text(encoding="utf-8") for path in folder.glob("*.md")}
+    return {**own, **made}
+
+
+def schema_keys(kind: str) -> set[tuple[str, str]]:
+    """(record, key) of every property in the JSON Schema of a kind of file."""
+    schema = keys.FILES[kind].json_schema()
+    records = {schema["title"]: schema, **schema.get("$defs", {})}
+    return {(name, key) for name, record in records.items() for key in record.get("properties", ())}
+
+
+@pytest.mark.parametrize("kind", ["scene", "eye", "dataset"])
+def test_every_key_of_a_schema_has_a_row_with_a_description(kind):
+    rows = {(row.record, row.key): row for record in keys.records_of(keys.FILES[kind]) for row in keys.rows_of(record)}
+    assert schema_keys(kind) <= rows.keys()
+    assert not [name for name, row in rows.items() if len(row.description) < 3]
+
+
+def test_rows_state_unit_range_default_and_source():
+    rows = {(row.record, row.key): row for record in keys.records_of(er.SceneSpec) for row in keys.rows_of(record)}
+    lid = rows["Lid", "upper_follows"]
+    assert (lid.kind, lid.range, lid.default, lid.source) == ("number", "≥ 0.6, ≤ 1", "`0.9`", "Becker")
+    assert rows["Sensor", "pixel_pitch_um"].unit == "µm"
+    assert rows["Panel", "radiance_w_m2_sr"].unit == "W/(m² sr)"
+    assert rows["Rig", "cameras"].range == "1 to 100 entries"
+    assert rows["Rig", "cameras"].default == "**required**"
+    assert rows["Led", "position_mm"].kind == "3 of number"
+
+
+def test_a_record_is_described_once_and_links_lead_to_it(pages):
+    text = "".join(pages[f"generated/keys_{kind}"] for kind in keys.FILES)
+    anchors = re.findall(r"^\((keys-\w+)\)=$", text, re.MULTILINE)
+    assert len(anchors) == len(set(anchors)) > 40
+    assert set(re.findall(r"\(#(keys-\w+)\)", text)) <= set(anchors)
+
+
+def test_every_public_name_has_a_docstring_page(pages):
+    found = references.names_on("".join(text for name, text in pages.items() if "/api_" in name))
+    assert found == (set(er.__all__) | set(er.gaze.__all__)) - {"gaze", "__version__"}
+
+
+def test_every_command_is_in_the_reference(pages):
+    text = pages["generated/commands"]
+    assert len(re.findall(r"^## eyerender ", text, re.MULTILINE)) > 15
+    assert "\neyerender render --output PATH [OPTIONS] SCENE\n" in text
+
+
+def test_every_page_is_in_a_table_of_contents(pages):
+    listed = {"index", "generated/validation_tables"}  # the second is included, not a page
+    for text in pages.values():
+        for body in re.findall(r"```\{toctree\}\n(.*?)```", text, re.DOTALL):
+            listed |= {line for line in body.splitlines() if line and not line.startswith(":")}
+    assert set(pages) == listed - {GALLERY}
+
+
+@pytest.mark.parametrize("source", ["docs", "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md"])
+def test_relative_links_resolve(pages, source):
+    texts = pages if source == "docs" else {source: (ROOT / source).read_text(encoding="utf-8")}
+    wrong = []
+    for name, text in texts.items():
+        for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.DOTALL)):
+            if re.match(r"[a-z]+:|#", target):
+                continue
+            path, _, anchor = target.partition("#")
+            here = (DOCS / name).parent if source == "docs" else ROOT
+            place = os.path.relpath(here / path, DOCS)
+            page = pages.get(place.removesuffix(".md"))
+            exists = page is not None or (here / path).exists() or place.startswith("gallery/")
+            if not exists or (anchor and (page is None or anchor not in anchors_of(page))):
+                wrong.append(f"{name}: {target}")
+    assert wrong == []
+
+
+def anchors_of(page: str) -> set[str]:
+    """The anchors of a page's headings, as GitHub and MyST make them."""
+    heads = re.findall(r"^#+ (.*)$", page, re.MULTILINE)
+    plain = (re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads)
+    return {*plain, *re.findall(r"^\(([\w-]+)\)=$", page, re.MULTILINE)}
+
+
+def test_pictures_are_small():
+    sizes = {path.name: path.stat().st_size for path in (DOCS / "images").iterdir()}
+    assert max(sizes.values()) < 100_000, sizes
+    assert sum(sizes.values()) < 1_000_000
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("sphinx") is None, reason="the extra `docs` is not installed")
+def test_the_site_builds_without_a_warning(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "-q", str(DOCS), str(tmp_path)]
+    done = subprocess.run(command, env={**os.environ, "EYERENDER_DOCS_EXAMPLES": "0"}, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (Path(tmp_path) / "generated" / "keys_scene.html").is_file()
