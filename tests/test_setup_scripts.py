@@ -18,6 +18,7 @@ SCRIPTS = (
     "scripts/_setup.sh",
     "scripts/eyerender",
     "scripts/test",
+    "scripts/docs",
     "scripts/test-dependencies",
     "scripts/prove-bare",
     ".ci/run",
