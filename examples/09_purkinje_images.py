@@ -3,7 +3,8 @@ The four Purkinje images
 ========================
 
 Every surface of the eye mirrors the lamp: the front and the back of the cornea, and the front and the back of the lens.
-The first image is the glint. The fourth moves against it when the eye turns, which dual-Purkinje trackers use.
+The first image is the glint. The third moves against the others when the eye turns. The first and the fourth move by
+different amounts, which dual-Purkinje trackers use.
 """
 
 import matplotlib.pyplot as plt
