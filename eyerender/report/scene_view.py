@@ -12,6 +12,8 @@ from ..observation import EYES, Observations
 from ..scene import Scene
 from .style import ANALYTIC, IMAGE, TARGET, figure
 
+MAX_NOTES = 4
+"""Reasons for missing rays that a figure names."""
 _LIGHT, _SIGHT, _SCREEN = "#E69F00", "#CC79A7", "#777777"
 
 
@@ -38,8 +40,34 @@ def scene_view(scene: Scene) -> Any:
         ax.set(xlabel="x, to the screen (mm)", ylabel="y, to the subject's left (mm)", zlabel="z, up (mm)")
         ax.view_init(elev=22, azim=-128)
         fig.legend(loc="outside lower center", ncols=4, frameon=False)
-        fig.suptitle(scene.name)
+        fig.suptitle("\n".join([scene.name, *_notes(scene, seen.take(rows))]), fontsize=10)
         return fig
+
+
+def _notes(scene: Scene, seen: Observations) -> list[str]:
+    """Say which pose is shown, and which rays are missing for what reason."""
+    index, pose = seen.index, seen.pose
+    fixations = int(scene.index().fixation.max()) + 1
+    heads = len(scene.spec.subject.head_positions_mm)
+    if np.isfinite(index.target_mm[0]).all():
+        what = f"target 1 of {fixations} at ({', '.join(f'{v:g}' for v in index.target_mm[0])}) mm"
+    else:
+        azimuth, elevation = np.degrees([pose.azimuth_rad[0], pose.elevation_rad[0]])
+        what = f"pose 1 of {fixations}: azimuth {azimuth:g}\N{DEGREE SIGN}, elevation {elevation:g}\N{DEGREE SIGN}"
+    missing: dict[str, list[str]] = {}
+    for k in range(len(seen)):
+        eye = f"{EYES[index.eye[k]]} eye, camera {index.camera[k]}"
+        if not seen.pupil.ok[k]:
+            missing.setdefault(f"no pupil's ray: {seen.pupil.reason[k]}", []).append(eye)
+        for j in np.flatnonzero(~seen.glints.ok[k]):
+            name = f"{eye}, light {seen.glints.light[k, j]}"
+            missing.setdefault(f"no glint: {seen.glints.reason[k, j]}", []).append(name)
+    lines = [
+        f"{reason} ({names[0]}{f' and {len(names) - 1} more' if names[1:] else ''})"
+        for reason, names in missing.items()
+    ]
+    rest = [f"and {len(lines) - MAX_NOTES} more reasons"] if len(lines) > MAX_NOTES else []
+    return [f"{what}, head position 1 of {heads}", *lines[:MAX_NOTES], *rest]
 
 
 def _screen(ax: Any, scene: Scene) -> None:
