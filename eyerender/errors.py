@@ -72,6 +72,9 @@ class Problems:
         self._listed: list[InputError] = []
         self._count = 0
 
+    def __len__(self) -> int:
+        return self._count
+
     def add(self, reason: str, path: str = "") -> None:
         """Note an error; only the first `MAX_ERRORS` are kept, the others are counted."""
         self._count += 1

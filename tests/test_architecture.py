@@ -222,10 +222,10 @@ def test_public_names_are_pinned():
 def test_gaze_names_are_pinned():
     assert eyerender.gaze.__all__ == sorted(eyerender.gaze._HOMES)
     assert eyerender.gaze.__all__ == [
-        "CrossRatio", "EyeParameters", "GazeErrors", "GazeEstimator", "GazePoints", "GazeRays", "GuestrinEizenman",
-        "Hennessey", "Homography", "ParameterBounds", "Recalibration", "Regression", "ShihWuLiu", "StoredEstimator",
-        "angular_error_deg", "binocular_average", "gaze_errors", "leave_one_target_out", "load_estimator",
-        "load_observations", "save_estimator",
+        "CrossRatio", "CsvColumns", "EyeParameters", "GazeErrors", "GazeEstimator", "GazePoints", "GazeRays",
+        "GuestrinEizenman", "Hennessey", "Homography", "ParameterBounds", "Recalibration", "Regression", "ShihWuLiu",
+        "StoredEstimator", "angular_error_deg", "binocular_average", "gaze_errors", "leave_one_target_out",
+        "load_estimator", "load_observations", "load_rig", "observations_from_csv", "save_estimator",
     ]  # fmt: skip
     for name in eyerender.gaze.__all__:
         assert getattr(eyerender.gaze, name) is not None

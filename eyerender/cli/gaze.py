@@ -27,6 +27,8 @@ def fit(
     estimator: Annotated[str, Parameter(name="--estimator")],
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     scene: str | None = None,
+    rig: str | None = None,
+    columns: Path | None = None,
     function: str = "R3",
     terms_x: str | None = None,
     terms_y: str | None = None,
@@ -42,14 +44,16 @@ def fit(
     """Calibrate a gaze estimator on records with known targets, and write the calibration.
 
     Args:
-        records: Records as `features` or `extract` write them (JSON), or one record per line (JSONL). Each record needs
-            its target_mm.
+        records: Records as `features` or `extract` write them (JSON), one record per line (JSONL), or a table (CSV).
+            Each needs its target.
         estimator: regression (polynomials of the pupil-glint vector; one light), homography (normalisation by four
             lights), cross-ratio (four lights at the screen's corners and one at the camera), hennessey (one camera, two
             lights), shih-wu-liu (two cameras, two lights), or guestrin-eizenman (one camera, two lights);
             or module:Class, a class of your own that can be made without arguments.
         output: The calibration file to write.
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
+        rig: A rig file or a scene file, for its rig.
+        columns: A YAML file that says what the columns of a table are (default: as their names say).
         function: regression: the function, R1 to R12.
         terms_x: regression: your own terms of x instead of a function, such as 'x + xy + 1'.
         terms_y: regression: your own terms of y.
@@ -79,9 +83,9 @@ def fit(
     )
     targets = _chosen(fixations)
     heed = Heed(strict)
-    observations, rig = load_observations(records, _scene(scene, heed))
-    fitted, summary = fit_estimator(chosen, observations, rig, targets, source=str(records), warn=heed)
-    save_estimator(output, fitted, rig)
+    observations, built = load_observations(records, _scene(scene, heed), rig=rig, columns=columns)
+    fitted, summary = fit_estimator(chosen, observations, built, targets, source=str(records), warn=heed)
+    save_estimator(output, fitted, built)
     summary = {**summary, "path": str(output)}
     mean = summary["calibration_error_deg"]["mean_deg"]
     text = f"{estimator}: calibrated on {summary['calibration_observations']} observations, written to {output}"
@@ -99,6 +103,8 @@ def predict(
     calibration: Annotated[Path, Parameter(name=["--calibration", "-c"])],
     estimator: str | None = None,
     scene: str | None = None,
+    rig: str | None = None,
+    columns: Path | None = None,
     strict: Strict = False,
     json: Result = None,
 ) -> int:
@@ -107,10 +113,12 @@ def predict(
     Where the targets are known, the errors are reported too.
 
     Args:
-        records: Records as `features` or `extract` write them (JSON), or one record per line (JSONL).
+        records: Records as `features` or `extract` write them (JSON), one record per line (JSONL), or a table (CSV).
         calibration: The calibration file.
         estimator: Your own class as module:Class, if it made the calibration. The file alone never imports code.
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
+        rig: A rig file or a scene file, for its rig.
+        columns: A YAML file that says what the columns of a table are (default: as their names say).
     """
     from ..gaze.records import load_observations
     from ..gaze.store import load_calibration, predictions
@@ -118,10 +126,10 @@ def predict(
 
     heed = Heed(strict)
     fitted, calibrated = load_calibration(calibration, estimator)
-    observations, rig = load_observations(records, _scene(scene, heed))
+    observations, built = load_observations(records, _scene(scene, heed), rig=rig, columns=columns)
     if calibrated is not None:
-        heed(rig_warnings(rig, calibrated, scene or str(records)))
-    data = predictions(fitted, observations, rig)
+        heed(rig_warnings(built, calibrated, scene or rig or str(records)))
+    data = predictions(fitted, observations, built)
     emit(data, _gaze_table(data), json, heed)
     return 0
 

@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .columns import CsvColumns
     from .crossratio import CrossRatio
     from .estimate import (
         GazeEstimator,
@@ -26,14 +27,16 @@ if TYPE_CHECKING:
     from .homography import Homography
     from .parameters import EyeParameters, ParameterBounds
     from .recalibration import Recalibration
-    from .records import load_observations
+    from .records import load_observations, load_rig
     from .regression import Regression
     from .store import load_estimator, save_estimator
+    from .table import observations_from_csv
     from .twocamera import ShihWuLiu
     from .validation import GazeErrors, gaze_errors, leave_one_target_out
 
 _HOMES = {
     "CrossRatio": "crossratio",
+    "CsvColumns": "columns",
     "EyeParameters": "parameters",
     "GazeErrors": "validation",
     "GazeEstimator": "estimate",
@@ -53,11 +56,14 @@ _HOMES = {
     "leave_one_target_out": "validation",
     "load_estimator": "store",
     "load_observations": "records",
+    "load_rig": "records",
+    "observations_from_csv": "table",
     "save_estimator": "store",
 }
 
 __all__ = [
     "CrossRatio",
+    "CsvColumns",
     "EyeParameters",
     "GazeErrors",
     "GazeEstimator",
@@ -77,6 +83,8 @@ __all__ = [
     "leave_one_target_out",
     "load_estimator",
     "load_observations",
+    "load_rig",
+    "observations_from_csv",
     "save_estimator",
 ]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,39 +15,79 @@ from ..files import parse_json, read_text
 from ..observation import Observations
 from ..rig.camera import CameraCalibration, PinholeCamera
 from ..rig.light import MAX_LIGHTS, Lamp
-from ..rig.rig import MAX_CAMERAS, RigGeometry
+from ..rig.rig import MAX_CAMERAS, Rig, RigGeometry, RigLike
 from ..rig.screen import ScreenPlane
 from ..scene import Scene, load_scene
-from ..spec import LARGEST
+from ..spec import LARGEST, FileSpec, read_yaml
+from .columns import CsvColumns
+from .table import observations_from_csv
 
 ReadArray = Callable[[Any, tuple[int, ...], str], Floats]
 """Turns a value into an array of a shape; raises `InputError` with the path."""
+
+TABLES = (".csv", ".tsv")
+"""Names of files that are read as tables end with one of these."""
 
 # This is about 40,000 observations. All of them are held in memory at once.
 MAX_RECORDS_BYTES = 128 * 2**20
 
 
-def load_observations(path: str | Path, scene: str | Scene | None = None) -> tuple[Observations, RigGeometry]:
-    """Load observations and rig from a file of records.
+def load_observations(
+    path: str | Path,
+    scene: str | Scene | None = None,
+    *,
+    rig: str | Path | RigLike | None = None,
+    columns: str | Path | Mapping[str, Any] | CsvColumns | None = None,
+) -> tuple[Observations, RigGeometry]:
+    """Load observations and their rig from a file of records, or from a table.
 
-    The file is JSON as `features` writes it, which includes the rig, or JSONL with one record a line. `scene`, if
-    given, provides the rig instead.
+    Args:
+        path: JSON as `features` writes it, which includes the rig; JSONL with one record a line; or a table (.csv or
+            .tsv, see `observations_from_csv`).
+        scene: provides the rig, if the file does not.
+        rig: provides the rig instead: a rig, or a file that `load_rig` reads.
+        columns: what the columns of a table are.
 
     Raises:
         InputError: naming the file and the key.
     """
     source = str(path)
-    records, rig = _read(read_text(path, limit=MAX_RECORDS_BYTES), source)
+    if scene is not None and rig is not None:
+        raise InputError("give either a scene or a rig", source="--rig")
+    given: RigGeometry | None = None
+    if scene is not None:
+        given = (scene if isinstance(scene, Scene) else load_scene(scene)).rig
+    elif rig is not None:
+        given = load_rig(rig) if isinstance(rig, str | Path) else rig.build()
+    if columns is not None or Path(path).suffix.lower() in TABLES:
+        if given is None:
+            raise InputError("holds no rig; give --rig or --scene", source=source)
+        return observations_from_csv(path, columns, given), given
+    records, own = _read(read_text(path, limit=MAX_RECORDS_BYTES), source)
     if not records:
         raise InputError("holds no records", source=source)
-    if scene is None and rig is None:
-        raise InputError("holds no rig; give --scene", source=source)
-    given = None if scene is None else (scene if isinstance(scene, Scene) else load_scene(scene)).rig
+    if given is None and own is None:
+        raise InputError("holds no rig; give --scene or --rig", source=source)
     problems = Problems(source)
-    built = given or problems.attempt(lambda: rig_from_mapping(rig, source=source))
+    built = given or problems.attempt(lambda: rig_from_mapping(own, source=source))
     observations = problems.attempt(lambda: Observations.from_records(records, source=source))
     problems.check()
     return observations, built
+
+
+class RigFile(FileSpec, Rig):
+    """A rig in a file of its own: `format: 1` and the keys of `rig` in a scene."""
+
+
+def load_rig(path: str | Path) -> RigGeometry:
+    """Read the rig of a scene (a file, or the name of a shipped one) or of a rig file.
+
+    Raises:
+        InputError: naming the file and the key.
+    """
+    if Path(path).suffix.lower() in (".yaml", ".yml") and "cameras" in read_yaml(path):
+        return RigFile.load(path).build()
+    return load_scene(path).rig
 
 
 def _read(text: str, source: str) -> tuple[list[Any], Any]:

@@ -61,6 +61,11 @@ def place(tmp_path, monkeypatch):
     Path("f.json").write_text(json.dumps(records), encoding="utf-8")
     own = {"schema": "eyerender/gaze-calibration/3", "estimator": {"reference": "exits:Mine"}, "rig": None, "state": {}}
     Path("own.json").write_text(json.dumps(own), encoding="utf-8")
+    Path("t.csv").write_text("time,pupil_x,pupil_y,target_x,target_y\n0,1,x,0,0\n1,y,2,0,0\n", encoding="utf-8")
+    Path("good.csv").write_text("pupil_x,pupil_y\n1,2\n", encoding="utf-8")
+    Path("columns.yaml").write_text("format: 1\npupil: [px, py]\ncolour: 1\n", encoding="utf-8")
+    Path("names.yaml").write_text("format: 1\npupil: [px, pupil_y]\n", encoding="utf-8")
+    Path("rig.yaml").write_text("format: 1\ncameras: []\nlights: [{position_mm: [1, 2, 3]}]\n", encoding="utf-8")
     Path("empty.png").write_bytes(b"")
     Path("noise.png").write_bytes(np.random.default_rng(0).bytes(400))
     colour = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
@@ -85,6 +90,8 @@ def place(tmp_path, monkeypatch):
     (Path("file")).write_text("x")
     return tmp_path
 
+
+FIT = ["gaze", "fit", "--estimator", "regression", "-o", "c.json"]
 
 TABLE = [
     # command, exit code, words on stderr
@@ -148,6 +155,18 @@ TABLE = [
         2,
         "own.json: estimator.reference: is 'e",
     ),
+    ([*FIT, "missing.csv", "--rig", "quickstart"], 2, "missing.csv: no such file"),
+    ([*FIT, "good.csv"], 2, "good.csv: holds no rig; give --rig or --scene"),
+    ([*FIT, "good.csv", "--rig", "quickstart", "--scene", "quickstart"], 2, "--rig: give either a scene or a rig"),
+    ([*FIT, "good.csv", "--rig", "nonsense"], 2, "nonsense: no such scene file"),
+    ([*FIT, "good.csv", "--rig", "missing.yaml"], 2, "missing.yaml: no such file"),
+    ([*FIT, "good.csv", "--rig", "rig.yaml"], 2, "rig.yaml: cameras: needs at least 1 entries"),
+    ([*FIT, "good.csv", "--rig", "quickstart"], 2, "good.csv: a calibration needs records with target_mm"),
+    ([*FIT, "good.csv", "--rig", "quickstart", "--columns", "missing.yaml"], 2, "missing.yaml: no such file"),
+    ([*FIT, "good.csv", "--rig", "quickstart", "--columns", "columns.yaml"], 2, "columns.yaml: colour: unknown key"),
+    ([*FIT, "good.csv", "--rig", "quickstart", "--columns", "names.yaml"], 2, "names.yaml: there is no column 'px'"),
+    ([*FIT, "pipe.yaml", "--rig", "quickstart", "--columns", "names.yaml"], 2, "pipe.yaml: is a pipe, not a file"),
+    (["gaze", "predict", "good.csv", "-c", "own.json", "--rig", "rig.yaml"], 2, "own.json: estimator.reference"),
     (["compare", "hollow", "--estimator", "magic"], 2, "--estimator: must be one of regression"),
     (["compare", "hollow", "--estimator", "json:JSONDecoder"], 2, "--estimator: json:JSONDecoder has no method fit"),
     (["compare", "hollow", "--function", "R13"], 2, "'R13' is not a regression function"),
@@ -296,6 +315,19 @@ def test_bad_input(place, capsys, argv, code, words):
     assert words in lines[0]
     assert out == ""
     assert sorted(str(p) for p in place.rglob("*")) == before
+
+
+def test_all_errors_of_an_input_have_a_line_each(place, capsys):
+    assert run([*FIT, "t.csv", "--rig", "quickstart"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines() == [
+        "error: t.csv: line 3.pupil_x: must be a number or empty, not 'y'",
+        "error: t.csv: line 2.pupil_y: must be a number or empty, not 'x'",
+        "error: t.csv: target_x, target_y: the unit is not known; say 'target_unit' (mm, px or fraction) in --columns, "
+        "or add _mm or _px",
+    ]
+    assert not Path("c.json").exists()
 
 
 def test_a_pupil_that_is_not_found_is_a_result(place, capsys):

@@ -1,0 +1,413 @@
+"""Tables of pupils, glints and targets (CSV) as observations.
+
+A row is one eye in one frame, or both eyes of a frame (with columns of the right and of the left eye), or one glint
+(with a column `light`). `CsvColumns` says which column is what.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints, Objects
+from ..errors import InputError, Problems
+from ..files import read_bytes, shown
+from ..observation import (
+    EYES,
+    MAX_GLINTS,
+    GlintFeatures,
+    Index,
+    Observations,
+    PoseTruth,
+    PupilFeatures,
+    count_heads,
+)
+from ..rig.light import MAX_LIGHTS
+from ..rig.rig import RigLike
+from ..rig.screen import ScreenPlane
+from ..status import Status
+from .columns import CsvColumns, EyeColumns, completed
+
+# A table is held in memory as text and as numbers, which takes some 20 times its size.
+MAX_TABLE_BYTES, MAX_COLUMNS = 64 * 2**20, 1000
+# Numbers that can still be squared.
+_LARGEST = 1e30
+_MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-"))
+_EYE_WORDS = {
+    **dict.fromkeys(("right", "r", "od", "0", "0.0", "eye0"), "right"),
+    **dict.fromkeys(("left", "l", "os", "1", "1.0", "eye1"), "left"),
+}
+
+
+def observations_from_csv(
+    path: str | Path,
+    columns: str | Path | Mapping[str, Any] | CsvColumns | None = None,
+    rig: RigLike | None = None,
+) -> Observations:
+    """Read a table of pupils, glints and targets.
+
+    Args:
+        path: the table (CSV with a header; commas, semicolons or tabs). An empty cell is a missing value.
+        columns: `CsvColumns`, a mapping of its keys or its YAML file; for columns with names of their own.
+        rig: the rig; needed for targets on its screen.
+
+    Returns:
+        The observations in frame order, the right eye first.
+
+    Raises:
+        InputError: naming the lines and columns that are wrong.
+    """
+    if columns is None:
+        given = CsvColumns()
+    elif isinstance(columns, CsvColumns):
+        given = columns
+    else:
+        given = CsvColumns.load(columns) if isinstance(columns, str | Path) else CsvColumns.from_mapping(columns)
+    told = str(columns) if isinstance(columns, str | Path) else "columns"
+    table = _Table.read(path, given.delimiter)
+    named = completed(given, table.header, told, table.problems)
+    screen = None if rig is None else rig.build().screen
+    return _observations(table, named, screen)
+
+
+@dataclass
+class _Table:
+    """The cells of a table, by the name of the column; and what is wrong with it."""
+
+    source: str
+    header: list[str]
+    cells: dict[str, list[str]]
+    lines: list[int]
+    decimal_comma: bool
+    problems: Problems
+
+    @classmethod
+    def read(cls, path: str | Path, delimiter: str | None) -> _Table:
+        source = str(path)
+        try:
+            text = read_bytes(path, limit=MAX_TABLE_BYTES).decode("utf-8-sig")
+        except UnicodeDecodeError:
+            raise InputError("cannot be read (not UTF-8 text)", source=source) from None
+        delimiter = delimiter or max(",;\t", key=text.split("\n", 1)[0].count)
+        problems = Problems(source)
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
+        rows, lines = [], []
+        try:
+            header = [name.strip() for name in next(reader, [])]
+            if not any(header) or len(header) > MAX_COLUMNS:
+                raise InputError(f"must be a header of 1 to {MAX_COLUMNS} columns", source=source, path="line 1")
+            for row in filter(any, reader):
+                if len(row) != len(header):
+                    problems.add(f"has {len(row)} cells; the header has {len(header)}", f"line {reader.line_num}")
+                rows.append(row)
+                lines.append(reader.line_num)
+        except csv.Error as error:
+            raise InputError(f"is not valid CSV: {error}", source=source, path=f"line {reader.line_num}") from None
+        again = sorted(name for name in set(header) if header.count(name) > 1)
+        if again:
+            problems.add(f"the column {shown(again[0])} appears twice", "line 1")
+        if not rows:
+            problems.add("holds no rows")
+        problems.check()
+        cells = {name: [row[k] for row in rows] for k, name in enumerate(header)}
+        return cls(source, header, cells, lines, delimiter == ";", problems)
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def refuse(self, row: int, column: str, reason: str) -> None:
+        self.problems.add(reason, f"line {self.lines[row]}.{column}")
+
+    def numbers(self, column: str | None) -> Floats:
+        """A column as numbers (n,), NaN where a cell is empty or there is no column."""
+        out = np.full(len(self), np.nan)
+        for k, cell in enumerate(self.cells[column] if column else ()):
+            word = cell.strip()
+            if word.lower() in _MISSING:
+                continue
+            try:
+                value = float(word.replace(",", ".") if self.decimal_comma else word)
+            except ValueError:
+                value = np.inf
+            if abs(value) <= _LARGEST:
+                out[k] = value
+            else:
+                self.refuse(k, str(column), f"must be a number or empty, not {shown(cell)}")
+        return out
+
+    def several(self, columns: tuple[str, ...] | None, count: int) -> Floats:
+        """Columns that belong together as (n, count): all of them are given in a row, or none."""
+        if columns is None:
+            return np.full((len(self), count), np.nan)
+        known = len(self.problems)
+        out = np.stack([self.numbers(column) for column in columns], axis=-1)
+        some = np.isnan(out).any(axis=1) & ~np.isnan(out).all(axis=1)
+        if len(self.problems) == known:
+            for k in np.flatnonzero(some).tolist():
+                empty = columns[int(np.isnan(out[k]).argmax())]
+                self.refuse(k, empty, f"is empty, but {', '.join(c for c in columns if c != empty)} is not")
+        return out
+
+    def counts(self, column: str | None, unknown: int, limit: int = 2**31 - 1) -> Ints:
+        """A column of whole numbers (n,), `unknown` where a cell is empty or there is no column."""
+        found = self.numbers(column)
+        empty = np.isnan(found)
+        bad = ~empty & ~((found >= 0) & (found <= limit) & (found == np.floor(found)))
+        for k in np.flatnonzero(bad).tolist():
+            self.refuse(k, str(column), f"must be a whole number from 0 to {limit}, not {found[k]:g}")
+        return np.where(empty | bad, unknown, np.where(bad, 0, found)).astype(np.int64)
+
+    def eyes(self, column: str | None, words: Mapping[str, str]) -> Ints:
+        """A column of eyes: 0 right, 1 left, -1 where a cell is empty or there is no column."""
+        out = np.full(len(self), -1, np.int64)
+        meanings = {**_EYE_WORDS, **{word.strip().lower(): side for word, side in words.items()}}
+        for k, cell in enumerate(self.cells[column] if column else ()):
+            word = cell.strip().lower()
+            if word in meanings:
+                out[k] = EYES.index(meanings[word])
+            elif word not in _MISSING:
+                self.refuse(k, str(column), f"must be right or left, not {shown(cell)}; say in 'eyes' what it means")
+        return out
+
+
+def _observations(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> Observations:
+    parts = _parts(table, columns)
+    n = len(table)
+    eye = np.concatenate([eye for _, eye in parts])
+    # One entry for each part of each row.
+    line = np.tile(np.arange(n), len(parts))
+    frame, camera = _frames(table, columns, eye)[line], table.counts(columns.camera, 0)[line]
+    fixation, light = table.counts(columns.fixation, -1)[line], table.counts(columns.light, -1, MAX_LIGHTS - 1)[line]
+    width = max(len(part.glints or ()) for part, _ in parts)
+    if len(line) * width > MAX_GLINTS:
+        raise InputError(f"holds more than {MAX_GLINTS} glints", source=table.source)
+    features = [_features(table, part, columns, width) for part, _ in parts]
+    values = {key: np.concatenate([part[key] for part in features]) for key in features[0]}
+    values["target"] = _targets(table, columns, screen)[line]
+    table.problems.check()
+
+    # One observation for each eye of each frame, in order; the right eye comes first.
+    keys = np.stack([frame, camera, eye], axis=1)
+    rows, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    which = which.reshape(-1)
+    lights = np.broadcast_to(np.arange(width), (len(rows), width))
+    if columns.light is None:
+        for k in np.flatnonzero(first[which] != np.arange(len(line))).tolist():
+            named = f"frame {frame[k]}" + (f", {EYES[eye[k]]} eye," if eye[k] >= 0 else "")
+            earlier = table.lines[line[first[which[k]]]]
+            table.problems.add(f"{named} is in line {earlier} already", f"line {table.lines[line[k]]}")
+        table.problems.check()
+        found = {key: value[first] for key, value in values.items()}
+    else:
+        glints, lights = _listed_glints(table, columns.light, values.pop("glints"), light, which, len(rows))
+        found = {key: _merged(table, key, value, which, len(rows)) for key, value in values.items()}
+        found["glints"] = glints
+        table.problems.check()
+
+    numbers = fixation[first]
+    if columns.fixation is None:
+        there = np.isfinite(found["target"]).all(axis=1)
+        numbers = np.full(len(rows), -1, np.int64)
+        numbers[there] = count_heads(found["target"][there])
+    position, head = _places(found["position"], rows[:, 0], rows[:, 2], columns)
+    seen: Bools = np.asarray(np.isfinite(found["glints"]).all(axis=2))
+    return Observations(
+        index=Index(
+            frame=rows[:, 0],
+            fixation=numbers,
+            camera=rows[:, 1],
+            head=np.zeros(len(rows), np.int64),
+            eye=rows[:, 2],
+            target_mm=found["target"],
+            head_mm=head,
+            eye_position_mm=position,
+        ),
+        pose=PoseTruth(azimuth_rad=np.full(len(rows), np.nan)),
+        pupil=_pupil(found, columns),
+        glints=GlintFeatures(
+            status=np.where(seen, Status.OK, Status.NOT_FOUND).astype(np.int8),
+            light=lights,
+            reason=_reasons(seen),
+            in_image=seen,
+            xy_px=np.where(seen[..., None], found["glints"], np.nan),
+        ),
+    )
+
+
+def _parts(table: _Table, columns: CsvColumns) -> list[tuple[EyeColumns, Ints]]:
+    """The columns of each eye, and the eye of each row."""
+    sides = [(getattr(columns, side), k) for k, side in enumerate(EYES) if getattr(columns, side) is not None]
+    parts = [(part, np.full(len(table), k, np.int64)) for part, k in sides]
+    if parts and columns.light is not None:
+        raise InputError("a row holds one glint (light) or both eyes (right, left), not both", source=table.source)
+    if not parts:
+        parts = [(columns, table.eyes(columns.eye, columns.eyes))]
+    if all(part.pupil is None and not part.glints for part, _ in parts):
+        raise InputError(
+            "has no column of a pupil or a glint (pupil_x and pupil_y, glint0_x and glint0_y, ...); say with --columns "
+            f"what {shown(', '.join(table.header), 150)} are",
+            source=table.source,
+        )
+    return parts
+
+
+def _frames(table: _Table, columns: CsvColumns, eye: Ints) -> Ints:
+    """Frame of each row."""
+    named = columns.frame or columns.time
+    for k, cell in enumerate(table.cells[named] if named else ()):
+        if cell.strip().lower() in _MISSING:
+            table.refuse(k, str(named), "is empty")
+    if columns.frame is not None:
+        return table.counts(columns.frame, -1)
+    if columns.time is not None:
+        times: dict[str, int] = {}
+        found = [times.setdefault(cell.strip(), len(times)) for cell in table.cells[columns.time]]
+        return np.array(found, np.int64)
+    if columns.light is not None or (columns.right is None and columns.left is None and len(np.unique(eye)) > 1):
+        raise InputError("needs a column frame or time, which says what rows are one frame", source=table.source)
+    return np.arange(len(table))
+
+
+def _features(table: _Table, part: EyeColumns, columns: CsvColumns, width: int) -> dict[str, Floats]:
+    """The numbers of one eye in each row: its pupil (n, 2), semi-axes and angle (n, 3), glints (n, width, 2), ..."""
+    shape = np.full((len(table), 3), np.nan)
+    if part.pupil_axes is not None:
+        semi = columns.axes == "semi" or (columns.axes is None and "semi" in part.pupil_axes[0].lower())
+        shape[:, :2] = table.several(part.pupil_axes, 2) * (1.0 if semi else 0.5)
+        named = part.pupil_angle is not None and re.search(r"(?i)[^a-z]rad", part.pupil_angle) is not None
+        angle = table.numbers(part.pupil_angle)
+        shape[:, 2] = (
+            angle if columns.angle_unit == "rad" or (columns.angle_unit is None and named) else np.radians(angle)
+        )
+    elif part.pupil_diameter is not None:
+        shape[:, :2] = table.numbers(part.pupil_diameter)[:, None] / 2
+    if part.pupil_axes is not None or part.pupil_diameter is not None:
+        for k in np.flatnonzero((shape[:, :2] < 0).any(axis=1)).tolist():
+            table.refuse(k, part.pupil_diameter or ", ".join(part.pupil_axes or ()), "must be > 0")
+        shape[(shape[:, :2] == 0).any(axis=1)] = np.nan
+    glints = np.full((len(table), width, 2), np.nan)
+    for k, pair in enumerate(part.glints or ()):
+        glints[:, k] = table.several(pair, 2) + columns.offset_px
+    return {
+        "pupil": table.several(part.pupil, 2) + columns.offset_px,
+        "shape": shape,
+        "glints": glints,
+        "confidence": table.numbers(part.confidence if columns.min_confidence is not None else None),
+        "position": table.several(part.eye_position, 3),
+    }
+
+
+def _targets(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> Floats:
+    """Target of each row (n, 3) mm in the world, NaN where there is none."""
+    names = columns.target
+    if names is None:
+        return np.full((len(table), 3), np.nan)
+    found = table.several(names, len(names))
+    if len(names) == 3:
+        return found
+    said = re.search(r"(?i)[^a-z](px|pixels?|mm|norm|fraction|normali[sz]ed)[^a-z]*$", names[0])
+    unit = columns.target_unit or ({"p": "px", "m": "mm"}.get(said[1][0].lower(), "fraction") if said else None)
+    problem = None
+    if unit is None:
+        problem = "the unit is not known; say 'target_unit' (mm, px or fraction) in --columns, or add _mm or _px"
+    elif screen is None:
+        problem = "targets on the screen need a rig with a screen"
+    elif unit == "px" and columns.screen_px is None:
+        problem = "targets in px need 'screen_px' (width and height of the screen in px) in --columns"
+    if problem is not None or unit is None or screen is None:
+        table.problems.add(str(problem), ", ".join(names))
+        return np.full((len(table), 3), np.nan)
+    size = np.array(screen.size_mm)
+    scale = {"mm": np.ones(2), "px": size / np.array(columns.screen_px or (1, 1)), "fraction": size}[unit]
+    origin = columns.target_origin or ("centre" if unit == "mm" else "top-left")
+    at = found * scale
+    if origin != "centre":
+        at = at - size / 2
+    if origin == "top-left":
+        at[:, 1] *= -1
+    return screen.world(at)
+
+
+def _listed_glints(
+    table: _Table, column: str, glints: Floats, light: Ints, which: Ints, count: int
+) -> tuple[Floats, Ints]:
+    """Glints (count, lights, 2) and their lights of rows that hold one glint each."""
+    here = np.isfinite(glints[:, 0]).all(axis=1) if glints.shape[1] else np.zeros(len(light), bool)
+    for k in np.flatnonzero(here & (light < 0)).tolist():
+        table.refuse(k, column, "is empty, but the row holds a glint")
+    lights = np.unique(light[light >= 0])
+    if count * len(lights) > MAX_GLINTS:
+        raise InputError(f"holds more than {MAX_GLINTS} glints", source=table.source)
+    out = np.full((count, len(lights), 2), np.nan)
+    for k in np.flatnonzero(here & (light >= 0)).tolist():
+        at = which[k], np.searchsorted(lights, light[k])
+        if np.isfinite(out[at]).all():
+            table.refuse(k, column, f"light {light[k]} has a glint in this frame already")
+        out[at] = glints[k, 0]
+    return out, np.broadcast_to(lights, (count, len(lights)))
+
+
+def _merged(table: _Table, key: str, values: Floats, which: Ints, count: int) -> Floats:
+    """Values of rows that are one observation: those of the first row that has them; the others must agree."""
+    out = np.full((count, *values.shape[1:]), np.nan)
+    there = np.nonzero(np.isfinite(values))
+    backwards = tuple(axis[::-1] for axis in there)  # the first one is written last
+    out[(which[backwards[0]], *backwards[1:])] = values[backwards]
+    other = np.isfinite(values) & (values != out[which])
+    for k in np.flatnonzero(other.reshape(len(values), -1).any(axis=1)).tolist():
+        table.problems.add(f"the {key} differs from another row of the same frame and eye", f"line {table.lines[k]}")
+    return out
+
+
+def _places(position: Floats, frame: Ints, eye: Ints, columns: CsvColumns) -> tuple[Floats, Floats]:
+    """Place of each eye without its head's, and the head's: the middle of both eyes where both are known, else 0."""
+    position = position.copy()
+    for side, place in columns.eye_position_mm.items():
+        position[(eye == EYES.index(side)) & np.isnan(position).any(axis=1)] = place
+    if len(columns.eye_position_mm) == 1:
+        position[(eye < 0) & np.isnan(position).any(axis=1)] = next(iter(columns.eye_position_mm.values()))
+    head = np.where(np.isnan(position), np.nan, 0.0)
+    _, which = np.unique(frame, return_inverse=True)
+    middle = np.zeros((int(which.max()) + 1, 2, 3))
+    middle[:] = np.nan
+    known = eye >= 0
+    middle[which[known], eye[known]] = position[known]
+    middle = middle.mean(axis=1)[which]
+    head = np.where(np.isfinite(middle).all(axis=1)[:, None] & known[:, None], middle, head)
+    return position - head, head
+
+
+def _reasons(found: Bools) -> Objects:
+    """Why features are missing; None where they were found."""
+    reason = np.full(found.shape, None, dtype=object)
+    reason[~found] = Status.NOT_FOUND.reason
+    return reason
+
+
+def _pupil(found: dict[str, Floats], columns: CsvColumns) -> PupilFeatures:
+    centre, shape = found["pupil"], found["shape"].copy()
+    # The larger axis comes first; its angle is in [0, pi).
+    turned = shape[:, 1] > shape[:, 0]
+    shape[turned] = np.stack([shape[turned, 1], shape[turned, 0], shape[turned, 2] + np.pi / 2], axis=-1)
+    ok: Bools = np.asarray(np.isfinite(centre).all(axis=1))
+    reason = _reasons(ok)
+    if columns.min_confidence is not None:
+        unsure: Bools = ok & ~(found["confidence"] >= columns.min_confidence)
+        for k in np.flatnonzero(unsure):
+            reason[k] = f"{Status.NOT_FOUND.reason} (confidence below {columns.min_confidence:g})"
+        ok = np.asarray(ok & ~unsure)
+    return PupilFeatures(
+        status=np.where(ok, Status.OK, Status.NOT_FOUND).astype(np.int8),
+        reason=reason,
+        in_image=ok,
+        centre_px=np.where(ok[:, None], centre, np.nan),
+        semi_axes_px=np.where(ok[:, None], shape[:, :2], np.nan),
+        angle_rad=np.where(ok, shape[:, 2] % np.pi, np.nan),
+    )

@@ -1,0 +1,95 @@
+"""docs/own_data.md: its files, scripts and commands are run as they stand."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+import eyerender as er
+from eyerender.cli.main import run
+from eyerender.gaze.columns import CsvColumns, EyeColumns
+from tests.support.paths import ROOT
+
+PAGE = (ROOT / "docs" / "own_data.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", PAGE, re.DOTALL)
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    """A folder with every file that the page shows by its name."""
+    monkeypatch.chdir(tmp_path)
+    for kind, text in BLOCKS:
+        if kind in ("yaml", "python") and (named := re.match(r"# (\S+\.(?:yaml|py))\n", text)):
+            (tmp_path / named[1]).write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+def export(path):
+    """The recording with the columns of columns.yaml."""
+    with open("recording.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))[1:]
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["FrameNo", "Eye", "PupX", "PupY", "CR1x", "CR1y", "CR2x", "CR2y", "StimX", "StimY"])
+        for time, eye, *features, x, y in rows:
+            spot = [(float(x) / 377 + 0.5) * 1280, (0.5 - float(y) / 301) * 1024]
+            writer.writerow([round(float(time) * 60), {"right": "OD", "left": "OS"}[eye], *features, *spot])
+
+
+def test_every_block_of_the_page_runs(page, capsys):
+    ran = 0
+    for kind, text in BLOCKS:
+        if kind == "sh":
+            for line in text.splitlines():
+                program, *argv = shlex.split(line)
+                if program == "python":
+                    subprocess.run([sys.executable, *argv], check=True)
+                    export("export.csv")
+                else:
+                    assert (program, run(argv)) == ("eyerender", 0), capsys.readouterr().err
+                ran += 1
+        elif kind == "python" and not text.startswith("# "):
+            exec(text, {})
+    assert ran >= 5
+    assert capsys.readouterr().err == ""
+    for name in ("gaze.json", "model_gaze.json"):
+        gaze = json.loads((page / name).read_text())["gaze"]
+        assert len(gaze) == 18
+        missed = [np.linalg.norm(np.subtract(g["point_mm"], g["target_mm"])) for g in gaze]
+        assert np.median(missed) < 10.0  # mm on the screen
+    seen, _ = er.gaze.load_observations("export.csv", columns="columns.yaml", rig="rig.yaml")
+    assert seen.pupil.ok.all()
+
+
+def test_every_name_on_the_page_exists():
+    names = set(re.findall(r"\ber\.((?:gaze\.)?\w+)", PAGE)) - {"gaze"}
+    for name in names:
+        found = er
+        for part in name.split("."):
+            found = getattr(found, part)
+
+
+def test_every_key_of_the_columns_is_on_the_page():
+    for key in (*CsvColumns.model_fields, *EyeColumns.model_fields):
+        assert re.search(rf"\b{key}\b", PAGE), key
+
+
+def test_the_names_that_the_page_lists_are_found(page):
+    rows = dict(re.findall(r"^\| (\w[^|]*?) \| (`[^|]*) \|$", PAGE, re.MULTILINE))
+    for quantity in ("frame", "time"):
+        for name in re.findall(r"`(\w+)`", rows[quantity]):
+            (page / "t.csv").write_text(f"{name},eye,pupil_x,pupil_y\n3,right,1,2\n3,left,1,2\n", encoding="utf-8")
+            seen = er.gaze.observations_from_csv("t.csv")
+            assert len(set(seen.index.frame.tolist())) == 1, name
+    for name in re.findall(r"`(\w+)_x`", rows["pupil centre"]):
+        (page / "t.csv").write_text(f"{name}_x,{name}_y\n1,2\n", encoding="utf-8")
+        assert er.gaze.observations_from_csv("t.csv").pupil.ok.all()
+    yaml.safe_load((page / "columns.yaml").read_text(encoding="utf-8"))
