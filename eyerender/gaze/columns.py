@@ -14,22 +14,22 @@ from ..observation import EYES
 from ..rig.light import MAX_LIGHTS
 from ..spec import FileSpec, Positive, Spec, Vec2, Vec3
 
-Name = Annotated[str, Field(min_length=1, max_length=200)]
-Pair = tuple[Name, Name]
+ColumnName = Annotated[str, Field(min_length=1, max_length=200)]
+ColumnPair = tuple[ColumnName, ColumnName]
 
 
 class EyeColumns(Spec):
     """The columns of one eye."""
 
-    pupil: Pair | None = Field(default=None, description="x and y of the pupil's centre, px")
-    pupil_axes: Pair | None = Field(default=None, description="lengths of the ellipse's axes, px")
-    pupil_angle: Name | None = Field(default=None, description="angle of the first axis, from +x towards +y")
-    pupil_diameter: Name | None = Field(default=None, description="diameter of a round pupil, px")
-    glints: Annotated[tuple[Pair | None, ...], Field(max_length=MAX_LIGHTS)] | None = Field(
+    pupil: ColumnPair | None = Field(default=None, description="x and y of the pupil's centre, px")
+    pupil_axes: ColumnPair | None = Field(default=None, description="lengths of the ellipse's axes, px")
+    pupil_angle: ColumnName | None = Field(default=None, description="angle of the first axis, from +x towards +y")
+    pupil_diameter: ColumnName | None = Field(default=None, description="diameter of a round pupil, px")
+    glints: Annotated[tuple[ColumnPair | None, ...], Field(max_length=MAX_LIGHTS)] | None = Field(
         default=None, description="x and y of the glint of light 0, 1, ..., px; null for a light without a column"
     )
-    confidence: Name | None = Field(default=None, description="confidence in the pupil")
-    eye_position: tuple[Name, Name, Name] | None = Field(
+    confidence: ColumnName | None = Field(default=None, description="confidence in the pupil")
+    eye_position: tuple[ColumnName, ColumnName, ColumnName] | None = Field(
         default=None, description="x, y and z of the eye (the apex of its cornea) in the world, mm"
     )
 
@@ -37,13 +37,17 @@ class EyeColumns(Spec):
 class CsvColumns(FileSpec, EyeColumns):
     """The names of a table's columns, where they differ from those that are found by themselves; and their units."""
 
-    time: Name | None = Field(default=None, description="rows with the same time are one frame, if there is no `frame`")
-    frame: Name | None = None
-    fixation: Name | None = Field(default=None, description="number of the target; default: equal targets are one")
-    camera: Name | None = Field(default=None, description="index of the camera; default: 0")
-    eye: Name | None = None
-    light: Name | None = Field(default=None, description="the light of a row that holds one glint")
-    target: Annotated[tuple[Name, ...], Field(min_length=2, max_length=3)] | None = Field(
+    time: ColumnName | None = Field(
+        default=None, description="rows with the same time are one frame, if there is no `frame`"
+    )
+    frame: ColumnName | None = None
+    fixation: ColumnName | None = Field(
+        default=None, description="number of the target; default: equal targets are one"
+    )
+    camera: ColumnName | None = Field(default=None, description="index of the camera; default: 0")
+    eye: ColumnName | None = None
+    light: ColumnName | None = Field(default=None, description="the light of a row that holds one glint")
+    target: Annotated[tuple[ColumnName, ...], Field(min_length=2, max_length=3)] | None = Field(
         default=None, description="x, y and z in the world (mm), or x and y on the screen"
     )
     right: EyeColumns | None = Field(default=None, description="columns of the right eye, if a row holds both")
