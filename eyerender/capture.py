@@ -16,7 +16,7 @@ from .eye.model import EyeModel
 from .eye.pose import Poses, rigid_motion
 from .imagefile import MAX_PIXELS
 from .observation import EYES
-from .progress import Progress
+from .progress import Progress, followed
 from .rig.camera import Window
 from .scene import Frames, Scene
 
@@ -98,7 +98,7 @@ def render_windows(
     check_windows(scene)
     if renderer is None:
         renderer = make_renderer(backend, threads)
-    for row in range(len(frames)):
+    for row in followed(range(len(frames)), progress):
         job = render_job(frames, row)
         done = renderer.render(job, spp=scene.spec.image.spp, moments=moments(frames, row, job))
         assert done.labels is not None
@@ -114,8 +114,6 @@ def render_windows(
             t=job.t,
             rendered=done,
         )
-        if progress is not None:
-            progress(row + 1, len(frames), "")
 
 
 def render_job(frames: Frames, row: int) -> RenderJob:

@@ -23,7 +23,7 @@ from .files import parse_json
 from .imagefile import read_image
 from .imagefolder import DATASET, ImageEntry, ImageFolder
 from .observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
-from .progress import Progress
+from .progress import Progress, followed
 from .rig.camera import PinholeCamera
 from .rig.rig import RigLike
 from .scene import Frames, Scene
@@ -84,7 +84,7 @@ class ImageObserver:
         parts: list[Observations] = []
         few: list[Observations] = []  # observations of one row each take ten times the memory of joined ones
         row = 0
-        for k, entry in enumerate(entries):
+        for entry in followed(entries, progress):
             image = entry.image()
             rows = np.arange(row, row + len(entry.records))
             depth = int(entry.line.get("bit_depth") or 8 * image.itemsize)
@@ -93,8 +93,6 @@ class ImageObserver:
                 parts.append(concatenate(few))
                 few = []
             row = int(rows[-1]) + 1 if len(rows) else row
-            if progress is not None:
-                progress(k + 1, len(entries), "")
         return concatenate([*parts, *few])
 
     def observe_files(
@@ -108,7 +106,7 @@ class ImageObserver:
             folder = ImageFolder.load(paths[0])
             return self.observe_folder(folder, scene or scene_of(folder), progress=progress)
         parts = []
-        for k, path in enumerate(paths):
+        for k, path in enumerate(followed(paths, progress)):
             image, depth = read_image(path)
             found = extract(image, bit_depth=depth if depth <= 16 else None, gamma=self.gamma, settings=self.settings)
             lights = [-1] * len(found.glints)
@@ -123,8 +121,6 @@ class ImageObserver:
                     )
                 lights, reasons = _lights(found, np.zeros(2), scene, camera, np.full(3, np.nan))
             parts.append(_observation(found, lights, reasons, np.zeros(2), Index(frame=np.array([k]))))
-            if progress is not None:
-                progress(k + 1, len(paths), "")
         return concatenate(parts)
 
     def _observe_rows(

@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
 
 Progress = Callable[[int, int, str], None]
 """Takes how many pieces of work are done, how many there are in all, and a note (often "")."""
 Say = Callable[[str], None]
 """Takes one line of text for the user."""
+
+T = TypeVar("T")
+
+
+def followed(items: Sequence[T], progress: Progress | None) -> Iterator[T]:
+    """Yield items, and report after each; the first report, of none done, states the total."""
+    if progress is not None:
+        progress(0, len(items), "")
+    for k, item in enumerate(items):
+        yield item
+        if progress is not None:
+            progress(k + 1, len(items), "")

@@ -102,6 +102,7 @@ def bench_extractors(
             if progress is not None:
                 progress(before + done, len(chosen) * len(images), name)
 
+        step(0)
         runs.append(run_extractor(extractor, images, timeout_s=timeout_s, start_timeout_s=start_timeout_s, step=step))
     data = {
         "schema": SCHEMA,

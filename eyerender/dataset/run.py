@@ -234,6 +234,7 @@ class _Run:
         if todo:
             self._note_backends(done)
             self._log("start", shards=len(todo), finished=len(done & mine), part=f"{k}/{n}", engine=self.options.engine)
+            self.progress(0, self.total, "samples")
             try:
                 lost = self._engine(len(todo)).run(todo, self)
             finally:

@@ -193,6 +193,8 @@ def _collected(
 ) -> list[Any]:
     """Results of a job for each item, in order."""
     out = []
+    if progress is not None:
+        progress(0, len(items), "")
     with _mapper(min(workers, len(items))) as mapped:
         for k, part in enumerate(mapped(job, items)):
             out.append(part)

@@ -85,6 +85,7 @@ def export(
         if progress is not None:
             progress(done, total, "")
 
+    step(0)
     items = Items(folder, step)
     with staged(out, overwrite=overwrite) as stage, _labels_as_made(items):
         items.survey()
