@@ -51,6 +51,7 @@ FLOORS = {
     "study": 8,
     "benchmark": 8,
     "quickstart": 8,
+    "torch": 8,
     "cli": 9,
     "__init__": 10,
     "__main__": 10,
@@ -194,7 +195,7 @@ def test_a_type_alias_is_defined_once():
 
 
 def test_import_is_light():
-    heavy = ("mitsuba", "drjit", "cv2", "skimage", "matplotlib")
+    heavy = ("mitsuba", "drjit", "cv2", "skimage", "matplotlib", "torch", "pyarrow")
     uses = {"None": heavy, "eyerender.gaze": (*heavy, "scipy", "pydantic"), "eyerender.gaze.Regression": heavy}
     for use, banned in uses.items():
         code = f"import sys, eyerender; {use}; print([m for m in {banned} if m in sys.modules])"

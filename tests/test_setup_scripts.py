@@ -20,6 +20,7 @@ SCRIPTS = (
     "scripts/test",
     "scripts/docs",
     "scripts/test-dependencies",
+    "scripts/test-torch",
     "scripts/prove-bare",
     ".ci/run",
 )

@@ -206,7 +206,7 @@ def export_dataset(
     out: Annotated[Path, Parameter(name="OUT")],
     /,
     *,
-    format: Literal["webdataset", "coco", "csv", "openeds", "ellseg", "teyed"],
+    format: Literal["webdataset", "coco", "csv", "parquet", "openeds", "ellseg", "teyed"],
     bits: Literal[8, 16] = 8,
     encoding: Literal["linear", "gamma"] | None = None,
     gain: float | None = None,
@@ -219,7 +219,7 @@ def export_dataset(
         folder: A folder written by generate.
         out: The folder to write.
         format: The layout.
-        bits: Bits per pixel of the images: 8, or 16 for webdataset, coco and csv.
+        bits: Bits per pixel of the images: 8, or 16 for webdataset, coco, csv and parquet.
         encoding: Linear, or with a gamma of 2.2 (default: gamma for 8 bits, linear for 16 bits).
         gain: Exposure gain of all images (default: measured on a sample of the images; 1 for 16-bit linear images).
     """

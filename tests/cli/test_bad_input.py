@@ -269,6 +269,7 @@ TABLE = [
     (["validate", "nowhere", "--deep"], 2, "nowhere: no such folder"),
     (["validate", "hollow", "--deep", "5"], 2, "5"),
     (["export-dataset", "hollow", "out", "--format", "coco"], 2, "hollow: holds no metadata.jsonl"),
+    (["export-dataset", "hollow", "out", "--format", "parquet"], 2, "hollow: holds no metadata.jsonl"),
     (["export-dataset", "hollow", "out", "--format", "zip"], 2, "zip"),
     (["export-dataset", "hollow", "out"], 2, "--format"),
     (["export-dataset", "hollow", "out", "--format", "csv", "--bits", "12"], 2, "--bits"),

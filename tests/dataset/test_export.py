@@ -13,12 +13,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 from scipy.io import loadmat
 
 from eyerender.cli.main import run
 from eyerender.dataset.columns import type_first
-from eyerender.dataset.export import FORMATS, export
+from eyerender.dataset.export import FORMATS, export, parquet
 from eyerender.dataset.export.coco import run_lengths
 from eyerender.dataset.export.video import LosslessVideo
 from eyerender.errors import InputError
@@ -138,6 +139,65 @@ def test_csv_rows(tiny, exported, lines):
         assert [float(row["pupil_amodal_x_px"]), float(row["pupil_amodal_y_px"])] == centre.tolist()
         assert float(row["camera_target_mm_z"]) == line["labels"]["space"]["camera"]["target_mm"][2]
         assert int(row["subject"]) == line["subject"]
+
+
+def test_hugging_face_reads_parquet_and_its_card(tiny, exported, lines, tmp_path, monkeypatch):
+    """The folder as it would be uploaded: the head of the card names the splits and the columns that are pictures."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    import datasets
+
+    folder = exported("parquet")
+    _, head, text = (folder / "README.md").read_text().split("---\n", 2)
+    card = yaml.safe_load(head)
+    assert text.startswith("# tiny: parquet")
+    read = datasets.load_dataset(str(folder), cache_dir=str(tmp_path / "cache"))
+    assert {name: len(rows) for name, rows in read.items()} == SPLITS
+    assert datasets.Features._from_yaml_list(card["dataset_info"]["features"]) == read["train"].features
+    pictures = [name for name, kind in read["train"].features.items() if isinstance(kind, datasets.Image)]
+    assert pictures == ["image", "mask"]
+    with open(exported("csv") / "labels.csv", newline="") as file:
+        table = {Path(row["file_name"]).stem: row for row in csv.DictReader(file)}
+    for split, rows in read.items():
+        for row in rows:
+            line = json.loads(row["line_json"])
+            name = Path(line["file_name"]).stem
+            source = lines[name]
+            np.testing.assert_array_equal(np.asarray(row["image"]), eight_bit(tiny, source, folder))
+            np.testing.assert_array_equal(np.asarray(row["mask"]), read_image(tiny / source["mask_file_name"])[0])
+            assert row["split"] == line["split"] == split
+            assert line["labels"] == source["labels"]
+            for key in row.keys() - {"image", "mask", "line_json"}:
+                expected = table[name][key]
+                assert (row[key] is None and expected == "") or type(row[key])(expected) == row[key]
+
+
+def test_parquet_files_load_without_the_card(exported, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    import datasets
+
+    files = {split: str(exported("parquet") / "data" / f"{split}-*.parquet") for split in SPLITS}
+    read = datasets.load_dataset("parquet", data_files=files, cache_dir=str(tmp_path))
+    assert {name: len(rows) for name, rows in read.items()} == SPLITS
+    assert np.asarray(read["test"][0]["image"]).shape == (72, 96)  # the files say which columns are pictures
+
+
+def test_parquet_files_and_groups_of_rows_are_limited(tiny, tmp_path, monkeypatch):
+    from pyarrow.parquet import ParquetFile
+
+    monkeypatch.setattr(parquet, "IMAGES_A_FILE", 5)
+    monkeypatch.setattr(parquet, "IMAGES_A_GROUP", 2)
+    export(tiny, "parquet", tmp_path / "out")
+    files = sorted((tmp_path / "out" / "data").glob("train-*"))
+    assert [file.name for file in files] == [f"train-{k:05d}-of-00003.parquet" for k in range(3)]
+    sizes = []
+    for place in files:
+        found = ParquetFile(place)
+        sizes.append([found.metadata.row_group(k).num_rows for k in range(found.num_row_groups)])
+    assert sizes == [[2, 2, 1], [2, 2, 1], [2]]
+    monkeypatch.setattr(parquet, "BYTES_A_GROUP", 1)
+    export(tiny, "parquet", tmp_path / "small")
+    found = ParquetFile(tmp_path / "small" / "data" / "test-00000-of-00002.parquet")
+    assert found.num_row_groups == 5
 
 
 def test_openeds_reads_it(tiny, exported):
@@ -332,11 +392,12 @@ def test_mlcroissant_validates_and_reads_the_description(tiny, lines):
         assert record["images/file_name"] in (line["file_name"], line["file_name"].encode())
 
 
-def test_ellseg_without_its_library_is_one_line(tiny, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    assert run(["export-dataset", str(tiny), str(tmp_path / "out"), "--format", "ellseg"]) == 2
+@pytest.mark.parametrize(("format", "library"), [("ellseg", "h5py"), ("parquet", "pyarrow")])
+def test_a_layout_without_its_library_is_one_line(tiny, tmp_path, monkeypatch, capsys, format, library):
+    monkeypatch.setitem(sys.modules, library, None)
+    assert run(["export-dataset", str(tiny), str(tmp_path / "out"), "--format", format]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == (
-        "error: --format ellseg: needs h5py (the extra 'ellseg'); run: pip install h5py"
+        f"error: --format {format}: needs {library} (the extra '{format}'); run: pip install {library}"
     )
     assert not (tmp_path / "out").exists()
 

@@ -20,12 +20,13 @@ from ...outfolder import staged
 from ...progress import Progress
 from ..assemble import verify_dataset
 from ..validation.problems import WRONG
-from . import coco, ellseg, openeds, table, teyed, webdataset
+from . import coco, ellseg, openeds, parquet, table, teyed, webdataset
 from .card import export_card
 from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain
 from .item import Item, Items
 
-Writer = Callable[[Items, Path], None]
+# Returns what README.md begins with, if anything.
+Writer = Callable[[Items, Path], str | None]
 
 SCHEMA = "eyerender/export/2"
 EXPORT, CARD = "export.json", "README.md"
@@ -33,12 +34,13 @@ FORMATS: dict[str, Writer] = {
     "webdataset": webdataset.write,
     "coco": coco.write,
     "csv": table.write,
+    "parquet": parquet.write,
     "openeds": openeds.write,
     "ellseg": ellseg.write,
     "teyed": teyed.write,
 }
 # The other layouts have 8 bits by definition.
-_SIXTEEN_BITS = ("webdataset", "coco", "csv")
+_SIXTEEN_BITS = ("webdataset", "coco", "csv", "parquet")
 
 
 def export(
@@ -58,7 +60,7 @@ def export(
         path: the dataset's folder.
         format: one of `FORMATS`.
         out: the folder to write.
-        bits: bits of the images, 8 or 16 (webdataset, coco and csv).
+        bits: bits of the images, 8 or 16 (webdataset, coco, csv and parquet).
         encoding: `linear` or `gamma`; by default gamma for 8 bits, linear for 16.
         gain: factor for all values; by default it is measured on a sample of the images, but is 1 for 16 bits, linear.
         overwrite: replace what `out` holds.
@@ -90,7 +92,7 @@ def export(
     with staged(out, overwrite=overwrite) as stage, _labels_as_made(items):
         items.survey()
         items.encoding = _encoding(items, bits, encoding or ("gamma" if bits == 8 else "linear"), gain)
-        FORMATS[format](items, stage)
+        head = FORMATS[format](items, stage) or ""
         done = {
             "schema": SCHEMA,
             "format": format,
@@ -101,7 +103,7 @@ def export(
             "image": items.encoding.to_mapping(),
         }
         layout = sys.modules[FORMATS[format].__module__].__doc__ or ""
-        write_text(stage / CARD, export_card(items.name, done, layout, items.encoding), sync=False)
+        write_text(stage / CARD, head + export_card(items.name, done, layout, items.encoding), sync=False)
         write_json(stage / EXPORT, done, sync=False)
     return {**done, "path": str(out)}
 

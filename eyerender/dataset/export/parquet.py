@@ -1,0 +1,171 @@
+"""Parquet: data/SPLIT-00000-of-00001.parquet with one row an image, as the Hugging Face Hub stores datasets.
+
+The columns `image` and `mask` (and `amodal_mask`, `noiseless` where the dataset has them) hold PNG files. The labels
+have the columns of the layout csv, in pixels of the image. `line_json` is the whole line of metadata as JSON text. Load
+the folder with `datasets.load_dataset("OUT")`, or upload it as it is: the head of this file tells the Hub's viewer the
+columns and the splits.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ...errors import InputError
+from ...files import read_bytes
+from .item import Item, Items
+from .table import row_of
+
+IMAGES_A_FILE = 2000
+# Readers take whole groups of rows into memory, and so does the writer.
+IMAGES_A_GROUP, BYTES_A_GROUP = 100, 32 * 2**20
+_PICTURES = {
+    "image": "file_name",
+    "mask": "mask_file_name",
+    "amodal_mask": "amodal_mask_file_name",
+    "noiseless": "noiseless_file_name",
+}
+_TEXTS = ("split", "encoding", "eye", "eye_model", "line_json")
+_WHOLE = ("sample", "subject", "sequence_index", "bit_depth", "source_bit_depth", "window_x0_px", "window_y0_px")
+_SIZES = ((1e3, "n<1K"), (1e4, "1K<n<10K"), (1e5, "10K<n<100K"), (1e6, "100K<n<1M"), (1e7, "1M<n<10M"))
+
+
+def write(items: Items, out: Path) -> str:
+    """Write data/, and return the head of README.md: YAML that names columns and splits."""
+    try:
+        pa: Any = import_module("pyarrow")
+        parquet: Any = import_module("pyarrow.parquet")
+    except ImportError:
+        raise InputError(
+            "needs pyarrow (the extra 'parquet'); run: pip install pyarrow", source="--format parquet"
+        ) from None
+    (out / "data").mkdir()
+    first = next(iter(items.sample(1)))
+    pictures = [name for name, key in _PICTURES.items() if first.line.get(key) is not None]
+    types = dict.fromkeys(pictures, "image") | {name: _type(name) for name in _row(first, items)}
+    schema = _schema(pa, types)
+    files: dict[str, _File] = {}
+    with ExitStack() as stack:
+        for item in items:
+            file = files.get(item.split)
+            if file is None:
+                file = stack.enter_context(
+                    _File(parquet, pa, schema, out, item.split, items.images_by_split[item.split])
+                )
+                files[item.split] = file
+            file.add({**{name: _picture(item, name) for name in pictures}, **_row(item, items)})
+    return _head(items, types, out)
+
+
+def _row(item: Item, items: Items) -> dict[str, Any]:
+    row = row_of(item, items.lights)
+    del row["file_name"], row["mask_file_name"]
+    for k in range(items.lights):
+        row[f"glint{k}_visible"] = bool(row[f"glint{k}_visible"])
+    return {**row, "line_json": json.dumps(item.exported_line(), sort_keys=True)}
+
+
+def _picture(item: Item, name: str) -> dict[str, Any] | None:
+    path = item.entry.file(_PICTURES[name])
+    if path is None:
+        return None
+    data = read_bytes(path, follow=False) if "mask" in name else item.encode(path)
+    return {"bytes": data, "path": f"{item.name}.png"}
+
+
+def _type(name: str) -> str:
+    """Type of a column of labels, as `datasets` calls it."""
+    if name in _TEXTS:
+        return "string"
+    if name in _WHOLE:
+        return "int64"
+    return "bool" if name.startswith("glint") and name.endswith("_visible") else "float64"
+
+
+def _schema(pa: Any, types: dict[str, str]) -> Any:
+    kinds = {
+        "image": pa.struct([("bytes", pa.binary()), ("path", pa.string())]),
+        "string": pa.string(),
+        "int64": pa.int64(),
+        "bool": pa.bool_(),
+        "float64": pa.float64(),
+    }
+    # `datasets` reads here which columns are pictures.
+    features = {
+        name: {"_type": "Image"} if kind == "image" else {"dtype": kind, "_type": "Value"}
+        for name, kind in types.items()
+    }
+    metadata = {"huggingface": json.dumps({"info": {"features": features}})}
+    return pa.schema([(name, kinds[kind]) for name, kind in types.items()], metadata=metadata)
+
+
+class _File:
+    """The files of a split, one after the other."""
+
+    def __init__(self, parquet: Any, pa: Any, schema: Any, out: Path, split: str, images: int) -> None:
+        self._parquet, self._pa, self._schema = parquet, pa, schema
+        self._out, self._split, self._files = out, split, -(-images // IMAGES_A_FILE)
+        self._writer: Any = None
+        self._rows: list[dict[str, Any]] = []
+        self._done = self._bytes = 0
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Add a row."""
+        if self._done % IMAGES_A_FILE == 0:
+            self._close()
+            name = f"{self._split}-{self._done // IMAGES_A_FILE:05d}-of-{self._files:05d}.parquet"
+            place = self._out / "data" / name
+            self._writer = self._parquet.ParquetWriter(place, self._schema, compression="zstd", write_page_index=True)
+        self._rows.append(row)
+        self._done += 1
+        self._bytes += sum(len(value["bytes"]) for value in row.values() if isinstance(value, dict))
+        if len(self._rows) >= IMAGES_A_GROUP or self._bytes >= BYTES_A_GROUP:
+            self._write()
+
+    def _write(self) -> None:
+        if self._rows:
+            self._writer.write_table(self._pa.Table.from_pylist(self._rows, schema=self._schema))
+        self._rows, self._bytes = [], 0
+
+    def _close(self) -> None:
+        if self._writer is not None:
+            self._write()
+            self._writer.close()
+            self._writer = None
+
+    def __enter__(self) -> _File:
+        return self
+
+    def __exit__(self, kind: object, error: object, at: object) -> None:
+        if kind is None:
+            self._close()
+        elif self._writer is not None:
+            self._writer.close()
+
+
+def _head(items: Items, types: dict[str, str], out: Path) -> str:
+    size = sum(path.stat().st_size for path in (out / "data").iterdir())
+    total = len(items)
+    data = {
+        "pretty_name": items.name,
+        "task_categories": ["image-segmentation", "keypoint-detection"],
+        "tags": ["eye-tracking", "gaze-estimation", "near-infrared", "synthetic"],
+        "size_categories": [next((name for end, name in _SIZES if total < end), "n>10M")],
+        "configs": [
+            {
+                "config_name": "default",
+                "data_files": [{"split": name, "path": f"data/{name}-*.parquet"} for name in items.splits],
+            }
+        ],
+        "dataset_info": {
+            "features": [{"name": name, "dtype": kind} for name, kind in types.items()],
+            "splits": [{"name": name, "num_examples": count} for name, count in items.images_by_split.items()],
+            "download_size": size,
+        },
+    }
+    return f"---\n{yaml.safe_dump(data, sort_keys=False)}---\n"

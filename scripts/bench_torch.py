@@ -1,0 +1,80 @@
+#!/usr/bin/env python3
+"""Bench of eyerender.torch: images a second that a stream gives with two workers, against those that `generate` makes.
+
+    bench_torch.py [--quick] [--json F] [--backend llvm|cuda]
+
+It needs PyTorch: .venv-torch/bin/python scripts/bench_torch.py, after scripts/test-torch has made that environment.
+Images are 640 x 480 px at 4 samples per pixel, without lids. Both sides have two workers of one thread each and are
+measured in turn, three times each; the medians count. Rates are measured after every worker has made its first samples,
+so they exclude starting and compiling. --quick makes fewer images, once. The exit code is 1 if a `must` is missed.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+from _bench import Report, Row, options_of, row, single_threaded
+
+single_threaded()
+
+from bench_generate import Clock, plan  # noqa: E402
+from eyerender.dataset.pool import LocalPool  # noqa: E402
+from eyerender.dataset.realise import frames_of  # noqa: E402
+from eyerender.dataset.worker import Job  # noqa: E402
+
+WORKERS, BATCH, SHARD = 2, 8, 48
+
+
+def generated(count: int, backend: str) -> float:
+    """Images a second of a run of `generate`."""
+    made = plan(count, SHARD)
+    with tempfile.TemporaryDirectory() as folder:
+        clock = Clock(WORKERS)
+        job = Job.of(made, frames_of(made), Path(folder), backend, 1)
+        lost = LocalPool(job, WORKERS).run(range(made.spec.shard_count), clock)
+        if lost:
+            raise RuntimeError(str(lost))
+    return clock.rate
+
+
+def streamed(count: int, backend: str) -> float:
+    """Images a second of a stream, from the first batch of the last worker on."""
+    from eyerender.torch import StreamDataset
+
+    stream = StreamDataset(plan(count, SHARD), batch_size=BATCH, backend=backend, threads=1)  # type: ignore[arg-type]
+    start, images = 0.0, 0
+    for number, batch in enumerate(stream.loader(WORKERS)):
+        if number >= WORKERS:
+            images += len(batch["image"])
+        elif number == WORKERS - 1:
+            start = time.perf_counter()
+    return images / (time.perf_counter() - start)
+
+
+def rows(backend: str, quick: bool) -> Iterable[Row]:
+    """All rows, as they are measured."""
+    count = 96 if quick else 288
+    found = [(generated(count, backend), streamed(count, backend)) for _ in range(1 if quick else 3)]
+    runs, streams = (statistics.median(side) for side in zip(*found, strict=True))
+    yield row("generate, two workers of one thread each", runs, "images/s")
+    yield row("stream, two workers of one thread each", streams, "images/s")
+    yield row("stream against generate", streams / runs, "ratio", must=0.9, at_least=True)
+
+
+def main() -> int:
+    """Measure, print, write."""
+    parser = options_of(__doc__, "fewer images, once")
+    parser.add_argument("--backend", choices=["auto", "llvm", "cuda"], default="auto")
+    options = parser.parse_args()
+    report = Report()
+    report.extend(rows(options.backend, options.quick))
+    return report.finish(options.json, ("eyerender", "torch", "mitsuba", "drjit", "numpy"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

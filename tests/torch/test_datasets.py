@@ -1,0 +1,216 @@
+"""Datasets for PyTorch: folders and streams give the same images, with workers, ranks and after resuming."""
+
+from __future__ import annotations
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+from eyerender.errors import InputError
+from eyerender.imagefolder import ImageFolder
+from tests.support.dataset_specs import plan
+
+torch = pytest.importorskip("torch", reason="needs PyTorch; run ./scripts/test-torch")
+
+from torch.utils.data import DataLoader  # noqa: E402
+
+from eyerender.torch import PARTS, FolderDataset, StreamDataset, collate, place  # noqa: E402
+
+pytestmark = pytest.mark.render
+ALL = tuple(part for part in PARTS if part != "amodal_mask")
+
+
+def brighter(item):
+    return {**item, "image": 2 * item["image"]}
+
+
+def same(a, b):
+    assert a.keys() == b.keys()
+    for key, value in a.items():
+        if isinstance(value, torch.Tensor):
+            assert value.dtype == b[key].dtype
+            torch.testing.assert_close(value, b[key], rtol=0, atol=0, equal_nan=True)
+        else:
+            assert value == b[key]
+
+
+def numbers(loader):
+    return [int(i) for batch in loader for i in batch["sample"]]
+
+
+def without_files(lines):
+    return [{k: v for k, v in line.items() if k != "schema" and not k.endswith("file_name")} for line in lines]
+
+
+def test_a_folder_gives_its_pictures_and_labels(folder):
+    data = FolderDataset(folder, parts=ALL)
+    assert len(data) == 20
+    for item, entry in zip((data[k] for k in range(len(data))), ImageFolder.load(folder), strict=True):
+        share = entry.image().astype(np.float32) / 65535
+        assert item["image"].dtype == torch.float32
+        assert item["image"].shape == (1, 72, 96)
+        np.testing.assert_array_equal(item["image"][0], share)
+        np.testing.assert_array_equal(item["noiseless"][0], entry.noiseless().astype(np.float32) / 65535)
+        assert item["mask"].dtype == torch.int64
+        np.testing.assert_array_equal(item["mask"], entry.mask())
+        assert item["line"] == entry.line
+        assert (item["sample"], item["subject"]) == (entry.line["sample"], entry.line["subject"])
+        # The ellipses lie in the window: the pupil's centre is on a pixel of the pupil.
+        for part, least in (("pupil", 3), ("iris", 2)):
+            x, y, a, b, _ = item[part].tolist()
+            assert a >= b > 0
+            assert entry.mask()[round(y), round(x)] >= least
+        space = entry.labels["space"]["camera"]
+        to_target = np.array(space["target_mm"]) - space["globe_centre_mm"]
+        assert item["gaze"] @ torch.tensor(to_target / np.linalg.norm(to_target), dtype=torch.float32) > 0.99
+        assert torch.linalg.norm(item["gaze"]) == pytest.approx(1, abs=1e-6)
+
+
+def test_splits_of_a_folder_share_no_subject(folder):
+    subjects = {}
+    for split, count in (("train", 10), ("validation", 5), ("test", 5)):
+        data = FolderDataset(folder, split=split, parts=())
+        assert len(data) == count
+        subjects[split] = {data[k]["subject"] for k in range(count)}
+    assert [len(s) for s in subjects.values()] == [2, 1, 1]
+    assert len(set.union(*subjects.values())) == 4
+
+
+def test_a_folder_with_workers_that_stay(folder):
+    data = FolderDataset(folder, split="train", parts=("image", "mask", "line"), transform=brighter)
+    loader = DataLoader(
+        pickle.loads(pickle.dumps(data)),
+        batch_size=4,
+        num_workers=2,
+        persistent_workers=True,
+        multiprocessing_context="spawn",
+        collate_fn=collate,
+    )
+    own = [data[k] for k in range(len(data))]
+    for _ in range(2):
+        found = list(loader)
+        for k, batch in enumerate(found):
+            same(batch, collate(own[4 * k : 4 * k + 4]))
+        assert [len(batch["line"]) for batch in found] == [4, 4, 2]
+
+
+@pytest.mark.parametrize(
+    ("workers", "batch_size", "options"), [(0, 4, {}), (2, 3, {}), (1, 20, {"multiprocessing_context": "forkserver"})]
+)
+def test_a_stream_equals_what_generate_writes(folder, spec, workers, batch_size, options):
+    stream = StreamDataset(spec, parts=ALL, batch_size=batch_size, transform=brighter)
+    data = FolderDataset(folder, parts=ALL, transform=brighter)
+    own = [data[k] for k in range(len(data))]
+    found = list(stream.loader(workers, **options))
+    assert len(found) == -(-20 // batch_size)
+    assert sorted(numbers(found)) == list(range(20))
+    for batch in found:
+        assert (batch["sample"].diff() == 1).all()
+        expected = collate([own[k] for k in batch["sample"]])
+        assert without_files(batch.pop("line")) == without_files(expected.pop("line"))
+        same(batch, expected)
+
+
+def test_a_split_of_a_stream_is_that_of_the_folder(folder, spec):
+    for split in ("train", "validation", "test"):
+        own = FolderDataset(folder, split=split, parts=())
+        stream = StreamDataset(spec, split=split, parts=("image",), batch_size=3)
+        assert numbers(stream) == [own[k]["sample"] for k in range(len(own))]
+
+
+def test_every_batch_has_one_place():
+    for count in (0, 1, 7, 24, 25):
+        assert [place(batch, count, 1) for batch in range(count)] == list(range(count))
+        for lanes in (2, 3, 6, 40):
+            order = [place(batch, count, lanes) for batch in range(count)]
+            assert sorted(order) == list(range(count))
+            for lane in range(lanes):
+                own = order[lane::lanes]
+                assert own == list(range(own[0], own[0] + len(own))) if own else lane >= count
+
+
+def test_ranks_and_workers_make_every_sample_once(spec):
+    def batches(workers, **options):
+        stream = StreamDataset(spec, batch_size=3, parts=(), **options)
+        return [batch["sample"].tolist() for batch in stream.loader(workers)]
+
+    whole = batches(0, lanes=4)
+    assert sorted(i for batch in whole for i in batch) == list(range(20))
+    assert whole[0] == [0, 1, 2]
+    assert whole[4] == [3, 4, 5]  # the second batch of the first lane
+    for rank in range(2):
+        assert batches(2, rank=rank, ranks=2) == whole[rank::2]  # four workers in all
+    assert batches(2, lanes=4, start=3) == whole[3:]
+    with pytest.raises(InputError, match="lanes: must be a multiple of 2, the number of workers of all ranks"):
+        batches(0, ranks=2, rank=0, lanes=3)
+
+
+def test_a_stream_goes_on_where_it_stopped(folder, spec):
+    data = FolderDataset(folder)
+    rest = list(StreamDataset(spec, batch_size=4, start=3, lanes=2).loader(2))
+    assert numbers(rest) == [16, 17, 18, 19, 8, 9, 10, 11]
+    same(rest[0], collate([data[k] for k in range(16, 20)]))
+    stream = StreamDataset(spec, batch_size=4, lanes=2)
+    parts = iter(stream)
+    for _ in range(3):
+        next(parts)
+    state = json.loads(json.dumps(stream.state_dict()))
+    resumed = StreamDataset(spec, batch_size=4, lanes=2)
+    resumed.load_state_dict(state)
+    for got, want in zip(resumed, rest, strict=True):
+        same(got, want)
+    assert sorted(numbers(resumed)) == list(range(20))  # another pass begins at the start
+    for other in (StreamDataset(plan(count=21), batch_size=4, lanes=2), StreamDataset(spec, batch_size=5, lanes=2)):
+        with pytest.raises(InputError, match=r"(digest|batch_size): is .* in the state, but .* here"):
+            other.load_state_dict(state)
+
+
+def test_each_worker_goes_on_in_its_own_batches(spec, monkeypatch):
+    """As a loader does that asks its workers for their states."""
+
+    class Worker:
+        id, num_workers = 1, 2
+
+    monkeypatch.setattr("eyerender.torch.get_worker_info", Worker)
+    own = [batch["sample"].tolist() for batch in StreamDataset(spec, batch_size=3, parts=(), start=1)]
+    stream = StreamDataset(spec, batch_size=3, parts=(), start=1)
+    assert next(iter(stream))["sample"].tolist() == own[0]
+    resumed = StreamDataset(spec, batch_size=3, parts=(), start=1)
+    resumed.load_state_dict(stream.state_dict())
+    assert [batch["sample"].tolist() for batch in resumed] == own[1:]
+
+
+def test_samples_that_were_given_up_are_left_out():
+    # Some targets are so far aside that the pupil leaves the window, and only one attempt is made.
+    wide = plan(
+        scene__image__window_px=[40, 40],
+        scene__targets__screen_mm=[[{"draw": "sobol", "low": -500, "high": 500}, 0.0]],
+        attempts=1,
+    )
+    found = numbers(StreamDataset(wide, batch_size=4, parts=("mask",)))
+    assert found == sorted(set(found))
+    assert 0 < len(found) < wide.spec.count
+
+
+def test_bad_arguments_are_one_line(folder, spec, tmp_path):
+    for make, words in (
+        (lambda: FolderDataset(tmp_path / "nowhere"), "no such folder"),
+        (
+            lambda: FolderDataset(folder, split="val"),
+            "no image is of the split 'val'; there are test, train, validation",
+        ),
+        (lambda: FolderDataset(folder, parts=("depth",)), "parts: must be some of image, noiseless, mask"),
+        (lambda: FolderDataset(folder, parts=("amodal_mask",))[0], "line 1: has no part 'amodal_mask'"),
+        (lambda: StreamDataset("no_such_spec"), "no such dataset file"),
+        (lambda: StreamDataset(spec, batch_size=0), "batch_size: must be >= 1, not 0"),
+        (lambda: StreamDataset(spec, start=-1), "start: must be >= 0, not -1"),
+        (lambda: StreamDataset(spec, rank=2, ranks=2), "rank: must be 0 to 1, not 2"),
+        (lambda: StreamDataset(spec, threads=0), "threads: must be >= 1, not 0"),
+        (lambda: StreamDataset(spec, split="val"), "split: must be one of train, validation, test, not 'val'"),
+        (lambda: StreamDataset(spec, parts=("amodal_mask",)), "amodal_mask: the spec makes none"),
+    ):
+        with pytest.raises(InputError) as refused:
+            make()
+        assert words in str(refused.value)
