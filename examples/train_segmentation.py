@@ -1,5 +1,10 @@
 #!/usr/bin/env python3
-"""Train a small U-Net to find the pupil and the iris in rendered eyes, and test it on subjects that it has not seen.
+"""
+Training a network
+==================
+
+This script trains a small U-Net to find the pupil and the iris in rendered eyes, and tests it on subjects that it has
+not seen::
 
     eyerender generate dataset_region out/region
     python examples/train_segmentation.py out/region
