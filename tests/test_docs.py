@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import subprocess
@@ -10,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 import eyerender as er
 from docs.tools import keys, references, validation
@@ -104,6 +106,20 @@ def anchors_of(page: str) -> set[str]:
     heads = re.findall(r"^#+ (.*)$", page, re.MULTILINE)
     plain = (re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads)
     return {*plain, *re.findall(r"^\(([\w-]+)\)=$", page, re.MULTILINE)}
+
+
+def test_measurements_are_those_of_tests_that_there_are():
+    """Every row of the validation page was measured by the assertion that it names, within its tolerance."""
+    wanted = yaml.safe_load((DOCS / "data" / "validation.yaml").read_text(encoding="utf-8"))
+    measured = json.loads((DOCS / "data" / "validation.json").read_text(encoding="utf-8"))["groups"]
+    named = {group: [tuple(case.values()) for case in cases] for group, cases in wanted.items()}
+    assert {group: [tuple(row.values())[:5] for row in rows] for group, rows in measured.items()} == named
+    for row in (row for rows in measured.values() for row in rows):
+        path, _, name = row["test"].partition("::")
+        text = (ROOT / path).read_text(encoding="utf-8")
+        body = re.split(r"\ndef ", text.partition(f"def {name}(")[2])[0]
+        assert row["assertion"] in body, row["what"]
+        assert 0 <= row["value"] <= row["limit"]
 
 
 def test_pictures_are_small():

@@ -13,14 +13,22 @@ def tables(data: dict[str, Any]) -> str:
     """The tables of one file: a section for each group of rows."""
     text = f"Measured on {data['measured']} with version {data['version']}, on {data['on']}.\n\n"
     for title, rows in data["groups"].items():
-        text += f"## {title}\n\n| quantity | compared with | largest deviation | cases | tolerance of the test |\n"
+        text += (
+            f"## {title}\n\n| quantity | compared with | largest deviation | tolerance of the test | comparisons |\n"
+        )
         text += "|---|---|---|---|---|\n"
         for row in rows:
-            value = f"{row['value']:.2g} {row['unit']}".strip()
-            limit = "" if row["limit"] is None else f"{row['limit']:.2g} {row['unit']}".strip()
-            text += f"| {row['what']} | {row['oracle']} | {value} | {row['cases']} | {limit} |\n"
+            value, limit = (quantity(row[key], row["unit"]) for key in ("value", "limit"))
+            text += f"| {row['what']} | {row['oracle']} | {value} | {limit} | {row['cases']} |\n"
         text += "\n"
     return text
+
+
+def quantity(number: float, unit: str) -> str:
+    """A number with two digits and its unit."""
+    if unit == "relative":
+        return f"{100 * number:.2g} %"
+    return f"{number:.2g}{'' if unit == '°' else ' '}{unit}"
 
 
 def write(folder: Path) -> None:
