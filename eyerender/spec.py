@@ -205,10 +205,23 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: it cannot be read.
     """
-    source = str(path)
-    text = read_text(path, limit=MAX_YAML_BYTES)
+    return parse_yaml(read_text(path, limit=MAX_YAML_BYTES), str(path))
+
+
+def parse_yaml(text: str, source: str, *, mapping_tags: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Parse the text of a YAML file as a mapping, safely; mappings may have the tags `!!TAG` of `mapping_tags`.
+
+    Raises:
+        InputError: it is not valid, or too large.
+    """
+
+    class Loader(_UniqueKeyLoader):
+        pass
+
+    for tag in mapping_tags:
+        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", _as_mapping)
     try:
-        data = yaml.load(text, Loader=_UniqueKeyLoader)
+        data = yaml.load(text, Loader=Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"line {mark.line + 1}" if mark is not None else ""
@@ -300,6 +313,10 @@ class _UniqueKeyLoader(yaml.SafeLoader):
                 )
             seen.add(key)
         return super().construct_mapping(node, deep)
+
+
+def _as_mapping(loader: Any, node: Any) -> Any:
+    return loader.construct_mapping(node, deep=True)
 
 
 _NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")

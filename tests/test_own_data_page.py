@@ -27,7 +27,7 @@ def page(tmp_path, monkeypatch):
     """A folder with every file that the page shows by its name."""
     monkeypatch.chdir(tmp_path)
     for kind, text in BLOCKS:
-        if kind in ("yaml", "python") and (named := re.match(r"# (\S+\.(?:yaml|py))\n", text)):
+        if kind in ("yaml", "python") and (named := re.match(r"# (\S+\.(?:ya?ml|py))\n", text)):
             (tmp_path / named[1]).write_text(text, encoding="utf-8")
     return tmp_path
 

@@ -1,4 +1,4 @@
-"""Files that a dataset's spec names (HDR maps, head meshes, eye files), and their checksums.
+"""Files that a dataset's spec names (HDR maps, head meshes, calibrations, eye files), and their checksums.
 
 Their content affects the images as the spec does. Their checksums, by the names in the spec, are therefore part of a
 run's identity. `Plan.of` adds the eye files, which it reads itself.
@@ -41,6 +41,7 @@ def check_files(files: Mapping[str, str], base: Path) -> None:
 
 def _names(scene: Mapping[str, Any], base: Path) -> Iterator[str]:
     yield from _texts(scene, "ambient", "map", "file")
+    yield from _texts(scene, "rig", "cameras", "calibration", "file")
     yield from _texts(scene, "region", "head", "texture")
     for name in _texts(scene, "region", "head", "file"):
         yield name
@@ -60,6 +61,9 @@ def _texts(node: Any, *keys: str) -> Iterator[str]:
         elif not keys and isinstance(value, list | tuple):
             for entry in value:
                 yield from _texts(entry)
+        elif keys and isinstance(value, list | tuple):
+            for entry in value:
+                yield from _texts(entry, *keys)
 
 
 def sum_of_file(path: Path) -> str:

@@ -86,7 +86,7 @@ def load_rig(path: str | Path) -> RigGeometry:
         InputError: naming the file and the key.
     """
     if Path(path).suffix.lower() in (".yaml", ".yml") and "cameras" in read_yaml(path):
-        return RigFile.load(path).build()
+        return RigFile.load(path).resolved(Path(path).parent).build()
     return load_scene(path).rig
 
 

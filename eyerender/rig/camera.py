@@ -8,15 +8,19 @@ subject, with +z up in the image.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..errors import InputError
 from ..spec import Number, Positive, Spec, Vec2, Vec3
+from .opencv import read_opencv
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
 Distortion = tuple[Number, Number, Number, Number, Number]
@@ -49,6 +53,24 @@ class CameraCalibration(Spec):
         return self
 
 
+class CalibrationFile(Spec):
+    """A calibration in a file of OpenCV (`cv2.FileStorage`: YAML, XML or JSON) or of ROS (`camera_info`)."""
+
+    file: Annotated[str, Field(min_length=1)] = Field(description="path, relative to the scene")
+    unit_mm: Positive = Field(default=1.0, description="length of the file's unit of translation")
+
+
+def _calibration_tag(value: Any) -> str:
+    named = isinstance(value, CalibrationFile) or (isinstance(value, Mapping) and "file" in value)
+    return "[file]" if named else "[numbers]"
+
+
+AnyCalibration = Annotated[
+    Annotated[CameraCalibration, Tag("[numbers]")] | Annotated[CalibrationFile, Tag("[file]")],
+    Discriminator(_calibration_tag),
+]
+
+
 class Camera(Spec):
     """A camera, given by place, direction and focal length, or by `calibration`."""
 
@@ -66,9 +88,60 @@ class Camera(Spec):
     sensor_mm: tuple[Positive, Positive] | None = Field(default=None, description="sensor width and height")
     principal_point_px: Vec2 | None = Field(default=None, description="default: the centre of the sensor")
     distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description="k1, k2, p1, p2, k3 (OpenCV)")
-    calibration: CameraCalibration | None = Field(
-        default=None, description="OpenCV's calibration, in place of position, direction and lens"
+    calibration: AnyCalibration | None = Field(
+        default=None,
+        description="OpenCV's calibration, in place of position, direction and lens; beside a calibration file, "
+        "position and direction replace the pose of the file",
     )
+
+    @classmethod
+    def from_opencv(
+        cls, path: str | Path, *, size_px: tuple[int, int] | None = None, unit_mm: float = 1.0, **fields: Any
+    ) -> Self:
+        """A camera from a calibration file of OpenCV (`cv2.FileStorage`: YAML, XML or JSON) or of ROS (`camera_info`).
+
+        The file holds a camera matrix, distortion coefficients and, optionally, the image size and the pose (R and T,
+        or rvec and tvec) in the world of this package: x_cam = R x_world + t.
+
+        Args:
+            path: the file.
+            size_px: width and height of the image, if the file does not say.
+            unit_mm: length of the file's unit of translation.
+            fields: `name`; instead of the file's pose, `position_mm`, `look_at_mm`, `pan_deg`, `tilt_deg`, `roll_deg`.
+
+        Raises:
+            InputError: the file cannot be read, has a distortion model that is not supported, or lacks something.
+        """
+        size = size_px or read_opencv(path).size_px
+        if size is None:
+            raise InputError("does not say the size of the image; give size_px", source=str(path))
+        calibration = {"file": str(path), "unit_mm": unit_mm}
+        return cls.from_mapping({"resolution_px": size, "calibration": calibration, **fields}).resolved()
+
+    def resolved(self, base: Path | None = None) -> Self:
+        """The camera with the numbers of its calibration file, which is relative to `base` or the current folder.
+
+        Raises:
+            InputError: the file cannot be read, or does not fit the camera.
+        """
+        if not isinstance(self.calibration, CalibrationFile):
+            return self
+        path = (base or Path()) / self.calibration.file
+        found = read_opencv(path)
+        if found.size_px not in (None, self.resolution_px):
+            raise InputError(
+                f"is for {found.size_px} px, but resolution_px of the camera is {self.resolution_px}", source=str(path)
+            )
+        if self.position_mm is not None:
+            placed = self.model_copy(update={"calibration": None, "focal_length_px": 1.0}).build()
+            R, t = placed.R, placed.t
+        elif found.R is None or found.t is None:
+            raise InputError("holds no pose; give position_mm and look_at_mm of the camera", source=str(path))
+        else:
+            R, t = found.R, found.t * self.calibration.unit_mm
+        numbers = {"K": found.K, "R": R, "t_mm": t, "distortion": found.distortion}
+        kept = {"name": self.name, "resolution_px": self.resolution_px, "calibration": numbers}
+        return type(self).from_mapping(kept, source=str(path))
 
     @classmethod
     def looking_at(
@@ -111,24 +184,37 @@ class Camera(Spec):
             )
             if getattr(self, k) is not None
         }
+        if isinstance(self.calibration, CalibrationFile):
+            wrong = sorted(placed & {"focal_length_px", "focal_length_mm", "sensor_mm", "principal_point_px"})
+            if wrong or any(self.distortion):
+                raise ValueError(f"the calibration file gives the lens; remove {', '.join(wrong) or 'distortion'}")
+            if self.position_mm is None and (placed or self.roll_deg != 0):
+                raise ValueError("give position_mm with the direction, or neither")
+            return self._checked_direction()
         if self.calibration is not None:
             if placed or self.roll_deg != 0 or any(self.distortion):
                 raise ValueError("a calibration gives position, direction and lens; remove the other keys")
             return self
         if self.position_mm is None:
             raise ValueError("give position_mm (or a calibration)")
-        if self.look_at_mm is not None and (self.pan_deg is not None or self.tilt_deg is not None):
-            raise ValueError("give look_at_mm or pan_deg and tilt_deg, not both")
-        if self.look_at_mm is not None and np.allclose(self.look_at_mm, self.position_mm, atol=1e-6):
-            raise ValueError("look_at_mm is the camera's own position")
+        self._checked_direction()
         if (self.focal_length_px is None) == (self.focal_length_mm is None):
             raise ValueError("give either focal_length_px or focal_length_mm with sensor_mm")
         if (self.focal_length_mm is None) != (self.sensor_mm is None):
             raise ValueError("focal_length_mm and sensor_mm belong together")
         return self
 
+    def _checked_direction(self) -> Self:
+        if self.look_at_mm is not None and (self.pan_deg is not None or self.tilt_deg is not None):
+            raise ValueError("give look_at_mm or pan_deg and tilt_deg, not both")
+        if self.look_at_mm is not None and np.allclose(self.look_at_mm, self.position_mm or np.inf, atol=1e-6):
+            raise ValueError("look_at_mm is the camera's own position")
+        return self
+
     def build(self) -> PinholeCamera:
         """Build the numeric camera."""
+        if isinstance(self.calibration, CalibrationFile):
+            return self.resolved().build()
         if self.calibration is not None:
             c = self.calibration
             return PinholeCamera.of(c.K, c.R, c.t_mm, self.resolution_px, c.distortion, self.name)

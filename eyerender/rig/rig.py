@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Protocol, Self
 
 import numpy as np
@@ -70,6 +71,16 @@ class Rig(Spec):
         leds[number] = {**leds[number], **changes}
         leds[number]["position_mm"] = np.asarray(leds[number]["position_mm"], dtype=float) + moved
         return type(self).from_mapping({"cameras": self.cameras, "lights": leds, "screen": self.screen})
+
+    def resolved(self, base: Path | None = None) -> Self:
+        """The rig with the numbers of its cameras' calibration files, which are relative to `base`.
+
+        Raises:
+            InputError: a file cannot be read, or does not fit its camera.
+        """
+        cameras = tuple(camera.resolved(base) for camera in self.cameras)
+        changed = any(new is not old for new, old in zip(cameras, self.cameras, strict=True))
+        return self.model_copy(update={"cameras": cameras}) if changed else self
 
     def build(self) -> RigGeometry:
         """Build the numeric rig."""

@@ -149,8 +149,13 @@ class Scene:
         base: Path | None = None,
         source: str = "",
     ) -> Scene:
-        """A scene of parts that are known to fit; without a `rig`, that of the spec."""
+        """A scene of parts that are known to fit; without a `rig`, that of the spec.
+
+        The numbers of calibration files become part of the spec.
+        """
         scene = object.__new__(cls)
+        if (authored := spec.rig.resolved(base)) is not spec.rig:
+            spec = spec.model_copy(update={"rig": authored})
         scene._set(spec, eye_spec, spec.rig.build() if rig is None else rig, base, source)
         return scene
 

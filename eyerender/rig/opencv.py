@@ -1,0 +1,210 @@
+"""Camera calibrations as OpenCV and ROS write them.
+
+OpenCV's `cv2.FileStorage` writes YAML (with a header and tags of its own), XML or JSON. ROS writes `camera_info` in
+YAML. All of them are read as plain data, without OpenCV.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import InputError, Problems
+from ..files import parse_json, read_text, shown
+from ..spec import LARGEST, MAX_YAML_BYTES, parse_yaml
+
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+_SUPPORTED = 5
+# Names in lower case, without underscores.
+_MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx")
+_DISTORTION = ("distortioncoefficients", "distcoeffs", "distortion", "dist", "d")
+_ROTATION = ("r", "rotation", "rotationmatrix", "rvec", "rotationvector")
+_TRANSLATION = ("t", "tvec", "translation", "translationvector")
+_SIZES = (("imagewidth", "imageheight"), ("width", "height"))
+_SIZE = ("imagesize", "size", "resolution")
+_ONLY = "; only k1, k2, p1, p2, k3 of a pinhole camera are supported"
+_MODELS = ("plumb_bob", "rational_polynomial", "pinhole", "", None)
+
+
+@dataclass(frozen=True, slots=True)
+class OpenCvCalibration:
+    """What a calibration file says.
+
+    Attributes:
+        K: (3, 3) camera matrix, px.
+        distortion: (5,) k1, k2, p1, p2, k3.
+        R: (3, 3) rotation, world to camera; None if the file has no pose.
+        t: (3,) translation, world to camera, in the file's unit of length; None if the file has no pose.
+        size_px: width and height of the image; None if the file does not say.
+    """
+
+    K: Floats
+    distortion: Floats
+    R: Floats | None
+    t: Floats | None
+    size_px: tuple[int, int] | None
+
+
+def read_opencv(path: str | Path) -> OpenCvCalibration:
+    """Read the calibration of one camera.
+
+    Raises:
+        InputError: it cannot be read, or uses a model that is not supported; naming the key.
+    """
+    source = str(path)
+    text = read_text(path, limit=MAX_YAML_BYTES)
+    data = {re.sub(r"[^a-z0-9]", "", key.lower()): (key, value) for key, value in _mapping(text, source).items()}
+    problems = Problems(source)
+
+    def array(names: tuple[str, ...]) -> tuple[str, Floats | None]:
+        key, value = next((data[name] for name in names if name in data), (names[0], None))
+        return key, None if value is None else problems.attempt(lambda: _array(value, source, key))
+
+    key, K = array(_MATRIX)
+    if K is None and len(problems) == 0:
+        problems.add(f"missing; the file holds {shown(', '.join(k for k, _ in data.values()), 120)}", "camera_matrix")
+    elif K is not None and K.shape != (3, 3):
+        problems.add("must be a 3 x 3 matrix", key)
+    distortion = _distortion(*array(_DISTORTION), data, problems)
+    R, t = _pose(array(_ROTATION), array(_TRANSLATION), problems)
+    size = _size(data, problems)
+    problems.check()
+    assert K is not None
+    return OpenCvCalibration(K, distortion, R, t, size)
+
+
+def _mapping(text: str, source: str) -> dict[str, Any]:
+    start = text.lstrip("\ufeff").lstrip()
+    if start.startswith("<"):
+        found = _xml(start, source)
+    elif start.startswith("{"):
+        found = parse_json(start, source=source)
+    else:
+        # OpenCV's header is no valid directive of YAML.
+        plain = re.sub(r"\A%YAML:[^\n]*", "", start)
+        found = parse_yaml(plain, source, mapping_tags=("opencv-matrix", "opencv-nd-matrix"))
+    if not isinstance(found, dict):
+        raise InputError("must hold named values", source=source)
+    return {str(key): value for key, value in found.items()}
+
+
+def _xml(text: str, source: str) -> dict[str, Any]:
+    if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
+        # Neither OpenCV nor ROS writes any; entities could stand for gigabytes.
+        raise InputError("holds a document type or entities, which are not read", source=source)
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"is not valid XML: {error}", source=source) from None
+    out: dict[str, Any] = {}
+    for node in root:
+        if node.get("type_id") == "opencv-matrix":
+            out[node.tag] = {part.tag: _numbers(part.text) for part in node}
+        else:
+            out[node.tag] = _numbers(node.text) if len(node) == 0 else None
+    return {key: value for key, value in out.items() if value is not None}
+
+
+def _numbers(text: str | None) -> Any:
+    """Numbers of an element's text: one number, or a list; the text itself if it holds anything else."""
+    words = (text or "").split()
+    try:
+        found = [float(word) for word in words]
+    except ValueError:
+        return text
+    return found[0] if len(found) == 1 else found
+
+
+def _array(value: Any, source: str, key: str) -> Floats:
+    """A matrix of OpenCV, or nested lists, as an array of finite numbers."""
+    shape = None
+    if isinstance(value, dict):
+        shape, value = (value.get("rows"), value.get("cols")), value.get("data")
+        value = value if isinstance(value, list) else [value]
+    try:
+        found = np.asarray(value)
+        if shape is not None:
+            found = found.reshape([int(size) for size in shape if size is not None])
+    except (ValueError, TypeError, OverflowError):
+        found = np.zeros(0, object)
+    if found.dtype.kind not in "iuf" or not (np.abs(found) <= LARGEST).all():
+        raise InputError("must be a matrix of finite numbers", source=source, path=key)
+    return np.asarray(found, dtype=float)
+
+
+def _distortion(key: str, found: Floats | None, data: dict[str, tuple[str, Any]], problems: Problems) -> Floats:
+    out = np.zeros(_SUPPORTED)
+    for name in ("distortionmodel", "cameramodel"):
+        named, model = data.get(name, ("", ""))
+        if model not in _MODELS:
+            problems.add(f"the model {shown(model)} is not supported{_ONLY}", named)
+    named, fisheye = data.get("fisheyemodel", ("", 0))
+    if fisheye not in (0, None):
+        problems.add(f"the fisheye model is not supported{_ONLY}", named)
+    if found is None:
+        return out
+    values = found.ravel()
+    if len(values) > len(_COEFFICIENTS):
+        problems.add(f"holds {len(values)} coefficients; OpenCV has at most {len(_COEFFICIENTS)}", key)
+        return out
+    extra = [_COEFFICIENTS[k] for k in range(_SUPPORTED, len(values)) if values[k] != 0]
+    if extra:
+        problems.add(f"{', '.join(extra)} must be 0{_ONLY}", key)
+    out[: min(len(values), _SUPPORTED)] = values[:_SUPPORTED]
+    return out
+
+
+def _pose(
+    rotation: tuple[str, Floats | None], translation: tuple[str, Floats | None], problems: Problems
+) -> tuple[Floats | None, Floats | None]:
+    (r_key, R), (t_key, t) = rotation, translation
+    if R is None and t is None:
+        return None, None
+    if R is None or t is None:
+        has, lacks = (t_key, "rotation") if R is None else (r_key, "translation")
+        problems.add(f"is given without the {lacks}", has)
+        return None, None
+    if R.size == 3:
+        R = rotation_of(R.ravel())
+    if R.shape != (3, 3):
+        problems.add("must be a 3 x 3 matrix or a vector of 3 numbers", r_key)
+    if t.size != 3:
+        problems.add("must be a vector of 3 numbers", t_key)
+    return R, t.ravel()
+
+
+def rotation_of(rvec: Floats) -> Floats:
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues): I + sin a [k] + (1 - cos a) [k]^2."""
+    angle = float(np.linalg.norm(rvec))
+    x, y, z = rvec / angle if angle > 0 else np.zeros(3)
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k))
+
+
+def _size(data: dict[str, tuple[str, Any]], problems: Problems) -> tuple[int, int] | None:
+    given: Any = None
+    key = "image size"
+    for pair in _SIZES:
+        if all(name in data for name in pair):
+            key, given = ", ".join(data[name][0] for name in pair), [data[name][1] for name in pair]
+            break
+    else:
+        for name in _SIZE:
+            if name in data:
+                key, given = data[name]
+                break
+    if given is None:
+        return None
+    numbers = given if isinstance(given, list) and len(given) == 2 else []
+    if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in numbers) or not numbers:
+        numbers = [0]
+    if not all(1 <= v <= 65536 and v == int(v) for v in numbers):
+        problems.add("must be two whole numbers from 1 to 65536", key)
+        return None
+    return int(numbers[0]), int(numbers[1])
