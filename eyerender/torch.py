@@ -12,7 +12,8 @@ Both datasets give an image as a mapping with the parts that are asked for:
 | `gaze` | float32 (3,): unit vector of the line of sight in the camera's frame, out of the eye |
 | `line` | the whole line of metadata, a dict |
 
-Every mapping also has `sample` and `subject`, the numbers of the sample and of its subject.
+Every mapping also has `sample` and `subject`, the numbers of the sample and of its subject. Folders that `render` wrote
+have only pictures and lines.
 """
 
 from __future__ import annotations

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
+import eyerender as er
 from eyerender.errors import InputError
 from eyerender.imagefolder import ImageFolder
 from tests.support.dataset_specs import plan
+from tests.support.paths import ROOT
 
 torch = pytest.importorskip("torch", reason="needs PyTorch; run ./scripts/test-torch")
 
@@ -66,6 +70,15 @@ def test_a_folder_gives_its_pictures_and_labels(folder):
         to_target = np.array(space["target_mm"]) - space["globe_centre_mm"]
         assert item["gaze"] @ torch.tensor(to_target / np.linalg.norm(to_target), dtype=torch.float32) > 0.99
         assert torch.linalg.norm(item["gaze"]) == pytest.approx(1, abs=1e-6)
+
+
+def test_a_rendered_scene_is_a_folder_too(spec, tmp_path):
+    er.render_folder(spec.draw(0).build(), tmp_path / "rendered")
+    data = FolderDataset(tmp_path / "rendered")
+    assert sorted(data[0]) == ["image", "mask"]
+    np.testing.assert_array_equal(data[0]["image"][0] * 65535, data.folder.entries[0].image())
+    with pytest.raises(InputError, match="line 1: has no part 'gaze'"):  # only generate writes it
+        _ = FolderDataset(tmp_path / "rendered", parts=("gaze",))[0]
 
 
 def test_splits_of_a_folder_share_no_subject(folder):
@@ -145,6 +158,30 @@ def test_ranks_and_workers_make_every_sample_once(spec):
     assert batches(2, lanes=4, start=3) == whole[3:]
     with pytest.raises(InputError, match="lanes: must be a multiple of 2, the number of workers of all ranks"):
         batches(0, ranks=2, rank=0, lanes=3)
+
+
+RANK = """
+import sys
+import torch.distributed as dist
+from eyerender.torch import StreamDataset
+from tests.support.dataset_specs import plan
+rank, place = int(sys.argv[1]), sys.argv[2]
+dist.init_process_group("gloo", init_method=f"file://{place}", rank=rank, world_size=2)
+stream = StreamDataset(plan(count=6, subjects=2), batch_size=2, parts=())
+print(stream.rank, stream.ranks, [int(i) for batch in stream for i in batch["sample"]])
+dist.barrier()
+dist.destroy_process_group()
+"""
+
+
+def test_a_process_group_says_which_rank_this_is(tmp_path):
+    argv = [sys.executable, "-c", RANK]
+    processes = [
+        subprocess.Popen([*argv, str(rank), str(tmp_path / "group")], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        for rank in range(2)
+    ]
+    found = [process.communicate(timeout=120)[0].strip() for process in processes]
+    assert found == ["0 2 [0, 1, 2, 3]", "1 2 [4, 5]"]
 
 
 def test_a_stream_goes_on_where_it_stopped(folder, spec):
