@@ -95,7 +95,9 @@ def _read(text: str, source: str) -> tuple[list[Any], Any]:
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
     # With one record a line, the first line is a whole object and not the last line.
     if len(lines) > 1 and lines[0][1].rstrip().endswith("}"):
-        objects = [parse_json(line, source=source, path=f"line {k}") for k, line in lines]
+        problems = Problems(source)
+        objects = [problems.attempt(partial(parse_json, line, source=source, path=f"line {k}")) for k, line in lines]
+        problems.check()
         # A line of a folder's metadata contains the records of its image.
         return [r for o in objects for r in (o["records"] if _is_image_line(o) else [o])], None
     if not lines:

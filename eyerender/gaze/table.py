@@ -35,8 +35,9 @@ from ..rig.screen import ScreenPlane
 from ..status import Status
 from .columns import CsvColumns, EyeColumns, completed
 
-# A table is held in memory as text and as numbers, which takes some 20 times its size.
-MAX_TABLE_BYTES, MAX_COLUMNS = 64 * 2**20, 1000
+# A table is held in memory as text and as numbers, which takes some 20 times its size. A million rows are half an hour
+# at 600 Hz.
+MAX_TABLE_BYTES, MAX_COLUMNS, MAX_ROWS = 64 * 2**20, 1000, 1_000_000
 # Numbers that can still be squared.
 _LARGEST = 1e30
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-"))
@@ -98,7 +99,8 @@ class _Table:
         delimiter = delimiter or max(",;\t", key=text.split("\n", 1)[0].count)
         problems = Problems(source)
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
-        rows, lines = [], []
+        rows: list[list[str]] = []
+        lines: list[int] = []
         try:
             header = [name.strip() for name in next(reader, [])]
             if not any(header) or len(header) > MAX_COLUMNS:
@@ -106,6 +108,8 @@ class _Table:
             for row in filter(any, reader):
                 if len(row) != len(header):
                     problems.add(f"has {len(row)} cells; the header has {len(header)}", f"line {reader.line_num}")
+                if len(rows) == MAX_ROWS:
+                    raise InputError(f"holds more than {MAX_ROWS} rows", source=source)
                 rows.append(row)
                 lines.append(reader.line_num)
         except csv.Error as error:

@@ -180,6 +180,15 @@ def test_errors_of_records_and_rig_are_reported_together(guestrin, tmp_path):
     ]  # fmt: skip
 
 
+def test_every_bad_line_of_a_file_of_records_is_named(guestrin, tmp_path):
+    lines = [json.dumps(r) for r in json.loads(guestrin.read_text())["records"][:4]]
+    path = tmp_path / "records.jsonl"
+    path.write_text("\n".join([lines[0], lines[1][:-1], lines[2], "NaN", lines[3]]))
+    with pytest.raises(InputError, match=r"records.jsonl: line 2: is not valid JSON") as caught:
+        load_observations(path, "guestrin2006")
+    assert [str(one) for one in caught.value.others] == [f"{path}: line 4: is not valid JSON: NaN is not a number"]
+
+
 def test_targets_off_the_screen_are_told(guestrin, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     data = json.loads(guestrin.read_text())

@@ -289,6 +289,15 @@ def test_files_that_are_no_tables(tmp_path, data, words):
         observations_from_csv(path)
 
 
+def test_a_table_of_too_many_rows_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("eyerender.gaze.table.MAX_ROWS", 2)
+    path = write(tmp_path / "t.csv", P, [[1, 2]] * 2)
+    assert len(observations_from_csv(path)) == 2
+    write(path, P, [[1, 2]] * 3)
+    with pytest.raises(InputError, match="holds more than 2 rows"):
+        observations_from_csv(path)
+
+
 def use(path: Any, columns: Any) -> None:
     _, rig = recording()
     strict_json(list(observations_from_csv(path, columns, rig).records()))
