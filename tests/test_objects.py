@@ -128,6 +128,14 @@ def test_with_changes_what_it_names_and_nothing_else():
             scene.with_({wrong: 1})
 
 
+def test_with_keeps_an_eye_that_was_given_instead_of_the_files(tmp_path, monkeypatch):
+    er.load_eye("E4").dump(tmp_path / "own.yaml")
+    monkeypatch.chdir(tmp_path)
+    scene = er.load_scene("quickstart", eye="own.yaml")
+    assert scene.with_(pupil_diameter_mm=3).eye_spec == scene.eye_spec
+    assert scene.with_({"eye.model": "E1"}).eye_spec.name == "E1"
+
+
 def test_one_led_of_a_ring_can_be_moved():
     ring = er.LedRing(radius_mm=20, count=6)
     rig = er.Rig(cameras=RIG.cameras, lights=(er.Led((600, 0, 100)), er.Led(ring=ring, radius_mm=1.5)))

@@ -186,15 +186,19 @@ class Scene:
         """
         if eye is not None:
             spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": eye})})
-        scene = cls.compiled(spec, spec.eye.spec(base if eye is None else None), base=base, source=source)
+        eye_spec = spec.eye.spec(base if eye is None else None)
+        return cls.compiled(spec, eye_spec, base=base, source=source)._checked()
+
+    def _checked(self) -> Scene:
+        """The scene itself, whose eye can be built and whose files exist."""
         try:
-            scene.eye("right")
-            for file in scene.files if base is not None else ():
+            self.eye("right")
+            for file in self.files if self.base is not None else ():
                 if not os.path.isfile(file):
                     raise InputError("no such file", source=str(file))
         except InputError as error:
-            raise error.placed(source=source) from None
-        return scene
+            raise error.placed(source=self.source) from None
+        return self
 
     def with_(
         self,
@@ -235,7 +239,10 @@ class Scene:
             paths["image.spp"] = spp
         for path, value in paths.items():
             _put(data, path, value)
-        return Scene.of(SceneSpec.from_mapping(data), base=self.base, source=self.source)
+        spec = SceneSpec.from_mapping(data)
+        # The eye of a scene may be another than its file names: one given instead, or one with drawn parameters.
+        same = spec.eye.model == self.spec.eye.model
+        return self.replaced(spec, eye_spec=self.eye_spec if same else spec.eye.spec(self.base))._checked()
 
     @property
     def name(self) -> str:
