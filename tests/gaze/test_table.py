@@ -160,6 +160,15 @@ def test_the_names_of_pupil_labs_are_known(tmp_path):
     assert observations_from_csv(path).pupil.ok.tolist() == [True, True, False]
 
 
+def test_a_light_may_have_no_column(tmp_path):
+    path = write(tmp_path / "t.csv", "pupil_x pupil_y a b", [[1, 2, 3, 4]])
+    found = observations_from_csv(path, {"glints": [None, ["a", "b"]]})
+    assert found.glints.ok.tolist() == [[False, True]]
+    assert found.glints.xy_px[0, 1].tolist() == [3.0, 4.0]
+    path = write(tmp_path / "t.csv", "pupil_x pupil_y glint0_x glint0_y glint2_x glint2_y", [[1, 2, 3, 4, 5, 6]])
+    assert observations_from_csv(path).glints.ok.tolist() == [[True, False, True]]
+
+
 @pytest.mark.parametrize("cell", ["", " ", "NaN", "n/a", "NULL", "-"])
 def test_empty_cells_are_missing_features(tmp_path, cell):
     path = write(
