@@ -101,6 +101,7 @@ if any(EXAMPLES.glob("[0-9]*_*.py")):
         "remove_config_comments": True,
         "download_all_examples": False,
         "min_reported_time": 1,
+        "write_computation_times": False,
         "abort_on_example_error": False,
     }
 else:
