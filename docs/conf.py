@@ -43,6 +43,7 @@ exclude_patterns = [
 ]
 suppress_warnings = ["config.cache"]  # the options of the gallery hold no functions, but Sphinx does not look
 
+autodoc_mock_imports = ["torch"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented_params"

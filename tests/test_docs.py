@@ -65,7 +65,8 @@ def test_a_record_is_described_once_and_links_lead_to_it(pages):
 
 
 def test_every_public_name_has_a_docstring_page(pages):
-    found = references.names_on("".join(text for name, text in pages.items() if "/api_" in name))
+    texts = (text for name, text in pages.items() if "/api_" in name and not name.endswith("/api_torch"))
+    found = references.names_on("".join(texts))
     assert found == (set(er.__all__) | set(er.gaze.__all__)) - {"gaze", "__version__"}
 
 

@@ -18,6 +18,21 @@ GROUPS = {
     "api_datasets": ("Datasets and folders of images", ("dataset", "imagefolder", "benchmark")),
 }
 
+# PyTorch need not be installed where the site is built.
+TORCH = """# Datasets for PyTorch
+
+[Training networks](../training.md) shows their use. `eyerender.torch` needs the extra `torch`.
+
+```{eval-rst}
+.. currentmodule:: eyerender.torch
+.. autoclass:: FolderDataset
+   :members:
+.. autoclass:: StreamDataset
+   :members:
+.. autofunction:: collate
+```
+"""
+
 
 def commands() -> str:
     """The help of every command, as the application prints it."""
@@ -50,6 +65,7 @@ def pages() -> dict[str, str]:
     for page, (title, _) in GROUPS.items():
         made[page] = api_page(title, "eyerender", [name for name, its in where.items() if its == page])
     made["api_gaze"] = api_page("Gaze estimators", "eyerender.gaze", er.gaze.__all__)
+    made["api_torch"] = TORCH
     return made
 
 
@@ -75,4 +91,4 @@ def write(folder: Path) -> None:
 
 def names_on(text: str) -> set[str]:
     """The public names that a page of the API documents."""
-    return set(re.findall(r"^\.\. auto\w+:: (\w+)", text, re.MULTILINE)) - {"summary"}
+    return set(re.findall(r"^\.\. auto(?:class|function|exception):: (\w+)", text, re.MULTILINE))
