@@ -229,6 +229,9 @@ def parse_yaml(text: str, source: str, *, mapping_tags: tuple[str, ...] = ()) ->
         raise InputError(f"not valid YAML: {problem}", source=source, path=where) from None
     except RecursionError:
         raise InputError("not valid YAML: nested too deeply", source=source) from None
+    except ValueError as error:
+        # The scanner reads the numbers of a %YAML directive with int().
+        raise InputError(f"not valid YAML: {error}", source=source) from None
     if not isinstance(data, dict):
         raise InputError("must be a YAML mapping of keys to values", source=source)
     return data

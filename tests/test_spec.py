@@ -122,6 +122,7 @@ def test_bad_keys_are_refused_with_their_path(tmp_path, path, value, words):
         ("format: 1\nseed: 1" + ":1" * 5000, "line 2: not valid YAML: a number of 10001 characters"),
         ('format: 1\nseed: !!int "x"', "is no int"),
         ("format: 1\nseed: !!timestamp x", "is no timestamp"),
+        ("%YAML 1." + "1" * 5000 + "\n---\nformat: 1", "not valid YAML: Exceeds the limit"),
         ("format: 1\nseed: !!bool x", "is no bool"),
         ("? [1, 2]\n: 3", "unhashable key"),
         ("format: 1\nname: !!binary aGVsbG8=", "no number, text or list"),
