@@ -32,7 +32,14 @@ _PICTURES = {
 }
 _TEXTS = ("split", "encoding", "eye", "eye_model", "line_json")
 _WHOLE = ("sample", "subject", "sequence_index", "bit_depth", "source_bit_depth", "window_x0_px", "window_y0_px")
-_SIZES = ((1e3, "n<1K"), (1e4, "1K<n<10K"), (1e5, "10K<n<100K"), (1e6, "100K<n<1M"), (1e7, "1M<n<10M"))
+_SIZES = (
+    (1e3, "n<1K"),
+    (1e4, "1K<n<10K"),
+    (1e5, "10K<n<100K"),
+    (1e6, "100K<n<1M"),
+    (1e7, "1M<n<10M"),
+    (1e8, "10M<n<100M"),
+)
 
 
 def write(items: Items, out: Path) -> str:
@@ -155,7 +162,7 @@ def _head(items: Items, types: dict[str, str], out: Path) -> str:
         "pretty_name": items.name,
         "task_categories": ["image-segmentation", "keypoint-detection"],
         "tags": ["eye-tracking", "gaze-estimation", "near-infrared", "synthetic"],
-        "size_categories": [next((name for end, name in _SIZES if total < end), "n>10M")],
+        "size_categories": [next((name for end, name in _SIZES if total < end), "100M<n<1B")],
         "configs": [
             {
                 "config_name": "default",
