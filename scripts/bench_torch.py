@@ -58,7 +58,7 @@ def streamed(count: int, backend: str) -> float:
 
 def rows(backend: str, quick: bool) -> Iterable[Row]:
     """All rows, as they are measured."""
-    count = 96 if quick else 288
+    count = 96 if quick else 192
     found = [(generated(count, backend), streamed(count, backend)) for _ in range(1 if quick else 3)]
     runs, streams = (statistics.median(side) for side in zip(*found, strict=True))
     yield row("generate, two workers of one thread each", runs, "images/s")
