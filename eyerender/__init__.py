@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from .region.headspec import Head, HeadParts
     from .region.look import Look
     from .report.comparison import write_report
-    from .rig.camera import Camera, CameraCalibration, PinholeCamera
+    from .rig.camera import CalibrationFile, Camera, CameraCalibration, PinholeCamera
     from .rig.imaging import Ambient, Lens, Motion, Panel, RadianceMap
     from .rig.light import Led, LedRing
     from .rig.rig import Rig, RigGeometry
@@ -55,6 +55,7 @@ _HOMES = {
     "AnalyticObserver": "analytic.observer",
     "BackendError": "errors",
     "Brow": "region.anatomy",
+    "CalibrationFile": "rig.camera",
     "Camera": "rig.camera",
     "CameraCalibration": "rig.camera",
     "Comparison": "comparison",
@@ -131,6 +132,7 @@ __all__ = [
     "AnalyticObserver",
     "BackendError",
     "Brow",
+    "CalibrationFile",
     "Camera",
     "CameraCalibration",
     "Comparison",

@@ -205,16 +205,15 @@ def test_import_is_light():
 
 def test_public_names_are_pinned():
     assert eyerender.__all__ == [
-        "Ambient", "AnalyticObserver", "BackendError", "Brow", "Camera", "CameraCalibration", "Comparison",
-        "DatasetSpec", "ExtractionSettings", "Extractor", "Eye", "EyeDirection", "EyeImage", "EyeModel", "EyeSpec",
-        "EyerenderError", "Face", "Fissure", "Frame", "Frames", "Head", "HeadParts", "ImageFolder", "ImageObserver",
-        "InputError", "LabelledImage", "Lashes", "Led", "LedRing", "Lens", "Lid", "Look", "Motion", "Observations",
-        "Observer", "Panel", "Picture", "PinholeCamera", "PupilMargin", "RadianceMap", "Region", "Rig",
+        "Ambient", "AnalyticObserver", "BackendError", "Brow", "CalibrationFile", "Camera", "CameraCalibration",
+        "Comparison", "DatasetSpec", "ExtractionSettings", "Extractor", "Eye", "EyeDirection", "EyeImage", "EyeModel",
+        "EyeSpec", "EyerenderError", "Face", "Fissure", "Frame", "Frames", "Head", "HeadParts", "ImageFolder",
+        "ImageObserver", "InputError", "LabelledImage", "Lashes", "Led", "LedRing", "Lens", "Lid", "Look", "Motion",
+        "Observations", "Observer", "Panel", "Picture", "PinholeCamera", "PupilMargin", "RadianceMap", "Region", "Rig",
         "RigGeometry", "Scene", "SceneSpec", "Screen", "Sensor", "Skin", "Status", "Subject", "Targets", "TearFilm",
-        "__version__", "bench_extractors", "compare", "compare_folder", "detect", "estimate", "export",
-        "export_scene", "extract", "gaze", "generate", "load_eye", "load_scene", "preview", "render",
-        "render_folder", "render_windows", "run_quickstart", "sample", "shipped_scenes", "trace", "validate",
-        "write_report",
+        "__version__", "bench_extractors", "compare", "compare_folder", "detect", "estimate", "export", "export_scene",
+        "extract", "gaze", "generate", "load_eye", "load_scene", "preview", "render", "render_folder", "render_windows",
+        "run_quickstart", "sample", "shipped_scenes", "trace", "validate", "write_report",
     ]  # fmt: skip
     for name in eyerender.__all__:
         assert getattr(eyerender, name) is not None

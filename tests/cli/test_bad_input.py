@@ -52,6 +52,8 @@ def place(tmp_path, monkeypatch):
     Path("text.yaml").write_text("format: 1\nname: [", encoding="utf-8")
     Path("binary.yaml").write_bytes(bytes(range(256)))
     Path("date.yaml").write_text("format: 1\nseed: 2020-13-45", encoding="utf-8")
+    scene("lens.yaml", "rig.cameras.0", {"resolution_px": [640, 480], "calibration": {"file": "text.yaml"}})
+    scene("nolens.yaml", "rig.cameras.0", {"resolution_px": [640, 480], "calibration": {"file": "none.yml"}})
     scene("focal.yaml", "rig.cameras.0.focal_length_mm", 1e300)
     scene("grid.yaml", "targets", {"grid": [10**9, 1]})
     os.mkfifo("pipe.yaml")
@@ -171,6 +173,8 @@ TABLE = [
     (["compare", "hollow", "--estimator", "json:JSONDecoder"], 2, "--estimator: json:JSONDecoder has no method fit"),
     (["compare", "hollow", "--function", "R13"], 2, "'R13' is not a regression function"),
     (["features", "date.yaml"], 2, "date.yaml: line 2: not valid YAML: is no timestamp (month must be in 1..12)"),
+    (["features", "lens.yaml"], 2, "text.yaml: line 2: not valid YAML"),
+    (["features", "nolens.yaml"], 2, "none.yml: no such file"),
     (["features", "focal.yaml"], 2, "focal.yaml: rig.cameras.0.focal_length_mm: must be <= 1e+09"),
     (["features", "grid.yaml"], 2, "grid.yaml: targets.grid.0: must be <= 1000"),
     (["features", "quickstart", "--points", "many"], 2, "--points"),
