@@ -223,9 +223,9 @@ def section(record: type[Spec], places: list[str], level: int = 2) -> str:
 
 INTRODUCTION = """Lists may be written as YAML lists; an integer may stand for a number. `[]` in a path stands for an
 entry of a list. Lengths are in mm and angles in degrees unless a key ends in another unit. Unless a row says otherwise,
-numbers lie between -1e9 and 1e9. A source says where a default comes from; "chosen" means that it was set by eye or
-lacks a published source, and an empty cell that the default is a convention or switches something off.
-[Conventions](../conventions.md) defines the frames."""
+numbers lie between -1e9 and 1e9. The last column says where a default comes from: "chosen" means that it was set by eye
+or lacks a published source, and "none stated" that the code names none. An empty cell means that there is no default,
+or that it is a convention or switches something off. [Conventions](../conventions.md) defines the frames."""
 
 
 def pages() -> dict[str, str]:
