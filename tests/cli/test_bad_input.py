@@ -38,7 +38,7 @@ def place(tmp_path, monkeypatch):
         *parents, last = path.split(".")
         for key in parents:
             node = node[int(key) if key.isdigit() else key]
-        node[last] = value
+        node[int(last) if last.isdigit() else last] = value
         Path(name).write_text(yaml.safe_dump(copy), encoding="utf-8")
 
     scene("key.yaml", "rig.lights.0.colour", 1)
