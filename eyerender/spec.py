@@ -17,7 +17,6 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import ErrorDetails
 
 from .errors import InputError, Problems
 from .files import opened, read_text, shown
@@ -351,7 +350,7 @@ def _problems(error: ValidationError) -> list[tuple[str, str]]:
     return kept
 
 
-def _described(problem: ErrorDetails, path: str) -> tuple[str, str]:
+def _described(problem: Mapping[str, Any], path: str) -> tuple[str, str]:
     """Dotted path and reason of one problem at a path."""
     context = problem.get("ctx", {})
     kind = problem["type"]
