@@ -81,6 +81,8 @@ def progress(what: str) -> Iterator[Steps]:
 
     def line(done: int, total: int, note: str) -> None:
         now = time.monotonic()
+        if done == 0:
+            return  # the total alone is worth no line
         if done == total or now - last[0] >= 2:
             last[0] = now
             say(f"{what}: {done}/{total}{' ' + note if note else ''}")
