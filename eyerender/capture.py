@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import Bytes, Floats, Singles
-from .backends.choose import BackendChoice
+from .backends.choose import BackendChoice, choose_backend
 from .errors import InputError
 from .eye.model import EyeModel
 from .eye.pose import Poses, rigid_motion
@@ -129,7 +129,7 @@ def render_job(frames: Frames, row: int) -> RenderJob:
         M=M,
         t=t,
         camera=scene.rig.cameras[camera],
-        window=scene.windows()[camera, head, int(index.eye[row])],
+        window=scene.window(camera, head, int(index.eye[row])),
         lights=scene.rig.lights,
         sensor=scene.spec.sensor,
         look=scene.spec.look,
@@ -167,8 +167,8 @@ def check_windows(scene: Scene) -> None:
         InputError: they cannot.
     """
     spp = scene.spec.image.spp
-    for i, camera in enumerate(scene.rig.cameras):
-        width, height = scene.spec.image.window_px or camera.resolution_px
+    for i in range(len(scene.rig.cameras)):
+        width, height = scene.window_size_px(i)
         if width * height > MAX_PIXELS:
             what = "image.window_px" if scene.spec.image.window_px else f"rig.cameras.{i}.resolution_px"
             raise InputError(
@@ -187,8 +187,6 @@ def make_renderer(backend: BackendChoice = "auto", threads: int | None = None) -
     Raises:
         BackendError: there is none; the message says how to fix it.
     """
-    from .backends.choose import choose_backend
-
     chosen = choose_backend(backend, threads)
     # Importing the renderer imports mitsuba, which requires a backend that is set up.
     from .rendering.renderer import Renderer

@@ -51,7 +51,7 @@ class EyeInWindow:
         index, scene = frames.index, frames.scene
         camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
         M, t = eye_motion(frames, row)
-        return cls(row, camera, scene.windows()[camera, head, side], scene.eye(EYES[side]), M, t)
+        return cls(row, camera, scene.window(camera, head, side), scene.eye(EYES[side]), M, t)
 
 
 def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:

@@ -136,6 +136,24 @@ def test_with_keeps_an_eye_that_was_given_instead_of_the_files(tmp_path, monkeyp
     assert scene.with_({"eye.model": "E1"}).eye_spec.name == "E1"
 
 
+def test_with_leaves_the_callers_values_alone():
+    sensor = {"bit_depth": 12}
+    changed = er.load_scene("quickstart").with_({"sensor.bit_depth": 8}, sensor=sensor)
+    assert changed.spec.sensor.bit_depth == 8
+    assert sensor == {"bit_depth": 12}
+
+
+def test_a_camera_in_an_eye_is_warned_of():
+    camera = er.Camera.from_mapping(
+        {"resolution_px": [640, 480], "calibration": {"K": [[900, 0, 320], [0, 900, 240], [0, 0, 1]],
+         "R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t_mm": [0, 32, 0]}}
+    )  # fmt: skip
+    rig = er.Rig(cameras=(camera,), lights=RIG.lights, screen=RIG.screen)
+    scene = er.Scene(er.Subject(er.Eye("E1"), ipd_mm=64), rig, targets=er.Targets(grid=(1, 1)))
+    assert any("the camera is in the right eye" in str(warning) for warning in scene.warnings())
+    assert set(scene.windows().values()) == {(0, 0, 640, 480)}
+
+
 def test_one_led_of_a_ring_can_be_moved():
     ring = er.LedRing(radius_mm=20, count=6)
     rig = er.Rig(cameras=RIG.cameras, lights=(er.Led((600, 0, 100)), er.Led(ring=ring, radius_mm=1.5)))

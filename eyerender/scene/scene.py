@@ -9,6 +9,7 @@ import hashlib
 import math
 import os
 from collections.abc import Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -27,12 +28,12 @@ from ..eye.spec import EyeSpec
 from ..observation import EYES, Index, PoseTruth
 from ..plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
 from ..region.anatomy import Region
-from ..rig.camera import PinholeCamera, Window
+from ..rig.camera import Window
 from ..rig.imaging import Ambient
 from ..rig.rig import Rig, RigGeometry, RigLike
 from ..spec import Spec, file_digest
 from ..status import Status
-from .spec import SceneSpec, SubjectSpec
+from .spec import EyeDirection, SceneSpec, SubjectSpec, Targets
 
 EYE_WINDOW_MM = (32.0, 24.0)
 """What a window shows about each of two eyes, where a scene says nothing else: both lids and the corners."""
@@ -228,10 +229,9 @@ class Scene:
         if gaze_deg is not None or target_mm is not None:
             data["targets"] = data["poses"] = None
         if gaze_deg is not None:
-            angles = np.asarray(gaze_deg, dtype=float).reshape(-1, 2)
-            data["poses"] = [{"azimuth_deg": azimuth, "elevation_deg": elevation} for azimuth, elevation in angles]
+            data["poses"] = EyeDirection.listed(gaze_deg)
         if target_mm is not None:
-            data["targets"] = {"world_mm": np.asarray(target_mm, dtype=float).reshape(-1, 3)}
+            data["targets"] = Targets.at(target_mm)
         paths = dict(changes or {})
         if pupil_diameter_mm is not None:
             paths["eye.pupil_diameter_mm"] = pupil_diameter_mm
@@ -433,27 +433,35 @@ class Scene:
         A window is centred on the image of the unrotated eye's apex, so it does not move with the gaze; it is kept on
         the sensor. Without `image.window_px` it is the whole sensor for one eye, and `EYE_WINDOW_MM` for two.
         """
-        out = {}
-        for c, camera in enumerate(self.rig.cameras):
-            w, h = camera.resolution_px
-            ww, wh = self._window_px(camera)
-            for k, head in enumerate(self.spec.subject.head_positions_mm):
-                for side in self.spec.subject.eyes:
-                    (u, v), front = camera.project(self.eye_position_mm(side) + np.array(head))
-                    front = front and np.isfinite(u) and np.isfinite(v)  # beside the camera distortion can overflow
-                    x0 = int(np.floor((u if front else (w - 1) / 2) - (ww - 1) / 2 + 0.5))
-                    y0 = int(np.floor((v if front else (h - 1) / 2) - (wh - 1) / 2 + 0.5))
-                    out[c, k, EYES.index(side)] = (min(max(x0, 0), w - ww), min(max(y0, 0), h - wh), ww, wh)
-        return out
+        return {
+            (c, k, EYES.index(side)): self.window(c, k, EYES.index(side))
+            for c in range(len(self.rig.cameras))
+            for k in range(len(self.spec.subject.head_positions_mm))
+            for side in self.spec.subject.eyes
+        }
 
-    def _window_px(self, camera: PinholeCamera) -> tuple[int, int]:
+    def window(self, camera: int, head: int, eye: int) -> Window:
+        """One of the `windows`: that of a camera, a head position and an eye (0 right, 1 left)."""
+        view = self.rig.cameras[camera]
+        (w, h), (ww, wh) = view.resolution_px, self.window_size_px(camera)
+        position = self.eye_position_mm(EYES[eye]) + np.array(self.spec.subject.head_positions_mm[head])
+        (u, v), front = view.project(position)
+        front = front and np.isfinite(u) and np.isfinite(v)  # beside the camera distortion can overflow
+        x0 = int(np.floor((u if front else (w - 1) / 2) - (ww - 1) / 2 + 0.5))
+        y0 = int(np.floor((v if front else (h - 1) / 2) - (wh - 1) / 2 + 0.5))
+        return min(max(x0, 0), w - ww), min(max(y0, 0), h - wh), ww, wh
+
+    def window_size_px(self, camera: int) -> tuple[int, int]:
         """Width and height of a camera's windows."""
         if self.spec.image.window_px is not None:
             return self.spec.image.window_px
-        w, h = camera.resolution_px
-        if len(self.spec.subject.eyes) == 1:
+        view = self.rig.cameras[camera]
+        w, h = view.resolution_px
+        positions = [self.eye_position_mm(side) for side in self.spec.subject.eyes]
+        # Where a camera stands in an eye, no scale is defined.
+        if len(positions) == 1 or any(np.array_equal(position, view.nodal_point_mm) for position in positions):
             return w, h
-        scale = max(camera.scale_at(self.eye_position_mm(side)) for side in self.spec.subject.eyes)
+        scale = max(map(view.scale_at, positions))
         width, height = (16 * math.ceil(side_mm * scale / 16) for side_mm in EYE_WINDOW_MM)
         return min(width, w), min(height, h)
 
@@ -468,12 +476,12 @@ def _put(data: dict[str, Any], path: str, value: Any) -> None:
     here: Any = data
     try:
         for key in keys[:-1]:
-            if isinstance(here, list):
-                here = here[int(key)]
-            else:
-                if isinstance(here.get(key), Spec):
-                    here[key] = here[key].to_mapping()
-                here = here.setdefault(key, {})
+            at: Any = int(key) if isinstance(here, list) else key
+            inner = here[at] if isinstance(here, list) else here.get(at, {})
+            # A copy, because the value may be the caller's own.
+            inner = inner.to_mapping() if isinstance(inner, Spec) else copy(inner)
+            here[at] = inner
+            here = inner
         here[int(keys[-1]) if isinstance(here, list) else keys[-1]] = value
     except (AttributeError, IndexError, TypeError, ValueError):
         raise InputError("there is no such key", path=path) from None

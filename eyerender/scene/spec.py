@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..errors import InputError
@@ -114,6 +116,11 @@ class Targets(Spec):
         default=None, description="points in the world"
     )
 
+    @classmethod
+    def at(cls, points_mm: ArrayLike) -> Self:
+        """World points, (3,) or (n, 3) mm."""
+        return cls.from_mapping({"world_mm": np.asarray(points_mm, dtype=float).reshape(-1, 3)})
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if sum(v is not None for v in (self.grid, self.screen_mm, self.world_mm)) != 1:
@@ -130,6 +137,12 @@ class EyeDirection(Spec):
     elevation_deg: Annotated[float, Field(gt=-90, lt=90)] = Field(
         description="elevation of the optic axis, positive upwards"
     )
+
+    @classmethod
+    def listed(cls, angles_deg: ArrayLike) -> list[Self]:
+        """Directions of azimuths and elevations, (2,) or (n, 2) degrees."""
+        angles = np.asarray(angles_deg, dtype=float).reshape(-1, 2)
+        return [cls(azimuth_deg=azimuth, elevation_deg=elevation) for azimuth, elevation in angles]
 
 
 class Picture(Spec):

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..rig.rig import Rig
 from .scene import Frames, Scene
-from .spec import Eye, EyeDirection, SubjectSpec
+from .spec import Eye, EyeDirection, SubjectSpec, Targets
 
 
 class Subject(SubjectSpec):
@@ -34,8 +33,7 @@ class Subject(SubjectSpec):
         Raises:
             InputError: a value does not fit, or a target that no pose of an eye fixates.
         """
-        targets = {"world_mm": np.asarray(targets_mm, dtype=float).reshape(-1, 3)}
-        return Scene(self, rig, targets=targets, **scene).frames()
+        return Scene(self, rig, targets=Targets.at(targets_mm), **scene).frames()
 
     def looking(self, directions_deg: ArrayLike, rig: Rig, **scene: Any) -> Frames:
         """The frames in which the optic axes of the eyes have directions, one after the other.
@@ -48,6 +46,4 @@ class Subject(SubjectSpec):
         Raises:
             InputError: a value does not fit.
         """
-        angles = np.asarray(directions_deg, dtype=float).reshape(-1, 2)
-        poses = [EyeDirection(azimuth_deg=azimuth, elevation_deg=elevation) for azimuth, elevation in angles]
-        return Scene(self, rig, poses=poses, **scene).frames()
+        return Scene(self, rig, poses=EyeDirection.listed(directions_deg), **scene).frames()
