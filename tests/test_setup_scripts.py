@@ -129,7 +129,7 @@ def test_python_that_is_too_old_is_told(checkout: Path) -> None:
 def test_dependencies_are_oldest_or_newest(checkout: Path) -> None:
     done = run(checkout, "./scripts/test-dependencies latest")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == "eyerender: error: usage: scripts/test-dependencies oldest|newest [PYTEST ARGS]\n"
+    assert done.stderr == "eyerender: error: usage: scripts/test-dependencies oldest|newest|INTERPRETER [PYTEST ARGS]\n"
     assert not list(checkout.glob(".venv*"))
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import email
 import json
 import os
+import re
 import subprocess
 import sys
+import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -16,13 +20,14 @@ from tests.support.paths import ROOT
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """A folder with the wheel installed in it."""
+    """A folder with the wheel installed in it, the wheel, and the archive of sources that the wheel was built from."""
     if not (ROOT / "pyproject.toml").is_file():
         pytest.skip("no checkout to build from")
     out = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(ROOT)]
+    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(ROOT)]  # sources, then wheel
     subprocess.run(build, check=True, capture_output=True)
     (wheel,) = out.glob("*.whl")
+    (sources,) = out.glob("*.tar.gz")
     install = [
         sys.executable,
         "-m",
@@ -35,7 +40,7 @@ def site(tmp_path_factory):
         str(out / "site"),
     ]
     subprocess.run([*install, str(wheel)], check=True, capture_output=True)
-    return out / "site", wheel
+    return out / "site", wheel, sources
 
 
 def run(site, cwd, *argv):
@@ -50,7 +55,7 @@ def run(site, cwd, *argv):
 
 
 def test_features_of_a_shipped_scene_from_another_folder(site, tmp_path):
-    folder, _ = site
+    folder, _, _ = site
     where = run(folder, tmp_path, "-c", "import eyerender; print(eyerender.__file__)")
     assert Path(where.stdout.strip()).is_relative_to(folder)
     done = run(folder, tmp_path, "-m", "eyerender", "features", "guestrin2006", "--json", "-")
@@ -63,10 +68,49 @@ def test_features_of_a_shipped_scene_from_another_folder(site, tmp_path):
 
 
 def test_wheel_holds_what_the_package_reads_and_nothing_of_the_checkout(site):
-    _, wheel = site
+    _, wheel, _ = site
     names = set(zipfile.ZipFile(wheel).namelist())
     scenes = {p.name for p in (ROOT / "scenes").glob("*.yaml")}
     assert {f"eyerender/data/scenes/{name}" for name in scenes} <= names
     assert "eyerender/py.typed" in names
     assert "eyerender/report/templates/comparison.html.j2" in names
     assert not [n for n in names if n.startswith(("tests/", "scripts/", "docs/"))]
+
+
+def package_files():
+    """The tracked files of the package, relative to the checkout."""
+    listed = subprocess.run(["git", "ls-files", "eyerender"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("no git to list the files of the package")
+    return set(listed.stdout.splitlines())
+
+
+def test_sources_and_wheel_hold_every_file_of_the_package(site):
+    _, wheel, sources = site
+    with tarfile.open(sources) as archive:
+        inside = {name.partition("/")[2] for name in archive.getnames()}
+    assert package_files() <= inside
+    assert {"README.md", "LICENSE", "CHANGELOG.md", "SECURITY.md", "CITATION.cff", "constraints.txt"} <= inside
+    assert {"docs/index.md", "examples/01_first_image.py", "scripts/test", "tests/conftest.py"} <= inside
+    assert package_files() <= set(zipfile.ZipFile(wheel).namelist())
+
+
+def test_metadata_says_what_the_index_shows(site):
+    _, wheel, _ = site
+    archive = zipfile.ZipFile(wheel)
+    (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/METADATA")]
+    data = email.message_from_bytes(archive.read(name))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (data["Name"], data["Version"]) == ("eyerender", project["version"])
+    assert (data["License-Expression"], data["Requires-Python"]) == ("MIT", ">=3.11")
+    assert data["Description-Content-Type"] == "text/markdown"
+    declared = {c.rpartition(" ")[2] for c in data.get_all("Classifier") if re.fullmatch(r".*Python :: 3\.\d+", c)}
+    assert declared == {"3.11", "3.12", "3.13"}
+
+
+def test_version_is_the_same_everywhere_and_its_changes_are_listed():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    releases = re.findall(r"^## (\S+) - (\d{4}-\d{2}-\d{2})$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert releases
+    assert releases[0][0] == version

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
+
 ANALYTIC, IMAGE, TARGET = "#0072B2", "#D55E00", "#222222"
 # These are the same two hues, light enough for dark images.
 ANALYTIC_ON_DARK, IMAGE_ON_DARK = "#56B4E9", "#FF9F1C"
@@ -39,7 +41,56 @@ def figure(width: float, height: float, columns: int = 1, rows: int = 1) -> Iter
 
 
 def svg(fig: Any) -> str:
-    """Convert a figure to an <svg> element for an HTML page, without the XML prologue."""
+    """Convert a figure to an <svg> element for an HTML page, without the XML prologue and without empty panels."""
+    _leave_out_empty_panels(fig)
     text = io.StringIO()
     fig.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()[text.getvalue().index("<svg") :]
+
+
+def _leave_out_empty_panels(fig: Any) -> None:
+    """Remove the panels that show no data and move the others together; a figure without any data says so."""
+    panels = [ax for ax in fig.axes if ax.get_subplotspec() is not None]
+    full = [ax for ax in panels if _has_data(ax)]
+    if len(full) == len(panels):
+        return
+    if not full:
+        full = panels[:1]
+        full[0].text(0.5, 0.5, "no values", transform=full[0].transAxes, ha="center", va="center", color="#666666")
+    grid = panels[0].get_subplotspec().get_gridspec()
+    columns = min(grid.ncols, len(full))
+    rows = -(-len(full) // columns)
+    width, height = fig.get_size_inches()
+    fig.set_size_inches(max(5.4, width * columns / grid.ncols), height * rows / grid.nrows)
+    first, way = panels[0], panels[0].get_ylabel()
+    names = [label.get_text() for label in first.get_yticklabels()]
+    for ax in panels:
+        if ax not in full:
+            ax.remove()
+    cells = fig.add_gridspec(rows, columns)
+    for k, ax in enumerate(full):
+        ax.set_subplotspec(cells[k // columns, k % columns])
+    if full[0] is not first and not full[0].get_ylabel():  # the panels of a row share the labels of the first
+        full[0].set_ylabel(way)
+        if not any(label.get_text() for label in full[0].get_yticklabels()):
+            full[0].set_yticks(full[0].get_yticks(), names)
+
+
+def _has_data(ax: Any) -> bool:
+    """Whether a panel shows any finite value; lines and areas across the whole panel are only references."""
+
+    def in_data(artist: Any) -> bool:
+        return all(artist.get_transform().contains_branch_seperately(ax.transData))
+
+    def finite(xy: Any) -> bool:
+        return bool(np.isfinite(np.ma.filled(np.ma.asarray(xy, dtype=float), np.nan)).all(axis=-1).any())
+
+    return (
+        bool(ax.images)
+        or any(in_data(patch) for patch in ax.patches)
+        or any(in_data(line) and finite(line.get_xydata()) for line in ax.lines)
+        or any(
+            finite(c.get_offsets()) if c.get_array() is None else finite(np.ma.ravel(c.get_array())[:, None])
+            for c in ax.collections
+        )
+    )

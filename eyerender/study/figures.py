@@ -160,7 +160,8 @@ def map_figure(
     maps: Mapping[str, Floats], x: Floats, y: Floats, xlabel: str, ylabel: str, colour_label: str, marks: Any = None
 ) -> str:
     """Draw maps of a mean error (len(y), len(x)) over two quantities, one per panel, on one scale; NaN is white."""
-    top = max(float(np.nanmax(m)) for m in maps.values())
+    maps = {name: values for name, values in maps.items() if np.isfinite(values).any()} or maps
+    top = max((float(np.nanmax(m)) for m in maps.values() if np.isfinite(m).any()), default=1.0)
     with figure(max(5.0, 2.1 * len(maps) + 1.0), 2.5, len(maps)) as (fig, axes):
         for k, (ax, (name, values)) in enumerate(zip(np.atleast_1d(axes), maps.items(), strict=True)):
             shown = ax.pcolormesh(x, y, values, cmap="cividis", vmin=0, vmax=top, shading="nearest")
