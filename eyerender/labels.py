@@ -95,8 +95,7 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
             "visible_fraction": seen["iris_visible_fraction"],
         },
         "glints": [
-            glint | _seen_glint(image, k, glint["in_window"], seen["glints"][k]["reason"])
-            for k, glint in enumerate(known["glints"])
+            glint | _seen_glint(image, k, seen["glints"][k]["reason"]) for k, glint in enumerate(known["glints"])
         ],
         "lid_margins_px": seen["lid_margins_px"],
         **{key: known[key] for key in ("space", "globe_radius_mm", "pose", "camera", "lights_mm")},
@@ -250,36 +249,41 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
 def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> list[dict[str, Any]]:
     """Place of each lamp's glint centre by ray optics."""
     glints, row = observations.glints, view.row
-    x0, y0, w, h = view.window
     out = []
     for k in range(len(scene.rig.lights)):
         xy, _ = glints.of_light(k)
         found = bool(np.isfinite(xy[row]).all())
         at = (glints.light[row] == k) & (glints.status[row] != Status.NONE)
         slot = int(at.argmax())
-        inside = found and bool(x0 - 0.5 <= xy[row, 0] <= x0 + w - 0.5 and y0 - 0.5 <= xy[row, 1] <= y0 + h - 0.5)
         out.append(
             {
                 "light": k,
                 "status": Status(glints.status[row, slot]).label,
                 "reason": glints.reason[row, slot] or None,
                 "xy_px": xy[row].tolist() if found else None,
-                "in_window": inside,
+                "in_window": found and _inside(view.window, xy[row]),
             }
         )
     return out
 
 
-def _seen_glint(image: EyeImage, k: int, in_window: bool, hidden_by: str | None) -> dict[str, Any]:
-    """Visible part of a lamp's glint."""
+def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any]:
+    """Visible part of a lamp's glint; it may be visible where the mirror point of the lamp's centre is not."""
     table = image.rendered.glints
-    lit = np.isfinite(table.xy_px[k]).all()
+    spot = table.xy_px[k]
+    lit = bool(np.isfinite(spot).all())
     return {
-        "visible": bool(table.visible[k]) and in_window,
+        "visible": lit and bool(table.visible[k]) and _inside(image.window, spot),
         "hidden_by": hidden_by,
         "visible_share": float(table.share[k]),
-        "spot_xy_px": table.xy_px[k].tolist() if lit else None,
+        "spot_xy_px": spot.tolist() if lit else None,
     }
+
+
+def _inside(window: Window, xy: Floats) -> bool:
+    """Whether a place (2,) in full-sensor pixels lies in a window."""
+    x0, y0, w, h = window
+    return bool(x0 - 0.5 <= xy[0] <= x0 + w - 0.5 and y0 - 0.5 <= xy[1] <= y0 + h - 0.5)
 
 
 def _share(value: float) -> float | None:

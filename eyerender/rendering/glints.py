@@ -8,15 +8,15 @@ The mirror point of each point of an LED comes from `optics.solve`, the ray tube
 
 theta is the angle to the optical axis, D the determinant of the Jacobian of the lens distortion. An LED of finite size
 is integrated with Gauss-Legendre nodes in r^2 and equal angles, each with its own position and energy. The image of a
-near LED, which spans several pixels, is thus an energy-weighted disc.
+near LED, which spans several pixels, is thus an energy-weighted disc. Where the limbus, the globe or something of the
+scene hides a part of an LED, the nodes are those of the visible part (`cut`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -24,15 +24,19 @@ from ..arrays import ArrayValue, Bools, Floats, frozen
 from ..geometry.surfaces import Surface, components, join
 from ..geometry.transforms import normalize
 from ..optics.interface import fresnel
-from ..optics.shooting import ray_tube
+from ..optics.shooting import RESIDUAL_LIMIT_MM, ray_tube
 from ..optics.solve import mirrored_rays
 from ..optics.trace import Crossing
 from ..rig.camera import PinholeCamera
 from ..rig.light import Lamp
 from ..status import Status
+from .cut import POINT, Nodes, cut_nodes, quadrature, rim
 from .frame import ring_radius_mm
 
+_MAP_ERROR = 1e-3  # of the extent of a lamp's image
+
 Visibility = Callable[[Floats, Floats], Bools]
+_RIM = rim(16)  # an edge that passes between these points hides less than 0.2 % of a disc
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +73,9 @@ class Image:
         entry_mm: (k, 3) where their light enters the eye.
         exit_mm: (k, 3) where it leaves the eye.
         xy_px: (k, 2) pixels.
-        energy: (k,) energies; 0 where there is no glint.
+        energy: (k,) energies, also where a larger cornea would mirror the point; 0 where no ray is found.
+        there: (k,) whether the eye mirrors the point to the camera.
+        found: (k,) whether it does, or a larger cornea would.
     """
 
     source_mm: Floats
@@ -77,6 +83,32 @@ class Image:
     exit_mm: Floats
     xy_px: Floats
     energy: Floats
+    there: Bools
+    found: Bools
+
+    @property
+    def spots(self) -> Spots:
+        """Points that the eye mirrors to the camera."""
+        return Spots(frozen(self.xy_px[self.there]), frozen(self.energy[self.there]))
+
+    def and_(self, other: Image) -> Image:
+        """Points of both images."""
+        return Image(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class Glint:
+    """A lamp's mirror image, and what the camera sees of it.
+
+    Attributes:
+        image: through points of the whole lamp and of its rim, whose energies are 0.
+        clear: (k,) whether nothing of the scene hides these points.
+        spots: the points that make up the visible part.
+    """
+
+    image: Image
+    clear: Bools
+    spots: Spots
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,38 +128,96 @@ class GlintScene:
     camera: PinholeCamera
     clear: Visibility
 
-    def images(self, lights: Sequence[Lamp], sigma_px: float) -> list[Image]:
-        """Compute the image of each lamp, as finely as its size and the point-spread function require."""
-        if all(lamp.radius_mm == 0 for lamp in lights):
-            return self._trace(lights, [POINT] * len(lights))
-        rough = self._trace(lights, [quadrature(1, 4) if lamp.radius_mm > 0 else POINT for lamp in lights])
-        nodes = []
-        for lamp, image in zip(lights, rough, strict=True):
-            if lamp.radius_mm == 0:
-                nodes.append(POINT)
-                continue
-            # The integrand, a Gaussian over the lamp's image, is smooth on the scale of sigma (and of the pixel).
-            xy = image.xy_px[image.energy > 0]
-            extent = float(np.max(np.hypot(*(xy - xy.mean(axis=0)).T))) if len(xy) else 1.0
-            radial = min(max(math.ceil(1.5 + 1.5 * extent / math.hypot(sigma_px, 0.29)), 2), 64)
-            nodes.append(quadrature(radial, 4 * radial + 2))
-        return self._trace(lights, nodes)
+    def glints(self, lights: Sequence[Lamp], sigma_px: float) -> list[Glint]:
+        """Compute the glint of each lamp, as finely as its size, its edges and the point-spread function require."""
+        wide = [lamp.radius_mm > 0 for lamp in lights]
+        rough = self._trace(lights, [_RIM if w else POINT for w in wide])
+        if not any(wide):
+            return self.seen(rough)
+        counts = [_node_counts(image.xy_px[image.there], sigma_px) for image in rough]
+        whole = self._trace(lights, [quadrature(*n) if w else POINT for n, w in zip(counts, wide, strict=True)])
+        glints = self.seen([a.and_(b) if w else a for a, b, w in zip(whole, rough, wide, strict=True)])
+        for k, glint in enumerate(glints):
+            visible = glint.clear & glint.image.there
+            if np.any(visible) and not np.all(visible):
+                glints[k] = replace(glint, spots=self._cut(lights[k], glint.image, counts[k]))
+        return glints
+
+    def seen(self, images: Sequence[Image]) -> list[Glint]:
+        """Glints of images, made of their points that the camera sees."""
+        out = []
+        ends = np.cumsum([len(i.energy) for i in images])[:-1]
+        ways = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm"))
+        for image, clear in zip(images, np.split(self._clear(*ways), ends), strict=True):
+            lit = clear & image.there & (image.energy > 0)
+            out.append(Glint(image, clear, Spots(frozen(image.xy_px[lit]), frozen(image.energy[lit]))))
+        return out
+
+    def _cut(self, lamp: Lamp, image: Image, counts: tuple[int, int]) -> Spots:
+        """Spots of the visible part of a lamp, whose whole `image` is known at some points."""
+        mirror = self._mirror_map(lamp, image)
+
+        def visible(points: Floats) -> Bools:
+            (seen,) = self._trace([lamp], [Nodes(points, np.ones(len(points)))])
+            return seen.there & self._clear(seen.source_mm, seen.entry_mm, seen.exit_mm)
+
+        def nearly_visible(points: Floats) -> Bools:
+            assert mirror is not None
+            source, y = disc_points(lamp, points), mirror(points)
+            at = y @ self.M.T + self.t
+            there = self.surface.axis_distance(components(y)) <= self.limbus_radius_mm
+            there &= ~self._behind_globe(y, (source - self.t) @ self.M - y) & ~self._behind_globe(y, self._eyepoint - y)
+            return np.asarray(there & self._clear(source, at, at))
+
+        nodes = cut_nodes(visible if mirror is None else nearly_visible, *counts)
+        (cut,) = self._trace([lamp], [nodes])
+        return cut.spots
+
+    def _mirror_map(self, lamp: Lamp, image: Image) -> Callable[[Floats], Floats] | None:
+        """Polynomial from points of the unit disc to mirror points (eye frame), or None where it is not accurate.
+
+        It only tells which points are visible; their places and energies are exact.
+        """
+        if float(ring_radius_mm(lamp)) > 0 or not np.all(image.found):
+            return None
+        e1, e2 = disc_basis(lamp)
+        offset = (image.source_mm - lamp.position_mm) / float(lamp.radius_mm)
+        terms = _terms(np.stack([offset @ e1, offset @ e2], axis=1))
+        y = (image.exit_mm - self.t) @ self.M
+        fit = np.linalg.lstsq(terms, y, rcond=None)[0]
+        if np.max(np.abs(terms @ fit - y)) > _MAP_ERROR * np.max(np.ptp(y, axis=0)):
+            return None
+        return lambda points: np.asarray(_terms(points) @ fit)
+
+    @property
+    def _eyepoint(self) -> Floats:
+        """The camera's nodal point in the eye frame."""
+        return np.asarray(self.M.T @ (self.camera.nodal_point_mm - self.t))
+
+    def _clear(self, sources: Floats, entries: Floats, exits: Floats) -> Bools:
+        """Whether nothing of the scene stands between points of lamps and of the eye, and the camera, (k,)."""
+        node = np.broadcast_to(self.camera.nodal_point_mm, exits.shape)
+        both = self.clear(np.concatenate([sources, node]), np.concatenate([entries, exits]))
+        return np.asarray(both[: len(sources)] & both[len(sources) :])
 
     def _trace(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:
         """Images of lamps through the given points of their discs; all lamps in one batch."""
         camera = self.camera
-        points = np.concatenate([disc_points(lamp, n) for lamp, n in zip(lights, nodes, strict=True)])
+        points = np.concatenate([disc_points(lamp, n.point) for lamp, n in zip(lights, nodes, strict=True)])
         counts = [len(n.weight) for n in nodes]
         which = np.repeat(np.arange(len(lights)), counts)
         weights = np.concatenate([n.weight for n in nodes])
         axes = np.stack([lamp.axis for lamp in lights]) @ self.M
         strength = np.array([float(lamp.intensity_mw_sr) for lamp in lights])
         exponent = np.array([float(lamp.lobe_exponent) for lamp in lights])
-        eyepoint = self.M.T @ (camera.nodal_point_mm - self.t)
+        eyepoint = self._eyepoint
         sources = (points - self.t) @ self.M
         lamp_xyz, node_xyz = components(sources), components(np.broadcast_to(eyepoint, sources.shape))
         rays = mirrored_rays(self.surface, lamp_xyz, node_xyz, rim_mm=self.limbus_radius_mm)
-        found = np.asarray(rays.status == Status.OK)
+        # Where a larger cornea would mirror a point, the solver finds the ray too.
+        found = np.asarray((rays.status == Status.OK) | (rays.status == Status.OUTSIDE_LIMBUS))
+        found &= rays.residual_mm < RESIDUAL_LIMIT_MM
+        there = found & (rays.status == Status.OK)
         mirror = (Crossing(self.surface, 1.0, reflects=True),)
         J = ray_tube(mirror, 1.0, node_xyz, rays.way, lamp_xyz).cross_section_mm2_sr
         # The solver's ray runs from the camera to the lamp, the light in the other direction.
@@ -143,11 +233,11 @@ class GlintScene:
         z = np.where(found, cam[:, 2], 1.0)
         x, v = cam[:, 0] / z, cam[:, 1] / z
         scale = camera.K[0, 0] * camera.K[1, 1] * distortion_determinant(camera, x, v) / z**3
-        found &= ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, eyepoint - y)
+        there &= found & ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, eyepoint - y)
         energy = np.where(found, weights * strength[which] * lobe * F / np.where(found, J, 1.0) * scale, 0.0)
         mirrors, xy = y @ self.M.T + self.t, camera.pixels_of(x, v)
         parts = np.cumsum(counts)[:-1]
-        columns = (np.split(a, parts) for a in (points, mirrors, mirrors, xy, energy))
+        columns = (np.split(a, parts) for a in (points, mirrors, mirrors, xy, energy, there, found))
         return [Image(*c) for c in zip(*columns, strict=True)]
 
     def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
@@ -159,65 +249,50 @@ class GlintScene:
         return np.asarray((disc > 0) & (-b - np.sqrt(np.maximum(disc, 0)) > 1e-6))
 
 
-def glint_table(scene: GlintScene, images: Sequence[Image]) -> tuple[GlintTable, list[Spots], list[Bools]]:
-    """Visible glints of all lamps.
-
-    Returns:
-        The table, the points that each glint is made of, and whether each of these points is unobstructed.
-    """
-    sources, entries, exits = (
-        np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm")
-    )
-    node = np.broadcast_to(scene.camera.nodal_point_mm, exits.shape)
-    both = scene.clear(np.concatenate([sources, node]), np.concatenate([entries, exits]))
-    clear = np.split(both[: len(sources)] & both[len(sources) :], np.cumsum([len(i.energy) for i in images])[:-1])
-    spots, place, share = [], [], []
-    for image, open_ in zip(images, clear, strict=True):
-        lit = open_ & (image.energy > 0)
-        xy, energy = image.xy_px[lit], image.energy[lit]
-        spots.append(Spots(frozen(xy), frozen(energy)))
+def glint_table(glints: Sequence[Glint]) -> GlintTable:
+    """Places, energies and visible shares of the glints of all lamps."""
+    place, share = [], []
+    for glint in glints:
+        xy, energy, whole = glint.spots.xy_px, glint.spots.energy, glint.image.energy.sum()
         place.append(np.average(xy, axis=0, weights=energy) if len(energy) else np.full(2, np.nan))
-        total = image.energy.sum()
-        share.append(energy.sum() / total if total > 0 else 0.0)
-    energies = np.array([s.energy.sum() for s in spots])
-    table = GlintTable(
+        seen = energy.sum() / whole if whole > 0 else 0.0
+        share.append(seen if seen < 1 - 1e-9 else 1.0)
+    energies = np.array([g.spots.energy.sum() for g in glints])
+    return GlintTable(
         frozen(np.reshape(place, (-1, 2))), frozen(energies), frozen(share), frozen(energies > 0, np.bool_)
     )
-    return table, spots, clear
 
 
-@dataclass(frozen=True, slots=True)
-class Nodes:
-    """A quadrature over the unit disc: points (k, 2) and weights (k,) whose sum is 1."""
-
-    point: Floats
-    weight: Floats
-
-
-POINT = Nodes(np.zeros((1, 2)), np.ones(1))
+def _node_counts(xy: Floats, sigma_px: float) -> tuple[int, int]:
+    """Numbers of circles and of points on each that a lamp needs whose rim is seen at pixels (k, 2)."""
+    # The integrand, a Gaussian over the lamp's image, is smooth on the scale of sigma (and of the pixel).
+    extent = float(np.max(np.hypot(*(xy - xy.mean(axis=0)).T))) / math.sqrt(2) if len(xy) else 1.0
+    radial = min(max(math.ceil(1.5 + 1.5 * extent / math.hypot(sigma_px, 0.29)), 2), 64)
+    return radial, 4 * radial + 2
 
 
-@lru_cache(maxsize=64)
-def quadrature(radial: int, angular: int) -> Nodes:
-    """Gauss-Legendre nodes in r^2 and equal angles."""
-    x, weight = np.polynomial.legendre.leggauss(radial)
-    angle = 2 * np.pi * (np.arange(angular) + 0.5) / angular
-    r = np.sqrt(0.5 * (x + 1))
-    point = np.stack([np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()], axis=1)
-    return Nodes(point, np.repeat(0.5 * weight, angular) / angular)
-
-
-def disc_points(light: Lamp, nodes: Nodes) -> Floats:
-    """Points (k, 3) of a lamp's disc or ring in the world."""
+def disc_basis(light: Lamp) -> tuple[Floats, Floats]:
+    """Two unit vectors (3,) across a lamp's axis."""
     axis = light.axis
     e1 = normalize(np.cross(axis, (1.0, 0.0, 0.0) if abs(axis[0]) < 0.6 else (0.0, 1.0, 0.0)))
-    e2 = np.cross(axis, e1)
+    return e1, np.cross(axis, e1)
+
+
+def disc_points(light: Lamp, point: Floats) -> Floats:
+    """Points (k, 3) of a lamp's disc or ring in the world, from points (k, 2) of the unit disc."""
+    e1, e2 = disc_basis(light)
     outer, inner = float(light.radius_mm), ring_radius_mm(light)
-    r2 = _dot(nodes.point, nodes.point)
+    r2 = _dot(point, point)
     # Equal areas on the disc stay equal on the ring: r^2 runs from inner^2 to outer^2.
     stretch = np.sqrt(inner**2 + r2 * (outer**2 - inner**2)) / np.sqrt(np.maximum(r2, 1e-300))
-    offset = (stretch[:, None] if outer > 0 else 0.0) * nodes.point
+    offset = (stretch[:, None] if outer > 0 else 0.0) * point
     return np.asarray(light.position_mm + offset[:, :1] * e1 + offset[:, 1:] * e2)
+
+
+def _terms(point: Floats) -> Floats:
+    """Monomials (k, 15) up to order 4 of points (k, 2)."""
+    a, b = point.T
+    return np.stack([a**i * b ** (n - i) for n in range(5) for i in range(n + 1)], axis=1)
 
 
 def distortion_determinant(camera: PinholeCamera, x: Floats, y: Floats) -> Floats:

@@ -14,19 +14,18 @@ _BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
 _MARKS = 17
 
 
-def glint_reason(energy: Floats, open_: Bools, blockers: Sequence[str | None]) -> str:
+def glint_reason(there: Bools, open_: Bools, blockers: Sequence[str | None]) -> str:
     """State whether a lamp's mirror image is visible, partly or fully occluded (and mostly by what), or off the cornea.
 
     Args:
-        energy: (k,) of the points of the image, 0 where the cornea sends none of it to the camera.
+        there: (k,) whether the cornea mirrors the points of the lamp to the camera.
         open_: (k,) whether nothing of the scene is in the way.
         blockers: (k,) names of the parts in the way, None where there is none.
     """
-    there = energy > 0
     if not np.any(there):
         return "off the cornea"
     if np.all(open_[there]):
-        return "visible"
+        return "visible" if np.all(there) else "partly off the cornea"
     names = [
         _BY.get(b, "head") for b, t, o in zip(blockers, there, open_, strict=True) if t and not o and b is not None
     ]

@@ -26,7 +26,8 @@ from ..optics.shooting import ray_tube
 from ..optics.trace import Crossing, Traced, trace
 from ..rig.light import Lamp
 from ..status import Status
-from .glints import GlintScene, Image, Nodes, disc_points, distortion_determinant
+from .cut import Nodes
+from .glints import GlintScene, Image, disc_points, distortion_determinant
 
 
 def purkinje_images(
@@ -39,7 +40,7 @@ def purkinje_images(
     path = purkinje_path(surfaces, indices, rims, passing, gradient)
     eyepoint = M.T @ (camera.nodal_point_mm - t)
     for lamp, node in zip(lights, nodes, strict=True):
-        points = disc_points(lamp, node)
+        points = disc_points(lamp, node.point)
         sources = (points - t) @ M
         found = purkinje_points(surfaces, indices, rims, passing, sources, eyepoint, gradient)
         ok = np.asarray(found.status) == Status.OK
@@ -60,7 +61,7 @@ def purkinje_images(
         scale = camera.K[0, 0] * camera.K[1, 1] * distortion_determinant(camera, x, y) / z**3
         energy = node.weight * float(lamp.intensity_mw_sr) * lobe * passed * scale / np.where(ok, tube, 1.0)
         entry, leave = traced.points_mm[-1] @ M.T + t, traced.points_mm[1] @ M.T + t
-        images.append(Image(points, entry, leave, camera.pixels_of(x, y), np.where(ok, energy, 0.0)))
+        images.append(Image(points, entry, leave, camera.pixels_of(x, y), np.where(ok, energy, 0.0), ok, ok))
     return images
 
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..rig import psf
+from .cut import POINT, quadrature
 from .frame import RenderJob
-from .glints import POINT, GlintScene, GlintTable, Image, Spots, glint_table, quadrature
+from .glints import Glint, GlintScene, GlintTable, Spots, glint_table
 from .occlusion import glint_reason
 from .purkinje import purkinje_images
 from .region import RegionScene, blockers
@@ -41,24 +42,22 @@ def add_glints(job: RenderJob, place: Surround | RegionScene, image: Floats) -> 
     reasons: tuple[str, ...] = ()
     for order in sorted({1, *job.purkinje}):
         if order == 1:
-            images = scene.images(job.lights, sigma)
+            glints = scene.glints(job.lights, sigma)
+            reasons = tuple(_reason(job, place, glint) for glint in glints)
         else:
             # These images are small, because their mirrors are strongly curved, or concave with a short focus.
             nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in job.lights]
-            images = purkinje_images(scene, eye, order, job.lights, nodes)
-        tables[order], spots, ways = glint_table(scene, images)
-        if order == 1:
-            pairs = zip(images, ways, strict=True)
-            reasons = tuple(_reason(job, place, image, open_) for image, open_ in pairs)
+            glints = scene.seen(purkinje_images(scene, eye, order, job.lights, nodes))
+        tables[order] = glint_table(glints)
         if order in job.purkinje:
-            _splat(job, image, spots)
+            _splat(job, image, [glint.spots for glint in glints])
     return Mirrored(tables[1], tuple((order, table) for order, table in tables.items() if order > 1), reasons)
 
 
-def _reason(job: RenderJob, place: Surround | RegionScene, image: Image, open_: Bools) -> str:
-    """State whether or why not a lamp's glint is visible; `open_` (k,) marks the points that nothing blocks."""
-    if not place.obstructed:
-        open_ = np.ones(len(open_), dtype=bool)
+def _reason(job: RenderJob, place: Surround | RegionScene, glint: Glint) -> str:
+    """State whether or why not a lamp's glint is visible."""
+    image = glint.image
+    open_ = glint.clear if place.obstructed else np.ones(len(glint.clear), dtype=bool)
     names: list[str | None] = [None] * len(open_)
     if isinstance(place, RegionScene) and not np.all(open_):
         anchor = job.anchor_mm
@@ -66,7 +65,7 @@ def _reason(job: RenderJob, place: Surround | RegionScene, image: Image, open_: 
         to_lamp = blockers(place, image.source_mm - anchor, image.entry_mm - anchor)
         to_camera = blockers(place, node - anchor, image.exit_mm - anchor)
         names = [c if c is not None else a for a, c in zip(to_lamp, to_camera, strict=True)]
-    return glint_reason(image.energy, open_, names)
+    return glint_reason(image.there, open_, names)
 
 
 def _splat(job: RenderJob, image: Floats, images: Sequence[Spots]) -> None:

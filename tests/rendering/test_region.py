@@ -186,11 +186,10 @@ def test_plain_tiles_leave_no_seam_where_fine_shadows_begin(renderer, monkeypatc
 
 def test_reasons_are_told_apart():
     yes, no = np.array([True, True]), np.array([False, False])
-    energy = np.array([1.0, 1.0])
-    assert glint_reason(energy * 0, yes, [None, None]) == "off the cornea"
-    assert glint_reason(energy, yes, [None, None]) == "visible"
-    assert glint_reason(energy, no, ["lashes", "lashes"]) == "occluded by lash"
-    assert glint_reason(energy, np.array([True, False]), [None, "skin"]) == "partly occluded by lid"
+    assert glint_reason(~yes, yes, [None, None]) == "off the cornea"
+    assert glint_reason(yes, yes, [None, None]) == "visible"
+    assert glint_reason(yes, no, ["lashes", "lashes"]) == "occluded by lash"
+    assert glint_reason(yes, np.array([True, False]), [None, "skin"]) == "partly occluded by lid"
 
 
 def test_arcs_of_a_half_hidden_disc():

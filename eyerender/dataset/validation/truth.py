@@ -24,7 +24,7 @@ from ...labels import EyeInWindow, known_labels, limbus_px
 from ...observation import EYES, Observations, version_of
 from ...region.mesh import lid_margins
 from ...rendering.frame import globe_of
-from ...rendering.glints import GlintScene
+from ...rendering.glints import GlintScene, glint_table
 from ...rendering.occlusion import lid_margins_px
 from ...scene import Frames, Scene
 from ...scene.spec import SceneSpec
@@ -230,17 +230,18 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
         eye.front[0], float(eye.front_indices[0]), float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm),
         float(eye.sclera.radius_mm), view.M, view.t, camera, _all_clear,
     )  # fmt: skip
-    images = mirror.images(scene.rig.lights, scene.spec.sensor.psf_sigma_px)
-    for image, glint in zip(images, line["labels"]["glints"], strict=True):
-        spot, lit = glint["spot_xy_px"], image.energy > 0
+    glints = mirror.glints(scene.rig.lights, scene.spec.sensor.psf_sigma_px)
+    for place, whole, glint in zip(glint_table(glints).xy_px, glints, line["labels"]["glints"], strict=True):
+        spot, spots = glint["spot_xy_px"], whole.spots
         if spot is None:
             continue
-        if not lit.any():
+        if len(spots.energy) == 0:
             yield f"the spot of light {glint['light']} is at {spot}, but its cornea reflects nothing to the camera"
             continue
-        low, high = image.xy_px[lit].min(axis=0), image.xy_px[lit].max(axis=0)
-        if glint["visible_share"] >= 1.0:
-            low = high = np.average(image.xy_px[lit], axis=0, weights=image.energy[lit])
+        low = high = place
+        if "occluded" in str(glint["hidden_by"]):
+            reach = np.concatenate([spots.xy_px, whole.image.xy_px[whole.image.there]])
+            low, high = reach.min(axis=0), reach.max(axis=0)
         if not (np.all(spot >= low - SPOT_PX) and np.all(spot <= high + SPOT_PX)):
             x, y = (float(v) for v in (low + high) / 2)
             yield f"computed again: the spot of light {glint['light']} is at {spot}, not at [{x:.3f}, {y:.3f}]"
