@@ -16,8 +16,10 @@ Where the contour is in front of the globe it lies on the globe. Beyond a polar 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Floats
 from .anatomy import Region
@@ -53,9 +55,9 @@ class Contour(ArrayValue):
     openness: float
 
 
-def step(x: Floats | float, low: float, high: float) -> Floats:
-    """Smooth step from 0 at `low` to 1 at `high`."""
-    s = np.clip((np.asarray(x, dtype=float) - low) / (high - low), 0, 1)
+def step(x: NDArray[Any] | float, low: float, high: float) -> NDArray[Any]:
+    """Smooth step from 0 at `low` to 1 at `high`, in the precision of `x`."""
+    s = np.clip((np.asarray(x) - low) / (high - low), 0, 1)
     return np.asarray(s * s * (3 - 2 * s))
 
 

@@ -1,59 +1,127 @@
-"""Seeded, periodic fields for textures: band-passed noise and the net of furrows between cells."""
+"""Seeded, periodic fields for textures: band-passed noise and the net of furrows between cells, in single precision."""
 
 from __future__ import annotations
 
-from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
 from scipy.spatial import cKDTree
 
-from ..arrays import Floats, frozen
+from ..arrays import Floats, Indices, Singles
+
+_NEGLIGIBLE = 4.0  # times a band's upper end, where its gain is 1e-7
+_BLOCK, _CANDIDATES = 8, 18
 
 
-@lru_cache(maxsize=16)
-def band(seed: int, size: int, across: tuple[float, float], up: tuple[float, float]) -> Floats:
+def gain(f: Floats, low: float, high: float) -> Floats:
+    """Gain of a band-pass from `low` to `high` at the frequencies f."""
+    out = np.exp(-((f / high) ** 2))
+    return np.asarray(out * (1 - np.exp(-((f / low) ** 2))) if low > 0 else out)
+
+
+def passed(white: Floats, across: tuple[float, float], up: tuple[float, float]) -> Singles:
+    """Band-passed copy (h, w) of periodic white noise, of unit variance; `(low, high)` cycles over width and height."""
+    h, w = white.shape
+    # Only the columns of the spectrum that the band keeps are computed.
+    kept = min(w // 2 + 1, int(_NEGLIGIBLE * across[1]) + 2)
+    spectrum = fft.fft(fft.rfft(white.astype(np.float32), axis=1)[:, :kept], axis=0)
+    spectrum *= (gain(np.abs(fft.fftfreq(h) * h), *up)[:, None] * gain(np.arange(kept), *across)).astype(np.float32)
+    spectrum[0, 0] = 0
+    # Columns stand for two frequencies, +k and -k, except the first and, for even widths, the last of all.
+    single = [0, w // 2] if kept == w // 2 + 1 and w % 2 == 0 else [0]
+    power = 2 * np.vdot(spectrum, spectrum).real - sum(np.vdot(c, c).real for c in spectrum.T[single])
+    spectrum *= np.float32(h * w / np.sqrt(power + 1e-30))
+    return np.asarray(fft.irfft(fft.ifft(spectrum, axis=0), n=w, axis=1))
+
+
+def band(seed: int, size: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
     """Gaussian noise of unit variance on a periodic square (rows: up), `(low, high)` cycles over the square."""
-    rng = np.random.default_rng((0xBA4D, seed))
-    fy = np.abs(np.fft.fftfreq(size) * size)[:, None]
-    fx = np.abs(np.fft.rfftfreq(size) * size)[None, :]
-
-    def keep(f: Floats, low: float, high: float) -> Floats:
-        out = np.exp(-((f / high) ** 2))
-        return np.asarray(out * (1 - np.exp(-((f / low) ** 2))) if low > 0 else out)
-
-    gain = keep(fy, *up) * keep(fx, *across)
-    gain[0, 0] = 0
-    field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((size, size))) * gain, s=(size, size))
-    return frozen(field / field.std())
+    return passed(np.random.default_rng((0xBA4D, seed)).standard_normal((size, size)), across, up)
 
 
-@lru_cache(maxsize=8)
-def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Floats:
+def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Singles:
     """Height 0 (furrow) to about 1 (plateau) over a periodic square of `cells` cells.
 
     The height is the distance to the border between the nearest two seeds. `stretch` > 1 draws cells out across.
     """
     rng = np.random.default_rng((0xF0, seed))
     # Vertical distances count `stretch` times as much.
-    seeds = rng.uniform(0, 1, (cells, 2)) * np.array([1.0, stretch])
-    tree = cKDTree(seeds, boxsize=np.array([1.0, stretch]))
+    extent = np.array([1.0, stretch])
+    seeds = rng.uniform(0, 1, (cells, 2)) * extent
     x, y = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size * stretch)
     wobble = 0.25 / np.sqrt(cells)
-    x = (x + wobble * band(seed + 1, size, (0, 40), (0, 40))) % 1.0
-    y = (y + wobble * stretch * band(seed + 2, size, (0, 40), (0, 40))) % stretch
-    distance, _ = tree.query(np.stack([x, y], axis=-1), k=2)
-    scale = np.sqrt(stretch / cells)
-    return frozen(np.clip((distance[..., 1] - distance[..., 0]) / (0.45 * scale), 0, 1))
+    x += wobble * band(seed + 1, size, (0, 40), (0, 40))
+    y += wobble * stretch * band(seed + 2, size, (0, 40), (0, 40))
+    copies = [seeds + extent * np.array([i, j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    first, second, _, _ = nearest_two(np.concatenate(copies), x, y)
+    return np.asarray(np.clip((second - first) / np.float32(0.45 * np.sqrt(stretch / cells)), 0, 1))
 
 
-def sampled(tile: Floats, x: Floats, y: Floats, period_mm: float) -> Floats:
-    """Sample a periodic square tile at (x, y) mm by linear interpolation."""
-    n = len(tile)
-    flat = np.pad(tile, (0, 1), mode="wrap").astype(np.float32).ravel()
-    u, v = np.asarray(x) * (n / period_mm), np.asarray(y) * (n / period_mm)
-    i, j = np.floor(u), np.floor(v)
-    du, dv = (u - i).astype(np.float32), (v - j).astype(np.float32)
-    at = np.mod(j, n).astype(np.intp) * (n + 1) + np.mod(i, n).astype(np.intp)
-    low = flat[at] + du * (flat[at + 1] - flat[at])
-    high = flat[at + n + 1] + du * (flat[at + n + 2] - flat[at + n + 1])
-    return np.asarray(low + dv * (high - low), dtype=float)
+def nearest_two(seeds: Floats, x: Floats, y: Floats, which: bool = False) -> tuple[Singles, Singles, Singles, Singles]:
+    """Distances of points (h, w) to the nearest and the second nearest seed (n, 2), and the numbers of these seeds.
+
+    The sides must be multiples of 8. Neighbouring points share a short list of candidates, which is much faster than a
+    search for each of them. The numbers are floats, and zero without `which`.
+    """
+    h, w = x.shape
+    shape = h // _BLOCK, _BLOCK, w // _BLOCK, _BLOCK
+
+    def blocks(v: Floats) -> Floats:
+        return v.reshape(shape).transpose(1, 3, 0, 2).reshape(_BLOCK * _BLOCK, -1)
+
+    def whole(v: Singles) -> Singles:
+        return v.reshape(_BLOCK, _BLOCK, *shape[::2]).transpose(2, 0, 3, 1).reshape(h, w)
+
+    bx, by = blocks(x), blocks(y)
+    middle = np.stack([bx.mean(axis=0), by.mean(axis=0)], axis=-1)
+    _, near = cKDTree(seeds).query(middle, k=_CANDIDATES)
+    bx, by = (bx - middle[:, 0]).astype(np.float32), (by - middle[:, 1]).astype(np.float32)
+    first, second = np.full(bx.shape, np.inf, np.float32), np.full(bx.shape, np.inf, np.float32)
+    one, two = np.zeros_like(first), np.zeros_like(first)
+    for candidate in near.T:
+        sx, sy = (seeds[candidate] - middle).astype(np.float32).T
+        d = np.square(bx - sx)
+        d += np.square(by - sy)
+        if which:
+            closer, between = d < first, d < second
+            np.copyto(two, candidate.astype(np.float32), where=between)
+            np.copyto(two, one, where=closer)
+            np.copyto(one, candidate.astype(np.float32), where=closer)
+        np.minimum(second, np.maximum(first, d), out=second)
+        np.minimum(first, d, out=first)
+    return whole(np.sqrt(first)), whole(np.sqrt(second)), whole(one), whole(two)
+
+
+class Padded:
+    """A square tile made ready for `Places`: every value with its difference to the next one in its row."""
+
+    def __init__(self, tile: Singles) -> None:
+        wide = np.pad(tile, ((0, 2), (0, 3)), mode="wrap")
+        pairs = np.empty((len(tile) + 2, tile.shape[1] + 2), np.complex64)
+        pairs.real, pairs.imag = wide[:, :-1], np.diff(wide, axis=1)
+        self.pairs = pairs.ravel()
+
+
+class Places:
+    """Places (x, y) mm on a periodic square, at which any tiles of one size are sampled by linear interpolation."""
+
+    def __init__(self, size: int, x: NDArray[Any], y: NDArray[Any], period_mm: float) -> None:
+        (column, self._du), (row, self._dv) = (self._split(c * np.float32(1 / period_mm), size) for c in (x, y))
+        self._at = row * (size + 2) + column
+        self._below = self._at + (size + 2)
+
+    @staticmethod
+    def _split(turns: Singles, size: int) -> tuple[Indices, Singles]:
+        """Whole and fractional part of coordinates in texels, the whole ones from 0 to `size`."""
+        texels = (turns - np.floor(turns)) * np.float32(size)
+        whole = texels.astype(np.intp)
+        return whole, texels - whole.astype(np.float32)
+
+    def sample(self, tile: Padded) -> Singles:
+        """Values of one tile, in the shape of the places."""
+        low, high = tile.pairs.take(self._at), tile.pairs.take(self._below)
+        out: Singles = low.real + self._du * low.imag
+        out += self._dv * (high.real + self._du * high.imag - out)
+        return out

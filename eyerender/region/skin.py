@@ -11,25 +11,32 @@ region is one mesh with one map. The map has four channels:
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..arrays import Floats, Singles, frozen
+from ..arrays import Bools, Floats, Singles, frozen
 from .anatomy import Region
 from .brow import brow_band
 from .contour import step
 from .globe import Globe
 from .lids import CONJUNCTIVA, LID, MARGIN, ROWS, sheet, skin_depth
 from .look import Look
-from .noise import band, furrows, sampled
+from .noise import Padded, Places, band, furrows
 
 SHEET_ROWS, BANDS = 960, 64
 _COLUMNS = 1536
 LASH, BROW, TEAR = 0, 1, 2
 _LINE = CONJUNCTIVA + MARGIN - 1  # the lash line's row
 _TILE_MM, _TILE = 24.0, 640
+_COARSE = 8
+_BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
+_STRIP = 32  # rows of the map that are made together, so that they stay in the processor's cache
 _SHOWN = 0.5  # of the furrows' slope: light scattered under the skin blurs structures finer than half a millimetre
 _REFERENCE_BLINK = 0.3  # at which the tissue is laid out: neither stretched nor hidden in the fold
 
@@ -58,43 +65,19 @@ def skin_map(spec: Region) -> Singles:
     """Map (rows, columns, 4) of a subject; it does not depend on the blink."""
     reference = spec.model_copy(update={"blink": _REFERENCE_BLINK})
     rest = sheet(reference, Globe.sphere()).vertices
-    rows = np.interp(np.arange(SHEET_ROWS), _texels(), np.arange(ROWS))[:, None]
-    columns = (np.arange(_COLUMNS) * (rest.shape[1] / _COLUMNS))[None, :]
-    place = np.stack(np.broadcast_arrays(rows, columns))
-    y, z = (
-        ndimage.map_coordinates(np.concatenate([rest[..., k], rest[:, :1, k]], axis=1), place, order=1) for k in (1, 2)
-    )
+    rows = np.interp(np.arange(SHEET_ROWS), _texels(), np.arange(ROWS))
+    columns = np.arange(_COLUMNS) * (rest.shape[1] / _COLUMNS)
+    closed = np.concatenate([rest, rest[:, :1]], axis=1)
+    y, z, out_mm = (_over_grid(v, rows, columns) for v in (closed[..., 1], closed[..., 2], _from_line(rest)))
     turn = 2 * np.pi * columns / rest.shape[1]
-    upper = np.sin(turn)
-    lid = step(rows, _LINE - 1, _LINE + 1)
-    near = lid * (1 - step(rows, ROWS - 18, ROWS - 8))
-    seed = spec.seed
-    level = _along_lids(y, z)
-    cells = _cells(spec, y=y, z=z, level=level, near=near)
-    out_mm = ndimage.map_coordinates(_from_line(rest), place, order=1)
-    creases = _creases(spec, y, out_mm, upper)
-    pores = _pores(spec, y, z, near)
-    height = (
-        _relief(spec, y=y, z=z, level=level, cells=cells) - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases
-    ) * lid
-    within = 1 - step(rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
-    # The fold of the plica darkens the conjunctiva towards the caruncle.
-    flesh = step(np.cos(turn), 0.60, 0.85) * within * step(rows, 0.0, 2.2)
-    height = height + 0.02 * flesh * _field(seed + 6, y, z, (18, 45), (18, 45))
-    # Furrows are darker because little light leaves them.
-    open_ = 1 + 0.13 * (cells - 0.5) - 0.16 * pores - 0.32 * spec.skin.wrinkles * creases
-    albedo = _albedo(spec, y=y, z=z, rows=rows, upper=upper, near=near, open_=open_, flesh=flesh)
-    wet = (0.78 - 0.21 * flesh) * (1 - step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN - 1.0))
-    # Oil forms films of varying thickness. It shines in points where the skin is smooth and swollen, in short streaks
-    # along the lids.
-    oil = 0.55 + 0.2 * _field(seed + 5, y, z, (0, 8), (0, 8))
-    points = np.maximum(_field(seed + 8, y, level, (30, 120), (70, 190)) - 0.7, 0.0)
-    sheen = 0.45 * spec.skin.sheen * np.clip(oil * (0.4 + 0.6 * cells) * (1 - pores) + 2.0 * points, 0.1, 2.2)
-    sheen = np.minimum(sheen, 0.45)
-    gloss = np.clip(sheen * lid + wet, 0, 1)
-    slope_y, slope_z = _slopes(height, y, z)
+    tiles, spots = _Tiles(spec), _spots(spec.seed, y, z)
     out = np.zeros((SHEET_ROWS + BANDS, _COLUMNS, 4), np.float32)
-    out[:SHEET_ROWS] = np.stack([albedo, slope_y, slope_z, gloss], axis=-1)
+    height = np.empty((SHEET_ROWS, _COLUMNS), np.float32)
+    for first in range(0, SHEET_ROWS, _STRIP):
+        k = slice(first, first + _STRIP)
+        strip = _Strip(tiles, y[k], z[k], out_mm[k], rows[k, None].astype(np.float32), turn[None, :])
+        out[k, :, 0], out[k, :, 3], height[k] = strip.look(spots[k])
+    _slopes(height, y, z, out[:SHEET_ROWS, :, 1:3])
     for which, (a, g) in enumerate(
         ((spec.lashes.albedo, 0.08), (spec.brow.albedo, 0.12), (0.9 * spec.skin.wet_albedo, 1.0))
     ):
@@ -104,45 +87,13 @@ def skin_map(spec: Region) -> Singles:
     return out
 
 
-def _field(seed: int, y: Floats, z: Floats, across: tuple[float, float], up: tuple[float, float]) -> Floats:
-    return sampled(band(seed, _TILE, across, up), y, z, _TILE_MM * 2)
-
-
-def _cells(spec: Region, *, y: Floats, z: Floats, level: Floats, near: Floats) -> Floats:
-    """Plateaus (about 1) separated by furrows (0).
-
-    The fields are wide on the face, and narrow and drawn out across on the lids. Both contain finer ones.
-    """
-    coarse = sampled(furrows(spec.seed, _TILE, 1700), y, z, 0.72 * _TILE_MM)
-    drawn = furrows(spec.seed + 7, _TILE, 1500, 0.6)
-    lids = np.exp(-((np.hypot(y / 19.0, z / 13.0)) ** 4)) * near
-    # The finer net is rotated so that the two nets cross.
-    fine = sampled(drawn, 0.8 * y + 0.6 * z, 0.8 * z - 0.6 * y, 0.42 * _TILE_MM)
-    wide = (1 - lids) * coarse + lids * sampled(drawn, y, level, 0.62 * _TILE_MM)
-    return np.asarray(wide * (0.7 + 0.3 * fine))
-
-
-def _along_lids(y: Floats, z: Floats) -> Floats:
-    """Coordinate z (mm) straightened so that lines along the lids are level."""
-    return np.asarray(z + 0.017 * np.minimum(y * y, 480.0) * np.tanh(z / 4.0))
-
-
-def _relief(spec: Region, *, y: Floats, z: Floats, level: Floats, cells: Floats) -> Floats:
-    """Height (mm) of the relief: cells separated by furrows, and lines.
-
-    The lines run along the lids and, at the temple, away from the canthus.
-    """
-    skin = spec.skin
-    grain = _field(spec.seed + 3, y, z, (60, 200), (60, 200))
-    sway = 0.5 * _field(spec.seed + 12, y, z, (0, 10), (0, 10))
-    lines = _field(spec.seed + 11, y, level + sway, (0, 6), (22, 60))
-    under = (
-        np.exp(-(((z + 11.0) / 6.0) ** 2))
-        + 0.7 * np.exp(-(((z - 8.0) / 4.0) ** 2))
-        + np.exp(-(((y + 21.0) / 5.0) ** 2))
-    )
-    amount = 0.025 * skin.wrinkles * np.exp(-((np.hypot(y / 26.0, z / 20.0)) ** 4)) * under
-    return np.asarray(_SHOWN * skin.relief_mm * (cells + 0.15 * grain) - amount * np.abs(lines))
+def _over_grid(values: Floats, rows: Floats, columns: Floats) -> Singles:
+    """Values (r, c) of a grid at all fractional rows (m,) and columns (n,), interpolated linearly: (m, n)."""
+    i, j = np.minimum(rows.astype(int), len(values) - 2), np.minimum(columns.astype(int), values.shape[1] - 2)
+    u, v = (rows - i)[:, None], columns - j
+    along = values[i] + u * (values[i + 1] - values[i])
+    left, steps = along.astype(np.float32), np.diff(along, axis=1).astype(np.float32)
+    return np.asarray(left[:, j] + v.astype(np.float32) * steps[:, j])
 
 
 def _from_line(rest: Floats) -> Floats:
@@ -152,119 +103,282 @@ def _from_line(rest: Floats) -> Floats:
     return np.concatenate([way, way[:, :1]], axis=1)
 
 
-def _creases(spec: Region, y: Floats, out_mm: Floats, upper: Floats) -> Floats:
-    """Depth, 0 to about 1, of the creases of the lids' thin skin.
+def _hill(y: Singles, z: Singles, wide: float, high: float) -> Singles:
+    """Hill exp(-((y / wide)^2 + (z / high)^2)^2) with a flat top about the middle of the fissure."""
+    return np.asarray(np.exp(-np.square(np.square(y * (1 / wide)) + np.square(z * (1 / high)))))
 
-    The creases run along the margin, begin and end, and branch: fine ones all over the lid, wider ones where it folds.
+
+def _bell(x: Singles, middle: float, width: float) -> Singles:
+    """Bell exp(-((x - middle) / width)^2)."""
+    return np.asarray(np.exp(-np.square((x - middle) * (1 / width))))
+
+
+class _Tiles:
+    """The noise of a subject, each tile made when it is first needed."""
+
+    def __init__(self, spec: Region) -> None:
+        self.spec = spec
+        self._made: dict[object, Padded] = {}
+
+    def at(self, number: int, places: Places, across: tuple[float, float], up: tuple[float, float]) -> Singles:
+        """Values of a band of noise (see `noise.band`) at places."""
+        key = number, across, up
+        if key not in self._made:
+            self._made[key] = Padded(band(self.spec.seed + number, _TILE, across, up))
+        return places.sample(self._made[key])
+
+    @cached_property
+    def net(self) -> Padded:
+        """Furrows of the face."""
+        return Padded(furrows(self.spec.seed, _TILE, 1700))
+
+    @cached_property
+    def drawn(self) -> Padded:
+        """Furrows of the lids, which are drawn out across."""
+        return Padded(furrows(self.spec.seed + 7, _TILE, 1500, 0.6))
+
+    @cached_property
+    def hollows(self) -> Padded:
+        """Depth of the face behind its own surroundings (mm), by mm from (-76, -76)."""
+        at = np.arange(-76.0, 76.5)
+        depth = skin_depth(self.spec, Globe.sphere(), *np.meshgrid(at, at))
+        behind = ndimage.gaussian_filter(depth, 4.5, mode="nearest") - depth
+        return Padded(behind.astype(np.float32))
+
+    @cached_property
+    def brow(self) -> tuple[Singles, Singles]:
+        """Lower z of the brow's band and its width (mm), at `_BROW_STEPS` places from -0.25 to 1.1 along it."""
+        _, low, high = brow_band(self.spec, np.clip(np.linspace(*_BROW_ENDS, _BROW_STEPS), -0.1, 1.1))
+        return low.astype(np.float32), (high - low).astype(np.float32)
+
+
+def _places(y: NDArray[Any], z: NDArray[Any]) -> Places:
+    return Places(_TILE, y, z, 2 * _TILE_MM)
+
+
+@dataclass
+class _Strip:
+    """Some rows of the map: all of it is made for them, except the slopes.
+
+    Attributes:
+        tiles: the subject's noise.
+        y: place in the region's frame, mm.
+        z: the same.
+        out_mm: distance over the sheet from the lash line.
+        rows: row of the sheet, (rows, 1).
+        turn: angle about the fissure, (1, columns).
     """
-    reach = step(out_mm, 0.4, 2.0) * np.exp(-((np.maximum(out_mm - 7.0, 0) / 5.0) ** 2))
-    reach = reach * step(np.abs(upper), 0.05, 0.5) * np.exp(-((y / 21.0) ** 6))
-    depth = np.zeros_like(y)
-    for side in (0, 1):
-        mine = (reach > 1e-3) & ((upper > 0) == (side == 0))
-        at, v, seed = y[mine], out_mm[mine], spec.seed + side
-        sway = 0.25 * _field(seed + 31, at, v, (0, 9), (0, 6))
-        wide = np.exp(-((_field(seed + 33, at, v + sway, (0, 1.6), (10, 26)) / 0.20) ** 2))
-        fine = np.exp(-((_field(seed + 35, at, v + sway, (0, 4.5), (30, 72)) / 0.30) ** 2))
-        some = step(_field(seed + 37, at, v, (1, 7), (4, 16)), -0.7, 1.6)
-        less = step(_field(seed + 39, at, v, (2, 12), (6, 22)), -0.9, 1.0)
-        depth[mine] = reach[mine] * (0.75 * wide * some + 0.5 * fine * less)
-    return depth
+
+    tiles: _Tiles
+    y: Singles
+    z: Singles
+    out_mm: Singles
+    rows: Singles
+    turn: Singles
+
+    def __post_init__(self) -> None:
+        rows, y, z = self.rows, self.y, self.z
+        self.spec = self.tiles.spec
+        self.upper = np.sin(self.turn).astype(np.float32)
+        self.lid = step(rows, _LINE - 1, _LINE + 1)
+        self.near = self.lid * (1 - step(rows, ROWS - 18, ROWS - 8))
+        # Coordinate z (mm) straightened so that lines along the lids are level.
+        self.level = z + 0.017 * np.minimum(y * y, 480.0) * np.tanh(z * 0.25)
+        self.places = _places(y, z)
+        self.within = 1 - step(rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
+        # The fold of the plica darkens the conjunctiva towards the caruncle.
+        self.flesh = step(np.cos(self.turn).astype(np.float32), 0.60, 0.85) * self.within * step(rows, 0.0, 2.2)
+        self.lids = _hill(y, z, 19.0, 13.0) * self.near
+
+    def field(self, number: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
+        """Band of noise at the places of the strip."""
+        return self.tiles.at(number, self.places, across, up)
+
+    def look(self, spots: Singles) -> tuple[Singles, Singles, Singles]:
+        """Albedo, gloss and height (mm) of the relief; `spots` is the light that the freckles leave."""
+        spec, rows = self.spec, self.rows
+        cells, creases, pores = self.cells(), self.creases(), self.pores()
+        height = (self.relief(cells) - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases) * self.lid
+        if np.any(self.flesh):
+            height = height + 0.02 * self.flesh * self.field(6, (18, 45), (18, 45))
+        # Furrows are darker because little light leaves them.
+        open_ = 1 + 0.13 * (cells - 0.5) - 0.16 * pores - 0.32 * spec.skin.wrinkles * creases
+        wet = (0.78 - 0.21 * self.flesh) * (1 - step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN - 1.0))
+        # Oil forms films of varying thickness. It shines in points where the skin is smooth and swollen, in short
+        # streaks along the lids.
+        oil = 0.55 + 0.2 * self.field(5, (0, 8), (0, 8))
+        points = np.maximum(self.tiles.at(8, _places(self.y, self.level), (30, 120), (70, 190)) - 0.7, 0.0)
+        sheen = 0.45 * spec.skin.sheen * np.clip(oil * (0.4 + 0.6 * cells) * (1 - pores) + 2.0 * points, 0.1, 2.2)
+        gloss = np.clip(np.minimum(sheen, 0.45) * self.lid + wet, 0, 1)
+        return self.albedo(open_, spots), gloss, height
+
+    def cells(self) -> Singles:
+        """Plateaus (about 1) separated by furrows (0).
+
+        The fields are wide on the face, and narrow and drawn out across on the lids. Both contain finer ones.
+        """
+        y, z, tiles = self.y, self.z, self.tiles
+        coarse = Places(_TILE, y, z, 0.72 * _TILE_MM).sample(tiles.net)
+        # The finer net is rotated so that the two nets cross.
+        fine = Places(_TILE, 0.8 * y + 0.6 * z, 0.8 * z - 0.6 * y, 0.42 * _TILE_MM).sample(tiles.drawn)
+        some = self.lids > 1e-4
+        if np.any(some):
+            narrow = Places(_TILE, y[some], self.level[some], 0.62 * _TILE_MM).sample(tiles.drawn)
+            coarse[some] += self.lids[some] * (narrow - coarse[some])
+        return np.asarray(coarse * (0.7 + 0.3 * fine))
+
+    def relief(self, cells: Singles) -> Singles:
+        """Height (mm) of the relief: cells separated by furrows, and lines.
+
+        The lines run along the lids and, at the temple, away from the canthus.
+        """
+        skin, y, z = self.spec.skin, self.y, self.z
+        grain = self.field(3, (60, 200), (60, 200))
+        sway = 0.5 * self.field(12, (0, 10), (0, 10))
+        lines = self.tiles.at(11, _places(y, self.level + sway), (0, 6), (22, 60))
+        under = _bell(z, -11.0, 6.0) + 0.7 * _bell(z, 8.0, 4.0) + _bell(y, -21.0, 5.0)
+        amount = 0.025 * skin.wrinkles * _hill(y, z, 26.0, 20.0) * under
+        return np.asarray(_SHOWN * skin.relief_mm * (cells + 0.15 * grain) - amount * np.abs(lines))
+
+    def creases(self) -> Singles:
+        """Depth, 0 to about 1, of the creases of the lids' thin skin.
+
+        The creases run along the margin, begin and end, and branch: fine ones all over the lid, wider ones where it
+        folds.
+        """
+        y, out_mm, tiles = self.y, self.out_mm, self.tiles
+        reach = step(out_mm, 0.4, 2.0) * np.exp(-np.square(np.maximum(out_mm - 7.0, 0) * 0.2))
+        reach = reach * step(np.abs(self.upper), 0.05, 0.5) * np.exp(-((np.square(y * (1 / 21.0))) ** 3))
+        depth = np.zeros_like(y)
+        for side in (0, 1):
+            mine = (reach > 1e-3) & ((self.upper > 0) == (side == 0))
+            if not np.any(mine):
+                continue
+            at, v = y[mine], out_mm[mine]
+            straight = _places(at, v)
+            bent = _places(at, v + 0.25 * tiles.at(31 + side, straight, (0, 9), (0, 6)))
+            wide = _bell(tiles.at(33 + side, bent, (0, 1.6), (10, 26)), 0.0, 0.20)
+            fine = _bell(tiles.at(35 + side, bent, (0, 4.5), (30, 72)), 0.0, 0.30)
+            some = step(tiles.at(37 + side, straight, (1, 7), (4, 16)), -0.7, 1.6)
+            less = step(tiles.at(39 + side, straight, (2, 12), (6, 22)), -0.9, 1.0)
+            depth[mine] = reach[mine] * (0.75 * wide * some + 0.5 * fine * less)
+        return depth
+
+    def pores(self) -> Singles:
+        """Pits, 0 to 1, a third of a millimetre wide, on cheek, nose and forehead; the lids have almost none."""
+        spots = np.maximum(self.field(41, (20, 42), (20, 42)) - 1.25, 0.0)
+        much = (0.55 + 0.25 * self.field(42, (0, 5), (0, 5))) * (1 - 0.9 * self.lids)
+        return np.asarray(self.spec.skin.pores * np.clip(1.7 * spots * np.maximum(much, 0.1), 0, 1))
+
+    def under_brow(self) -> Singles:
+        """Loss of light between the brow's hairs, and in the points of short ones below it and between the brows."""
+        low, width = self.tiles.brow
+        out = np.zeros_like(self.y)
+        inside = (self.z > np.min(low - width)) & (self.z < np.max(low + 2 * width))
+        y, z = self.y[inside], self.z[inside]
+        along = (21.0 - y) / 46.0
+        start, end = _BROW_ENDS
+        k = np.clip((along - start) * ((_BROW_STEPS - 1) / (end - start)) + 0.5, 0, _BROW_STEPS - 1).astype(np.intp)
+        across = (z - low[k]) / width[k]
+        length = step(along, -0.12, 0.1) * (1 - step(along, 0.75, 1.1))
+        hairs = length * step(across, -0.25, 0.35) * (1 - step(across, 0.65, 1.3))
+        reach = step(along, -0.25, 0.0) * (1 - step(along, 0.7, 1.05))
+        short = reach * step(across, -0.75, -0.1) * (1 - step(across, 1.1, 1.5))
+        some = short > 1e-2
+        points = np.zeros_like(y)
+        if np.any(some):
+            fine = self.tiles.at(61, _places(y[some], z[some]), (50, 95), (50, 95))
+            points[some] = np.clip(fine - 1.2, 0.0, 1.2)
+        out[inside] = min(self.spec.brow.count / 470, 1.0) * np.clip(0.16 * hairs + 0.30 * short * points, 0, 0.5)
+        return out
+
+    def hollows(self) -> Singles:
+        """Loss of light, -0.05 to 0.25, where the face is hollow."""
+        y, z = (np.clip(v + 76.0, 0, 151.999) for v in (self.y, self.z))
+        behind = Places(153, y, z, 153.0).sample(self.tiles.hollows)
+        return np.asarray(np.clip(0.05 * behind, -0.05, 0.25))
+
+    def veins(self) -> Singles:
+        """Loss of light, 0 to about 0.2, over the veins under the lids' skin: broad, blurred and scattered."""
+        tiles, lids = self.tiles, _hill(self.y, self.z, 22.0, 17.0)
+        out: Singles = np.zeros_like(self.y)
+        some = lids > 1e-2
+        if not np.any(some):
+            return out
+        y, z = self.y[some], self.z[some]
+        straight = _places(y, z)
+        way = z + 2.0 * tiles.at(51, straight, (0, 4), (0, 4))
+        bent = _places(y + 0.6 * way, 1.3 * way)
+        course = _bell(tiles.at(52, bent, (0, 5), (0, 8)), 0.0, 0.13)
+        thin = _bell(tiles.at(53, _places(y, way), (2, 9), (2, 9)), 0.0, 0.11)
+        where = step(tiles.at(54, straight, (0, 5), (0, 5)), -0.6, 0.9) * lids[some]
+        out[some] = where * (0.17 * course + 0.09 * thin)
+        return out
+
+    def albedo(self, open_: Singles, spots: Singles) -> Singles:
+        """Diffuse reflectance; `open_` is the light that leaves the furrows."""
+        skin, y, z, rows, upper = self.spec.skin, self.y, self.z, self.rows, self.upper
+        slow = self.field(21, (0, 4), (0, 4))
+        blotch = self.field(22, (3, 22), (3, 22))
+        fine = self.field(23, (40, 150), (40, 150))
+        tone = (1 + skin.mottling * (0.05 * slow + 0.022 * blotch + 0.024 * fine)) * open_
+        tone *= 1 - skin.veins * self.veins()
+        # The hollow beside the nose and the rim below the lower lid are a little darker, the lash line more so.
+        tone *= 1 - 0.20 * _bell(y, 15.5, 5.5) * _bell(z, 5.0, 8.0)
+        tone *= 1 - 0.06 * _bell(z, -12.0, 5.0) * _bell(y, 4.0, 14.0)
+        tone *= 1 - 0.34 * _bell(rows, _LINE, 2.6) * np.abs(upper)
+        tone *= 1 - 0.06 * step(rows, CONJUNCTIVA + MARGIN, CONJUNCTIVA + MARGIN + LID) * self.near * (upper > 0)
+        tone *= (1 - self.under_brow()) * (1 - self.hollows())
+        # In the crease, skin lies against skin.
+        tone *= 1 - 0.12 * _bell(rows, CONJUNCTIVA + MARGIN + LID - 0.7, 0.9) * step(upper, 0.12, 0.75)
+        outer = skin.albedo * tone * spots
+        # Where the conjunctiva lies on the globe, it is as white as the adjacent sclera.
+        white = Look().sclera_albedo
+        moist = white + step(rows, 1.0, CONJUNCTIVA - 1.0) * (skin.wet_albedo - white)
+        moist = moist * (1 - 0.40 * self.flesh) * (1 + 0.04 * blotch + 0.04 * fine)
+        s = step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN)
+        return np.asarray(np.clip(moist + s * (outer - moist), 0.02, 0.95))
 
 
-def _pores(spec: Region, y: Floats, z: Floats, near: Floats) -> Floats:
-    """Pits, 0 to 1, a third of a millimetre wide, on cheek, nose and forehead; the lids have almost none."""
-    spots = np.maximum(_field(spec.seed + 41, y, z, (20, 42), (20, 42)) - 1.25, 0.0)
-    lids = np.exp(-((np.hypot(y / 19.0, z / 13.0)) ** 4)) * near
-    much = (0.55 + 0.25 * _field(spec.seed + 42, y, z, (0, 5), (0, 5))) * (1 - 0.9 * lids)
-    return np.asarray(spec.skin.pores * np.clip(1.7 * spots * np.maximum(much, 0.1), 0, 1))
-
-
-def _slopes(height: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
-    """Gradient of the height over (y, z), from differences along rows and columns of the map."""
-
-    def along_columns(v: Floats) -> Floats:
-        return np.asarray((np.roll(v, -1, axis=1) - np.roll(v, 1, axis=1)) / 2)
-
-    hr, yr, zr = (np.gradient(v, axis=0) for v in (height, y, z))
-    hc, yc, zc = (along_columns(v) for v in (height, y, z))
-    det = yr * zc - yc * zr
-    # Where the sheet is edge-on, the slope over (y, z) is undefined.
-    good = np.abs(det) > 1e-5
-    det = np.where(good, det, 1.0)
-    sy = np.where(good, (hr * zc - hc * zr) / det, 0.0)
-    sz = np.where(good, (hc * yr - hr * yc) / det, 0.0)
-    return np.clip(sy, -0.5, 0.5), np.clip(sz, -0.5, 0.5)
-
-
-def _under_brow(spec: Region, y: Floats, z: Floats) -> Floats:
-    """Loss of light between the brow's hairs, and in the points of short ones below it and between the brows."""
-    count = min(spec.brow.count / 470, 1.0)
-    along = (21.0 - y) / 46.0
-    _, low, high = brow_band(spec, np.clip(along, -0.1, 1.1))
-    across = (z - low) / (high - low)
-    length = step(along, -0.12, 0.1) * (1 - step(along, 0.75, 1.1))
-    hairs = length * step(across, -0.25, 0.35) * (1 - step(across, 0.65, 1.3))
-    reach = step(along, -0.25, 0.0) * (1 - step(along, 0.7, 1.05))
-    short = reach * step(across, -0.75, -0.1) * (1 - step(across, 1.1, 1.5))
-    some = short > 1e-2
-    points = np.zeros_like(y)
-    points[some] = np.clip(_field(spec.seed + 61, y[some], z[some], (50, 95), (50, 95)) - 1.2, 0.0, 1.2)
-    return np.asarray(count * np.clip(0.16 * hairs + 0.30 * short * points, 0, 0.5))
-
-
-def _hollows(spec: Region, y: Floats, z: Floats) -> Floats:
-    """Loss of light, -0.05 to 0.25, where the face is hollow, from its depth behind its own surroundings."""
-    at = np.arange(-76.0, 76.5)
-    depth = skin_depth(spec, Globe.sphere(), *np.meshgrid(at, at))
-    behind = ndimage.gaussian_filter(depth, 4.5, mode="nearest") - depth
-    place = np.stack([z - at[0], y - at[0]])
-    return np.asarray(np.clip(0.05 * ndimage.map_coordinates(behind, place, order=1, mode="nearest"), -0.05, 0.25))
-
-
-def _veins(seed: int, y: Floats, z: Floats) -> Floats:
-    """Loss of light, 0 to about 0.2, over the veins under the lids' skin: broad, blurred and scattered."""
-    lids = np.exp(-((np.hypot(y / 22.0, z / 17.0)) ** 4))
-    out, some = np.zeros_like(y), lids > 1e-2
-    y, z = y[some], z[some]
-    way = z + 2.0 * _field(seed + 51, y, z, (0, 4), (0, 4))
-    course = np.exp(-((_field(seed + 52, y + 0.6 * way, 1.3 * way, (0, 5), (0, 8)) / 0.13) ** 2))
-    thin = np.exp(-((_field(seed + 53, y, way, (2, 9), (2, 9)) / 0.11) ** 2))
-    where = step(_field(seed + 54, y, z, (0, 5), (0, 5)), -0.6, 0.9) * lids[some]
-    out[some] = where * (0.17 * course + 0.09 * thin)
-    return out
-
-
-def _albedo(
-    spec: Region, *, y: Floats, z: Floats, rows: Floats, upper: Floats, near: Floats, open_: Floats, flesh: Floats
-) -> Floats:
-    skin, seed = spec.skin, spec.seed
-    slow = _field(seed + 21, y, z, (0, 4), (0, 4))
-    blotch = _field(seed + 22, y, z, (3, 22), (3, 22))
-    fine = _field(seed + 23, y, z, (40, 150), (40, 150))
-    tone = (1 + skin.mottling * (0.05 * slow + 0.022 * blotch + 0.024 * fine)) * open_
-    tone = tone * (1 - skin.veins * _veins(seed, y, z))
-    # The hollow beside the nose and the rim below the lower lid are a little darker, the lash line more so.
-    tone = tone * (1 - 0.20 * np.exp(-(((y - 15.5) / 5.5) ** 2) - ((z - 5.0) / 8.0) ** 2))
-    tone = tone * (1 - 0.06 * np.exp(-(((z + 12.0) / 5.0) ** 2) - ((y - 4) / 14.0) ** 2))
-    line = np.exp(-(((rows - _LINE) / 2.6) ** 2))
-    tone = tone * (1 - 0.34 * line * np.abs(upper))
-    tone = tone * (1 - 0.06 * step(rows, CONJUNCTIVA + MARGIN, CONJUNCTIVA + MARGIN + LID) * near * (upper > 0))
-    tone = tone * (1 - _under_brow(spec, y, z)) * (1 - _hollows(spec, y, z))
-    # In the crease, skin lies against skin.
-    fold = np.exp(-(((rows - (CONJUNCTIVA + MARGIN + LID - 0.7)) / 0.9) ** 2))
-    tone = tone * (1 - 0.12 * fold * step(upper, 0.12, 0.75))
+def _spots(seed: int, y: Singles, z: Singles) -> Singles:
+    """Light that some freckles leave, 1 elsewhere."""
     rng = np.random.default_rng((0x5407, seed))
-    spots = np.ones_like(y)
+    left = np.ones_like(y)
+    coarse = _COARSE
+    y_some, z_some = y[::coarse, ::coarse], z[::coarse, ::coarse]
     for _ in range(int(rng.integers(4, 16))):
         sy, sz, r = rng.uniform(-32, 30), rng.uniform(-32, 34), rng.uniform(0.12, 0.4)
-        near_it = (np.abs(y - sy) < 3 * r) & (np.abs(z - sz) < 3 * r)
-        away2 = (y[near_it] - sy) ** 2 + (z[near_it] - sz) ** 2
-        spots[near_it] -= rng.uniform(0.1, 0.45) * np.exp(-away2 / r**2)
-    outer = skin.albedo * tone * np.maximum(spots, 0.3)
-    # Where the conjunctiva lies on the globe, it is as white as the adjacent sclera.
-    white = Look().sclera_albedo
-    moist = white + step(rows, 1.0, CONJUNCTIVA - 1.0) * (skin.wet_albedo - white)
-    moist = moist * (1 - 0.40 * flesh) * (1 + 0.04 * blotch + 0.04 * fine)
-    s = step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN)
-    return np.asarray(np.clip(moist + s * (outer - moist), 0.02, 0.95))
+        depth = rng.uniform(0.1, 0.45)
+        for part in _parts_near((np.abs(y_some - sy) < 3 * r + 1.5) & (np.abs(z_some - sz) < 3 * r + 1.5)):
+            dy, dz = y[part] - sy, z[part] - sz
+            near_it = (np.abs(dy) < 3 * r) & (np.abs(dz) < 3 * r)
+            left[part] -= np.where(near_it, depth * np.exp(-(dy * dy + dz * dz) / r**2), 0)
+    return np.maximum(left, 0.3)
+
+
+def _parts_near(marked: Bools) -> Iterator[tuple[slice, slice]]:
+    """Rectangle of the map that contains the marked places of every `_COARSE`-th row and column, if there are any."""
+    if np.any(marked):
+        ends = [np.flatnonzero(np.any(marked, axis=axis))[[0, -1]] for axis in (1, 0)]
+        rows, columns = (slice(max(a - 1, 0) * _COARSE, (b + 2) * _COARSE) for a, b in ends)
+        yield rows, columns
+
+
+def _slopes(height: Singles, y: Singles, z: Singles, out: Singles) -> None:
+    """Write the gradient (rows, columns, 2) of the height over (y, z), from differences in the map."""
+    for first in range(0, len(y), _STRIP):
+        before, end = max(first - 1, 0), first + _STRIP
+        parts = [v[before : end + 1] for v in (height, y, z)]
+        hr, yr, zr = (np.gradient(v, axis=0)[first - before :][:_STRIP] for v in parts)
+        hc, yc, zc = (_along_columns(v[first:end]) for v in (height, y, z))
+        det = yr * zc - yc * zr
+        # Where the sheet is edge-on, the slope over (y, z) is undefined.
+        inverse = np.where(np.abs(det) > 1e-5, 1 / np.where(det == 0, 1, det), 0)
+        out[first:end, :, 0] = np.clip((hr * zc - hc * zr) * inverse, -0.5, 0.5)
+        out[first:end, :, 1] = np.clip((hc * yr - hr * yc) * inverse, -0.5, 0.5)
+
+
+def _along_columns(v: Singles) -> Singles:
+    """Half the difference of both neighbours in the row, which is closed."""
+    wide = np.concatenate([v[:, -1:], v, v[:, :1]], axis=1)
+    return np.asarray((wide[:, 2:] - wide[:, :-2]) * 0.5)

@@ -9,14 +9,16 @@ visible in every eye colour.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
-from scipy.spatial import cKDTree
+from numpy.typing import NDArray
+from scipy import fft
 
 from ..arrays import Floats, Singles
+from .noise import nearest_two, passed
 
 Texture = Singles
 
@@ -27,23 +29,13 @@ def _noise(
     rows: tuple[float, float],
     columns: tuple[float, float],
     periodic_rows: bool = False,
-) -> Floats:
+) -> Singles:
     """Gaussian noise of unit variance, band-passed: `rows`, `columns` are (low, high) cycles over the whole extent."""
     h, w = shape
-    height = h if periodic_rows else 2 * h
-    spectrum = np.fft.rfft2(rng.standard_normal((height, w)))
-    extent = 1 if periodic_rows else 2
-    fy = np.abs(np.fft.fftfreq(height) * height)[:, None] / extent
-    fx = np.abs(np.fft.rfftfreq(w) * w)[None, :]
-
-    def band(f: Floats, low: float, high: float) -> Floats:
-        keep: Floats = np.exp(-((f / high) ** 2))
-        return keep * (1 - np.exp(-((f / low) ** 2))) if low > 0 else keep
-
-    spectrum *= band(fy, *rows) * band(fx, *columns)
-    spectrum[0, 0] = 0
-    field = np.fft.irfft2(spectrum, s=(height, w))[:h]
-    return np.asarray(field / (field.std() + 1e-30))
+    if periodic_rows:
+        return passed(rng.standard_normal(shape), columns, rows)
+    field = passed(rng.standard_normal((2 * h, w)), columns, (2 * rows[0], 2 * rows[1]))[:h]
+    return np.asarray(field / field.std(dtype=float).astype(np.float32))
 
 
 def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) -> Floats:
@@ -76,8 +68,8 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     """
     rng = np.random.default_rng((0x1815, seed))
     shape = (radial, angular)
-    s = ((np.arange(radial) + 0.5) / radial)[:, None]
-    turn = ((np.arange(angular) + 0.5) / angular)[None, :]
+    s = ((np.arange(radial, dtype=np.float32) + 0.5) / radial)[:, None]
+    turn = ((np.arange(angular, dtype=np.float32) + 0.5) / angular)[None, :]
 
     collarette = (
         0.34
@@ -88,10 +80,13 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
 
     # Fibres are angular noise that is elongated along the radius; a slow sideways warp bends its columns.
     warp = 3.6 * _noise(rng, shape, (0, 2.2), (0, 14)) + 1.0 * _noise(rng, shape, (0, 6), (0, 60))
-    rows, columns = np.meshgrid(np.arange(radial), np.arange(angular), indexing="ij")
 
-    def bent(field: Floats, strength: float) -> Floats:
-        return np.asarray(ndimage.map_coordinates(field, [rows, columns + strength * warp], order=1, mode="grid-wrap"))
+    def bent(field: Singles, strength: float) -> Singles:
+        place = np.arange(angular, dtype=np.float32) + np.float32(strength) * warp
+        left = np.floor(place)
+        column, share = left.astype(np.intp) % angular, place - left
+        low = np.take_along_axis(field, column, axis=1)
+        return np.asarray(low + share * (np.take_along_axis(field, (column + 1) % angular, axis=1) - low))
 
     coarse = bent(_noise(rng, shape, (0, 1.6), (22, 60)), 1.0)
     medium = bent(_noise(rng, shape, (0, 2.5), (50, 120)), 1.0)
@@ -116,14 +111,14 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     texture = texture * (1 - 0.45 * np.exp(-((s / np.maximum(beads, 0.006)) ** 2)))
 
     texture = np.clip(texture, 0.30, 1.9)
-    area = 2.0 + s * 3.8
+    area = (2.0 + s * 3.8).astype(float)
     texture = texture / (np.sum(texture * area) / np.sum(np.broadcast_to(area, shape)))
     return _sealed(texture)
 
 
-def _furrows(rng: np.random.Generator, s: Floats, turn: Floats) -> Floats:
+def _furrows(rng: np.random.Generator, s: NDArray[Any], turn: NDArray[Any]) -> Singles:
     """Concentric contraction furrows: dark arcs in the outer half, each over a part of the circle."""
-    out = np.ones(np.broadcast_shapes(s.shape, turn.shape))
+    out = np.ones(np.broadcast_shapes(s.shape, turn.shape), np.float32)
     for place in (0.60, 0.71, 0.82, 0.91):
         start, span = rng.uniform(0, 1), rng.uniform(0.35, 0.9)
         wave = 0.008 * np.sin(2 * np.pi * (turn * rng.integers(2, 6) + rng.uniform()))
@@ -134,7 +129,9 @@ def _furrows(rng: np.random.Generator, s: Floats, turn: Floats) -> Floats:
     return out
 
 
-def _crypts(rng: np.random.Generator, *, s: Floats, turn: Floats, collarette: Floats, warp: Floats) -> Floats:
+def _crypts(
+    rng: np.random.Generator, *, s: NDArray[Any], turn: NDArray[Any], collarette: Singles, warp: Singles
+) -> Singles:
     """Fuchs' crypts: lens-shaped gaps in the front layer between trabeculae.
 
     They form a lattice along the collarette that is deep in some sectors and closed in others, with a few single crypts
@@ -144,22 +141,24 @@ def _crypts(rng: np.random.Generator, *, s: Floats, turn: Floats, collarette: Fl
     around, along = 2 * np.pi * 3.2, 3.8 / 2.0
     count = 430
     seeds = np.stack([rng.uniform(0, around, count), rng.uniform(0, along, count)], axis=-1)
-    tree = cKDTree(np.concatenate([seeds + np.array([shift, 0.0]) for shift in (-around, 0.0, around)]))
+    copies = np.concatenate([seeds + np.array([shift, 0.0]) for shift in (-around, 0.0, around)])
     deep = np.where(rng.uniform(size=count) < 0.36, rng.uniform(0.15, 0.46, count), rng.uniform(0, 0.06, count))
     pale = rng.uniform(0.05, 0.42, count) * (rng.uniform(size=count) < 0.7)
+    deep, pale = deep.astype(np.float32), pale.astype(np.float32)
     rows = np.flatnonzero((s[:, 0] > 0.16) & (s[:, 0] < 0.86))
     # Trabeculae bend like the fibres beside them.
-    x = (turn + 0.0035 * warp[rows]) * around
-    y = np.broadcast_to(s[rows] * along, x.shape) + 0.02 * np.roll(warp[rows], 97, axis=1)
-    distance, nearest = tree.query(np.stack([x, y], axis=-1), k=2)
-    gap = distance[..., 1] - distance[..., 0]
+    some = slice(rows[0], rows[0] + -(-len(rows) // 8) * 8)  # a few rows more, as `nearest_two` requires
+    x = (turn + 0.0035 * warp[some]) * around
+    y = np.broadcast_to(s[some] * along, x.shape) + 0.02 * np.roll(warp[some], 97, axis=1)
+    first, second, one, two = (v[: len(rows)] for v in nearest_two(copies, x, y, which=True))
+    gap = second - first
     sector = np.clip(0.72 + 0.5 * _noise(rng, (1, turn.shape[1]), (0, 1), (0, 5), True), 0.05, 1.35)
     off = s[rows] - collarette
     zone = np.exp(-(((off - 0.05) / 0.1) ** 2)) * sector + 0.16 * _step(off, 0.08, 0.2) * (s[rows] < 0.8)
-    mine = nearest % count
-    trabecula = np.maximum(pale[mine[..., 0]], pale[mine[..., 1]]) * np.exp(-((gap / 0.055) ** 2))
-    out = np.ones(np.broadcast_shapes(s.shape, turn.shape))
-    out[rows] += zone * (trabecula - deep[mine[..., 0]] * _step(gap, 0.03, 0.15))
+    nearest, next_ = one.astype(np.intp) % count, two.astype(np.intp) % count
+    trabecula = np.maximum(pale[nearest], pale[next_]) * np.exp(-((gap / 0.055) ** 2))
+    out = np.ones(np.broadcast_shapes(s.shape, turn.shape), np.float32)
+    out[rows] += zone * (trabecula - deep[nearest] * _step(gap, 0.03, 0.15))
     return np.maximum(out, 0.35)
 
 
@@ -176,36 +175,50 @@ def sclera_texture(seed: int, size: int = 768) -> Texture:
         + 0.025 * _noise(rng, (size, size), (0, 5), (0, 5), True)
         + 0.012 * _noise(rng, (size, size), (10, 40), (10, 40), True)
     )
-    layers = [np.zeros((size, size)) for _ in range(3)]
+    vessels = _vessels(rng, size)
+    texture = shade * (1 - np.clip(vessels, 0, 0.3))
+    return _sealed(texture / texture.mean(dtype=float))
+
+
+def _vessels(rng: np.random.Generator, size: int) -> Singles:
+    """Loss of light over the vessels of a globe's front, (size, size)."""
+    places: list[list[int]] = [[], [], []]
+    weights: list[list[float]] = [[], [], []]
     limbus = 0.29 / 0.6 / 2 * size / np.pi * 1.02  # 29 degrees of polar angle, in pixels of the map
+    uniform, normal, half = rng.random, rng.standard_normal, size / 2
+    hypot, atan2, sin, cos = math.hypot, math.atan2, math.sin, math.cos
 
     def grow(x: float, y: float, heading: float, weight: float, steps: int, level: int) -> None:
+        place, share = places[min(level, 2)], weights[min(level, 2)]
         for _ in range(steps):
-            r = np.hypot(x - size / 2, y - size / 2)
-            if r < limbus * rng.uniform(1.05, 1.7) or not (1 < x < size - 2 and 1 < y < size - 2):
+            r = hypot(x - half, y - half)
+            if r < limbus * (1.05 + 0.65 * uniform()) or not (1 < x < size - 2 and 1 < y < size - 2):
                 return
-            inward = np.arctan2(size / 2 - y, size / 2 - x)
-            heading += rng.normal(0, 0.16) + 0.02 * np.sin(inward - heading)
-            x, y = x + 0.8 * np.cos(heading), y + 0.8 * np.sin(heading)
-            layers[min(level, 2)][int(y), int(x)] += weight
+            inward = atan2(half - y, half - x)
+            heading += 0.16 * normal() + 0.02 * sin(inward - heading)
+            x, y = x + 0.8 * cos(heading), y + 0.8 * sin(heading)
+            place.append(int(y) * size + int(x))
+            share.append(weight)
             weight *= 0.9985
-            if level < 3 and rng.uniform() < 0.012:
+            if level < 3 and uniform() < 0.012:
                 grow(x, y, heading + rng.choice([-1, 1]) * rng.uniform(0.3, 0.8), weight * 0.7, steps // 2, level + 1)
 
     for _ in range(70):
         a = rng.uniform(0, 2 * np.pi)
         r = size * rng.uniform(0.36, 0.48)
         grow(
-            size / 2 + r * np.cos(a), size / 2 + r * np.sin(a), a + np.pi + rng.normal(0, 0.5), rng.uniform(0.3, 1),
+            half + r * math.cos(a), half + r * math.sin(a), a + np.pi + rng.normal(0, 0.5), rng.uniform(0.3, 1),
             int(rng.integers(120, 420)), int(rng.integers(0, 3)),
         )  # fmt: skip
-    vessels = sum(
-        0.16 * width * ndimage.gaussian_filter(layer, width)
-        for layer, width in zip(layers, (2.2, 1.4, 0.9), strict=True)
-    )
-    vessels = vessels + 0.05 * ndimage.gaussian_filter(layers[0] + layers[1], 5.0) * 5
-    texture = shade * (1 - np.clip(vessels, 0, 0.3))
-    return _sealed(texture / texture.mean())
+    f2 = np.square(fft.fftfreq(size))[:, None] + np.square(fft.rfftfreq(size))
+    blurred = np.zeros(f2.shape, np.complex64)
+    for place, share, width in zip(places, weights, (2.2, 1.4, 0.9), strict=True):
+        layer = np.bincount(place, share, minlength=size * size).reshape(size, size).astype(np.float32)
+        gain = 0.16 * width * np.exp(-2 * (np.pi * width) ** 2 * f2)
+        if width > 1:  # wider vessels have a soft halo
+            gain += 0.25 * np.exp(-2 * (np.pi * 5.0) ** 2 * f2)
+        blurred += gain.astype(np.float32) * fft.rfft2(layer)
+    return np.asarray(fft.irfft2(blurred, s=(size, size)))
 
 
 @lru_cache(maxsize=4)
