@@ -51,6 +51,7 @@ FLOORS = {
     "study": 8,
     "benchmark": 8,
     "quickstart": 8,
+    "realism": 8,
     "torch": 8,
     "cli": 9,
     "__init__": 10,

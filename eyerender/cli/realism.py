@@ -1,0 +1,73 @@
+"""The command realism."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from ..errors import InputError
+from .app import app
+from .options import Result
+from .output import emit, progress
+
+
+@app.command(name="realism")
+def realism(
+    folder: Annotated[Path, Parameter(name="DIR")],
+    other: Annotated[Path | None, Parameter(name="OTHER")] = None,
+    /,
+    *,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    gamma: tuple[float, ...] = (),
+    limit: int = 200,
+    json: Result = None,
+) -> int:
+    """Measure how real pictures of eyes look: contrasts, edges, texture, highlights, noise.
+
+    With a second folder, for instance of your own camera's frames, the figures of both stand side by side.
+
+    Args:
+        folder: A folder of images of one eye each: written by this package, exported by it, or your own.
+        other: A second folder, to compare with.
+        output: An HTML page to write, with the table and montages at equal scale.
+        gamma: Encoding gamma of the pixel values; give it twice for two folders. Default: what a folder of this package
+            or an export states, else 1 (linear).
+        limit: The largest number of images of a folder, chosen evenly.
+    """
+    from ..realism import realism as measured
+
+    if output is not None and output.suffix.lower() not in (".html", ".htm"):
+        raise InputError("must end with .html", source="--output")
+    folders = [folder] if other is None else [folder, other]
+    with progress("measuring") as steps:
+        data = measured(folders, output=output, gammas=gamma, limit=limit, progress=steps)
+    page = f"\n\npage: {output}" if output is not None else ""
+    emit(data, _table(data) + page, json)
+    return 0
+
+
+def _table(data: dict[str, Any]) -> str:
+    """One line per figure: median and the middle half of the images of each folder, and the ratio of the medians."""
+    folders, ratios = data["folders"], data["ratios"]
+    lines = []
+    for k, f in enumerate(folders):
+        lines.append(
+            f"{'AB'[k]}: {f['path']}: {f['measured']} of {f['images']} images, gamma {f['gamma']:g} "
+            f"({f['gamma_from']}), pupil and iris from: {f['landmarks']}"
+        )
+    heads = "".join(f"{'AB'[k]:>10} {'middle half':>19}" for k in range(len(folders)))
+    lines += ["", f"{'':<24}{heads}{'A / B':>9}" if ratios else f"{'':<24}{heads}"]
+    for name in data["definitions"]:
+        cells = ""
+        for f in folders:
+            s = f["figures"][name]
+            spread = f"[{_f(s['q25'])}, {_f(s['q75'])}]" if s["n"] else ""
+            cells += f"{_f(s['median']):>10} {spread:>19}"
+        lines.append(f"{name:<24}{cells}" + (f"{_f(ratios[name]):>9}" if ratios else ""))
+    return "\n".join(lines)
+
+
+def _f(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"

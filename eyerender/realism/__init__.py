@@ -1,0 +1,7 @@
+"""Figures of how real pictures look, for any folders of near-infrared images of eyes (docs/realism.md)."""
+
+from __future__ import annotations
+
+from .compare import FolderFigures, measure_folder, realism
+
+__all__ = ["FolderFigures", "measure_folder", "realism"]

@@ -1,0 +1,186 @@
+"""The figures of one folder of pictures, or of two to compare, as numbers and as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Bytes
+from ..errors import InputError
+from ..files import read_json
+from ..progress import Progress, followed
+from .figures import FIGURES, RADIUS_PX, Scaled, measure
+from .folder import Skipped, Source, open_source, pictures
+
+SCHEMA = "eyerender/realism/1"
+DEFAULT_LIMIT = 200
+MAX_LIMIT = 10_000
+EXPORT = "export.json"
+_SKIPPED_SHOWN = 50
+_TILE_R = (5.6, 4.2)  # width and height of a tile of the montage, R
+_WHITE = 235.0  # grey level at which a tile shows the 98th percentile of its picture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FolderFigures:
+    """The figures of a folder.
+
+    Attributes:
+        path: the folder.
+        images: how many images were read.
+        gamma: the images store intensity^(1 / gamma).
+        gamma_from: why this gamma was used: the folder states it, it was given, or neither ("assumed").
+        landmarks: where pupil and iris come from.
+        rows: name and figures of each measured image.
+        skipped: images that could not be measured.
+        tiles: every measured image about its eye, at equal scale.
+    """
+
+    path: str
+    images: int
+    gamma: float
+    gamma_from: str
+    landmarks: str
+    rows: tuple[tuple[str, dict[str, float | None]], ...]
+    skipped: tuple[Skipped, ...]
+    tiles: tuple[Bytes, ...]
+
+    def values(self, name: str) -> list[float]:
+        """Values of a figure in all images that have it."""
+        return [row[name] for _, row in self.rows if row[name] is not None]  # type: ignore[misc]
+
+    def median(self, name: str) -> float | None:
+        """Median of a figure over the images; None where no image has it."""
+        values = self.values(name)
+        return float(np.median(values)) if values else None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """What the JSON holds of the folder."""
+        return {
+            "path": self.path,
+            "images": self.images,
+            "measured": len(self.rows),
+            "skipped": len(self.skipped),
+            "skipped_first": [{"name": s.name, "reason": s.reason} for s in self.skipped[:_SKIPPED_SHOWN]],
+            "landmarks": self.landmarks,
+            "gamma": self.gamma,
+            "gamma_from": self.gamma_from,
+            "figures": {name: _summary(self.values(name)) for name in FIGURES},
+        }
+
+
+def _summary(values: Sequence[float]) -> dict[str, float | int | None]:
+    names, shares = ("q10", "q25", "median", "q75", "q90"), (0.1, 0.25, 0.5, 0.75, 0.9)
+    found = np.quantile(values, shares).tolist() if values else [None] * len(shares)
+    return {"n": len(values), **dict(zip(names, found, strict=True))}
+
+
+def measure_folder(
+    path: str | Path, *, gamma: float | None = None, limit: int = DEFAULT_LIMIT, progress: Progress | None = None
+) -> FolderFigures:
+    """Measure the pictures of a folder.
+
+    Args:
+        path: a folder that this package wrote, or any folder of greyscale images of one eye each.
+        gamma: the images store intensity^(1 / gamma). By default it is what the folder states (this package's folders
+            and exports do), else 1.
+        limit: the largest number of images, which are chosen evenly over the folder.
+        progress: called with (images done, images in all, "").
+
+    Raises:
+        InputError: there is no such folder or it holds no images, or an argument is out of range.
+    """
+    if not 1 <= limit <= MAX_LIMIT:
+        raise InputError(f"must be 1 to {MAX_LIMIT}", source="--limit")
+    if gamma is not None and not (np.isfinite(gamma) and 0.1 <= gamma <= 10):
+        raise InputError("must be between 0.1 and 10", source="--gamma")
+    source = open_source(path, limit)
+    known, origin = _encoding(source) if gamma is None else (gamma, "given")
+    rows, skipped, tiles = [], [], []
+    found = pictures(source, known)
+    for name in followed(source.names, progress):
+        picture = next(found)
+        if isinstance(picture, Skipped):
+            skipped.append(picture)
+            continue
+        scaled = Scaled.of(picture)
+        rows.append((name, measure(picture, scaled)))
+        tiles.append(_tile(scaled))
+    return FolderFigures(
+        str(path), len(source.names), known, origin, source.landmarks, tuple(rows), tuple(skipped), tuple(tiles)
+    )
+
+
+def _encoding(source: Source) -> tuple[float, str]:
+    """Gamma of a folder's images, and where it is known from."""
+    if source.entries:
+        return 1.0, "the folder: linear counts"
+    stated = source.path / EXPORT
+    if not stated.is_file():
+        return 1.0, "assumed"
+    image = read_json(stated, follow=False).get("image")
+    gamma = image.get("gamma") if isinstance(image, dict) else None
+    if isinstance(gamma, bool) or not isinstance(gamma, int | float) or not 0.1 <= gamma <= 10:
+        return 1.0, "assumed"
+    return float(gamma), f"the folder's {EXPORT}"
+
+
+def _tile(s: Scaled) -> Bytes:
+    """The picture about its eye, with R at 50 px and its 98th percentile at one grey level."""
+    width, height = (round(k * RADIUS_PX) for k in _TILE_R)
+    x, y = round(s.centre[0]) - width // 2, round(s.centre[1]) - height // 2
+    rows, columns = np.arange(height) + y, np.arange(width) + x
+    inside = ((rows >= 0) & (rows < s.level.shape[0]))[:, None] & (columns >= 0) & (columns < s.level.shape[1])
+    cut = s.level[np.clip(rows, 0, s.level.shape[0] - 1)][:, np.clip(columns, 0, s.level.shape[1] - 1)]
+    white = max(float(np.percentile(cut[inside], 98)), 1e-6) if inside.any() else 1.0
+    return np.where(inside, np.clip(np.round(cut * _WHITE / white), 0, 255), 255).astype(np.uint8)
+
+
+def realism(
+    folders: Sequence[str | Path],
+    *,
+    output: str | Path | None = None,
+    gammas: Sequence[float] = (),
+    limit: int = DEFAULT_LIMIT,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Measure one folder of pictures, or two to compare.
+
+    Args:
+        folders: one or two folders, as for `measure_folder`.
+        output: an HTML page to write, with the table and montages at equal scale.
+        gammas: none, one for all folders, or one for each.
+        limit: the largest number of images of a folder.
+        progress: called with (images done, images in all, "") for each folder.
+
+    Returns:
+        Schema eyerender/realism/1: the definitions, the figures of each folder, and for two folders the ratio of their
+        medians, first over second.
+
+    Raises:
+        InputError: a folder or an argument cannot be used.
+    """
+    if len(gammas) not in (0, 1, len(folders)):
+        raise InputError("give one for all folders, or one for each", source="--gamma")
+    each = [gammas[k if len(gammas) > 1 else 0] if gammas else None for k in range(len(folders))]
+    found = [measure_folder(f, gamma=g, limit=limit, progress=progress) for f, g in zip(folders, each, strict=True)]
+    ratios = {name: _ratio(found, name) for name in FIGURES} if len(found) == 2 else None
+    if output is not None:
+        from .page import write
+
+        write(Path(output), found, ratios)
+    return {
+        "schema": SCHEMA,
+        "definitions": dict(FIGURES),
+        "folders": [f.to_mapping() for f in found],
+        "ratios": ratios,
+    }
+
+
+def _ratio(found: Sequence[FolderFigures], name: str) -> float | None:
+    first, second = (f.median(name) for f in found)
+    return first / second if first is not None and second else None

@@ -1,0 +1,159 @@
+"""Pictures of eyes from a folder: one that this package wrote, with its masks, or any folder of image files.
+
+The files may come from anybody; they are read as untrusted ones are everywhere in the package.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Bytes, Singles
+from ..errors import InputError
+from ..extraction import FAST, extract
+from ..files import inside
+from ..geometry.ellipse import Ellipse
+from ..imagefile import read_image
+from ..imagefolder import IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
+from .figures import EyePicture
+from .limbus import iris_extent
+
+ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".gif", ".webp", ".jp2")
+MAX_FILES = 1_000_000
+_LEAST_RADIUS_PX = 8.0
+_LEAST_MASK_PX = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Skipped:
+    """An image that cannot be measured, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A folder of pictures.
+
+    Attributes:
+        path: the folder.
+        names: names of the images, relative to the folder.
+        entries: the entries of the images, if this package wrote the folder.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    entries: tuple[ImageEntry, ...] = ()
+
+    @property
+    def landmarks(self) -> str:
+        """Where pupil and iris come from: masks, or what is found in the picture."""
+        return "masks" if self.entries else "found in the picture"
+
+
+def open_source(path: str | Path, limit: int) -> Source:
+    """Open a folder and choose `limit` of its images, evenly over all of them.
+
+    Raises:
+        InputError: there is no such folder, or it holds no images.
+    """
+    folder = Path(path)
+    if not os.path.isdir(folder):
+        raise InputError("no such folder", source=str(path))
+    if (folder / METADATA).is_file():
+        entries = ImageFolder.load(folder).entries
+        chosen = tuple(entries[i] for i in _spread(len(entries), limit))
+        return Source(folder, tuple(entry.name for entry in chosen), chosen)
+    found = sorted(_image_files(folder))
+    if not found:
+        raise InputError(f"holds no images ({', '.join(ENDINGS)})", source=str(path))
+    return Source(folder, tuple(found[i] for i in _spread(len(found), limit)))
+
+
+def _spread(count: int, limit: int) -> list[int]:
+    return [k * count // min(count, limit) for k in range(min(count, limit))]
+
+
+def _image_files(folder: Path) -> Iterator[str]:
+    """Names of the image files in a folder and below it; links are not followed."""
+    seen = 0
+    for place, inner, names in os.walk(folder):
+        inner.sort()
+        for name in names:
+            seen += 1
+            if seen > MAX_FILES:
+                raise InputError(f"holds more than {MAX_FILES} files", source=str(folder))
+            if name.lower().endswith(ENDINGS):
+                yield str((Path(place) / name).relative_to(folder))
+
+
+def pictures(source: Source, gamma: float) -> Iterator[EyePicture | Skipped]:
+    """Each image of a source with its landmarks, or the reason why it cannot be measured.
+
+    Args:
+        source: the folder.
+        gamma: the images store intensity^(1 / gamma).
+    """
+    for k, name in enumerate(source.names):
+        try:
+            yield _labelled(source.entries[k], gamma) if source.entries else _unlabelled(source.path, name, gamma)
+        except InputError as error:
+            yield Skipped(name, error.reason)
+
+
+def _labelled(entry: ImageEntry, gamma: float) -> EyePicture | Skipped:
+    if len(entry.records) != 1:
+        return Skipped(entry.name, f"shows {len(entry.records)} eyes; a picture of one is needed")
+    mask = entry.mask()
+    if mask is None:
+        return Skipped(entry.name, "has no mask")
+    image = entry.image()
+    codes = _codes(image, int(entry.line.get("bit_depth") or 8 * image.itemsize))
+    pupil = _pupil(entry, mask)
+    columns = np.flatnonzero(np.any((mask == IRIS) | (mask == PUPIL), axis=0))
+    if pupil is None or not len(columns):
+        return Skipped(entry.name, "shows no pupil")
+    radius = (columns[-1] - columns[0] + 1) / 2
+    return _checked(EyePicture(entry.name, codes, gamma, pupil, float(columns[-1] + columns[0]) / 2, radius, mask))
+
+
+def _pupil(entry: ImageEntry, mask: Bytes) -> Ellipse | None:
+    """Outline of the pupil by ray optics, if the picture shows some of it."""
+    if np.count_nonzero(mask == PUPIL) < _LEAST_MASK_PX:
+        return None
+    found = entry.truth().pupil
+    if not found.ok[0]:
+        return None
+    return Ellipse(found.centre_px[0] - entry.window[:2], found.semi_axes_px[0], float(found.angle_rad[0]))
+
+
+def _unlabelled(folder: Path, name: str, gamma: float) -> EyePicture | Skipped:
+    image, depth = read_image(inside(folder, name.replace(os.sep, "/"), source=str(folder)))
+    if image.dtype.kind == "f":
+        return Skipped(name, "holds floating-point levels, whose full scale is unknown")
+    found = extract(image, bit_depth=depth, gamma=gamma, settings=FAST)
+    if found.pupil.ellipse is None:
+        return Skipped(name, f"no pupil found ({found.pupil.reason})")
+    codes = _codes(image, depth)
+    extent = iris_extent((255 * (codes / 255) ** gamma).astype(np.float32), found.pupil.ellipse)
+    if extent is None:
+        return Skipped(name, "no limbus found on both sides of the pupil")
+    return _checked(EyePicture(name, codes, gamma, found.pupil.ellipse, *extent))
+
+
+def _checked(picture: EyePicture) -> EyePicture | Skipped:
+    if picture.radius_px < _LEAST_RADIUS_PX:
+        return Skipped(picture.name, f"the iris' radius is {picture.radius_px:.1f} px; {_LEAST_RADIUS_PX:g} are needed")
+    return picture
+
+
+def _codes(image: NDArray[Any], bits: int) -> Singles:
+    """Stored codes with full scale 255."""
+    return image.astype(np.float32) * np.float32(255 / (2**bits - 1))

@@ -1,0 +1,118 @@
+"""The figures of drawn pictures are those that were drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from eyerender.imagefolder import PUPIL as PUPIL_CLASS
+from eyerender.realism.figures import BANDS_R, FIGURES, measure, noise
+from tests.realism import drawn
+from tests.realism.drawn import CENTRE, LEVELS, PUPIL, R
+
+WIDTH_OF_SIGMA = 2.563  # 10 to 90 % of a Gaussian's integral
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_ratios_of_levels(labelled):
+    found = measure(drawn.picture(drawn.levels(), labelled=labelled))
+    assert list(found) == list(FIGURES)
+    expected = {
+        "pupil : iris": LEVELS["pupil"] / LEVELS["iris"],
+        "iris : sclera": LEVELS["iris"] / LEVELS["sclera"],
+        "skin : sclera": LEVELS["skin"] / LEVELS["sclera"],
+        "limbal ring : mid iris": 1.0,
+        "clipped pixels (%)": 0.0,
+        "bright points (1/R^2)": 0.0,
+    }
+    # The levels are flat, so only the blur of the edges and of the resizing reaches into the areas.
+    assert {name: found[name] for name in expected} == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("gamma", [1.6, 2.2])
+def test_a_stated_gamma_is_undone(gamma):
+    linear = drawn.levels()
+    encoded = 255 * (linear / 255) ** (1 / gamma)
+    plain, decoded = measure(drawn.picture(linear)), measure(drawn.picture(encoded, gamma))
+    wrong = measure(drawn.picture(encoded))
+    for name in ("pupil : iris", "iris : sclera", "skin : sclera", "limbus (R)"):
+        assert decoded[name] == pytest.approx(plain[name], rel=0.01)
+    assert wrong["pupil : iris"] == pytest.approx(plain["pupil : iris"] ** (1 / gamma), rel=0.01)
+
+
+@pytest.mark.parametrize(("pupil_sigma", "limbus_sigma"), [(2.0, 4.0), (3.0, 6.0), (4.5, 9.0)])
+@pytest.mark.parametrize("labelled", [True, False])
+def test_edge_widths(pupil_sigma, limbus_sigma, labelled):
+    rng = np.random.default_rng(3)
+    codes = drawn.levels(pupil_sigma, limbus_sigma) + rng.normal(0, 1.0, (drawn.HIGH, drawn.WIDE))
+    found = measure(drawn.picture(codes, labelled=labelled))
+    # Halving the picture blurs by half a pixel; the noise moves crossings by a few per cent.
+    assert found["pupil edge (R)"] == pytest.approx(WIDTH_OF_SIGMA * pupil_sigma / R, rel=0.1, abs=0.004)
+    # The profile ends 4 widths from the edge, but the widest limbus has not reached its end there.
+    assert found["limbus (R)"] == pytest.approx(WIDTH_OF_SIGMA * limbus_sigma / R, rel=0.1, abs=0.004)
+
+
+@pytest.mark.parametrize("band", [1, 2, 3])
+def test_texture_is_measured_in_its_band(band):
+    fine, coarse = (k * R for k in BANDS_R[band])
+    contrast = 0.03
+    relative = 1 + contrast * drawn.noise_of_band((drawn.HIGH, drawn.WIDE), fine, coarse, band)
+    found = measure(drawn.picture(np.full((drawn.HIGH, drawn.WIDE), 100.0) * relative))
+    # The widest grains are few in the area, so their scatter is known to a tenth or two.
+    for area in ("iris", "skin"):
+        assert found[f"{area} texture {band + 1}"] == pytest.approx(contrast, rel=0.25)
+        # Differences of Gaussians are broad, so a band two octaves away still has up to half of the contrast.
+        others = [found[f"{area} texture {k + 1}"] for k in range(4) if abs(k - band) > 1]
+        assert max(others) < 0.6 * contrast
+
+
+def test_dark_lashes_and_ring():
+    codes = drawn.levels()
+    v, u = np.mgrid[: drawn.HIGH, : drawn.WIDE]
+    lash = (v < CENTRE[1] - 1.31 * R) & (u % 20 < 2)
+    rho = drawn.distance()
+    codes[(rho > 0.86 * R) & (rho < 0.96 * R)] *= 0.6
+    codes[lash] *= 0.25
+    found = measure(drawn.picture(codes))
+    # Lashes of 2 px in 20 are one pixel wide when halved, so the resizing leaves some of them whole.
+    assert found["lash : lid skin"] == pytest.approx(0.25, abs=0.05)
+    assert found["limbal ring : mid iris"] == pytest.approx(0.6, abs=0.02)
+
+
+def test_highlights_are_counted_outside_the_cornea_only():
+    codes = drawn.levels()
+    v, u = np.mgrid[: drawn.HIGH, : drawn.WIDE]
+    spots = [(-1.5, 0.2), (-1.4, -0.4), (1.6, 0.1), (1.3, 0.7), (0.3, 0.2)]  # the last lies on the cornea
+    for x, y in spots:
+        codes[np.hypot(u - CENTRE[0] - x * R, v - CENTRE[1] - y * R) < 4] = 230.0
+    found = measure(drawn.picture(codes))
+    outside = ~np.isin(drawn.parts(), (2, 3)) & (drawn.distance() < 2 * R)
+    assert found["bright points (1/R^2)"] == pytest.approx(4 / (outside.sum() / R**2), rel=0.02)
+
+
+def test_noise_clipping_and_fall_off():
+    rng = np.random.default_rng(5)
+    flat = 100 + rng.normal(0, 2.5, (300, 400)).astype(np.float32)
+    assert noise(flat) == pytest.approx(2.5, rel=0.03)
+    v, u = np.mgrid[: drawn.HIGH, : drawn.WIDE]
+    assert noise((0.5 * u + 0.2 * v).astype(np.float32)) == pytest.approx(0, abs=1e-4)  # a plane has none
+    codes = drawn.levels()
+    codes[:51] = 255
+    assert measure(drawn.picture(codes))["clipped pixels (%)"] == pytest.approx(100 * 51 / drawn.HIGH)
+    # Light that falls off linearly from 200 to 100 across the picture: percentiles of a uniform spread.
+    ramp = np.broadcast_to(np.linspace(200, 100, drawn.WIDE), (drawn.HIGH, drawn.WIDE))
+    far = drawn.distance() > 1.9 * R
+    expected = np.quantile(ramp[far], 0.9) / np.quantile(ramp[far], 0.1)
+    assert measure(drawn.picture(ramp))["fall-off"] == pytest.approx(expected, rel=0.02)
+
+
+def test_what_a_picture_does_not_show_has_no_figure():
+    codes = drawn.levels()[: int(CENTRE[1] + 1.2 * R)]
+    shown = drawn.picture(drawn.levels())
+    mask = drawn.parts()[: len(codes)]
+    cut = type(shown)("cut", codes.astype(np.float32), 1.0, shown.pupil, CENTRE[0], R, mask)
+    found = measure(cut)
+    assert found["skin : sclera"] is None
+    assert found["skin texture 1"] is None
+    assert found["iris : sclera"] == pytest.approx(0.75, abs=0.01)
+    assert np.count_nonzero(mask == PUPIL_CLASS) == pytest.approx(np.pi * PUPIL**2, rel=0.01)
