@@ -4,7 +4,7 @@ The map is fixed to the tissue: columns run once around the fissure, rows from t
 a moving lid takes its skin along. The last rows hold the constant values of lashes, brow and tears, so that the whole
 region is one mesh with one map. The map has four channels:
 
-    albedo        diffuse reflectance
+    albedo        diffuse reflectance; its mean over the skin about the eye is `skin.albedo`
     slope y, z    d(height)/dy and d(height)/dz of the relief, over the region's frame
     gloss         weight of the mirror-like part: below 0.5 skin's sheen (rough), above it wet tissue (smooth)
 """
@@ -38,6 +38,7 @@ _COARSE = 8
 _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
 _STRIP = 32  # rows of the map that are made together, so that they stay in the processor's cache
 _SHOWN = 0.5  # of the furrows' slope: light scattered under the skin blurs structures finer than half a millimetre
+_SHOWN_MM = 25.0  # about the middle of the fissure: the skin whose mean albedo is that of the spec
 _REFERENCE_BLINK = 0.3  # at which the tissue is laid out: neither stretched nor hidden in the fold
 
 
@@ -78,6 +79,7 @@ def skin_map(spec: Region) -> Singles:
         strip = _Strip(tiles, y[k], z[k], out_mm[k], rows[k, None].astype(np.float32), turn[None, :])
         out[k, :, 0], out[k, :, 3], height[k] = strip.look(spots[k])
     _slopes(height, y, z, out[:SHEET_ROWS, :, 1:3])
+    _normalise(out[:SHEET_ROWS, :, 0], y, z, rows, spec.skin.albedo)
     for which, (a, g) in enumerate(
         ((spec.lashes.albedo, 0.08), (spec.brow.albedo, 0.12), (0.9 * spec.skin.wet_albedo, 1.0))
     ):
@@ -85,6 +87,20 @@ def skin_map(spec: Region) -> Singles:
         out[int(middle - BANDS / 8) : int(middle + BANDS / 8)] = (a, 0, 0, g)
     out.flags.writeable = False
     return out
+
+
+def _normalise(albedo: Singles, y: Singles, z: Singles, rows: Floats, wanted: float) -> None:
+    """Give the skin about the eye its mean albedo, each texel weighted by its area as seen from the front.
+
+    A window of one eye shows this skin. Farther out the tone is up to 7 % lighter. Wet tissue stays as it is.
+    """
+    some = rows > _LINE
+    near = np.hypot(y[some], z[some]) < _SHOWN_MM
+    (yr, yc), (zr, zc) = (np.gradient(v[some]) for v in (y, z))
+    area = np.abs(yr * zc - yc * zr) * near
+    share = step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN)[:, None]
+    gain = wanted * np.sum(area, dtype=float) / np.sum(albedo[some] * area, dtype=float)
+    np.minimum(albedo * (1 + share * (gain - 1)), 0.95, out=albedo)
 
 
 def _over_grid(values: Floats, rows: Floats, columns: Floats) -> Singles:

@@ -3,7 +3,7 @@
 In front of an eye region, which fills the image, `shade_group` lets several samples of a pixel share the shading of the
 skin and the rays from there to the lamps. The groups of a pixel take the lamps in turn. A lamp used by c of G groups
 counts G / c times, so that every lamp has its exact share in every pixel. On the globe, which is shaded for every
-sample, the samples take the lamps in turn in the same way.
+sample, each has the light of all lamps, and the samples take the rays to the lamps in turn in the same way.
 """
 
 from __future__ import annotations
@@ -140,13 +140,14 @@ def _groups(
 
     lights = shown.lights
     lamps, groups, all_samples = lights.count, dr.opaque(mi.UInt32, spp // size), dr.opaque(mi.UInt32, spp)
-    # With fewer samples than lamps, the first lamp of a pixel is random.
-    start = mi.UInt32(samples.pair(mi.UInt32(0), 1).x * mi.Float(lamps))
 
-    def lamp(j: mi.UInt32) -> tuple[Lamp, mi.Float]:
-        which = dr.select(all_samples < lamps, number(j) + start, number(j)) % lamps
-        share = mi.Float(all_samples) / mi.Float((all_samples + lamps - 1 - which) // lamps)
-        return lights[which], dr.select(all_samples < lamps, mi.Float(lamps), share)
+    def asked(j: mi.UInt32) -> mi.UInt32:
+        return dr.select(all_samples < lamps, (all_samples + lamps - 1 - number(j)) // all_samples, 1)
+
+    def lamp(j: mi.UInt32, k: mi.UInt32) -> tuple[Lamp, mi.Float]:
+        which = number(j) % lamps + k * all_samples
+        users = dr.maximum((all_samples + lamps - 1 - which) // lamps, 1)
+        return lights[which], mi.Float(all_samples) / mi.Float(users)
 
     def shared(k: mi.UInt32) -> tuple[Lamp, mi.Float]:
         which = group % lamps + k * groups
@@ -162,6 +163,7 @@ def _groups(
             each,
             ray,
             lambda j: samples.pair(number(j), 0),
+            asked,
             lamp,
             dr.select(several, (groups + lamps - 1 - group) // groups, 1),
             shared,

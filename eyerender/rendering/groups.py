@@ -28,7 +28,8 @@ class Group:
         count: number of samples.
         ray: origin, direction (scene's frame) and weight of sample j.
         spot: place of sample j on the lamps' discs, [0, 1)^2.
-        lamp: lamp that sample j uses where it meets the globe, and its weight.
+        asked: number of lamps to which sample j sends rays where it meets the globe.
+        lamp: the k-th of these lamps, and its weight.
         lamps: number of lamps that the whole group uses where it meets the region.
         shared: the k-th of these lamps, and its weight.
         fine: whether pairs of samples send rays of their own to the lamp about the lids and on hairs, where lashes cast
@@ -39,7 +40,8 @@ class Group:
     count: mi.UInt32
     ray: Callable[[mi.UInt32], tuple[mi.Vector3f, mi.Vector3f, mi.Float]]
     spot: Callable[[mi.UInt32], mi.Point2f]
-    lamp: Callable[[mi.UInt32], tuple[Lamp, mi.Float]]
+    asked: Callable[[mi.UInt32], mi.UInt32]
+    lamp: Callable[[mi.UInt32, mi.UInt32], tuple[Lamp, mi.Float]]
     lamps: mi.UInt32
     shared: Callable[[mi.UInt32], tuple[Lamp, mi.Float]]
     fine: mi.Bool
@@ -149,15 +151,37 @@ class _GroupShading:
         """Radiance of the globe along sample j's ray, and failed light paths."""
         values, lights, textures, scene, group = self.values, self.lights, self.textures, self.scene, self.group
         seen = replace(view, other=mi.Bool(False))
-        lamp, share = group.lamp(j)
-        source = self.lamp_point(lamp, j)
-        outer, shine = straight(lamp, source, seen, -values.vector_to_eye(d))
         inner, missed = through_cornea(values, lights, scene, seen.inner, seen.lit_inside, *group.spot(j))
         albedo = outer_albedo(values, textures, seen, mi.Bool(True))
-        lit = direct(seen, albedo, outer, shine)
-        barred = lamp_blocked(values, scene, seen.point, source, False, ~seen.cornea, lit > 0)
         rest = indirect(values, textures, scene, seen, d, albedo, inner)
-        return rest + dr.select(barred, 0, lit * share), missed
+        return rest + self.lamps_on_globe(seen, albedo, -values.vector_to_eye(d), j), missed
+
+    def lamps_on_globe(self, seen: View, albedo: mi.Float, back: mi.Vector3f, j: mi.UInt32) -> mi.Float:
+        """Radiance of the matte globe at sample j: the light of all lamps, less what is kept from it.
+
+        The samples of a pixel share the rays to the lamps. So only shadows that end within the pixel are noisy.
+        """
+        values, lights, group = self.values, self.lights, self.group
+
+        def lit_by(lamp: Lamp) -> tuple[mi.Vector3f, mi.Float]:
+            source = self.lamp_point(lamp, j)
+            return source, direct(seen, albedo, *straight(lamp, source, seen, back))
+
+        def add(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            return i + 1, total + lit_by(lights[i])[1]
+
+        state = (mi.UInt32(0), mi.Float(0))
+        _, total = dr.while_loop(state, lambda i, _: i < lights.count, add, labels=("i", "total"), label="all lamps")
+
+        def subtract(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            lamp, share = group.lamp(j, k)
+            source, lit = lit_by(lamp)
+            barred = lamp_blocked(values, self.scene, seen.point, source, False, ~seen.cornea, lit > 0)
+            return k + 1, total - dr.select(barred, lit * share, 0)
+
+        state, asked = (mi.UInt32(0), total), group.asked(j)
+        _, total = dr.while_loop(state, lambda k, _: k < asked, subtract, labels=("k", "total"), label="shadows")
+        return dr.maximum(total, 0)
 
     def with_untraced(self, sheet: Kept, i: mi.UInt32, settled: mi.Bool) -> Kept:
         """Add to the skin's hit the weights of the samples from the i-th on, which a plain pixel left untraced."""

@@ -67,7 +67,9 @@ def test_the_map_is_its_specs_and_strengths_darken_their_own_places():
     assert not full.flags.writeable
     rows = (sheet_v(np.linspace(0, 1, ROWS)) * len(full)).astype(int)
     share = full[:SHEET_ROWS, :, 0] / none[:SHEET_ROWS, :, 0]
-    assert share.max() < 1 + 1e-5
+    # The mean stays that of the spec, so the skin between them is lighter.
+    assert 1.0 < share.max() < 1.05
+    share /= share.max()
     lid = share[rows[CONJUNCTIVA + MARGIN + 2] : rows[CONJUNCTIVA + MARGIN + LID], 300:460]
     far = share[rows[ROWS - 8] : rows[ROWS - 1]]
     assert 0.8 < lid.mean() < 0.995  # veins

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from eyerender.arrays import frozen
-from eyerender.rendering.export import export_scene
 from eyerender.rig.camera import Camera
 from eyerender.rig.light import Lamp
+from tests.support.render_oracles import cos4, stock
 from tests.support.render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of, remote_rig
 
 MATTE = PLAIN.model_copy(
@@ -24,19 +24,6 @@ MATTE = PLAIN.model_copy(
         "backdrop_albedo": 0.6,
     }
 )
-
-
-def stock(job, folder, max_depth, spp, **meshes):
-    import mitsuba as mi
-
-    scene = mi.load_file(str(export_scene(job, folder, max_depth=max_depth, **meshes)))
-    return np.array(mi.render(scene, spp=spp, seed=3))[..., 0].astype(float)
-
-
-def cos4(job):
-    x0, y0, w, h = job.window
-    grid = np.stack(np.meshgrid(np.arange(w) + x0, np.arange(h) + y0), axis=-1).reshape(-1, 2)
-    return ((job.camera.rays(grid) @ job.camera.axis) ** 4).reshape(h, w)
 
 
 @pytest.mark.parametrize(("bounces", "spp", "tolerance"), [(0, 64, 2e-3), (3, 128, 8e-3)])

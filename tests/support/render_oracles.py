@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.path import Path
+from matplotlib.path import Path as Outline
 from scipy.optimize import least_squares
 
+from eyerender.arrays import Floats
 from eyerender.eye.model import EyeModel
 from eyerender.optics.solve import apparent_points
+
+if TYPE_CHECKING:
+    from eyerender.rendering.frame import RenderJob
 
 RINGS_MM = ((2.1, 3.1), (3.1, 4.1), (4.1, 5.1))
 HARMONICS = 12
@@ -107,7 +114,7 @@ def coverage(polygon: np.ndarray, window: tuple[int, int, int, int], k: int = 40
     x0, y0, w, h = window
     out = np.zeros((h, w))
     sub = (np.arange(k) + 0.5) / k - 0.5
-    path = Path(polygon)
+    path = Outline(polygon)
     v, u = np.mgrid[:h, :w]
     centre = polygon.mean(axis=0)
     r = np.linalg.norm(polygon - centre, axis=1)
@@ -150,3 +157,20 @@ def contour_error(rendered: np.ndarray, polygon: np.ndarray, window: tuple[int, 
     missing = box(rendered - coverage(polygon, window))
     delta = np.linalg.lstsq(wide[rows], missing[rows], rcond=None)[0]
     return float(np.sqrt(np.mean((np.stack(basis, axis=1) @ delta) ** 2)))
+
+
+def stock(job: RenderJob, folder: Path, max_depth: int, spp: int, seed: int = 3, **meshes: int) -> Floats:
+    """Radiance (h, w) of a job by Mitsuba's stock path integrator, on the exported meshes."""
+    import mitsuba as mi
+
+    from eyerender.rendering.export import export_scene
+
+    scene = mi.load_file(str(export_scene(job, folder, max_depth=max_depth, **meshes)))
+    return np.array(mi.render(scene, spp=spp, seed=seed))[..., 0].astype(float)
+
+
+def cos4(job: RenderJob) -> Floats:
+    """cos^4 (h, w) of the field angle of a window's pixels."""
+    x0, y0, w, h = job.window
+    grid = np.stack(np.meshgrid(np.arange(w) + x0, np.arange(h) + y0), axis=-1).reshape(-1, 2)
+    return np.asarray((job.camera.rays(grid) @ job.camera.axis) ** 4).reshape(h, w)
