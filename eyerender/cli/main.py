@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from types import FrameType
 from typing import Any
 
@@ -31,10 +32,12 @@ def run(argv: Sequence[str] | None = None) -> int:
     """Run one command and return the exit code."""
     tokens = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in tokens
-    tokens = [t for t in tokens if t != "--debug"]
+    cached = "--no-cache" not in tokens
+    tokens = [t for t in tokens if t not in ("--debug", "--no-cache")]
     previous = _terminate_like_interrupt()
     try:
-        code = app(tokens, exit_on_error=False, print_error=False)
+        with nullcontext() if cached else _without_cache():
+            code = app(tokens, exit_on_error=False, print_error=False)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except BrokenPipeError:
@@ -49,6 +52,13 @@ def run(argv: Sequence[str] | None = None) -> int:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def _without_cache() -> AbstractContextManager[None]:
+    # The package's regions are imported only where they are needed.
+    from ..region.mapcache import without_cache
+
+    return without_cache()
 
 
 def _reported(error: BaseException) -> int | None:

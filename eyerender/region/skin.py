@@ -103,6 +103,11 @@ def _normalise(albedo: Singles, y: Singles, z: Singles, rows: Floats, wanted: fl
     np.minimum(albedo * (1 + share * (gain - 1)), 0.95, out=albedo)
 
 
+def skin_texels(spec: Region) -> NDArray[np.float16]:
+    """Map of `skin_map` in half precision, which is what is rendered: albedo and slope need no more digits."""
+    return skin_map(spec).astype(np.float16)
+
+
 def _over_grid(values: Floats, rows: Floats, columns: Floats) -> Singles:
     """Values (r, c) of a grid at all fractional rows (m,) and columns (n,), interpolated linearly: (m, n)."""
     i, j = np.minimum(rows.astype(int), len(values) - 2), np.minimum(columns.astype(int), values.shape[1] - 2)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
-from ..arrays import Floats, Singles
+from ..arrays import Floats
 from ..errors import InputError
 from ..region.anatomy import Region
 from ..region.globe import Globe
@@ -55,8 +56,8 @@ class HeadScene(RegionScene):
         return self._still
 
     @staticmethod
-    def _look(spec: Region) -> Singles:
-        return head_map(spec, load_head(_head(spec)))
+    def _look(spec: Region) -> NDArray[np.float16]:
+        return head_map(spec, load_head(_head(spec))).astype(np.float16)
 
     def _refuse_crossing(self, spec: Region, globe: Globe) -> None:
         """Raise an error where the mesh reaches too deep into the cornea.

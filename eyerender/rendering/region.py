@@ -14,13 +14,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats, Singles
+from ..arrays import Bools, Floats
 from ..region.anatomy import Region
 from ..region.globe import Globe
 from ..region.head import file_states
+from ..region.mapcache import kept
 from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh
-from ..region.skin import skin_map
+from ..region.skin import skin_texels
 from .surround import clear_between, rays_between
 from .values import aligned
 
@@ -52,7 +54,7 @@ class RegionScene:
         self.scene = mi.load_dict(parts)
         self._params: Any = mi.traverse(self.scene)
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
-        pixels = aligned(self._look(spec).astype(np.float16))
+        pixels = aligned(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         moving = next((s for s in self.scene.shapes() if s.id() == "shown_moving"), None)
         self.skin = SkinGeometry(look, layout, faces, moving, -1.0 if globe.mirrored else 1.0)
@@ -89,8 +91,8 @@ class RegionScene:
         return region_mesh(spec, globe)
 
     @staticmethod
-    def _look(spec: Region) -> Singles:
-        return skin_map(spec)
+    def _look(spec: Region) -> NDArray[np.float16]:
+        return kept(skin_texels, spec.model_copy(update={"blink": 0.0}))
 
     def clear(self, a: Floats, b: Floats) -> Bools:
         """Whether nothing of the region stands between points (n, 3) of the scene's frame; ends not included."""

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..arrays import ArrayValue, Bools, Floats, Ints
 from ..region.look import Look
+from ..region.mapcache import kept
 from ..region.texture import skin_texture
 
 _HALF_MM = 500.0
@@ -53,7 +54,7 @@ class Surround:
             return
         if self._shown is None or self._shown[0] != wanted[0]:
             self._params["backdrop.vertex_positions"] = mi.Float(_corners(wanted[0]).ravel())
-        tile = wanted[1] * (1 + wanted[2] * (skin_texture(1) - 1))
+        tile = wanted[1] * (1 + wanted[2] * (kept(skin_texture, 1) - 1))
         names: list[str] = list(self._params.keys())  # iterating over it would give pairs
         (key,) = (k for k in names if k.startswith("backdrop") and k.endswith("reflectance.data"))
         self._params[key] = mi.TensorXf(np.clip(tile, 0.0, 0.98).astype(np.float32)[..., None])

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..region.mapcache import kept
 from ..region.texture import iris_texture, sclera_texture
 from .surfaces import fresnel
 from .values import Values
@@ -76,12 +77,12 @@ class Textures:
     @classmethod
     def of_seed(cls, seed: int) -> Textures:
         """Make the textures of one eye."""
-        rows = iris_texture(seed)
+        rows = kept(iris_texture, seed)
         # The texture repeats so that the angle wraps. Additional rows separate the ends along the radius.
         rows = np.concatenate([rows[:1], rows, rows[-1:]])
         texture: Any = mi.Texture2f
         iris = texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
-        sclera = texture(mi.TensorXf(sclera_texture(seed)[..., None]), use_accel=False)
+        sclera = texture(mi.TensorXf(kept(sclera_texture, seed)[..., None]), use_accel=False)
         return cls(iris, sclera)
 
 

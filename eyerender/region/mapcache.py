@@ -1,0 +1,174 @@
+"""The maps of subjects on disk: what takes a second to make is read in milliseconds the next time.
+
+A file is named by the digest of everything that determines its content: the maker, its argument, the code of this
+package's regions, and the versions of NumPy and SciPy. It is written under another name and renamed when complete, so
+several processes may use the folder at once. Nothing in it is trusted: a file whose header, size or checksum is wrong
+is removed and made again. Where the folder cannot be used, maps are made every time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from ..backends.libraries import cache_folder
+from ..errors import EyerenderError, InputError
+from ..files import PART, read_bytes, written
+from .anatomy import Region
+
+LIMIT = "EYERENDER_MAP_CACHE_MB"
+"""Environment variable: megabytes of maps that are kept; 0 keeps none and reads none."""
+DEFAULT_MB = 1000
+SCHEMA = "eyerender/map/1"
+_ENDING = ".map"
+_DTYPES = ("float16", "float32")
+_LARGEST_HEADER, _ALIGNMENT = 4096, 64
+_STALE_S = 3600.0  # a temporary file of this age was left by a process that ended
+_KEPT_SHARE = 0.9  # of the limit, after files were removed
+_Argument = TypeVar("_Argument", int, Region)
+
+
+@contextmanager
+def without_cache() -> Iterator[None]:
+    """Neither read nor keep maps while the block runs, in this process and those that it starts."""
+    before = os.environ.get(LIMIT)
+    os.environ[LIMIT] = "0"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[LIMIT]
+        else:
+            os.environ[LIMIT] = before
+
+
+def kept(make: Callable[[_Argument], NDArray[Any]], argument: _Argument) -> NDArray[Any]:
+    """Read-only array that `make(argument)` gives, float16 or float32; from disk where it is known.
+
+    Args:
+        make: a function of the module's top level that depends on its argument alone.
+        argument: a seed or a region.
+    """
+    file = _place(make.__name__, argument)
+    if file is None:
+        return make(argument)
+    known = _read(file)
+    if known is None:
+        known = make(argument)
+        with suppress(OSError, EyerenderError):
+            _write(file, known)
+            _trim(file.parent, _limit_bytes())
+    return known
+
+
+def folder() -> Path | None:
+    """Folder of the maps; None where none are kept."""
+    place = cache_folder()
+    return place / "maps" if place is not None and _limit_bytes() > 0 else None
+
+
+def _limit_bytes() -> float:
+    try:
+        limit = float(os.environ.get(LIMIT, DEFAULT_MB))
+    except ValueError:
+        raise InputError("must be a number of megabytes", source=LIMIT) from None
+    return limit * 1e6
+
+
+def _place(name: str, argument: int | Region) -> Path | None:
+    place = folder()
+    if place is None:
+        return None
+    said = argument.to_mapping() if isinstance(argument, Region) else int(argument)
+    key = json.dumps([SCHEMA, name, said, _code()], sort_keys=True)
+    return place / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:32]}{_ENDING}"
+
+
+@lru_cache(maxsize=1)
+def _code() -> list[str]:
+    """What makes the maps: the package's version, a digest of this folder's sources, NumPy and SciPy."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return [version("eyerender"), digest.hexdigest(), np.__version__, scipy.__version__]
+
+
+def _checksum(data: memoryview | bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def _write(file: Path, values: NDArray[Any]) -> None:
+    """Write a map: a header, one line of JSON, and the bytes of the array."""
+    data = np.ascontiguousarray(values)
+    header = {"schema": SCHEMA, "dtype": str(data.dtype), "shape": data.shape, "blake2b": _checksum(data.data)}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with written(file, sync=False) as out:  # the checksum finds what a power cut leaves
+        line = json.dumps(header).encode()
+        out.write(line + b" " * (-(len(line) + 1) % _ALIGNMENT) + b"\n")
+        out.write(data.data)
+
+
+def _read(file: Path) -> NDArray[Any] | None:
+    """Map of a file; None where there is none. A damaged file is removed."""
+    try:
+        if not file.is_file():
+            return None
+        data = read_bytes(file, follow=False)
+        found = _decoded(data)
+    except (InputError, OSError):
+        return None
+    with suppress(OSError):
+        os.utime(file) if found is not None else file.unlink()
+    return found
+
+
+def _decoded(data: bytes) -> NDArray[Any] | None:
+    line = data[:_LARGEST_HEADER].partition(b"\n")[0]
+    try:
+        header = json.loads(line)
+        dtype, shape = header["dtype"], tuple(header["shape"])
+        sound = header["schema"] == SCHEMA and dtype in _DTYPES and all(type(n) is int and n >= 0 for n in shape)
+        body = memoryview(data)[len(line) + 1 :]
+        if sound and len(body) == np.prod(shape) * np.dtype(dtype).itemsize and header["blake2b"] == _checksum(body):
+            return np.frombuffer(body, dtype).reshape(shape)
+    except (ValueError, KeyError, TypeError, OverflowError):
+        pass
+    return None
+
+
+def _trim(place: Path, limit: float) -> None:
+    """Remove what was not used for longest where the maps take more than `limit` bytes, and stale temporary files."""
+    now = time.time()
+    files = []
+    for path in _entries(place):
+        with suppress(OSError):
+            state = path.stat()
+            if path.name.endswith(PART) and now - state.st_mtime > _STALE_S:
+                path.unlink()
+            elif path.suffix == _ENDING:
+                files.append((state.st_mtime, state.st_size, path))
+    size = sum(entry[1] for entry in files)
+    if size > limit:
+        for _, bytes_, path in sorted(files):
+            if size <= _KEPT_SHARE * limit:
+                break
+            with suppress(OSError):
+                path.unlink()
+            size -= bytes_
+
+
+def _entries(place: Path) -> Iterator[Path]:
+    with suppress(OSError):
+        yield from place.iterdir()
