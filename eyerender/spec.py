@@ -164,11 +164,21 @@ class FileSpec(Spec):
         if "format" not in data:
             raise InputError(f"missing; write 'format: {cls.FORMATS[-1]}'", source=str(path), path="format")
         if data["format"] not in cls.FORMATS or not isinstance(data["format"], int) or data["format"] is True:
-            known = " and ".join(map(str, cls.FORMATS))
+            *older, latest = map(str, cls.FORMATS)
+            known = f"{', '.join(older)} and {latest}" if older else latest
             raise InputError(
                 f"is {shown(data['format'])}; this version reads format {known}", source=str(path), path="format"
             )
+        try:
+            data = cls.gathered(data, Path(path).parent)
+        except InputError as error:
+            raise error.placed(source=str(path)) from None
         return cls.from_mapping(data, source=str(path))
+
+    @classmethod
+    def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """The mapping of a file in this folder, with the content of other files that become part of the spec."""
+        return data
 
     @classmethod
     def from_mapping(cls, data: object, *, source: str = "") -> Self:

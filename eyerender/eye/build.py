@@ -18,6 +18,7 @@ from ..geometry.surfaces_quadric import Quadric
 from ..geometry.transforms import flip_y, mirror_rotation, read_only, rotation_x, tilt_rotation
 from ..optics.gradient import GradientMedium
 from ..optics.media import CauchyMedium, ConstantMedium, Medium
+from .corneas import grid_surface, zernike_surface
 from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
 from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
 from .parts import (
@@ -27,6 +28,7 @@ from .parts import (
     EllipsoidSpec,
     EyeParts,
     GradientLensSpec,
+    GridSpec,
     MediumSpec,
     PlacedSpec,
     PlaneSpec,
@@ -34,6 +36,7 @@ from .parts import (
     Side,
     SphereSpec,
     SurfaceLensSpec,
+    ZernikeSpec,
 )
 from .shells import SHELLS, Layers, even_layers, lens_shells, passing_shells
 
@@ -126,6 +129,10 @@ def surface_of(placed: PlacedSpec) -> Surface:
         return Quadric.conic(shape.radius_mm, conic_constant, position, rotation)
     if isinstance(shape, BiconicSpec):
         return Biconic(position, rotation, np.array(shape.radii_mm), np.array(shape.conic_constants))
+    if isinstance(shape, ZernikeSpec):
+        return zernike_surface(shape).placed(position, rotation)
+    if isinstance(shape, GridSpec):
+        return grid_surface(shape).placed(position, rotation)
     if isinstance(shape, EllipsoidSpec):
         front = shape.side == "front"
         lead = shape.semi_axes_mm[0] * (-1.0 if front else 1.0)

@@ -11,17 +11,20 @@ from ..arrays import Bools, Floats
 from ..errors import InputError, Refuse
 from ..geometry.surfaces import Surface, components
 from .build import gradient_geometry, stop_of, stop_reach_mm
+from .corneas import WINDOW
 from .model import Stop
 from .parts import (
     BiconicSpec,
     ConicSpec,
     EyeParts,
     GradientLensSpec,
+    GridSpec,
     MediumSpec,
     PlacedSpec,
     QuadricSpec,
     SphereSpec,
     SurfaceLensSpec,
+    ZernikeSpec,
 )
 
 _TOUCH_MM = 1e-6
@@ -169,6 +172,27 @@ def _shape_problem(placed: PlacedSpec) -> tuple[str, str] | None:
         first, second = shape.radii_mm
         if first * second <= 0.0:
             return "shape.radii_mm", "must both be > 0 or both be < 0"
+    if isinstance(shape, ZernikeSpec) and shape.base_radius_mm == 0.0:
+        return "shape.base_radius_mm", "must not be 0"
+    if isinstance(shape, GridSpec):
+        return _grid_problem(shape)
     if isinstance(shape, QuadricSpec) and not any(shape.coefficients[:9]):
         return "shape.coefficients", "must not all be 0"
+    return None
+
+
+def _grid_problem(shape: GridSpec) -> tuple[str, str] | None:
+    if shape.file is not None:
+        return "shape.file", "is read with an eye file only; name the eye file here"
+    if shape.heights_mm is None or shape.spacing_mm is None:
+        return "shape", "give 'heights_mm' and 'spacing_mm', or 'file'"
+    count = len(shape.heights_mm)
+    if count % 2 == 0:
+        return "shape.heights_mm", f"must have an odd number of rows, not {count}"
+    wrong = [k for k, row in enumerate(shape.heights_mm) if len(row) != count]
+    if wrong:
+        return f"shape.heights_mm.{wrong[0]}", f"must have {count} values, as there are rows"
+    half = 0.5 * (count - 1) * shape.spacing_mm
+    if shape.zone_radius_mm is not None and WINDOW[1] * shape.zone_radius_mm > half * (1.0 + 1e-9):
+        return "shape.zone_radius_mm", f"must be <= {half / WINDOW[1]:.6g}, so that the grid covers the transition"
     return None

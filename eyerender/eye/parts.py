@@ -16,6 +16,8 @@ from ..spec import FileSpec, Number, Positive, Spec, Vec2, Vec3
 
 # This is the number of surfaces of the finest lens of shells.
 MAX_SURFACES = 400
+# Zernike terms of radial order 14, and nodes of a grid in a row: a grid of 201 x 201 takes some seconds to fit.
+MAX_TERMS, MAX_NODES = 120, 201
 # Germanium has the highest index of all materials that are transparent somewhere in the infrared: 4.
 LARGEST_INDEX = 5.0
 # Cauchy's coefficients grow with the sixth power of nanometres.
@@ -69,6 +71,77 @@ class QuadricSpec(Spec):
     side: Facing = Field(default="front", description="the sheet that is the surface")
 
 
+class ZernikeSpec(Spec):
+    """Zernike terms on a conic: x = conic(y, z) - sum_j c_j Z_j(y / r, z / r), shifted to x = 0 at the position.
+
+    The terms are orthonormal on the disc of radius r and stand in the standard order of OSA/ANSI: j = (n (n + 2) + m) /
+    2, the angle counted from +y (nasal) towards +z (up). Coefficients are depths, positive into the eye. Beyond the
+    measured zone a biconic continues the surface, see `zone_radius_mm`.
+    """
+
+    kind: Literal["zernike"] = Field(description="the shape")
+    radius_mm: Positive = Field(description="r, the radius of the disc on which the terms are orthonormal")
+    coefficients_mm: tuple[Number, ...] = Field(
+        min_length=1, max_length=MAX_TERMS, description="c_0, c_1, ..., depths; order 14 at most"
+    )
+    base_radius_mm: Number | None = Field(
+        default=None, description="signed radius of curvature of the conic at its apex; default: a plane"
+    )
+    base_conic_constant: Number = Field(default=0.0, description="Q of the conic")
+    zone_radius_mm: Positive | None = Field(
+        default=None,
+        description="radius of the measured zone; between 0.75 and 1.15 of it a biconic takes over; default: r",
+    )
+
+
+class TopographySpec(Spec):
+    """A file of measured points: a table (CSV) or a mesh (PLY), with its axes and units."""
+
+    path: str = Field(min_length=1, max_length=1024, description="file, relative to the eye file")
+    layout: Literal["points", "polar", "matrix", "mesh"] = Field(
+        description="`points`: columns x, y, z; `polar`: columns radius, angle (deg, from x to y), z; `matrix`: x in "
+        "the first row, y in the first column, z in the cells; `mesh`: the vertices of a PLY file"
+    )
+    columns: tuple[str | int, str | int, str | int] | None = Field(
+        default=None,
+        description="names of the three columns, or their numbers from 0 in a table without a header; default: 0, 1, 2",
+    )
+    x: Literal["nasal", "temporal"] = Field(description="where the file's x axis points")
+    y: Literal["up", "down"] = Field(description="where the file's y axis points")
+    z: Literal["out", "in"] = Field(description="where the file's z axis points: out of the eye (heights) or into it")
+    unit: Literal["mm", "um", "m"] = Field(description="unit of x, y and radius")
+    z_unit: Literal["mm", "um", "m"] | None = Field(default=None, description="unit of z; default: that of x")
+    centre: Vec2 = Field(default=(0.0, 0.0), description="place (x, y) of the eye's axis in the file, in its unit")
+    spacing_mm: float = Field(default=0.2, ge=0.02, le=2.0, description="spacing of the grid that is fitted")
+    smoothing: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1e6,
+        description="weight of the penalty on third differences of the grid, against the squares of the deviations; "
+        "0 passes through the points as far as the grid can",
+    )
+
+
+class GridSpec(Spec):
+    """A square grid of depths x over (y, z): a bicubic surface with continuous curvature, shifted to its position.
+
+    The rows run from low z to high z, and each runs from temporal to nasal (+y). Their number is odd, and the middle
+    lies on the axis. `file` stands in place of `heights_mm` and is read with the eye file.
+    """
+
+    kind: Literal["grid"] = Field(description="the shape")
+    spacing_mm: float | None = Field(default=None, ge=0.02, le=2.0, description="spacing of the grid")
+    heights_mm: tuple[tuple[Number, ...], ...] | None = Field(
+        default=None, min_length=5, max_length=MAX_NODES, description="x of the surface, row by row"
+    )
+    zone_radius_mm: Positive | None = Field(
+        default=None,
+        description="radius of the measured zone; between 0.75 and 1.15 of it a biconic takes over; default: so that "
+        "1.15 of it is half of the grid's width",
+    )
+    file: TopographySpec | None = Field(default=None, description="measured points, in place of the heights")
+
+
 class PlaneSpec(Spec):
     """Plane x = 0 of its frame."""
 
@@ -86,11 +159,13 @@ ShapeSpec = Annotated[
     | Annotated[BiconicSpec, Tag("BiconicSpec")]
     | Annotated[EllipsoidSpec, Tag("EllipsoidSpec")]
     | Annotated[QuadricSpec, Tag("QuadricSpec")]
-    | Annotated[PlaneSpec, Tag("PlaneSpec")],
+    | Annotated[PlaneSpec, Tag("PlaneSpec")]
+    | Annotated[ZernikeSpec, Tag("ZernikeSpec")]
+    | Annotated[GridSpec, Tag("GridSpec")],
     Discriminator(
         _shape_tag,
         custom_error_type="unknown_kind",
-        custom_error_message="kind must be sphere, conic, biconic, ellipsoid, quadric or plane",
+        custom_error_message="kind must be sphere, conic, biconic, ellipsoid, quadric, plane, zernike or grid",
     ),
 ]
 
@@ -267,9 +342,9 @@ class EyeParts(FileSpec):
     `sources` maps a dotted path (or the beginning of one) to the source of its values.
     """
 
-    FORMATS: ClassVar[tuple[int, ...]] = (1, 2)
+    FORMATS: ClassVar[tuple[int, ...]] = (1, 2, 3)
 
-    format: int = Field(default=2, description="version of this file format")
+    format: int = Field(default=3, description="version of this file format")
     name: str = Field(description="name of the model")
     description: str = Field(default="", description="what the model is, in a sentence")
     cornea: tuple[SurfaceSpec, ...] = Field(

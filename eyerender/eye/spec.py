@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Self
 
 from pydantic import model_validator
@@ -14,6 +15,7 @@ from .check import check_eye
 from .format1 import upgraded
 from .model import EyeModel
 from .parts import EyeParts, Side
+from .topography import with_topographies
 
 
 class EyeSpec(EyeParts):
@@ -21,8 +23,16 @@ class EyeSpec(EyeParts):
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Bring a mapping of format 1 to format 2, which describes the same eye."""
-        return upgraded(data) if data.get("format") == 1 else data
+        """Bring a mapping of an older format to the present one, which describes the same eye."""
+        if data.get("format") == 1:
+            data = upgraded(data)
+        # Format 3 added the shapes of measured corneas, and changed nothing else.
+        return {**data, "format": 3} if data.get("format") == 2 else data
+
+    @classmethod
+    def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """Read the measured points that the shapes name, and put the grids fitted to them in their place."""
+        return with_topographies(data, folder)
 
     @model_validator(mode="after")
     def _check(self) -> Self:

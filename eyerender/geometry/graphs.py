@@ -9,19 +9,8 @@ import numpy as np
 
 from ..arrays import FloatLike, Floats
 from .surfaces import Surface, fit
-from .surfaces_biconic import Biconic
+from .surfaces_graph import GraphSurface, Jet
 from .surfaces_quadric import Quadric
-
-
-class Jet(NamedTuple):
-    """Height h, its slopes and its second derivatives."""
-
-    x: Floats
-    y: Floats
-    z: Floats
-    yy: Floats
-    yz: Floats
-    zz: Floats
 
 
 class Graph(Protocol):
@@ -96,24 +85,35 @@ class QuadricGraph(NamedTuple):
         return np.asarray(-rest / (half + u)), u
 
 
-class BiconicGraph(NamedTuple):
-    """A biconic in its own frame."""
+class SheetGraph(NamedTuple):
+    """A graph surface in a frame with its own axes; `offset` (..., 3) is its origin there."""
 
-    surface: Biconic
+    surface: GraphSurface
+    offset: Floats
 
     def height(self, y: Floats, z: Floats) -> Floats:
-        """Height h(y, z), the sag of the biconic."""
-        return self.surface.local_sag(y, z)
+        """Height h(y, z), the sag of the surface."""
+        x, y, z = self._moved(y, z)
+        return np.asarray(self.surface.local_sag(y, z) + x)
 
     def jet(self, y: Floats, z: Floats) -> Jet:
         """Height h with its first and second derivatives."""
-        return Jet(*self.surface.sag_derivatives(y, z)[:6])
+        x, y, z = self._moved(y, z)
+        jet = self.surface.jet(y, z)
+        return jet._replace(x=jet.x + x)
+
+    def _moved(self, y: Floats, z: Floats) -> tuple[FloatLike, Floats, Floats]:
+        if not self.offset.any():
+            return 0.0, y, z
+        dx, dy, dz = (fit(self.offset[..., i], y.ndim) for i in range(3))
+        return dx, y - dy, z - dz
 
 
 def graphs_of(surfaces: Sequence[Surface], ndim: int) -> tuple[list[Graph], Floats, Floats] | None:
     """Express surfaces as graphs over one plane.
 
-    The working frame is the eye's, or that of the biconic if there is one. Two biconics have no frame in common.
+    The working frame is the eye's, or that of the first surface that is a graph of its own frame. Another one must have
+    parallel axes.
 
     Args:
         surfaces: what to express.
@@ -122,19 +122,17 @@ def graphs_of(surfaces: Sequence[Surface], ndim: int) -> tuple[list[Graph], Floa
     Returns:
         (graphs, origin, rotation) of the working frame, or None where the surfaces have no common frame.
     """
-    frame: Biconic | None = None
-    for surface in surfaces:
-        if isinstance(surface, Biconic):
-            if frame is not None:
-                return None
-            frame = surface
+    frame = next((surface for surface in surfaces if isinstance(surface, GraphSurface)), None)
     first = surfaces[0]
     origin = np.zeros_like(first.origin_mm) if frame is None else frame.origin_mm
     rotation = np.broadcast_to(np.eye(3), first.rotation.shape) if frame is None else frame.rotation
     graphs: list[Graph] = []
     for surface in surfaces:
-        if isinstance(surface, Biconic):
-            graphs.append(BiconicGraph(surface))
+        if isinstance(surface, GraphSurface):
+            if not np.array_equal(surface.rotation, rotation):
+                return None
+            offset = (np.swapaxes(rotation, -1, -2) @ (surface.origin_mm - origin)[..., None])[..., 0]
+            graphs.append(SheetGraph(surface, offset))
         elif isinstance(surface, Quadric):
             moved = surface if frame is None else surface.seen_from(origin, rotation)
             if not np.all(moved.rotation[..., 0, 0] > 0.5):

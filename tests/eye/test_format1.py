@@ -64,7 +64,7 @@ def test_twice_the_shells_rate_gives_the_layers_that_it_stood_for():
     assert len(spec.build().back) == 10
 
 
-def test_a_file_without_these_keys_is_the_same_eye_and_is_written_in_format_2(tmp_path):
+def test_a_file_without_these_keys_is_the_same_eye_and_is_written_in_the_latest(tmp_path):
     file = tmp_path / "eye.yaml"
     for name in ("E1", "E4", "E5"):
         data = old(name)
@@ -75,7 +75,7 @@ def test_a_file_without_these_keys_is_the_same_eye_and_is_written_in_format_2(tm
         file.write_text(yaml.safe_dump(data), encoding="utf-8")
         spec = EyeSpec.load(file)
         assert spec == load_eye(name)
-        assert "format: 2\n" in spec.to_yaml()
+        assert "format: 3\n" in spec.to_yaml()
 
 
 @pytest.mark.parametrize(
@@ -120,6 +120,12 @@ def test_bad_rates_are_refused():
 
 def test_a_later_format_is_refused(tmp_path):
     file = tmp_path / "eye.yaml"
-    file.write_text(yaml.safe_dump(old() | {"format": 3}), encoding="utf-8")
-    with pytest.raises(InputError, match="format: is 3; this version reads format 1 and 2"):
+    file.write_text(yaml.safe_dump(old() | {"format": 4}), encoding="utf-8")
+    with pytest.raises(InputError, match="format: is 4; this version reads format 1, 2 and 3"):
         EyeSpec.load(file)
+
+
+def test_a_file_of_format_2_is_the_same_eye(tmp_path):
+    file = tmp_path / "eye.yaml"
+    file.write_text(yaml.safe_dump(load_eye("E5").to_mapping() | {"format": 2}), encoding="utf-8")
+    assert EyeSpec.load(file) == load_eye("E5")

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from eyerender.eye.build import surface_of
+from eyerender.eye.parts import PlacedSpec
 from eyerender.geometry.graphs import graphs_of
 from eyerender.geometry.surfaces import components, join
 from eyerender.geometry.surfaces_biconic import Biconic
 from eyerender.geometry.surfaces_quadric import Quadric, centre_of
 from eyerender.geometry.transforms import flip_y, tilt_rotation
+from tests.support.corneas import measured_shapes
 
 TILT = tilt_rotation(np.radians([1.0, -2.0, 3.0]))
 SURFACES = {
@@ -27,6 +30,8 @@ SURFACES = {
     "biconic": Biconic(np.array([0.0, 0.22, -0.23]), TILT, np.array([7.76, 7.74]), np.array([-0.272, -0.361])),
     "biconic back": Biconic(np.array([-7.0, 0.0, 0.0]), np.eye(3), np.array([-6.0, -6.9]), np.array([-0.8, 0.4])),
 }
+for _name, _shape in measured_shapes().items():
+    SURFACES[_name] = surface_of(PlacedSpec(shape=_shape, position_mm=(-0.5, 0.1, -0.2), tilt_deg=(1.0, -2.0, 3.0)))
 cases = pytest.mark.parametrize("surface", SURFACES.values(), ids=SURFACES.keys())
 
 

@@ -1,0 +1,70 @@
+"""Measured shapes of an eye file as surfaces: the outer biconic is fitted here, once for each shape."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from ..arrays import Floats
+from ..geometry.surfaces_measured import GridSurface, ZernikeSurface
+from ..geometry.topography import outer_biconic, spline_coefficients
+from ..geometry.zernike import order_of, terms
+from .parts import GridSpec, ZernikeSpec
+
+WINDOW = (0.75, 1.15)
+"""Shares of the zone's radius between which the biconic takes over.
+
+Over this width the bends of a healthy cornea stay as they are inside (of the trials 0.6 to 0.85 and 1.0 to 1.15); a
+polynomial is hardly worse 15 % beyond its disc.
+"""
+_FITTED = (0.75, 1.0)
+_FAR = np.array([1e6, 2e6])
+_ANY = np.array([8.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+@lru_cache(maxsize=4096)
+def zernike_surface(shape: ZernikeSpec) -> ZernikeSurface:
+    """The surface of Zernike terms at the eye's origin."""
+    coefficients = np.zeros(terms(max(order_of(len(shape.coefficients_mm)), 1)))
+    coefficients[: len(shape.coefficients_mm)] = shape.coefficients_mm
+    base = np.array([0.0 if shape.base_radius_mm is None else 1.0 / shape.base_radius_mm, shape.base_conic_constant])
+    radius = np.array(shape.radius_mm)
+    zone = shape.radius_mm if shape.zone_radius_mm is None else shape.zone_radius_mm
+    alone = ZernikeSurface(np.zeros(3), np.eye(3), base, radius, coefficients, _ANY, _FAR)
+    outer = outer_biconic(lambda y, z: alone.measured(y, z, False)[0], _ring(zone))
+    return ZernikeSurface(np.zeros(3), np.eye(3), base, radius, coefficients, outer, _window(zone))
+
+
+@lru_cache(maxsize=256)
+def grid_surface(shape: GridSpec) -> GridSurface:
+    """The bicubic surface of a grid of heights at the eye's origin."""
+    heights, spacing = np.array(shape.heights_mm).T, np.array(shape.spacing_mm)
+    half = 0.5 * (len(heights) - 1) * float(spacing)
+    zone = half / WINDOW[1] if shape.zone_radius_mm is None else shape.zone_radius_mm
+    origin, middle = np.zeros(3), np.zeros(2)
+
+    def on_biconic(outer: Floats, rest: Floats) -> GridSurface:
+        coefficients = spline_coefficients(rest)[None]
+        return GridSurface(origin, np.eye(3), outer, _window(zone), middle, spacing, np.array(0), coefficients)
+
+    # On a plane first (a biconic of no curvature), only to find the biconic.
+    flat = np.array([np.inf, np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    raw = on_biconic(flat, heights)
+    outer = outer_biconic(lambda y, z: raw.measured(y, z, False)[0], _ring(zone))
+    place = np.linspace(-half, half, len(heights))
+    y, z = np.meshgrid(place, place, indexing="ij")
+    biconic = raw.with_outer(outer)
+    base = biconic.outer_slopes(y, z)
+    # Beyond the reach of the biconic there is no rest; those nodes lie far beyond the window.
+    surface = on_biconic(outer, np.where(base.inside, heights - base.x, 0.0))
+    apex = surface.measured(np.zeros(1), np.zeros(1), False)[0][0]
+    return surface.with_outer(outer - apex * np.eye(8)[5])
+
+
+def _window(zone_mm: float) -> Floats:
+    return zone_mm * np.array(WINDOW)
+
+
+def _ring(zone_mm: float) -> tuple[float, float]:
+    return zone_mm * _FITTED[0], zone_mm * _FITTED[1]

@@ -1,0 +1,226 @@
+"""Surfaces that are graphs x = h(y, z) of their own frame: rays meet them by safeguarded Newton steps."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Bools, FloatLike, Floats
+from .surfaces import Hit, Surface, SymmetricMatrix, Xyz, fit, shift, turn, turn_back
+
+STEPS = 12
+SETTLED_MM = 1e-7
+"""Newton converges quadratically: an error of 1e-7 before the last step leaves less than 1e-14 after it."""
+_SEARCHED_MM = 4.0
+_SAMPLES = 41
+_HALVINGS = 30
+
+
+class Jet(NamedTuple):
+    """Height h over (y, z), its slopes and its second derivatives."""
+
+    x: Floats
+    y: Floats
+    z: Floats
+    yy: Floats
+    yz: Floats
+    zz: Floats
+
+
+class Slopes(NamedTuple):
+    """Height h over (y, z), its slopes, and whether the sheet reaches there."""
+
+    x: Floats
+    y: Floats
+    z: Floats
+    inside: Bools
+
+
+class GraphSurface(Surface):
+    """A surface x = h(y, z) of the local frame.
+
+    F = 2 (x - h(y, z)), so that the half gradient is (1, -dh/dy, -dh/dz), whose local x component is 1 everywhere: the
+    sheet is the whole graph.
+    """
+
+    __slots__ = ()
+
+    @property
+    @abstractmethod
+    def untilted(self) -> bool:
+        """Whether the local axes are those of the eye."""
+
+    @abstractmethod
+    def slopes(self, y: Floats, z: Floats) -> Slopes:
+        """Height and slopes over the local (y, z)."""
+
+    @abstractmethod
+    def jet(self, y: Floats, z: Floats) -> Jet:
+        """Height, slopes and second derivatives over the local (y, z)."""
+
+    @abstractmethod
+    def likeness(self) -> tuple[Floats, Floats]:
+        """Curvature and 1 + Q, (...,), of the conic from whose hit the search starts."""
+
+    def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
+        """Solve x - h(y, z) = 0 along the ray by Newton, from the hit on a conic that is like the surface.
+
+        Rays for which the steps do not settle are searched by bisection about that hit. The residual of every hit is
+        checked.
+        """
+        start = self.local_point(origin)
+        way = self.local_vector(direction)
+        shape = np.broadcast_shapes(*(a.shape for a in (*start, *way)))
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            guess, possible = self._conic_hit(start, way, len(shape), inward)
+            t, error = self._newton(start, way, guess, possible)
+            lost = possible & ~(np.abs(error) < SETTLED_MM)
+            if lost.any():
+                t, error = self._searched(start, way, guess, t, error, lost, inward)
+            sag = self.slopes(start[1] + t * way[1], start[2] + t * way[2])
+            crossing = way[0] - sag.y * way[1] - sag.z * way[2]
+            ok = possible & (np.abs(error) < SETTLED_MM) & sag.inside & np.isfinite(t)
+            ok &= crossing < 0.0 if inward else crossing > 0.0
+        point = (origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2])
+        return Hit(t, point, self.eye_vector((np.ones_like(sag.y), -sag.y, -sag.z)), ok)
+
+    def _conic_hit(self, start: Xyz, way: Xyz, ndim: int, inward: bool) -> tuple[Floats, Bools]:
+        """Distance to the conic of `likeness`, times its curvature: c (y^2 + z^2) + 2 x + c p x^2 = 0."""
+        (ox, oy, oz), (dx, dy, dz) = start, way
+        curvature, shape = (fit(value, ndim) for value in self.likeness())
+        gx = 1.0 + curvature * shape * ox
+        a = curvature * (1.0 + (shape - 1.0) * (dx * dx))
+        b = gx * dx + curvature * (oy * dy + oz * dz)
+        value = (gx + 1.0) * ox + curvature * (oy * oy + oz * oz)
+        square = b * b - a * value
+        root = np.sqrt(np.maximum(square, 0.0))
+        t = value / (root - b) if inward else value / (-root - b)
+        possible = np.asarray((square >= 0.0) & np.isfinite(t))
+        return np.where(possible, t, 0.0), possible
+
+    def _newton(self, start: Xyz, way: Xyz, guess: Floats, wanted: Bools) -> tuple[Floats, Floats]:
+        """Newton steps from `guess`: the distance, and the error before the last step."""
+        (ox, oy, oz), (dx, dy, dz) = start, way
+        t, error = guess, np.full_like(guess, np.inf)
+        for _ in range(STEPS):
+            sag = self.slopes(oy + t * dy, oz + t * dz)
+            error = ox + t * dx - sag.x
+            t = t - error / (dx - sag.y * dy - sag.z * dz)
+            if not np.max(np.abs(error), where=wanted & np.isfinite(error), initial=0.0) > SETTLED_MM:
+                break
+        return t, error
+
+    def _searched(
+        self, start: Xyz, way: Xyz, guess: Floats, t: Floats, error: Floats, lost: Bools, inward: bool
+    ) -> tuple[Floats, Floats]:
+        """Search `lost` rays: the first change of sign within some mm of the guess, halved, and Newton from there."""
+        rows = np.nonzero(lost) if lost.ndim else (np.zeros(1, dtype=np.intp),)
+        shape = lost.shape or (1,)
+        few = self.take(rows[0])
+        (ox, oy, oz), (dx, dy, dz) = (tuple(np.broadcast_to(a, shape)[rows] for a in vector) for vector in (start, way))
+        near = np.broadcast_to(guess, shape)[rows]
+
+        def side(s: Floats) -> Floats:
+            """Positive before the crossing that is sought, negative behind it; NaN where the sheet does not reach."""
+            value = ox + s * dx - few.local_sag(oy + s * dy, oz + s * dz)
+            return value if inward else -value
+
+        low, high = np.full(near.shape, np.nan), np.full(near.shape, np.nan)
+        before, value = near - _SEARCHED_MM, side(near - _SEARCHED_MM)
+        for k in range(1, _SAMPLES):
+            after = near - _SEARCHED_MM + 2.0 * _SEARCHED_MM * k / (_SAMPLES - 1)
+            there = side(after)
+            found = np.isnan(low) & (value > 0.0) & (there <= 0.0)
+            low, high = np.where(found, before, low), np.where(found, after, high)
+            before, value = after, there
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            behind = side(middle) <= 0.0
+            low, high = np.where(behind, low, middle), np.where(behind, middle, high)
+        better, left = few._newton((ox, oy, oz), (dx, dy, dz), 0.5 * (low + high), ~np.isnan(low))
+        t, error = np.array(np.broadcast_to(t, shape)), np.array(np.broadcast_to(error, shape))
+        t[rows], error[rows] = better, left
+        return t.reshape(lost.shape), error.reshape(lost.shape)
+
+    def value_at(self, point: Xyz) -> Floats:
+        """Implicit function F = 2 (x - h(y, z))."""
+        x, y, z = self.local_point(point)
+        return 2.0 * (x - self.slopes(y, z).x)
+
+    def gradient_at(self, point: Xyz) -> Xyz:
+        """Half gradient (1, -dh/dy, -dh/dz) of the local frame, rotated to the eye frame."""
+        _, y, z = self.local_point(point)
+        sag = self.slopes(y, z)
+        return self.eye_vector((np.ones_like(sag.y), -sag.y, -sag.z))
+
+    def hessian_at(self, point: Xyz) -> SymmetricMatrix:
+        """Derivative of the half gradient, H with dg = H dp."""
+        _, y, z = self.local_point(point)
+        sag = self.jet(y, z)
+        if self.untilted:
+            return SymmetricMatrix(0.0, -sag.yy, -sag.zz, 0.0, 0.0, -sag.yz)
+        r = [[fit(self.rotation[..., i, j], y.ndim) for j in range(3)] for i in range(3)]
+
+        def entry(i: int, j: int) -> Floats:
+            cross = r[i][1] * r[j][2] + r[i][2] * r[j][1]
+            return np.asarray(-(r[i][1] * r[j][1] * sag.yy + r[i][2] * r[j][2] * sag.zz + cross * sag.yz))
+
+        return SymmetricMatrix(entry(0, 0), entry(1, 1), entry(2, 2), entry(0, 1), entry(0, 2), entry(1, 2))
+
+    def local_sag(self, y: Floats, z: Floats) -> Floats:
+        """Height x of the sheet in the local frame over the local (y, z); NaN where it does not reach."""
+        sag = self.slopes(y, z)
+        return np.asarray(np.where(sag.inside, sag.x, np.nan))
+
+    def local_point(self, point: Xyz) -> Xyz:
+        """Transform points of the eye frame to the local frame."""
+        return self.local_vector(shift(point, self.origin_mm, -1.0))
+
+    def local_vector(self, vector: Xyz) -> Xyz:
+        """Turn directions of the eye frame to the local frame."""
+        return vector if self.untilted else turn_back(self.rotation, vector)
+
+    def eye_vector(self, vector: Xyz) -> Xyz:
+        """Turn directions of the local frame to the eye frame."""
+        return vector if self.untilted else turn(self.rotation, vector)
+
+
+def biconic_slopes(constants: tuple[FloatLike, ...], y: Floats, z: Floats) -> Slopes:
+    """Height and slopes of x = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - k_y y^2 - k_z z^2)).
+
+    Args:
+        constants: (c_y, c_z, k_y, k_z), c = 1/R and k = (1 + Q) c^2 in the meridians of y and z.
+        y: places.
+        z: places.
+    """
+    cy, cz, ky, kz = constants
+    y_square, z_square = y * y, z * z
+    square = 1.0 - ky * y_square - kz * z_square
+    inside = np.asarray(square > 0.0)
+    w = np.sqrt(np.where(inside, square, 1.0))
+    d = 1.0 / (1.0 + w)
+    x = -(cy * y_square + cz * z_square) * d
+    lever = x / w
+    return Slopes(x, -d * y * (2.0 * cy - ky * lever), -d * z * (2.0 * cz - kz * lever), inside)
+
+
+def biconic_jet(constants: tuple[FloatLike, ...], y: Floats, z: Floats) -> Jet:
+    """Height of `biconic_slopes` with its first and second derivatives.
+
+    With N = c_y y^2 + c_z z^2 and W the square root, x (1 + W) = -N is differentiated twice.
+    """
+    cy, cz, ky, kz = constants
+    square = 1.0 - ky * y * y - kz * z * z
+    w = np.sqrt(np.where(square > 0.0, square, 1.0))
+    d = 1.0 / (1.0 + w)
+    x = -(cy * y * y + cz * z * z) * d
+    wy, wz = -ky * y / w, -kz * z / w
+    xy = -d * (2.0 * cy * y + x * wy)
+    xz = -d * (2.0 * cz * z + x * wz)
+    wyy, wzz, wyz = -(ky + wy * wy) / w, -(kz + wz * wz) / w, -wy * wz / w
+    xyy = -d * (2.0 * cy + 2.0 * xy * wy + x * wyy)
+    xzz = -d * (2.0 * cz + 2.0 * xz * wz + x * wzz)
+    xyz = -d * (xy * wz + xz * wy + x * wyz)
+    return Jet(x, xy, xz, xyy, xyz, xzz)
