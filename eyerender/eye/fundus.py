@@ -1,0 +1,196 @@
+"""Light that the fundus returns through the pupil: bright near the lamp's own direction, dark elsewhere.
+
+A lamp sends a pencil of rays through each point q of the pupil. On the retina the pencil arrives at the direction
+
+    theta_L(q) = u_L + (F - V_L) q
+
+in object space, where u_L is the direction of the lamp, V_L = 1/d_L its vergence and F the vergence at which the eye
+is focused. The fundus spreads the light with a kernel K (1/sr) about that direction and returns a share rho of it. A
+camera that looks through the pupil's point p sees the direction theta_C(p), so the radiance in air is
+
+    L(p) = T_L T_C rho / (pi n'^2 f^2) * integral E(q) K(theta_C(p) - theta_L(q)) dA_q
+
+with E the irradiance of the stop, n' the index and f the nodal length of the eye, and T the transmittances of the
+cornea. The optics is paraxial about the camera's ray. The spread is a Gaussian core (aberrations and diffraction) and
+an exponential halo: choroid and retina carry infrared light sideways before it returns. What is left, after several
+reflections in the globe, is even.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import ArrayValue, Floats
+from .model import EyeModel
+
+EDGE = 1.25  # half width of the grid, in semi-axes of the stop; uneven margins reach beyond 1
+CELLS = 24
+# Optic disc in the visual field: 15.5 deg temporal of the line of sight and 1.5 deg below it; and its radius.
+_DISC_DEG, _DISC_RADIUS_DEG = (15.5, -1.5), 2.9
+# Delori and Pflibsen 1989, table I, at 805 nm: 10.37 % at the fovea, 11.27 % beside it, 12.52 % nasally.
+_FOVEA_SHARE, _FOVEA_DEG = 0.92, 2.5
+_NODES = 169  # points of the pupil
+_REACH = 12.0  # halo widths, beyond which a lamp returns less than a hundred-thousandth of its halo's peak
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FundusLight(ArrayValue):
+    """Return factors over the stop for each lamp.
+
+    Attributes:
+        factors: (m, CELLS, CELLS) radiance in air towards the camera per irradiance of the stop (1/sr), before the
+            transmittance of the cornea on the way out. Row and column are the coordinates along the second and the
+            first semi-axis of the stop, from -EDGE to EDGE in units of these, at the centres of the cells.
+    """
+
+    factors: Floats
+
+    def at(self, lamp: int, first: Floats, second: Floats) -> Floats:
+        """Interpolate the factor of a lamp at stop coordinates (...), bilinearly."""
+        table = self.factors[lamp]
+        x, y = (np.clip((np.asarray(c) / EDGE + 1) * CELLS / 2 - 0.5, 0, CELLS - 1 - 1e-9) for c in (first, second))
+        i, j = x.astype(int), y.astype(int)
+        s, t = x - i, y - j
+        low = (1 - s) * table[j, i] + s * table[j, i + 1]
+        high = (1 - s) * table[j + 1, i] + s * table[j + 1, i + 1]
+        return np.asarray((1 - t) * low + t * high)
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """How the fundus returns light.
+
+    Attributes:
+        reflectance: share of the light that returns, away from fovea and optic disc.
+        halo_share: share of that light in the halo.
+        halo_rad: distance at which the halo has fallen by e, in object space.
+        blur_rad: standard deviation of the core, in object space.
+        disc_gain: reflectance of the optic disc over that of the fundus beside it.
+    """
+
+    reflectance: float
+    halo_share: float
+    halo_rad: float
+    blur_rad: float
+    disc_gain: float
+
+
+def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: float, spread: Spread) -> FundusLight:
+    """Light of lamps that the fundus returns to a camera.
+
+    Args:
+        eye: the eye.
+        lamps_mm: (m, 3) places of the lamps in the eye frame.
+        camera_mm: (3,) place of the camera's pinhole in the eye frame.
+        focus_dpt: vergence of the place for which the eye is focused, 1 / distance in metres from the pupil; negative
+            for a hyperope who does not accommodate.
+        spread: how the fundus returns light.
+    """
+    centre, scale = entrance_pupil(eye)
+    lamps, camera = np.asarray(lamps_mm, float) - centre, np.asarray(camera_mm, float) - centre
+    axes = scale * eye.stop.rotation[:, 1:] * eye.stop.semi_axes_mm
+    out_of_pupil = camera / np.linalg.norm(camera)
+    e1 = np.cross([0.0, 0.0, 1.0], out_of_pupil)
+    e1 /= np.linalg.norm(e1)
+    plane = np.stack([e1, np.cross(out_of_pupil, e1)])
+
+    line = (np.arange(CELLS) + 0.5) * 2 * EDGE / CELLS - EDGE
+    first, second = np.meshgrid(line, line)
+    p = np.stack([first, second], -1) @ (plane @ axes).T  # mm
+    nodes, weight = _pupil_nodes(eye)
+    q = nodes @ (plane @ axes).T
+    cell_mm = np.sqrt(weight * scale**2)
+
+    theta_c = (focus_dpt - 1e3 / np.linalg.norm(camera)) * p * 1e-3
+    factors = np.zeros((len(lamps), CELLS, CELLS))
+    reach = max(_REACH * spread.halo_rad, 6 * spread.blur_rad) + np.abs(theta_c).max()
+    for k, lamp in enumerate(lamps):
+        distance = np.linalg.norm(lamp)
+        blur = focus_dpt - 1e3 / distance
+        aside = _direction(lamp / distance, out_of_pupil, plane)
+        if np.linalg.norm(aside) > reach + np.abs(blur * q).max() * 1e-3:
+            continue
+        theta_l = aside + blur * q * 1e-3
+        gap = np.linalg.norm(theta_c[..., None, :] - theta_l, axis=-1)
+        # The light of a node comes from all over its cell.
+        sigma = np.hypot(spread.blur_rad, abs(blur) * cell_mm * 1e-3 / np.sqrt(12))
+        core = np.exp(-0.5 * (gap / sigma) ** 2) / (2 * np.pi * sigma**2)
+        halo = np.exp(-gap / spread.halo_rad) / (2 * np.pi * spread.halo_rad**2)
+        kernel = (1 - spread.halo_share) * core + spread.halo_share * halo
+        factors[k] = kernel.sum(-1) * weight
+    f, index = nodal_length_mm(eye), _inner_index(eye)
+    rho = spread.reflectance * _relative_reflectance(eye, out_of_pupil, plane, theta_c, spread.disc_gain)
+    even = len(nodes) * weight * spread.reflectance / (1 - spread.reflectance) / _retina_area_mm2(eye)
+    return FundusLight(rho * (factors / f**2 + even) / (np.pi * index**2))
+
+
+def entrance_pupil(eye: EyeModel) -> tuple[Floats, float]:
+    """Centre (3,) mm and lateral magnification of the paraxial image of the stop, seen from air.
+
+    n / s - n' / s' = (n - n') / R at each surface, from the stop outwards; m = n s' / (n' s).
+    """
+    x, scale = float(eye.stop.centre_mm[0]), 1.0
+    indices = [1.0, *(float(n) for n in eye.front_indices)]
+    for k in range(len(eye.front) - 1, -1, -1):
+        surface, n, n_out = eye.front[k], indices[k + 1], indices[k]
+        apex = float(surface.origin_mm[0] + surface.rotation[0, 0] * surface.sag(0.0, 0.0))
+        h = 0.05
+        R = h**2 / float(2 * surface.sag(0.0, 0.0) - surface.sag(h, 0.0) - surface.sag(0.0, h))
+        depth = apex - x
+        out = n_out / (n / depth - (n - n_out) / R)
+        scale *= n * out / (n_out * depth)
+        x = apex - out
+    return np.array([x, *(scale * eye.stop.centre_mm[1:])]), scale
+
+
+def nodal_length_mm(eye: EyeModel) -> float:
+    """Distance from the eye's nodal points to the retina: that of the fovea from the incident node."""
+    return float(np.linalg.norm(eye.fovea_mm - eye.incident_node_mm))
+
+
+def _inner_index(eye: EyeModel) -> float:
+    return float((eye.back_indices or eye.front_indices)[-1])
+
+
+def _retina_area_mm2(eye: EyeModel) -> float:
+    """Area of the inside of the globe, that of the sclera's sphere less its wall of about 1 mm."""
+    return float(4 * np.pi * (float(eye.sclera.radius_mm) - 1.0) ** 2)
+
+
+def _pupil_nodes(eye: EyeModel) -> tuple[Floats, float]:
+    """Points (n, 2) of the stop in units of its semi-axes, and the area (mm^2) of the stop for which each stands."""
+    k = np.arange(_NODES)
+    radius, angle = np.sqrt((k + 0.5) / _NODES), k * np.pi * (3 - np.sqrt(5))  # Vogel's spiral, even by area
+    f = np.arange(360) * np.pi / 180
+    area = np.pi * float(np.prod(eye.stop.semi_axes_mm)) * float(np.mean(eye.stop.relative_radius(f) ** 2))
+    if eye.stop.contour.shape[-1]:
+        radius = radius * eye.stop.relative_radius(angle)
+    side = float(eye.stop.handed)
+    return np.stack([side * radius * np.cos(angle), radius * np.sin(angle)], -1), area / _NODES
+
+
+def _direction(way: Floats, axis: Floats, plane: Floats) -> Floats:
+    """Angle (2,) rad between a unit vector and an axis, along the axes of a plane across it."""
+    across = plane @ way
+    sine = np.linalg.norm(across)
+    return np.asarray(across * (np.arctan2(sine, way @ axis) / sine) if sine > 0 else across)
+
+
+def _relative_reflectance(eye: EyeModel, axis: Floats, plane: Floats, theta: Floats, disc_gain: float) -> Floats:
+    """Reflectance at directions `theta` from the camera's axis, over that of the fundus away from fovea and disc."""
+    way = axis + theta @ plane
+    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    sight = eye.chief_ray.direction
+    # Field angles from the line of sight, temporal and up. A right eye has +y nasal.
+    temporal = np.cross([0.0, 0.0, 1.0], sight) * (-1.0 if eye.side == "right" else 1.0)
+    temporal /= np.linalg.norm(temporal)
+    up = np.cross(sight, temporal) * (1.0 if eye.side == "left" else -1.0)
+    ahead = way @ sight
+    field = np.degrees(np.stack([np.arctan2(way @ temporal, ahead), np.arctan2(way @ up, ahead)], -1))
+    to_disc = np.linalg.norm(field - np.array(_DISC_DEG), axis=-1)
+    s = np.clip((_DISC_RADIUS_DEG + 0.4 - to_disc) / 0.8, 0, 1)
+    on_disc = s * s * (3 - 2 * s)
+    fovea = (1 - _FOVEA_SHARE) * np.exp(-0.5 * (np.linalg.norm(field, axis=-1) / _FOVEA_DEG) ** 2)
+    return np.asarray((1 - fovea) * (1 + (disc_gain - 1) * on_disc))
