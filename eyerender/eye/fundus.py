@@ -10,10 +10,10 @@ camera that looks through the pupil's point p sees the direction theta_C(p), so 
 
     L(p) = T_L T_C rho / (pi n'^2 f^2) * integral E(q) K(theta_C(p) - theta_L(q)) dA_q
 
-with E the irradiance of the stop, n' the index and f the nodal length of the eye, and T the transmittances of the
-cornea. The optics is paraxial about the camera's ray. The spread is a Gaussian core (aberrations and diffraction) and
-an exponential halo: choroid and retina carry infrared light sideways before it returns. What is left, after several
-reflections in the globe, is even.
+with E the irradiance of the stop, n' the index of the vitreous, f the height on the retina per angle in air, and T the
+transmittances of the cornea. The optics is paraxial about the camera's ray. The spread is a Gaussian core (aberrations
+and diffraction) and an exponential halo: choroid and retina carry infrared light sideways before it returns. What is
+left, after several reflections in the globe, is even.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: 
         halo = np.exp(-gap / spread.halo_rad) / (2 * np.pi * spread.halo_rad**2)
         kernel = (1 - spread.halo_share) * core + spread.halo_share * halo
         factors[k] = kernel.sum(-1) * weight
-    f, index = nodal_length_mm(eye), _inner_index(eye)
+    f, index = retinal_scale_mm(eye), _inner_index(eye)
     rho = spread.reflectance * _relative_reflectance(eye, out_of_pupil, plane, theta_c, spread.disc_gain)
     even = len(nodes) * weight * spread.reflectance / (1 - spread.reflectance) / _retina_area_mm2(eye)
     return FundusLight(rho * (factors / f**2 + even) / (np.pi * index**2))
@@ -145,9 +145,16 @@ def entrance_pupil(eye: EyeModel) -> tuple[Floats, float]:
     return np.array([x, *(scale * eye.stop.centre_mm[1:])]), scale
 
 
-def nodal_length_mm(eye: EyeModel) -> float:
-    """Distance from the eye's nodal points to the retina: that of the fovea from the incident node."""
-    return float(np.linalg.norm(eye.fovea_mm - eye.incident_node_mm))
+def retinal_scale_mm(eye: EyeModel) -> float:
+    """Height on the retina per angle (rad) in air about the entrance pupil, mm.
+
+    Without a lens it is D w / u, with D the distance of the stop from the fovea, and u = n w / m by Lagrange's
+    invariant. An eye with a lens is nearly in focus; then it is the distance of the nodes from the fovea.
+    """
+    if eye.back:
+        return float(np.linalg.norm(eye.fovea_mm - eye.incident_node_mm))
+    depth = float(np.linalg.norm(eye.fovea_mm - eye.stop.centre_mm))
+    return depth * entrance_pupil(eye)[1] / float(eye.front_indices[-1])
 
 
 def _inner_index(eye: EyeModel) -> float:
