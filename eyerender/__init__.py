@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from .rig.sensor import Sensor
     from .scene import Frame, Frames, Scene, load_scene, shipped_scenes
     from .scene.observer import Observer
+    from .scene.people import Population
     from .scene.spec import Eye, EyeDirection, Picture, SceneSpec, Targets
     from .scene.subject import Subject
     from .status import Status
@@ -90,6 +91,7 @@ _HOMES = {
     "Panel": "rig.imaging",
     "Picture": "scene.spec",
     "PinholeCamera": "rig.camera",
+    "Population": "scene.people",
     "PupilMargin": "eye.margin",
     "RadianceMap": "rig.imaging",
     "Region": "region.anatomy",
@@ -167,6 +169,7 @@ __all__ = [
     "Panel",
     "Picture",
     "PinholeCamera",
+    "Population",
     "PupilMargin",
     "RadianceMap",
     "Region",

@@ -147,7 +147,7 @@ def render_folder(
                 "labels": seen_labels(image, truth),
                 "parameters": {
                     "eye_model": scene.eye_spec.name,
-                    "pupil_diameter_mm": scene.pupil_diameter_mm,
+                    "pupil_diameter_mm": scene.stop_diameter_mm(records[image.row]["eye"]),
                     "wavelength_nm": spec.wavelength_nm,
                     "spp": spec.image.spp,
                     "seed": spec.seed,

@@ -44,7 +44,7 @@ def image_line(
         "labels": labels,
         "parameters": {
             "eye_model": scene.eye_spec.name,
-            "pupil_diameter_mm": scene.pupil_diameter_mm,
+            "pupil_diameter_mm": scene.stop_diameter_mm(side),
             "wavelength_nm": scene.spec.wavelength_nm,
             "spp": scene.spec.image.spp,
             "seed": scene.spec.seed,

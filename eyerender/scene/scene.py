@@ -6,6 +6,7 @@ Frames are ordered by head position, then fixation, then camera; within a frame 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -27,6 +28,8 @@ from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
 from ..observation import EYES, Index, PoseTruth
 from ..plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
+from ..population.model import SIDES
+from ..population.people import Person
 from ..region.anatomy import Region
 from ..rig.camera import Window
 from ..rig.imaging import Ambient
@@ -104,7 +107,8 @@ class Scene:
 
     Attributes:
         spec: what a scene file says.
-        eye_spec: what the eye file says.
+        eye_spec: what the eye file says; of a drawn person the right eye's.
+        left_eye_spec: the left eye's, written as a right eye; the same object where it is the mirror image.
         rig: the numeric rig.
         base: what files of its pictures (an HDR map, a head mesh) are relative to, by default the current folder.
         source: what messages call the scene's file.
@@ -112,6 +116,7 @@ class Scene:
 
     spec: SceneSpec
     eye_spec: EyeSpec
+    left_eye_spec: EyeSpec
     rig: RigGeometry
     base: Path | None = field(compare=False)
     source: str = field(compare=False)
@@ -133,12 +138,8 @@ class Scene:
         """
         given = {key: value for key, value in {"subject": subject, "rig": rig, **fields}.items() if value is not None}
         made = Scene.of(SceneSpec(name=name, **given))
-        self._set(made.spec, made.eye_spec, made.rig, made.base, made.source)
-
-    def _set(self, spec: SceneSpec, eye_spec: EyeSpec, rig: RigGeometry, base: Path | None, source: str) -> None:
-        parts = {"spec": spec, "eye_spec": eye_spec, "rig": rig, "base": base, "source": source}
-        for key, value in parts.items():
-            object.__setattr__(self, key, value)
+        for name in made.__slots__:
+            object.__setattr__(self, name, getattr(made, name))
 
     @classmethod
     def compiled(
@@ -152,12 +153,18 @@ class Scene:
     ) -> Scene:
         """A scene of parts that are known to fit; without a `rig`, that of the spec.
 
-        The numbers of calibration files become part of the spec.
+        The numbers of calibration files become part of the spec. A drawn person has its own eyes instead of `eye_spec`.
+
+        Raises:
+            InputError: an eye of the person cannot exist.
         """
-        scene = object.__new__(cls)
         if (authored := spec.rig.resolved(base)) is not spec.rig:
             spec = spec.model_copy(update={"rig": authored})
-        scene._set(spec, eye_spec, spec.rig.build() if rig is None else rig, base, source)
+        built = spec.rig.build() if rig is None else rig
+        eyes = (eye_spec, eye_spec) if spec.person is None else _eyes_of(spec, spec.person, built)
+        scene = object.__new__(cls)
+        for name, value in zip(cls.__slots__, (spec, *eyes, built, base, source), strict=True):
+            object.__setattr__(scene, name, value)
         return scene
 
     def replaced(
@@ -186,14 +193,15 @@ class Scene:
             InputError: an eye is not possible or, where a `base` is given, a file does not exist.
         """
         if eye is not None:
-            spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": eye})})
+            spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": eye}), "person": None})
         eye_spec = spec.eye.spec(base if eye is None else None)
         return cls.compiled(spec, eye_spec, base=base, source=source)._checked()
 
     def _checked(self) -> Scene:
         """The scene itself, whose eye can be built and whose files exist."""
         try:
-            self.eye("right")
+            for side in EYES if self.spec.person is not None else EYES[:1]:
+                self.eye(side)
             for file in self.files if self.base is not None else ():
                 if not os.path.isfile(file):
                     raise InputError("no such file", source=str(file))
@@ -225,7 +233,10 @@ class Scene:
         Raises:
             InputError: a value does not fit, or an eye that cannot be.
         """
-        data = {**self.spec.to_mapping(), **fields}
+        data = self.spec.to_mapping()
+        if any(path.partition(".")[0] == "population" for path in (*fields, *(changes or {}))):
+            data = _without_person(data)
+        data |= fields
         if gaze_deg is not None or target_mm is not None:
             data["targets"] = data["poses"] = None
         if gaze_deg is not None:
@@ -251,8 +262,19 @@ class Scene:
 
     @property
     def pupil_diameter_mm(self) -> float:
-        """Diameter of the anatomical pupil: the scene's, or the eye's own."""
-        return float(2 * self.eye("right").stop.semi_axes_mm[0])
+        """Diameter of the anatomical pupil: the scene's, or the (right) eye's own."""
+        return self.stop_diameter_mm("right")
+
+    def stop_diameter_mm(self, side: str) -> float:
+        """Diameter of the anatomical pupil of one eye, which differs between the eyes of a drawn person."""
+        if self.spec.person is None:
+            return float(2 * self.eye("right").stop.semi_axes_mm[0])
+        given = self.spec.eye.pupil_diameter_mm
+        return self.eye_file(side).stop.diameter_mm if given is None else given
+
+    def eye_file(self, side: str) -> EyeSpec:
+        """Eye file of one side, written as a right eye."""
+        return self.left_eye_spec if side == "left" else self.eye_spec
 
     def warnings(self) -> list[InputWarning]:
         """Probable mistakes in the scene: a pupil of 0.4 mm, lengths in metres, a lamp in the head, ...
@@ -291,7 +313,8 @@ class Scene:
 
     def digest(self) -> str:
         """SHA-256 of everything on which the scene's images depend, including the content of the eye file."""
-        parts = [self.spec.digest(), self.eye_spec.digest(), *(file_digest(file) for file in self.files)]
+        eyes = {id(eye): eye.digest() for eye in (self.eye_spec, self.left_eye_spec)}
+        parts = [self.spec.digest(), *eyes.values(), *(file_digest(file) for file in self.files)]
         return hashlib.sha256("".join(parts).encode()).hexdigest()
 
     @property
@@ -329,7 +352,7 @@ class Scene:
     def eye(self, side: Literal["right", "left"] | str) -> EyeModel:
         """Numeric eye of one side at the scene's wavelength, with the scene's pupil size and margin."""
         eye = self.spec.eye
-        same = _Same(self.eye_spec)
+        same = _Same(self.eye_file(side))
         return _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
 
     def eye_position_mm(self, side: str) -> Floats:
@@ -339,16 +362,7 @@ class Scene:
     @property
     def targets_mm(self) -> Floats | None:
         """Targets (f, 3) in the world, in fixation order; None where the scene gives poses."""
-        targets, screen = self.spec.targets, self.rig.screen
-        if targets is None:
-            return None
-        if targets.world_mm is not None:
-            return np.array(targets.world_mm, dtype=float)
-        if screen is None:
-            raise InputError("targets on a screen need rig.screen")
-        if targets.grid is not None:
-            return screen.grid(*targets.grid)
-        return screen.world(np.array(targets.screen_mm, dtype=float))
+        return targets_of(self.spec, self.rig)
 
     def index(self) -> Index:
         """Index of all (frame, eye) of the scene, in order; n rows."""
@@ -485,6 +499,63 @@ def _put(data: dict[str, Any], path: str, value: Any) -> None:
         here[int(keys[-1]) if isinstance(here, list) else keys[-1]] = value
     except (AttributeError, IndexError, TypeError, ValueError):
         raise InputError("there is no such key", path=path) from None
+
+
+def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
+    """Accommodation that a scene asks of a drawn person: its own value, or the mean vergence of its targets (D).
+
+    The vergence of a target is 1 / its distance from the point midway between the eyes, at the first head position.
+    """
+    if spec.subject.accommodation_d is not None:
+        return spec.subject.accommodation_d
+    if targets_mm is None:
+        return 0.0
+    distance = np.linalg.norm(targets_mm - np.array(spec.subject.head_positions_mm[0]), axis=-1)
+    return float(np.mean(1000.0 / np.maximum(distance, 1.0)))
+
+
+def targets_of(spec: SceneSpec, rig: RigGeometry) -> Floats | None:
+    """Targets (f, 3) in the world, in fixation order; None where the scene gives poses."""
+    targets, screen = spec.targets, rig.screen
+    if targets is None:
+        return None
+    if targets.world_mm is not None:
+        return np.array(targets.world_mm, dtype=float)
+    if screen is None:
+        raise InputError("targets on a screen need rig.screen")
+    if targets.grid is not None:
+        return screen.grid(*targets.grid)
+    return screen.world(np.array(targets.screen_mm, dtype=float))
+
+
+def _eyes_of(spec: SceneSpec, person: Person, rig: RigGeometry) -> tuple[EyeSpec, EyeSpec]:
+    """Right and left eye of a person in the light and at the distance of a scene."""
+    subject = spec.subject
+    state = (subject.luminance_cd_m2, subject.field_deg, demand_d(spec, targets_of(spec, rig)))
+    try:
+        return _drawn_eyes(person.to_json(), *state)
+    except InputError as error:
+        raise error.placed(under="person") from None
+
+
+@lru_cache(maxsize=64)
+def _drawn_eyes(
+    person: str, luminance_cd_m2: float | None, field_deg: float | None, demand: float
+) -> tuple[EyeSpec, EyeSpec]:
+    """Eyes of a person from its JSON, cached because making them takes longer than everything else of a scene."""
+    who = Person.from_mapping(json.loads(person))
+    right, left = (
+        who.eye(side, luminance_cd_m2=luminance_cd_m2, field_deg=field_deg, demand_d=demand) for side in SIDES
+    )
+    return right, left
+
+
+def _without_person(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A scene's mapping without its person and what it may have brought."""
+    rest = {key: value for key, value in data.items() if key not in ("person", "look", "region")}
+    rest["eye"] = {key: value for key, value in data["eye"].items() if key != "model"}
+    rest["subject"] = {key: value for key, value in data["subject"].items() if key != "ipd_mm"}
+    return rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,6 +17,7 @@ from ..eye.model import EyeModel
 from ..eye.parts import Side
 from ..eye.spec import EyeSpec
 from ..observation import MAX_GLINTS
+from ..population.people import Person, PersonChoice
 from ..region.anatomy import Region
 from ..region.look import Look
 from ..rig.imaging import Ambient, Lens, Motion
@@ -97,6 +98,17 @@ class SubjectSpec(Spec):
     head_positions_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] = Field(
         default=((0.0, 0.0, 0.0),), description="displacements of the head in the world; each has frames of its own"
     )
+    luminance_cd_m2: Positive | None = Field(
+        default=None, description="luminance of what a drawn person sees, which sets the pupil; default: 20"
+    )
+    field_deg: Annotated[float, Field(gt=0, le=180)] | None = Field(
+        default=None, description="diameter of the lit field of a drawn person; default: 60"
+    )
+    accommodation_d: Annotated[float, Field(ge=0, le=20)] | None = Field(
+        default=None,
+        description="dioptres to which a drawn person is asked to accommodate; default: the mean vergence of the "
+        "targets, 0 with poses",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -164,6 +176,10 @@ NOT_A_DATASET = (
 )
 
 
+LIFTED = ("eye", "person", "look", "region")
+"""Keys of a scene that a subject in Python code may bring."""
+
+
 class SceneSpec(FileSpec):
     """A scene file."""
 
@@ -171,6 +187,14 @@ class SceneSpec(FileSpec):
     description: str = Field(default="", description="what the scene is for, in a sentence")
     eye: Eye = Field(default=Eye(), description="the eye model and its settings")
     subject: SubjectSpec = Field(default=SubjectSpec(), description="eyes, their distance and the head's positions")
+    population: PersonChoice | None = Field(
+        default=None,
+        description="a subject drawn from a population, in place of `eye.model`; it becomes `person`, and gives "
+        "`look`, `region` and `subject.ipd_mm` where the scene does not",
+    )
+    person: Person | None = Field(
+        default=None, description="a person as drawn, whose eyes replace `eye.model`; written by `population`"
+    )
     rig: Rig = Field(description="cameras, lights and screen")
     targets: Targets | None = Field(default=None, description="what the eyes fixate; give this or `poses`")
     poses: Annotated[tuple[EyeDirection, ...], Field(min_length=1)] | None = Field(
@@ -205,13 +229,15 @@ class SceneSpec(FileSpec):
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The mapping with the subject's eye under the scene's own key."""
+        """The mapping with what its subject or its population says under the scene's own keys."""
         subject = data.get("subject")
-        if not isinstance(subject, Spec) or "eye" not in (rest := subject.to_mapping()):
-            return data
-        if "eye" in data:
-            raise InputError("is given twice, for the scene and for its subject", path="eye")
-        return {**data, "eye": rest.pop("eye"), "subject": rest}
+        if isinstance(subject, Spec):
+            rest = subject.to_mapping()
+            lifted = {key: rest.pop(key) for key in LIFTED if key in rest}
+            if "eye" in lifted and "eye" in data:
+                raise InputError("is given twice, for the scene and for its subject", path="eye")
+            data = {**lifted, **data, "subject": rest}
+        return data if data.get("population") is None else _peopled(data)
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
@@ -255,3 +281,41 @@ class SceneSpec(FileSpec):
             InputError: naming the option --spp.
         """
         return self.replaced("--spp", {"image": {**self.to_mapping()["image"], "spp": spp}})
+
+
+def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A scene's mapping with the person of its population; what the scene itself says stays."""
+    eye = data.get("eye")
+    if isinstance(eye, Spec) or (isinstance(eye, Mapping) and "model" in eye):
+        raise InputError("cannot stand beside a population, which gives the eyes", path="eye.model")
+    if data.get("person") is not None:
+        raise InputError("cannot stand beside a population, which gives the person", path="person")
+    given = data["population"]
+    try:
+        choice = PersonChoice.from_mapping(given.to_mapping() if isinstance(given, Spec) else given)
+        person = choice.chosen()
+    except InputError as error:
+        raise error.placed(under="population") from None
+    return with_person({key: value for key, value in data.items() if key != "population"}, person)
+
+
+def with_person(data: Mapping[str, Any], person: Person) -> dict[str, Any]:
+    """A scene's mapping with a person, whose distance of the pupils, look and region hold where the scene has none."""
+    subject = data.get("subject") or {}
+    subject = subject.to_mapping() if isinstance(subject, Spec) else subject
+    out = {**data, "person": person.to_mapping(), "subject": {"ipd_mm": person.ipd_mm, **subject}}
+    for key, own in (("look", person.look()), ("region", person.region())):
+        given = data.get(key, {})
+        given = given.to_mapping() if isinstance(given, Spec) else given
+        if isinstance(given, Mapping) and not (key == "region" and given.get("head") is not None):
+            out[key] = _merged(own.to_mapping(), given)
+    return out
+
+
+def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in over.items():
+        value = value.to_mapping() if isinstance(value, Spec) else value
+        inner = out.get(key)
+        out[key] = _merged(inner, value) if isinstance(inner, Mapping) and isinstance(value, Mapping) else value
+    return out

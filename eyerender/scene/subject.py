@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from ..population.people import Person
+from ..region.anatomy import Region
+from ..region.look import Look
 from ..rig.rig import Rig
 from .scene import Frames, Scene
 from .spec import Eye, EyeDirection, SubjectSpec, Targets
@@ -21,6 +24,20 @@ class Subject(SubjectSpec):
         def __init__(self, eye: Any = None, **fields: Any) -> None: ...
 
     eye: Eye = Field(default=Eye(), description="the eye model and its settings")
+    person: Person | None = Field(default=None, description="a drawn person, whose eyes replace the eye model")
+    look: Look | None = Field(default=None, description="albedos and textures of the eye; default: the scene's")
+    region: Region | None = Field(default=None, description="lids, lashes, brow and skin; default: the scene's")
+
+    @classmethod
+    def of(cls, person: Person, **fields: Any) -> Self:
+        """The subject that a drawn person is.
+
+        Args:
+            person: the person.
+            fields: further fields, such as `eyes` or `luminance_cd_m2`.
+        """
+        own = {"ipd_mm": person.ipd_mm, "look": person.look(), "region": person.region()}
+        return cls(person=person, **{**own, **fields})
 
     def fixating(self, targets_mm: ArrayLike, rig: Rig, **scene: Any) -> Frames:
         """The frames in which the subject fixates targets, one after the other.

@@ -169,7 +169,7 @@ class SceneTruth:
             "records": list(found.take([row]).records(version_of(record))),
             "parameters": {
                 "eye_model": scene.eye_spec.name,
-                "pupil_diameter_mm": scene.pupil_diameter_mm,
+                "pupil_diameter_mm": scene.stop_diameter_mm(record["eye"]),
                 "wavelength_nm": scene.spec.wavelength_nm,
                 "spp": scene.spec.image.spp,
                 "seed": scene.spec.seed,

@@ -1,0 +1,80 @@
+"""The entrance pupil: the image of the stop that the cornea shows to a distant observer on the optic axis.
+
+Rays from the margin's points leave the cornea parallel to the axis. Their feet (y, z) outline the entrance pupil, whose
+diameter is that of the circle of equal area. With the outline's Fourier series y + i z = sum_m c_m exp(i m f) in the
+margin's parameter f, its area is pi |sum_m m |c_m|^2|, which is exact for an ellipse and converges with the number of
+points faster than any power.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.surfaces import Surface
+from ..optics.solve import apparent_points
+from ..status import Status
+from .model import EyeModel, Stop
+
+FAR_MM = 1e6
+"""Distance of the observer. From there, the entrance pupil is 3e-6 of its size larger than from infinity."""
+POINTS = 32
+_STEPS = 12
+_SETTLED_MM = 1e-10
+
+
+def entrance_pupil_mm(eye: EyeModel, *, points: int = POINTS) -> float:
+    """Diameter of the entrance pupil of a single eye, for the circle of equal area.
+
+    Raises:
+        InputError: a ray from the margin does not leave the eye.
+    """
+    return _diameter(eye.front, tuple(float(n) for n in eye.front_indices), eye.stop, points)
+
+
+def stop_for_entrance(
+    front: tuple[Surface, ...],
+    indices: tuple[float, ...],
+    stop_of: Callable[[float], Stop],
+    entrance_mm: float,
+    *,
+    points: int = POINTS,
+) -> float:
+    """Diameter of the stop that has an entrance pupil of `entrance_mm`.
+
+    Args:
+        front: refracting surfaces before the stop, outside in.
+        indices: index behind each.
+        stop_of: stop of a diameter; its place and shape may depend on the diameter.
+        entrance_mm: wanted diameter of the entrance pupil.
+        points: number of points of the margin.
+
+    Raises:
+        InputError: the search does not end, or a ray does not leave the eye.
+    """
+
+    def miss(diameter: float) -> float:
+        return _diameter(front, indices, stop_of(diameter), points) - entrance_mm
+
+    low, high = entrance_mm / 1.2, entrance_mm / 1.12
+    f_low, f_high = miss(low), miss(high)
+    for _ in range(_STEPS):
+        if abs(f_high) < _SETTLED_MM:
+            return high
+        low, f_low, high = high, f_high, high - f_high * (high - low) / (f_high - f_low)
+        f_high = miss(high)
+    if abs(f_high) < 1e-8:
+        return high
+    raise InputError(f"no stop has an entrance pupil of {entrance_mm:g} mm", path="stop.diameter_mm")
+
+
+def _diameter(front: tuple[Surface, ...], indices: tuple[float, ...], stop: Stop, points: int) -> float:
+    found = apparent_points(front, indices, stop.boundary(points), np.array([FAR_MM, 0.0, 0.0]))
+    if (found.status != Status.OK).any():
+        raise InputError("a ray from the margin does not leave the eye", path="stop.diameter_mm")
+    exits = found.exit_points_mm
+    series = np.fft.fft(exits[:, 1] + 1j * exits[:, 2]) / points
+    order = np.fft.fftfreq(points, 1.0 / points)
+    return float(2.0 * np.sqrt(abs(np.sum(order * np.abs(series) ** 2))))

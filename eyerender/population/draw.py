@@ -1,0 +1,201 @@
+"""Drawing people: pure functions of (population, seed, subject).
+
+The latent numbers of subject k at attempt a are the outputs k w, k w + 1, ... of the counter-based generator Philox
+(Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3", SC11) whose key is (seed, a). Matrix products are
+sums in one order for each person, which those of BLAS are not. So a subject depends neither on how many are drawn nor
+on the pieces in which they are drawn.
+
+Conditions. An exact value of a predictor or of another quantity with a marginal of its own fixes its latent number, and
+the others follow by Gaussian conditioning. An exact value of a regression's quantity fixes a latent number that depends
+on the predictors: these are drawn first, and accepted with the probability
+
+    exp(-(c - m)^T V^-1 (c - m) / 2),
+
+c the latent numbers that the values require, m and V their conditional mean and covariance given the latent numbers of
+the predictors; then the others follow as above. A range of a quantity that is independent of all others truncates its
+latent number. Any other range is met by drawing again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+
+from ..arrays import Bools, Floats, Indices
+from ..errors import InputError
+from .marginals import Share, Uniform, truncated
+from .model import Model
+from .table import ROOTS, Distribution, Regression
+
+Condition = float | tuple[float, float]
+ATTEMPTS = 2000
+"""So often a subject is drawn until it meets the conditions."""
+_FEW = 32
+_TAG = 0x9E0
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions, sorted by how they are met.
+
+    Attributes:
+        exact: quantities with a regression -> value.
+        ranges: quantity -> low and high.
+        cut: latent column -> ends of the truncated latent number.
+        fixed: (f,) latent numbers of `columns`.
+        columns: (f,) their columns.
+        carry: (f, w) change of all latent numbers per change of those.
+        mean: (r, e) conditional mean of the latent numbers of `exact`, of those of `given`.
+        given: (r,) columns of the predictors and of fixed numbers.
+        fitted: (e,) columns of `exact`.
+        precision: (e, e) inverse V^-1.
+        follow: (e, w) change of all latent numbers per change of those of `exact`.
+    """
+
+    exact: Mapping[str, float]
+    ranges: Mapping[str, tuple[float, float]]
+    cut: Mapping[int, tuple[float, float]]
+    fixed: Floats
+    columns: list[int]
+    carry: Floats
+    mean: Floats
+    given: list[int]
+    fitted: list[int]
+    precision: Floats
+    follow: Floats
+
+    @classmethod
+    def of(cls, model: Model, where: Mapping[str, Condition]) -> Conditions:
+        """Sort conditions.
+
+        Raises:
+            InputError: there is no such quantity, or it never has that value.
+        """
+        fixed: dict[int, float] = {}
+        exact: dict[str, float] = {}
+        ranges: dict[str, tuple[float, float]] = {}
+        cut: dict[int, tuple[float, float]] = {}
+        for name, wanted in where.items():
+            found, places = model.distributions[name], model.places(name)
+            if isinstance(found, Regression):
+                if isinstance(wanted, int | float):
+                    exact[name] = float(wanted)
+                else:
+                    ranges[name] = _range(name, wanted)
+                continue
+            if isinstance(found, Share) or not isinstance(wanted, int | float):
+                ends = _ends(name, found, wanted)
+                alone = all(np.count_nonzero(model.reference.latent[p]) == 1 for p in places)
+                if alone:
+                    cut |= dict.fromkeys(places, ends)
+                else:
+                    assert not isinstance(wanted, int | float)
+                    ranges[name] = _range(name, wanted)
+            else:
+                z = float(found.latent(np.array(float(wanted))))
+                if not np.isfinite(z) or abs(float(found.at(np.array(z))) - wanted) > 1e-6 * (1 + abs(wanted)):
+                    raise InputError(f"nobody in this population has the value {wanted:g}", path=name)
+                fixed |= dict.fromkeys(places, z)
+        cov = model.reference.latent
+        columns = list(fixed)
+        given = sorted({p for root in ROOTS for p in model.places(root)} | set(columns))
+        fitted = [p for name in exact for p in model.places(name)]
+        weight = np.linalg.solve(cov[np.ix_(given, given)], cov[given])
+        rest = cov - cov[:, given] @ weight
+        precision = np.linalg.inv(rest[np.ix_(fitted, fitted)])
+        return cls(
+            exact=exact,
+            ranges=ranges,
+            cut=cut,
+            fixed=np.array([fixed[c] for c in columns]),
+            columns=columns,
+            carry=np.asarray(np.linalg.solve(cov[np.ix_(columns, columns)], cov[columns]), dtype=np.float64),
+            mean=np.asarray(weight[:, fitted], dtype=np.float64),
+            given=given,
+            fitted=fitted,
+            precision=np.asarray(precision, dtype=np.float64),
+            follow=precision @ rest[fitted],
+        )
+
+
+def latent_numbers(model: Model, conditions: Conditions, seed: int, first: int, count: int) -> Floats:
+    """Latent numbers (count, width) of subjects `first` and following that meet the conditions.
+
+    Raises:
+        InputError: hardly anybody meets them.
+    """
+    out = np.empty((count, model.width))
+    left: Indices = np.arange(count)
+    for attempt in range(ATTEMPTS):
+        stream = (_TAG << 32) + attempt
+        if len(left) > _FEW:
+            u = uniform_numbers(seed, stream, first, count, model.width + 1)[left]
+        else:
+            u = np.concatenate([uniform_numbers(seed, stream, first + int(k), 1, model.width + 1) for k in left])
+        z, good = _conditioned(model, conditions, _times(ndtri(u[:, :-1]), model.factor.T), u[:, -1])
+        out[left[good]] = z[good]
+        left = left[~good]
+        if not len(left):
+            return out
+    raise InputError(f"less than one person in {ATTEMPTS} meets the conditions", path="where")
+
+
+def uniform_numbers(seed: int, stream: int, first: int, count: int, width: int) -> Floats:
+    """Numbers in (0, 1), (count, width), of items `first` and following; a pure function of (seed, stream, item)."""
+    padded = -(-width // 4) * 4
+    generator = np.random.Philox(key=np.array([seed, stream], dtype=np.uint64))
+    generator.advance(first * (padded // 4))
+    raw = generator.random_raw(count * padded).reshape(count, padded)[:, :width]
+    return np.asarray(((raw >> np.uint64(11)) + 0.5) * 2.0**-53)
+
+
+def _conditioned(model: Model, conditions: Conditions, z: Floats, u: Floats) -> tuple[Floats, Bools]:
+    """Latent numbers with the exact conditions, and whether each subject is accepted."""
+    good = np.ones(len(z), dtype=bool)
+    for column, (low, high) in conditions.cut.items():
+        z[:, column] = truncated(z[:, column], low, high)
+    if conditions.columns:
+        z = z + _times(conditions.fixed - z[:, conditions.columns], conditions.carry)
+    if conditions.exact:
+        required = np.column_stack([model.required(name, value, z) for name, value in conditions.exact.items()])
+        gap = required - _times(z[:, conditions.given], conditions.mean)
+        good &= u < np.exp(-0.5 * np.sum(gap * _times(gap, conditions.precision), axis=1))
+        z = z + _times(required - z[:, conditions.fitted], conditions.follow)
+    for name, (low, high) in conditions.ranges.items():
+        value = model.value(name, z).reshape(len(z), -1)
+        good &= ((value >= low) & (value <= high)).all(axis=1)
+    return z, good
+
+
+def _times(rows: Floats, matrix: Floats) -> Floats:
+    """Matrix product whose sums run in one order, whatever the number of rows."""
+    return np.asarray(np.einsum("ij,jk->ik", rows, np.ascontiguousarray(matrix)))
+
+
+def _range(name: str, wanted: tuple[float, float] | float) -> tuple[float, float]:
+    assert not isinstance(wanted, int | float)
+    low, high = wanted
+    if not low < high:
+        raise InputError("the first number must be below the second", path=name)
+    return low, high
+
+
+def _ends(name: str, found: Distribution, wanted: Condition) -> tuple[float, float]:
+    """Ends of the latent number of a quantity with a marginal."""
+    assert not isinstance(found, Regression)
+    if isinstance(found, Share):
+        number = float(found.latent(np.array(wanted))) if isinstance(wanted, int | float) else np.nan
+        if not np.isfinite(number):
+            raise InputError("must be 0 or 1, and somebody must have it", path=name)
+        edge = float(ndtri(1.0 - found.share))
+        return (edge, np.inf) if wanted == 1 else (-np.inf, edge)
+    span = _range(name, wanted)
+    low, high = (float(v) for v in found.latent(np.array(span)))
+    if isinstance(found, Uniform):
+        low, high = -np.inf if span[0] <= found.low else low, np.inf if span[1] >= found.high else high
+    if not low < high:
+        raise InputError("nobody in this population lies in the range", path=name)
+    return low, high

@@ -1,0 +1,190 @@
+"""From the numbers of a drawn eye to its eye file, at one accommodation and with one entrance pupil."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..eye.build import index_at, stop_of, surface_of
+from ..eye.entrance import stop_for_entrance
+from ..eye.margin import drawn_contour
+from ..eye.parts import EyeParts
+from ..eye.spec import EyeSpec
+from .pupil import ellipticity
+from .refraction import AQUEOUS, CORNEA, LENS, VITREOUS
+from .table import Table
+
+LENS_MM_PER_D, LENS_MM_PER_D_YEAR = 0.058, -0.0005
+FRONT_PER_D, BACK_PER_D = 0.0077, 0.0043
+FRONT_Q_PER_D = -0.5
+"""Change of the lens per dioptre: thickness 0.058 - 0.0005 y mm, curvatures 0.0077 and 0.0043 /mm, Q (Navarro 2014)."""
+FORWARD = 0.75
+"""Share of the lens' thickening that moves its front forward (chosen; Dubbelman et al. 2005, from memory)."""
+_ROOT_GAP_MM = 0.1
+_IRIS_GAP_MM = 0.02
+_SHIFTED_MM = 0.3  # how far pupils move with their size
+_LIMBUS_GAP_MM = 0.35
+_DESIGN_NM = 850.0
+
+
+def eye_file(
+    name: str,
+    eye: Mapping[str, float],
+    table: Table,
+    *,
+    age_years: float,
+    accommodation_d: float,
+    entrance_mm: float,
+    seed: int,
+) -> EyeSpec:
+    """Eye file of a drawn eye.
+
+    Args:
+        name: name of the eye.
+        eye: numbers of the eye by their names in the table, with those that `refraction.solve` finds.
+        table: the table, for its constants.
+        age_years: age of the person.
+        accommodation_d: dioptres by which the lens is accommodated.
+        entrance_mm: diameter of the entrance pupil, which the stop is made for.
+        seed: selects the outline of the pupil.
+
+    Raises:
+        InputError: the eye cannot exist: surfaces cross, or the stop lies outside the chamber.
+    """
+    if not np.isfinite(eye["lens_c0"]):
+        raise InputError("no lens of this shape gives the eye its refraction", path="lens.surfaces.0.medium")
+    data = _mapping(name, eye, table, age_years, accommodation_d)
+    contour = drawn_contour(seed, eye["pupil_noncircularity"])
+    data["stop"]["contour"] = contour.to_mapping()
+    parts = EyeParts.from_mapping(data)
+    front = tuple(surface_of(s) for s in parts.cornea)
+    indices = tuple(index_at(s.medium, _DESIGN_NM, "cornea") for s in parts.cornea)
+
+    def shaped(diameter: float) -> Any:
+        # The size at which the file's own pupil is, so that its shift is the same at every other size.
+        flat, axis = ellipticity(diameter)
+        own = parts.stop.model_copy(update={"ellipticity": flat, "axis_deg": axis})
+        return stop_of(parts.model_copy(update={"stop": own}), diameter)
+
+    diameter = stop_for_entrance(front, indices, shaped, entrance_mm)
+    stop = shaped(diameter)
+    flat, axis = ellipticity(diameter)
+    data["stop"] |= {
+        "diameter_mm": diameter,
+        "position_mm": [float(v) for v in stop.centre_mm],
+        "ellipticity": flat,
+        "axis_deg": axis,
+    }
+    return EyeSpec.from_mapping(data)
+
+
+def _mapping(name: str, eye: Mapping[str, float], table: Table, age: float, accommodation: float) -> dict[str, Any]:
+    """The keys of the eye file, with the stop at the table's reference diameter."""
+    constant = table.constant
+    thicker = (LENS_MM_PER_D + LENS_MM_PER_D_YEAR * age) * accommodation
+    lens_front = -(eye["chamber_depth_mm"] - FORWARD * thicker)
+    lens_back = -(eye["chamber_depth_mm"] + eye["lens_thickness_mm"] + (1.0 - FORWARD) * thicker)
+    front_radius = 1.0 / (1.0 / eye["lens_front_radius_mm"] + FRONT_PER_D * accommodation)
+    back_radius = 1.0 / (1.0 / eye["lens_back_radius_mm"] + BACK_PER_D * accommodation)
+    stop_x = lens_front + _stop_gap(eye)
+    limbus = eye["iris_diameter_mm"] / 2.0
+    place = [eye["lens_nasal_mm"], eye["lens_up_mm"]]
+    tilt = [0.0, eye["lens_tilt_y_deg"], eye["lens_tilt_z_deg"]]
+    direction = np.radians(eye["pupil_shift_direction_deg"])
+    slope = eye["pupil_shift_mm_per_mm"]
+    return {
+        "name": name,
+        "cornea": [
+            {
+                "name": "anterior cornea",
+                **_toric(eye["flat_mm"], eye["steep_mm"], eye["flat_axis_deg"], eye["corneal_asphericity"]),
+                "medium": {"cauchy": list(CORNEA)},
+            },
+            {
+                "name": "posterior cornea",
+                **_toric(
+                    eye["posterior_flat_mm"],
+                    eye["posterior_steep_mm"],
+                    eye["posterior_flat_axis_deg"],
+                    eye["posterior_asphericity"],
+                ),
+                "position_mm": [-eye["corneal_thickness_mm"], 0.0, 0.0],
+                "medium": {"cauchy": list(AQUEOUS)},
+            },
+        ],
+        "lens": {
+            "kind": "surfaces",
+            "surfaces": [
+                {
+                    "name": "lens front",
+                    "shape": {
+                        "kind": "conic",
+                        "radius_mm": front_radius,
+                        "conic_constant": constant("lens_front_asphericity") + FRONT_Q_PER_D * accommodation,
+                    },
+                    "position_mm": [lens_front, *place],
+                    "tilt_deg": tilt,
+                    "medium": {"cauchy": [eye["lens_c0"], *LENS]},
+                },
+                {
+                    "name": "lens back",
+                    "shape": {
+                        "kind": "conic",
+                        "radius_mm": -back_radius,
+                        "conic_constant": constant("lens_back_asphericity"),
+                    },
+                    "position_mm": [lens_back, *place],
+                    "tilt_deg": tilt,
+                    "medium": {"cauchy": list(VITREOUS)},
+                },
+            ],
+        },
+        "retina": {
+            "shape": {
+                "kind": "ellipsoid",
+                "semi_axes_mm": [eye["retina_axial_mm"], eye["retina_horizontal_mm"], eye["retina_vertical_mm"]],
+                "side": "back",
+            },
+            "position_mm": [-eye["axial_length_mm"], 0.0, 0.0],
+        },
+        "stop": {
+            "diameter_mm": constant("pupil_reference_mm"),
+            "position_mm": [stop_x, eye["pupil_nasal_mm"], eye["pupil_up_mm"]],
+            "shift_mm_per_mm": [float(-slope * np.cos(direction)), float(slope * np.sin(direction))],
+        },
+        "limbus_radius_mm": limbus,
+        "iris": {"root_radius_mm": _iris_root(eye, stop_x, limbus)},
+        "sclera": {"radius_mm": eye["sclera_radius_mm"]},
+        "rotation": {
+            "azimuth_centre_mm": [-eye["rotation_azimuth_mm"], constant("rotation_nasal_mm"), 0.0],
+            "elevation_centre_mm": [-eye["rotation_elevation_mm"], 0.0, constant("rotation_up_mm")],
+        },
+        "fovea": {"field_deg": [eye["alpha_horizontal_deg"], eye["alpha_vertical_deg"]]},
+    }
+
+
+def _toric(flat_mm: float, steep_mm: float, axis_deg: float, asphericity: float) -> dict[str, Any]:
+    """Biconic whose meridian `axis_deg`, from nasal towards up, has the larger radius."""
+    # A turn about x of +t carries nasal (+y) towards up (+z).
+    return {
+        "shape": {"kind": "biconic", "radii_mm": [flat_mm, steep_mm], "conic_constants": [asphericity, asphericity]},
+        "tilt_deg": [axis_deg, 0.0, 0.0],
+    }
+
+
+def _stop_gap(eye: Mapping[str, float]) -> float:
+    """Distance of the stop before the lens' apex, so that its centre is before a tilted lens at every size."""
+    away = np.hypot(eye["pupil_nasal_mm"] - eye["lens_nasal_mm"], eye["pupil_up_mm"] - eye["lens_up_mm"])
+    tilt = np.radians(np.hypot(eye["lens_tilt_y_deg"], eye["lens_tilt_z_deg"]))
+    return float(_IRIS_GAP_MM + (away + _SHIFTED_MM) * np.tan(tilt))
+
+
+def _iris_root(eye: Mapping[str, float], stop_x: float, limbus: float) -> float:
+    """Radius of the iris' root: just inside the posterior cornea in the stop's plane, and inside the limbus."""
+    depth = max(-stop_x - eye["corneal_thickness_mm"], 0.0)
+    radius, q = eye["posterior_steep_mm"], eye["posterior_asphericity"]
+    reach = np.sqrt(max(2.0 * radius * depth - (1.0 + q) * depth**2, 0.0))
+    return float(min(limbus - _LIMBUS_GAP_MM, reach - _ROOT_GAP_MM))

@@ -1,0 +1,279 @@
+"""The joint distribution of a population: a Gaussian copula with regressions.
+
+Every quantity q of a person has a latent standard normal number z_q. A marginal makes the value F^-1(Phi(z_q)), a
+regression m_q(age, sex, refraction) + s_q z_q. The latent numbers have one correlation matrix, of the subject's
+quantities and of those of both eyes. For eye quantities i and j with correlation C_ij within an eye and correlations
+r_i, r_j between the eyes, that between i of one eye and j of the other is sqrt(r_i r_j) C_ij.
+
+The table gives total means, spreads and correlations of its reference population. What the predictors explain is
+subtracted: s_i^2 = sd_i^2 - var(m_i), and the residuals' correlation is (r_ij sd_i sd_j - cov(m_i, m_j)) / (s_i s_j).
+Pairs that the table does not name are independent given the others (Dempster 1972). The nearest correlation matrix
+(Higham 2002) replaces the one that results, where that is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..eye.parts import Side
+from .correlation import completed, nearest_correlation
+from .marginals import nodes
+from .table import ROOTS, Distribution, Pair, Quantity, Regression, Table, default_table
+
+SIDES: tuple[Side, Side] = ("right", "left")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The table's reference population: moments of its predictors, its regressions, the latent correlations.
+
+    Attributes:
+        table: the table.
+        distributions: distribution of each quantity.
+        correlation: (e, e) latent correlations that the table gives within an eye; 0 where it gives none.
+        latent: (s + 2 e, s + 2 e) correlation matrix of subject, right eye and left eye.
+        distance: Frobenius distance of `latent` from the completed matrix, of which it is the nearest that is one.
+    """
+
+    table: Table
+    distributions: Mapping[str, Distribution]
+    correlation: Floats
+    latent: Floats
+    distance: float
+
+    @classmethod
+    def of(cls, table: Table) -> Reference:
+        """Solve the residuals of a table.
+
+        Raises:
+            InputError: its predictors explain more of a quantity than its whole spread.
+        """
+        about = {root: _moments(_marginal(table.quantities[root]))[0] for root in ROOTS}
+        found = {name: _resolved(name, q, table, about) for name, q in table.quantities.items()}
+        eye = [name for name, q in table.quantities.items() if q.of == "eye"]
+        asked = np.eye(len(eye))
+        pairs = []
+        for pair in table.correlations:
+            i, j = (eye.index(name) for name in pair.pair)
+            asked[i, j] = asked[j, i] = _latent(pair, table, found)
+            pairs.append((i, j))
+        inside = completed(asked, pairs)
+        subjects = sum(q.of == "subject" for q in table.quantities.values())
+        root = np.sqrt([max(table.quantities[name].eyes, 0.0) for name in eye])
+        between = root[:, None] * inside * root
+        np.fill_diagonal(between, [table.quantities[name].eyes for name in eye])
+        whole = np.eye(subjects + 2 * len(eye))
+        whole[subjects:, subjects:] = np.block([[inside, between], [between.T, inside]])
+        nearest = nearest_correlation(whole)
+        return cls(table, found, asked, nearest, float(np.linalg.norm(nearest - whole)))
+
+
+@dataclass(frozen=True)
+class Model:
+    """The joint distribution of one population.
+
+    Attributes:
+        reference: where the residuals come from.
+        distributions: distribution of each quantity, replaced ones included.
+    """
+
+    reference: Reference
+    distributions: Mapping[str, Distribution]
+
+    @cached_property
+    def subject_names(self) -> tuple[str, ...]:
+        """Quantities of a subject."""
+        return tuple(n for n, q in self.reference.table.quantities.items() if q.of == "subject")
+
+    @cached_property
+    def eye_names(self) -> tuple[str, ...]:
+        """Quantities of an eye."""
+        return tuple(n for n, q in self.reference.table.quantities.items() if q.of == "eye")
+
+    @property
+    def width(self) -> int:
+        """Number of latent numbers of a person."""
+        return len(self.subject_names) + 2 * len(self.eye_names)
+
+    @cached_property
+    def factor(self) -> Floats:
+        """Lower triangular factor of the latent correlation matrix."""
+        return np.asarray(np.linalg.cholesky(self.reference.latent))
+
+    def places(self, name: str) -> tuple[int, ...]:
+        """Columns of a quantity's latent numbers: one, or right and left.
+
+        Raises:
+            InputError: there is no such quantity.
+        """
+        if name in self.subject_names:
+            return (self.subject_names.index(name),)
+        if name in self.eye_names:
+            k = len(self.subject_names) + self.eye_names.index(name)
+            return k, k + len(self.eye_names)
+        raise InputError(f"no such quantity; there are {', '.join(self.distributions)}", path=name)
+
+    def value(self, name: str, latent: Floats, known: Mapping[str, Floats] | None = None) -> Floats:
+        """Values of a quantity, (n,) or (n, 2) for right and left, of latent numbers (n, width).
+
+        `known` holds values of the predictors, where they were computed before.
+        """
+        places, found = self.places(name), self.distributions[name]
+        z = latent[:, places[0]] if len(places) == 1 else latent[:, places]
+        if isinstance(found, Regression):
+            return np.asarray(self.mean(name, latent, known) + found.residual_sd * z)
+        return found.at(z)
+
+    def mean(self, name: str, latent: Floats, known: Mapping[str, Floats] | None = None) -> Floats:
+        """Mean (n,) or (n, 2) of a regression, of the predictors of latent numbers (n, width).
+
+        A regression of a subject's quantity on the refraction uses the mean of both eyes.
+        """
+        found, places = self.distributions[name], self.places(name)
+        assert isinstance(found, Regression)
+        shape = (len(latent),) if len(places) == 1 else (len(latent), 2)
+        roots: dict[str, Floats] = {}
+        for root in {*found.slopes, *(("refraction_d",) if found.tangent is not None else ())}:
+            value = self.value(root, latent) if known is None else known[root]
+            if value.ndim > len(shape):
+                value = value.mean(axis=1)
+            roots[root] = value if value.ndim == len(shape) else value[:, None]
+        return np.broadcast_to(regressed(found, roots), shape)
+
+    def values(self, latent: Floats) -> dict[str, Floats]:
+        """Values of every quantity, (n,) or (n, 2), of latent numbers (n, width)."""
+        roots = {root: self.value(root, latent) for root in ROOTS}
+        return {name: roots[name] if name in roots else self.value(name, latent, roots) for name in self.distributions}
+
+    def required(self, name: str, value: float, latent: Floats) -> Floats:
+        """Latent numbers (n,) or (n, 2) that give a quantity one value."""
+        found, places = self.distributions[name], self.places(name)
+        shape = (len(latent),) if len(places) == 1 else (len(latent), 2)
+        if isinstance(found, Regression):
+            return np.asarray((value - self.mean(name, latent)) / found.residual_sd)
+        return np.broadcast_to(found.latent(np.array(value)), shape)
+
+    def expected(self, name: str) -> tuple[float, float]:
+        """Mean and standard deviation of a quantity, exactly (to 1e-4 of the standard deviation)."""
+        found = self.distributions[name]
+        if not isinstance(found, Regression):
+            return found.moments
+        variance = found.residual_sd**2 + _explained(found, found, self.distributions)
+        return _mean(found, self.distributions), float(np.sqrt(variance))
+
+    def expected_correlation(self, first: str, second: str) -> float:
+        """Correlation of two quantities of one eye: regressions exactly, others by their latent number."""
+        a, b = self.distributions[first], self.distributions[second]
+        i, j = self.places(first)[0], self.places(second)[0]
+        latent = float(self.reference.latent[i, j])
+        if not (isinstance(a, Regression) and isinstance(b, Regression)):
+            return latent
+        shared = latent * a.residual_sd * b.residual_sd + _explained(a, b, self.distributions)
+        return shared / (self.expected(first)[1] * self.expected(second)[1])
+
+
+def regressed(found: Regression, roots: Mapping[str, Floats]) -> Floats:
+    """Mean of a regression at values of its predictors."""
+    mean: Floats = np.asarray(found.mean)
+    if found.tangent is not None:
+        t = found.tangent
+        scale = t.node_mm / (t.node_mm + t.slope * roots["refraction_d"])
+        mean = np.degrees(np.arctan(scale * np.tan(np.radians(found.mean))))
+    for root, slope in found.slopes.items():
+        mean = mean + slope * (roots[root] - found.about[root])
+    return np.asarray(mean)
+
+
+@cache
+def default_reference() -> Reference:
+    """Reference population of the package's table, solved once."""
+    return Reference.of(default_table())
+
+
+def _marginal(quantity: Quantity) -> Distribution:
+    assert quantity.marginal is not None
+    return quantity.marginal
+
+
+def _resolved(name: str, quantity: Quantity, table: Table, about: Mapping[str, float]) -> Distribution:
+    if quantity.marginal is not None:
+        return quantity.marginal
+    assert quantity.mean is not None
+    bare = Regression(
+        mean=quantity.mean,
+        residual_sd=1.0 if quantity.residual_sd is None else quantity.residual_sd,
+        slopes=quantity.slopes,
+        about={root: about[root] for root in quantity.slopes},
+        tangent=quantity.tangent,
+    )
+    if quantity.residual_sd is not None:
+        return bare
+    assert quantity.sd is not None
+    roots = {root: _marginal(table.quantities[root]) for root in ROOTS}
+    rest = quantity.sd**2 - _explained(bare, bare, roots)
+    if not rest > 0:
+        raise InputError("is smaller than what the predictors explain", path=f"quantities.{name}.sd")
+    return bare.model_copy(update={"residual_sd": float(np.sqrt(rest))})
+
+
+def _latent(pair: Pair, table: Table, found: Mapping[str, Distribution]) -> float:
+    """Correlation of the latent numbers of a pair."""
+    a, b = (found[name] for name in pair.pair)
+    if pair.of == "residuals" or not (isinstance(a, Regression) and isinstance(b, Regression)):
+        return pair.r
+    roots = {root: found[root] for root in ROOTS}
+    spreads = [np.sqrt(q.residual_sd**2 + _explained(q, q, roots)) for q in (a, b)]
+    rest = pair.r * spreads[0] * spreads[1] - _explained(a, b, roots)
+    return float(np.clip(rest / (a.residual_sd * b.residual_sd), -0.999, 0.999))
+
+
+def _by_refraction(found: Regression, roots: Mapping[str, Distribution]) -> Floats:
+    """Mean of a regression at the refraction's nodes, with the other predictors where they have no effect."""
+    z, _ = nodes()
+    refraction = _at(roots["refraction_d"], z)
+    own = Regression(
+        mean=found.mean,
+        residual_sd=1.0,
+        tangent=found.tangent,
+        slopes={k: v for k, v in found.slopes.items() if k == "refraction_d"},
+        about={k: v for k, v in found.about.items() if k == "refraction_d"},
+    )
+    return np.broadcast_to(regressed(own, {"refraction_d": refraction}), z.shape)
+
+
+def _explained(a: Regression, b: Regression, roots: Mapping[str, Distribution]) -> float:
+    """Covariance of the means of two regressions; the predictors are independent of each other."""
+    total = 0.0
+    for root in ("age_years", "male"):
+        marginal = roots[root]
+        assert not isinstance(marginal, Regression)
+        total += a.slopes.get(root, 0.0) * b.slopes.get(root, 0.0) * marginal.moments[1] ** 2
+    _, weight = nodes()
+    first, second = _by_refraction(a, roots), _by_refraction(b, roots)
+    return total + float(weight @ ((first - weight @ first) * (second - weight @ second)))
+
+
+def _mean(found: Regression, roots: Mapping[str, Distribution]) -> float:
+    total = float(nodes()[1] @ _by_refraction(found, roots))
+    for root in ("age_years", "male"):
+        if root in found.slopes:
+            marginal = roots[root]
+            assert not isinstance(marginal, Regression)
+            total += found.slopes[root] * (marginal.moments[0] - found.about[root])
+    return total
+
+
+def _moments(found: Distribution) -> tuple[float, float]:
+    assert not isinstance(found, Regression)
+    return found.moments
+
+
+def _at(found: Distribution, z: Floats) -> Floats:
+    assert not isinstance(found, Regression)
+    return found.at(z)

@@ -1,0 +1,275 @@
+"""Populations and the people drawn from them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..eye.parts import Side
+from ..eye.spec import EyeSpec
+from ..region.anatomy import Region
+from ..region.look import Look
+from ..spec import KeyProblem, Number, Spec
+from .draw import Conditions, latent_numbers
+from .eyes import eye_file
+from .marginals import Fixed
+from .model import SIDES, Model, default_reference
+from .pupil import watson_yellott_mm
+from .refraction import Biometry, solve
+from .table import ROOTS, Distribution, Regression, Table, default_table
+
+SOLVED = (
+    "steep_mm", "flat_mm", "flat_axis_deg", "posterior_steep_mm", "posterior_flat_mm", "posterior_flat_axis_deg",
+    "lens_c0",
+)  # fmt: skip
+"""Numbers of an eye that follow from its refraction."""
+
+
+class PopulationSpec(Spec):
+    """People: one of the table's populations, with other distributions, and with conditions on anything."""
+
+    preset: str = Field(default="adults", description="adults, emmetropic_adults, myopes, children or elderly")
+    replace: dict[str, Distribution] = Field(
+        default_factory=dict, description="quantity of the table -> another distribution of it"
+    )
+    where: dict[str, Number | tuple[Number, Number]] = Field(
+        default_factory=dict,
+        description="quantity -> its value, or the range in which it must lie (of an eye's quantity: of both eyes)",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        table = default_table()
+        if self.preset not in table.presets:
+            raise KeyProblem("preset", f"must be one of {', '.join(table.presets)}, not {self.preset!r}")
+        for key, names in (("replace", self.replace), ("where", self.where)):
+            for name in names:
+                if name not in table.quantities:
+                    raise KeyProblem(f"{key}.{name}", "no such quantity of the table")
+        for root in ROOTS:
+            if isinstance(self.replace.get(root), Regression):
+                raise KeyProblem(f"replace.{root}", "must be a marginal, because the regressions start from it")
+        for name, found in self.replace.items():
+            if isinstance(found, Fixed) and name in self.where:
+                raise KeyProblem(f"where.{name}", "has one value already")
+        try:
+            Conditions.of(self.model, self.where)
+        except InputError as error:
+            raise KeyProblem(f"where.{error.path}", error.reason) from None
+        return self
+
+    @cached_property
+    def model(self) -> Model:
+        """Joint distribution of this population."""
+        reference = default_reference()
+        preset = reference.table.presets[self.preset]
+        return Model(reference, {**reference.distributions, **preset.replace, **self.replace})
+
+    def numbers(self, n: int, seed: int = 0, *, first: int = 0) -> dict[str, Floats]:
+        """Numbers of subjects `first` to `first + n - 1`, name -> (n,) or (n, 2) for right and left.
+
+        A subject's numbers depend on (this population, seed, subject) alone. Besides the quantities of the table they
+        are `entrance_pupil_mm`, at the table's luminance, and what follows from the refraction: the cornea's principal
+        radii (`steep_mm`, `flat_mm`, ...) and the lens (`lens_c0`).
+
+        Raises:
+            InputError: n < 1, or hardly anybody meets the conditions.
+        """
+        if n < 1:
+            raise InputError(f"must be >= 1, not {n}", path="n")
+        return _values(self.model, latent_numbers(self.model, Conditions.of(self.model, self.where), seed, first, n))
+
+    def person(self, subject: int, seed: int = 0) -> Person:
+        """One subject."""
+        return Person.of(self.preset, seed, subject, {k: v[0] for k, v in self.numbers(1, seed, first=subject).items()})
+
+
+class Person(Spec):
+    """A drawn person: its numbers, from which eyes, lids and face are made."""
+
+    preset: str = Field(description="population of the person")
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="seed of the draw")
+    subject: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="number of the subject")
+    numbers: dict[str, Number | tuple[Number, Number]] = Field(
+        description="quantity -> value, or its values of the right and the left eye"
+    )
+
+    @classmethod
+    def of(cls, preset: str, seed: int, subject: int, numbers: Mapping[str, Any]) -> Self:
+        """Person of numbers that may be NumPy's."""
+        plain = {name: np.asarray(value).tolist() for name, value in numbers.items()}
+        return cls(preset=preset, seed=seed, subject=subject, numbers=plain)
+
+    def number(self, name: str, side: Side | None = None) -> float:
+        """A number of the person, or of one eye.
+
+        Raises:
+            InputError: there is no such number.
+        """
+        value = self.numbers.get(name)
+        if value is None or isinstance(value, tuple) != (side is not None):
+            raise InputError("missing, or not of the right kind", path=f"person.numbers.{name}")
+        return value[SIDES.index(side)] if isinstance(value, tuple) and side is not None else float(value)  # type: ignore[arg-type]
+
+    def to_json(self) -> str:
+        """The person as text, the same for equal persons."""
+        return json.dumps(self.to_mapping(), sort_keys=True)
+
+    @property
+    def sex(self) -> str:
+        """Male or female."""
+        return "male" if self.number("male") > 0.5 else "female"
+
+    @property
+    def ipd_mm(self) -> float:
+        """Distance between the pupils."""
+        return self.number("ipd_mm")
+
+    def draw_seed(self, purpose: str) -> int:
+        """A seed of 31 bits for something that has no quantity of the table, such as hairs."""
+        text = f"{self.preset}/{self.seed}/{self.subject}/{purpose}"
+        return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") >> 1
+
+    @property
+    def amplitude_d(self) -> float:
+        """Largest accommodation by age; 0 at the least."""
+        table = default_table()
+        age = self.number("age_years")
+        return max(table.constant("amplitude_d") + table.constant("amplitude_d_per_year") * age, 0.0)
+
+    def accommodation_d(self, demand_d: float) -> float:
+        """Accommodation to a demand: the demand itself, as far as the age allows."""
+        return min(max(demand_d, 0.0), self.amplitude_d)
+
+    def entrance_pupil_mm(
+        self, luminance_cd_m2: float | None = None, field_deg: float | None = None, demand_d: float = 0.0
+    ) -> float:
+        """Diameter of the entrance pupil in a field of a luminance and diameter (deg), looking at a distance.
+
+        The near response narrows it by the person's miosis per dioptre of the demand that it accommodates to.
+        """
+        table = default_table()
+        luminance = table.constant("luminance_cd_m2") if luminance_cd_m2 is None else luminance_cd_m2
+        field = table.constant("field_deg") if field_deg is None else field_deg
+        far = far_pupil_mm(table, luminance, field, np.array(self.number("age_years")), self.number("pupil_score"))
+        near = float(far) - self.number("miosis_mm_per_d") * self.accommodation_d(demand_d)
+        return float(np.clip(near, table.constant("smallest_pupil_mm"), table.constant("largest_pupil_mm")))
+
+    def eye(
+        self,
+        side: Side,
+        *,
+        luminance_cd_m2: float | None = None,
+        field_deg: float | None = None,
+        demand_d: float = 0.0,
+    ) -> EyeSpec:
+        """Eye file of one eye, written as a right eye as all eye files are.
+
+        Args:
+            side: right or left.
+            luminance_cd_m2: luminance of what the person sees; default: the table's.
+            field_deg: diameter of the lit field; default: the table's.
+            demand_d: accommodation that the target asks for, in dioptres.
+
+        Raises:
+            InputError: the eye cannot exist.
+        """
+        k = SIDES.index(side)
+        numbers = {name: value[k] for name, value in self.numbers.items() if isinstance(value, tuple)}
+        return eye_file(
+            f"{self.preset} {self.seed}/{self.subject}",
+            numbers,
+            default_table(),
+            age_years=self.number("age_years"),
+            accommodation_d=self.accommodation_d(demand_d),
+            entrance_mm=self.entrance_pupil_mm(luminance_cd_m2, field_deg, demand_d),
+            seed=self.draw_seed(f"pupil/{side}"),
+        )
+
+    def region(self) -> Region:
+        """Lids, lashes, brow, face and skin; numbers outside the range of a key are moved to its end."""
+        data: dict[str, Any] = {"seed": self.draw_seed("region")}
+        for group, kind in Region.model_fields.items():
+            fields = getattr(kind.annotation, "model_fields", {})
+            mine = {key: _within(fields[key], value) for key, value in self._under(f"{group}.").items()}
+            if mine:
+                data[group] = mine
+        return Region.from_mapping(data)
+
+    def look(self) -> Look:
+        """Albedos and textures of the eyes; numbers outside the range of a key are moved to its end."""
+        mine = {key: _within(Look.model_fields[key], value) for key, value in self._under("look.").items()}
+        return Look.from_mapping({"iris_seed": self.draw_seed("iris"), **mine})
+
+    def _under(self, prefix: str) -> dict[str, float]:
+        return {name[len(prefix) :]: self.number(name) for name in self.numbers if name.startswith(prefix)}
+
+
+class PersonChoice(PopulationSpec):
+    """`population` of a scene: one subject of a population."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(default=0, description="seed of the draw")
+    subject: Annotated[int, Field(ge=0, lt=2**53)] = Field(default=0, description="number of the subject")
+
+    def chosen(self) -> Person:
+        """The person."""
+        return self.person(self.subject, self.seed)
+
+
+def far_pupil_mm(table: Table, luminance: float, field: float, age_years: Floats, score: Floats | float) -> Floats:
+    """Entrance pupils of people who look far away: the mean of their age, and their standard score times its spread."""
+    mean = watson_yellott_mm(luminance, field, age_years)
+    small, large = table.constant("pupil_sd_small_mm"), table.constant("pupil_sd_large_mm")
+    spread = small + (large - small) * np.clip((mean - 2.5) / 4.0, 0.0, 1.0)
+    far = mean + score * spread
+    return np.clip(far, table.constant("smallest_pupil_mm"), table.constant("largest_pupil_mm"))
+
+
+def _values(model: Model, latent: Floats) -> dict[str, Floats]:
+    """Every number of people with latent numbers."""
+    values = model.values(latent)
+    table = model.reference.table
+    values["entrance_pupil_mm"] = far_pupil_mm(
+        table,
+        table.constant("luminance_cd_m2"),
+        table.constant("field_deg"),
+        values["age_years"],
+        values["pupil_score"],
+    )
+    optics = solve(biometry(table, values))
+    for name in SOLVED:
+        values[name] = np.asarray(getattr(optics, name))
+    return values
+
+
+def biometry(table: Table, values: Mapping[str, Floats]) -> Biometry:
+    """Lengths and radii of people's eyes, (n, 2) each."""
+    return Biometry(
+        refraction=(values["refraction_d"], values["refraction_j0_d"], values["refraction_j45_d"]),
+        corneal_radius_mm=values["corneal_radius_mm"],
+        posterior_radius_mm=values["posterior_radius_mm"],
+        posterior_astigmatism_d=(values["posterior_j0_d"], values["posterior_j45_d"]),
+        corneal_thickness_mm=values["corneal_thickness_mm"],
+        chamber_depth_mm=values["chamber_depth_mm"],
+        lens_thickness_mm=values["lens_thickness_mm"],
+        lens_radii_mm=(values["lens_front_radius_mm"], values["lens_back_radius_mm"]),
+        axial_length_mm=values["axial_length_mm"],
+        vertex_mm=table.constant("vertex_mm"),
+        wavelength_nm=table.constant("refraction_nm"),
+    )
+
+
+def _within(field: Any, value: float) -> float | int:
+    """A number moved into the range of a key, whole where the key is."""
+    low = next((m.ge for m in field.metadata if getattr(m, "ge", None) is not None), -np.inf)
+    high = next((m.le for m in field.metadata if getattr(m, "le", None) is not None), np.inf)
+    moved = min(max(value, low), high)
+    return round(moved) if field.annotation is int else float(moved)

@@ -1,0 +1,185 @@
+"""The eye that has a drawn refraction: which corneal astigmatism and which lens make it so.
+
+All vergences are power matrices [[m + a, b], [b, m - a]] in the meridians y (nasal) and z (up), written (m, a, b) =
+(M, J0, J45), in 1/mm. The spectacles of power F at the distance d from the cornea leave light of vergence K = F / (1 -
+d F) at the cornea. With the powers P_a and P_p of the cornea's surfaces, its thickness t and index n, light behind the
+cornea has the vergence
+
+    W = V / (1 - V t / n) + P_p,   V = K + P_a.
+
+The lens is symmetric about the axis, so W must be the same in all meridians. Its mean part follows from the drawn mean
+radius, and P_a = V - K is then the power matrix of the front surface: the corneal astigmatism that, with the posterior
+one, makes that of the drawn refraction.
+
+The residual of all lengths and radii goes into the equivalent index of the lens, because lens powers are what biometry
+leaves open and differ most between eyes: the index is the one that brings W to a focus on the retina. (SyntEyes derives
+its index from a lens power in the same way: Rozema et al. 2016, Invest. Ophthalmol. Vis. Sci. 57, 683.) A gradient
+n_core - (n_core - n_edge) p^2 like that of E5 is far too strong with the radii of Navarro 2014, so the lens is
+homogeneous.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import ArrayValue, Floats
+from ..optics.media import CauchyMedium
+
+# Navarro, Lopez-Gil and Palos 2014 and Atchison and Smith 2005, as in E5 of the catalogue: Cauchy's coefficients.
+CORNEA = (1.362994, 6009.687, -6.760760e8, 5.908450e13)
+AQUEOUS = (1.323031, 6070.796, -7.062305e8, 6.147861e13)
+VITREOUS = (1.323757, 5560.240, -5.817391e8, 5.036810e13)
+LENS = (6521.218, -6.11066e8, 5.908191e13)
+"""Coefficients of the lens after the first, as of the core of E5's lens."""
+SMALLEST_INDEX, LARGEST_INDEX = 1.345, 1.6
+"""Limits of the lens' equivalent index; one outside makes an eye that cannot exist."""
+_START = 1.41
+_NEWTON = 8
+
+Power = tuple[Floats, Floats, Floats]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optics(ArrayValue):
+    """What makes eyes have their refraction, (...,) each.
+
+    Attributes:
+        steep_mm: smaller principal radius of the front cornea.
+        flat_mm: larger principal radius.
+        flat_axis_deg: direction of the meridian of the larger radius, from nasal towards up.
+        posterior_steep_mm: smaller principal radius of the back cornea.
+        posterior_flat_mm: larger principal radius.
+        posterior_flat_axis_deg: direction of its meridian.
+        lens_c0: first coefficient of the lens' equivalent index; NaN where none within its limits makes the
+            refraction.
+    """
+
+    steep_mm: Floats
+    flat_mm: Floats
+    flat_axis_deg: Floats
+    posterior_steep_mm: Floats
+    posterior_flat_mm: Floats
+    posterior_flat_axis_deg: Floats
+    lens_c0: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Biometry(ArrayValue):
+    """Lengths (mm) and radii (mm, positive) of eyes, (...,) each; the refraction in dioptres at the spectacles."""
+
+    refraction: tuple[Floats, Floats, Floats]
+    corneal_radius_mm: Floats
+    posterior_radius_mm: Floats
+    posterior_astigmatism_d: tuple[Floats, Floats]
+    corneal_thickness_mm: Floats
+    chamber_depth_mm: Floats
+    lens_thickness_mm: Floats
+    lens_radii_mm: tuple[Floats, Floats]
+    axial_length_mm: Floats
+    vertex_mm: float
+    wavelength_nm: float
+
+
+def lens_index(lens_c0: Floats, wavelength_nm: float) -> Floats:
+    """Equivalent index of lenses at a wavelength."""
+    return np.asarray(lens_c0 + CauchyMedium(0.0, *LENS).index(wavelength_nm))
+
+
+def solve(eyes: Biometry) -> Optics:
+    """Find the cornea's astigmatism and the lens' index of eyes with drawn refractions."""
+    cornea, aqueous, _ = _indices(eyes.wavelength_nm)
+    spectacles = tuple(np.asarray(p) / 1000.0 for p in eyes.refraction)
+    at_cornea = _mapped((spectacles[0], spectacles[1], spectacles[2]), lambda v: v / (1.0 - eyes.vertex_mm * v))
+    back = (
+        (aqueous - cornea) / eyes.posterior_radius_mm,
+        eyes.posterior_astigmatism_d[0] / 1000.0,
+        eyes.posterior_astigmatism_d[1] / 1000.0,
+    )
+    wanted = (cornea - 1.0) / eyes.corneal_radius_mm + at_cornea[0]
+    share = eyes.corneal_thickness_mm / cornea
+    behind = wanted / (1.0 - share * wanted) + back[0]
+    for _ in range(_NEWTON):
+        before = _before(behind, back, share)
+        behind = behind + (wanted - before[0]) * (1.0 + share * (behind - back[0])) ** 2
+    before = _before(behind, back, share)
+    front = (before[0] - at_cornea[0], before[1] - at_cornea[1], before[2] - at_cornea[2])
+    flat, steep, axis = _principal(front, cornea - 1.0)
+    p_flat, p_steep, p_axis = _principal(back, aqueous - cornea)
+    return Optics(steep, flat, axis, p_steep, p_flat, p_axis, _lens(eyes, behind))
+
+
+def refraction_with(eyes: Biometry, lens_c0: Floats) -> Floats:
+    """Mean refraction (D) that the eyes would have with other lenses, in closed form backwards from the retina."""
+    cornea, aqueous, vitreous = _indices(eyes.wavelength_nm)
+    index = lens_index(lens_c0, eyes.wavelength_nm)
+    front, back = eyes.lens_radii_mm
+    depth = eyes.axial_length_mm - eyes.chamber_depth_mm - eyes.lens_thickness_mm
+    inside = vitreous / depth - (index - vitreous) / back
+    at_lens = inside / (1.0 + eyes.lens_thickness_mm / index * inside) - (index - aqueous) / front
+    gap = (eyes.chamber_depth_mm - eyes.corneal_thickness_mm) / aqueous
+    behind = at_lens / (1.0 + gap * at_lens) - (aqueous - cornea) / eyes.posterior_radius_mm
+    before = behind / (1.0 + eyes.corneal_thickness_mm / cornea * behind)
+    at_cornea = before - (cornea - 1.0) / eyes.corneal_radius_mm
+    return np.asarray(1000.0 * at_cornea / (1.0 + eyes.vertex_mm * at_cornea))
+
+
+def _lens(eyes: Biometry, behind: Floats) -> Floats:
+    """First coefficient of the lens that brings the vergence behind the cornea to a focus on the retina."""
+    _, aqueous, vitreous = _indices(eyes.wavelength_nm)
+    at_lens = behind / (1.0 - (eyes.chamber_depth_mm - eyes.corneal_thickness_mm) / aqueous * behind)
+    front, back = eyes.lens_radii_mm
+    depth = eyes.axial_length_mm - eyes.chamber_depth_mm - eyes.lens_thickness_mm
+    wanted = vitreous / depth
+
+    def miss(index: Floats) -> Floats:
+        entering = at_lens + (index - aqueous) / front
+        return np.asarray(
+            entering / (1.0 - eyes.lens_thickness_mm / index * entering) + (index - vitreous) / back - wanted
+        )
+
+    low = np.full(behind.shape, lens_index(np.array(_START), eyes.wavelength_nm))
+    high = low + 0.01
+    f_low, f_high = miss(low), miss(high)
+    for _ in range(_NEWTON):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.where(f_high == f_low, 0.0, f_high * (high - low) / (f_high - f_low))
+        low, f_low, high = high, f_high, high - step
+        f_high = miss(high)
+    found = high - lens_index(np.array(0.0), eyes.wavelength_nm)
+    return np.where((high > SMALLEST_INDEX) & (high < LARGEST_INDEX), found, np.nan)
+
+
+def _indices(wavelength_nm: float) -> tuple[float, float, float]:
+    """Indices of cornea, aqueous and vitreous."""
+    cornea, aqueous, vitreous = (float(CauchyMedium(*c).index(wavelength_nm)) for c in (CORNEA, AQUEOUS, VITREOUS))
+    return cornea, aqueous, vitreous
+
+
+def _before(behind: Floats, back: Power, share: Floats) -> Power:
+    """Vergence in front of the cornea's thickness that becomes `behind` after its back surface."""
+    zero = np.zeros_like(behind)
+    return _mapped((behind - back[0], zero - back[1], zero - back[2]), lambda v: v / (1.0 + share * v))
+
+
+def _mapped(power: Power, f: object) -> Power:
+    """Function of a power matrix: of its two eigenvalues."""
+    assert callable(f)
+    m, a, b = power
+    r = np.hypot(a, b)
+    high, low = f(m + r), f(m - r)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.where(r > 0.0, (high - low) / (2.0 * r), 0.0)
+    return (high + low) / 2.0, a * scale, b * scale
+
+
+def _principal(power: Power, step: float) -> tuple[Floats, Floats, Floats]:
+    """Larger and smaller radius of a surface's power, and the direction of the larger one's meridian, 0 to 180 deg."""
+    m, a, b = power
+    r = np.hypot(a, b)
+    high, low = step / (m + r), step / (m - r)
+    axis = np.degrees(0.5 * np.arctan2(b, a))
+    # The meridian of m + r is the axis; which radius is larger there depends on the power's sign.
+    turned = np.where(high >= low, axis, axis + 90.0)
+    return np.maximum(high, low), np.minimum(high, low), np.mod(turned, 180.0)

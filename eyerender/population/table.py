@@ -1,0 +1,165 @@
+"""The table of a population: marginals, regressions, correlations and presets, each with its source."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from ..spec import FileSpec, Number, Positive, Spec
+from .marginals import Fixed, Lognormal, Marginal, Mixture, Normal, Share, Uniform
+
+FOLDER = Path(__file__).parent / "tables"
+ROOTS = ("age_years", "male", "refraction_d")
+"""Predictors of the regressions."""
+
+Mark = Literal["read", "abstract", "memory", "chosen"]
+Correlation = Annotated[float, Field(gt=-1, lt=1)]
+
+
+class Source(Spec):
+    """Where a number comes from."""
+
+    what: str = Field(description="the keys that it is for, or all")
+    mark: Mark = Field(description="how well the source is known")
+    text: str = Field(description="the source, and what it says")
+
+
+class Tangent(Spec):
+    """Mean of an angle that shrinks as the eye grows: atan(d / (d + s S) tan(mean)), S the refraction."""
+
+    node_mm: Positive = Field(description="distance d of the fovea from the node")
+    slope: Number = Field(description="change s of that distance per dioptre")
+
+
+class Regression(Spec):
+    """Mean + sum of slopes (predictor - its `about`) + a normal residual."""
+
+    kind: Literal["regression"] = Field(default="regression", description="the distribution")
+    mean: Number = Field(description="mean where the predictors have the values `about`")
+    residual_sd: Positive = Field(description="standard deviation about the regression")
+    slopes: dict[str, Number] = Field(default_factory=dict, description="predictor -> change per unit")
+    about: dict[str, Number] = Field(default_factory=dict, description="predictor -> value at which the mean holds")
+    tangent: Tangent | None = Field(default=None, description="for an angle: how its mean depends on the refraction")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for name in (*self.slopes, *self.about):
+            if name not in ROOTS:
+                raise ValueError(f"slopes: predictors are {', '.join(ROOTS)}, not {name}")
+        if self.slopes.keys() - self.about.keys():
+            raise ValueError("about: give the value of every predictor at which the mean holds")
+        return self
+
+
+def _tag(value: object) -> str:
+    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+    return f"{str(kind).capitalize()}Spec"
+
+
+Distribution = Annotated[
+    Annotated[Fixed, Tag("FixedSpec")]
+    | Annotated[Normal, Tag("NormalSpec")]
+    | Annotated[Lognormal, Tag("LognormalSpec")]
+    | Annotated[Uniform, Tag("UniformSpec")]
+    | Annotated[Share, Tag("ShareSpec")]
+    | Annotated[Mixture, Tag("MixtureSpec")]
+    | Annotated[Regression, Tag("RegressionSpec")],
+    Discriminator(
+        _tag,
+        custom_error_type="unknown_kind",
+        custom_error_message="kind must be fixed, normal, lognormal, uniform, share, mixture or regression",
+    ),
+]
+
+
+class Quantity(Spec):
+    """One quantity: a marginal, or a regression on refraction, age and sex."""
+
+    of: Literal["subject", "eye"] = Field(description="whether each eye has its own")
+    marginal: Marginal | None = Field(default=None, description="its distribution, if no regression")
+    mean: Number | None = Field(default=None, description="mean of the reference population")
+    sd: Positive | None = Field(default=None, description="standard deviation of the reference population")
+    residual_sd: Positive | None = Field(default=None, description="standard deviation about the regression")
+    slopes: dict[str, Number] = Field(default_factory=dict, description="predictor -> change per unit")
+    tangent: Tangent | None = Field(default=None, description="for an angle: how its mean depends on the refraction")
+    eyes: Correlation = Field(default=0.9, description="correlation of the two eyes' residuals")
+    sources: Annotated[tuple[Source, ...], Field(min_length=1)] = Field(description="where the numbers come from")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        regression = self.mean is not None
+        if (self.marginal is None) != regression:
+            raise ValueError("give either a marginal or a mean")
+        if regression and (self.sd is None) == (self.residual_sd is None):
+            raise ValueError("give either sd or residual_sd")
+        if not self.slopes.keys() <= set(ROOTS):
+            raise ValueError(f"slopes: predictors are {', '.join(ROOTS)}")
+        return self
+
+
+class Pair(Spec):
+    """Correlation of two quantities of one eye."""
+
+    pair: tuple[str, str] = Field(description="the two quantities")
+    r: Correlation = Field(description="correlation")
+    of: Literal["values", "residuals"] = Field(description="of the quantities, or of what their regressions leave")
+    mark: Mark = Field(description="how well the source is known")
+    text: str = Field(description="the source, and what it says")
+
+
+class Constant(Spec):
+    """A number that is the same in all people."""
+
+    value: Number = Field(description="the number")
+    mark: Mark = Field(description="how well the source is known")
+    text: str = Field(description="the source, and what it says")
+
+
+class Preset(Spec):
+    """A population: the reference population with other distributions."""
+
+    description: str = Field(description="who they are")
+    replace: dict[str, Distribution] = Field(default_factory=dict, description="quantity -> its distribution")
+    sources: tuple[Source, ...] = Field(default=(), description="where the numbers come from")
+
+
+class Table(FileSpec):
+    """A table of people."""
+
+    name: str = Field(description="name of the table")
+    reference: str = Field(description="the preset of which means, spreads and correlations are those of the table")
+    quantities: dict[str, Quantity] = Field(description="name -> quantity")
+    correlations: tuple[Pair, ...] = Field(description="correlations within one eye")
+    constants: dict[str, Constant] = Field(description="name -> number")
+    presets: dict[str, Preset] = Field(description="name -> population")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        known = self.quantities
+        for name in ROOTS:
+            if name not in known or known[name].marginal is None:
+                raise ValueError(f"quantities.{name}: missing, or without a marginal")
+        eyes = {name for name, q in known.items() if q.of == "eye"}
+        for k, pair in enumerate(self.correlations):
+            if not set(pair.pair) <= eyes - set(ROOTS) or len(set(pair.pair)) != 2:
+                raise ValueError(f"correlations.{k}.pair: name two quantities of an eye that are no predictors")
+        if self.reference not in self.presets or self.presets[self.reference].replace:
+            raise ValueError("reference: must be a preset that replaces nothing")
+        for name, preset in self.presets.items():
+            unknown = preset.replace.keys() - known.keys()
+            if unknown:
+                raise ValueError(f"presets.{name}.replace: unknown quantity {min(unknown)}")
+        return self
+
+    def constant(self, name: str) -> float:
+        """Value of a constant."""
+        return self.constants[name].value
+
+
+@cache
+def default_table() -> Table:
+    """The table that comes with the package."""
+    return Table.load(FOLDER / "default.yaml")

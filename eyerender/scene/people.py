@@ -1,0 +1,100 @@
+"""Populations in Python code: people as arrays, and each of them as a subject of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from ..errors import InputError
+from ..population.model import SIDES
+from ..population.people import Person, PopulationSpec
+from .subject import Subject
+
+CHUNK = 4096
+"""People drawn at once: their numbers take 5 MB."""
+
+
+class Population(PopulationSpec):
+    """People: one of the table's populations, with other distributions, and with conditions on anything."""
+
+    POSITIONAL: ClassVar[tuple[str, ...]] = ("preset",)
+    if TYPE_CHECKING:
+
+        def __init__(self, preset: str = "adults", **fields: Any) -> None: ...
+
+    def draw(self, n: int, seed: int = 0, *, first: int = 0) -> People:
+        """Draw subjects `first` to `first + n - 1`; a subject depends on (this population, seed, subject) alone.
+
+        Raises:
+            InputError: n < 1, or hardly anybody meets the conditions.
+        """
+        if n < 1:
+            raise InputError(f"must be >= 1, not {n}", path="n")
+        parts = [part.values for part in self.chunks(n, seed, first=first)]
+        values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return People(self, seed, np.arange(first, first + n), values)
+
+    def chunks(self, n: int, seed: int = 0, *, first: int = 0, size: int = CHUNK) -> Iterator[People]:
+        """Draw the same people in pieces of at most `size`, so that memory does not grow with n."""
+        for start in range(first, first + n, size):
+            count = min(size, first + n - start)
+            yield People(self, seed, np.arange(start, start + count), self.numbers(count, seed, first=start))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class People:
+    """People as arrays: `people["axial_length_mm"]` is (n, 2) for right and left, `people["age_years"]` is (n,).
+
+    Attributes:
+        population: whom they are drawn from.
+        seed: the seed.
+        number: (n,) their numbers as subjects.
+        values: name -> (n,) or (n, 2); see `PopulationSpec.numbers`.
+    """
+
+    population: PopulationSpec
+    seed: int
+    number: Ints
+    values: Mapping[str, Floats]
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def __getitem__(self, name: str) -> Floats:
+        """One quantity.
+
+        Raises:
+            InputError: there is no such quantity.
+        """
+        if name not in self.values:
+            raise InputError(f"no such quantity; there are {', '.join(self.values)}", path=name)
+        return self.values[name]
+
+    def person(self, row: int) -> Person:
+        """Person of a row."""
+        row = range(len(self))[row]
+        numbers = {name: column[row] for name, column in self.values.items()}
+        return Person.of(self.population.preset, self.seed, int(self.number[row]), numbers)
+
+    def subject(self, row: int, **fields: Any) -> Subject:
+        """Person of a row as the subject of a scene, with lids, face, and an own eye on each side.
+
+        Args:
+            row: the row.
+            fields: further fields of `Subject`: `eyes`, `luminance_cd_m2`, `accommodation_d`, ...
+        """
+        return Subject.of(self.person(row), **fields)
+
+    def columns(self) -> dict[str, Floats]:
+        """Every number as a column (n,) for a table; those of an eye end with `.right` and `.left`."""
+        out: dict[str, Floats] = {}
+        for name, column in self.values.items():
+            if column.ndim == 1:
+                out[name] = column
+            else:
+                out |= {f"{name}.{side}": column[:, k] for k, side in enumerate(SIDES)}
+        return out

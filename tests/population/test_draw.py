@@ -1,0 +1,142 @@
+"""Draws of people: moments, purity, conditions, memory."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+import eyerender as er
+from eyerender.population.model import default_reference
+
+PRESETS = ("adults", "emmetropic_adults", "myopes", "children", "elderly")
+
+
+def standard_errors(x, expected):
+    """How many standard errors the mean and the standard deviation of n values are off."""
+    mean, sd = expected
+    n = len(x)
+    centred = x - x.mean()
+    kurtosis = np.mean(centred**4) / np.mean(centred**2) ** 2
+    of_sd = sd * np.sqrt(max(kurtosis - 1, 1e-9) / (4 * n))
+    return (x.mean() - mean) / (sd / np.sqrt(n)), (x.std() - sd) / of_sd
+
+
+def worst_errors(population, n, seed):
+    """Largest |standard errors| of means, spreads and correlations, and the number of comparisons."""
+    people, model = population.draw(n, seed), population.model
+    found = []
+    for name in model.distributions:
+        x = people[name] if people[name].ndim == 1 else people[name][:, 0]
+        found += [abs(e) for e in standard_errors(x, model.expected(name))]
+    names = model.eye_names
+    values = np.column_stack([people[name][:, 0] for name in names])
+    measured = np.asarray(np.corrcoef(values.T))
+    for pair in default_reference().table.correlations:
+        i, j = (names.index(name) for name in pair.pair)
+        r = model.expected_correlation(*pair.pair)
+        found.append(abs(np.arctanh(measured[i, j]) - np.arctanh(r)) * np.sqrt(n - 3))
+    return np.array(found)
+
+
+def test_moments_are_those_of_the_table():
+    errors = worst_errors(er.Population("adults"), 20_000, 20)
+    # Some 150 comparisons: the largest of as many standard normal numbers is below 4 in all but one of 100 draws.
+    assert errors.max() < 4.0
+    assert np.mean(errors < 2.0) > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", PRESETS)
+def test_moments_of_a_hundred_thousand(preset):
+    errors = worst_errors(er.Population(preset), 100_000, 2)
+    assert errors.max() < 4.0
+    # 0.27 % of standard normal numbers are beyond 3.
+    assert np.mean(errors > 3.0) <= 0.02
+
+
+def test_correlation_of_the_eyes():
+    people, reference = er.Population("adults").draw(20_000, 5), default_reference()
+    for name in ("iris_diameter_mm", "pupil_nasal_mm", "corneal_asphericity"):
+        right, left = people[name].T
+        r = np.asarray(np.corrcoef(right, left))[0, 1]
+        assert np.arctanh(r) == pytest.approx(
+            np.arctanh(reference.table.quantities[name].eyes), abs=4 / np.sqrt(20_000)
+        )
+    assert np.asarray(np.corrcoef(people["axial_length_mm"].T))[0, 1] > 0.93
+
+
+def test_a_subject_depends_on_nothing_but_seed_and_number():
+    population = er.Population("adults", where={"axial_length_mm": (23.0, 25.0), "age_years": 40})
+    whole = population.draw(60, 9)
+    for start, count in ((0, 7), (33, 27), (59, 1)):
+        part = population.draw(count, 9, first=start)
+        for name in whole.values:
+            np.testing.assert_array_equal(part[name], whole[name][start : start + count], err_msg=name)
+    assert whole.person(59) == population.person(59, 9)
+    assert not np.array_equal(population.draw(60, 10)["ipd_mm"], whole["ipd_mm"])
+
+
+def test_conditions_equal_selection():
+    """People of one axial length are those that a narrow selection from everybody finds."""
+    wanted = {"axial_length_mm": 25.0, "male": 1}
+    given = er.Population("adults", where=wanted).draw(3000, 1)
+    np.testing.assert_allclose(given["axial_length_mm"], 25.0, atol=1e-9)
+    assert np.all(given["male"] == 1)
+    near = er.Population("adults", where={"axial_length_mm": (24.85, 25.15), "male": 1}).draw(3000, 2)
+    for name in ("refraction_d", "corneal_radius_mm", "chamber_depth_mm", "age_years", "ipd_mm"):
+        a, b = given[name], near[name]
+        error = np.sqrt((a.var() + b.var()) / 3000)
+        # The selection's mean length lies up to 0.02 mm below 25, which moves the others by less than 0.02 of a spread.
+        assert a.mean() == pytest.approx(b.mean(), abs=4 * error + 0.02 * a.std()), name
+        assert a.std() == pytest.approx(b.std(), rel=0.06), name
+
+
+def test_exact_conditions_on_predictors():
+    people = er.Population("adults", where={"age_years": 33, "refraction_d": -4.0, "ipd_mm": 60.0}).draw(50, 3)
+    np.testing.assert_allclose(people["age_years"], 33, atol=1e-9)
+    np.testing.assert_allclose(people["refraction_d"], -4.0, atol=1e-9)
+    np.testing.assert_allclose(people["ipd_mm"], 60.0, atol=1e-9)
+    assert people["axial_length_mm"].mean() > 24
+
+
+def test_replaced_marginals_are_used():
+    population = er.Population("adults", replace={"age_years": {"kind": "uniform", "low": 25, "high": 26}})
+    ages = population.draw(200, 1)["age_years"]
+    assert ages.min() >= 25
+    assert ages.max() <= 26
+
+
+def test_memory_is_flat():
+    population = er.Population("adults")
+    next(population.chunks(10))
+    peaks = []
+    for n in (12_288, 40_960):
+        tracemalloc.start()
+        for _ in population.chunks(n, 1):
+            pass
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.05 * peaks[0] + 1e5
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"preset": "martians"}, "preset: must be one of adults"),
+        ({"where": {"length": 3.0}}, "where.length: no such quantity"),
+        ({"where": {"age_years": 5}}, "where.age_years: nobody"),
+        ({"where": {"age_years": (40, 30)}}, "where.age_years: the first number"),
+        ({"replace": {"ipd_mm": {"kind": "gamma"}}}, "replace.ipd_mm: kind must be"),
+        ({"replace": {"age_years": {"kind": "regression", "mean": 3.0, "residual_sd": 1.0}}}, "must be a marginal"),
+    ],
+)
+def test_wrong_populations_name_the_key(fields, message):
+    with pytest.raises(er.InputError, match=message):
+        er.Population(**fields)
+
+
+def test_conditions_that_hardly_anybody_meets_are_refused():
+    with pytest.raises(er.InputError, match="meets the conditions"):
+        er.Population("adults", where={"axial_length_mm": (35.0, 36.0)}).draw(1)
