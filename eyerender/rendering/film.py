@@ -27,6 +27,7 @@ _LARGEST_GROUP = 4
 _PACKET = 16
 _LEAST_GROUPS = 4  # a pixel
 _FEW_LAMPS = 2  # with so few lamps shadows are dark, and they are sampled finely
+_SMALL = 0.02  # radius over distance of lamps whose shadows are so fine
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,8 @@ def mean_radiance(
             seen, failures = _singles(integrator, shown, window, spp=spp, seed=seed, first=first, count=count)
         total += seen
         failed += failures
-    return (total / spp).reshape(height, width), failed
+    # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
+    return np.maximum(total / spp, 0).reshape(height, width), failed
 
 
 def _samples(u: mi.Int32, v: mi.Int32, spp: int, seed: int) -> Samples:
@@ -163,11 +165,12 @@ def _groups(
             each,
             ray,
             lambda j: samples.pair(number(j), 0),
+            samples.pair(dr.select(several, group, group // lamps), 0),
             asked,
             lamp,
             dr.select(several, (groups + lamps - 1 - group) // groups, 1),
             shared,
-            (lamps <= _FEW_LAMPS) & ~several,
+            (lamps <= _FEW_LAMPS) & ~several & dr.opaque(mi.Bool, lights.widest < _SMALL),
             _plain(plain, window, u, v),
         ),
     )

@@ -28,6 +28,7 @@ class Group:
         count: number of samples.
         ray: origin, direction (scene's frame) and weight of sample j.
         spot: place of sample j on the lamps' discs, [0, 1)^2.
+        shared_spot: the same for the group. The groups that use a lamp have consecutive places.
         asked: number of lamps to which sample j sends rays where it meets the globe.
         lamp: the k-th of these lamps, and its weight.
         lamps: number of lamps that the whole group uses where it meets the region.
@@ -40,6 +41,7 @@ class Group:
     count: mi.UInt32
     ray: Callable[[mi.UInt32], tuple[mi.Vector3f, mi.Vector3f, mi.Float]]
     spot: Callable[[mi.UInt32], mi.Point2f]
+    shared_spot: mi.Point2f
     asked: Callable[[mi.UInt32], mi.UInt32]
     lamp: Callable[[mi.UInt32, mi.UInt32], tuple[Lamp, mi.Float]]
     lamps: mi.UInt32
@@ -181,7 +183,7 @@ class _GroupShading:
 
         state, asked = (mi.UInt32(0), total), group.asked(j)
         _, total = dr.while_loop(state, lambda k, _: k < asked, subtract, labels=("k", "total"), label="shadows")
-        return dr.maximum(total, 0)
+        return total
 
     def with_untraced(self, sheet: Kept, i: mi.UInt32, settled: mi.Bool) -> Kept:
         """Add to the skin's hit the weights of the samples from the i-th on, which a plain pixel left untraced."""
@@ -209,7 +211,8 @@ class _GroupShading:
 
         def lamp_light(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             lamp, share = group.shared(k)
-            source = self.lamp_point(lamp, kept.j)
+            spot = group.shared_spot
+            source = lamp.point(spot.x, *dr.sincos(spot.y * (2 * dr.pi)))
             outer, shine = straight(lamp, source, view, -values.vector_to_eye(d))
             lit = direct(view, view.albedo, outer, shine) * share
             asked = (kept.shared > 0) & (lit > 0)

@@ -134,10 +134,15 @@ class PupilBoundary:
 
 
 class Lights:
-    """The lamps in the eye frame, (n, 10) numbers in one buffer; kernels do not depend on their number."""
+    """The lamps in the eye frame, (n, 10) numbers in one buffer; kernels do not depend on their number.
+
+    `widest` is the largest radius over the distance from the eye.
+    """
 
     def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
         self._len = len(table)
+        away = np.linalg.norm(table[:, :3], axis=1)
+        self.widest = float(np.max(table[:, 6] / np.maximum(away, 1e-3), initial=0.0))
         self.count = dr.opaque(mi.UInt32, len(table))
         self._buffer = mi.Float(np.ascontiguousarray(table, dtype=np.float32).reshape(-1))
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
+from eyerender.arrays import frozen
 from eyerender.region.anatomy import Region
 from tests.support.render_oracles import cos4, stock
 from tests.support.render_rigs import PLAIN, eye_of, head_rig, job_of, remote_rig
@@ -21,6 +24,21 @@ def test_more_lamps_than_samples_leave_no_noise_on_the_sclera(renderer):
     assert sclera.sum() > 1000
     few, many = (renderer.radiance(job, spp=spp)[sclera] for spp in (4, 32))
     assert np.sqrt(np.mean((few / many - 1) ** 2)) < 0.0135
+
+
+def test_lamps_on_the_sclera_add_up_also_in_shadows(renderer):
+    # One lamp of two is hidden by the nose or a lid in places. The rest is noise of soft edges at 8 samples.
+    rig = remote_rig()
+    job = job_of(eye_of("E2"), rig, rig.window(160, 60), look=PLAIN, region=Region())
+    lamp = rig.lights[0]
+    lamps = tuple(replace(lamp, position_mm=frozen(p)) for p in ([300.0, 400.0, 50.0], [300.0, -100.0, -400.0]))
+    sclera = ndimage.binary_erosion(renderer.labels(job).part == 1)
+    one, two, both = (
+        renderer.radiance(replace(job, lights=some), spp=8)[sclera] for some in (lamps[:1], lamps[1:], lamps)
+    )
+    assert np.mean(one < 0.02 * one.max()) + np.mean(two < 0.02 * two.max()) > 0.1
+    assert both.mean() == pytest.approx((one + two).mean(), rel=3e-3)
+    assert np.quantile(np.abs(both - one - two), 0.9) < 0.01 * both.mean()
 
 
 def test_mean_skin_has_the_albedo_of_the_spec(renderer, tmp_path):
