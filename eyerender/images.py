@@ -152,6 +152,7 @@ def render_folder(
                     "spp": spec.image.spp,
                     "seed": spec.seed,
                     "camera": image.camera,
+                    **scene.person_numbers(records[image.row]["eye"]),
                 },
             }
             write_png(folder / line["file_name"], image.counts)

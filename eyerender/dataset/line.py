@@ -32,6 +32,7 @@ def image_line(
     (record,) = observations.take([row]).records(record_version)
     frame = record["frame"]
     side = EYES[int(observations.index.eye[row])]
+    eye = sample.eye or scene.eye_file(side).to_mapping()
     line = {
         "sample": turn.sample,
         "subject": turn.subject,
@@ -52,9 +53,10 @@ def image_line(
             "attempt": turn.attempt,
             "subject_attempt": turn.subject_attempt,
             "draws": sample.draws,
+            **scene.person_numbers(side),
             # They are stored as text, because their nested keys may differ between samples, which columns must not.
             "scene_json": json.dumps(sample.scene, sort_keys=True),
-            "eye_json": json.dumps({k: v for k, v in sample.eye.items() if k != "sources"}, sort_keys=True),
+            "eye_json": json.dumps({k: v for k, v in eye.items() if k != "sources"}, sort_keys=True),
         },
     }
     return image_name(turn.sample, frame, frames, side), line

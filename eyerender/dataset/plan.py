@@ -22,6 +22,9 @@ from numpy.typing import NDArray
 from ..errors import InputError, InputWarning
 from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
+from ..observation import EYES
+from ..population.model import SIDES
+from ..population.people import PersonChoice
 from ..scene import Scene
 from ..scene.spec import SceneSpec
 from .draws import is_draw, unit_number
@@ -42,7 +45,7 @@ class Sample:
         turn: which sample it is.
         split: its split.
         scene: plain mapping that `SceneSpec` validates.
-        eye: mapping of its eye file.
+        eye: mapping of its eye file; empty for a drawn person, whose eyes differ.
         modified: whether the eye differs from the model's own.
         draws: every draw of the spec by its path, None where it was not used.
         base: folder to which the files of the scene are relative.
@@ -63,8 +66,10 @@ class Sample:
             InputError: the drawn values do not fit together.
         """
         spec = SceneSpec.from_mapping(self.scene, source=f"sample {self.turn.sample}")
-        scene = Scene.compiled(spec, _eye(json.dumps(self.eye, sort_keys=True)), base=self.base)
-        scene.eye("right")
+        eye = _eye(json.dumps(self.eye, sort_keys=True)) if self.eye else None
+        scene = Scene.compiled(spec, eye, base=self.base)
+        for side in EYES if eye is None else EYES[:1]:
+            scene.eye(side)
         return scene
 
     def to_mapping(self) -> dict[str, Any]:
@@ -142,13 +147,7 @@ class Plan:
         """
         eyes: dict[str, Mapping[str, Any]] = {}
         sums: dict[str, str] = {}
-        eye_part = spec.scene.get("eye", {})
-        if is_draw(eye_part):
-            raise InputError("draw single values of the eye, not the whole eye", source=source, path="scene.eye")
-        names = possible(eye_part.get("model", "E2")) if isinstance(eye_part, Mapping) else ["E2"]
-        for name in names:
-            if not isinstance(name, str):
-                raise InputError(f"must be the name of an eye, not {name!r}", source=source, path="scene.eye.model")
+        for name in _eye_names(spec, source):
             file = str(base / name) if base is not None and name not in catalogue_names() else name
             try:
                 if name not in catalogue_names() and os.path.isfile(file):
@@ -289,6 +288,8 @@ class Plan:
         turn = Turn(sample=sample, subject=subject, sequence=sequence, attempt=attempt, subject_attempt=subject_attempt)
         tree, drawn = self.scene_template.values(turn)
         tree.setdefault("format", 1)
+        if spec.population is not None:
+            tree["population"] = self.person_of(subject, subject_attempt).to_mapping()
         tree.setdefault("name", f"{spec.name} {sample}")
         if "seed" not in tree:
             tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
@@ -310,6 +311,15 @@ class Plan:
     def _identify(self, subject: int) -> tuple[int, tuple[str, ...]]:
         reasons: list[str] = []
         for attempt in range(self.spec.attempts):
+            if self.spec.population is not None:
+                try:
+                    person = self.person_of(subject, attempt).chosen()
+                    for side in SIDES:
+                        person.eye(side).build()
+                except InputError as error:
+                    reasons.append(error.reason if not error.path else f"{error.path}: {error.reason}")
+                    continue
+                return attempt, tuple(reasons)
             turn = Turn(sample=0, subject=subject, sequence=0, attempt=0, subject_attempt=attempt)
             tree, _ = self.scene_template.values(turn)
             try:
@@ -324,7 +334,17 @@ class Plan:
             return attempt, tuple(reasons)
         raise InputError(f"its eye cannot be made: {reasons[-1]}", source=self.source, path=f"subject {subject}")
 
+    def person_of(self, subject: int, attempt: int) -> PersonChoice:
+        """Person of a subject at an attempt: the first has the dataset's seed, others a seed that follows from it."""
+        assert self.spec.population is not None
+        seed = self.spec.seed
+        if attempt:
+            seed = int(unit_number(seed, "population", "subject", subject, attempt) * 2**53)
+        return PersonChoice.from_mapping({**self.spec.population.to_mapping(), "seed": seed, "subject": subject})
+
     def _eye_of(self, tree: Mapping[str, Any], turn: Turn) -> tuple[dict[str, Any], dict[str, Any], bool]:
+        if self.spec.population is not None:
+            return {}, {}, False
         values, drawn = self.eye_template.values(turn)
         eye_part = tree.get("eye")
         model = eye_part.get("model", "E2") if isinstance(eye_part, Mapping) else "E2"
@@ -339,9 +359,29 @@ class Plan:
         return eye, asked, bool(mine)
 
 
+def _eye_names(spec: DatasetSpec, source: str) -> list[str]:
+    """Names of the eye models that a spec may use; none where it draws people."""
+    part = spec.scene.get("eye", {})
+    if is_draw(part):
+        raise InputError("draw single values of the eye, not the whole eye", source=source, path="scene.eye")
+    given = isinstance(part, Mapping) and "model" in part
+    if spec.population is not None:
+        if given:
+            reason = "cannot stand beside a population, which gives the eyes"
+            raise InputError(reason, source=source, path="scene.eye.model")
+        return []
+    names = possible(part["model"]) if given else ["E2"]
+    for name in names:
+        if not isinstance(name, str):
+            raise InputError(f"must be the name of an eye, not {name!r}", source=source, path="scene.eye.model")
+    return names
+
+
 def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
     """Parts of a spec with another eye model in place of its own."""
     part = spec.scene.get("eye", {})
+    if spec.population is not None:
+        raise InputError("the spec draws people with eyes of their own; take 'population' out of it", source="--eye")
     if not isinstance(part, Mapping) or is_draw(part):
         raise InputError("the spec draws the whole eye; choose the model in the spec", source="--eye")
     load_eye(eye)

@@ -64,6 +64,8 @@ class Realised:
     def write(self, path: str | Path) -> None:
         """Write scene.yaml and eye.yaml of the sample into a new folder, for other commands to read.
 
+        A drawn person is in scene.yaml, from which its eyes follow; there is no eye.yaml then.
+
         Raises:
             InputError: the sample was given up, or the folder is not empty.
             EyerenderError: the folder cannot be written.
@@ -73,10 +75,13 @@ class Realised:
         folder = Path(path)
         refuse_non_empty(folder, False)
         spec = self.scene.located()
-        spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": "eye.yaml"})})
+        drawn = spec.person is not None
+        if not drawn:
+            spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": "eye.yaml"})})
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self.scene.eye_spec.dump(folder / "eye.yaml")
+            if not drawn:
+                self.scene.eye_spec.dump(folder / "eye.yaml")
             spec.dump(folder / "scene.yaml")
         except OSError as error:
             raise EyerenderError(f"{folder}: cannot be written ({error.strerror or error})") from None

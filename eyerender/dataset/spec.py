@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from ..errors import InputError
+from ..population.people import PopulationSpec
 from ..scene import is_shipped_dataset, refuse_folder, shipped_files
 from ..scene.spec import DATASET_KIND, NOT_A_DATASET
 from ..spec import FileSpec, Positive, Spec
@@ -61,6 +62,11 @@ class DatasetSpec(FileSpec):
     eye_parameters: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="eye model -> dotted path in its eye file -> value or draw"
     )
+    population: PopulationSpec | None = Field(
+        default=None,
+        description="whom the subjects are drawn from: eyes, lids, face and distance of the pupils; what `scene` says "
+        "of `look`, `region` and `subject.ipd_mm` stays; default: the eye of the scene",
+    )
     labels: LabelsSpec = Field(default=LabelsSpec(), description="labels in addition to those that every image has")
     require: Literal["pupil", "nothing"] = Field(
         default="pupil", description="pupil: draw a sample again if its window does not contain the apparent pupil"
@@ -75,6 +81,11 @@ class DatasetSpec(FileSpec):
             raise ValueError("planned: must be >= count")
         if self.subjects is not None and self.subjects > self.planned_count:
             raise ValueError("subjects: must be <= count")
+        if self.population is not None and self.eye_parameters:
+            raise ValueError("eye_parameters: cannot stand beside a population; use its 'replace'")
+        for key in ("population", "person"):
+            if key in self.scene:
+                raise ValueError(f"scene.{key}: write 'population' beside 'scene', not in it")
         if not self.splits:
             raise ValueError("splits: give at least one")
         for name in self.splits:

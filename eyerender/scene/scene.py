@@ -145,7 +145,7 @@ class Scene:
     def compiled(
         cls,
         spec: SceneSpec,
-        eye_spec: EyeSpec,
+        eye_spec: EyeSpec | None = None,
         *,
         rig: RigGeometry | None = None,
         base: Path | None = None,
@@ -153,7 +153,8 @@ class Scene:
     ) -> Scene:
         """A scene of parts that are known to fit; without a `rig`, that of the spec.
 
-        The numbers of calibration files become part of the spec. A drawn person has its own eyes instead of `eye_spec`.
+        The numbers of calibration files become part of the spec. Without an `eye_spec` the eye is the
+        spec's; a drawn person always has its own.
 
         Raises:
             InputError: an eye of the person cannot exist.
@@ -161,7 +162,11 @@ class Scene:
         if (authored := spec.rig.resolved(base)) is not spec.rig:
             spec = spec.model_copy(update={"rig": authored})
         built = spec.rig.build() if rig is None else rig
-        eyes = (eye_spec, eye_spec) if spec.person is None else _eyes_of(spec, spec.person, built)
+        if spec.person is not None:
+            eyes = _eyes_of(spec, spec.person, built)
+        else:
+            own = spec.eye.spec(base) if eye_spec is None else eye_spec
+            eyes = own, own
         scene = object.__new__(cls)
         for name, value in zip(cls.__slots__, (spec, *eyes, built, base, source), strict=True):
             object.__setattr__(scene, name, value)
@@ -271,6 +276,22 @@ class Scene:
             return float(2 * self.eye("right").stop.semi_axes_mm[0])
         given = self.spec.eye.pupil_diameter_mm
         return self.eye_file(side).stop.diameter_mm if given is None else given
+
+    def person_numbers(self, side: str) -> dict[str, dict[str, float | int | str]]:
+        """`person` as images record it: who it is, and the numbers of the person and of this eye.
+
+        It is {} where no person is drawn. Dots in the names of numbers become underscores, as names of columns need it.
+        """
+        person = self.spec.person
+        if person is None:
+            return {}
+        k = EYES.index(side)
+        numbers = {
+            name.replace(".", "_"): value[k] if isinstance(value, tuple) else value
+            for name, value in person.numbers.items()
+        }
+        who: dict[str, float | int | str] = {"preset": person.preset, "seed": person.seed, "subject": person.subject}
+        return {"person": {**who, "sex": person.sex, **numbers}}
 
     def eye_file(self, side: str) -> EyeSpec:
         """Eye file of one side, written as a right eye."""

@@ -174,6 +174,7 @@ class SceneTruth:
                 "spp": scene.spec.image.spp,
                 "seed": scene.spec.seed,
                 "camera": view.camera,
+                **scene.person_numbers(record["eye"]),
             },
         }
         problems = [*_differences(expected, line), *_lids(scene, found, view, line)]
