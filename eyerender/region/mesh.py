@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 import trimesh
 
-from ..arrays import ArrayValue, Floats, Ints, frozen
+from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
 from .anatomy import Region
 from .brow import brow
 from .contour import COLUMNS, Contour, contour
@@ -168,6 +168,13 @@ def _grid_faces(rows: int) -> Ints:
     a, b, c, d = i * n + j, i * n + j + 1, (i + 1) * n + j, (i + 1) * n + j + 1
     both = [np.stack([a, c, d], -1).reshape(-1, 3), np.stack([a, d, b], -1).reshape(-1, 3)]
     return np.concatenate(both).astype(np.int64)
+
+
+@lru_cache(maxsize=1)
+def sheet_ends() -> Bools:
+    """Whether each triangle of the sheet of skin is in its first or last row, which no other row continues."""
+    row = np.arange(2 * (ROWS - 1) * COLUMNS) % ((ROWS - 1) * COLUMNS) // COLUMNS
+    return frozen((row == 0) | (row == ROWS - 2), np.bool_)
 
 
 def _grid_uv(rows: int, v: float | None) -> Floats:

@@ -24,7 +24,7 @@ from .view import Textures
 
 _LANES = 2**24  # samples at a time; more are rendered in several passes
 _LARGEST_GROUP = 4
-_PACKET = 16
+_TILE = 4  # pixels across and down
 _LEAST_GROUPS = 4  # a pixel
 _FEW_LAMPS = 2  # with so few lamps shadows are dark, and they are sampled finely
 _SMALL = 0.02  # radius over distance of lamps whose shadows are so fine
@@ -112,22 +112,19 @@ def _groups(
     shown: Exposed, window: Window, plain: tuple[Bools, int], *, spp: int, seed: int, first: int, count: int, size: int
 ) -> tuple[Floats, int]:
     """Sum over `count` groups of each pixel, one group per lane; sample j of group g is number g size + j."""
-    pixels = window[2] * window[3]
-    # Embree traces sixteen neighbouring lanes together. They are a few groups of a few pixels, so that their camera
-    # rays stay close and their lamp rays have few directions. There are fewer groups where each uses lamps of its own.
-    wide = next(w for w in ((2, 1) if len(shown.lights) > spp // size else (4, 2, 1)) if count % w == 0)
-    tall = _PACKET // wide
-    blocks = -(-pixels // tall)  # the last may extend beyond the window
-    index = dr.arange(mi.UInt32, blocks * tall * count)
-    n = dr.opaque(mi.UInt32, tall * count)
-    block = index // n
-    within = index - block * n
-    packet = within // _PACKET
-    lane = within - packet * _PACKET
-    across = dr.opaque(mi.UInt32, wide)
-    step = lane // across
-    u, v = pixels_of(block * dr.opaque(mi.UInt32, tall) + step, window)
-    group = packet * across + (lane - step * across) + dr.opaque(mi.UInt32, first)
+    # Embree traces sixteen neighbouring lanes together. They are one group of 4 x 4 pixels each, so that their camera
+    # rays are close and their lamp rays go the same way.
+    columns, rows = (-(-n // _TILE) for n in window[2:])  # the last tiles may extend beyond the window
+    index = dr.arange(mi.UInt32, rows * columns * _TILE * _TILE * count)
+    packet = index // (_TILE * _TILE)
+    lane = index - packet * (_TILE * _TILE)
+    tile = packet // dr.opaque(mi.UInt32, count)
+    row = tile // dr.opaque(mi.UInt32, columns)
+    x = (tile - row * dr.opaque(mi.UInt32, columns)) * _TILE + lane % _TILE
+    y = row * _TILE + lane // _TILE
+    u = mi.Int32(x) + dr.opaque(mi.Int32, window[0])
+    v = mi.Int32(y) + dr.opaque(mi.Int32, window[1])
+    group = packet - tile * dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
     samples = _samples(u, v, spp, seed)
     each = dr.opaque(mi.UInt32, size)
 
@@ -174,16 +171,20 @@ def _groups(
             _plain(plain, window, u, v),
         ),
     )
-    inside = block * dr.opaque(mi.UInt32, tall) + step < dr.opaque(mi.UInt32, pixels)
+    inside = (x < dr.opaque(mi.UInt32, window[2])) & (y < dr.opaque(mi.UInt32, window[3]))
     failures = dr.select(inside, failures, 0)
     dr.eval(radiance, failures)
-    seen = dr.block_sum(radiance, wide).numpy().reshape(blocks, count // wide, tall).sum(axis=1, dtype=float)
-    return seen.reshape(-1)[:pixels], int(dr.sum(failures).numpy()[0])
+    tiles = radiance.numpy().reshape(rows, columns, count, _TILE, _TILE).sum(axis=2, dtype=float)
+    seen = tiles.transpose(0, 2, 1, 3).reshape(rows * _TILE, columns * _TILE)[: window[3], : window[2]]
+    return seen.reshape(-1), int(dr.sum(failures).numpy()[0])
 
 
 def _plain(plain: tuple[Bools, int], window: Window, u: mi.Int32, v: mi.Int32) -> mi.Bool:
     """Whether pixels of a window show nothing but skin."""
     tiles, across = plain
     x, y, size, rows, columns = (dr.opaque(mi.Int32, k) for k in (*window[:2], across, *tiles.shape))
-    row = dr.minimum((v - y) // size, rows - 1)  # lanes may be outside the window
-    return dr.gather(mi.UInt32, mi.UInt32(tiles.ravel().astype(np.uint32)), row * columns + (u - x) // size) > 0
+    row, column = (
+        dr.minimum((v - y) // size, rows - 1),
+        dr.minimum((u - x) // size, columns - 1),
+    )  # lanes may be outside
+    return dr.gather(mi.UInt32, mi.UInt32(tiles.ravel().astype(np.uint32)), row * columns + column) > 0

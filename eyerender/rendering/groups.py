@@ -68,11 +68,11 @@ def shade_group(
         state, shading.goes_on, shading.trace_sample, labels=names, label="group"
     )
     sheet = shading.with_untraced(sheet, i, settled)
-    for kept in (sheet, before):
+    for kept, on_sheet in ((sheet, True), (before, False)):
         (total,) = dr.if_stmt(
             (total,),
             kept.weight > 0,
-            lambda total, kept=kept: (shading.add_region(total, kept),),
+            lambda total, kept=kept, on_sheet=on_sheet: (shading.add_region(total, kept, on_sheet),),
             lambda total: (total,),
         )
     return total, failures
@@ -140,7 +140,7 @@ class _GroupShading:
 
         def own_ray(_: mi.Bool) -> mi.Bool:
             source = self.lamp_point(group.shared(mi.UInt32(0))[0], j)
-            return lamp_blocked(values, self.scene, values.point_to_eye(at), source, True, True, asked)
+            return self.skin_blocked(group.shared(mi.UInt32(0))[0], source, values.point_to_eye(at), on_sheet, asked)
 
         blocked = dr.if_stmt((blocked,), asked, own_ray, lambda blocked: blocked)
         known |= asked
@@ -199,7 +199,17 @@ class _GroupShading:
         _, weight, shared = dr.while_loop(state, more, add, labels=("i", "weight", "shared"), label="settled")
         return replace(sheet, weight=weight, shared=shared)
 
-    def add_region(self, total: mi.Float, kept: Kept) -> mi.Float:
+    def skin_blocked(
+        self, lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, asked: mi.Bool
+    ) -> mi.Bool:
+        """Whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
+        values, views = self.values, self.textures.lamp_views
+        assert views is not None
+        # Where the lamp's own view shows bare skin alone, only the globe may be in the way.
+        clear = views.clear(lamp.number, values.point_to_scene(x), asked & on_sheet)
+        return lamp_blocked(values, self.scene, x, source, True, True, asked & ~clear)
+
+    def add_region(self, total: mi.Float, kept: Kept, on_sheet: bool) -> mi.Float:
         """Add to `total` the radiance of a kept hit on the region, from the lamps that the group uses."""
         values, group = self.values, self.group
         _, d, _ = group.ray(kept.j)
@@ -216,7 +226,7 @@ class _GroupShading:
             outer, shine = straight(lamp, source, view, -values.vector_to_eye(d))
             lit = direct(view, view.albedo, outer, shine) * share
             asked = (kept.shared > 0) & (lit > 0)
-            blocked = lamp_blocked(values, self.scene, view.point, source, True, True, asked)
+            blocked = self.skin_blocked(lamp, source, view.point, on_sheet, asked)
             return k + 1, total + lit * (kept.clear + dr.select(blocked, 0, kept.shared))
 
         return dr.while_loop((mi.UInt32(0), total), more, lamp_light, labels=("k", "total"), label="its lamps")[1]

@@ -59,6 +59,9 @@ class HeadScene(RegionScene):
     def _look(spec: Region) -> NDArray[np.float16]:
         return head_map(spec, load_head(_head(spec))).astype(np.float16)
 
+    def _inner(self) -> None:
+        return None
+
     def _refuse_crossing(self, spec: Region, globe: Globe) -> None:
         """Raise an error where the mesh reaches too deep into the cornea.
 

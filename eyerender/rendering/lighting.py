@@ -42,7 +42,12 @@ def lamp_blocked(
         return blocked | (values.point_to_scene(lamp).x < values.backdrop_x)
     ray = mi.Ray3f(mi.Point3f(values.point_to_scene(x + EPSILON_MM * d)), values.vector_to_scene(d))
     ray.maxt = distance * (1 - 1e-4)
-    return blocked | scene.ray_test(ray, coherent=True, active=active & ~blocked)
+    return dr.if_stmt(
+        (blocked,),
+        active & ~blocked,
+        lambda blocked: blocked | scene.ray_test(ray, coherent=True, active=True),
+        lambda blocked: blocked,
+    )
 
 
 def _globe_blocks(

@@ -21,7 +21,7 @@ from ..region.anatomy import Region
 from ..region.globe import Globe
 from ..region.head import file_states
 from ..region.mapcache import kept
-from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh
+from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh, sheet_ends
 from ..region.skin import skin_texels
 from .surround import clear_between, rays_between
 from .values import aligned
@@ -57,7 +57,7 @@ class RegionScene:
         pixels = aligned(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         moving = next((s for s in self.scene.shapes() if s.id() == "shown_moving"), None)
-        self.skin = SkinGeometry(look, layout, faces, moving, -1.0 if globe.mirrored else 1.0)
+        self.skin = SkinGeometry(look, layout, faces, moving, -1.0 if globe.mirrored else 1.0, self._inner())
         self.skin.pose(posed)
         self._shown: tuple[Region, Globe] | None = (spec, globe)
         self.posed = posed
@@ -93,6 +93,10 @@ class RegionScene:
     @staticmethod
     def _look(spec: Region) -> NDArray[np.float16]:
         return kept(skin_texels, spec.model_copy(update={"blink": 0.0}))
+
+    def _inner(self) -> Bools | None:
+        """Which triangles of the sheet of skin are not at its ends; None if it is not known to be one surface."""
+        return ~sheet_ends()
 
     def clear(self, a: Floats, b: Floats) -> Bools:
         """Whether nothing of the region stands between points (n, 3) of the scene's frame; ends not included."""
@@ -134,11 +138,19 @@ class SkinGeometry:
     """A posed region for the kernels: the corners of its triangles, and the map."""
 
     def __init__(
-        self, look: mi.Texture2f, layout: RegionLayout, moving: int, instance: mi.Shape | None, mirror: float
+        self,
+        look: mi.Texture2f,
+        layout: RegionLayout,
+        moving: int,
+        instance: mi.Shape | None,
+        mirror: float,
+        inner: Bools | None,
     ) -> None:
         self._map = look
-        corners = np.zeros((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
+        corners = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
         corners[:, :3] = layout.faces
+        corners[: layout.face_ends[0], 3] = False if inner is None else ~inner
+        self.faces, self.is_sheet = len(corners), inner is not None
         self._corners = mi.UInt32(aligned(corners.ravel()))
         self._records = np.zeros((len(layout.uv), 8), np.float32)
         self._records[:, 3], self._records[:, 7] = layout.uv.T
@@ -151,6 +163,12 @@ class SkinGeometry:
         """Update the corners to a pose."""
         self._records[:, 0:3], self._records[:, 4:7] = posed.vertices, posed.normals
         self._buffer = mi.Float(aligned(self._records.ravel()))
+
+    def corners(self, face: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f, mi.Bool]:
+        """Corners of triangles (scene's frame), and whether these are more than a part inside the sheet of skin."""
+        corner = dr.gather(mi.Vector4u, self._corners, face)
+        a, b, c = (dr.gather(mi.Vector4f, self._buffer, 2 * i) for i in (corner.x, corner.y, corner.z))
+        return *(mi.Vector3f(p.x, p.y, p.z) for p in (a, b, c)), corner.w > 0
 
     def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
         """Index of the layout's triangle that was hit."""

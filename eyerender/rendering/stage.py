@@ -16,6 +16,7 @@ from .environment import Ambience, Maps
 from .film import Exposed
 from .frame import RenderJob, boundary_waves, globe_of, kinds, light_table, panel_table, parameters_of
 from .head import place_scene
+from .lampviews import LampViews
 from .lidshade import LidShade
 from .plain import plain_tiles
 from .region import RegionScene
@@ -65,7 +66,8 @@ class Stage:
             return plain_tiles(region.posed, job.camera, anchor, window)
 
         if region is not None:
-            textures = replace(textures, region=region.skin)
+            views = LampViews(job.lights, anchor, _reach_mm(job), region.skin if region.skin.is_sheet else None)
+            textures = replace(textures, region=region.skin, lamp_views=views)
         return Exposed(place.scene, values, lights, textures, plain), place
 
     def _place(self, job: RenderJob) -> Surround | RegionScene:
@@ -91,3 +93,14 @@ class Stage:
                 self._textures.pop(next(iter(self._textures)))
             self._textures[seed] = Textures.of_seed(seed)
         return self._textures[seed]
+
+
+def _reach_mm(job: RenderJob) -> float:
+    """Distance from the apex of the unrotated eye within which the window shows skin, mm; with some to spare."""
+    x0, y0, width, height = job.window
+    corners = np.array([[x0, y0], [x0 + width, y0], [x0, y0 + height], [x0 + width, y0 + height]], dtype=float) - 0.5
+    apex = job.camera.project(job.anchor_mm)[0]
+    px_per_mm = float(job.camera.scale_at(job.anchor_mm))
+    if not (np.all(np.isfinite(apex)) and px_per_mm > 0):
+        return np.inf
+    return 1.5 * float(np.max(np.linalg.norm(corners - apex, axis=1))) / px_per_mm + 5.0

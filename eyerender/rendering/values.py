@@ -152,7 +152,8 @@ class Lights:
     def __getitem__(self, i: mi.UInt32) -> Lamp:
         base = i * LIGHT_WIDTH
         row = [dr.gather(mi.Float, self._buffer, base + k) for k in range(LIGHT_WIDTH)]
-        return Lamp(mi.Vector3f(*row[0:3]), mi.Vector3f(*row[3:6]), *row[6:10])
+        radius, intensity, exponent, inner_radius = row[6:10]
+        return Lamp(mi.Vector3f(*row[0:3]), mi.Vector3f(*row[3:6]), radius, intensity, exponent, inner_radius, i)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +166,7 @@ class Lamp:
     intensity: mi.Float
     exponent: mi.Float
     inner_radius: mi.Float
+    number: mi.UInt32
 
     def point(self, u: mi.Float, sine: mi.Float, cosine: mi.Float) -> mi.Vector3f:
         """Point of the emitting disc or ring, uniform by area: u in [0, 1) and a direction in its plane."""

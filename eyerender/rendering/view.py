@@ -20,6 +20,7 @@ from .values import Values
 
 if TYPE_CHECKING:
     from .environment import Ambience
+    from .lampviews import LampViews
     from .region import SkinGeometry
 
 EPSILON_MM = 2e-3  # points closer than this are the same in single precision
@@ -73,6 +74,7 @@ class Textures:
     sclera: mi.Texture2f
     region: SkinGeometry | None = None
     ambience: Ambience | None = None
+    lamp_views: LampViews | None = None
 
     @classmethod
     def of_seed(cls, seed: int) -> Textures:

@@ -1,0 +1,177 @@
+"""What the lamps see of an eye region: where nothing but bare skin is in the way, no ray is needed for a shadow.
+
+The view of every lamp, a stereographic map of the directions from its middle, is divided into cells. A cell is marked
+if it may show a hair, a line of tears, an end of the sheet of skin, or a triangle of the sheet that turns its back to
+any point of the lamp. A ray through a cell without marks meets the sheet from its front only. The crossings from the
+front, less those from the back, are at most one, because the sheet is one surface with a hole (see `plain`). So a point
+of the sheet in such a cell is the only one there, and the lamp lights it.
+
+A lamp of radius r is more than its middle. Seen from another of its points, an occluder at the distance a shifts
+against a receiver at the distance b by r (1 / a - 1 / b) at most. The marks are as much wider.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..arrays import Floats
+from ..rig.light import Lamp
+from .values import aligned
+
+if TYPE_CHECKING:
+    from .region import SkinGeometry
+
+_CELLS = 512  # along each side of a map
+_WIDTH = 16  # numbers of a lamp
+_REACH_MM = 72.0  # of the sheet about the apex of the eye
+_LARGEST = 0.85  # half the width of a map: tan of half the angle to the axis
+
+
+class LampViews:
+    """The maps of all lamps for one pose of a region, on the device.
+
+    Args:
+        lights: the lamps.
+        anchor_mm: origin of the scene's frame in the world.
+        reach_mm: distance from this origin within which skin matters.
+        skin: the posed region; None for one whose sheet is not known to be one surface, where every cell is marked.
+    """
+
+    def __init__(self, lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float, skin: SkinGeometry | None) -> None:
+        reach = min(reach_mm, _REACH_MM)
+        table = np.array([_frame(lamp, anchor_mm, reach) for lamp in lights], dtype=np.float32).reshape(-1)
+        self._table = mi.Float(aligned(table))
+        self._known = dr.opaque(mi.Bool, skin is not None)
+        self._marks = dr.zeros(mi.UInt32, max(len(lights), 1) * _CELLS * _CELLS if skin is not None else 1)
+        if skin is not None and len(lights):
+            self._mark(skin, len(lights))
+
+    def clear(self, lamp: mi.UInt32, x: mi.Vector3f, active: mi.Bool) -> mi.Bool:
+        """Whether nothing of the region stands between points of the sheet (scene's frame) and any point of a lamp."""
+        view = self._view(lamp)
+        u, v, _ = view.place(x)
+        inside = active & self._known & (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
+        cell = (lamp * _CELLS + mi.UInt32(v)) * _CELLS + mi.UInt32(u)
+        return inside & (dr.gather(mi.UInt32, self._marks, cell, inside) == 0)
+
+    def _view(self, lamp: mi.UInt32) -> _View:
+        row = [dr.gather(mi.Float, self._table, lamp * _WIDTH + k) for k in range(15)]
+        return _View(*(mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9)), *row[12:15])
+
+    def _mark(self, skin: SkinGeometry, lamps: int) -> None:
+        """Mark the cells that triangles may cover."""
+        faces = dr.opaque(mi.UInt32, skin.faces)
+        index = dr.arange(mi.UInt32, skin.faces * lamps)
+        lamp = index // faces
+        view = self._view(lamp)
+        a, b, c, special = skin.corners(index - lamp * faces)
+        normal = dr.cross(b - a, c - a)
+        limit = view.radius * dr.norm(normal)
+        front = dr.minimum(
+            dr.minimum(dr.dot(normal, view.origin - a), dr.dot(normal, view.origin - b)),
+            dr.dot(normal, view.origin - c),
+        )
+        marked = special | (front <= limit)
+        places = [view.place(p) for p in (a, b, c)]
+        us, vs, wide = ([p[k] for p in places] for k in range(3))
+        spread = dr.maximum(dr.maximum(wide[0], wide[1]), wide[2])
+        lowest = [dr.minimum(dr.minimum(k[0], k[1]), k[2]) for k in (us, vs)]
+        highest = [dr.maximum(dr.maximum(k[0], k[1]), k[2]) for k in (us, vs)]
+        # Straight edges are arcs in a map, of a radius of one unit at least.
+        slack = (
+            spread + 0.02 + (dr.square(highest[0] - lowest[0]) + dr.square(highest[1] - lowest[1])) / (8 * view.scale)
+        )
+        first = [mi.Int32(dr.clip(dr.floor(k - slack), -1, _CELLS)) for k in lowest]
+        last = [mi.Int32(dr.clip(dr.floor(k + slack), -1, _CELLS)) for k in highest]
+        columns = mi.UInt32(dr.maximum(last[0] - first[0] + 1, 0))
+        count = dr.select(marked, columns * mi.UInt32(dr.maximum(last[1] - first[1] + 1, 0)), 0)
+        # Hairs are thin, so of the cells about them those near the longest edge matter.
+        edge = _Edge.longest(us, vs)
+        reach = edge.width + slack + 0.71
+        marks = self._marks
+
+        def more(k: mi.UInt32) -> mi.Bool:
+            return k < count
+
+        def mark(k: mi.UInt32) -> mi.UInt32:
+            row = k // columns
+            u, v = first[0] + mi.Int32(k - row * columns), first[1] + mi.Int32(row)
+            near = edge.distance2(mi.Float(u) + 0.5, mi.Float(v) + 0.5) < reach * reach
+            inside = (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
+            cell = (lamp * _CELLS + mi.UInt32(v)) * _CELLS + mi.UInt32(u)
+            dr.scatter(marks, mi.UInt32(1), cell, near & inside)
+            return k + 1
+
+        dr.while_loop((mi.UInt32(0),), more, lambda k: (mark(k),), labels=("k",), label="marks")
+        dr.eval(marks)
+
+
+class _View:
+    """One lamp's view: its place, two axes across its axis, the axis, cells per unit, radius, and farthest distance."""
+
+    def __init__(
+        self, origin: mi.Vector3f, e1: mi.Vector3f, e2: mi.Vector3f, axis: mi.Vector3f, *scalars: mi.Float
+    ) -> None:
+        self.origin, self._e1, self._e2, self._axis = origin, e1, e2, axis
+        self.scale, self.radius, self._farthest = scalars
+
+    def place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Place (u, v) in cells of points of the scene's frame, and by how many cells the lamp's size moves them."""
+        p = x - self.origin
+        distance = dr.norm(p)
+        ahead = dr.maximum(dr.dot(p, self._axis) + distance, 1e-3 * distance)
+        k = self.scale / ahead
+        middle = 0.5 * _CELLS
+        shift = self.radius * dr.maximum(1 / distance - 1 / self._farthest, 0) * distance * k
+        return middle + k * dr.dot(p, self._e1), middle + k * dr.dot(p, self._e2), shift
+
+
+class _Edge:
+    """Longest edge of triangles in a map, and how far the third corner is from it."""
+
+    def __init__(self, u: mi.Float, v: mi.Float, du: mi.Float, dv: mi.Float, width: mi.Float) -> None:
+        self._u, self._v, self._du, self._dv, self.width = u, v, du, dv, width
+        self._inverse = dr.rcp(dr.maximum(du * du + dv * dv, 1e-12))
+
+    @classmethod
+    def longest(cls, us: Sequence[mi.Float], vs: Sequence[mi.Float]) -> _Edge:
+        edges = [(us[i], vs[i], us[j] - us[i], vs[j] - vs[i]) for i, j in ((0, 1), (1, 2), (2, 0))]
+        best, size = edges[0], edges[0][2] * edges[0][2] + edges[0][3] * edges[0][3]
+        for edge in edges[1:]:
+            other = edge[2] * edge[2] + edge[3] * edge[3]
+            best = tuple(dr.select(other > size, x, y) for x, y in zip(edge, best, strict=True))
+            size = dr.maximum(size, other)
+        area = dr.abs(edges[0][2] * edges[2][3] - edges[0][3] * edges[2][2])
+        return cls(*best, area * dr.rsqrt(dr.maximum(size, 1e-12)))
+
+    def distance2(self, u: mi.Float, v: mi.Float) -> mi.Float:
+        """Squared distance of points from the edge."""
+        x, y = u - self._u, v - self._v
+        t = dr.clip((x * self._du + y * self._dv) * self._inverse, 0, 1)
+        return dr.square(x - t * self._du) + dr.square(y - t * self._dv)
+
+
+def _frame(lamp: Lamp, anchor_mm: Floats, reach_mm: float) -> list[float]:
+    """Numbers of a lamp's view, in the scene's frame."""
+    origin = np.asarray(lamp.position_mm - anchor_mm, dtype=float)
+    distance = float(np.linalg.norm(origin))
+    axis = -origin / distance if distance > 0 else np.array([-1.0, 0.0, 0.0])
+    e1 = np.cross(axis, (0.0, 0.0, 1.0) if abs(axis[2]) < 0.8 else (0.0, 1.0, 0.0))
+    e1 /= np.linalg.norm(e1)
+    widest = np.arcsin(min(reach_mm / max(distance, 1e-9), 1.0))
+    half = min(float(np.tan(widest / 2)), _LARGEST)
+    return [
+        *origin,
+        *e1,
+        *np.cross(axis, e1),
+        *axis,
+        0.5 * _CELLS / half,
+        float(lamp.radius_mm),
+        distance + reach_mm,
+        0,
+    ]
