@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from .eye.spec import EyeSpec
     from .imagefolder import ImageFolder
     from .imageobserver import ImageObserver, detect
-    from .images import LabelledImage, export_scene, render, render_folder
+    from .images import LabelledImage, auto_exposed, export_scene, render, render_folder
     from .observation import Observations
     from .quickstart import compare_folder, run_quickstart
     from .region.anatomy import Brow, Face, Fissure, Lashes, Lid, Region, Skin, TearFilm
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from .region.look import Look
     from .report.comparison import write_report
     from .rig.camera import CalibrationFile, Camera, CameraCalibration, PinholeCamera
-    from .rig.imaging import Ambient, Lens, Motion, Panel, RadianceMap
+    from .rig.imaging import Ambient, Lens, Motion, Opening, Panel, RadianceMap
     from .rig.light import Led, LedRing
     from .rig.rig import Rig, RigGeometry
     from .rig.screen import Screen
@@ -88,6 +88,7 @@ _HOMES = {
     "Motion": "rig.imaging",
     "Observations": "observation",
     "Observer": "scene.observer",
+    "Opening": "rig.imaging",
     "Panel": "rig.imaging",
     "Picture": "scene.spec",
     "PinholeCamera": "rig.camera",
@@ -112,6 +113,7 @@ _HOMES = {
     "detect": "imageobserver",
     "estimate": "dataset.estimate",
     "export": "dataset.export",
+    "auto_exposed": "images",
     "export_scene": "images",
     "extract": "extraction",
     "generate": "dataset.run",
@@ -166,6 +168,7 @@ __all__ = [
     "Motion",
     "Observations",
     "Observer",
+    "Opening",
     "Panel",
     "Picture",
     "PinholeCamera",
@@ -185,6 +188,7 @@ __all__ = [
     "Targets",
     "TearFilm",
     "__version__",
+    "auto_exposed",
     "bench_extractors",
     "compare",
     "compare_folder",

@@ -14,7 +14,7 @@ from .backends.choose import BackendChoice, choose_backend
 from .errors import InputError
 from .eye.model import EyeModel
 from .eye.pose import Poses, rigid_motion
-from .imagefile import MAX_PIXELS
+from .imagefile import MAX_PIXELS, compressed
 from .observation import EYES
 from .progress import Progress, followed
 from .rig.camera import Window
@@ -38,7 +38,7 @@ class EyeImage:
         window: (x0, y0, width, height) of the window in full-sensor pixels.
         counts: what the sensor stores, (height, width) uint8 or uint16 DN.
         irradiance: on the sensor before noise and quantisation, (height, width) mW/mm^2.
-        parts: part of the eye at each pixel's centre, (height, width) uint8 (docs/formats.md).
+        parts: part of the picture at each pixel's centre, (height, width) uint8 (docs/formats.md).
         eye: the eye's model, placed in the world by x_world = M x + t.
         M: (3, 3) rotation of that motion.
         t: (3,) translation of that motion, mm.
@@ -201,16 +201,22 @@ def image_seed(seed: int, frame: int, eye: int) -> int:
 
 def noiseless(image: EyeImage) -> NDArray[Any]:
     """Counts of an image without the sensor's noise, as with `sensor.noise: false`."""
-    from .rig.exposure import expose
+    from .rig.exposure import recorded
 
     spec = image.scene.spec
     sensor = spec.sensor.model_copy(update={"noise": False})
-    return _stored(image.scene, expose(sensor, image.irradiance.astype(float), spec.wavelength_nm, 0))
+    camera = image.scene.rig.cameras[image.camera]
+    dn = recorded(sensor, camera, image.window, image.irradiance.astype(float), spec.wavelength_nm, 0)
+    return dn.astype(np.uint8) if sensor.bit_depth == 8 else dn
 
 
 def _stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
-    """Convert counts to the type in which they are written."""
-    return dn.astype(np.uint8) if scene.spec.sensor.bit_depth == 8 else dn
+    """Convert counts to the type in which they are written, through the sensor's compression."""
+    sensor = scene.spec.sensor
+    if sensor.bit_depth != 8:
+        return dn
+    codes = dn.astype(np.uint8)
+    return codes if sensor.jpeg_quality is None else compressed(codes, sensor.jpeg_quality)
 
 
 def eye_motion(frames: Frames, row: int) -> tuple[Floats, Floats]:

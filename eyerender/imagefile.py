@@ -5,6 +5,7 @@ Pixel values are linear sensor counts. Nothing here scales or gamma-encodes them
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
 import zlib
@@ -42,6 +43,13 @@ def encode_png(target: Path | BinaryIO, image: NDArray[Any]) -> None:
     # Noise does not compress, and writing must not cost more than rendering. Run lengths alone are faster and, for
     # noise and for masks, smaller than zlib's search for repetitions.
     Image.fromarray(np.ascontiguousarray(image)).save(target, format="PNG", compress_level=1, compress_type=zlib.Z_RLE)
+
+
+def compressed(image: Bytes, quality: int) -> Bytes:
+    """An 8-bit image (h, w) after compression as JPEG of a quality from 1 to 100."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="JPEG", quality=quality)
+    return np.asarray(Image.open(buffer, formats=("JPEG",)))
 
 
 def read_image(path: str | Path) -> tuple[NDArray[Any], int]:

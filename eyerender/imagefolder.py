@@ -22,7 +22,9 @@ from .jsonlines import JsonLines
 from .observation import EYES, Observations, concatenate, count_heads
 from .rig.camera import Window
 
-IMAGE_SCHEMA = "eyerender/image/1"
+IMAGE_SCHEMA = "eyerender/image/2"
+# Version 1 has neither `gamma` nor the class 4 of masks; it is read wherever version 2 is.
+IMAGE_SCHEMAS = (IMAGE_SCHEMA, "eyerender/image/1")
 DATASET_SCHEMA = "eyerender/dataset/1"
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
 RUN = "run.json"  # in a folder that `generate` fills, from its start
@@ -30,15 +32,17 @@ STAGE = ".partial-"
 _BATCH = 1024  # number of lines whose records are in memory at a time
 _MAX_PX = 2**31
 
-BACKGROUND, SCLERA, IRIS, PUPIL = 0, 1, 2, 3  # classes of a mask
+BACKGROUND, SCLERA, IRIS, PUPIL, FRAME = 0, 1, 2, 3, 4  # classes of a mask
 
 CONVENTIONS = {
     "world_frame": "mm; origin midway between the corneal apexes of the unrotated eyes at the reference head position; "
     "+x to the screen, +y to the subject's left, +z up",
     "pixels": "pixel centres at integers, x right, y down, full-sensor coordinates also for a window",
     "ellipse": "semi-axes a >= b in px, angle of a from +x toward +y in [0, pi) rad, direct least squares",
-    "values": "linear sensor counts; exposure belongs to the scene, never to the image",
-    "mask": "0 background or skin, 1 sclera, 2 iris, 3 pupil, as seen through the cornea at pixel centres",
+    "values": "sensor counts, linear unless the line's gamma is not 1 (then count / full scale = linear^(1 / gamma)); "
+    "exposure belongs to the scene, never to the image",
+    "mask": "0 background or skin, 1 sclera, 2 iris, 3 pupil, as seen through the cornea at pixel centres; 4 what "
+    "frames the camera's view (openings of the lens, borders of the sensor)",
 }
 
 
@@ -87,6 +91,11 @@ class ImageEntry:
         return inside(self.folder, name, source=str(self.folder / METADATA), path=self._where(key))
 
     @property
+    def gamma(self) -> float:
+        """The image stores linear intensity^(1 / gamma)."""
+        return float(self.line.get("gamma") or 1.0)
+
+    @property
     def window(self) -> Window:
         """Window x0, y0, width, height in full-sensor pixels."""
         w = self.line["window_px"]
@@ -101,7 +110,7 @@ class ImageEntry:
         return self._picture(self.path)
 
     def mask(self) -> Bytes | None:
-        """Read the part of the eye at each pixel, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil.
+        """Read what each pixel shows, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 a frame.
 
         Returns:
             The mask, None where the line names none.
@@ -285,7 +294,7 @@ def _check_line(line: dict[str, Any], source: str, where: str) -> None:
     def refuse(key: str, reason: str) -> NoReturn:
         raise InputError(reason, source=source, path=f"{where}.{key}")
 
-    if line.get("schema") != IMAGE_SCHEMA:
+    if line.get("schema") not in IMAGE_SCHEMAS:
         refuse("schema", f"is {shown(line.get('schema'))}, not an image record ({IMAGE_SCHEMA!r})")
     for key in FILE_KEYS:
         name = line.get(key)
@@ -299,6 +308,9 @@ def _check_line(line: dict[str, Any], source: str, where: str) -> None:
     depth = line.get("bit_depth")
     if depth is not None and not (_is_whole(depth) and 1 <= depth <= 32):
         refuse("bit_depth", "must be 1 to 32")
+    gamma = line.get("gamma")
+    if gamma is not None and (isinstance(gamma, bool) or not isinstance(gamma, int | float) or not 0.1 <= gamma <= 10):
+        refuse("gamma", "must be 0.1 to 10")
     _check_names(line, refuse)
     _check_records(line.get("records"), refuse)
 

@@ -68,6 +68,7 @@ class ImageObserver:
                     image.frame.index,
                     np.array([0]),
                     image.scene,
+                    image.scene.spec.sensor.gamma,
                 )
                 for image in images
             ]
@@ -88,7 +89,7 @@ class ImageObserver:
             image = entry.image()
             rows = np.arange(row, row + len(entry.records))
             depth = int(entry.line.get("bit_depth") or 8 * image.itemsize)
-            few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene))
+            few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene, entry.gamma))
             if len(few) == _BATCH:
                 parts.append(concatenate(few))
                 few = []
@@ -124,7 +125,14 @@ class ImageObserver:
         return concatenate(parts)
 
     def _observe_rows(
-        self, image: NDArray[Any], depth: int, origin: tuple[int, int], index: Index, rows: Ints, scene: Scene
+        self,
+        image: NDArray[Any],
+        depth: int,
+        origin: tuple[int, int],
+        index: Index,
+        rows: Ints,
+        scene: Scene,
+        gamma: float,
     ) -> Observations:
         """Extract the eyes of one image; if there are two, each is searched in its own part of the image."""
         parts = []
@@ -142,7 +150,7 @@ class ImageObserver:
                     "radius_max_px": max(5.0 * px_per_mm, 8.0),
                 }
             )
-            found = extract(cut, bit_depth=depth, gamma=self.gamma, settings=settings)
+            found = extract(cut, bit_depth=depth, gamma=gamma if gamma != 1 else self.gamma, settings=settings)
             lights, reasons = _lights(found, corner, scene, camera, eye_mm)
             parts.append(_observation(found, lights, reasons, corner, index.take([row])))
         return concatenate(parts)

@@ -8,17 +8,20 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, overload
 
+import numpy as np
+
 from .analytic.observer import trace
 from .backends.choose import BackendChoice
 from .capture import EyeImage, check_windows, make_renderer, render_job, render_windows
 from .errors import InputError, Warn
 from .imagefile import encode_png, preview, write_png
-from .imagefolder import write_dataset
+from .imagefolder import FRAME, write_dataset
 from .labels import image_labels, seen_labels
 from .observation import EYES
 from .outfolder import MARKER, refuse_non_empty, staged
 from .plausibility import is_saturated, saturation_warnings
 from .progress import Progress
+from .rig.exposure import electrons
 from .rig.rig import RigLike
 from .scene import Frame, Frames, Scene
 
@@ -42,7 +45,9 @@ class LabelledImage(EyeImage):
     def _repr_png_(self) -> bytes:
         """The picture as notebooks show it, brightened for people to look at."""
         buffer = io.BytesIO()
-        encode_png(buffer, preview(self.counts, self.scene.spec.sensor.full_scale_dn))
+        encode_png(
+            buffer, preview(self.counts, self.scene.spec.sensor.full_scale_dn, 2.2 / self.scene.spec.sensor.gamma)
+        )
         return buffer.getvalue()
 
 
@@ -143,6 +148,7 @@ def render_folder(
                 "mask_file_name": f"masks/{image.name}.png",
                 "window_px": dict(zip(("x0", "y0", "width", "height"), image.window, strict=True)),
                 "bit_depth": spec.sensor.bit_depth,
+                "gamma": spec.sensor.gamma,
                 "records": [records[image.row]],
                 "labels": seen_labels(image, truth),
                 "parameters": {
@@ -174,6 +180,55 @@ def render_folder(
         "images": len(lines),
         "warnings": [warning.to_mapping() for warning in (*warnings, *found)],
     }
+
+
+_LOOKED_AT = 6  # frames by which a run is exposed
+_LONGEST_MS = 1000.0
+
+
+def auto_exposed(
+    scene: Scene,
+    level: float = 0.7,
+    *,
+    share: float = 0.98,
+    backend: BackendChoice = "auto",
+    threads: int | None = None,
+) -> Scene:
+    """Give a scene one exposure for all of its images, as a camera's automatic exposure settles for a run.
+
+    The exposure time is chosen so that `share` of the pixels of a few of its frames, evenly chosen and rendered with
+    few samples, are at most `level` of full scale (linear, black level included). What frames the view does not count.
+
+    Args:
+        scene: the scene.
+        level: share of full scale.
+        share: share of the pixels that are at most at this level.
+        backend: the render backend.
+        threads: total number of processor threads; None: all.
+
+    Returns:
+        The scene with another `sensor.exposure_ms`.
+
+    Raises:
+        InputError: an argument is out of range, or the images are dark.
+    """
+    if not 0.01 <= level <= 2:
+        raise InputError("must be 0.01 to 2", source="--auto-exposure")
+    if not 0 < share <= 1:
+        raise InputError("must be above 0 and at most 1", path="share")
+    sensor = scene.spec.sensor
+    quiet = scene.with_(spp=4, sensor={**sensor.to_mapping(), "noise": False})
+    frames = quiet.frames()
+    count = min(_LOOKED_AT, len(frames))
+    rows = np.array([k * len(frames) // count for k in range(count)])
+    images = render_windows(frames.take(rows), backend=backend, threads=threads)
+    seen = np.concatenate([image.irradiance[image.parts != FRAME].astype(float) for image in images])
+    charge = float(np.quantile(electrons(sensor, seen, scene.spec.wavelength_nm), share)) if seen.size else 0.0
+    room = level * sensor.full_scale_dn - sensor.black_dn
+    if not charge * sensor.gain > 1e-3 or room <= 0:
+        raise InputError("the images are too dark to be exposed automatically", source=scene.source)
+    time_ms = min(sensor.exposure_ms * room / (charge * sensor.gain), _LONGEST_MS)
+    return scene.with_(sensor={**sensor.to_mapping(), "exposure_ms": float(f"{time_ms:.4g}")})
 
 
 def export_scene(

@@ -20,6 +20,7 @@ from .capture import EyeImage, eye_motion
 from .eye.fixation import fixations
 from .eye.model import EyeModel
 from .geometry.ellipse import fit_ellipse_direct
+from .imagefolder import IRIS, PUPIL
 from .observation import EYES, Observations
 from .rig.camera import PinholeCamera, Window
 from .scene import Frames, Scene
@@ -27,7 +28,6 @@ from .status import Status
 
 _OUTLINE_POINTS = 60
 _SAG_STEP_MM = 0.05
-IRIS, PUPIL = 2, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@ Both datasets give an image as a mapping with the parts that are asked for:
 | part | value |
 |---|---|
 | `image`, `noiseless` | float32 (1, h, w): linear counts as a share of the full scale, 0 to 1 |
-| `mask`, `amodal_mask` | int64 (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil |
+| `mask`, `amodal_mask` | int64 (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 what frames the view |
 | `pupil`, `iris` | float32 (5,): ellipse of the amodal outline: x, y, a, b in px of the image, angle in rad; or nan |
 | `gaze` | float32 (3,): unit vector of the line of sight in the camera's frame, out of the eye |
 | `line` | the whole line of metadata, a dict |
@@ -319,6 +319,8 @@ def _value(part: str, line: dict[str, Any], picture: Callable[[str], NDArray[Any
         share = pixels.astype(np.float32)
         if pixels.dtype.kind == "u":
             share /= 2 ** line["bit_depth"] - 1
+            gamma = line.get("gamma") or 1.0
+            share = share if gamma == 1 else share**gamma
         return torch.from_numpy(share)[None]
     if part in ("pupil", "iris"):
         ellipse, window = line["labels"][part]["amodal"], line["window_px"]

@@ -19,7 +19,7 @@ from scipy import ndimage, optimize
 from eyerender.analytic.observer import trace
 from eyerender.capture import render_windows
 from eyerender.geometry.ellipse import Ellipse, signed_distance
-from eyerender.labels import PUPIL
+from eyerender.imagefolder import PUPIL
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 from make_ideal_images import Drawing

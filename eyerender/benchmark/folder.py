@@ -163,7 +163,12 @@ def _hints(
     """
     eye_mm = truth.index.eye_position_mm[row] + truth.index.head_mm[row]
     camera, lights = _camera_and_lights(line, int(truth.index.camera[row]), scene_rig)
-    hints: dict[str, Any] = {"polarity": "dark", "gamma": 1.0, "radius_px": None, "rig": None}
+    hints: dict[str, Any] = {
+        "polarity": "dark",
+        "gamma": float(line.get("gamma") or 1.0),
+        "radius_px": None,
+        "rig": None,
+    }
     if camera is None or not np.isfinite(eye_mm).all():
         return hints
     scale = camera.scale_at(eye_mm)

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from .app import app
 from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads, positive
-from .output import Heed, emit, progress
+from .output import Heed, emit, progress, say
 
 
 @app.command(name="render")
@@ -24,6 +24,7 @@ def render(
     backend: Backend = "auto",
     threads: Threads = None,
     exr: bool = False,
+    auto_exposure: float | None = None,
     overwrite: Overwrite = False,
     strict: Strict = False,
     json: Result = None,
@@ -35,14 +36,21 @@ def render(
         output: The folder to write.
         spp: Replace the scene's samples per pixel.
         exr: Also write the noise-free linear irradiance as EXR.
+        auto_exposure: Choose one exposure time for the whole run, so that 98 % of the pixels are at most at this share
+            of full scale (0.7, for instance; more than 1 clips).
     """
-    from ..images import render_folder
+    from ..images import auto_exposed, render_folder
+    from ..outfolder import refuse_non_empty
     from ..scene import load_scene
 
     positive("--threads", threads)
     heed = Heed(strict)
     loaded = load_scene(scene, eye=eye, spp=spp, seed=seed)
     heed(loaded.warnings())
+    refuse_non_empty(output, overwrite)
+    if auto_exposure is not None:
+        loaded = auto_exposed(loaded, auto_exposure, backend=backend, threads=threads)
+        say(f"exposure: {loaded.spec.sensor.exposure_ms:g} ms")
     with progress("rendering") as steps:
         done = render_folder(
             loaded, output, backend=backend, threads=threads, overwrite=overwrite, exr=exr, progress=steps, warn=heed

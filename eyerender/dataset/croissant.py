@@ -11,12 +11,13 @@ CROISSANT = "croissant.json"
 _TEXT, _INTEGER = "sc:Text", "sc:Integer"
 _FIELDS = (
     ("file_name", _TEXT, "The image, relative to the dataset's folder"),
-    ("mask_file_name", _TEXT, "The mask: 0 background or skin, 1 sclera, 2 iris, 3 pupil"),
+    ("mask_file_name", _TEXT, "The mask: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 what frames the view"),
     ("sample", _INTEGER, "Which sample of the spec"),
     ("subject", _INTEGER, "Subject; each subject is in one split only"),
     ("split", _TEXT, "Which split"),
     ("sequence_index", _INTEGER, "Index in the subject's sequence of frames"),
     ("bit_depth", _INTEGER, "Of the image's values"),
+    ("gamma", "sc:Float", "The values store the linear share of full scale^(1 / gamma)"),
 )
 _CONTEXT: dict[str, Any] = {
     "@language": "en",

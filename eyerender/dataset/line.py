@@ -40,6 +40,7 @@ def image_line(
         "sequence_index": turn.sequence,
         "window_px": dict(zip(("x0", "y0", "width", "height"), window, strict=True)),
         "bit_depth": scene.spec.sensor.bit_depth,
+        "gamma": scene.spec.sensor.gamma,
         # A frame's number is unique in the whole dataset.
         "records": [{**record, "frame": turn.sample * frames + frame}],
         "labels": labels,

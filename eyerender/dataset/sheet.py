@@ -121,7 +121,7 @@ def _of_plan(plan: Plan, backend: BackendChoice, threads: int | None) -> Iterato
             raise InputError(f"sample {made.index} cannot be made: {made.rejections[-1].reason}", source=plan.source)
         image = made.images[0]
         caption = f"{image.line['split']} sample {made.index} subject {image.line['subject']}"
-        yield count, _tile(image.pictures["images"], image.line["bit_depth"], caption), image.saturated
+        yield count, _tile(image.pictures["images"], image.line, caption), image.saturated
 
 
 def _of_scene(scene: Scene, backend: BackendChoice, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:
@@ -130,9 +130,10 @@ def _of_scene(scene: Scene, backend: BackendChoice, threads: int | None) -> Iter
     rows = np.array([k * len(frames) // count for k in range(count)])
     renderer = make_renderer(backend, threads)
     for image in render_windows(frames.take(rows), renderer=renderer):
-        tile = _tile(image.counts, scene.spec.sensor.bit_depth, image.name)
+        sensor = scene.spec.sensor
+        tile = _tile(image.counts, {"bit_depth": sensor.bit_depth, "gamma": sensor.gamma}, image.name)
         yield count, tile, is_saturated(image.counts, scene.spec.sensor)
 
 
-def _tile(dn: Any, bit_depth: int, caption: str) -> Tile:
-    return eight_bit(dn, 2.0**bit_depth - 1), caption
+def _tile(dn: Any, line: dict[str, Any], caption: str) -> Tile:
+    return eight_bit(dn, 2.0 ** line["bit_depth"] - 1, 2.2 / line["gamma"]), caption

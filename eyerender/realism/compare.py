@@ -118,7 +118,7 @@ def measure_folder(
 def _encoding(source: Source) -> tuple[float, str]:
     """Gamma of a folder's images, and where it is known from."""
     if source.entries:
-        return 1.0, "the folder: linear counts"
+        return source.entries[0].gamma, "the folder"
     stated = source.path / EXPORT
     if not stated.is_file():
         return 1.0, "assumed"

@@ -25,6 +25,7 @@ from ..arrays import ArrayValue, Floats, frozen
 from ..errors import InputError
 from ..files import opened
 from ..rig.imaging import RadianceMap
+from ..rig.surroundings import paint
 from ..spec import file_digest
 from .exr import second_thread
 from .lidshade import LidShade
@@ -186,6 +187,15 @@ def map_rotation(spec: RadianceMap) -> Floats:
     return np.asarray(Rz @ Ry @ Rx)
 
 
+def _values(spec: RadianceMap) -> Floats:
+    """Values of a map: those of its file, or painted ones."""
+    if spec.file is None:
+        return paint(str(spec.place), spec.place_seed)
+    if spec.sha256 is not None and file_digest(Path(spec.file)) != spec.sha256:
+        raise InputError("does not have the given sha256", source=spec.file)
+    return read_map(spec.file, spec.channel)
+
+
 class Maps:
     """The maps in use, on the device; each is read and sent there once."""
 
@@ -197,18 +207,17 @@ class Maps:
         """Texture and map of a spec (its file's path is absolute or relative to the current folder)."""
         if spec is None:
             return self._none
-        path = Path(spec.file)
-        try:
-            state = path.stat()
-        except OSError:
-            raise InputError("no such file", source=spec.file) from None
-        key = (spec.file, spec.channel, spec.sha256, state.st_mtime_ns, state.st_size)
+        key: tuple[Any, ...] = (spec.place, spec.place_seed)
+        if spec.file is not None:
+            try:
+                state = Path(spec.file).stat()
+            except OSError:
+                raise InputError("no such file", source=spec.file) from None
+            key = (spec.file, spec.channel, spec.sha256, state.st_mtime_ns, state.st_size)
         if key not in self._kept:
             if len(self._kept) >= _KEPT:
                 self._kept.pop(next(iter(self._kept)))
-            if spec.sha256 is not None and file_digest(path) != spec.sha256:
-                raise InputError("does not have the given sha256", source=spec.file)
-            self._kept[key] = self._sent(surrounding(read_map(path, spec.channel)))
+            self._kept[key] = self._sent(surrounding(_values(spec)))
         return self._kept[key]
 
     @staticmethod

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import ArrayValue, Bytes, Singles, frozen
+from ..arrays import ArrayValue, Bools, Bytes, Singles, frozen
+from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..rig.camera import Window
 from .film import Exposed, pixels_of
 from .sampling import camera_ray
 from .view import meet
-
-BACKGROUND, SCLERA, IRIS, PUPIL = 0, 1, 2, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +21,7 @@ class PartLabels(ArrayValue):
     """What each pixel's centre shows, seen through the cornea; arrays (height, width).
 
     Attributes:
-        part: 0 background or skin, 1 sclera, 2 iris, 3 pupil.
+        part: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 what frames the camera's view.
         amodal: the same for the eye alone, without occluders.
         depth_mm: distance from the nodal point to the first surface, infinite where there is none.
     """
@@ -30,6 +29,10 @@ class PartLabels(ArrayValue):
     part: Bytes
     amodal: Bytes
     depth_mm: Singles
+
+    def behind(self, covered: Bools) -> PartLabels:
+        """The labels where what frames the camera's view covers the pixels (height, width)."""
+        return replace(self, part=frozen(np.where(covered, FRAME, self.part), np.uint8))
 
     def visible_fraction(self, part: int) -> float:
         """Visible share of the amodal pixels of a part in the window; NaN where there are none."""

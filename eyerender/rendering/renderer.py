@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Floats, Singles, frozen
 from ..errors import InputError
-from ..rig import defocus, exposure, psf
+from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
+from ..rig import defocus, exposure, psf, stray
 from ..rig.camera import Window
 from .film import Exposed, mean_radiance
 from .frame import RenderJob
 from .glints import GlintTable
 from .integrator import integrator_class
-from .labels import BACKGROUND, IRIS, PUPIL, SCLERA, PartLabels, part_labels
+from .labels import PartLabels, part_labels
 from .lighting import through_cornea
 from .occlusion import lid_margins_px
 from .region import RegionScene
@@ -30,7 +31,7 @@ from .surround import Obstacle, Surround
 if TYPE_CHECKING:
     from ..backends.choose import Backend
 
-__all__ = ["BACKGROUND", "IRIS", "PUPIL", "SCLERA", "PartLabels", "RenderJob", "RenderedWindow", "Renderer"]
+__all__ = ["BACKGROUND", "FRAME", "IRIS", "PUPIL", "SCLERA", "PartLabels", "RenderJob", "RenderedWindow", "Renderer"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +98,7 @@ class Renderer:
             InputError: numbers so extreme that the image is not finite.
         """
         spp = spp or self.spp
+        seen = (job.lens, job.camera, job.window)
         if moments:
             shots = [self._picture(shot, *self.bind(shot), max(1, spp // len(moments))) for shot in moments]
             shown, place = self.bind(job)
@@ -105,19 +107,27 @@ class Renderer:
         else:
             shown, place = self.bind(job)
             picture, mirrored, failed = self._picture(job, shown, place, spp)
-        blurred = picture * defocus.vignette(job.lens, job.camera, job.window)
+        picture = stray.framed(picture * defocus.vignette(job.lens, job.camera, job.window), *seen)
+        blurred = stray.scattered(picture, *seen)
         irradiance = frozen(blurred * exposure.radiance_to_irradiance(job.sensor), np.float32)
         if not np.all(np.isfinite(irradiance)):
             raise InputError("the numbers of the scene are too extreme: its image is not finite")
         # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
-        dn = exposure.expose(job.sensor, irradiance.astype(float), job.wavelength_nm, job.seed)
+        dn = exposure.recorded(
+            job.sensor, job.camera, job.window, irradiance.astype(float), job.wavelength_nm, job.seed
+        )
         margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
+        labels = part_labels(shown, job.window) if job.labels else None
+        covered = stray.covered(job.lens, job.sensor, job.camera, job.window)
+        if covered is not None:
+            labels = labels.behind(covered) if labels is not None else None
+            mirrored = mirrored.behind(covered, job.window)
         return RenderedWindow(
             job.window,
             irradiance,
             frozen(dn, np.uint16),
             job.sensor.bit_depth,
-            part_labels(shown, job.window) if job.labels else None,
+            labels,
             mirrored.glints,
             mirrored.others,
             failed,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, frozen
 from ..rig import psf
+from ..rig.camera import Window
 from .cut import POINT, quadrature
 from .frame import RenderJob
 from .glints import Glint, GlintScene, GlintTable, Spots, glint_table
@@ -16,6 +17,8 @@ from .occlusion import glint_reason
 from .purkinje import purkinje_images
 from .region import RegionScene, blockers
 from .surround import Surround
+
+_FRAMED = "occluded by frame"
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +28,21 @@ class Mirrored:
     glints: GlintTable
     others: tuple[tuple[int, GlintTable], ...]
     reasons: tuple[str, ...]
+
+    def behind(self, covered: Bools, window: Window) -> Mirrored:
+        """The same where what frames the camera's view covers pixels (height, width) of a window."""
+        table, (x0, y0, width, height) = self.glints, window
+        xy = np.nan_to_num(table.xy_px, nan=-1e6)
+        column, row = (np.rint(xy - (x0, y0)).astype(int)).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        hidden = inside & table.visible & covered[np.where(inside, row, 0), np.where(inside, column, 0)]
+        glints = replace(
+            table,
+            share=frozen(np.where(hidden, 0.0, table.share)),
+            visible=frozen(table.visible & ~hidden, np.bool_),
+        )
+        reasons = tuple(_FRAMED if h else reason for h, reason in zip(hidden, self.reasons, strict=True))
+        return Mirrored(glints, self.others, reasons)
 
 
 def add_glints(job: RenderJob, place: Surround | RegionScene, image: Floats) -> Mirrored:

@@ -2,15 +2,44 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ..spec import NonNegative, Positive, Spec, Vec2, Vec3
 
 
+class Opening(Spec):
+    """An opening that the camera looks through: a lens barrel, an aperture, a hot mirror in its holder.
+
+    It stands near the lens, so it is out of focus: its edge is blurred. Its shape is a superellipse in the picture,
+    |x / a|^p + |y / b|^p = 1. A straight edge is a rectangle whose other edges lie far outside the picture.
+    """
+
+    centre: Vec2 = Field(
+        default=(0.0, 0.0),
+        description="centre, to the right and down from the sensor's middle, in halves of the sensor's width",
+    )
+    half_size: tuple[Annotated[float, Field(gt=0, le=20)], Annotated[float, Field(gt=0, le=20)]] = Field(
+        default=(1.05, 1.05), description="semi-axes a and b, in halves of the sensor's width"
+    )
+    power: Annotated[float, Field(ge=1, le=50)] = Field(
+        default=2.0, description="exponent p: 2 is an ellipse, larger ones approach a rectangle"
+    )
+    turn_deg: Annotated[float, Field(ge=-180, le=180)] = Field(
+        default=0.0, description="turn of the shape in the picture, clockwise"
+    )
+    edge_px: Annotated[float, Field(ge=0, le=400)] = Field(
+        default=4.0, description="standard deviation of the edge's blur (chosen)"
+    )
+    radiance_w_m2_sr: NonNegative = Field(default=0.0, description="radiance of the rim, within the camera's filter")
+
+
 class Lens(Spec):
-    """A thin lens out of focus, and vignetting beyond cos^4."""
+    """A thin lens out of focus, vignetting beyond cos^4, light that the lens scatters, and what frames its view.
+
+    Scattered light keeps its energy: `glare` and `ghost` are shares that leave their place and arrive elsewhere.
+    """
 
     focus_mm: Positive | None = Field(
         default=None, description="distance of the plane in focus from the nodal point; default: the eye is in focus"
@@ -18,6 +47,27 @@ class Lens(Spec):
     vignetting: Annotated[float, Field(ge=0, le=0.9)] = Field(
         default=0.0,
         description="loss of light in the corner of the sensor beyond cos^4; the loss grows with the squared radius",
+    )
+
+    glare: Annotated[float, Field(ge=0, le=0.3)] = Field(
+        default=0.0,
+        description="share of the light that the lens scatters widely over the picture (veiling glare, ISO 9358; a few "
+        "hundredths for lenses of cameras, chosen)",
+    )
+    glare_radius_px: Positive = Field(
+        default=80.0, description="radius r0 of the scatter, whose irradiance falls as (1 + (r / r0)^2)^(-3/2) (chosen)"
+    )
+    ghost: Annotated[float, Field(ge=0, le=0.1)] = Field(
+        default=0.0,
+        description="share of the light in a ghost, a blurred picture turned by 180 degrees about the optical axis "
+        "(two reflections of 0.005 at coated surfaces return 2.5e-5, one of 0.05 at the sensor and one more 2.5e-4)",
+    )
+    ghost_scale: Annotated[float, Field(ge=0.1, le=5)] = Field(default=1.0, description="size of the ghost (chosen)")
+    ghost_blur_px: Annotated[float, Field(ge=0, le=200)] = Field(
+        default=6.0, description="standard deviation of the ghost's blur (chosen)"
+    )
+    openings: Annotated[tuple[Opening, ...], Field(max_length=8)] = Field(
+        default=(), description="openings that the camera looks through; the picture is dark outside any of them"
     )
 
 
@@ -44,8 +94,14 @@ class RadianceMap(Spec):
     middle the forward direction, and it continues to the subject's right.
     """
 
-    file: Annotated[str, Field(min_length=1)] = Field(
-        description="a linear picture, .hdr, .exr, .pfm or .npy (relative to the scene)"
+    file: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None, description="a linear picture, .hdr, .exr, .pfm or .npy (relative to the scene); this or `place`"
+    )
+    place: Literal["office", "car", "outdoors"] | None = Field(
+        default=None, description="painted surroundings, whose value 1 is 1 W/m^2/sr (values chosen); this or `file`"
+    )
+    place_seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(
+        default=1, description="selects windows, buildings, trees and clouds of painted surroundings"
     )
     scale_w_m2_sr: NonNegative = Field(
         default=1.0, description="radiance of the value 1, within the camera's filter; scales the map"
@@ -65,6 +121,14 @@ class RadianceMap(Spec):
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = Field(
         default=None, description="SHA-256 of the file; a different file is refused"
     )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.file is None) == (self.place is None):
+            raise ValueError("give either file or place")
+        if self.file is None and self.sha256 is not None:
+            raise ValueError("sha256: needs a file")
+        return self
 
 
 class Ambient(Spec):

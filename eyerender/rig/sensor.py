@@ -4,21 +4,24 @@
     mu_e = eta E A t lambda / (h c)                          photo-electrons of a pixel
     DN = clip(black + K (min(mu_e + shot, full well) + read))  rounded to whole numbers, 0 .. 2^bits - 1
 
+mu_e of a pixel varies by its photo-response non-uniformity, and its read-out has a fixed offset of its own. A pixel
+beyond the full well may spill into its neighbours. With a gamma g, codes are full scale (DN / full scale)^(1/g).
 `exposure_ms` and the gain K belong to the scene; images are never normalised one by one.
 Source: EMVA Standard 1288 (release 4.0, 2021), linear model, equations 3-8.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ..spec import NonNegative, Positive, Spec
 
 # Converters reach full scale slightly below the full well, so saturated pixels all read full scale instead of a noisy
 # level.
 _WELL_AT_FULL_SCALE = 0.98
+Border = Annotated[int, Field(ge=0, le=4096)]
 
 
 class Sensor(Spec):
@@ -43,7 +46,50 @@ class Sensor(Spec):
     psf_sigma_px: Annotated[float, Field(ge=0, le=20)] = Field(
         default=0.7, description="standard deviation of the Gaussian point-spread function, pixel area not included"
     )
-    noise: bool = Field(default=True, description="shot and read noise; false stores the rounded expected value")
+    noise: bool = Field(
+        default=True,
+        description="noise and fixed patterns; false stores the rounded expected value of a sensor without either",
+    )
+    prnu: Annotated[float, Field(ge=0, le=0.2)] = Field(
+        default=0.0,
+        description="photo-response non-uniformity: standard deviation of the pixels' sensitivities over their mean "
+        "(EMVA 1288; CMOS sensors have about 0.005 to 0.02)",
+    )
+    dsnu_e: NonNegative = Field(
+        default=0.0,
+        description="dark signal non-uniformity: standard deviation of the pixels' fixed offsets, electrons",
+    )
+    column_e: NonNegative = Field(
+        default=0.0, description="standard deviation of the columns' fixed offsets, electrons"
+    )
+    pattern_seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(
+        default=0, description="selects the fixed pattern of the sensor: one specimen of the camera"
+    )
+    blooming: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.0,
+        description="share of the charge beyond the full well that spills into neighbours; the rest is drained",
+    )
+    blooming_along: Literal["columns", "rows"] = Field(default="columns", description="where that charge spills")
+    gamma: Annotated[float, Field(ge=1, le=4)] = Field(
+        default=1.0, description="codes store the linear number^(1 / gamma); 1 is linear"
+    )
+    jpeg_quality: Annotated[int, Field(ge=5, le=100)] | None = Field(
+        default=None, description="quality of the JPEG compression that 8-bit codes pass through; default: none"
+    )
+    border_px: tuple[Border, Border, Border, Border] = Field(
+        default=(0, 0, 0, 0),
+        description="columns and rows without a picture at the left, top, right and bottom of the sensor: letterboxes, "
+        "shielded pixels",
+    )
+    border_dn: NonNegative = Field(default=0.0, description="code of these pixels")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.jpeg_quality is not None and self.bit_depth != 8:
+            raise ValueError("jpeg_quality: needs bit_depth 8")
+        if self.border_dn > self.full_scale_dn:
+            raise ValueError(f"border_dn: must be <= {self.full_scale_dn}")
+        return self
 
     @property
     def full_scale_dn(self) -> int:
@@ -58,7 +104,8 @@ class Sensor(Spec):
     @property
     def saturation_dn(self) -> float:
         """Level from which a pixel counts as saturated: full scale, or the full well minus three read noises."""
-        return min(self.full_scale_dn, self.black_dn + self.gain * (self.full_well_e - 3 * self.read_noise_e))
+        level = min(self.full_scale_dn, self.black_dn + self.gain * (self.full_well_e - 3 * self.read_noise_e))
+        return float(self.full_scale_dn * (level / self.full_scale_dn) ** (1 / self.gamma))
 
     @property
     def gain(self) -> float:

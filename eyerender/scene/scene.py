@@ -342,7 +342,7 @@ class Scene:
     def ambient(self) -> Ambient:
         """Ambient light, with the file of its map as an absolute path."""
         ambient = self.spec.ambient
-        if ambient.map is None:
+        if ambient.map is None or ambient.map.file is None:
             return ambient
         file = str((Path.cwd() if self.base is None else self.base.resolve()) / ambient.map.file)
         return ambient.model_copy(update={"map": ambient.map.model_copy(update={"file": file})})
@@ -359,7 +359,7 @@ class Scene:
     def files(self) -> tuple[Path, ...]:
         """Files on which images depend, besides the eye's."""
         ambient, region = self.ambient, self.region
-        named = [] if ambient.map is None else [ambient.map.file]
+        named = [] if ambient.map is None or ambient.map.file is None else [ambient.map.file]
         if self.spec.region is not None and self.spec.region.head is not None and self.spec.region.head.manifest:
             named.append(str((Path.cwd() if self.base is None else self.base) / self.spec.region.head.files[0]))
         if region is not None and region.head is not None:

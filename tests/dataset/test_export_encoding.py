@@ -57,13 +57,13 @@ def test_the_gain_looks_at_most_pixels_and_not_at_the_brightest():
     for image in glints:
         image[10:12, 10:13] = 65535  # 6 of 2500 pixels
     for images in (dim, glints):
-        gain = measured_gain((image, 16) for image in images)
+        gain = measured_gain((image, 16, 1.0) for image in images)
         assert gain == pytest.approx(0.8 * 65535 / 6000, rel=0.02)
-    assert measured_gain((image // 64, 10) for image in dim) == pytest.approx(0.8 * 65535 / 6000, rel=0.02)
+    assert measured_gain((image // 64, 10, 1.0) for image in dim) == pytest.approx(0.8 * 65535 / 6000, rel=0.02)
     bright = [np.full((4, 4), 65535, np.uint16)]
-    assert measured_gain((image, 16) for image in bright) == 1.0
+    assert measured_gain((image, 16, 1.0) for image in bright) == 1.0
     dark = [np.full((4, 4), 257, np.uint16)]
-    assert measured_gain((image, 16) for image in dark) == 32.0
+    assert measured_gain((image, 16, 1.0) for image in dark) == 32.0
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,18 @@ import numpy as np
 import pytest
 from scipy import ndimage, special, stats
 
+from eyerender.errors import InputError
 from eyerender.rig import psf
-from eyerender.rig.exposure import electrons, expose, photon_counts, radiance_to_irradiance
+from eyerender.rig.camera import Camera
+from eyerender.rig.exposure import (
+    bloomed,
+    electrons,
+    expose,
+    pattern,
+    photon_counts,
+    radiance_to_irradiance,
+    recorded,
+)
 from eyerender.rig.sensor import Sensor
 
 
@@ -101,3 +111,85 @@ def test_a_splat_outside_the_window_adds_nothing():
     patch, rows, columns = psf.splat(np.array([[500.0, 5.0]]), np.ones(1), 1.0, (0, 0, 24, 20))
     assert patch.size == 0
     assert (rows, columns) == (slice(0, 0), slice(0, 0))
+
+
+def quiet(**fields):
+    """A sensor whose full scale is its full well, without noise."""
+    return Sensor.from_mapping({"read_noise_e": 0.0, "black_level_dn": 0.0, "full_well_e": 60000.0, **fields})
+
+
+def bright(sensor, electrons_wanted, shape):
+    """Irradiance at which a sensor's mean charge is the wanted one."""
+    per_unit = float(electrons(sensor, np.array(1.0), 850.0))
+    return np.full(shape, electrons_wanted / per_unit)
+
+
+def test_the_fixed_pattern_has_the_stated_spread_and_stays():
+    sensor = quiet(prnu=0.02, dsnu_e=0.0)
+    image = bright(sensor, 20000.0, (300, 300))
+    frames = [expose(sensor, image, 850.0, seed).astype(float) for seed in range(40)]
+    mean = np.mean(frames, axis=0)
+    # What forty frames of shot noise leave is 1 / sqrt(40 x 20000), a twentieth of the pattern.
+    assert mean.std() / mean.mean() == pytest.approx(0.02, rel=0.02)
+    other = expose(quiet(prnu=0.02, pattern_seed=1), image, 850.0, 0).astype(float)
+    same = expose(sensor, image, 850.0, 99).astype(float)
+    assert np.corrcoef(mean.ravel(), same.ravel())[0, 1] > 0.9
+    assert abs(np.corrcoef(mean.ravel(), other.ravel())[0, 1]) < 0.02
+
+
+def test_offsets_of_pixels_and_columns_in_the_dark():
+    sensor = quiet(dsnu_e=30.0, column_e=50.0, black_level_dn=3000.0)
+    dn = expose(sensor, np.zeros((400, 500)), 850.0, 0) / sensor.gain
+    columns = dn.mean(axis=0)
+    assert columns.std() == pytest.approx(50.0, rel=0.1)  # of 500 columns
+    assert (dn - columns).std() == pytest.approx(30.0, rel=0.01)
+
+
+def test_the_pattern_belongs_to_the_sensors_pixels():
+    whole = pattern(7, 0, (0, 0), (60, 80))
+    assert np.array_equal(pattern(7, 0, (10, 20), (30, 40)), whole[20:50, 10:50])
+    assert stats.kstest(pattern(7, 1, (0, 0), (300, 300)).ravel(), "norm").pvalue > 1e-3
+    assert abs(np.corrcoef(whole[:, 1:].ravel(), whole[:, :-1].ravel())[0, 1]) < 0.05
+
+
+@pytest.mark.parametrize("along", ["columns", "rows"])
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_blooming_keeps_the_charge_that_spills(share, along):
+    rng = np.random.default_rng(8)
+    charge = rng.uniform(0, 800.0, (120, 90))
+    charge[60, 40], charge[61, 40], charge[20, 70] = 9000.0, 4000.0, 3000.0
+    out = bloomed(charge, 1000.0, share, along)
+    excess = np.maximum(charge - 1000.0, 0).sum()
+    assert out.max() <= 1000.0
+    assert out.sum() == pytest.approx(np.minimum(charge, 1000.0).sum() + share * excess, rel=1e-12)
+    changed = np.nonzero(~np.isclose(out, np.minimum(charge, 1000.0)))
+    assert set(changed[1] if along == "columns" else changed[0]) == ({40, 70} if along == "columns" else {20, 60, 61})
+
+
+def test_nothing_blooms_below_the_full_well():
+    charge = np.full((20, 20), 500.0)
+    assert np.array_equal(bloomed(charge, 1000.0, 1.0), charge)
+
+
+@pytest.mark.parametrize("gamma", [1.8, 2.2])
+def test_codes_with_a_gamma(gamma):
+    linear = quiet(bit_depth=8, noise=False)
+    encoded = quiet(bit_depth=8, noise=False, gamma=gamma)
+    ramp = np.linspace(0, 1, 200)[None] * bright(linear, 60000.0, (1, 1))
+    a, b = (expose(s, ramp, 850.0, 0).astype(float) for s in (linear, encoded))
+    assert np.abs(255 * (b / 255) ** gamma - a).max() < 0.5 + 0.5 * gamma  # half a step of either code
+    assert encoded.saturation_dn == pytest.approx(255 * (linear.saturation_dn / 255) ** (1 / gamma))
+    assert expose(encoded, ramp * 4, 850.0, 0).max() >= encoded.saturation_dn
+
+
+def test_borders_hold_their_code_and_jpeg_needs_eight_bits():
+    camera = Camera.looking_at([0, 0, 0], position_mm=[40, 0, 0], size_px=(100, 80), focal_length_px=90.0).build()
+    sensor = quiet(border_px=(4, 0, 0, 6), border_dn=17.0)
+    dn = recorded(sensor, camera, (0, 0, 100, 80), bright(sensor, 30000.0, (80, 100)), 850.0, 0)
+    assert (dn[:, :4] == 17).all()
+    assert (dn[74:] == 17).all()
+    assert dn[:74, 4:].min() > 20000
+    with pytest.raises(InputError, match="jpeg_quality: needs bit_depth 8"):
+        Sensor.from_mapping({"jpeg_quality": 60})
+    with pytest.raises(InputError, match="border_dn: must be <= 255"):
+        Sensor.from_mapping({"bit_depth": 8, "border_dn": 300.0})

@@ -113,7 +113,7 @@ def _encoding(items: Items, bits: int, curve: Curve, gain: float | None) -> Enco
         return Encoding(bits, curve, float(gain), "given")
     if curve == "linear" and bits == 16:
         return RAW
-    measured = measured_gain((item.image, item.bit_depth) for item in items.sample(SAMPLED))
+    measured = measured_gain((item.image, item.bit_depth, item.entry.gamma) for item in items.sample(SAMPLED))
     return Encoding(bits, curve, measured, "measured")
 
 

@@ -40,14 +40,17 @@ class Encoding:
     gain: float
     gain_from: str
 
-    def apply(self, image: NDArray[Any], bit_depth: int) -> NDArray[Any]:
-        """Codes, (h, w) uint8 or uint16, of an image's counts, (h, w) unsigned integers of `bit_depth`."""
-        table = _table(self.bits, self.curve, self.gain, 2**bit_depth - 1)
+    def apply(self, image: NDArray[Any], bit_depth: int, gamma: float = 1.0) -> NDArray[Any]:
+        """Codes, (h, w) uint8 or uint16, of an image's counts, (h, w) unsigned integers of `bit_depth`.
+
+        The counts are the linear share of full scale^(1 / gamma).
+        """
+        table = _table(self.bits, self.curve, self.gain, 2**bit_depth - 1, gamma)
         return np.asarray(table[np.minimum(image.astype(np.intp), len(table) - 1)])
 
-    def keeps(self, bit_depth: int) -> bool:
+    def keeps(self, bit_depth: int, gamma: float = 1.0) -> bool:
         """Whether the codes are the counts themselves."""
-        return self.curve == "linear" and self.gain == 1 and self.bits == bit_depth
+        return self.curve == "linear" and self.gain == 1 and self.bits == bit_depth and gamma == 1
 
     def to_mapping(self) -> dict[str, Any]:
         """Convert to the mapping in export.json."""
@@ -61,7 +64,8 @@ class Encoding:
             "gain_from": self.gain_from,
             "formula": f"code = round({full} * min(1, gain * s)" + (f" ** (1 / {GAMMA}))" if gamma else ")"),
             "inverse": (f"s = (code / {full}) ** {GAMMA} / gain" if gamma else f"s = code / {full} / gain"),
-            "s": "count / (2 ** source_bit_depth - 1), the linear share of the source's full scale",
+            "s": "count / (2 ** source_bit_depth - 1), to the power of the source's gamma where that is not 1: the "
+            "linear share of the source's full scale",
         }
 
     def __str__(self) -> str:
@@ -71,16 +75,17 @@ class Encoding:
 RAW = Encoding(16, "linear", 1.0, "none")
 
 
-def measured_gain(images: Iterable[tuple[NDArray[Any], int]]) -> float:
+def measured_gain(images: Iterable[tuple[NDArray[Any], int, float]]) -> float:
     """Gain that brings the quantile `SHARE` of all pixels to `LEVEL`: 1 to `LARGEST_GAIN`, to four digits.
 
     Args:
-        images: counts (h, w) and their bit depths.
+        images: counts (h, w), their bit depths and their gammas.
     """
     counts = np.zeros(65536, dtype=np.int64)
-    for image, bit_depth in images:
+    for image, bit_depth, gamma in images:
         full = 2**bit_depth - 1
-        share = np.round(np.minimum(image.astype(np.intp), full) * (65535 / full)).astype(np.intp)
+        linear = (np.minimum(image.astype(np.intp), full) / full) ** gamma
+        share = np.round(linear * 65535).astype(np.intp)
         counts += np.bincount(share.ravel(), minlength=65536)
     below = np.cumsum(counts)
     level = int(np.searchsorted(below, SHARE * below[-1]))
@@ -102,9 +107,9 @@ def check(bits: int, curve: str | None, gain: float | None) -> None:
 
 
 @lru_cache(maxsize=4)
-def _table(bits: int, curve: Curve, gain: float, full: int) -> NDArray[Any]:
+def _table(bits: int, curve: Curve, gain: float, full: int, source_gamma: float) -> NDArray[Any]:
     """Code of each count."""
-    value = np.minimum(1.0, gain * (np.arange(full + 1) / full))
+    value = np.minimum(1.0, gain * (np.arange(full + 1) / full) ** source_gamma)
     if curve == "gamma":
         value = value ** (1 / GAMMA)
     return np.asarray(np.round((2**bits - 1) * value), dtype=np.uint8 if bits == 8 else np.uint16)

@@ -18,10 +18,8 @@ from ...errors import InputError
 from ...files import read_bytes
 from ...geometry.ellipse import Ellipse, signed_distance
 from ...imagefile import encode_png, read_image
-from ...imagefolder import METADATA, ImageEntry, ImageFolder
+from ...imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
 from .encoding import RAW, Encoding
-
-IRIS, PUPIL = 2, 3
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class Item:
     @property
     def encoded(self) -> NDArray[Any]:
         """Image as the export stores it, (h, w) uint8 or uint16."""
-        return self.encoding.apply(self.image, self.bit_depth)
+        return self.encoding.apply(self.image, self.bit_depth, self.entry.gamma)
 
     def encode(self, path: Path) -> bytes:
         """Encode one of the sample's images of counts as the PNG file that the export stores.
@@ -78,15 +76,17 @@ class Item:
         Raises:
             InputError: the file cannot be read.
         """
-        if self.encoding.keeps(self.bit_depth):
+        if self.encoding.keeps(self.bit_depth, self.entry.gamma):
             return read_bytes(path, follow=False)
         buffer = io.BytesIO()
-        encode_png(buffer, self.encoding.apply(_integers(read_image(path)[0], path), self.bit_depth))
+        counts = _integers(read_image(path)[0], path)
+        encode_png(buffer, self.encoding.apply(counts, self.bit_depth, self.entry.gamma))
         return buffer.getvalue()
 
     def exported_line(self) -> dict[str, Any]:
         """Line of metadata for the exported image."""
-        own = {"bit_depth": self.encoding.bits, "encoding": self.encoding.curve, "gain": self.encoding.gain}
+        e = self.encoding
+        own = {"bit_depth": e.bits, "encoding": e.curve, "gamma": e.to_mapping()["gamma"], "gain": e.gain}
         return {**self.line, **own, "source_bit_depth": self.bit_depth}
 
     def _where(self, key: str) -> str:
@@ -94,9 +94,9 @@ class Item:
 
     @cached_property
     def mask(self) -> Bytes:
-        """Mask (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil."""
+        """Mask (h, w): 0 background, skin or what frames the view, 1 sclera, 2 iris, 3 pupil."""
         mask = self.entry.mask()
-        return np.zeros(self.image.shape, np.uint8) if mask is None else mask
+        return np.zeros(self.image.shape, np.uint8) if mask is None else np.where(mask > PUPIL, BACKGROUND, mask)
 
     @cached_property
     def amodal(self) -> Bytes:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ...arrays import Bools, Floats
 from ...imagefile import read_image
-from ...imagefolder import ImageEntry
-from ...labels import IRIS, PUPIL, moments_ellipse
+from ...imagefolder import FRAME, IRIS, PUPIL, ImageEntry
+from ...labels import moments_ellipse
 from ...rig.camera import Window
 from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
 
@@ -83,10 +83,15 @@ def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats 
         if picture.shape != (h, w):
             yield f"its {name} is {_size(picture)} px"
             return
-        if int(picture.max()) > PUPIL:
+        if int(picture.max()) > (FRAME if picture is mask else PUPIL):
             yield f"its {name} holds the value {int(picture.max())}"
     yield from _visible(entry.line, mask, entry.window)
     yield from _outlines(entry.line, mask, whole, limbus_px, entry.window)
+
+
+def _iris(mask: Mask) -> Bools:
+    """Pixels of iris and pupil."""
+    return np.asarray((mask == IRIS) | (mask == PUPIL))
 
 
 def _size(picture: NDArray[Any]) -> str:
@@ -95,7 +100,7 @@ def _size(picture: NDArray[Any]) -> str:
 
 def _visible(line: dict[str, Any], mask: Mask, window: Window) -> Iterator[str]:
     """Compare the visible ellipses with those of the mask's own pixels."""
-    for name, inside in (("pupil", mask == PUPIL), ("iris", mask >= IRIS)):
+    for name, inside in (("pupil", mask == PUPIL), ("iris", _iris(mask))):
         own = line.get("labels", {}).get(name)
         if isinstance(own, dict):
             again = moments_ellipse(inside, window)
@@ -127,9 +132,9 @@ def _outlines(
             clear = picture == IRIS if within is None else (picture == IRIS) | ((picture == SCLERA) & within)
             yield from _compare(f"{what} of its pupil", picture == PUPIL, clear | other, pupil, window)
         if iris is not None:
-            yield from _compare(f"{what} of its iris", picture >= IRIS, (picture == SCLERA) | other, iris, window)
+            yield from _compare(f"{what} of its iris", _iris(picture), (picture == SCLERA) | other, iris, window)
     if whole is not None:
-        if np.any((mask != SKIN) & (mask != whole)):
+        if np.any((mask != SKIN) & (mask != FRAME) & (mask != whole)):
             yield "its mask shows a part that its amodal mask lacks there"
         for name, part, share in zip(("pupil", "iris"), (PUPIL, IRIS), shares, strict=True):
             there = np.count_nonzero(whole == part)

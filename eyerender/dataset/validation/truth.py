@@ -166,6 +166,7 @@ class SceneTruth:
         expected = {
             "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
             "bit_depth": scene.spec.sensor.bit_depth,
+            **({"gamma": scene.spec.sensor.gamma} if "gamma" in line else {}),
             "records": list(found.take([row]).records(version_of(record))),
             "parameters": {
                 "eye_model": scene.eye_spec.name,

@@ -1,0 +1,102 @@
+"""Light that goes astray between lens and sensor: openings that cut it off, ghosts, veiling glare.
+
+They change the finished picture in this order. With the shares g of the glare and s of the ghost,
+
+    I1 = T I + (1 - T) rim,   I2 = (1 - s) I1 + s ghost(I1),   I3 = (1 - g) I2 + g K * I2,
+
+where T is the share that the openings let through, and K the glare's kernel r0 / (2 pi (r^2 + r0^2)^(3/2)), whose sum
+is 1 and whose Fourier transform is exp(-r0 k). The picture is continued by its mirror image, so it keeps its energy:
+what glare carries over the border comes back from the continuation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import fft, ndimage, special
+
+from ..arrays import Bools, Floats
+from .camera import PinholeCamera, Window
+from .imaging import Lens, Opening
+from .sensor import Sensor
+
+
+def framed(picture: Floats, lens: Lens, camera: PinholeCamera, window: Window) -> Floats:
+    """Picture (h, w) behind the lens' openings; radiances in mW/mm^2/sr."""
+    for opening in lens.openings:
+        through = transmission(opening, camera, window)
+        picture = picture * through + 1e-3 * opening.radiance_w_m2_sr * (1 - through)
+    return picture
+
+
+def scattered(picture: Floats, lens: Lens, camera: PinholeCamera, window: Window) -> Floats:
+    """Picture (h, w) with ghost and glare."""
+    if lens.ghost > 0:
+        picture = (1 - lens.ghost) * picture + lens.ghost * ghost(picture, lens, camera, window)
+    if lens.glare > 0:
+        picture = picture + lens.glare * (veil(picture, lens.glare_radius_px) - picture)
+    return picture
+
+
+def transmission(opening: Opening, camera: PinholeCamera, window: Window) -> Floats:
+    """Share (h, w) of the light that an opening lets through to each pixel of a window."""
+    half = camera.resolution_px[0] / 2
+    x0, y0, width, height = window
+    x = (np.arange(x0, x0 + width) + 0.5 - camera.resolution_px[0] / 2) / half - opening.centre[0]
+    y = (np.arange(y0, y0 + height) + 0.5 - camera.resolution_px[1] / 2) / half - opening.centre[1]
+    cos, sin = np.cos(np.radians(opening.turn_deg)), np.sin(np.radians(opening.turn_deg))
+    u = np.abs(x[None, :] * cos + y[:, None] * sin) / opening.half_size[0]
+    v = np.abs(y[:, None] * cos - x[None, :] * sin) / opening.half_size[1]
+    # f is 1 on the edge; (1 - f) / |grad f| is the distance from it to first order.
+    p = opening.power
+    most = np.maximum(np.maximum(u, v), 1e-9)
+    u, v = u / most, v / most  # large powers would overflow
+    size = (u**p + v**p) ** (1 / p)
+    slope = np.hypot((u / size) ** (p - 1) / opening.half_size[0], (v / size) ** (p - 1) / opening.half_size[1])
+    inside_px = half * (1 - most * size) / slope
+    if opening.edge_px == 0:
+        return np.asarray((inside_px >= 0).astype(float))
+    return np.asarray(special.ndtr(inside_px / opening.edge_px))
+
+
+def ghost(picture: Floats, lens: Lens, camera: PinholeCamera, window: Window) -> Floats:
+    """The picture turned by 180 degrees about the optical axis, scaled by m and blurred.
+
+    G(x) = I(c + (c - x) / m) / m^2, from the light of the window alone.
+    """
+    m = lens.ghost_scale
+    cx, cy = camera.K[0, 2] - window[0], camera.K[1, 2] - window[1]
+    offset = np.array([cy + cy / m, cx + cx / m])
+    # A ghost of another size would skip parts of single bright pixels, so these are spread first.
+    source = picture if m == 1 else ndimage.gaussian_filter(picture, 0.7 * max(1, 1 / m), mode="constant")
+    turned = ndimage.affine_transform(source, np.array([-1 / m, -1 / m]), offset, order=1) / m**2
+    return np.asarray(ndimage.gaussian_filter(turned, lens.ghost_blur_px, mode="constant"))
+
+
+def veil(picture: Floats, radius_px: float) -> Floats:
+    """The picture (h, w) convolved with the glare's kernel, continued by its mirror image."""
+    rows, columns = (np.pi * np.arange(n) / n for n in picture.shape)
+    damped = fft.dctn(picture, type=2) * np.exp(-radius_px * np.hypot(rows[:, None], columns[None, :]))
+    return np.asarray(np.maximum(fft.idctn(damped, type=2), 0))
+
+
+def covered(lens: Lens, sensor: Sensor, camera: PinholeCamera, window: Window) -> Bools | None:
+    """Pixels (h, w) of a window that show no eye: less than half of their light passes the openings, or the border.
+
+    None where there are neither openings nor a border.
+    """
+    if not lens.openings and not any(sensor.border_px):
+        return None
+    through = np.ones((window[3], window[2]))
+    for opening in lens.openings:
+        through = through * transmission(opening, camera, window)
+    return np.asarray((through < 0.5) | border(sensor, camera, window))
+
+
+def border(sensor: Sensor, camera: PinholeCamera, window: Window) -> Bools:
+    """Pixels (h, w) of a window in the sensor's border, which holds no picture."""
+    x0, y0, width, height = window
+    left, top, right, bottom = sensor.border_px
+    x, y = np.arange(x0, x0 + width), np.arange(y0, y0 + height)
+    columns = (x < left) | (x >= camera.resolution_px[0] - right)
+    rows = (y < top) | (y >= camera.resolution_px[1] - bottom)
+    return np.asarray(rows[:, None] | columns[None, :])

@@ -1,0 +1,125 @@
+"""Stray light keeps its energy, openings cut off what they should, and ghosts arrive where they should."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from eyerender.rig.camera import Camera
+from eyerender.rig.imaging import Lens, Opening
+from eyerender.rig.sensor import Sensor
+from eyerender.rig.stray import border, covered, framed, ghost, scattered, transmission, veil
+
+CAMERA = Camera.looking_at([0, 0, 0], position_mm=[40, 0, 0], size_px=(320, 240), focal_length_px=300.0).build()
+WHOLE = (0, 0, 320, 240)
+
+
+@pytest.fixture
+def picture():
+    """Random light with a few bright points."""
+    rng = np.random.default_rng(4)
+    out = rng.uniform(0.1, 1.0, (240, 320))
+    out[rng.integers(30, 210, 9), rng.integers(30, 290, 9)] = 60.0
+    return out
+
+
+@pytest.mark.parametrize("radius", [3.0, 40.0, 500.0])
+@pytest.mark.parametrize("glare", [0.02, 0.3])
+def test_glare_moves_light_and_keeps_its_energy(picture, glare, radius):
+    lens = Lens(glare=glare, glare_radius_px=radius)
+    out = scattered(picture, lens, CAMERA, WHOLE)
+    assert out.sum() == pytest.approx(picture.sum(), rel=1e-12)
+    assert out.min() > 0
+    # The stated share leaves every pixel: what remains above the veil is 1 - glare of the picture.
+    assert np.allclose(out - glare * veil(picture, radius), (1 - glare) * picture, atol=1e-9)
+
+
+def test_the_glares_profile_is_that_of_its_kernel():
+    radius, size = 6.0, 401
+    point = np.zeros((size, size))
+    point[200, 200] = 1.0
+    spread = veil(point, radius)
+    r = np.arange(10, 60)
+    expected = radius / (2 * np.pi * (r**2 + radius**2) ** 1.5)
+    # The mirrored continuation adds what lies beyond the border: at most a few per cent here.
+    assert spread[200, 200 + r] == pytest.approx(expected, rel=0.05)
+
+
+def test_a_dark_pupil_gets_the_stated_share_of_a_wide_field():
+    field = np.full((240, 320), 2.0)
+    v, u = np.mgrid[:240, :320]
+    field[np.hypot(u - 160, v - 120) < 8] = 0.0
+    out = scattered(field, Lens(glare=0.05, glare_radius_px=60), CAMERA, WHOLE)
+    # The veiling glare index: a small black area in a bright field shows the glare's share of the field.
+    assert out[120, 160] / 2.0 == pytest.approx(0.05, rel=0.15)
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.0, 1.6])
+def test_a_ghost_lies_opposite_and_has_the_stated_energy(scale):
+    cx, cy = CAMERA.K[0, 2], CAMERA.K[1, 2]
+    point = np.zeros((240, 320))
+    spot = (130, 185)  # row, column
+    point[spot] = 100.0
+    lens = Lens(ghost=0.01, ghost_scale=scale, ghost_blur_px=5.0)
+    out = scattered(point, lens, CAMERA, WHOLE)
+    assert out.sum() == pytest.approx(100.0, rel=2e-3)
+    made = ghost(point, lens, CAMERA, WHOLE)
+    v, u = np.mgrid[:240, :320]
+    place = np.array([(made * u).sum(), (made * v).sum()]) / made.sum()
+    assert place == pytest.approx([cx - scale * (spot[1] - cx), cy - scale * (spot[0] - cy)], abs=0.1)
+    assert made.sum() == pytest.approx(100.0, rel=0.02)  # linear interpolation between pixels
+
+
+@pytest.mark.parametrize("turn", [0.0, 30.0])
+def test_an_elliptic_opening_covers_the_right_area(turn):
+    opening = Opening(half_size=(0.8, 0.5), edge_px=0.0, turn_deg=turn)
+    through = transmission(opening, CAMERA, WHOLE)
+    assert set(np.unique(through)) == {0.0, 1.0}
+    assert through.sum() == pytest.approx(np.pi * 0.8 * 0.5 * 160**2, rel=2e-3)
+
+
+def test_the_edge_of_an_opening_is_as_blurred_as_stated():
+    opening = Opening(half_size=(0.6, 0.6), edge_px=5.0)
+    row = transmission(opening, CAMERA, WHOLE)[119]
+    x = np.arange(320) + 0.5 - 160
+    slope = -np.gradient(row[160:])
+    place = (slope * x[160:]).sum() / slope.sum()
+    width = np.sqrt((slope * (x[160:] - place) ** 2).sum() / slope.sum())
+    assert place == pytest.approx(0.6 * 160, abs=0.2)
+    assert width == pytest.approx(5.0, rel=0.05)
+
+
+def test_openings_are_fixed_to_the_sensor_not_to_the_window():
+    opening = Opening(centre=(0.1, -0.2), half_size=(0.9, 0.6), power=6, turn_deg=10)
+    whole = transmission(opening, CAMERA, WHOLE)
+    assert np.allclose(transmission(opening, CAMERA, (40, 20, 100, 90)), whole[20:110, 40:140])
+
+
+def test_a_wide_rectangle_is_a_straight_edge():
+    opening = Opening(centre=(0.0, -9.4), half_size=(30.0 / 2, 10.0), power=50, edge_px=0)
+    through = transmission(opening, CAMERA, WHOLE)
+    edge = 120 + (10.0 - 9.4) * 160  # rows above it are open
+    assert through[: int(edge) - 1].all()
+    assert not through[int(edge) + 2 :].any()
+
+
+def test_the_rim_shows_its_own_radiance(picture):
+    lens = Lens(openings=(Opening(half_size=(0.5, 0.5), radiance_w_m2_sr=30.0),))
+    out = framed(picture, lens, CAMERA, WHOLE)
+    assert out[0, 0] == pytest.approx(0.03)  # mW/mm^2/sr
+    assert out[120, 160] == pytest.approx(picture[120, 160])
+
+
+def test_what_is_covered():
+    assert covered(Lens(), Sensor(), CAMERA, WHOLE) is None
+    sensor = Sensor(border_px=(3, 0, 5, 20))
+    bars = border(sensor, CAMERA, WHOLE)
+    assert bars.sum() == 8 * 240 + 20 * 320 - 8 * 20
+    assert np.array_equal(
+        border(sensor, CAMERA, (310, 200, 20, 40)), np.pad(bars, ((0, 0), (0, 10)), mode="edge")[200:, 310:]
+    )
+    both = covered(Lens(openings=(Opening(half_size=(0.9, 0.9)),)), sensor, CAMERA, WHOLE)
+    assert both is not None
+    assert both[bars].all()
+    assert both.sum() > bars.sum()
+    assert not both[120, 160]
