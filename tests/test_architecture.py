@@ -212,21 +212,12 @@ def test_public_names_are_pinned():
         "Comparison", "DatasetSpec", "ExtractionSettings", "Extractor", "Eye", "EyeDirection", "EyeImage", "EyeModel",
         "EyeSpec", "EyerenderError", "Face", "Fissure", "Frame", "Frames", "Head", "HeadParts", "ImageFolder",
         "ImageObserver", "InputError", "LabelledImage", "Lashes", "Led", "LedRing", "Lens", "Lid", "Look", "Motion",
-<<<<<<< HEAD
-        "Observations", "Observer", "Panel", "Picture", "PinholeCamera", "Population", "PupilMargin", "RadianceMap",
-        "Region", "Rig", "RigGeometry", "Scene", "SceneSpec", "Screen", "Sensor", "Skin", "Status", "Subject",
-        "Targets", "TearFilm", "__version__", "bench_extractors", "compare", "compare_folder", "detect", "estimate",
-        "export", "export_scene",
-        "extract", "gaze", "generate", "load_eye", "load_scene", "preview", "render", "render_folder", "render_windows",
-        "run_quickstart", "sample", "shipped_scenes", "trace", "validate", "write_report",
-=======
-        "Observations", "Observer", "Opening", "Panel", "Picture", "PinholeCamera", "PupilMargin", "RadianceMap",
-        "Region", "Rig", "RigGeometry", "Scene", "SceneSpec", "Screen", "Sensor", "Skin", "Status", "Subject",
-        "Targets", "TearFilm", "__version__", "auto_exposed", "bench_extractors", "compare", "compare_folder",
-        "detect", "estimate", "export", "export_scene", "extract", "gaze", "generate", "load_eye", "load_scene",
-        "preview", "render", "render_folder", "render_windows", "run_quickstart", "sample", "shipped_scenes", "trace",
-        "validate", "write_report",
->>>>>>> 5015a9f (Model what frames the camera's view, stray light, the sensor's patterns and codes, and painted surroundings)
+        "Observations", "Observer", "Opening", "Panel", "Picture", "PinholeCamera", "Population", "PupilMargin",
+        "RadianceMap", "Region", "Rig", "RigGeometry", "Scene", "SceneSpec", "Screen", "Sensor", "Skin", "Status",
+        "Subject", "Targets", "TearFilm", "__version__", "auto_exposed", "bench_extractors", "compare",
+        "compare_folder", "detect", "estimate", "export", "export_scene", "extract", "gaze", "generate", "load_eye",
+        "load_scene", "preview", "render", "render_folder", "render_windows", "run_quickstart", "sample",
+        "shipped_scenes", "trace", "validate", "write_report",
     ]  # fmt: skip
     for name in eyerender.__all__:
         assert getattr(eyerender, name) is not None
