@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import FloatLike, Floats, Indices
 from ..geometry.surfaces import Surface
-from ..geometry.transforms import read_only
+from ..geometry.transforms import read_only, stacked
 from ..optics.gradient import GradientMedium
 from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
 
@@ -34,14 +34,15 @@ def structure_of(eye: EyeModel) -> Structure:
 def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
     """Stack n eyes of one structure into a batch; name and side are those of the first."""
     first = eyes[0]
-    if any(structure_of(eye) != structure_of(first) for eye in eyes):
+    structure = structure_of(first)
+    if any(structure_of(eye) != structure for eye in eyes):
         raise ValueError("eyes of different structure cannot be stacked")
 
     def numbers(values: Sequence[FloatLike]) -> Floats:
         return read_only([float(v) for v in values])
 
     def points(values: Sequence[Floats]) -> Floats:
-        return read_only(np.stack(values))
+        return read_only(stacked(values))
 
     gradients = [e.lens_gradient for e in eyes if e.lens_gradient is not None]
     waves = max(e.stop.contour.shape[-1] for e in eyes)

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import FloatLike, Floats, Indices
 from .surfaces import fit
 from .surfaces_graph import GraphSurface, Jet, Slopes, biconic_jet, biconic_slopes
-from .transforms import flip_y, mirror_rotation, read_only
+from .transforms import flip_y, mirror_rotation, read_only, stacked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +82,7 @@ class Biconic(GraphSurface):
     @classmethod
     def stack(cls, surfaces: tuple[Self, ...]) -> Self:
         """Combine single biconics into a batch."""
-        return cls(*(np.stack(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
+        return cls(*(stacked(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
 
     def _constants(self, ndim: int) -> tuple[FloatLike, ...]:
         curvature = 1.0 / self.radii_mm

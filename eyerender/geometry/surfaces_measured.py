@@ -19,7 +19,7 @@ import numpy as np
 from ..arrays import FloatLike, Floats, Indices
 from .surfaces import fit
 from .surfaces_graph import GraphSurface, Jet, Slopes, biconic_jet, biconic_slopes
-from .transforms import flip_y, mirror_rotation, read_only
+from .transforms import flip_y, mirror_rotation, read_only, stacked
 from .zernike import mirrored, order_of, product_basis, products
 
 Parts = tuple[Floats, ...]
@@ -203,9 +203,10 @@ class ZernikeSurface(Measured):
     def measured(self, y: Floats, z: Floats, second: bool, outer: Parts | None = None) -> Parts:
         """Height of the expansion and its derivatives (see `Measured`)."""
         count = 6 if second else 3
-        radius, batch = fit(self.radius_mm, y.ndim), len(self.batch_shape)
+        radius = fit(self.radius_mm, y.ndim)
         p, q = y / radius, z / radius
-        # The products of a batch lie eye by eye, for one matrix product each.
+        # One small matrix product for each row: large ones would be spread over cores, which costs more than it saves.
+        batch = min(max(p.ndim - 1, len(self.batch_shape)), 1)
         basis = product_basis(self.order, p, q, batch)
         flat = basis.reshape(*basis.shape[: batch + 1], -1)
         found = (self.table[..., :count, :] @ flat).reshape(*p.shape[:batch], count, *p.shape[batch:])
@@ -266,11 +267,16 @@ class ZernikeSurface(Measured):
     @classmethod
     def stack(cls, surfaces: tuple[Self, ...]) -> Self:
         """Combine single expansions into a batch; shorter ones are padded with zeros."""
-        keys = [list(surface._key()) for surface in surfaces]
-        most = max(key[4].shape[-1] for key in keys)
-        for key in keys:
-            key[4] = np.pad(key[4], (0, most - key[4].shape[-1]))
-        return cls(*(np.stack(parts) for parts in zip(*keys, strict=True)))
+        counts = {surface.coefficients_mm.shape[-1] for surface in surfaces}
+        if len(counts) > 1:
+            surfaces = tuple(surface.with_terms(max(counts)) for surface in surfaces)
+        keys = ((*surface._key(), surface.table) for surface in surfaces)
+        return cls(*(stacked(parts) for parts in zip(*keys, strict=True)))
+
+    def with_terms(self, count: int) -> Self:
+        """The same surface with coefficients of 0 up to `count` terms."""
+        missing = count - self.coefficients_mm.shape[-1]
+        return replace(self, coefficients_mm=np.pad(self.coefficients_mm, (0, missing)), table=np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -404,7 +410,7 @@ class GridSurface(Measured):
             pad = (size - surface.table.shape[-1]) // 2
             whole[pad : pad + surface.table.shape[-1], pad : pad + surface.table.shape[-1]] = surface.coefficients_mm
         parts = zip(*(surface._parts()[:-1] for surface in surfaces), strict=True)
-        o, r, outer, window, centre, spacing = (np.stack(part) for part in parts)
+        o, r, outer, window, centre, spacing = (stacked(part) for part in parts)
         return cls(o, r, outer, window, centre, spacing, np.arange(len(surfaces)), table)
 
 

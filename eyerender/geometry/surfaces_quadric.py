@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..arrays import Bools, Floats, Indices
 from .surfaces import Hit, Surface, SymmetricMatrix, Xyz, fit
-from .transforms import MIRROR, flip_y, mirror_rotation, read_only
+from .transforms import MIRROR, flip_y, mirror_rotation, read_only, stacked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,7 +230,7 @@ class Quadric(Surface):
     @classmethod
     def stack(cls, surfaces: tuple[Self, ...]) -> Self:
         """Combine single quadrics into a batch."""
-        return cls(*(np.stack(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
+        return cls(*(stacked(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
 
 
 def centre_of(quadric: Quadric) -> Floats:
