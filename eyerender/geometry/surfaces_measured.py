@@ -331,7 +331,7 @@ class GridSurface(Measured):
         places = []
         for k, place in ((0, y), (1, z)):
             u = (place - fit(self.centre_mm[..., k], y.ndim)) / spacing + 0.5 * (size - 1)
-            first = np.clip(np.floor(u), 1.0, size - 3.0)
+            first = np.clip(np.floor(np.nan_to_num(u)), 1.0, size - 3.0)
             places.append((first.astype(np.intp) - 1, splines(u - first, spacing, second)))
         (i, along_y), (j, along_z) = places
         row = self.row.reshape(self.row.shape + (1,) * (y.ndim - self.row.ndim)) if self.row.ndim else self.row

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Floats
 from ..errors import InputError
 from ..eye.model import EyeModel
 from ..geometry.surfaces import Surface
 from ..geometry.surfaces_biconic import Biconic
+from ..geometry.surfaces_measured import Measured
 from ..geometry.surfaces_quadric import Quadric
 from ..region.anatomy import Region
 from ..region.globe import Globe
@@ -20,10 +22,12 @@ from ..rig.camera import PinholeCamera, Window
 from ..rig.imaging import Ambient, Lens
 from ..rig.light import Lamp
 from ..rig.sensor import Sensor
+from .lattice import lattice
 from .parameters import (
     CameraParameters,
     ImageParameters,
     IrisParameters,
+    Kind,
     LimbusParameters,
     Parameters,
     PoseParameters,
@@ -99,9 +103,18 @@ def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
     )
 
 
-def kinds(eye: EyeModel) -> tuple[tuple[bool, bool], ...]:
-    """Whether each refracting surface in front of the iris is biconic, and whether it is tilted."""
-    return tuple((isinstance(s, Biconic), not np.array_equal(s.rotation, np.eye(3))) for s in eye.front)
+def kinds(eye: EyeModel) -> tuple[tuple[Kind, bool], ...]:
+    """Kind of each refracting surface in front of the iris, and whether it is tilted."""
+    return tuple((_kind(s), not np.array_equal(s.rotation, np.eye(3))) for s in eye.front)
+
+
+def _kind(surface: Surface) -> Kind:
+    return "biconic" if isinstance(surface, Biconic) else "measured" if isinstance(surface, Measured) else "quadric"
+
+
+def tables(eye: EyeModel) -> tuple[NDArray[np.float32] | None, ...]:
+    """Spline coefficients of the measured surfaces in front of the iris; None for the others."""
+    return tuple(lattice(s, float(eye.limbus_radius_mm)).table if isinstance(s, Measured) else None for s in eye.front)
 
 
 def parameters_of(job: RenderJob) -> Parameters:
@@ -109,7 +122,7 @@ def parameters_of(job: RenderJob) -> Parameters:
     eye, look, anchor, camera = job.eye, job.look, job.anchor_mm, job.camera
     indices = np.asarray(eye.front_indices, dtype=float)
     surfaces = tuple(
-        _surface_parameters(surface, before / index)
+        _surface_parameters(surface, before / index, float(eye.limbus_radius_mm))
         for surface, index, before in zip(eye.front, indices, [1.0, *indices[:-1]], strict=True)
     )
     front, stop, sclera = eye.front[0], eye.stop, eye.sclera
@@ -152,10 +165,10 @@ def parameters_of(job: RenderJob) -> Parameters:
     )
 
 
-def _surface_parameters(surface: Surface, eta: float) -> SurfaceParameters:
+def _surface_parameters(surface: Surface, eta: float, limbus_mm: float) -> SurfaceParameters:
     rotation = np.asarray(surface.rotation)
     axes = None if np.array_equal(rotation, np.eye(3)) else (rotation[:, 0], rotation[:, 1], rotation[:, 2])
-    return SurfaceParameters(surface.origin_mm, tuple(_shape(surface)), eta, axes)
+    return SurfaceParameters(surface.origin_mm, tuple(_shape(surface, limbus_mm)), eta, axes)
 
 
 def boundary_waves(eye: EyeModel) -> Floats:
@@ -204,7 +217,9 @@ def ring_radius_mm(lamp: Lamp) -> float:
     return lamp.inner_radius_mm
 
 
-def _shape(surface: Surface) -> Floats:
+def _shape(surface: Surface, limbus_mm: float) -> Floats:
+    if isinstance(surface, Measured):
+        return np.array(lattice(surface, limbus_mm).shape)
     if isinstance(surface, Biconic):
         return np.array([*surface.radii_mm, *(1 + np.asarray(surface.conic_constants)), 0.0])
     if not isinstance(surface, Quadric):
@@ -241,5 +256,6 @@ def apex_of(surface: Surface) -> Floats:
 def _curvature(surface: Surface) -> float:
     """Mean curvature at the apex (1/mm), from the sag."""
     h = 0.05
-    apex = float(surface.sag(0.0, 0.0))
-    return float((2 * apex - surface.sag(h, 0.0) - surface.sag(0.0, h)) / h**2)
+    # A measured surface may lean at its apex, so both sides count.
+    ends = sum(surface.sag(s * h, 0.0) + surface.sag(0.0, s * h) for s in (1, -1))
+    return float((4 * surface.sag(0.0, 0.0) - ends) / (2 * h**2))

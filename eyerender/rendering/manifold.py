@@ -73,11 +73,12 @@ def connect(
     def newton(
         y: mi.Vector3f, last: mi.Vector3f, step: mi.UInt32, on: mi.Bool, dark: mi.Bool, transfer: mi.Float
     ) -> tuple[mi.Vector3f, mi.Vector3f, mi.UInt32, mi.Bool, mi.Bool, mi.Float]:
+        y, form = front.on_surface(y)
         d = y - lamp
         distance = dr.norm(d)
         d /= distance
         e1, e2 = mi.coordinate_system(d)
-        b, passed, c = front.bend(Bundle(y, d, distance * e1, distance * e2, e1, e2))
+        b, passed, c = front.bend(Bundle(y, d, distance * e1, distance * e2, e1, e2), form)
         y1, y2 = b.da, b.db
         over = c < _GRAZING  # beyond the horizon, go half the way back
         ok = ~over
@@ -96,7 +97,7 @@ def connect(
         move = (dr.dot(b.w, dr.cross(r, a2)) * inv) * y1 + (dr.dot(b.w, dr.cross(a1, r)) * inv) * y2
         size = dr.norm(move)
         move *= dr.minimum(1, _STEP_MM / dr.maximum(size, 1e-9))
-        after = front.on_surface(dr.select(over, 0.5 * (y + last), y + move))
+        after = dr.select(over, 0.5 * (y + last), y + move)  # the next step brings it to the surface
         step += 1
         local = front.point_in(y)
         out = local.y * local.y + local.z * local.z > dr.square(reach + 1)
@@ -129,5 +130,4 @@ def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vect
     centre = mi.Vector3f(-7.8, 0, 0)
     half = dr.normalize(dr.normalize(front.point_in(lamp) - centre) + mi.Vector3f(1, 0, 0))
     local = dr.select(good, straight, centre + 7.8 * half)
-    out = front.vector_out(local) + front.origin
-    return front.on_surface(out)
+    return front.vector_out(local) + front.origin

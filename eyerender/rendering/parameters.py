@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
+Kind = Literal["quadric", "biconic", "measured"]
 _Tree = TypeVar("_Tree")
 
 
@@ -25,7 +26,8 @@ class SurfaceParameters:
 
     Attributes:
         origin: (3,) origin of the surface's own frame.
-        shape: (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic (see `surfaces`).
+        shape: (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic, (R, p, cells per mm, cells in a
+            row, 0) of a measured surface (see `surfaces`).
         eta: index of refraction before the surface over that behind it, for light that enters the eye.
         axes: the unit axes of its frame, three (3,); None if they are the eye's own.
     """

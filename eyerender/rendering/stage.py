@@ -14,7 +14,7 @@ from ..rig.camera import Window
 from ..rig.imaging import Ambient
 from .environment import Ambience, Maps
 from .film import Exposed
-from .frame import RenderJob, boundary_waves, globe_of, kinds, light_table, panel_table, parameters_of
+from .frame import RenderJob, boundary_waves, globe_of, kinds, light_table, panel_table, parameters_of, tables
 from .head import place_scene
 from .lampviews import LampViews
 from .lidshade import LidShade
@@ -49,7 +49,7 @@ class Stage:
             job.ambient != Ambient(),
         )
         anchor = job.anchor_mm
-        values = Values(structure, parameters_of(job), boundary_waves(job.eye))
+        values = Values(structure, parameters_of(job), boundary_waves(job.eye), tables(job.eye))
         lights = Lights(light_table(job.lights, job.M, job.t))
         textures = self._textures_of(job)
         if structure.ambient:

@@ -4,18 +4,23 @@ A surface is given in its own frame, +x outward:
 
     quadric   a.x x^2 + a.y y^2 + a.z z^2 + 2 b x + c = 0, half gradient (a.x x + b, a.y y, a.z z) outward
     biconic   x + g(y, z) = 0,  g = e / (1 + r),  e = cy y^2 + cz z^2,  r = sqrt(1 - py cy^2 y^2 - pz cz^2 z^2)
+    measured  x + g(y, z) = 0,  g = (y^2 + z^2) / (2 R) + sum_pq a_pq s^p t^q,  a bicubic in each cell
 
-with c = 1/R > 0 and p = 1 + Q for the biconic's two meridians. A conic has a = (1 + Q, 1, 1), b = R, c = 0.
-Lengths are in mm. The differentials follow Igehy (1999), 'Tracing ray differentials', equations 10-18.
+with c = 1/R > 0 and p = 1 + Q for the biconic's two meridians. A conic has a = (1 + Q, 1, 1), b = R, c = 0. The
+coefficients of a measured surface are data (see `lattice`), so a new one compiles nothing. Lengths are in mm. The
+differentials follow Igehy (1999), 'Tracing ray differentials', equations 10-18.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+
+from .parameters import Kind
 
 _SETTLED_MM = 0.1
 
@@ -32,6 +37,14 @@ class Bundle:
     wb: mi.Vector3f
 
 
+class NormalForm(NamedTuple):
+    """Outward unit normal, inverse length of the gradient, and the Hessian as a function of a vector."""
+
+    normal: mi.Vector3f
+    inverse: mi.Float
+    hessian: Callable[[mi.Vector3f], mi.Vector3f]
+
+
 @dataclass(frozen=True, slots=True)
 class Surface:
     """One refracting surface; every number is a Dr.Jit array of size one.
@@ -39,16 +52,19 @@ class Surface:
     Attributes:
         origin: origin of the surface's frame.
         axes: unit axes of the surface's frame in the eye frame, or None if they are the eye's own.
-        shape: (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic.
+        shape: (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic, (R, p, cells per mm, cells in a
+            row, 0) of a measured surface, whose conic of R and p is where the search for hits starts.
         eta: index before over index behind, for light that enters the eye.
-        biconic: which of the two it is.
+        kind: which of the three it is.
+        table: the cells of a measured surface (see `lattice`).
     """
 
     origin: mi.Vector3f
     axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f] | None
     shape: tuple[mi.Float, ...]
     eta: mi.Float
-    biconic: bool
+    kind: Kind
+    table: mi.Float | None = None
 
     def point_in(self, x: mi.Vector3f) -> mi.Vector3f:
         """Transform a point from the eye frame to the surface's frame."""
@@ -70,11 +86,15 @@ class Surface:
     def hit(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool]:
         """Distance to the point where a ray from outside enters, and whether it does, in the surface's frame.
 
-        The origin must be within some centimetres, or single precision costs more than a micrometre.
+        The origin must be within some centimetres, or single precision costs more than a micrometre. A measured surface
+        is replaced by the conic that is like it, which is enough for shadows and first guesses; `meet` is exact.
         """
-        if self.biconic:
+        if self.kind == "biconic":
             Ry, Rz, py, pz, _ = self.shape
             ax, ay, az, b, c = 0.5 * (py + pz), 1, 1, 0.5 * (Ry + Rz), 0
+        elif self.kind == "measured":
+            b, ax, *_ = self.shape
+            ay, az, c = 1, 1, 0
         else:
             ax, ay, az, b, c = self.shape
         A = ax * d.x * d.x + ay * d.y * d.y + az * d.z * d.z
@@ -85,7 +105,7 @@ class Surface:
         q = dr.sqrt(dr.maximum(D, 0)) - B
         t = C / q
         ok = (D > 0) & (q > 0)
-        if self.biconic:
+        if self.kind == "biconic":
             for _ in range(3):
                 value, slope = self._sag_form(o + t * d)
                 step = value / dr.dot(slope, d)
@@ -94,13 +114,37 @@ class Surface:
             ok &= dr.abs(step) < _SETTLED_MM
         return t, ok
 
+    def meet(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool, mi.Vector3f]:
+        """Distance and success as from `hit`, exact for every surface, and the outward unit normal there."""
+        t, ok = self.hit(o, d)
+        if self.kind != "measured":
+            return t, ok, self.normal(o + t * d)
+        t, ok, jet = self._refined(o, d, t, ok, 1)
+        return t, ok, dr.normalize(mi.Vector3f(1, jet[1], jet[2]))
+
+    def _refined(
+        self, o: mi.Vector3f, d: mi.Vector3f, t: mi.Float, ok: mi.Bool, order: int
+    ) -> tuple[mi.Float, mi.Bool, tuple[mi.Float, ...]]:
+        """Two Newton steps from the conic to a measured surface, and its sag where the second one began.
+
+        The conic is within 0.1 mm, the first step within 1 um, where the slopes are as good as exact.
+        """
+        value, slope = self._sag_form(o + t * d)
+        t -= value / dr.dot(slope, d)
+        x = o + t * d
+        jet = self._sag(x.y, x.z, order)
+        step = (x.x + jet[0]) / (d.x + jet[1] * d.y + jet[2] * d.z)
+        return t - step, ok & (dr.abs(step) < _SETTLED_MM), jet
+
     def _sag_form(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f]:
-        """Biconic's F = x + g(y, z) and its gradient."""
-        g, gy, gz, *_ = self._sag(x.y, x.z)
+        """F = x + g(y, z) of a biconic or a measured surface, and its gradient."""
+        g, gy, gz, *_ = self._sag(x.y, x.z, 1)
         return x.x + g, mi.Vector3f(1, gy, gz)
 
-    def _sag(self, y: mi.Float, z: mi.Float) -> tuple[mi.Float, ...]:
-        """Sag g, its two first and three second derivatives (yy, yz, zz)."""
+    def _sag(self, y: mi.Float, z: mi.Float, order: int = 2) -> tuple[mi.Float, ...]:
+        """Sag g, its two first and three second derivatives (yy, yz, zz); at least those up to `order`."""
+        if self.table is not None:
+            return self._spline(self.table, y, z, order)
         Ry, Rz, py, pz, _ = self.shape
         cy, cz = 1 / Ry, 1 / Rz
         e = cy * y * y + cz * z * z
@@ -117,67 +161,87 @@ class Surface:
         gyz = (-gz * ry - gy * rz - g * ryz) * k
         return g, gy, gz, gyy, gyz, gzz
 
+    def _spline(self, table: mi.Float, y: mi.Float, z: mi.Float, order: int) -> tuple[mi.Float, ...]:
+        """Sag of a measured surface as in `_sag`."""
+        radius, _, density, count, _ = self.shape
+        u, v = y * density + 0.5 * count, z * density + 0.5 * count
+        i, j = (dr.clip(dr.floor(place), 0, count - 1) for place in (u, v))
+        s, t = u - i, v - j
+        cell = 4 * (mi.UInt32(i) * mi.UInt32(count) + mi.UInt32(j))
+        rows = [dr.gather(mi.Vector4f, table, cell + p) for p in range(4)]
+        values = [((c.w * t + c.z) * t + c.y) * t + c.x for c in rows]
+        bend = 1 / radius
+        g = 0.5 * bend * (y * y + z * z) + _cubic(values, s)
+        if order == 0:
+            return (g,)
+        slopes = [(3 * c.w * t + 2 * c.z) * t + c.y for c in rows]
+        gy, gz = bend * y + density * _slope(values, s), bend * z + density * _cubic(slopes, s)
+        if order == 1:
+            return g, gy, gz
+        bends = [6 * c.w * t + 2 * c.z for c in rows]
+        square = density * density
+        gyy = bend + square * (6 * values[3] * s + 2 * values[2])
+        return g, gy, gz, gyy, square * _slope(slopes, s), bend + square * _cubic(bends, s)
+
     def normal(self, x: mi.Vector3f) -> mi.Vector3f:
         """Outward unit normal at a point of the surface, in the surface's frame."""
         return dr.normalize(self._gradient(x))
 
     def _gradient(self, x: mi.Vector3f) -> mi.Vector3f:
-        if self.biconic:
+        if self.kind != "quadric":
             return self._sag_form(x)[1]
         ax, ay, az, b, _ = self.shape
         return mi.Vector3f(ax * x.x + b, ay * x.y, az * x.z)
 
-    def _normal_form(self, x: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float, Callable[[mi.Vector3f], mi.Vector3f]]:
-        """Outward unit normal, inverse length of the gradient, and the Hessian as a function of a vector."""
-        if self.biconic:
-            _, gy, gz, gyy, gyz, gzz = self._sag(x.y, x.z)
-            G = mi.Vector3f(1, gy, gz)
-
-            def hessian(v: mi.Vector3f) -> mi.Vector3f:
-                return mi.Vector3f(0, gyy * v.y + gyz * v.z, gyz * v.y + gzz * v.z)
-        else:
-            ax, ay, az, *_ = self.shape
-            G = self._gradient(x)
-
-            def hessian(v: mi.Vector3f) -> mi.Vector3f:
-                return mi.Vector3f(ax * v.x, ay * v.y, az * v.z)
-
+    def _normal_form(self, x: mi.Vector3f) -> NormalForm:
+        """Normal form at a point of the surface."""
+        if self.kind != "quadric":
+            return _form_of(self._sag(x.y, x.z))
+        ax, ay, az, *_ = self.shape
+        G = self._gradient(x)
         inv = dr.rsqrt(dr.squared_norm(G))
-        return G * inv, inv, hessian
+        return NormalForm(G * inv, inv, lambda v: mi.Vector3f(ax * v.x, ay * v.y, az * v.z))
 
     def refract(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Bool]:
         """Enter the eye along a ray of the eye frame: hit point, direction behind, transmittance 1 - F, and success."""
         ol, dl = self.point_in(o), self.vector_in(d)
-        t, ok = self.hit(ol, dl)
-        y = ol + t * dl
-        N = self.normal(y)
+        t, ok, N = self.meet(ol, dl)
         c = -dr.dot(N, dl)
         c2 = dr.sqrt(dr.maximum(1 - self.eta * self.eta * (1 - c * c), 0))
         w = self.eta * dl + (self.eta * c - c2) * N
         return o + t * d, self.vector_out(w), 1 - fresnel(c, c2, self.eta), ok & (c > 0)
 
-    def on_surface(self, x: mi.Vector3f) -> mi.Vector3f:
-        """Point of the surface (eye frame) at the same local (y, z) as a point near it."""
+    def on_surface(self, x: mi.Vector3f) -> tuple[mi.Vector3f, NormalForm]:
+        """Point of the surface (eye frame) at the same local (y, z) as a point near it, and its form for `bend`."""
         l = self.point_in(x)
-        if self.biconic:
-            sag = -self._sag(l.y, l.z)[0]
+        form: NormalForm | None = None
+        if self.kind != "quadric":
+            jet = self._sag(l.y, l.z)
+            sag, form = -jet[0], _form_of(jet)
         else:
             ax, ay, az, b, c = self.shape
             C = ay * l.y * l.y + az * l.z * l.z + c
             sag = -C / (b + dr.sqrt(dr.maximum(b * b - ax * C, 1e-3)))
         # In single precision the change must be computed apart from the point, because it is much smaller.
-        return x + self.vector_out(mi.Vector3f(sag - l.x, 0, 0))
+        point = x + self.vector_out(mi.Vector3f(sag - l.x, 0, 0))
+        return point, self._normal_form(self.point_in(point)) if form is None else form
 
     def refract_bundle(self, b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
         """Enter the eye with ray differentials: the bundle behind, the transmittance 1 - F, and success."""
-        t, ok = self.hit(self.point_in(b.y), self.vector_in(b.w))
-        out, share, c = self.bend(Bundle(b.y + t * b.w, b.w, b.da + t * b.wa, b.db + t * b.wb, b.wa, b.wb))
+        o, d = self.point_in(b.y), self.vector_in(b.w)
+        t, ok = self.hit(o, d)
+        form: NormalForm | None = None
+        if self.kind == "measured":
+            t, ok, jet = self._refined(o, d, t, ok, 2)
+            form = _form_of(jet)
+        there = Bundle(b.y + t * b.w, b.w, b.da + t * b.wa, b.db + t * b.wb, b.wa, b.wb)
+        out, share, c = self.bend(there, self._normal_form(self.point_in(there.y)) if form is None else form)
         return out, share, ok & (c > 1e-4)
 
-    def bend(self, b: Bundle) -> tuple[Bundle, mi.Float, mi.Float]:
+    def bend(self, b: Bundle, form: NormalForm) -> tuple[Bundle, mi.Float, mi.Float]:
         """Refract a bundle whose ray has reached the surface: the bundle behind, 1 - F, and the cosine of incidence."""
         d = self.vector_in(b.w)
-        N, inv, hessian = self._normal_form(self.point_in(b.y))
+        N, inv, hessian = form
         c = -dr.dot(N, d)
         c2 = dr.sqrt(dr.maximum(1 - self.eta * self.eta * (1 - c * c), 1e-6))
         k = self.eta * c - c2
@@ -193,6 +257,24 @@ class Surface:
             moved.append(self.vector_out(dy))
             turned.append(self.vector_out(self.eta * e + dc * slope * N + k * dN))
         return Bundle(b.y, self.vector_out(w), *moved, *turned), 1 - fresnel(c, c2, self.eta), c
+
+
+def _form_of(jet: tuple[mi.Float, ...]) -> NormalForm:
+    """Normal form of a graph x + g(y, z) = 0 from g and its derivatives."""
+    _, gy, gz, gyy, gyz, gzz = jet
+    G = mi.Vector3f(1, gy, gz)
+    inv = dr.rsqrt(dr.squared_norm(G))
+    return NormalForm(G * inv, inv, lambda v: mi.Vector3f(0, gyy * v.y + gyz * v.z, gyz * v.y + gzz * v.z))
+
+
+def _cubic(c: list[mi.Float], s: mi.Float) -> mi.Float:
+    """Cubic c_0 + c_1 s + c_2 s^2 + c_3 s^3."""
+    return ((c[3] * s + c[2]) * s + c[1]) * s + c[0]
+
+
+def _slope(c: list[mi.Float], s: mi.Float) -> mi.Float:
+    """Derivative of `_cubic`."""
+    return (3 * c[3] * s + 2 * c[2]) * s + c[1]
 
 
 def fresnel(c1: mi.Float, c2: mi.Float, eta: mi.Float) -> mi.Float:

@@ -6,6 +6,7 @@ What determines the kernel (the kinds of surfaces, whether the lens distorts) is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .parameters import Parameters, packed, rebuilt
+from .parameters import Kind, Parameters, packed, rebuilt
 from .surfaces import Surface
 
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
@@ -38,12 +39,12 @@ def aligned(values: NDArray[Any]) -> NDArray[Any]:
 class Structure:
     """What a kernel is compiled for.
 
-    It holds (biconic, tilted) of each surface, whether the camera's lens distorts, whether anything can stand in the
+    It holds (kind, tilted) of each surface, whether the camera's lens distorts, whether anything can stand in the
     way of light (the surround's plane cannot: it hides no lamp before it), whether the scene is an eye region instead
     of a surround, and whether there is other light than that of the lamps.
     """
 
-    surfaces: tuple[tuple[bool, bool], ...]
+    surfaces: tuple[tuple[Kind, bool], ...]
     distorted: bool = False
     obstacles: bool = True
     region: bool = False
@@ -58,6 +59,7 @@ class Values:
         structure: Structure,
         parameters: Parameters,
         waves: np.ndarray[Any, np.dtype[np.float64]],
+        tables: Sequence[NDArray[np.float32] | None],
     ) -> None:
         numbers = packed(parameters)
         buffer = mi.Float(numbers)
@@ -73,8 +75,8 @@ class Values:
         self.structure = structure
         self.boundary = PupilBoundary(waves)
         self.surfaces = tuple(
-            Surface(one.origin, one.axes, one.shape, one.eta, biconic)
-            for one, (biconic, _) in zip(found.surfaces, structure.surfaces, strict=True)
+            Surface(one.origin, one.axes, one.shape, one.eta, kind, None if table is None else mi.Float(aligned(table)))
+            for one, (kind, _), table in zip(found.surfaces, structure.surfaces, tables, strict=True)
         )
         self.stop, self.iris, self.limbus, self.sclera = found.stop, found.iris, found.limbus, found.sclera
         self.image, self.pose, self.camera = found.image, found.pose, found.camera

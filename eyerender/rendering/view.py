@@ -125,7 +125,7 @@ def meet(
     oe, de = values.point_to_eye(o + t0 * d), values.vector_to_eye(d)
     front = values.surfaces[0]
     ol, dl = front.point_in(oe), front.vector_in(de)
-    tc, on_cornea = front.hit(ol, dl)
+    tc, on_cornea, facing = front.meet(ol, dl)
     yl = ol + tc * dl
     rho = dr.sqrt(yl.y * yl.y + yl.z * yl.z)
     on_cornea &= (rho < values.limbus.radius) & (yl.x > values.limbus.floor)
@@ -144,10 +144,10 @@ def meet(
     on_cornea &= on_eye
     on_sclera &= on_eye
     normal, mirrored, passed, inner, pupil = dr.if_stmt(
-        (yl, oe + tc * de, dl),
+        (facing, oe + tc * de, dl),
         amodal_cornea,
-        lambda yl, y, dl: _refracted(values, yl, y, dl),
-        lambda yl, y, dl: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Bool(False)),
+        lambda facing, y, dl: _refracted(values, facing, y, dl),
+        lambda facing, y, dl: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Bool(False)),
     )
     xs = oe + ts * de
     view = View(
@@ -216,14 +216,13 @@ def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector
 
 
 def _refracted(
-    values: Values, yl: mi.Vector3f, y: mi.Vector3f, dl: mi.Vector3f
+    values: Values, N: mi.Vector3f, y: mi.Vector3f, dl: mi.Vector3f
 ) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Vector3f, mi.Bool]:
     """From the front cornea to the plane of the iris: normal, reflectance, transmittance, point, whether in the pupil.
 
-    yl, dl: hit point and direction in the front surface's frame; y: the point in the eye frame.
+    N, dl: normal and direction in the front surface's frame; y: the point in the eye frame.
     """
     front = values.surfaces[0]
-    N = front.normal(yl)
     c = -dr.dot(N, dl)
     c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
     mirrored = fresnel(c, c2, front.eta)
