@@ -20,7 +20,7 @@ from ..rig.camera import Window
 from .groups import Group, shade_group
 from .sampling import Sampler, Samples, camera_ray
 from .values import Lamp, Lights, Values
-from .view import Textures
+from .view import Textures, meet
 
 _LANES = 2**24  # samples at a time; more are rendered in several passes
 _LARGEST_GROUP = 4
@@ -66,22 +66,47 @@ def mean_radiance(
     integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, spp: int, seed: int
 ) -> tuple[Floats, int]:
     """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
+    (total,), failed = _sums(integrator, shown, window, spp=spp, seed=seed, layered=False)
+    # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
+    return np.maximum(total / spp, 0), failed
+
+
+def mean_parts(
+    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, spp: int, seed: int
+) -> tuple[Floats, int]:
+    """Parts of the scene from front to back: hairs and tears, skin, globe; or surround and globe; failed light paths.
+
+    The array (parts, 3, height, width) holds the radiance of each part (their sum is that of `mean_radiance`), the
+    share of the pixel's samples that show the part, and that share times their mean inverse depth (1/mm).
+    """
+    sums, failed = _sums(integrator, shown, window, spp=spp, seed=seed, layered=True)
+    return np.reshape(sums, (-1, 3, *sums[0].shape)) / spp, failed
+
+
+def _sums(
+    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, *, spp: int, seed: int, layered: bool
+) -> tuple[list[Floats], int]:
+    """Sums over the samples of each pixel, (height, width): radiance; or radiance, weight, nearness of each part."""
     width, height = window[2:]
     grouped = shown.values.structure.region and integrator.bounces == 0
     size = group_size(spp) if grouped else 1
-    total, failed = np.zeros(width * height), 0
+    totals: list[Floats] = []
+    failed = 0
     each = max(1, min(spp // size, _LANES // (width * height * size)))
     plain = shown.plain(window) if grouped else None
     for first in range(0, spp // size, each):
         count = min(each, spp // size - first)
         if plain is not None:
-            seen, failures = _groups(shown, window, plain, spp=spp, seed=seed, first=first, count=count, size=size)
+            seen, failures = _groups(
+                shown, window, plain, spp=spp, seed=seed, first=first, count=count, size=size, layered=layered
+            )
         else:
-            seen, failures = _singles(integrator, shown, window, spp=spp, seed=seed, first=first, count=count)
-        total += seen
+            seen, failures = _singles(
+                integrator, shown, window, spp=spp, seed=seed, first=first, count=count, layered=layered
+            )
+        totals = [a + b for a, b in zip(totals, seen, strict=True)] if totals else seen
         failed += failures
-    # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
-    return np.maximum(total / spp, 0).reshape(height, width), failed
+    return [t.reshape(height, width) for t in totals], failed
 
 
 def _samples(u: mi.Int32, v: mi.Int32, spp: int, seed: int) -> Samples:
@@ -90,9 +115,17 @@ def _samples(u: mi.Int32, v: mi.Int32, spp: int, seed: int) -> Samples:
 
 
 def _singles(
-    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, *, spp: int, seed: int, first: int, count: int
-) -> tuple[Floats, int]:
-    """Sum over `count` samples of each pixel, one per lane."""
+    integrator: mi.SamplingIntegrator,
+    shown: Exposed,
+    window: Window,
+    *,
+    spp: int,
+    seed: int,
+    first: int,
+    count: int,
+    layered: bool,
+) -> tuple[list[Floats], int]:
+    """Sums over `count` samples of each pixel, one per lane."""
     index = dr.arange(mi.UInt32, window[2] * window[3] * count)
     n = dr.opaque(mi.UInt32, count)
     pixel = index // n
@@ -103,15 +136,29 @@ def _singles(
     o, d, cosine = camera_ray(shown.values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
     seen, _, _ = integrator.sample(shown.scene, Sampler(samples, k), mi.Ray3f(mi.Point3f(o), d))
     cosine = cosine * cosine
-    lanes, failures = seen[0] * cosine * cosine, integrator.failures
+    lanes, failures = [seen[0] * cosine * cosine], integrator.failures
+    if layered:
+        view, _ = meet(shown.values, shown.scene, o, d, True)
+        near = view.nearness(shown.values, d)
+        parts = (view.other, view.cornea | view.sclera)
+        lanes = [dr.select(part, x, 0) for part in parts for x in (lanes[0], mi.Float(1), near)]
     dr.eval(lanes, failures)  # together, because a separate reduction would trace everything again
-    return dr.block_sum(lanes, count).numpy().astype(float), int(dr.sum(failures).numpy()[0])
+    return [dr.block_sum(x, count).numpy().astype(float) for x in lanes], int(dr.sum(failures).numpy()[0])
 
 
 def _groups(
-    shown: Exposed, window: Window, plain: tuple[Bools, int], *, spp: int, seed: int, first: int, count: int, size: int
-) -> tuple[Floats, int]:
-    """Sum over `count` groups of each pixel, one group per lane; sample j of group g is number g size + j."""
+    shown: Exposed,
+    window: Window,
+    plain: tuple[Bools, int],
+    *,
+    spp: int,
+    seed: int,
+    first: int,
+    count: int,
+    size: int,
+    layered: bool,
+) -> tuple[list[Floats], int]:
+    """Sums over `count` groups of each pixel, one group per lane; sample j of group g is number g size + j."""
     # Embree traces sixteen neighbouring lanes together. They are one group of 4 x 4 pixels each, so that their camera
     # rays are close and their lamp rays go the same way.
     columns, rows = (-(-n // _TILE) for n in window[2:])  # the last tiles may extend beyond the window
@@ -153,7 +200,7 @@ def _groups(
         return lights[which], mi.Float(groups) / mi.Float(dr.maximum((groups + lamps - 1 - which) // lamps, 1))
 
     several = groups < lamps
-    radiance, failures = shade_group(
+    parts, radiance, failures = shade_group(
         shown.values,
         lights,
         shown.textures,
@@ -169,14 +216,21 @@ def _groups(
             shared,
             (lamps <= _FEW_LAMPS) & ~several & dr.opaque(mi.Bool, lights.widest < _SMALL),
             _plain(plain, window, u, v),
+            layered,
         ),
     )
     inside = (x < dr.opaque(mi.UInt32, window[2])) & (y < dr.opaque(mi.UInt32, window[3]))
     failures = dr.select(inside, failures, 0)
-    dr.eval(radiance, failures)
-    tiles = radiance.numpy().reshape(rows, columns, count, _TILE, _TILE).sum(axis=2, dtype=float)
-    seen = tiles.transpose(0, 2, 1, 3).reshape(rows * _TILE, columns * _TILE)[: window[3], : window[2]]
-    return seen.reshape(-1), int(dr.sum(failures).numpy()[0])
+    one = dr.rcp(ray(mi.UInt32(0))[2])  # the weight of a sample hardly differs within a pixel
+    lanes = [x for p in parts for x in (p.radiance, p.weight * one, p.near * one)] if layered else [radiance]
+    dr.eval(lanes, failures)
+
+    def summed(lane: mi.Float) -> Floats:
+        tiles = lane.numpy().reshape(rows, columns, count, _TILE, _TILE).sum(axis=2, dtype=float)
+        seen = tiles.transpose(0, 2, 1, 3).reshape(rows * _TILE, columns * _TILE)[: window[3], : window[2]]
+        return np.asarray(seen.reshape(-1))
+
+    return [summed(lane) for lane in lanes], int(dr.sum(failures).numpy()[0])
 
 
 def _plain(plain: tuple[Bools, int], window: Window, u: mi.Int32, v: mi.Int32) -> mi.Bool:

@@ -33,6 +33,7 @@ from ..status import Status
 from .cut import POINT, Nodes, cut_nodes, quadrature, rim
 from .frame import ring_radius_mm
 
+_PARALLAX_MM = 0.05
 _MAP_ERROR = 1e-3  # of the extent of a lamp's image
 
 Visibility = Callable[[Floats, Floats], Bools]
@@ -142,6 +143,22 @@ class GlintScene:
             if np.any(visible) and not np.all(visible):
                 glints[k] = replace(glint, spots=self._cut(lights[k], glint.image, counts[k]))
         return glints
+
+    def nearness(self, lights: Sequence[Lamp]) -> Floats:
+        """Inverse depths (1/mm) of the lamps' mirror images for lenses that are wide across and down, (n, 2).
+
+        When the nodal point moves by q, the image of a point at depth z moves by -f q / z. NaN where there is no image.
+        """
+        camera, out = self.camera, []
+        for axis in (0, 1):
+            xy = []
+            for step in (_PARALLAX_MM, -_PARALLAX_MM):
+                K, R = camera.K, camera.R
+                moved = PinholeCamera.of(K, R, camera.t - step * np.eye(3)[axis], camera.resolution_px)
+                images = replace(self, camera=moved)._trace(lights, [POINT] * len(lights))
+                xy.append([i.xy_px[0, axis] if i.found[0] else np.nan for i in images])
+            out.append((np.array(xy[1]) - xy[0]) / (2 * _PARALLAX_MM * camera.K[axis, axis]))
+        return np.stack(out, axis=1)
 
     def seen(self, images: Sequence[Image]) -> list[Glint]:
         """Glints of images, made of their points that the camera sees."""

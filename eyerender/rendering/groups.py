@@ -36,6 +36,7 @@ class Group:
         fine: whether pairs of samples send rays of their own to the lamp about the lids and on hairs, where lashes cast
             shadows finer than a pixel. There is one lamp then.
         plain: whether the samples' pixel shows nothing but the sheet of skin.
+        layered: whether the parts of the sum, and their distances, are wanted one by one.
     """
 
     count: mi.UInt32
@@ -48,12 +49,25 @@ class Group:
     shared: Callable[[mi.UInt32], tuple[Lamp, mi.Float]]
     fine: mi.Bool
     plain: mi.Bool
+    layered: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What a group sees of one part of the scene: radiance, weight of the samples, and weight times inverse depth."""
+
+    radiance: mi.Float
+    weight: mi.Float
+    near: mi.Float
 
 
 def shade_group(
     values: Values, lights: Lights, textures: Textures, scene: mi.Scene, group: Group
-) -> tuple[mi.Float, mi.UInt32]:
+) -> tuple[tuple[Part, ...], mi.Float, mi.UInt32]:
     """Sum radiance and failed light paths over a group's samples in front of an eye region.
+
+    The parts, from front to back, are what is before the skin, the skin, and the globe. There are none unless the group
+    is layered.
 
     Every sample has a ray of its own, and the globe is shaded for each. The region is shaded once for the sheet of skin
     and once for everything in front of it (hairs, tears), at the first sample that hits it. The result is multiplied by
@@ -62,12 +76,21 @@ def shade_group(
     assert textures.region is not None
     shading = _GroupShading(values, lights, textures, textures.region, scene, group)
     no = mi.Bool(False)
-    state = (mi.UInt32(0), no, mi.Float(0), Kept.none(), Kept.none(), no, no, mi.UInt32(0))
-    names = ("i", "settled", "total", "sheet", "before", "known", "blocked", "failures")
-    i, settled, total, sheet, before, _, _, failures = dr.while_loop(
+    depths = tuple(mi.Float(0) for _ in range(4)) if group.layered else ()
+    state = (mi.UInt32(0), no, mi.Float(0), Kept.none(), Kept.none(), no, no, mi.UInt32(0), depths)
+    names = ("i", "settled", "total", "sheet", "before", "known", "blocked", "failures", "depths")
+    i, settled, total, sheet, before, _, _, failures, depths = dr.while_loop(
         state, shading.goes_on, shading.trace_sample, labels=names, label="group"
     )
+    traced = sheet.weight
     sheet = shading.with_untraced(sheet, i, settled)
+    if group.layered:
+        globe, *near = depths
+        near[1] *= dr.select(traced > 0, sheet.weight / traced, 1)
+        radiance = [shading.add_region(mi.Float(0), before, False), shading.add_region(mi.Float(0), sheet, True)]
+        weights = (before.weight, sheet.weight, globe)
+        parts = tuple(Part(*part) for part in zip((*radiance, total), weights, near, strict=True))
+        return parts, total, failures
     for kept, on_sheet in ((sheet, True), (before, False)):
         (total,) = dr.if_stmt(
             (total,),
@@ -75,7 +98,7 @@ def shade_group(
             lambda total, kept=kept, on_sheet=on_sheet: (shading.add_region(total, kept, on_sheet),),
             lambda total: (total,),
         )
-    return total, failures
+    return (), total, failures
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +136,8 @@ class _GroupShading:
         known: mi.Bool,
         blocked: mi.Bool,
         failures: mi.UInt32,
-    ) -> tuple[mi.UInt32, mi.Bool, mi.Float, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32]:
+        depths: tuple[mi.Float, ...],
+    ) -> tuple[mi.UInt32, mi.Bool, mi.Float, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32, tuple[mi.Float, ...]]:
         """Trace one sample: shade the globe if the sample hits it, else keep the hit on the region.
 
         `known` says whether the previous sample has sent its own ray to the lamp, `blocked` whether that ray met
@@ -123,14 +147,21 @@ class _GroupShading:
         j = self.number(i)
         o, d, weight = group.ray(j)
         view, hit = meet(values, self.scene, o, d, mi.Bool(True))
+        face = skin.face(hit)
+        on_sheet = skin.on_sheet(face)
+        if group.layered:
+            # Before the branches below: Dr.Jit would reuse their values outside of them.
+            weight_globe, *near = depths
+            add = weight * view.nearness(values, d)
+            seen = (view.other & ~on_sheet, view.other & on_sheet, view.cornea | view.sclera)
+            near = [n + dr.select(there, add, 0) for n, there in zip(near, seen, strict=True)]
+            depths = (weight_globe + dr.select(seen[2], weight, 0), *near)
 
         def globe(total: mi.Float, failures: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
             radiance, missed = self.globe_radiance(view, d, j)
             return total + radiance * weight, failures + missed
 
         total, failures = dr.if_stmt((total, failures), view.cornea | view.sclera, globe, lambda *unchanged: unchanged)
-        face = skin.face(hit)
-        on_sheet = skin.on_sheet(face)
         at = o + hit.t * d
         alone = view.other & group.fine & (~on_sheet | (at.y * at.y + at.z * at.z < _LIDS_MM * _LIDS_MM))
 
@@ -147,7 +178,7 @@ class _GroupShading:
         sheet = sheet.with_(view.other & on_sheet, j, face, hit.prim_uv, weight, alone, blocked)
         before = before.with_(view.other & ~on_sheet, j, face, hit.prim_uv, weight, alone, blocked)
         settled = group.plain & view.other & on_sheet & ~alone
-        return i + 1, settled, total, sheet, before, known, blocked, failures
+        return i + 1, settled, total, sheet, before, known, blocked, failures, depths
 
     def globe_radiance(self, view: View, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
         """Radiance of the globe along sample j's ray, and failed light paths."""

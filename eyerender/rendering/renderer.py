@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -16,7 +16,8 @@ from ..errors import InputError
 from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..rig import defocus, exposure, psf, stray
 from ..rig.camera import Window
-from .film import Exposed, mean_radiance
+from .blur import Blur
+from .film import Exposed, mean_parts, mean_radiance
 from .frame import RenderJob
 from .glints import GlintTable
 from .integrator import integrator_class
@@ -24,7 +25,7 @@ from .labels import PartLabels, part_labels
 from .lighting import through_cornea
 from .occlusion import lid_margins_px
 from .region import RegionScene
-from .splat import Mirrored, add_glints
+from .splat import add_glints
 from .stage import Stage
 from .surround import Obstacle, Surround
 
@@ -97,16 +98,24 @@ class Renderer:
         Raises:
             InputError: numbers so extreme that the image is not finite.
         """
-        spp = spp or self.spp
-        seen = (job.lens, job.camera, job.window)
+        shots = moments or (job,)
+        spp = max(1, (spp or self.spp) // len(shots))
+        blur: Blur | None = None
+        pictures, glints, failed = [], np.zeros((job.window[3], job.window[2])), 0
+        for shot in shots:
+            shown, place = self.bind(shot)
+            blur = blur or Blur.of(job, place)
+            picture, missed = self._pictures(shot, shown, blur, spp)
+            pictures.append(picture)
+            mirrored = add_glints(shot, place, glints, blur)
+            failed += missed
+        assert blur is not None
         if moments:
-            shots = [self._picture(shot, *self.bind(shot), max(1, spp // len(moments))) for shot in moments]
             shown, place = self.bind(job)
-            picture = np.mean([radiance for radiance, _, _ in shots], axis=0)
-            mirrored, failed = add_glints(job, place, np.zeros_like(picture)), sum(missed for *_, missed in shots)
-        else:
-            shown, place = self.bind(job)
-            picture, mirrored, failed = self._picture(job, shown, place, spp)
+            mirrored = add_glints(job, place, np.zeros_like(glints), blur)
+        soft = blur.of_pictures(pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0))
+        picture = psf.blur(soft, job.sensor.psf_sigma_px) + glints / len(shots)
+        seen = (job.lens, job.camera, job.window)
         picture = stray.framed(picture * defocus.vignette(job.lens, job.camera, job.window), *seen)
         blurred = stray.scattered(picture, *seen)
         irradiance = frozen(blurred * exposure.radiance_to_irradiance(job.sensor), np.float32)
@@ -135,22 +144,13 @@ class Renderer:
             margins,
         )
 
-    def _picture(
-        self, job: RenderJob, shown: Exposed, place: Surround | RegionScene, spp: int
-    ) -> tuple[Floats, Mirrored, int]:
-        """Radiance of a window behind the lens, including the glints; the glints; failed light paths."""
-        depth = float(job.camera.R[2] @ (job.anchor_mm - job.camera.nodal_point_mm))
-        kernel = defocus.disc(defocus.confusion_px(job.lens, job.camera, job.sensor, depth))
+    def _pictures(self, job: RenderJob, shown: Exposed, blur: Blur, spp: int) -> tuple[Floats, int]:
+        """Radiance of a window, or its parts, with the border that the lens needs, and failed light paths."""
+        pad = blur.reach + psf.margin(job.sensor.psf_sigma_px)
         x0, y0, width, height = job.window
-        reach = kernel.shape[0] // 2
-        sharp = replace(job, window=(x0 - reach, y0 - reach, width + 2 * reach, height + 2 * reach))
-        pad = psf.margin(job.sensor.psf_sigma_px)
-        x0, y0, width, height = sharp.window
         padded = (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad)
-        radiance, failed = mean_radiance(self._integrator, shown, padded, spp, job.seed)
-        blurred = psf.blur(radiance, job.sensor.psf_sigma_px).copy()
-        mirrored = add_glints(sharp, place, blurred)
-        return defocus.defocused(blurred, kernel), mirrored, failed
+        look = mean_parts if blur.layered else mean_radiance
+        return look(self._integrator, shown, padded, spp, job.seed)
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
         """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), before lens and glints."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..arrays import Bools, Floats, frozen
-from ..rig import psf
+from ..rig import defocus, psf
 from ..rig.camera import Window
+from .blur import Blur
 from .cut import POINT, quadrature
 from .frame import RenderJob
 from .glints import Glint, GlintScene, GlintTable, Spots, glint_table
@@ -45,7 +45,7 @@ class Mirrored:
         return Mirrored(glints, self.others, reasons)
 
 
-def add_glints(job: RenderJob, place: Surround | RegionScene, image: Floats) -> Mirrored:
+def add_glints(job: RenderJob, place: Surround | RegionScene, image: Floats, blur: Blur) -> Mirrored:
     """Add the mirror images of a job's lamps to its blurred image (height, width)."""
     eye, anchor, sigma = job.eye, job.anchor_mm, job.sensor.psf_sigma_px
 
@@ -68,7 +68,11 @@ def add_glints(job: RenderJob, place: Surround | RegionScene, image: Floats) -> 
             glints = scene.seen(purkinje_images(scene, eye, order, job.lights, nodes))
         tables[order] = glint_table(glints)
         if order in job.purkinje:
-            _splat(job, image, [glint.spots for glint in glints])
+            # The further images are about as far as the iris.
+            own = order == 1 and job.lens.focus_mm is not None
+            nearness = scene.nearness(job.lights) if own else np.full((len(glints), 2), np.nan)
+            for glint, near in zip(glints, nearness, strict=True):
+                _splat(job, image, glint.spots, defocus.disc(blur.of_image(near)))
     return Mirrored(tables[1], tuple((order, table) for order, table in tables.items() if order > 1), reasons)
 
 
@@ -86,9 +90,11 @@ def _reason(job: RenderJob, place: Surround | RegionScene, glint: Glint) -> str:
     return glint_reason(image.there, open_, names)
 
 
-def _splat(job: RenderJob, image: Floats, images: Sequence[Spots]) -> None:
-    for spots in images:
-        if len(spots.energy):
-            cosine = job.camera.rays(spots.xy_px) @ job.camera.axis
-            patch, rows, columns = psf.splat(spots.xy_px, spots.energy * cosine**4, job.sensor.psf_sigma_px, job.window)
-            image[rows, columns] += patch
+def _splat(job: RenderJob, image: Floats, spots: Spots, spread: Floats) -> None:
+    """Add the spots of a glint, blurred by the lens and convolved with `spread`."""
+    if len(spots.energy):
+        cosine = job.camera.rays(spots.xy_px) @ job.camera.axis
+        patch, rows, columns = psf.splat(
+            spots.xy_px, spots.energy * cosine**4, job.sensor.psf_sigma_px, job.window, spread
+        )  # fmt: skip
+        image[rows, columns] += patch

@@ -65,6 +65,18 @@ class View:
         """Whether the ray meets anything."""
         return self.cornea | self.sclera | self.other
 
+    def nearness(self, values: Values, d: mi.Vector3f) -> mi.Float:
+        """Inverse depth (1/mm) of what camera rays along d (scene's frame) show, behind the cornea of its image.
+
+        The paraxial image of the iris is where the rays that leave the cornea seem to come from.
+        """
+        scale, shift = values.image.scale, values.image.shift
+        image = mi.Vector3f(self.inner.x + shift, self.inner.y * scale, self.inner.z * scale)
+        forward = values.camera.forward
+        inside = dr.dot(values.point_to_scene(image) - values.camera.centre, forward)
+        deep = self.lit_inside & (self.opacity < 0.5)
+        return dr.rcp(dr.maximum(dr.select(deep, inside, self.distance * dr.dot(d, forward)), 1e-3))
+
 
 @dataclass(frozen=True, slots=True)
 class Textures:

@@ -1,75 +1,229 @@
-"""Defocus and vignetting, applied to the finished image, including the glints.
+"""Defocus by depth, and vignetting.
 
-Defocus uses one kernel per window, for the depth z of the unrotated eye's apex. The thin lens' circle of confusion is
+A thin lens of working f-number N, at the image distance v = f_px p (focal length of the camera's matrix times pixel
+pitch), has the aperture v / N. Moving the pinhole by q across the axis, with the plane at distance s held still, moves
+the image of a point at depth z by v q (1/z - 1/s). So the circle of confusion has the diameter (px)
 
-    c = (f / N) |z - s| / z * f / (s - f),
+    c = (f_px^2 p / N) |1/z - 1/s|      (Born & Wolf, section 6.1)
 
-where f is the focal length, N the f-number and s the distance in focus (Born & Wolf, section 6.1). The kernel is a disc
-integrated over the pixels. A symmetric kernel does not move centroids, so labels need no change. Vignetting multiplies
-by 1 - v (r / r_corner)^2.
+The picture is blurred in layers, from front to back: what lies in front of other things keeps a layer of its own. Every
+pixel of a layer is spread over the disc of its own depth. With the kernels K of the layer's own depths, its radiance R,
+its coverage a, and the share V of each pixel that the layers before it leave open,
+
+    alpha_k = K*a / K*V,   picture = sum_k (prod_{j<k} (1 - alpha_j)) K*R / K*V
+
+Behind an edge, a layer is thus continued by what is seen of it, so nothing bleeds from one depth into another. Where
+all depths have the same kernel, this is the plain convolution. A symmetric kernel does not move centroids, so labels
+need no change. Vignetting multiplies by 1 - v (r / r_corner)^2.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from scipy import signal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 
-from ..arrays import Floats
+import numpy as np
+from scipy import fft, ndimage, special
+
+from ..arrays import ArrayValue, Bools, Floats, Singles
 from ..errors import InputError
 from ..rig.camera import Window
 from .camera import PinholeCamera
 from .imaging import Lens
 from .sensor import Sensor
 
-_FINE = 9
-# No eye can be recognised in an image with more blur, and the cost of the kernel grows with the square.
+# No eye can be recognised in an image with more blur, and the cost grows with the square.
 MAX_CONFUSION_PX = 400
+_SHARP_PX = 0.1  # a smaller disc changes nothing
+_RIPPLES_PX = 4
+_LARGEST_PX = 64.0  # in a layer: what is blurred more shows no structure
+_RATIO = 1.2  # between the diameters of neighbouring kernels
+_ALIKE = 0.03  # relative difference of blurs' widths that does not matter
+_PIXEL_VARIANCE = 1 / 12
+_LEAST_ROOM = 0.02
 
 
-def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: float) -> float:
-    """Diameter (px) of the circle of confusion of a point.
+def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: Floats | float) -> Floats:
+    """Diameters (px) of the circles of confusion of points.
 
     Args:
         lens: the lens, which gives the distance in focus.
         camera: the camera.
-        sensor: the sensor, which gives aperture and pixel pitch.
-        depth_mm: depth of the point along the optical axis.
+        sensor: the sensor, which gives working f-number and pixel pitch.
+        depth_mm: depths of the points along the optical axis.
+    """
+    return confusion_of(lens, camera, sensor, 1 / np.maximum(np.asarray(depth_mm, dtype=float), 1e-3))
+
+
+def confusion_of(lens: Lens, camera: PinholeCamera, sensor: Sensor, nearness: Floats) -> Floats:
+    """The same of points whose inverse depths (1/mm) are given."""
+    if lens.focus_mm is None:
+        return np.zeros(np.shape(nearness))
+    strength = float(camera.K[0, 0]) ** 2 * sensor.pixel_pitch_um * 1e-3 / sensor.f_number
+    return np.asarray(strength * np.abs(nearness - 1 / lens.focus_mm))
+
+
+def checked(diameter_px: float) -> float:
+    """Return the diameter of the circle of confusion of a picture's subject.
 
     Raises:
-        InputError: the diameter exceeds 400 px.
+        InputError: it exceeds 400 px.
     """
-    if lens.focus_mm is None:
-        return 0.0
-    pitch_mm = sensor.pixel_pitch_um * 1e-3
-    focal_mm = float(camera.K[0, 0]) * pitch_mm
-    if lens.focus_mm <= focal_mm or depth_mm <= focal_mm:
-        return 0.0
-    blur = focal_mm / sensor.f_number * abs(depth_mm - lens.focus_mm) / depth_mm * focal_mm / (lens.focus_mm - focal_mm)
-    if blur / pitch_mm > MAX_CONFUSION_PX:
+    if diameter_px > MAX_CONFUSION_PX:
         raise InputError(
-            f"the picture would be blurred over {blur / pitch_mm:.3g} px; at most {MAX_CONFUSION_PX}",
+            f"the picture would be blurred over {diameter_px:.3g} px; at most {MAX_CONFUSION_PX}",
             path="lens.focus_mm",
         )
-    return float(blur / pitch_mm)
+    return diameter_px
+
+
+def one_blur(diameters_px: Floats, subject_px: float, sigma_px: float) -> bool:
+    """Whether a single kernel, that of the subject, serves all diameters within 3 % of the picture's whole blur.
+
+    Args:
+        diameters_px: of the nearest and farthest things.
+        subject_px: of the subject.
+        sigma_px: standard deviation of the point-spread function.
+    """
+    own = subject_px**2 / 16 + sigma_px**2 + _PIXEL_VARIANCE
+    width = np.sqrt((np.asarray(diameters_px) ** 2 - subject_px**2) / 16 / own + 1)
+    return bool(np.all(np.abs(width - 1) < _ALIKE))
 
 
 def disc(diameter_px: float) -> Floats:
-    """Share of each pixel in the disc, odd and square, sum 1; a single 1 below a tenth of a pixel."""
-    if diameter_px < 0.1:
+    """Kernel of a disc for pictures of pixel means: odd, square, sum 1; a single 1 below a tenth of a pixel.
+
+    Its Fourier transform is that of the disc, 2 J1(pi c f) / (pi c f), up to the highest frequency of the pixel grid.
+    So a disc of a pixel's size blurs as much as it should. A disc that is integrated over the pixels would blur by
+    another pixel, and a kernel with the disc's variance alone would leave too much of fine structure.
+    """
+    if diameter_px < _SHARP_PX:
         return np.ones((1, 1))
-    reach = int(np.ceil(diameter_px / 2 - 0.5 + 1e-9))
-    n = (2 * reach + 1) * _FINE
-    at = (np.arange(n) + 0.5) / _FINE - (2 * reach + 1) / 2
-    inside = np.hypot(at[:, None], at[None, :]) <= diameter_px / 2
-    share = inside.reshape(2 * reach + 1, _FINE, 2 * reach + 1, _FINE).sum(axis=(1, 3)).astype(float)
-    return np.asarray(share / share.sum())
+    n = 2 * _margin(diameter_px) + 1
+    kernel = fft.fftshift(fft.irfft2(_transfer(diameter_px, (n, n)), (n, n)))
+    return np.asarray(kernel / kernel.sum())
 
 
-def defocused(picture: Floats, kernel: Floats) -> Floats:
-    """Convolve the image with an odd kernel; the result is smaller by the kernel's reach on every side."""
-    if kernel.shape == (1, 1):
+def _margin(diameter_px: float) -> int:
+    """Reach of the kernel of a disc: beyond it, its ripples are below 1 %."""
+    return int(np.ceil(diameter_px / 2)) + _RIPPLES_PX
+
+
+@lru_cache(maxsize=32)
+def _transfer(diameter_px: float, shape: tuple[int, int]) -> Singles:
+    """Fourier transform of a disc at the frequencies of `rfft2`."""
+    x = np.pi * diameter_px * np.hypot(fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])[None, :])
+    found = np.divide(2 * special.j1(x), x, out=np.ones_like(x), where=x > 0)
+    return np.asarray(found, dtype=np.float32)
+
+
+def defocused(picture: Floats, diameter_px: float) -> Floats:
+    """Convolve the image with a disc; the result is smaller by `reach_px` on every side."""
+    m = reach_px(diameter_px)
+    if m == 0:
         return picture
-    return np.asarray(np.maximum(signal.fftconvolve(picture, kernel, mode="valid"), 0.0))
+    whole = _Convolution(picture.shape, m)
+    return np.asarray(np.maximum(whole.back(whole.of(picture, diameter_px)), 0.0)[m:-m, m:-m])
+
+
+def reach_px(diameter_px: float) -> int:
+    """Pixels that must be rendered beyond a window's border for discs of at most this diameter."""
+    return 0 if diameter_px < _SHARP_PX else _margin(min(diameter_px, _LARGEST_PX))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layer(ArrayValue):
+    """What a picture shows at one place in the order from front to back, (height, width) each.
+
+    Attributes:
+        radiance: sum over the pixel's samples that show it, over their whole number.
+        coverage: share of these samples.
+        confusion_px: diameter of the circle of confusion; without meaning where the coverage is 0.
+    """
+
+    radiance: Floats
+    coverage: Floats
+    confusion_px: Floats
+
+
+def blurred(layers: Sequence[Layer], reach: int) -> Floats:
+    """Blur layers, from front to back, each by its own depths; smaller by `reach` pixels on every side."""
+    shape = layers[0].radiance.shape
+    plan = _Convolution(shape, reach)
+    out, through, open_ = np.zeros(shape), np.ones(shape), np.ones(shape)
+    foremost = True  # such a layer has the whole picture to itself
+    for layer in layers:
+        covered = layer.coverage > 0
+        if not covered.any():
+            continue
+        pictures = [layer.radiance, layer.coverage]
+        if not foremost:
+            pictures.append(np.maximum(open_, layer.coverage))
+        radiance, coverage, *rest = plan.spread(pictures, _continued(layer, covered))
+        room = rest[0] if rest else np.ones(shape)
+        foremost = False
+        room = np.maximum(room, _LEAST_ROOM)
+        alpha = coverage / room
+        out += through * np.maximum(radiance, 0) / (room * np.maximum(alpha, 1))
+        through *= 1 - np.clip(alpha, 0, 1)
+        open_ = np.maximum(open_ - layer.coverage, 0)
+    m = reach
+    return out[m:-m, m:-m] if m else out
+
+
+def _continued(layer: Layer, covered: Bools) -> Floats:
+    """Diameters of a layer, continued beyond it from the nearest pixel."""
+    size = np.clip(layer.confusion_px, 0, _LARGEST_PX)
+    if covered.all():
+        return np.asarray(size)
+    nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    return np.asarray(size[tuple(nearest)])
+
+
+class _Convolution:
+    """Convolutions of pictures of one shape by Fourier transforms; the borders repeat nothing within `reach`."""
+
+    def __init__(self, shape: tuple[int, ...], reach: int) -> None:
+        self._shape = shape
+        height, width = (fft.next_fast_len(n + reach, real=True) for n in shape)
+        self._size = (height, width)
+
+    def of(self, picture: Floats, diameter_px: float) -> Floats:
+        """Fourier transform of a picture convolved with a disc."""
+        return np.asarray(fft.rfft2(picture.astype(np.float32), self._size) * _transfer(diameter_px, self._size))
+
+    def back(self, transform: Floats) -> Floats:
+        """Picture of a Fourier transform."""
+        return np.asarray(fft.irfft2(transform, self._size)[: self._shape[0], : self._shape[1]])
+
+    def spread(self, pictures: Sequence[Floats], diameters: Floats) -> list[Floats]:
+        """Spread every pixel of some pictures over the disc of its own diameter, mixed from two kernels."""
+        sizes = _sizes(float(diameters.min()), float(diameters.max()))
+        totals: list[Floats | float] = [0.0] * len(pictures)
+        for k, size in enumerate(sizes):
+            weight = _weight(diameters, sizes, k)
+            if not weight.any():
+                continue
+            for i, picture in enumerate(pictures):
+                totals[i] = totals[i] + self.of(picture * weight, size)
+        return [self.back(np.asarray(t)) for t in totals]
+
+
+def _sizes(low: float, high: float) -> list[float]:
+    """Diameters of kernels that enclose a range; from a common list, so that kernels are made once."""
+    sizes = [0.0, 0.4]
+    while sizes[-1] < high:
+        sizes.append(sizes[-1] * _RATIO)
+    first = max(k for k, size in enumerate(sizes) if size <= low)
+    last = next((k for k, size in enumerate(sizes) if size >= high), len(sizes) - 1)
+    return sizes[first : max(last, first) + 1]
+
+
+def _weight(diameters: Floats, sizes: Sequence[float], k: int) -> Floats:
+    """Share of kernel k for pixels of given diameters: mixtures keep the variance."""
+    square = np.asarray(sizes) ** 2
+    return np.asarray(np.interp(diameters**2, square, np.arange(len(sizes)) == k))
 
 
 def vignette(lens: Lens, camera: PinholeCamera, window: Window) -> Floats | float:

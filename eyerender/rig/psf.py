@@ -8,7 +8,7 @@ grid) would then have different lenses.
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage, special
+from scipy import ndimage, signal, special
 
 from ..arrays import Floats
 from ..rig.camera import Window
@@ -35,7 +35,9 @@ def blur(image: Floats, sigma_px: float) -> Floats:
     return np.asarray(out[m:-m, m:-m])
 
 
-def splat(xy_px: Floats, energy: Floats, sigma_px: float, window: Window) -> tuple[Floats, slice, slice]:
+def splat(
+    xy_px: Floats, energy: Floats, sigma_px: float, window: Window, spread: Floats | None = None
+) -> tuple[Floats, slice, slice]:
     """Draw spots of given energies, the Gaussian integrated over each pixel, on the part of a window that they reach.
 
     Args:
@@ -43,11 +45,14 @@ def splat(xy_px: Floats, energy: Floats, sigma_px: float, window: Window) -> tup
         energy: (n,) sums over the pixels.
         sigma_px: standard deviation; 0 is a point in one pixel.
         window: x0, y0, width, height in full-sensor pixels.
+        spread: a further kernel, odd and square, with which the spots are convolved.
 
     Returns:
         The patch and its rows and columns in the window (empty where no spot reaches it).
     """
     x0, y0, width, height = window
+    if spread is not None and len(spread) > 1:
+        return _spread(xy_px, energy, sigma_px, window, spread)
     reach = 7 * sigma_px + 1
     low = np.floor(xy_px.min(axis=0) - reach).astype(int) - (x0, y0)
     high = np.ceil(xy_px.max(axis=0) + reach).astype(int) - (x0, y0)
@@ -58,6 +63,27 @@ def splat(xy_px: Floats, energy: Floats, sigma_px: float, window: Window) -> tup
     gx = _integrals(np.arange(columns.start, columns.stop, dtype=float) + x0, xy_px[:, 0], sigma_px)
     gy = _integrals(np.arange(rows.start, rows.stop, dtype=float) + y0, xy_px[:, 1], sigma_px)
     return np.asarray(gy.T @ (gx * energy[:, None])), rows, columns
+
+
+def _spread(
+    xy_px: Floats, energy: Floats, sigma_px: float, window: Window, kernel: Floats
+) -> tuple[Floats, slice, slice]:
+    """Draw spots and convolve them."""
+    x0, y0, width, height = window
+    m = len(kernel) // 2
+    # The window is wider by the kernel on both sides, and the patch again: nothing is cut off before the convolution.
+    patch, rows, columns = splat(xy_px, energy, sigma_px, (x0 - m, y0 - m, width + 2 * m, height + 2 * m))
+    if not patch.size:
+        return patch, rows, columns
+    patch = signal.convolve(patch, kernel)
+    first_row, first_column = rows.start - 2 * m, columns.start - 2 * m
+    top, left = max(first_row, 0), max(first_column, 0)
+    bottom = min(first_row + patch.shape[0], height)
+    right = min(first_column + patch.shape[1], width)
+    if bottom <= top or right <= left:
+        return np.zeros((0, 0)), slice(0, 0), slice(0, 0)
+    inside = patch[top - first_row : bottom - first_row, left - first_column : right - first_column]
+    return np.asarray(inside), slice(top, bottom), slice(left, right)
 
 
 def _integrals(pixels: Floats, centres: Floats, sigma: float) -> Floats:
