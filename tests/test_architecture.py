@@ -52,6 +52,7 @@ FLOORS = {
     "study": 8,
     "benchmark": 8,
     "quickstart": 8,
+    "survey": 8,
     "realism": 8,
     "torch": 8,
     "cli": 9,

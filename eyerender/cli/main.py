@@ -16,7 +16,7 @@ from cyclopts import CycloptsError
 from ..errors import MAX_MESSAGE, EyerenderError, InputError, one_line
 
 # Importing them registers their commands.
-from . import benchmark, dataset, environment, export, eyes, gaze, images, observe, realism, study  # noqa: F401
+from . import benchmark, dataset, environment, export, eyes, gaze, images, observe, population, realism, study  # noqa: F401
 from .app import app
 
 INTERRUPTED = 130

@@ -1,0 +1,88 @@
+"""The command population."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from ..errors import InputError
+from .app import app
+from .options import Backend, Overwrite, Result, Threads
+from .output import emit, progress
+
+
+@app.command(name="population")
+def population(
+    preset: str = "adults",
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    count: int = 10_000,
+    check: int = 200,
+    faces: int = 16,
+    spp: int = 16,
+    seed: int = 0,
+    backend: Backend = "auto",
+    threads: Threads = None,
+    overwrite: Overwrite = False,
+    json: Result = None,
+) -> int:
+    """Draw people and compare them with the sources of their joint distribution.
+
+    The output folder receives report.html (histograms and correlations next to the table's values, with standard
+    errors, faces, sources), people.csv, faces.png and summary.json.
+
+    Args:
+        preset: adults, emmetropic_adults, myopes, children or elderly, or a YAML file with the keys of `population`.
+        output: The folder to write.
+        count: Number of people in the statistics and in people.csv.
+        check: Number of people whose eyes are built, to count what physics refuses.
+        faces: Number of people whose eyes are rendered (0: none).
+        spp: Samples per pixel of the faces.
+        seed: The seed of the draw.
+    """
+    from ..spec import read_yaml
+    from ..survey import REPORT, Population, run_survey
+
+    if not 1 <= spp <= 65536:
+        raise InputError(f"must be 1 to 65536, not {spp}", source="--spp")
+    if not 0 <= seed < 2**63:
+        raise InputError(f"must be 0 to 2^63 - 1, not {seed}", source="--seed")
+    if preset.endswith((".yaml", ".yml")):
+        data = read_yaml(preset)
+        people = Population.from_mapping(data.get("population", data), source=preset)
+    else:
+        try:
+            people = Population(preset)
+        except InputError as error:
+            raise InputError(error.reason, source="PRESET") from None
+    with progress("drawing") as steps:
+        found = run_survey(
+            people,
+            output,
+            seed=seed,
+            count=count,
+            check=check,
+            faces=faces,
+            spp=spp,
+            backend=backend,
+            threads=threads,
+            overwrite=overwrite,
+            progress=steps,
+        )
+    emit(found, f"{_text(found)}\n\nreport: {output / REPORT}", json)
+    return 0
+
+
+def _text(found: dict[str, Any]) -> str:
+    lines = [f"{'':<26} {'drawn':>22} {'table':>18}"]
+    for name in ("age_years", "refraction_d", "axial_length_mm", "corneal_radius_mm", "chamber_depth_mm",
+                 "lens_thickness_mm", "iris_diameter_mm", "ipd_mm"):  # fmt: skip
+        q = found["quantities"].get(name)
+        if q is not None:
+            told = "" if q["expected_mean"] is None else f"{q['expected_mean']:.3f} +- {q['expected_sd']:.3f}"
+            lines.append(f"{name:<26} {q['mean']:>12.3f} +- {q['sd']:.3f} {told:>18}")
+    lines.append(f"refused by physics: {found['refused']} of {found['checked']} people")
+    return "\n".join(lines)

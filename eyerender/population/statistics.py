@@ -1,0 +1,195 @@
+"""Statistics of drawn people against their table, and the eyes that physics refuses."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from ..errors import InputError
+from ..progress import Progress
+from .model import SIDES, Model
+from .people import PopulationSpec
+
+CHUNK = 4096
+BINS = 48
+_REACH = 4.0  # histograms reach so many standard deviations on either side of the mean
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Mean and standard deviation of a quantity as drawn, with standard errors, and as expected.
+
+    Attributes:
+        name: the quantity; of an eye's quantity the right eyes count.
+        n: number of people.
+        mean: mean.
+        mean_error: its standard error.
+        sd: standard deviation.
+        sd_error: its standard error, from the kurtosis.
+        expected_mean: mean of the joint distribution; NaN for a quantity that follows from others.
+        expected_sd: its standard deviation.
+        edges: (b + 1,) edges of the histogram.
+        counts: (b,) people in it.
+    """
+
+    name: str
+    n: int
+    mean: float
+    mean_error: float
+    sd: float
+    sd_error: float
+    expected_mean: float
+    expected_sd: float
+    edges: Floats
+    counts: Ints
+
+    @property
+    def errors(self) -> tuple[float, float]:
+        """How many standard errors mean and standard deviation are off; 0 where nothing is expected or varies."""
+        if not np.isfinite(self.expected_mean) or self.expected_sd == 0:
+            return 0.0, 0.0
+        return (self.mean - self.expected_mean) / self.mean_error, (self.sd - self.expected_sd) / self.sd_error
+
+
+@dataclass(frozen=True, slots=True)
+class PairStatistic:
+    """Correlation of two quantities of the right eyes as drawn and as expected, with its source."""
+
+    pair: tuple[str, str]
+    r: float
+    error: float
+    expected: float
+    told: float
+    mark: str
+    text: str
+
+    @property
+    def off(self) -> float:
+        """How many standard errors it is off the expected one."""
+        return (self.r - self.expected) / self.error
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """Statistics of n people."""
+
+    n: int
+    moments: tuple[Moments, ...]
+    pairs: tuple[PairStatistic, ...]
+    names: tuple[str, ...]
+    correlation: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Refusals:
+    """What physics refuses of n people.
+
+    Attributes:
+        n: number of people.
+        people: how many have an eye that cannot be.
+        reasons: reason -> number of eyes.
+        shifts: quantity -> mean of the people who stay less that of all, in standard deviations.
+    """
+
+    n: int
+    people: int
+    reasons: Mapping[str, int]
+    shifts: Mapping[str, float]
+
+
+def pieces(population: PopulationSpec, n: int, seed: int) -> Iterator[dict[str, Floats]]:
+    """Numbers of n people in pieces, name -> (k,) or (k, 2)."""
+    for start in range(0, n, CHUNK):
+        yield population.numbers(min(CHUNK, n - start), seed, first=start)
+
+
+def survey(population: PopulationSpec, n: int, seed: int = 0) -> Survey:
+    """Compare n people with the joint distribution; memory does not grow with n.
+
+    Raises:
+        InputError: hardly anybody meets the population's conditions.
+    """
+    model = population.model
+    first = population.numbers(min(n, CHUNK), seed)
+    names = tuple(name for name, column in first.items() if _right(column).std() > 0)
+    centre = np.array([_right(first[name]).mean() for name in names])
+    spread = np.array([_right(first[name]).std() for name in names])
+    edges = centre[:, None] + spread[:, None] * np.linspace(-_REACH, _REACH, BINS + 1)
+    powers, cross = np.zeros((4, len(names))), np.zeros((len(names), len(names)))
+    counts = np.zeros((len(names), BINS), dtype=np.int64)
+    for piece in pieces(population, n, seed):
+        x = np.column_stack([_right(piece[name]) for name in names])
+        t = (x - centre) / spread
+        powers += [np.sum(t**k, axis=0) for k in (1, 2, 3, 4)]
+        cross += t.T @ t
+        for k in range(len(names)):
+            counts[k] += np.histogram(x[:, k], edges[k])[0]
+    m1, m2, m3, m4 = powers / n
+    variance = m2 - m1**2
+    fourth = m4 - 4 * m1 * m3 + 6 * m1**2 * m2 - 3 * m1**4
+    sd_error = np.sqrt(np.maximum(fourth - variance**2, 1e-12) / (4 * n * variance))
+    scale = np.sqrt(np.outer(variance, variance))
+    correlation = (cross / n - np.outer(m1, m1)) / scale
+    plain = not population.where
+    moments = tuple(
+        Moments(
+            name, n, float(centre[k] + spread[k] * m1[k]), float(spread[k] * np.sqrt(variance[k] / n)),
+            float(spread[k] * np.sqrt(variance[k])), float(spread[k] * sd_error[k]),
+            *_expected(model, name, plain), edges[k], counts[k],
+        )
+        for k, name in enumerate(names)
+    )  # fmt: skip
+    return Survey(n, moments, tuple(_pairs(model, names, correlation, n, plain)), names, correlation)
+
+
+def refusals(population: PopulationSpec, n: int, seed: int = 0, *, progress: Progress | None = None) -> Refusals:
+    """Build both eyes of n people, and compare those who can be with all.
+
+    Raises:
+        InputError: hardly anybody meets the population's conditions.
+    """
+    values: dict[str, list[Floats]] = {}
+    stays, reasons = np.ones(n, dtype=bool), Counter[str]()
+    for start in range(0, n, CHUNK):
+        piece = population.numbers(min(CHUNK, n - start), seed, first=start)
+        for name, column in piece.items():
+            values.setdefault(name, []).append(_right(column))
+    for subject in range(n):
+        person = population.person(subject, seed)
+        for side in SIDES:
+            try:
+                person.eye(side).build()
+            except InputError as error:
+                stays[subject] = False
+                reasons[f"{error.path}: {error.reason}" if error.path else error.reason] += 1
+        if progress is not None:
+            progress(subject + 1, n, "eyes built")
+    shifts = {}
+    for name, parts in values.items():
+        x = np.concatenate(parts)
+        if x.std() > 0 and stays.any():
+            shifts[name] = float((x[stays].mean() - x.mean()) / x.std())
+    return Refusals(n, int(np.count_nonzero(~stays)), dict(reasons), shifts)
+
+
+def _right(column: Floats) -> Floats:
+    return column if column.ndim == 1 else column[:, 0]
+
+
+def _expected(model: Model, name: str, plain: bool) -> tuple[float, float]:
+    if not plain or name not in model.distributions:
+        return np.nan, np.nan
+    return model.expected(name)
+
+
+def _pairs(model: Model, names: tuple[str, ...], correlation: Floats, n: int, plain: bool) -> Iterator[PairStatistic]:
+    for pair in model.reference.table.correlations:
+        if set(pair.pair) <= set(names):
+            i, j = (names.index(name) for name in pair.pair)
+            expected = model.expected_correlation(*pair.pair) if plain else float(correlation[i, j])
+            r = float(correlation[i, j])
+            yield PairStatistic(pair.pair, r, (1 - r * r) / np.sqrt(n - 1), expected, pair.r, pair.mark, pair.text)
