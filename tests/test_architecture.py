@@ -55,6 +55,7 @@ FLOORS = {
     "survey": 8,
     "realism": 8,
     "torch": 8,
+    "live": 8,
     "cli": 9,
     "__init__": 10,
     "__main__": 10,

@@ -16,7 +16,20 @@ from cyclopts import CycloptsError
 from ..errors import MAX_MESSAGE, EyerenderError, InputError, one_line
 
 # Importing them registers their commands.
-from . import benchmark, dataset, environment, export, eyes, gaze, images, observe, population, realism, study  # noqa: F401
+from . import (  # noqa: F401
+    benchmark,
+    dataset,
+    environment,
+    export,
+    eyes,
+    gaze,
+    images,
+    live,
+    observe,
+    population,
+    realism,
+    study,
+)
 from .app import app
 
 INTERRUPTED = 130

@@ -57,31 +57,47 @@ def eye_picture(
         f'<image width="{cw}" height="{ch}" style="image-rendering:pixelated" '
         f'href="data:image/png;base64,{_png(shown)}"/>',
     ]
-    for name, colour, seen in (("analytic", ANALYTIC_ON_DARK, truth), ("found", IMAGE_ON_DARK, found)):
-        parts.append(f'<g class="{name}" fill="none" stroke="{colour}" vector-effect="non-scaling-stroke">')
-        if seen.pupil.ok[row]:
-            cx, cy = seen.pupil.centre_px[row] - shift
-            a, b = seen.pupil.semi_axes_px[row]
-            turn = np.degrees(seen.pupil.angle_rad[row])
-            dash = "" if name == "analytic" else ' stroke-dasharray="1.6 1.2"'
-            parts.append(
-                f'<ellipse cx="{cx:.3f}" cy="{cy:.3f}" rx="{a:.3f}" ry="{b:.3f}" '
-                f'transform="rotate({turn:.3f} {cx:.3f} {cy:.3f})" stroke-width=".45"{dash}/>'
-            )
-            parts.append(_cross(seen.pupil.centre_px[row] - shift, 2.2, diagonal=name == "found"))
-        for j in np.flatnonzero(seen.glints.ok[row]):
-            place, diagonal = seen.glints.xy_px[row, j] - shift, name == "found"
-            if seen.glints.light[row, j] >= 0:
-                parts.append(_cross(place, 3.2, diagonal=diagonal))
-            else:  # detected but without a light: small and faint, with the reason
-                reason = html.escape(str(seen.glints.reason[row, j] or "of no known light"))
-                parts.append(f'<g opacity=".6"><title>{reason}</title>{_cross(place, 1.6, diagonal=diagonal)}</g>')
-        parts.append("</g>")
+    for name, seen in (("analytic", truth), ("found", found)):
+        parts.append(feature_marks(seen, row, shift, analytic=name == "analytic"))
     parts.append("</svg>")
     return "".join(parts)
 
 
-def _cross(at: Floats, size: float, *, diagonal: bool) -> str:
+def feature_marks(seen: Observations, row: int, shift: Floats, *, analytic: bool, scale: float = 1.0) -> str:
+    """Draw the pupil and the glints of one observer as an SVG group.
+
+    Args:
+        seen: what the observer reports.
+        row: the row to draw.
+        shift: (2,) full-sensor pixel that lies at the origin of the drawing.
+        analytic: draw blue upright crosses and a solid outline, else orange diagonal crosses and a dashed outline.
+        scale: size of crosses and lines relative to those of a small picture.
+    """
+    name, colour = ("analytic", ANALYTIC_ON_DARK) if analytic else ("found", IMAGE_ON_DARK)
+    parts = [f'<g class="{name}" fill="none" stroke="{colour}" vector-effect="non-scaling-stroke">']
+    if seen.pupil.ok[row]:
+        cx, cy = seen.pupil.centre_px[row] - shift
+        a, b = seen.pupil.semi_axes_px[row]
+        turn = np.degrees(seen.pupil.angle_rad[row])
+        dash = "" if analytic else f' stroke-dasharray="{1.6 * scale:g} {1.2 * scale:g}"'
+        parts.append(
+            f'<ellipse cx="{cx:.3f}" cy="{cy:.3f}" rx="{a:.3f}" ry="{b:.3f}" '
+            f'transform="rotate({turn:.3f} {cx:.3f} {cy:.3f})" stroke-width="{_thin(0.45 * scale)}"{dash}/>'
+        )
+        parts.append(_cross(seen.pupil.centre_px[row] - shift, 2.2 * scale, diagonal=not analytic, scale=scale))
+    for j in np.flatnonzero(seen.glints.ok[row]):
+        place = seen.glints.xy_px[row, j] - shift
+        if seen.glints.light[row, j] >= 0:
+            parts.append(_cross(place, 3.2 * scale, diagonal=not analytic, scale=scale))
+        else:  # detected but without a light: small and faint, with the reason
+            reason = html.escape(str(seen.glints.reason[row, j] or "of no known light"))
+            cross = _cross(place, 1.6 * scale, diagonal=not analytic, scale=scale)
+            parts.append(f'<g opacity=".6"><title>{reason}</title>{cross}</g>')
+    parts.append("</g>")
+    return "".join(parts)
+
+
+def _cross(at: Floats, size: float, *, diagonal: bool, scale: float = 1.0) -> str:
     """A cross with an open centre, so that the marked point stays visible."""
     x, y = at
     arms = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
@@ -92,7 +108,11 @@ def _cross(at: Floats, size: float, *, diagonal: bool) -> str:
         f"M{x + dx * size * inner:.3f} {y + dy * size * inner:.3f}L{x + dx * size:.3f} {y + dy * size:.3f}"
         for dx, dy in arms
     )
-    return f'<path d="{path}" stroke-width=".5"/>'
+    return f'<path d="{path}" stroke-width="{_thin(0.5 * scale)}"/>'
+
+
+def _thin(width: float) -> str:
+    return f"{width:g}".removeprefix("0")
 
 
 def _png(image: Bytes) -> str:

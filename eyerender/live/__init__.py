@@ -1,0 +1,5 @@
+"""A live page on 127.0.0.1: the rig in three dimensions, and its picture, which follows what the user moves.
+
+The extra `live` installs the libraries that it needs. The modules `guard`, `setup`, `source`, `drawing` and `painter`
+do without them.
+"""

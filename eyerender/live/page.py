@@ -1,0 +1,460 @@
+"""The live page: what a tab shows, and what its knobs do."""
+
+from __future__ import annotations
+
+import asyncio
+import html
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fastapi import Response
+from nicegui import app, ui
+
+from ..analytic.observer import trace
+from ..errors import EyerenderError, one_line
+from ..observation import Observations
+from ..report.overlay import feature_marks
+from ..report.style import ANALYTIC, IMAGE
+from ..scene import Frames, Scene
+from .drawing import LEGEND, Strokes, apex_mm, strokes
+from .painter import GOAL_SPP, MAX_REASON, Order, Painter, Shown, line_of
+from .rig_view import RigView
+from .setup import Setup, directions, named
+from .source import python_source
+
+STYLE = Path(__file__).with_name("page.css")
+Change = Callable[[Setup], Setup]
+
+
+class Slider(ui.slider):
+    """A slider that does not wait for the server's echo while it is dragged."""
+
+    LOOPBACK = False
+
+
+class Knob:
+    """A number with a name, a slider and a field for exact values, which may lie beyond the slider's ends."""
+
+    def __init__(self, name: str, unit: str, step: float, act: Callable[[float], None], *, digits: int = 1) -> None:
+        self._act, self._quiet, self._digits, self._value = act, False, digits, 0.0
+        self._number: Any
+        with ui.element("div").classes("knob") as self.row:
+            ui.label(f"{name} ({unit})").classes("name")
+            self._slider = Slider(min=0, max=1, step=step, on_change=lambda e: self._moved(e.value, self._number))
+            self._slider.props(f'aria-label="{name}" dense')
+            self._number = ui.number(step=step, on_change=lambda e: self._moved(e.value, self._slider))
+            self._number.props(f'aria-label="{name}, exact" dense borderless debounce=300 hide-bottom-space')
+
+    @property
+    def value(self) -> float:
+        """The value that it shows."""
+        return self._value
+
+    def set(self, value: float, low: float, high: float) -> None:
+        """Show a value between two ends, without acting."""
+        low, high, value = min(low, value), max(high, value), round(value, self._digits)
+        self._quiet, self._value = True, value
+        self._slider.props["min"], self._slider.props["max"] = low, high
+        self._slider.set_value(value)
+        self._number.set_value(value)
+        self._quiet = False
+
+    def enable(self, on: bool) -> None:
+        """Let the user move it, or not."""
+        for part in (self._slider, self._number):
+            part.set_enabled(on)
+
+    def _moved(self, value: Any, other: Any) -> None:
+        if self._quiet or not isinstance(value, int | float) or not np.isfinite(value):
+            return
+        self._quiet, self._value = True, float(value)
+        other.set_value(round(value, self._digits))
+        self._quiet = False
+        self._act(float(value))
+
+
+@dataclass(eq=False)
+class Studio:
+    """What all tabs share: the scene as it was loaded, the painter, and the pictures to fetch."""
+
+    scene: Scene
+    painter: Painter
+    tabs: dict[str, Tab] = field(default_factory=dict)
+
+    def register(self) -> None:
+        """Add the page and its pictures to NiceGUI's application."""
+
+        @app.get("/picture/{key}")  # type: ignore[untyped-decorator]
+        def picture(key: str) -> Response:
+            tab = self.tabs.get(key)
+            if tab is None or tab.shown is None:
+                return Response(status_code=404)
+            return Response(tab.shown.data, media_type=tab.shown.kind, headers={"Cache-Control": "no-store"})
+
+        @ui.page("/", title=f"{self.scene.name} · eyerender live", response_timeout=30)  # type: ignore[untyped-decorator]
+        def page() -> None:
+            tab = Tab(self)
+            self.tabs[tab.key] = tab
+            ui.context.client.on_delete(tab.close)
+
+
+class Tab:
+    """One tab of the browser: its setup, its knobs and what it shows."""
+
+    def __init__(self, studio: Studio) -> None:
+        self.key = secrets.token_urlsafe(16)
+        self.shown: Shown | None = None
+        self._studio, self._loop = studio, asyncio.get_event_loop()
+        self._setup = Setup.of(studio.scene)
+        self._orders = 0
+        self._light = self._lens = 0  # the light and the camera that the knobs move
+        self._frames: Frames
+        self._truth: Observations
+        self._row = 0
+        self._drawn = Strokes()
+        self._quiet = False
+        self._build()
+        studio.painter.open(self.key, self._deliver)
+        self._apply(lambda setup: setup)
+        self._look_at_rig()
+        self._refresh()
+
+    def _deliver(self, shown: Shown) -> None:
+        """Take a picture from the painter's thread to the loop's."""
+        self._loop.call_soon_threadsafe(self._receive, shown)
+
+    def close(self) -> None:
+        """Free what the tab holds."""
+        self._studio.painter.drop(self.key)
+        self._studio.tabs.pop(self.key, None)
+        self.shown = None
+
+    # What the page consists of
+
+    def _build(self) -> None:
+        ui.add_css(STYLE.read_text(encoding="utf-8"))
+        spec = self._setup.origin
+        with ui.element("header").classes("top"):
+            ui.label(spec.name).classes("title")
+            ui.label(spec.description).classes("lead")
+            ui.space()
+            with ui.element("div").classes("buttons"):
+                _button("Save YAML", self._save_yaml)
+                _button("Save Python", self._save_python)
+                _button("Start again", self._restart)
+        with ui.element("div").classes("desk"):
+            with ui.element("section").classes("picture"):
+                self._build_picture()
+            with ui.element("section").classes("rig"):
+                self._build_rig()
+            with ui.element("section").classes("knobs"):
+                self._build_knobs()
+
+    def _build_picture(self) -> None:
+        with ui.element("div").classes("frame"):
+            self._image = ui.interactive_image(events=[]).classes("image")
+            self._wait = ui.label("The first picture takes some seconds.").classes("wait")
+        self._status = ui.label("").classes("status").props('role="status"')
+        self._problem = ui.label("").classes("problem").props('role="alert"')
+        with ui.element("div").classes("line"):
+            self._analytic = ui.checkbox("analytic", value=True, on_change=self._draw_features)
+            self._analytic.props("dense").style(f"--q-primary: {ANALYTIC}; color: {ANALYTIC}")
+            self._found = ui.checkbox("extracted from the picture", value=True, on_change=lambda: self._order())
+            self._found.props("dense").style(f"--q-primary: {IMAGE}; color: {IMAGE}")
+        self._table = ui.html("", sanitize=False).classes("features")
+
+    def _build_rig(self) -> None:
+        self._rig = RigView()
+        with ui.element("div").classes("line"):
+            _button("Whole rig", self._look_at_rig)
+            _button("Eye", lambda: self._rig.look_at_eye(apex_mm(self._frames, self._row)))
+            _button("From the camera", self._look_from_camera)
+            ui.label("Drag to turn, wheel to zoom, right button to move.").classes("hint")
+        items = "".join(f'<li><i style="background:{colour}"></i>{html.escape(name)}</li>' for name, colour in LEGEND)
+        ui.html(f'<ul class="legend">{items}</ul>', sanitize=False)
+
+    def _build_knobs(self) -> None:
+        spec = self._setup.origin
+        with _group("Frame") as group:
+            eyes = list(spec.subject.eyes)
+            self._eye = _choice("Eye", {eye: eye for eye in eyes}, lambda v: self._show(eye=v))
+            self._camera = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), lambda v: self._show(camera=v))
+            heads = {k: f"{k}" for k in range(len(spec.subject.head_positions_mm))}
+            self._head = _choice("Head", heads, lambda v: self._apply(lambda s: s.with_head(v)))
+        group.set_visibility(any(box.visible for box in (self._eye, self._camera, self._head)))
+        with _group("Gaze"):
+            name = "target" if spec.targets is not None else "pose"
+            choices = {-1: "set by hand", **{k: f"{name} {k + 1}" for k in range(min(self._setup.fixations, 500))}}
+            self._fixation = _choice(f"Follows {name}", choices, self._follow)
+            self._azimuth = Knob("Azimuth, to the subject's left", "°", 0.5, lambda _: self._turn(), digits=2)
+            self._elevation = Knob("Elevation, up", "°", 0.5, lambda _: self._turn(), digits=2)
+        with _group("Eye"):
+            self._pupil = Knob(
+                "Pupil", "mm", 0.1, lambda v: self._apply(lambda s: s.changed({"eye.pupil_diameter_mm": v})), digits=2
+            )
+            self._lid = Knob("Lid opening", "%", 1, lambda v: self._apply(lambda s: s.with_opening(v / 100)))
+        with _group("LED"):
+            count = len(self._setup.scene.rig.lights)
+            self._lamp = _choice("LED", {k: str(k) for k in range(count)}, self._choose_light)
+            self._lamp_place = [Knob(axis, "mm", 0.5, lambda _: self._move_light()) for axis in AXES]
+            self._power = Knob("Intensity", "mW/sr", 0.01, lambda _: self._move_light(), digits=3)
+        with _group("Camera"):
+            self._chosen = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), self._choose_camera)
+            self._camera_place = [Knob(axis, "mm", 0.5, lambda _: self._move_camera()) for axis in AXES]
+            self._aim = _button("Aim at the eye", lambda: self._apply(lambda s: s.with_camera_aimed(self._lens)))
+
+    # What the knobs do
+
+    def _apply(self, change: Change, *, refresh: bool = False) -> None:
+        """Change the setup, draw the rig, and order a picture; bad input leaves all as it was."""
+        if self._quiet:
+            return
+        try:
+            setup = change(self._setup)
+            frames = setup.frames()
+            row = setup.row(frames)
+            truth = trace(frames)
+            drawn = strokes(frames, truth, row)
+        except EyerenderError as error:
+            self._complain(f"Not applied: {line_of(error)}")
+            return
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+            self._complain(f"Not applied: no ray can be traced ({one_line(str(error), MAX_REASON)})")
+            return
+        self._setup, self._frames, self._truth, self._row, self._drawn = setup, frames, truth, row, drawn
+        warnings = [_short(str(warning)) for warning in setup.scene.warnings()]
+        self._complain(one_line("; ".join(warnings), MAX_REASON))
+        self._rig.show(drawn)
+        self._order()
+        if refresh:
+            self._refresh()
+
+    def _show(self, *, eye: str | None = None, camera: int | None = None) -> None:
+        def change(setup: Setup) -> Setup:
+            return Setup(
+                setup.origin,
+                setup.scene,
+                setup.eye if eye is None else eye,
+                setup.camera if camera is None else camera,
+                setup.fixation,
+                setup.head,
+            )
+
+        self._apply(change, refresh=True)
+
+    def _follow(self, fixation: int) -> None:
+        if fixation >= 0:
+            self._apply(lambda setup: setup.following(fixation), refresh=True)
+
+    def _turn(self) -> None:
+        self._apply(lambda setup: setup.looking(self._azimuth.value, self._elevation.value))
+        with self._silence():
+            self._fixation.set_value(-1)
+
+    def _choose_light(self, light: int) -> None:
+        self._light = light
+        self._refresh()
+
+    def _choose_camera(self, camera: int) -> None:
+        self._lens = camera
+        self._refresh()
+
+    def _move_light(self) -> None:
+        place, power = [knob.value for knob in self._lamp_place], self._power.value
+        self._apply(lambda setup: setup.with_light(self._light, position_mm=place, intensity_mw_sr=power))
+
+    def _move_camera(self) -> None:
+        place = [knob.value for knob in self._camera_place]
+        self._apply(lambda setup: setup.with_camera_at(self._lens, place))
+
+    def _restart(self) -> None:
+        self._apply(lambda _: Setup.of(self._studio.scene), refresh=True)
+
+    def _look_at_rig(self) -> None:
+        self._rig.look_at_rig(self._drawn, apex_mm(self._frames, self._row))
+
+    def _look_from_camera(self) -> None:
+        camera = self._setup.scene.rig.cameras[self._setup.camera]
+        place, apex = camera.nodal_point_mm, apex_mm(self._frames, self._row)
+        self._rig.look_from(place, place + camera.axis * float((apex - place) @ camera.axis))
+
+    def _save_yaml(self) -> None:
+        self._save(lambda: self._setup.saved().to_yaml(), "yaml", "application/yaml")
+
+    def _save_python(self) -> None:
+        self._save(lambda: python_source(self._setup.saved()), "py", "text/x-python")
+
+    def _save(self, text: Callable[[], str], suffix: str, kind: str) -> None:
+        try:
+            name = "".join(c if c.isalnum() or c in "-_" else "_" for c in self._setup.origin.name)
+            ui.download.content(text().encode(), f"{name}.{suffix}", kind)
+        except EyerenderError as error:
+            self._complain(f"Not saved: {line_of(error)}")
+
+    # What the tab shows
+
+    def _refresh(self) -> None:
+        """Show the values of the setup on the knobs."""
+        setup, scene = self._setup, self._setup.scene
+        with self._silence():
+            self._eye.set_value(setup.eye)
+            self._camera.set_value(setup.camera)
+            self._head.set_value(setup.head)
+            self._fixation.set_value(-1 if setup.fixation is None else setup.fixation)
+            self._lamp.set_value(self._light)
+            self._chosen.set_value(self._lens)
+        gaze = directions(setup)
+        self._azimuth.set(gaze.azimuth_deg, -40, 40)
+        self._elevation.set(gaze.elevation_deg, -30, 30)
+        self._pupil.set(scene.pupil_diameter_mm, 1.5, 8)
+        region = scene.spec.region
+        self._lid.enable(region is not None and region.head is None)
+        self._lid.set(100 * (1 - (region.blink if region is not None else 0)), 0, 100)
+        lamp = scene.rig.lights[self._light]
+        apex = apex_mm(self._frames, self._row)
+        _set_place(self._lamp_place, lamp.position_mm, apex)
+        self._power.set(lamp.intensity_mw_sr, 0, _round_up(3 * lamp.intensity_mw_sr))
+        _set_place(self._camera_place, scene.rig.cameras[self._lens].nodal_point_mm, apex)
+        self._aim.set_enabled(scene.spec.rig.cameras[self._lens].calibration is None)
+
+    @contextmanager
+    def _silence(self) -> Iterator[None]:
+        self._quiet = True
+        yield
+        self._quiet = False
+
+    def _order(self) -> None:
+        self._orders += 1
+        frame = self._frames.take([self._row])
+        self._studio.painter.ask(self.key, Order(self._orders, frame, extract=bool(self._found.value)))
+
+    def _receive(self, shown: Shown) -> None:
+        """Show a picture that the painter made."""
+        if self.key not in self._studio.tabs:
+            return
+        self._wait.set_visibility(False)
+        if shown.problem:
+            self._complain(shown.problem)
+            return
+        self.shown = shown
+        self._image.set_source(f"/picture/{self.key}?{shown.number}.{shown.samples}.{shown.coarse}")
+        self._draw_features()
+        width, height = shown.size_px
+        coarse = f", pixels {shown.coarse} x {shown.coarse}" if shown.coarse > 1 else ""
+        more = "" if shown.samples >= GOAL_SPP else f" of {GOAL_SPP}"
+        full = " · saturated" if shown.saturated else ""
+        self._status.set_text(
+            f"{width} x {height} px · {shown.samples}{more} samples per pixel{coarse} · "
+            f"{1000 * shown.seconds:.0f} ms to render{full}"
+        )
+
+    def _draw_features(self) -> None:
+        shown = self.shown
+        if shown is None:
+            return
+        current = shown.number == self._orders
+        shift = np.array([shown.window[0] - 0.5, shown.window[1] - 0.5])
+        scale = max(shown.size_px) / 200
+        truth = self._truth.take([self._row])
+        marks = ""
+        if self._analytic.value and current:
+            marks += feature_marks(truth, 0, shift, analytic=True, scale=scale)
+        if self._found.value and shown.found is not None:
+            marks += feature_marks(shown.found, 0, shift, analytic=False, scale=scale)
+        self._image.set_content(marks)
+        if current:
+            self._table.set_content(feature_table(truth, shown.found if self._found.value else None, shown.hidden))
+
+    def _complain(self, text: str) -> None:
+        self._problem.set_text(text)
+        self._problem.set_visibility(bool(text))
+
+
+AXES = ("x, to the screen", "y, to the subject's left", "z, up")
+
+
+def feature_table(truth: Observations, found: Observations | None, hidden: tuple[str, ...]) -> str:
+    """An HTML table of the pupil and the glints of one row: by ray optics, and from the picture.
+
+    Args:
+        truth: what the analytic observer reports, one row.
+        found: what the image observer reports, one row; None where it was not asked.
+        hidden: what hides the glint of each light in the picture.
+    """
+    rows = [_pupil_row(truth, found)]
+    for k, light in enumerate(truth.glints.light[0]):
+        rows.append(_glint_row(truth, found, k, int(light), hidden[int(light)] if int(light) < len(hidden) else ""))
+    head = "<tr><th>px</th><th>analytic</th><th>extracted</th><th>difference</th></tr>"
+    return f"<table>{head}{''.join(rows)}</table>"
+
+
+def _pupil_row(truth: Observations, found: Observations | None) -> str:
+    exact = truth.pupil.centre_px[0] if truth.pupil.ok[0] else None
+    seen = found.pupil.centre_px[0] if found is not None and found.pupil.ok[0] else None
+    why = found.pupil.reason[0] if found is not None and seen is None else ""
+    return _row("pupil", exact, truth.pupil.reason[0], seen, why)
+
+
+def _glint_row(truth: Observations, found: Observations | None, k: int, light: int, hidden: str) -> str:
+    exact = truth.glints.xy_px[0, k] if truth.glints.ok[0, k] else None
+    seen, why = None, ""
+    if found is not None:
+        at = np.flatnonzero(found.glints.ok[0] & (found.glints.light[0] == light))
+        seen = found.glints.xy_px[0, at[0]] if len(at) else None
+        why = "not found" if hidden in ("", "visible") else f"hidden: {hidden}"
+    return _row(f"glint {light}", exact, truth.glints.reason[0, k], seen, why)
+
+
+def _row(name: str, exact: Any, why_exact: Any, seen: Any, why_seen: Any) -> str:
+    apart = f"{np.hypot(*(np.asarray(seen) - exact)):.2f}" if exact is not None and seen is not None else ""
+    return f"<tr><td>{name}</td>{_cell(exact, why_exact)}{_cell(seen, why_seen)}<td>{apart}</td></tr>"
+
+
+def _cell(place: Any, reason: Any) -> str:
+    if place is None:
+        return f'<td class="none">{html.escape(str(reason or ""))}</td>'
+    return f"<td>{place[0]:.2f}, {place[1]:.2f}</td>"
+
+
+def _short(warning: str) -> str:
+    """A warning without the file that it names."""
+    for start in ("rig.", "eye.", "subject.", "image.", "region."):
+        if (at := warning.find(start)) > 0:
+            return warning[at:]
+    return warning
+
+
+def _round_up(value: float) -> float:
+    """The next of 1, 2 or 5 times a power of ten."""
+    power = 10 ** np.floor(np.log10(value))
+    return float(power * next(k for k in (1, 2, 5, 10) if k * power >= value * 0.999))
+
+
+def _set_place(knobs: list[Knob], place_mm: Any, apex: Any) -> None:
+    """Show a place on three knobs, which reach as far as a third of its distance to the eye."""
+    reach = _round_up(max(10.0, float(np.linalg.norm(place_mm - apex)) / 3))
+    for knob, value in zip(knobs, place_mm, strict=True):
+        knob.set(float(value), float(np.floor(value - reach)), float(np.ceil(value + reach)))
+
+
+def _button(text: str, act: Callable[[], None]) -> ui.button:
+    return ui.button(text, on_click=lambda: act()).props("dense flat no-caps").classes("action")
+
+
+def _choice(name: str, choices: dict[Any, str], act: Callable[[Any], None]) -> ui.select:
+    first = next(iter(choices))
+    box = ui.select(choices, value=first, label=name, on_change=lambda e: act(e.value)).props("dense options-dense")
+    box.set_visibility(len(choices) > 1)
+    return box
+
+
+@contextmanager
+def _group(name: str) -> Iterator[ui.element]:
+    with ui.element("div").classes("group") as group:
+        ui.label(name).classes("heading")
+        yield group

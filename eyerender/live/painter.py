@@ -1,0 +1,393 @@
+"""The one renderer of the live page, in a thread of its own.
+
+Each tab has at most one order: the frame that it wants to see. A new order takes the place of the old one, so a slider
+that moves faster than frames render leaves no queue behind. A new order is answered with a preview of a few samples,
+with coarser pixels where whole ones would take too long. When the tab has rested for a moment, passes over the whole
+window follow, whose mean is sent at 4, 8, 16, 32 and 64 samples. A pass goes over the window in bands, and the thread
+looks for new orders between them. Tabs take turns, and previews come before passes.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from ..arrays import Bytes, Floats
+from ..backends.choose import BackendChoice
+from ..capture import EyeImage, check_windows, make_renderer, moments, render_job
+from ..errors import EyerenderError, one_line
+from ..imagefile import preview
+from ..imageobserver import detect
+from ..observation import Observations
+from ..plausibility import is_saturated
+from ..rig.camera import PinholeCamera, Window
+from ..rig.exposure import expose
+from ..scene import Frames
+
+if TYPE_CHECKING:
+    from ..rendering.frame import RenderJob
+    from ..rendering.renderer import RenderedWindow, Renderer
+
+PREVIEW_SPP = 4
+PASS_SPP = 4
+GOAL_SPP = 64
+BUDGET_S = 0.2
+"""Time that a preview, or a band of a pass, should take at most."""
+PREVIEW_PX = (20_000, 160_000, 640_000)
+"""Pixels that a preview may have: the fewest, those of the first one, and the most."""
+REST_S = 0.25
+"""How long a tab must rest before its picture is refined."""
+BAND_PX = 40_000
+SENT_AT = frozenset({4, 8, 16, 32, 64})
+MAX_REASON = 300
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What a tab wants to see.
+
+    Attributes:
+        number: counts the orders of the tab.
+        frame: one row: the eye in its pose, and the scene.
+        extract: whether to find the features in the picture.
+    """
+
+    number: int
+    frame: Frames
+    extract: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """An answer to an order: a picture, or what prevents it.
+
+    Attributes:
+        number: that of the order.
+        samples: samples per pixel so far.
+        coarse: side of the preview's pixels in pixels of the sensor; 1 for a whole picture.
+        size_px: width and height of the picture.
+        window: the window of the sensor.
+        data: the picture as a file, brightened for people.
+        kind: media type of that file.
+        found: the features that the image observer found; None where they were not wanted.
+        hidden: for each light, what hides its glint ("" for a visible one).
+        saturated: whether the picture is saturated.
+        seconds: time of the last rendering.
+        problem: one line; then there is no picture.
+    """
+
+    number: int
+    samples: int = 0
+    coarse: int = 1
+    size_px: tuple[int, int] = (0, 0)
+    window: Window = (0, 0, 0, 0)
+    data: bytes = b""
+    kind: str = ""
+    found: Observations | None = None
+    hidden: tuple[str, ...] = ()
+    saturated: bool = False
+    seconds: float = 0.0
+    problem: str = ""
+
+
+Deliver = Callable[[Shown], None]
+
+
+@dataclass(slots=True, eq=False)
+class _Canvas:
+    """The work on one order: the sum of its passes."""
+
+    order: Order
+    born: float
+    total: Floats | None = None
+    samples: int = 0
+    hidden: tuple[str, ...] = ()
+
+
+@dataclass(slots=True, eq=False)
+class _Tab:
+    deliver: Deliver
+    canvas: _Canvas | None = None
+    fresh: bool = False  # the canvas waits for its preview
+
+
+@dataclass(slots=True)
+class Pace:
+    """How many pixels a preview may have. It follows the times that previews take here."""
+
+    pixels: int = PREVIEW_PX[1]
+    _times: deque[float] = field(default_factory=lambda: deque(maxlen=3))
+
+    def coarse(self, pixels: int) -> int:
+        """Side of the pixels of a preview of a window with so many pixels."""
+        return math.ceil(math.sqrt(pixels / self.pixels))
+
+    def took(self, seconds: float) -> None:
+        """Learn from a preview. A single slow one, as the first one, which is compiled, changes nothing."""
+        self._times.append(seconds)
+        if len(self._times) < 3:
+            return
+        middle = sorted(self._times)[1]
+        if middle > BUDGET_S:
+            self._become(self.pixels // 2)
+        elif middle < BUDGET_S / 4:
+            self._become(self.pixels * 2)
+
+    def _become(self, pixels: int) -> None:
+        self.pixels = min(max(pixels, PREVIEW_PX[0]), PREVIEW_PX[2])
+        self._times.clear()
+
+
+@dataclass(slots=True, eq=False)
+class Painter:
+    """Renders the orders of all tabs with one renderer; `start` it, and `close` it in the end.
+
+    Args:
+        backend: the render backend.
+        threads: processor threads for rendering; None: all.
+        goal: samples per pixel after which a picture is finished.
+    """
+
+    backend: BackendChoice = "auto"
+    threads: int | None = None
+    goal: int = GOAL_SPP
+    _tabs: dict[str, _Tab] = field(default_factory=dict)
+    _changed: threading.Condition = field(default_factory=threading.Condition)
+    _stopped: bool = False
+    _thread: threading.Thread | None = None
+    _failure: Exception | None = None
+    _pace: Pace = field(default_factory=Pace)
+    _pixel_s: float = 0.0  # time of the last band per pixel
+
+    def start(self) -> None:
+        """Start the renderer in its thread.
+
+        Raises:
+            BackendError: no backend renders.
+        """
+        ready = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(ready,), name="painter", daemon=True)
+        self._thread.start()
+        ready.wait()
+        if self._failure is not None:
+            raise self._failure
+
+    def open(self, key: str, deliver: Deliver) -> None:
+        """Take on a tab; `deliver` is called in the painter's thread."""
+        with self._changed:
+            self._tabs[key] = _Tab(deliver)
+
+    def ask(self, key: str, order: Order) -> None:
+        """Replace the order of a tab."""
+        with self._changed:
+            tab = self._tabs.get(key)
+            if tab is not None:
+                tab.canvas, tab.fresh = _Canvas(order, time.monotonic()), True
+                self._changed.notify()
+
+    def drop(self, key: str) -> None:
+        """Forget a tab and its pictures."""
+        with self._changed:
+            self._tabs.pop(key, None)
+
+    def close(self) -> None:
+        """Stop after the present band."""
+        with self._changed:
+            self._stopped = True
+            self._tabs.clear()
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join(timeout=10)
+
+    def _run(self, ready: threading.Event) -> None:
+        try:
+            renderer = make_renderer(self.backend, self.threads)
+        except Exception as error:
+            self._failure = error
+            return
+        finally:
+            ready.set()
+        while (work := self._next()) is not None:
+            tab, canvas, fresh = work
+            try:
+                shown = self._preview(renderer, canvas) if fresh else self._pass(renderer, tab, canvas)
+            except Exception as error:
+                shown = Shown(canvas.order.number, problem=line_of(error))
+                canvas.samples = self.goal
+            if shown is not None and not self._stopped:
+                tab.deliver(shown)
+
+    def _next(self) -> tuple[_Tab, _Canvas, bool] | None:
+        """Wait for work: the oldest order without a preview, else the rested tab with the fewest samples."""
+        with self._changed:
+            while not self._stopped:
+                tabs = [(tab, tab.canvas) for tab in self._tabs.values() if tab.canvas is not None]
+                fresh = [(canvas.born, k) for k, (tab, canvas) in enumerate(tabs) if tab.fresh]
+                if fresh:
+                    tab, canvas = tabs[min(fresh)[1]]
+                    tab.fresh = False
+                    return tab, canvas, True
+                unfinished = [(tab, canvas) for tab, canvas in tabs if canvas.samples < self.goal]
+                rest = [canvas.born + REST_S - time.monotonic() for _, canvas in unfinished]
+                rested = [pair for pair, left in zip(unfinished, rest, strict=True) if left <= 0]
+                if rested:
+                    tab, canvas = min(rested, key=lambda pair: pair[1].samples)
+                    return tab, canvas, False
+                self._changed.wait(min(rest) if rest else None)
+        return None
+
+    def _busy(self, tab: _Tab, canvas: _Canvas) -> bool:
+        """Whether something is more urgent than a pass of this canvas."""
+        with self._changed:
+            return self._stopped or tab.canvas is not canvas or any(other.fresh for other in self._tabs.values())
+
+    def _preview(self, renderer: Renderer, canvas: _Canvas) -> Shown:
+        frame = canvas.order.frame
+        check_windows(frame.scene)
+        job = _job(frame, 0)
+        _, _, width, height = job.window
+        began = time.perf_counter()
+        coarse = self._pace.coarse(width * height)
+        shrunk = coarser(job, coarse)
+        done = renderer.render(shrunk, spp=PREVIEW_SPP, moments=moments(frame, 0, shrunk))
+        seconds = time.perf_counter() - began
+        self._pace.took(seconds)
+        canvas.hidden = done.glint_reasons
+        irradiance = enlarged(done.irradiance, coarse, (width, height))
+        return _shown(canvas, job, done, irradiance, PREVIEW_SPP, seconds, coarse=coarse)
+
+    def _pass(self, renderer: Renderer, tab: _Tab, canvas: _Canvas) -> Shown | None:
+        """One pass over the window, in bands; None where it was interrupted, or is not to be sent."""
+        frame = canvas.order.frame
+        job = _job(frame, canvas.samples + 1)
+        x0, y0, width, height = job.window
+        pixels = BAND_PX if self._pixel_s == 0.0 else max(BAND_PX, int(BUDGET_S / self._pixel_s))
+        rows = max(1, min(height, pixels // width))
+        taken = np.zeros((height, width))
+        began = time.perf_counter()
+        for top in range(0, height, rows):
+            if self._busy(tab, canvas):
+                return None
+            band = replace(job, window=(x0, y0 + top, width, min(rows, height - top)))
+            start = time.perf_counter()
+            done = renderer.render(band, spp=PASS_SPP, moments=moments(frame, 0, band))
+            self._pixel_s = (time.perf_counter() - start) / done.irradiance.size
+            taken[top : top + rows] = done.irradiance
+        seconds = time.perf_counter() - began
+        share = PASS_SPP / (canvas.samples + PASS_SPP)
+        canvas.total = taken if canvas.total is None else canvas.total + share * (taken - canvas.total)
+        canvas.samples += PASS_SPP
+        if canvas.samples not in SENT_AT and canvas.samples < self.goal:
+            return None
+        return _shown(canvas, job, done, canvas.total, canvas.samples, seconds, last=canvas.samples >= self.goal)
+
+
+def coarser(job: RenderJob, side: int) -> RenderJob:
+    """The same window with pixels that are `side` times as wide, as if the sensor had such pixels.
+
+    Pixel centres lie at integers, so pixel u of the window holds the pixels side u to side u + side - 1.
+    """
+    if side == 1:
+        return job
+    x0, y0, width, height = job.window
+    old = job.camera
+    K = old.K.copy()
+    K[0, 2], K[1, 2] = (np.array([K[0, 2] - x0, K[1, 2] - y0]) + 0.5) / side - 0.5
+    K[0, 0], K[1, 1] = K[0, 0] / side, K[1, 1] / side
+    size = (-(-width // side), -(-height // side))
+    camera = PinholeCamera.of(K, old.R, old.t, size, old.distortion, old.name)
+    sensor = job.sensor.model_copy(
+        update={
+            "pixel_pitch_um": job.sensor.pixel_pitch_um * side,
+            "psf_sigma_px": job.sensor.psf_sigma_px / side,
+        }
+    )
+    return replace(job, camera=camera, sensor=sensor, window=(0, 0, *size))
+
+
+def enlarged(picture: NDArray[Any], side: int, size_px: tuple[int, int]) -> Floats:
+    """A picture (h, w) with coarse pixels in the size of a whole one, smoothly between their centres."""
+    if side == 1:
+        return np.asarray(picture, dtype=float)
+    width, height = size_px
+    image = Image.fromarray(np.asarray(picture, dtype=np.float32))
+    wide = image.resize((image.width * side, image.height * side), Image.Resampling.BILINEAR)
+    return np.asarray(wide, dtype=float)[:height, :width]
+
+
+def _job(frame: Frames, draw: int) -> RenderJob:
+    """The job of a pass, with samples of its own. The sensor's noise is added to the mean of all passes."""
+    job = render_job(frame, 0)
+    seed = int(np.random.SeedSequence([job.seed, draw]).generate_state(1, np.uint64)[0])
+    quiet = job.sensor.model_copy(update={"noise": False})
+    return replace(job, seed=seed, sensor=quiet, labels=False)
+
+
+def _shown(
+    canvas: _Canvas,
+    job: RenderJob,
+    done: RenderedWindow,
+    irradiance: Floats,
+    samples: int,
+    seconds: float,
+    *,
+    coarse: int = 1,
+    last: bool = False,
+) -> Shown:
+    """Expose the sensor, find the features and make a file of the picture."""
+    frame, order = canvas.order.frame, canvas.order
+    scene, sensor = frame.scene, frame.scene.spec.sensor
+    own = render_job(frame, 0).seed
+    counts = expose(sensor, irradiance, scene.spec.wavelength_nm, own)
+    image = EyeImage(
+        frame=frame,
+        row=0,
+        window=job.window,
+        counts=counts,
+        irradiance=np.asarray(irradiance, dtype=np.float32),
+        parts=np.zeros(counts.shape, np.uint8),
+        eye=job.eye,
+        M=job.M,
+        t=job.t,
+        rendered=done,
+    )
+    kind = "PNG" if last else "JPEG"
+    return Shown(
+        number=order.number,
+        samples=samples,
+        coarse=coarse,
+        size_px=(job.window[2], job.window[3]),
+        window=job.window,
+        data=_encoded(preview(counts, sensor.full_scale_dn), kind),
+        kind=f"image/{kind.lower()}",
+        found=detect(image) if order.extract else None,
+        hidden=canvas.hidden,
+        saturated=is_saturated(counts, sensor),
+        seconds=seconds,
+    )
+
+
+def _encoded(pixels: Bytes, kind: str) -> bytes:
+    buffer = io.BytesIO()
+    options = {"compress_level": 1} if kind == "PNG" else {"quality": 88}
+    Image.fromarray(pixels).save(buffer, format=kind, **options)
+    return buffer.getvalue()
+
+
+def line_of(error: Exception) -> str:
+    """One line for an error."""
+    if isinstance(error, EyerenderError):
+        return one_line(str(error), MAX_REASON)
+    if isinstance(error, MemoryError):
+        return "out of memory"
+    return one_line(f"this frame cannot be rendered ({type(error).__name__}: {error})", MAX_REASON)

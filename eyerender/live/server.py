@@ -1,0 +1,109 @@
+"""The live page's server, on 127.0.0.1 behind the guard."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import Callable, Iterator
+
+import uvicorn
+from fastapi import FastAPI
+from nicegui import ui
+
+from ..backends.choose import BackendChoice
+from ..errors import InputError
+from ..scene import Scene
+from .guard import Guard, new_token
+from .page import Studio
+from .painter import Painter
+
+HOST = "127.0.0.1"
+RECONNECT_S = 3.0
+
+
+def serve(
+    scene: Scene,
+    *,
+    port: int = 0,
+    backend: BackendChoice = "auto",
+    threads: int | None = None,
+    announce: Callable[[str], None] = print,
+) -> None:
+    """Show a scene on a page of this machine until it is interrupted.
+
+    Args:
+        scene: the scene.
+        port: the port; 0 takes a free one.
+        backend: the render backend.
+        threads: processor threads for rendering; None: all.
+        announce: is told the address, with its token, when the page can be opened.
+
+    Raises:
+        InputError: the port is taken.
+        BackendError: no backend renders.
+    """
+    with _listening(port) as listener:
+        painter = Painter(backend, threads)
+        painter.start()
+        try:
+            _run(Studio(scene, painter), listener, announce)
+        finally:
+            painter.close()
+
+
+@contextlib.contextmanager
+def _listening(port: int) -> Iterator[socket.socket]:
+    """A socket that listens on the loopback alone."""
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        try:
+            listener.bind((HOST, port))
+        except (OSError, OverflowError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "must be between 0 and 65535"
+            raise InputError(f"{port} cannot be used ({reason})", source="--port") from None
+        yield listener
+    finally:
+        listener.close()
+
+
+def _run(studio: Studio, listener: socket.socket, announce: Callable[[str], None]) -> None:
+    token = new_token()
+    inner = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+    studio.register()
+    ui.run_with(
+        inner,
+        reconnect_timeout=RECONNECT_S,
+        message_history_length=100,
+        show_welcome_message=False,
+        tailwind=False,
+        favicon="\N{EYE}",
+    )
+    logging.getLogger("nicegui").setLevel(logging.ERROR)
+    config = uvicorn.Config(
+        Guard(inner, token),
+        log_level="critical",
+        access_log=False,  # the addresses hold the token
+        server_header=False,
+        proxy_headers=False,
+        timeout_graceful_shutdown=1,
+        ws_max_size=2**20,
+        h11_max_incomplete_event_size=2**16,
+    )
+    server = _Server(config, lambda: announce(f"http://{HOST}:{listener.getsockname()[1]}/{token}/"))
+    asyncio.run(server.serve(sockets=[listener]))
+
+
+class _Server(uvicorn.Server):
+    """A server that tells when it listens."""
+
+    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._ready = ready
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        if self.started:
+            self._ready()

@@ -1,0 +1,174 @@
+"""What one tab of the live page shows: a scene that its knobs change, and which of its frames is in the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..observation import EYES
+from ..rig.camera import Camera
+from ..scene import Frames, Scene
+from ..scene.spec import EyeDirection, SceneSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """A scene with one fixation and one head position, taken from a scene that may have many.
+
+    Every method that changes something returns a new setup, and raises `InputError` for a value that does not fit.
+
+    Attributes:
+        origin: the spec as it was loaded, with all of its fixations and head positions.
+        scene: the scene that is shown; it has one fixation and one head position.
+        eye: the eye that is shown, "right" or "left".
+        camera: the camera that takes the picture.
+        fixation: number of the fixation of `origin` that is shown; None for a gaze that the user has set.
+        head: number of the head position of `origin`.
+    """
+
+    origin: SceneSpec
+    scene: Scene
+    eye: str
+    camera: int = 0
+    fixation: int | None = 0
+    head: int = 0
+
+    @classmethod
+    def of(cls, scene: Scene) -> Self:
+        """The first frame of a scene."""
+        spec = scene.spec
+        start = cls(spec, scene, spec.subject.eyes[0])
+        return start.following(0).with_head(0)
+
+    @property
+    def fixations(self) -> int:
+        """Number of fixations of the loaded scene."""
+        targets = self._targets()
+        return len(targets) if targets is not None else len(self.origin.poses or ())
+
+    @property
+    def apex_mm(self) -> Floats:
+        """Apex of the unrotated eye that is shown, (3,) mm in the world."""
+        head = np.array(self.scene.spec.subject.head_positions_mm[0])
+        return np.asarray(self.scene.eye_position_mm(self.eye) + head)
+
+    def frames(self) -> Frames:
+        """All frames of the shown fixation: a row for each camera and eye."""
+        return self.scene.frames()
+
+    def row(self, frames: Frames) -> int:
+        """The row of `frames` that is shown."""
+        index = frames.index
+        return int(np.flatnonzero((index.camera == self.camera) & (index.eye == EYES.index(self.eye)))[0])
+
+    def changed(self, changes: Mapping[str, Any]) -> Self:
+        """Change keys of the scene by their paths."""
+        return replace(self, scene=self.scene.with_(changes))
+
+    def looking(self, azimuth_deg: float, elevation_deg: float) -> Self:
+        """Turn the optic axes of the eyes in a direction, whatever the targets."""
+        return replace(self, scene=self.scene.with_(gaze_deg=(azimuth_deg, elevation_deg)), fixation=None)
+
+    def following(self, fixation: int) -> Self:
+        """Let the eyes fixate a target of the loaded scene, or take one of its poses."""
+        if not 0 <= fixation < self.fixations:
+            raise InputError(f"there is no fixation {fixation}, only {self.fixations}", path="fixation")
+        targets = self._targets()
+        if targets is not None:
+            scene = self.scene.with_(target_mm=targets[fixation])
+        else:
+            pose = (self.origin.poses or ())[fixation]
+            scene = self.scene.with_(gaze_deg=(pose.azimuth_deg, pose.elevation_deg))
+        return replace(self, scene=scene, fixation=fixation)
+
+    def with_head(self, head: int) -> Self:
+        """Move the head to one of the positions of the loaded scene."""
+        places = self.origin.subject.head_positions_mm
+        return replace(self.changed({"subject.head_positions_mm": [places[head]]}), head=head)
+
+    def with_opening(self, share: float) -> Self:
+        """Open the lids to a share of their opening: 1 open, 0 shut."""
+        if self.scene.spec.region is None:
+            raise InputError("the scene has no lids; add a region to it", path="region.blink")
+        return self.changed({"region.blink": round(1 - share, 6)})
+
+    def with_light(self, light: int, **changes: Any) -> Self:
+        """Change a light. LEDs of rings become LEDs of their own (`Rig.with_light`)."""
+        rig = self.scene.spec.rig.with_light(light, **changes)
+        return replace(self, scene=self.scene.with_(rig=rig))
+
+    def with_camera_at(self, camera: int, position_mm: ArrayLike) -> Self:
+        """Move a camera. One that looks at a point goes on looking at it; others keep their direction."""
+        spec = self.scene.spec.rig.cameras[camera]
+        place = np.round(np.asarray(position_mm, dtype=float), 6)
+        if spec.calibration is None:
+            return self.changed({f"rig.cameras.{camera}.position_mm": place.tolist()})
+        turn = self.scene.rig.cameras[camera].R
+        return self.changed({f"rig.cameras.{camera}.calibration.t_mm": (-turn @ place).tolist()})
+
+    def with_camera_aimed(self, camera: int) -> Self:
+        """Turn a camera to the shown eye."""
+        spec = self.scene.spec.rig.cameras[camera]
+        if spec.calibration is not None:
+            raise InputError("has a calibration, which fixes its direction", path=f"rig.cameras.{camera}")
+        path = f"rig.cameras.{camera}"
+        return self.changed(
+            {f"{path}.look_at_mm": self.apex_mm.tolist(), f"{path}.pan_deg": None, f"{path}.tilt_deg": None}
+        )
+
+    def saved(self) -> SceneSpec:
+        """The spec to save: what the knobs changed, with all fixations and head positions of the loaded scene.
+
+        A gaze that the user has set takes the place of the fixations. Files are absolute paths, so the scene means the
+        same in every folder.
+        """
+        shown = self.scene.located()
+        data = shown.to_mapping()
+        data["subject"] = {**data["subject"], "head_positions_mm": self.origin.subject.head_positions_mm}
+        if self.fixation is not None:
+            data.pop("targets", None)
+            data.pop("poses", None)
+            kept = self.origin.to_mapping()
+            data |= {key: kept[key] for key in ("targets", "poses") if key in kept}
+        model = data["eye"].get("model")
+        if isinstance(model, str) and model.endswith((".yaml", ".yml")) and self.scene.base is not None:
+            data["eye"]["model"] = str((self.scene.base / model).resolve())
+        return SceneSpec.from_mapping(data)
+
+    def _targets(self) -> Any:
+        """Targets of the loaded scene on the present screen, (f, 3); None where it gives poses."""
+        if self.origin.targets is None:
+            return None
+        spec = self.scene.spec.model_copy(update={"targets": self.origin.targets, "poses": None})
+        return self.scene.replaced(spec, rig=self.scene.rig).targets_mm
+
+
+def named(cameras: tuple[Camera, ...]) -> list[str]:
+    """Names of cameras for people: number and name."""
+    return [f"{k}: {camera.name}" for k, camera in enumerate(cameras)]
+
+
+def loaded(path: str | Path, eye: str | None = None) -> Setup:
+    """The first frame of a scene file, or of a shipped scene.
+
+    Raises:
+        InputError: the scene cannot be read.
+    """
+    from ..scene import load_scene
+
+    return Setup.of(load_scene(path, eye=eye))
+
+
+def directions(setup: Setup) -> EyeDirection:
+    """The direction of the optic axis of the shown eye, rounded to what a knob can show."""
+    frames = setup.frames()
+    row = setup.row(frames)
+    azimuth, elevation = np.degrees([frames.pose.azimuth_rad[row], frames.pose.elevation_rad[row]])
+    return EyeDirection(azimuth_deg=round(float(azimuth), 2), elevation_deg=round(float(elevation), 2))
