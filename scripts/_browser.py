@@ -93,10 +93,11 @@ def chromium(width: int = 1440, height: int = 900) -> Iterator[Any]:
     with tempfile.TemporaryDirectory() as folder:
         for flag in (*_FLAGS, f"--user-data-dir={folder}/profile"):
             options.add_argument(flag)
-        options.add_experimental_option("prefs", {"download.default_directory": folder})
         options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
         driver = webdriver.Chrome(options=options, service=Service(found[1]))
         driver.downloads = Path(folder)
+        behaviour = {"behavior": "allow", "downloadPath": folder}
+        driver.execute_cdp_cmd("Browser.setDownloadBehavior", behaviour)
         try:
             resize(driver, width, height)
             yield driver

@@ -3,8 +3,9 @@
 Each tab has at most one order: the frame that it wants to see. A new order takes the place of the old one, so a slider
 that moves faster than frames render leaves no queue behind. A new order is answered with a preview of a few samples,
 with coarser pixels where whole ones would take too long. When the tab has rested for a moment, passes over the whole
-window follow, whose mean is sent at 4, 8, 16, 32 and 64 samples. A pass goes over the window in bands, and the thread
-looks for new orders between them. Tabs take turns, and previews come before passes.
+window follow: after the first one, each takes as many samples as all before it, so their mean has 4, 8, 16, 32 and 64.
+A pass goes over the window in bands, and the thread looks for new orders between them. Tabs take turns, and previews
+come before passes.
 """
 
 from __future__ import annotations
@@ -39,16 +40,15 @@ if TYPE_CHECKING:
     from ..rendering.renderer import RenderedWindow, Renderer
 
 PREVIEW_SPP = 4
-PASS_SPP = 4
 GOAL_SPP = 64
 BUDGET_S = 0.2
 """Time that a preview, or a band of a pass, should take at most."""
 PREVIEW_PX = (20_000, 160_000, 640_000)
 """Pixels that a preview may have: the fewest, those of the first one, and the most."""
 REST_S = 0.25
-"""How long a tab must rest before its picture is refined."""
-BAND_PX = 40_000
-SENT_AT = frozenset({4, 8, 16, 32, 64})
+"""How long a tab must rest after a preview before its picture is refined."""
+BAND_PX = 20_000
+"""The fewest pixels of a band: the preparation of each takes some time."""
 MAX_REASON = 300
 
 
@@ -105,11 +105,11 @@ Deliver = Callable[[Shown], None]
 
 @dataclass(slots=True, eq=False)
 class _Canvas:
-    """The work on one order: the sum of its passes."""
+    """The work on one order: the mean of its passes."""
 
     order: Order
-    born: float
-    total: Floats | None = None
+    since: float  # when it was ordered, or shown first
+    mean: Floats | None = None
     samples: int = 0
     hidden: tuple[str, ...] = ()
 
@@ -167,7 +167,7 @@ class Painter:
     _thread: threading.Thread | None = None
     _failure: Exception | None = None
     _pace: Pace = field(default_factory=Pace)
-    _pixel_s: float = 0.0  # time of the last band per pixel
+    _sample_s: float = 1e-6  # time of the last band per sample
 
     def start(self) -> None:
         """Start the renderer in its thread.
@@ -226,19 +226,21 @@ class Painter:
                 canvas.samples = self.goal
             if shown is not None and not self._stopped:
                 tab.deliver(shown)
+            if fresh:
+                canvas.since = time.monotonic()
 
     def _next(self) -> tuple[_Tab, _Canvas, bool] | None:
         """Wait for work: the oldest order without a preview, else the rested tab with the fewest samples."""
         with self._changed:
             while not self._stopped:
                 tabs = [(tab, tab.canvas) for tab in self._tabs.values() if tab.canvas is not None]
-                fresh = [(canvas.born, k) for k, (tab, canvas) in enumerate(tabs) if tab.fresh]
+                fresh = [(canvas.since, k) for k, (tab, canvas) in enumerate(tabs) if tab.fresh]
                 if fresh:
                     tab, canvas = tabs[min(fresh)[1]]
                     tab.fresh = False
                     return tab, canvas, True
                 unfinished = [(tab, canvas) for tab, canvas in tabs if canvas.samples < self.goal]
-                rest = [canvas.born + REST_S - time.monotonic() for _, canvas in unfinished]
+                rest = [canvas.since + REST_S - time.monotonic() for _, canvas in unfinished]
                 rested = [pair for pair, left in zip(unfinished, rest, strict=True) if left <= 0]
                 if rested:
                     tab, canvas = min(rested, key=lambda pair: pair[1].samples)
@@ -267,12 +269,12 @@ class Painter:
         return _shown(canvas, job, done, irradiance, PREVIEW_SPP, seconds, coarse=coarse)
 
     def _pass(self, renderer: Renderer, tab: _Tab, canvas: _Canvas) -> Shown | None:
-        """One pass over the window, in bands; None where it was interrupted, or is not to be sent."""
+        """One pass over the window, in bands; None where it was interrupted."""
         frame = canvas.order.frame
         job = _job(frame, canvas.samples + 1)
         x0, y0, width, height = job.window
-        pixels = BAND_PX if self._pixel_s == 0.0 else max(BAND_PX, int(BUDGET_S / self._pixel_s))
-        rows = max(1, min(height, pixels // width))
+        spp = max(PREVIEW_SPP, canvas.samples)
+        rows = max(1, min(height, max(BAND_PX, int(BUDGET_S / (self._sample_s * spp))) // width))
         taken = np.zeros((height, width))
         began = time.perf_counter()
         for top in range(0, height, rows):
@@ -280,16 +282,14 @@ class Painter:
                 return None
             band = replace(job, window=(x0, y0 + top, width, min(rows, height - top)))
             start = time.perf_counter()
-            done = renderer.render(band, spp=PASS_SPP, moments=moments(frame, 0, band))
-            self._pixel_s = (time.perf_counter() - start) / done.irradiance.size
+            done = renderer.render(band, spp=spp, moments=moments(frame, 0, band))
+            self._sample_s = (time.perf_counter() - start) / (spp * done.irradiance.size)
             taken[top : top + rows] = done.irradiance
         seconds = time.perf_counter() - began
-        share = PASS_SPP / (canvas.samples + PASS_SPP)
-        canvas.total = taken if canvas.total is None else canvas.total + share * (taken - canvas.total)
-        canvas.samples += PASS_SPP
-        if canvas.samples not in SENT_AT and canvas.samples < self.goal:
-            return None
-        return _shown(canvas, job, done, canvas.total, canvas.samples, seconds, last=canvas.samples >= self.goal)
+        share = spp / (canvas.samples + spp)
+        canvas.mean = taken if canvas.mean is None else canvas.mean + share * (taken - canvas.mean)
+        canvas.samples += spp
+        return _shown(canvas, job, done, canvas.mean, canvas.samples, seconds, last=canvas.samples >= self.goal)
 
 
 def coarser(job: RenderJob, side: int) -> RenderJob:

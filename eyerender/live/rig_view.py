@@ -15,6 +15,7 @@ from .drawing import Label, Strokes, colours_of, extent_mm
 _CM = 0.1
 """The view's unit is 1 cm, which suits its near plane and its wheel."""
 _FIELD_DEG = 40.0
+_IDLE_FPS, _TURNED_FPS = 8, 30
 
 
 class Segments(Object3D, component="segments.js"):  # type: ignore[call-arg]
@@ -34,10 +35,15 @@ class RigView:
 
     def __init__(self) -> None:
         camera = ui.scene.perspective_camera(fov=_FIELD_DEG, near=0.05, far=5000)
-        with ui.scene(grid=False, camera=camera, background_color="#ffffff", click_events=[], fps=15) as self._scene:
+        with ui.scene(
+            grid=False, camera=camera, background_color="#ffffff", click_events=[], fps=_IDLE_FPS
+        ) as self._scene:
             self._segments = Segments(Strokes())
             self._labels: list[Any] = []
         self._scene.classes("rig-view").props('aria-label="the rig in three dimensions"')
+        # It is drawn all the time, and without a graphics card that takes the time of the renderer.
+        self._scene.on("pointerenter", lambda: self._draw_at(_TURNED_FPS))
+        self._scene.on("pointerleave", lambda: self._draw_at(_IDLE_FPS))
         self._shown: list[Label] = []
 
     def show(self, drawn: Strokes) -> None:
@@ -64,6 +70,9 @@ class RigView:
     def look_from(self, place_mm: Floats, target_mm: Floats) -> None:
         """Look from a camera's place along its axis."""
         self._move(place_mm, target_mm)
+
+    def _draw_at(self, fps: int) -> None:
+        self._scene.props["fps"] = fps
 
     def _look(self, middle: Floats, distance: float, way: Floats) -> None:
         self._move(middle + distance * way / np.linalg.norm(way), middle)

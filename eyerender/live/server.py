@@ -20,7 +20,8 @@ from .page import Studio
 from .painter import Painter
 
 HOST = "127.0.0.1"
-RECONNECT_S = 3.0
+RECONNECT_S = 20.0
+"""How long a tab may be away, on a slow line or a busy machine, before what it holds is freed."""
 
 
 def serve(

@@ -1,0 +1,140 @@
+"""What the knobs of a tab do to its scene, and what it saves."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+import eyerender as er
+from eyerender.errors import InputError
+from eyerender.live.setup import Setup, directions
+from eyerender.live.source import python_source
+
+
+def setup_of(name):
+    return Setup.of(er.load_scene(name))
+
+
+@pytest.fixture(scope="module")
+def desk():
+    return setup_of("desktop_tracker")
+
+
+def built(spec):
+    """The scene that the script of a spec builds."""
+    names: dict[str, Any] = {"__name__": "saved"}
+    exec(python_source(spec), names)
+    return names["scene"].spec
+
+
+@pytest.mark.parametrize("name", sorted(er.shipped_scenes()))
+def test_an_unchanged_scene_is_saved_as_it_was(name):
+    start = setup_of(name)
+    assert start.saved() == start.scene.replaced(start.origin).located()
+    assert built(start.saved()) == start.saved()
+
+
+def test_changes_are_saved_and_the_rest_stays(desk):
+    changed = desk.changed({"eye.pupil_diameter_mm": 5.5}).with_opening(0.7)
+    changed = changed.with_light(1, position_mm=[500, -100, -90], intensity_mw_sr=44.0)
+    changed = changed.with_camera_at(0, [610.0, 5.0, -170.0])
+    saved = changed.saved()
+    assert saved == er.SceneSpec.from_mapping(yaml.safe_load(saved.to_yaml()))
+    assert built(saved) == saved
+    assert saved.targets == desk.origin.targets
+    assert saved.poses is None
+    assert saved.eye.pupil_diameter_mm == 5.5
+    assert saved.region.blink == pytest.approx(0.3)
+    assert saved.rig.lights[1].position_mm == (500, -100, -90)
+    assert saved.rig.lights[0] == desk.origin.rig.lights[0]
+    assert saved.rig.cameras[0].look_at_mm == desk.origin.rig.cameras[0].look_at_mm
+    np.testing.assert_allclose(saved.rig.cameras[0].build().nodal_point_mm, [610, 5, -170], atol=1e-9)
+
+
+def test_a_gaze_set_by_hand_takes_the_place_of_the_targets(desk):
+    turned = desk.looking(7.5, -3.25)
+    assert directions(turned).azimuth_deg == 7.5
+    saved = turned.saved()
+    assert saved.targets is None
+    assert [(p.azimuth_deg, p.elevation_deg) for p in saved.poses] == [(7.5, -3.25)]
+    assert built(saved) == saved
+    assert turned.following(4).saved() == desk.saved()
+
+
+def test_the_shown_frame_is_that_of_the_whole_scene(desk):
+    """One fixation and one head position are cut out; pose, window and target are those of the same frame."""
+    whole = er.load_scene("desktop_tracker").frames()
+    for fixation in (0, 5):
+        cut = desk.following(fixation)
+        frames = cut.frames()
+        one = frames.take([cut.row(frames)])
+        rows = np.flatnonzero((whole.index.fixation == fixation) & (whole.index.eye == 0))
+        np.testing.assert_allclose(one.pose.azimuth_rad, whole.pose.azimuth_rad[rows], atol=1e-12)
+        np.testing.assert_allclose(one.index.target_mm, whole.index.target_mm[rows], atol=1e-12)
+        assert one.scene.window(0, 0, 0) == whole.scene.window(0, 0, 0)
+
+
+def test_head_positions_are_kept():
+    scene = er.load_scene("blignaut2014").with_({"subject.head_positions_mm": [[0, 0, 0], [10, 0, 5]]})
+    moved = Setup.of(scene).with_head(1)
+    assert moved.scene.spec.subject.head_positions_mm == ((10, 0, 5),)
+    assert moved.saved().subject.head_positions_mm == ((0, 0, 0), (10, 0, 5))
+
+
+def test_a_calibrated_camera_moves_without_turning(desk):
+    camera = desk.scene.rig.cameras[0]
+    numbers = {"K": camera.K, "R": camera.R, "t_mm": camera.t}
+    fixed = er.Camera(resolution_px=camera.resolution_px, calibration=er.CameraCalibration(**numbers))
+    scene = desk.scene.with_(rig=er.Rig(cameras=(fixed,), lights=desk.origin.rig.lights, screen=desk.origin.rig.screen))
+    moved = Setup.of(scene).with_camera_at(0, [650.0, 10.0, -200.0])
+    after = moved.scene.rig.cameras[0]
+    np.testing.assert_allclose(after.nodal_point_mm, [650, 10, -200], atol=1e-6)
+    np.testing.assert_array_equal(after.R, camera.R)
+    with pytest.raises(InputError, match="calibration"):
+        moved.with_camera_aimed(0)
+
+
+def test_an_aimed_camera_sees_the_eye_in_its_middle(desk):
+    aimed = desk.with_camera_at(0, [580.0, 90.0, -200.0]).with_camera_aimed(0)
+    camera = aimed.scene.rig.cameras[0]
+    pixel, front = camera.project(aimed.apex_mm)
+    assert front
+    np.testing.assert_allclose(pixel, [camera.K[0, 2], camera.K[1, 2]], atol=1e-6)
+
+
+def test_bad_input_names_the_key_and_changes_nothing(desk):
+    for change, path in (
+        (lambda: desk.changed({"eye.pupil_diameter_mm": -1.0}), "eye.pupil_diameter_mm"),
+        (lambda: desk.looking(95, 0), "azimuth_deg"),
+        (lambda: desk.with_light(7, intensity_mw_sr=1.0), "lights"),
+        (lambda: desk.following(99), "fixation"),
+        (lambda: desk.with_opening(1.5), "region.blink"),
+        (lambda: setup_of("head_mounted").with_opening(0.5), "region.blink"),
+    ):
+        with pytest.raises(InputError, match=path):
+            change()
+
+
+def test_files_are_saved_as_absolute_paths(tmp_path):
+    (tmp_path / "mine.yaml").write_text(er.load_eye("E4").to_yaml())
+    spec = er.load_scene("head_mounted").with_({"eye.model": "E4"}).spec.to_mapping()
+    spec["eye"]["model"] = "mine.yaml"
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(spec))
+    saved = Setup.of(er.load_scene(tmp_path / "scene.yaml")).saved()
+    assert saved.eye.model == str(tmp_path / "mine.yaml")
+    assert er.Scene.of(saved).eye_spec == er.load_eye("E4")
+
+
+def test_the_saved_script_runs(tmp_path, desk):
+    script, scene = tmp_path / "scene.py", tmp_path / "scene.yaml"
+    saved = desk.looking(3, 4).saved()
+    script.write_text(python_source(saved))
+    out = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=True)
+    scene.write_text(out.stdout)
+    assert er.load_scene(scene).spec == saved
+    assert max(map(len, python_source(saved).splitlines())) <= 120
