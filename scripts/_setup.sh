@@ -30,8 +30,8 @@ fingerprint() {
       cat "$root/pyproject.toml" "$root/constraints.txt"; } | checksum
 }
 
-# There are four set-ups: run, test (the extra `test` too), all (`test` and `ray`), and docs, which has an environment of
-# its own. Each leaves the stamps of those that it holds.
+# There are five set-ups: run, live (the extra `live` too), test (`test`), all (`test` and `ray`), and docs, which has an
+# environment of its own. Each leaves the stamps of those that it holds.
 is_set_up() {
     [ -x "$venv/bin/python" ] && [ -f "$venv/.stamp-$1" ] && [ "$(cat "$venv/.stamp-$1")" = "$(fingerprint)" ]
 }
@@ -115,7 +115,7 @@ failure() {
     fi
 }
 
-# set_up run|test|all|docs: returns at once where the stamp is right.
+# set_up run|live|test|all|docs: returns at once where the stamp is right.
 set_up() {
     is_set_up "$1" && return
     [ -f "$root/constraints.txt" ] || die "$root/constraints.txt is missing"
@@ -133,6 +133,7 @@ set_up() {
     case $1 in
         all) wanted="$root[test,ray]" stamps="all test run" size="1.6 GB" ;;
         test) wanted="$root[test]" stamps="test run" size="1.3 GB" ;;
+        live) wanted="$root[live]" stamps="live run" size="1 GB" ;;
         docs) wanted="$root[docs]" stamps="docs run" size="1 GB" ;;
         *) wanted=$root stamps=run size="900 MB" ;;
     esac

@@ -21,6 +21,7 @@ SCRIPTS = (
     "scripts/docs",
     "scripts/test-dependencies",
     "scripts/test-torch",
+    "scripts/test-live",
     "scripts/prove-bare",
     ".ci/run",
 )

@@ -138,6 +138,7 @@ class Tab:
     # What the page consists of
 
     def _build(self) -> None:
+        ui.colors(primary=ANALYTIC)
         ui.add_css(STYLE.read_text(encoding="utf-8"))
         spec = self._setup.origin
         with ui.element("header").classes("top"):
@@ -351,7 +352,7 @@ class Tab:
         full = " · saturated" if shown.saturated else ""
         self._status.set_text(
             f"{width} x {height} px · {shown.samples}{more} samples per pixel{coarse} · "
-            f"{1000 * shown.seconds:.0f} ms to render{full}"
+            f"rendered in {1000 * shown.seconds:.0f} ms{full}"
         )
 
     def _draw_features(self) -> None:

@@ -61,7 +61,7 @@ class RigView:
     def look_at_rig(self, drawn: Strokes, eye_mm: Floats) -> None:
         """Turn the view to the whole rig."""
         middle, radius = extent_mm(drawn, eye_mm)
-        self._look(middle, 0.95 * radius / np.sin(np.radians(_FIELD_DEG / 2)), np.array([0.45, -0.75, 0.5]))
+        self._look(middle, 1.25 * radius / np.sin(np.radians(_FIELD_DEG / 2)), np.array([0.45, -0.75, 0.5]))
 
     def look_at_eye(self, apex_mm: Floats) -> None:
         """Turn the view to an eye."""
