@@ -106,7 +106,7 @@ def render_windows(
             frame=frames.take([row]),
             row=row,
             window=done.window,
-            counts=_stored(scene, done.dn),
+            counts=stored(scene, done.dn),
             irradiance=done.irradiance,
             parts=done.labels.part,
             eye=job.eye,
@@ -210,7 +210,7 @@ def noiseless(image: EyeImage) -> NDArray[Any]:
     return dn.astype(np.uint8) if sensor.bit_depth == 8 else dn
 
 
-def _stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
+def stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
     """Convert counts to the type in which they are written, through the sensor's compression."""
     sensor = scene.spec.sensor
     if sensor.bit_depth != 8:

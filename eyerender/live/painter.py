@@ -25,14 +25,16 @@ from PIL import Image
 
 from ..arrays import Bytes, Floats
 from ..backends.choose import BackendChoice
-from ..capture import EyeImage, check_windows, make_renderer, moments, render_job
+from ..capture import EyeImage, check_windows, make_renderer, moments, render_job, stored
 from ..errors import EyerenderError, one_line
 from ..imagefile import preview
 from ..imageobserver import detect
 from ..observation import Observations
 from ..plausibility import is_saturated
 from ..rig.camera import PinholeCamera, Window
-from ..rig.exposure import expose
+from ..rig.defocus import vignette
+from ..rig.exposure import radiance_to_irradiance, recorded
+from ..rig.stray import framed, scattered
 from ..scene import Frames
 
 if TYPE_CHECKING:
@@ -326,11 +328,24 @@ def enlarged(picture: NDArray[Any], side: int, size_px: tuple[int, int]) -> Floa
 
 
 def _job(frame: Frames, draw: int) -> RenderJob:
-    """The job of a pass, with samples of its own. The sensor's noise is added to the mean of all passes."""
+    """The job of a pass, with samples of its own; what `developed` does to the whole picture is left out."""
     job = render_job(frame, 0)
     seed = int(np.random.SeedSequence([job.seed, draw]).generate_state(1, np.uint64)[0])
-    quiet = job.sensor.model_copy(update={"noise": False})
-    return replace(job, seed=seed, sensor=quiet, labels=False)
+    quiet = job.sensor.model_copy(update={"noise": False, "border_px": (0, 0, 0, 0)})
+    clear = job.lens.model_copy(update={"vignetting": 0.0, "glare": 0.0, "ghost": 0.0, "openings": ()})
+    return replace(job, seed=seed, sensor=quiet, lens=clear, labels=False)
+
+
+def developed(job: RenderJob, irradiance: Floats) -> tuple[Floats, NDArray[np.uint16]]:
+    """Irradiance (h, w) and codes of the sensor for the mean of all passes of a job.
+
+    Vignetting, openings, scattered light and the sensor belong to the window as a whole, so bands and coarse pixels
+    are rendered without them.
+    """
+    seen = (job.lens, job.camera, job.window)
+    picture = irradiance / radiance_to_irradiance(job.sensor) * vignette(*seen)
+    behind = scattered(framed(picture, *seen), *seen) * radiance_to_irradiance(job.sensor)
+    return behind, recorded(job.sensor, job.camera, job.window, behind, job.wavelength_nm, job.seed)
 
 
 def _shown(
@@ -347,8 +362,8 @@ def _shown(
     """Expose the sensor, find the features and make a file of the picture."""
     frame, order = canvas.order.frame, canvas.order
     scene, sensor = frame.scene, frame.scene.spec.sensor
-    own = render_job(frame, 0).seed
-    counts = expose(sensor, irradiance, scene.spec.wavelength_nm, own)
+    irradiance, codes = developed(render_job(frame, 0), irradiance)
+    counts = stored(scene, codes)
     image = EyeImage(
         frame=frame,
         row=0,
@@ -368,7 +383,7 @@ def _shown(
         coarse=coarse,
         size_px=(job.window[2], job.window[3]),
         window=job.window,
-        data=_encoded(preview(counts, sensor.full_scale_dn), kind),
+        data=_encoded(preview(counts, sensor.full_scale_dn, 2.2 / sensor.gamma), kind),
         kind=f"image/{kind.lower()}",
         found=detect(image) if order.extract else None,
         hidden=canvas.hidden,

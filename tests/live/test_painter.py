@@ -36,6 +36,14 @@ def setup():
 
 
 @pytest.fixture(scope="module")
+def blurry(setup):
+    """The same with everything that a lens and a sensor do to a whole picture."""
+    opening = {"half_size": [0.2, 0.12], "power": 4.0, "edge_px": 3.0}
+    lens = {"vignetting": 0.5, "glare": 0.1, "glare_radius_px": 20.0, "ghost": 0.02, "openings": [opening]}
+    return setup.changed({"lens": lens, "sensor.border_px": [250, 0, 0, 190]})
+
+
+@pytest.fixture(scope="module")
 def painter():
     painter = Painter(goal=16)
     painter.start()
@@ -86,6 +94,24 @@ def test_a_picture_is_shown_at_once_and_grows_better(painter, setup):
     found, truth = sent[-1].found, er.trace(frames).take([setup.row(frames)])
     assert found.pupil.ok[0]
     assert np.hypot(*(found.pupil.centre_px[0] - truth.pupil.centre_px[0])) < 0.3
+
+
+def test_bands_and_passes_give_the_picture_of_the_renderer(painter, blurry, monkeypatch):
+    monkeypatch.setattr("eyerender.live.painter.BUDGET_S", 0.0)
+    monkeypatch.setattr("eyerender.live.painter.BAND_PX", 4000)
+    tab = Tab(painter, "f")
+    tab.ask(order(1, blurry, extract=False))
+    while (shown := tab.next()).samples < 16:
+        pass
+    painter.drop("f")
+    frames = blurry.frames()
+    image = er.render(frames[blurry.row(frames)], spp=64)
+    expected = preview(image.counts, blurry.scene.spec.sensor.full_scale_dn).astype(float)
+    apart = pixels(shown) - expected
+    # A wrong veil, edge or seam differs by many grey levels over many pixels; the noise of single pixels does not.
+    assert np.abs(apart.reshape(24, 5, 32, 5).mean(axis=(1, 3))).max() < 2.0
+    assert np.ptp(expected) > 100
+    assert (expected[:, :10] == expected[0, 0]).all()  # the border
 
 
 def test_the_latest_order_wins(painter, setup):
