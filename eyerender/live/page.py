@@ -39,14 +39,20 @@ class Slider(ui.slider):
 
 
 class Knob:
-    """A number with a name, a slider and a field for exact values, which may lie beyond the slider's ends."""
+    """A number with a name, a slider and a field for exact values, which may lie beyond the slider's ends.
 
-    def __init__(self, name: str, unit: str, step: float, act: Callable[[float], None], *, digits: int = 1) -> None:
+    Without a `step`, the slider has some 500 of them.
+    """
+
+    def __init__(
+        self, name: str, unit: str, step: float | None, act: Callable[[float], None], *, digits: int = 1
+    ) -> None:
+        self._step = step
         self._act, self._quiet, self._digits, self._value = act, False, digits, 0.0
         self._number: Any
         with ui.element("div").classes("knob") as self.row:
             ui.label(f"{name} ({unit})").classes("name")
-            self._slider = Slider(min=0, max=1, step=step, on_change=lambda e: self._moved(e.value, self._number))
+            self._slider = Slider(min=0, max=1, step=step or 1, on_change=lambda e: self._moved(e.value, self._number))
             self._slider.props(f'aria-label="{name}" dense')
             self._number = ui.number(step=step, on_change=lambda e: self._moved(e.value, self._slider))
             self._number.props(f'aria-label="{name}, exact" dense borderless debounce=300 hide-bottom-space')
@@ -61,6 +67,8 @@ class Knob:
         low, high, value = min(low, value), max(high, value), round(value, self._digits)
         self._quiet, self._value = True, value
         self._slider.props["min"], self._slider.props["max"] = low, high
+        if self._step is None:
+            self._slider.props["step"] = _round_up(high - low) / 500
         self._slider.set_value(value)
         self._number.set_value(value)
         self._quiet = False
@@ -187,7 +195,7 @@ class Tab:
             self._eye = _choice("Eye", {eye: eye for eye in eyes}, lambda v: self._show(eye=v))
             self._camera = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), lambda v: self._show(camera=v))
             heads = {k: f"{k}" for k in range(len(spec.subject.head_positions_mm))}
-            self._head = _choice("Head", heads, lambda v: self._apply(lambda s: s.with_head(v)))
+            self._head = _choice("Head", heads, self._move_head)
         group.set_visibility(any(box.visible for box in (self._eye, self._camera, self._head)))
         with _group("Gaze"):
             name = "target" if spec.targets is not None else "pose"
@@ -204,11 +212,11 @@ class Tab:
             count = len(self._setup.scene.rig.lights)
             self._lamp = _choice("LED", {k: str(k) for k in range(count)}, self._choose_light)
             self._lamp_place = [Knob(axis, "mm", 0.5, lambda _: self._move_light()) for axis in AXES]
-            self._power = Knob("Intensity", "mW/sr", 0.01, lambda _: self._move_light(), digits=3)
+            self._power = Knob("Intensity", "mW/sr", None, lambda _: self._move_light(), digits=3)
         with _group("Camera"):
             self._chosen = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), self._choose_camera)
             self._camera_place = [Knob(axis, "mm", 0.5, lambda _: self._move_camera()) for axis in AXES]
-            self._aim = _button("Aim at the eye", lambda: self._apply(lambda s: s.with_camera_aimed(self._lens)))
+            self._aim = _button("Aim at the eye", self._aim_camera)
 
     # What the knobs do
 
@@ -249,6 +257,9 @@ class Tab:
 
         self._apply(change, refresh=True)
 
+    def _move_head(self, head: int) -> None:
+        self._apply(lambda setup: setup.with_head(head), refresh=True)
+
     def _follow(self, fixation: int) -> None:
         if fixation >= 0:
             self._apply(lambda setup: setup.following(fixation), refresh=True)
@@ -273,6 +284,10 @@ class Tab:
     def _move_camera(self) -> None:
         place = [knob.value for knob in self._camera_place]
         self._apply(lambda setup: setup.with_camera_at(self._lens, place))
+        self._refresh_light()  # rings move with their camera
+
+    def _aim_camera(self) -> None:
+        self._apply(lambda setup: setup.with_camera_aimed(self._lens), refresh=True)
 
     def _restart(self) -> None:
         self._apply(lambda _: Setup.of(self._studio.scene), refresh=True)
@@ -317,12 +332,15 @@ class Tab:
         region = scene.spec.region
         self._lid.enable(region is not None and region.head is None)
         self._lid.set(100 * (1 - (region.blink if region is not None else 0)), 0, 100)
-        lamp = scene.rig.lights[self._light]
+        self._refresh_light()
         apex = apex_mm(self._frames, self._row)
-        _set_place(self._lamp_place, lamp.position_mm, apex)
-        self._power.set(lamp.intensity_mw_sr, 0, _round_up(3 * lamp.intensity_mw_sr))
         _set_place(self._camera_place, scene.rig.cameras[self._lens].nodal_point_mm, apex)
         self._aim.set_enabled(scene.spec.rig.cameras[self._lens].calibration is None)
+
+    def _refresh_light(self) -> None:
+        lamp = self._setup.scene.rig.lights[self._light]
+        _set_place(self._lamp_place, lamp.position_mm, apex_mm(self._frames, self._row))
+        self._power.set(lamp.intensity_mw_sr, 0, _round_up(3 * lamp.intensity_mw_sr))
 
     @contextmanager
     def _silence(self) -> Iterator[None]:

@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..observation import EYES
 from ..rig.camera import Camera
 from ..scene import Frames, Scene
+from ..scene.scene import demand_d
 from ..scene.spec import EyeDirection, SceneSpec
 
 
@@ -44,6 +45,8 @@ class Setup:
     def of(cls, scene: Scene) -> Self:
         """The first frame of a scene."""
         spec = scene.spec
+        if spec.person is not None:  # the eyes of a drawn person depend on all targets, not on the one that is shown
+            scene = scene.with_({"subject.accommodation_d": demand_d(spec, scene.targets_mm)})
         start = cls(spec, scene, spec.subject.eyes[0])
         return start.following(0).with_head(0)
 
@@ -133,6 +136,7 @@ class Setup:
         data = shown.to_mapping()
         data["subject"] = {**data["subject"], "head_positions_mm": self.origin.subject.head_positions_mm}
         if self.fixation is not None:
+            data["subject"]["accommodation_d"] = self.origin.subject.accommodation_d
             data.pop("targets", None)
             data.pop("poses", None)
             kept = self.origin.to_mapping()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -127,6 +129,30 @@ def test_a_port_that_is_taken_is_one_line(server):
     assert done.stderr == f"error: --port: {server.port} cannot be used (Address already in use)\n"
 
 
+@contextlib.contextmanager
+def forwarded(port):
+    """Another port of this machine that leads to the server's, as `ssh -L` makes it."""
+
+    def carry(source, sink):
+        with contextlib.suppress(OSError):
+            while chunk := source.recv(65536):
+                sink.sendall(chunk)
+        with contextlib.suppress(OSError):
+            sink.shutdown(socket.SHUT_WR)
+
+    def accept():
+        with contextlib.suppress(OSError):
+            while True:
+                near = listener.accept()[0]
+                far = socket.create_connection(("127.0.0.1", port))
+                for pair in ((near, far), (far, near)):
+                    threading.Thread(target=carry, args=pair, daemon=True).start()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=accept, daemon=True).start()
+        yield listener.getsockname()[1]
+
+
 def text(driver, selector):
     return driver.execute_script("return document.querySelector(arguments[0])?.innerText ?? ''", selector)
 
@@ -180,6 +206,15 @@ def test_the_page_follows_refines_and_saves(server):
         urls = [part.split('"')[0] for m in asked for part in m.split('"url":"')[1:2]]
         outside = [url for url in urls if not url.startswith((own, "data:", "blob:", "chrome"))]
         assert outside == []
+
+
+@in_a_browser
+def test_the_page_works_through_another_port(server):
+    with forwarded(server.port) as port, chromium() as driver:
+        driver.get(f"http://localhost:{port}/{server.token}/")
+        until(lambda: pictured(driver), 120)
+        driver.execute_script(WATCH)
+        assert latency_s(driver, "Pupil", "ArrowRight", 60) > 0
 
 
 @in_a_browser

@@ -79,6 +79,17 @@ def test_the_shown_frame_is_that_of_the_whole_scene(desk):
         assert one.scene.window(0, 0, 0) == whole.scene.window(0, 0, 0)
 
 
+def test_a_drawn_person_has_the_same_eyes_as_in_the_whole_scene():
+    scene = er.load_scene("desktop_tracker").with_({"population": {"preset": "adults"}})
+    scene = scene.with_(targets={"world_mm": [[300, 0, 0], [900, 50, 0]]})
+    start = Setup.of(scene)
+    assert start.scene.eye("left") == scene.eye("left")
+    assert start.saved() == scene.located()
+    assert built(start.saved()) == start.saved()
+    alone = scene.with_(target_mm=[300, 0, 0])
+    assert alone.eye("left") != scene.eye("left")  # why it matters
+
+
 def test_head_positions_are_kept():
     scene = er.load_scene("blignaut2014").with_({"subject.head_positions_mm": [[0, 0, 0], [10, 0, 5]]})
     moved = Setup.of(scene).with_head(1)
