@@ -27,6 +27,8 @@ MAX_IMAGE_BYTES = 2**30
 # Pillow supports many more formats, some of which start other programs.
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "GIF", "WEBP", "JPEG2000")
 
+COLOURED = ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr", "HSV", "LAB")
+
 
 def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> None:
     """Write (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour, completely or not at all.
@@ -62,6 +64,23 @@ def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
         InputError: the file is missing, not regular, unreadable, empty or too large, or the image has real colour,
             transparency or several frames.
     """
+    image, depth, _ = _read(path, colour=False)
+    return image, depth
+
+
+def read_any_image(path: str | Path) -> tuple[NDArray[Any], int, bool]:
+    """Read an image like `read_image`, but take the luminance (ITU-R BT.601) where it has real colour.
+
+    Returns:
+        The image and its bit depth as of `read_image`, and whether it has colour.
+
+    Raises:
+        InputError: as `read_image`, except for colour.
+    """
+    return _read(path, colour=True)
+
+
+def _read(path: str | Path, *, colour: bool) -> tuple[NDArray[Any], int, bool]:
     source = str(path)
     try:
         with opened(path, limit=MAX_IMAGE_BYTES) as data:
@@ -69,7 +88,7 @@ def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
                 raise InputError("is empty", source=source)
             # Where Pillow warns, it either reads the image nevertheless or fails with an error.
             with warnings.catch_warnings(action="ignore"), Image.open(data, formats=FORMATS) as file:
-                return _decoded(file, source)
+                return _decoded(file, source, colour)
     except InputError:
         raise
     except MemoryError:
@@ -79,31 +98,37 @@ def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
         raise InputError("is not a readable image", source=source) from None
 
 
-def _decoded(file: Image.Image, source: str) -> tuple[NDArray[Any], int]:
+def _decoded(file: Image.Image, source: str, colour: bool) -> tuple[NDArray[Any], int, bool]:
     if file.width * file.height > MAX_PIXELS:
         raise InputError(f"is too large ({file.width} x {file.height} pixels)", source=source)
     # Counting the frames would read the whole file.
     if getattr(file, "is_animated", False):
         raise InputError("holds several images; give a file with one", source=source)
-    mode = file.mode
-    if mode in ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr", "HSV", "LAB"):
-        if file.has_transparency_data and np.asarray(file.convert("RGBA"))[..., 3].min() < 255:
-            raise InputError("has transparent pixels", source=source)
-        grey = _same_channels(file)
-        if grey is None:
-            raise InputError(f"has colour channels ({mode}); give a greyscale near-infrared image", source=source)
-        return grey, 8
+    if file.mode in COLOURED:
+        return _from_colour(file, source, colour)
     file.load()
     data = np.asarray(file)
-    if mode == "1":
-        return data.astype(np.uint8) * np.uint8(255), 8
-    if mode == "L":
-        return data, 8
-    if mode == "F":
-        return data.astype(np.float32), 32
+    if file.mode == "1":
+        return data.astype(np.uint8) * np.uint8(255), 8, False
+    if file.mode == "L":
+        return data, 8, False
+    if file.mode == "F":
+        return data.astype(np.float32), 32, False
     if data.min(initial=0) < 0 or data.max(initial=0) > 65535:
         raise InputError("has values outside 16 bits", source=source)
-    return data.astype(np.uint16), 16
+    return data.astype(np.uint16), 16, False
+
+
+def _from_colour(file: Image.Image, source: str, colour: bool) -> tuple[Bytes, int, bool]:
+    """Grey levels of a file with colour channels; real colour only where it is allowed."""
+    if file.has_transparency_data and np.asarray(file.convert("RGBA"))[..., 3].min() < 255:
+        raise InputError("has transparent pixels", source=source)
+    grey = _same_channels(file)
+    if grey is not None:
+        return grey, 8, False
+    if not colour:
+        raise InputError(f"has colour channels ({file.mode}); give a greyscale near-infrared image", source=source)
+    return np.asarray(file.convert("RGB").convert("L")), 8, True
 
 
 def _same_channels(file: Image.Image) -> Bytes | None:

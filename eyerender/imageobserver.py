@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +18,18 @@ from numpy.typing import NDArray
 from .arrays import Floats, Ints
 from .backends.choose import BackendChoice
 from .capture import EyeImage, render_windows
-from .errors import InputError
+from .errors import InputError, InputWarning, Warn
 from .extraction import Extraction, ExtractionSettings, extract
 from .extraction.glints.matching import assign_lights, predict_glints
+from .extraction.overlay import overlay
+from .extraction.pair import extract_eyes
+from .extraction.preprocessing import single_threaded
 from .eye.spec import EyeSpec
 from .files import parse_json
-from .imagefile import read_image
+from .imagefile import read_any_image, write_png
 from .imagefolder import DATASET, ImageEntry, ImageFolder
 from .observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
-from .progress import Progress, followed
+from .progress import Progress, followed, followed_by
 from .rig.camera import PinholeCamera
 from .rig.rig import RigLike
 from .scene import Frames, Scene
@@ -32,6 +38,8 @@ from .scene.spec import SceneSpec
 # Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
 _PLACE_MM = 1.5
 _BATCH = 256
+# A process takes a second to start, as long as some thirty images take.
+LEAST_FOR_POOL = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,31 +105,60 @@ class ImageObserver:
         return concatenate([*parts, *few])
 
     def observe_files(
-        self, paths: Sequence[str | Path], *, scene: Scene | None = None, progress: Progress | None = None
+        self,
+        paths: Sequence[str | Path],
+        *,
+        scene: Scene | None = None,
+        progress: Progress | None = None,
+        eyes: int = 1,
+        processes: int = 1,
+        pictures: Path | None = None,
+        warn: Warn | None = None,
     ) -> Observations:
-        """Extract the features of any greyscale images, or of one folder that this package wrote.
+        """Extract the features of any images, or of one folder that this package wrote.
 
-        Each image shows one eye and counts as a frame; with a scene its glints are assigned to lights.
+        Each image is a frame; with a scene its glints are assigned to lights.
+
+        Args:
+            paths: images, or one folder.
+            scene: the scene whose rig took the images.
+            progress: called after each image.
+            eyes: 1, or 2 for images of both eyes. The eye on the image's left is then the right eye, as a camera in
+                front of the subject sees it.
+            processes: how many images are worked on at the same time.
+            pictures: folder for a picture of what was found in each image.
+            warn: receives a warning if images have colour.
         """
         if len(paths) == 1 and os.path.isdir(paths[0]):
             folder = ImageFolder.load(paths[0])
             return self.observe_folder(folder, scene or scene_of(folder), progress=progress)
+        parts, coloured = [], 0
+        job = _FileJob(self.settings, self.gamma, eyes, pictures)
+        with _mapper(processes if len(paths) >= LEAST_FOR_POOL else 1) as each:
+            for k, (found, shape, colour) in enumerate(followed_by(each(job, paths), len(paths), progress)):
+                coloured += colour
+                parts.append(self.observe_found(found, k, shape, scene=scene, source=str(paths[k])))
+        if coloured and warn is not None:
+            warn([colour_warning(coloured, "images" if coloured > 1 else "image")])
+        return concatenate(parts)
+
+    def observe_found(
+        self, found: Sequence[Extraction], frame: int, shape: tuple[int, int], *, scene: Scene | None, source: str
+    ) -> Observations:
+        """Report what was extracted from a whole sensor image (h, w): of one eye, or of the left and right half."""
         parts = []
-        for k, path in enumerate(followed(paths, progress)):
-            image, depth = read_image(path)
-            found = extract(image, bit_depth=depth if depth <= 16 else None, gamma=self.gamma, settings=self.settings)
-            lights = [-1] * len(found.glints)
-            reasons: Sequence[str | None] = [None] * len(found.glints)
+        for side, one in enumerate(found):
+            lights: Sequence[int] = [-1] * len(one.glints)
+            reasons: Sequence[str | None] = [None] * len(one.glints)
             if scene is not None:
                 # The part of the sensor that a single image shows is unknown, so only a whole sensor image can be
                 # placed.
                 camera = scene.rig.cameras[0]
-                if image.shape != (camera.resolution_px[1], camera.resolution_px[0]):
-                    raise InputError(
-                        f"is {image.shape[1]} x {image.shape[0]} px, but the scene's sensor is not", source=str(path)
-                    )
-                lights, reasons = _lights(found, np.zeros(2), scene, camera, np.full(3, np.nan))
-            parts.append(_observation(found, lights, reasons, np.zeros(2), Index(frame=np.array([k]))))
+                if shape != (camera.resolution_px[1], camera.resolution_px[0]):
+                    raise InputError(f"is {shape[1]} x {shape[0]} px, but the scene's sensor is not", source=source)
+                lights, reasons = _lights(one, np.zeros(2), scene, camera, np.full(3, np.nan))
+            eye = np.array([side if len(found) > 1 else -1])
+            parts.append(_observation(one, lights, reasons, np.zeros(2), Index(frame=np.array([frame]), eye=eye)))
         return concatenate(parts)
 
     def _observe_rows(
@@ -154,6 +191,53 @@ class ImageObserver:
             lights, reasons = _lights(found, corner, scene, camera, eye_mm)
             parts.append(_observation(found, lights, reasons, corner, index.take([row])))
         return concatenate(parts)
+
+
+@dataclass(frozen=True, slots=True)
+class _FileJob:
+    """What is done with one image file; a process of its own may do it."""
+
+    settings: ExtractionSettings
+    gamma: float
+    eyes: int
+    pictures: Path | None
+
+    def __call__(self, path: str | Path) -> tuple[tuple[Extraction, ...], tuple[int, int], bool]:
+        """What was found in a file, its (h, w), and whether it has colour."""
+        image, depth, colour = read_any_image(path)
+        options: dict[str, Any] = {
+            "bit_depth": depth if depth <= 16 else None,
+            "gamma": self.gamma,
+            "settings": self.settings,
+        }
+        found = extract_eyes(image, **options) if self.eyes == 2 else (extract(image, **options),)
+        if self.pictures is not None:
+            full = float(2**depth - 1) if depth <= 16 else float(max(image.max(), 1e-9))
+            picture = overlay(image, found, full)
+            write_png(self.pictures / f"{Path(path).stem}.png", np.ascontiguousarray(picture[..., ::-1]))
+        return found, (image.shape[0], image.shape[1]), colour
+
+
+def colour_warning(count: int, what: str) -> InputWarning:
+    """Warning that images or frames have colour."""
+    return InputWarning(
+        code="colour", reason=f"{count} {what} in colour; the luminance is taken, but near-infrared images are grey"
+    )
+
+
+@contextmanager
+def _mapper(processes: int) -> Iterator[Callable[[_FileJob, Sequence[str | Path]], Iterable[Any]]]:
+    """A map of a job over paths, in this process or in several, in the order of the paths."""
+    if processes <= 1:
+        yield lambda job, paths: map(job, paths)
+        return
+    # New processes: those that are forked inherit the threads of OpenCV and of the renderer in a broken state.
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=single_threaded) as pool:
+        try:
+            yield lambda job, paths: pool.map(job, paths, chunksize=4)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def detect(
@@ -240,8 +324,13 @@ def _lights(
 def _observation(
     found: Extraction, lights: Sequence[int], reasons: Sequence[str | None], corner: Floats, index: Index
 ) -> Observations:
-    """Convert the extraction of one image to a batch of one; `corner` shifts it to full-sensor pixels."""
-    pupil, glints = found.pupil, found.glints
+    """Convert the extraction of one image to a batch of one; `corner` shifts it to full-sensor pixels.
+
+    Glints are in the order of the rig's lights, and those of no light follow.
+    """
+    order = sorted(range(len(lights)), key=lambda i: (lights[i] < 0, lights[i]))
+    lights, reasons = [lights[i] for i in order], [reasons[i] for i in order]
+    pupil, glints = found.pupil, [found.glints[i] for i in order]
     m = len(glints)
     known: dict[str, Any] = {"status": [pupil.status], "reason": [pupil.reason]}
     if pupil.ellipse is not None:

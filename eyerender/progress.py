@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar
 
 Progress = Callable[[int, int, str], None]
@@ -15,9 +15,14 @@ T = TypeVar("T")
 
 def followed(items: Sequence[T], progress: Progress | None) -> Iterator[T]:
     """Yield items, and report after each; the first report, of none done, states the total."""
+    return followed_by(items, len(items), progress)
+
+
+def followed_by(items: Iterable[T], total: int, progress: Progress | None) -> Iterator[T]:
+    """Yield `total` items that come one by one, and report like `followed`."""
     if progress is not None:
-        progress(0, len(items), "")
+        progress(0, total, "")
     for k, item in enumerate(items):
         yield item
         if progress is not None:
-            progress(k + 1, len(items), "")
+            progress(k + 1, total, "")

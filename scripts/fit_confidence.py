@@ -1,18 +1,24 @@
 #!/usr/bin/env python3
-"""Fit the weights of the extractor's confidence on ideal images and print the table of confidence.py.
+"""Fit the weights of the extractor's confidence on drawn and rendered images and print the table of scoring.py.
 
-    fit_confidence.py [--count 8000] [--processes 2]
+    fit_confidence.py [--rendered DIR] [--count 1200] [--faces 60] [--processes 2] [--write]
 
-It uses development seeds only (below 10,000): `count` mixed images and a tenth as many without an eye. It takes about a
-quarter of an hour.
+It uses development seeds only (below 10,000): `count` mixed images, a sixth as many without an eye, a tenth as many of
+each hard condition, and `faces` of each row of hard_eyes.py, which are rendered into DIR where they are not there yet.
+All hypotheses of the search are judged, the likeliest few also by the pixel model. The calibration is that of the
+hypotheses that the search would choose. `--write` replaces the table in scoring.py.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import re
 import textwrap
+from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing import Pool
+from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -20,64 +26,135 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+import hard_eyes
 import make_ideal_images as ideal
-from eyerender.extraction import ExtractionSettings, extract
-from eyerender.extraction.pupil.scoring import TABLE, design, features
+from eyerender.extraction import ExtractionSettings
+from eyerender.extraction.pipeline import explained
+from eyerender.extraction.preprocessing import prepare
+from eyerender.extraction.pupil import scoring, search
+from eyerender.extraction.pupil.scoring import FEATURES, TABLE, design, features, goodness_of
+from eyerender.extraction.settings import Shape
 from eyerender.geometry.ellipse import Ellipse, iou
 
 Array = NDArray[np.float64]
 METHODS: tuple[Literal["fast", "refined"], ...] = ("fast", "refined")
 PRIOR_VARIANCE = 20.0
 FOLDS = 10
-EYELESS = -1  # seeds below this stand for images without an eye
+REFINED_OF_IMAGE = 3  # hypotheses of an image to which the pixel model is fitted
+HARD = ("ring-light", "jpeg", "grey-pupil", "any-size", "eight-glints")
+Task = tuple[str, int]
 
 
-def observe(seed: int) -> list[tuple[Array, bool] | None]:
-    """(features, whether IoU > 0.9) by each method; None where nothing was found."""
+@dataclass(slots=True)
+class Observed:
+    """All hypotheses of one image: features by each method (n, f), which are right, late, or with a dark core.
+
+    `refined` are the numbers of those to which the pixel model was fitted.
+    """
+
+    fast: list[Array] = field(default_factory=list)
+    pixel: list[Array] = field(default_factory=list)
+    refined: list[int] = field(default_factory=list)
+    right: list[bool] = field(default_factory=list)
+    right_refined: list[bool] = field(default_factory=list)
+    late: list[bool] = field(default_factory=list)
+    core: list[bool] = field(default_factory=list)
+
+
+def _image_of(task: Task, folder: Path) -> tuple[Any, int, Ellipse | None]:
+    row, seed = task
+    if row == "no eye":
+        return ideal.draw_no_eye(seed), 8, None
+    if row in hard_eyes.ROWS:
+        eye = hard_eyes.load(hard_eyes.render_one((row, seed, folder)))
+        return eye.image, eye.bit_depth, eye.pupil
+    drawing = ideal.draw(row, seed)
+    label = drawing.label["pupil"]
+    return (
+        drawing.image,
+        drawing.parameters["bit_depth"],
+        Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"]),
+    )
+
+
+def observe(task: Task, folder: Path) -> Observed:
+    """Judge the hypotheses of one image."""
     cv2.setNumThreads(1)
-    truth = None
-    if seed <= EYELESS:
-        image: Any = ideal.draw_no_eye(EYELESS - seed)
-    else:
-        drawing = ideal.draw("mixed", seed)
-        image, label = drawing.image, drawing.label["pupil"]
-        truth = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"])
-    out: list[tuple[Array, bool] | None] = []
-    for method in METHODS:
-        pupil = extract(image, settings=ExtractionSettings(method=method, min_confidence=0.0)).pupil
-        if pupil.ellipse is None or pupil.goodness is None:
-            out.append(None)
-        else:
-            right = truth is not None and iou(pupil.ellipse, truth) > 0.9
-            out.append((features(pupil.ellipse, pupil.goodness), right))
+    ideal.CELLS = 2
+    image, depth, truth = _image_of(task, folder)
+    out = Observed()
+    prepared = prepare(image, depth, 1.0)
+    if isinstance(prepared, str):
+        return out
+    rough = ExtractionSettings(min_confidence=0.0)
+    boundaries: list[Any] = []
+    for late, found in search.hypotheses(prepared, Shape.of(rough, prepared.linear.shape)):
+        if isinstance(found, str):
+            continue
+        out.fast.append(features(found.boundary.ellipse, goodness_of(found, None)))
+        out.right.append(truth is not None and iou(found.boundary.ellipse, truth) > 0.9)
+        out.late.append(late or found.core_dn > 0.0)
+        out.core.append(found.core_dn > 0.0)
+        boundaries.append(found)
+    # The right ones and the most visible ones: those that may be chosen.
+    order = sorted(range(len(boundaries)), key=lambda i: -boundaries[i].boundary.support)
+    for i in order[:REFINED_OF_IMAGE]:
+        pupil = explained(prepared, boundaries[i], rough).pupil
+        if pupil.ellipse is not None and pupil.goodness is not None:
+            out.refined.append(i)
+            out.pixel.append(features(pupil.ellipse, pupil.goodness))
+            out.right_refined.append(truth is not None and iou(pupil.ellipse, truth) > 0.9)
     return out
 
 
-def fit(rows: Array, right: Array) -> tuple[Array, Array, Array, Array]:
+def chosen(observed: Observed, logit: Array) -> int | None:
+    """The hypothesis that the search takes, from the logits of all; None if there are none."""
+    sure, late = math.log(search.SURE / (1.0 - search.SURE)), math.log(1.0 / (1.0 / search.LATE_CONFIDENCE - 1.0))
+    best = None
+    for i in range(logit.size):
+        if logit[i] >= sure and not observed.core[i]:
+            return i
+        if not (observed.late[i] and logit[i] < late) and (best is None or logit[i] > logit[best]):
+            best = i
+    return best
+
+
+def fit(rows: Array, right: Array, group: Array, observed: list[Observed] | None) -> tuple[Array, Array, Array, Array]:
     """(low, high, weights, calibration).
 
-    The calibration is fitted to the outcomes and the logits of ten-fold cross-validation, so that it takes out the
-    optimism that the weights bring along. Source: Platt (1999), with a bend.
+    The calibration is fitted to the outcomes and the logits of ten-fold cross-validation over images, so that it takes
+    out the optimism that the weights bring along; with `observed`, only of the hypotheses that would be chosen. Source:
+    Platt (1999), with a bend.
     """
     low, high = np.percentile(rows, (1.0, 99.0), axis=0)
     columns = design(rows, low, high)
-    fold = np.random.default_rng(0).integers(0, FOLDS, right.size)
+    # An image counts as much as two hypotheses, however many it has.
+    weight = np.minimum(2.0 / np.bincount(group)[group], 1.0)
+    fold = np.random.default_rng(0).integers(0, FOLDS, int(group.max()) + 1)[group]
     logit = np.empty(right.size)
     for k in range(FOLDS):
-        logit[fold == k] = columns[fold == k] @ _weights(columns[fold != k], right[fold != k], PRIOR_VARIANCE)
-    bend = _weights(np.stack([np.ones_like(logit), logit, np.minimum(logit, 1.0)], axis=-1), right, math.inf)
-    return low, high, _weights(columns, right, PRIOR_VARIANCE), bend
+        train = fold != k
+        logit[~train] = columns[~train] @ _weights(columns[train], right[train], weight[train], PRIOR_VARIANCE)
+    told = np.arange(right.size)
+    if observed is not None:
+        first = np.concatenate([[0], np.cumsum([len(one.fast) for one in observed])])
+        picks = [(k, chosen(one, logit[first[k] : first[k + 1]])) for k, one in enumerate(observed)]
+        told = np.array([first[k] + i for k, i in picks if i is not None])
+    taken = logit[told]
+    columns_of_bend = np.stack([np.ones_like(taken), taken, np.minimum(taken, 1.0)], axis=-1)
+    bend = _weights(columns_of_bend, right[told], np.ones(told.size), math.inf)
+    return low, high, _weights(columns, right, weight, PRIOR_VARIANCE), bend
 
 
-def _weights(columns: Array, right: Array, variance: float) -> Array:
+def _weights(columns: Array, right: Array, weight: Array, variance: float) -> Array:
     """Logistic regression, Gaussian prior on all weights but the first."""
 
     def cost(weights: Array) -> tuple[float, Array]:
         logit = columns @ weights
         probability = 1.0 / (1.0 + np.exp(-logit))
         prior = np.concatenate([[0.0], weights[1:]]) / variance
-        value = np.sum(np.logaddexp(0.0, logit) - right * logit) + 0.5 * float(prior @ weights)
-        return float(value), columns.T @ (probability - right) + prior
+        value = np.sum(weight * (np.logaddexp(0.0, logit) - right * logit)) + 0.5 * float(prior @ weights)
+        return float(value), columns.T @ (weight * (probability - right)) + prior
 
     start = np.zeros(columns.shape[1])
     found = minimize(cost, start, jac=True, method="L-BFGS-B", options={"maxiter": 5000, "maxfun": 20000})
@@ -90,32 +167,50 @@ def lines(values: Array) -> str:
     return textwrap.indent(f"(\n{textwrap.indent(body, '    ')},\n),", " " * 8)
 
 
+def table_of(observed: list[Observed]) -> str:
+    """The table's source."""
+    text = ["TABLE: dict[str, tuple[tuple[float, ...], ...]] = {"]
+    for method in METHODS:
+        fast = method == "fast"
+        rows = np.array([row for one in observed for row in (one.fast if fast else one.pixel)])
+        right = np.array(
+            [ok for one in observed for ok in (one.right if fast else one.right_refined)], dtype=np.float64
+        )
+        group = np.array([k for k, one in enumerate(observed) for _ in (one.fast if fast else one.pixel)])
+        text.append(f'    "{method}": (')
+        text += [lines(values) for values in fit(rows, right, group, observed if fast else None)]
+        text.append(f"    ),  # {right.size} hypotheses, {100 * right.mean():.1f} % of them right")
+    return "\n".join([*text, "}  # fmt: skip", ""])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=8000)
+    parser.add_argument("--rendered", type=Path, default=Path("hard_eyes"))
+    parser.add_argument("--count", type=int, default=1200)
+    parser.add_argument("--faces", type=int, default=60)
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     if not 0 < options.count <= 10_000:
         raise SystemExit("error: --count: must be between 1 and 10,000 (the seeds for development)")
+    options.rendered.mkdir(parents=True, exist_ok=True)
     # The table of other features would not fit; extraction needs one to report a number.
+    size = len(FEATURES)
     for method in METHODS:
-        TABLE[method] = ((0.0,) * 15, (1.0,) * 15, (0.0,) * 46, (0.0, 1.0, 0.0))
-    # Half the cells of the images that are reported on: outlines are still sampled 8 times a pixel, at a quarter of the
-    # time.
-    ideal.CELLS = 2
-    seeds = [*range(options.count), *(EYELESS - i for i in range(options.count // 10))]
+        TABLE[method] = ((0.0,) * size, (1.0,) * size, (0.0,) * (1 + 3 * size), (0.0, 1.0, 0.0))
+    tasks: list[Task] = [("mixed", seed) for seed in range(options.count)]
+    tasks += [("no eye", seed) for seed in range(options.count // 6)]
+    tasks += [(row, seed) for row in HARD for seed in range(options.count // 10)]
+    tasks += [(row, seed) for row in hard_eyes.ROWS for seed in range(options.faces)]
     with Pool(options.processes) as pool:
-        observed = pool.map(observe, seeds, chunksize=20)
-    print("TABLE: dict[str, tuple[tuple[float, ...], ...]] = {")
-    for i, method in enumerate(METHODS):
-        found = [one for item in observed if (one := item[i]) is not None]
-        rows, right = np.array([row for row, _ in found]), np.array([float(ok) for _, ok in found])
-        table = fit(rows, right)
-        print(f'    "{method}": (')
-        for values in table:
-            print(lines(values))
-        print(f"    ),  # {len(found)} found, {100 * right.mean():.1f} % of them right")
-    print("}  # fmt: skip")
+        observed = pool.map(partial(observe, folder=options.rendered), tasks, chunksize=8)
+    table = table_of([one for one in observed if one.fast])
+    if options.write:
+        path = Path(scoring.__file__)
+        source = re.sub(r"TABLE: dict.*", lambda _: table, path.read_text(), flags=re.DOTALL)
+        path.write_text(source)
+    else:
+        print(table)
 
 
 if __name__ == "__main__":

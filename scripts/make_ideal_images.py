@@ -14,6 +14,7 @@ The folder holds `metadata.jsonl` (one record per image), `images/` and `dataset
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import math
 import zlib
@@ -45,12 +46,14 @@ class Condition:
     step: tuple[float, float] = (55.0, 55.0)  # pupil to iris
     texture: tuple[float, float] = (0.0, 0.0)
     lid: tuple[float, float] | None = None  # covered part of the pupil, in units of its vertical semi-axis
-    glints: str = "isolated"  # isolated | edge | saturated | ring | scatter | none
+    glints: str = "isolated"  # isolated | edge | saturated | ring | eight | scatter | none
     glint_peak: float = 225.0  # grey level at the spot's centre, background included
     glint_sigma: tuple[float, float] = (1.0, 1.6)  # of the blurred spot
     bare_globe: bool = False  # the eyeball before a darker backdrop
     bright_pupil: bool = False
     bit_depth: int = 8
+    jpeg: tuple[int, int] | None = None  # range of the quality with which the image is compressed
+    log_size: bool = False  # the semi-axis is drawn evenly in its logarithm
 
 
 CONDITIONS: dict[str, Condition] = {
@@ -72,6 +75,25 @@ CONDITIONS: dict[str, Condition] = {
     ),
     "head-mounted": Condition(
         semi_axis=(60, 90), noise=(2, 4), aspect=(0.6, 1.0), glints="ring", glint_sigma=(1.2, 2.0), texture=(0, 6)
+    ),
+    "eight-glints": Condition(noise=(2, 2), glints="eight"),
+    # A ring light close to the eye: eight spots fill a small pupil.
+    "ring-light": Condition(
+        size=(320, 240), semi_axis=(14, 28), aspect=(0.85, 1.0), noise=(1, 4), glints="eight",
+        glint_sigma=(1.2, 2.2), texture=(0, 6),
+    ),
+    "jpeg": Condition(
+        size=(320, 240), semi_axis=(11, 40), noise=(1, 4), blur=(0.8, 2.0), texture=(0, 6), glints="scatter",
+        jpeg=(20, 50),
+    ),
+    # The pupil has 0.3 to 0.6 of the iris' level.
+    "grey-pupil": Condition(
+        size=(320, 240), semi_axis=(12, 40), noise=(1, 4), pupil_level=(40, 66), step=(44, 90), texture=(0, 5),
+        glints="scatter",
+    ),
+    "any-size": Condition(
+        size=(1280, 960), semi_axis=(5, 200), noise=(1, 3), blur=(0.7, 1.2), texture=(0, 4), glints="two",
+        glint_sigma=(0.8, 1.4), log_size=True,
     ),
     # Wide: what a calibrated confidence has to stand; about one image in five is beyond any extractor.
     "mixed": Condition(
@@ -143,7 +165,7 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
     pupil_level = pick(c.pupil_level)
     iris_level = pupil_level + step
     sclera_level = min(2.0 * max(iris_level, 40.0), 200.0)
-    a = pick(c.semi_axis)
+    a = float(np.exp(rng.uniform(*np.log(c.semi_axis)))) if c.log_size else pick(c.semi_axis)
     reach = min(2.4 * a, 0.42 * height)
     spread = 0.12 * np.array([width, height])
     pupil = _Conic(
@@ -188,7 +210,9 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
 
     full = 2**c.bit_depth - 1
     data = (image + rng.normal(0.0, 1.0, image.shape) * noise) * (full / 255.0)
-    dtype = np.uint8 if c.bit_depth == 8 else np.uint16
+    stored = np.clip(np.rint(data), 0, full).astype(np.uint8 if c.bit_depth == 8 else np.uint16)
+    if c.jpeg is not None:
+        stored = _compressed(stored, int(rng.integers(*c.jpeg, endpoint=True)))
     record = _record(pupil, glints, seed)
     parameters = {
         "condition": name, "seed": seed, "noise_dn": noise, "blur_px": blur, "step_dn": step, "texture_dn": texture,
@@ -196,7 +220,14 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
         "bit_depth": c.bit_depth,
         "pupil_contrast_to_noise": abs(step) / max(noise, 1e-9), "polarity": "bright" if c.bright_pupil else "dark",
     }  # fmt: skip
-    return Drawing(np.clip(np.rint(data), 0, full).astype(dtype), record, parameters)
+    return Drawing(stored, record, parameters)
+
+
+def _compressed(image: NDArray[Any], quality: int) -> NDArray[Any]:
+    """What JPEG leaves of an image."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "jpeg", quality=quality)
+    return np.asarray(Image.open(buffer))
 
 
 def draw_no_eye(seed: int, size: tuple[int, int] = (320, 240)) -> NDArray[np.uint8]:
@@ -301,8 +332,16 @@ def _place_glints(c: Condition, pupil: _Conic, iris: _Conic, rng: np.random.Gene
     """Spots with their true centre and sigma; the wanted clearances are met by drawing again."""
     if c.glints == "none":
         return []
+    if c.glints == "eight":
+        middle, radius = pupil.at(rng.uniform(0.0, 0.35), rng.uniform(0.0, 2.0 * math.pi)), rng.uniform(0.45, 0.8)
+        turn = rng.uniform(0.0, 2.0 * math.pi) + np.arange(8) * (math.pi / 4.0)
+        around = radius * pupil.semi[1] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        return [
+            {"xy": middle + xy, "sigma": float(s)} for xy, s in zip(around, rng.uniform(*c.glint_sigma, 8), strict=True)
+        ]
     sigma = [float(s) for s in rng.uniform(*c.glint_sigma, 6)]
-    count = {"isolated": 2, "saturated": 2, "edge": 2, "ring": 6, "scatter": int(rng.integers(0, 4))}[c.glints]
+    some = {"scatter": 4, "two": 3}
+    count = {"isolated": 2, "saturated": 2, "edge": 2, "ring": 6}.get(c.glints) or int(rng.integers(0, some[c.glints]))
     clearance = 4.0 * max(sigma[:count], default=1.0) + 2.0
     spots: list[Array] = []
     start = rng.uniform(0.0, 2.0 * math.pi)
@@ -316,7 +355,7 @@ def _place_glints(c: Condition, pupil: _Conic, iris: _Conic, rng: np.random.Gene
             if c.glints == "edge" and index == 0:
                 spot = pupil.at(1.0, t) + rng.uniform(-0.7, 0.7, 2)
                 break
-            if c.glints == "scatter":
+            if c.glints in some:
                 spot = iris.at(math.sqrt(rng.uniform(0.0, 1.0)), t)
                 free = True
             else:

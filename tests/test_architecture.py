@@ -44,6 +44,7 @@ FLOORS = {
     "gaze": 5,
     "capture": 6,
     "imageobserver": 6,
+    "videoobserver": 6,
     "labels": 6,
     "images": 6,
     "comparison": 6,
@@ -81,6 +82,7 @@ ORDER = [
     "comparison",
     "capture",
     "imageobserver",
+    "videoobserver",
     "labels",
     "images",
 ]
@@ -156,7 +158,7 @@ def test_datasets_use_opencv_for_nothing_but_videos():
 @pytest.mark.parametrize("observer", ["analytic", "image"])
 def test_observers_are_siblings(observer):
     """Neither observer uses the other; what composes both stands above them."""
-    image = {"rendering", "extraction", "capture", "imageobserver"}
+    image = {"rendering", "extraction", "capture", "imageobserver", "videoobserver"}
     own, other = ({"analytic"}, image) if observer == "analytic" else (image, {"analytic"})
     used = {
         name.split(".")[1]
@@ -216,11 +218,10 @@ def test_public_names_are_pinned():
         "ImageObserver", "InputError", "LabelledImage", "Lashes", "Led", "LedRing", "Lens", "Lid", "Look", "Motion",
         "Observations", "Observer", "Opening", "Panel", "Picture", "PinholeCamera", "Population", "PupilMargin",
         "RadianceMap", "Region", "Rig", "RigGeometry", "Scene", "SceneSpec", "Screen", "Sensor", "Skin", "Status",
-        "Subject", "SyntEye", "SyntEyes", "Targets", "TearFilm", "TopographySpec", "__version__", "auto_exposed",
-        "bench_extractors", "compare", "compare_folder", "detect", "estimate", "export", "export_scene", "extract",
-        "gaze", "generate", "kappa_deg", "load_eye", "load_scene", "preview", "read_topography", "render",
-        "render_folder", "render_windows", "run_quickstart", "sample", "shipped_scenes", "trace", "validate",
-        "with_kappa", "write_report",
+        "Subject", "Targets", "TearFilm", "__version__", "auto_exposed", "bench_extractors", "compare",
+        "compare_folder", "detect", "estimate", "export", "export_scene", "extract", "gaze", "generate", "load_eye",
+        "load_scene", "preview", "render", "render_folder", "render_windows", "run_quickstart", "sample",
+        "shipped_scenes", "trace", "validate", "write_report",
     ]  # fmt: skip
     for name in eyerender.__all__:
         assert getattr(eyerender, name) is not None

@@ -1,6 +1,7 @@
 """A labelled folder for the bench: images, true features in image coordinates, hints, and factors that vary.
 
-Two kinds are read: what this package renders (docs/formats.md), and folders of ideal images.
+Three kinds are read: what this package renders (docs/formats.md), folders of ideal images, and a person's own images
+with labels (`own`).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..files import inside, read_json
 from ..geometry.ellipse import Ellipse
-from ..imagefile import read_image
+from ..imagefile import read_any_image, read_image
 from ..imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ..jsonlines import JsonLines
 from ..observation import Observations
@@ -25,6 +26,7 @@ from ..rig.camera import PinholeCamera
 from ..rig.rig import RigGeometry
 from ..scene import Scene
 from ..scene.spec import SceneSpec
+from .own import is_own, own_labels
 
 IDEAL_SCHEMA = "eyerender/ideal-images/1"
 # Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens them.
@@ -79,6 +81,8 @@ def load_labelled(folder: str | Path) -> list[LabelledImage]:
     path = Path(folder)
     if _is_ideal(path):
         return _load_ideal(path)
+    if is_own(path):
+        return _load_own(path)
     images = ImageFolder.load(path)
     truth = images.truth()
     scene_rig = _rig_of(images)
@@ -93,6 +97,30 @@ def load_labelled(folder: str | Path) -> list[LabelledImage]:
             )
         # There is one record per image, so an image's row in the truth is its number.
         out.append(_rendered(entry, truth, k, scene_rig))
+    return out
+
+
+def _load_own(folder: Path) -> list[LabelledImage]:
+    out = []
+    for name, path, pupil in own_labels(folder):
+        image, depth, _ = read_any_image(path)
+        out.append(
+            LabelledImage(
+                name,
+                path,
+                depth,
+                (image.shape[1], image.shape[0]),
+                pupil,
+                np.zeros((0, 2)) if pupil is None else pupil.points(120),
+                None,
+                (),
+                {"polarity": "auto", "gamma": 1.0, "radius_px": None, "rig": None},
+                {},
+                _ellipse_factors(pupil, None),
+            )
+        )
+    if not out:
+        raise InputError("holds no labelled images", source=str(folder))
     return out
 
 

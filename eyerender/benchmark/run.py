@@ -16,23 +16,24 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import EyerenderError, InputError
 from ..files import write_json
-from ..imagefile import read_image
+from ..imagefile import read_any_image
 from ..imagefolder import versions
 from ..outfolder import refuse_non_empty, staged
 from ..progress import Progress
-from ..report.benchmark import write_bench_report
+from ..report.benchmark import Thumbnail, write_bench_report
 from .bound import Edge, edge_of
 from .folder import LabelledImage, load_labelled
 from .process import ExtractorProcess, Failed
 from .protocol import Greeting, Request
 from .registry import ExtractorCommand, defaults, resolve
 from .score import Score, failed, score
-from .summary import FACTORS, breakdown, failures, summarise
+from .summary import FACTORS, breakdown, failure_kind, failures, summarise
 
 SCHEMA = "eyerender/bench-extractors/1"
 REPORT, RESULTS, TABLE = "report.html", "results.json", "results.csv"
 # Consecutive deaths after which an extractor is not started again.
 PATIENCE = 3
+THUMBNAILS = 4  # pictures of each kind of failure of an extractor
 START_S = 60.0
 
 
@@ -120,7 +121,7 @@ def bench_extractors(
     rows = [_row(run, k, images[k], sigmas[k], factors[k]) for run in runs for k in range(len(images))]
     with staged(output, overwrite=overwrite or _is_bench(Path(output))) as place:
         _write_csv(place / TABLE, rows)
-        write_bench_report(place / REPORT, data, rows)
+        write_bench_report(place / REPORT, data, rows, [one for run in runs for one in _thumbnails(run, images)])
         write_json(place / RESULTS, data)
     return data
 
@@ -169,8 +170,23 @@ def run_extractor(
 
 def _edge(image: LabelledImage) -> Edge | None:
     glints: Floats = np.array([g.xy_px for g in image.glints]).reshape(-1, 2)
-    grey = read_image(image.path)[0] if not image.known else np.zeros((0, 0))
+    grey = read_any_image(image.path)[0] if not image.known else np.zeros((0, 0))
     return edge_of(grey, image.bit_depth, image.pupil, image.visible, glints, image.known)
+
+
+def _thumbnails(run: Run, images: Sequence[LabelledImage]) -> list[Thumbnail]:
+    """Pictures of the first images of every kind of failure, the most frequent kinds first."""
+    kinds: dict[tuple[str, str], list[int]] = {}
+    for k, s in enumerate(run.scores):
+        if s.outcome not in ("right", "absent"):
+            kinds.setdefault((s.outcome, failure_kind(s)), []).append(k)
+    out = []
+    for (outcome, reason), which in sorted(kinds.items(), key=lambda item: -len(item[1])):
+        for k in which[:THUMBNAILS]:
+            image, _, _ = read_any_image(images[k].path)
+            text = f"{outcome}: {reason}; {images[k].name}"
+            out.append(Thumbnail(run.extractor.name, text, image, images[k].pupil, run.scores[k].ellipse))
+    return out
 
 
 def _factors(image: LabelledImage, edge: Edge | None) -> dict[str, float]:

@@ -58,6 +58,7 @@ class Score:
         cpu_s: processor time that the extractor reports.
         wall_s: elapsed time that the extractor reports.
         trip_s: time from question to answer.
+        ellipse: the ellipse that was reported.
     """
 
     outcome: Outcome
@@ -72,6 +73,7 @@ class Score:
     cpu_s: float | None = None
     wall_s: float | None = None
     trip_s: float | None = None
+    ellipse: Ellipse | None = None
 
     @property
     def centre_px(self) -> float | None:
@@ -88,7 +90,7 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
     found, true = reply.ellipse, image.pupil
     if true is None:
         outcome: Outcome = "absent" if found is None else "false"
-        return Score(outcome, reply.reason, None, None, None, None, None, reply.confidence, glints, *times)
+        return Score(outcome, reply.reason, None, None, None, None, None, reply.confidence, glints, *times, found)
     if found is None:
         reason = reply.reason or "gave no reason"
         return Score("none", reason, None, None, None, None, None, reply.confidence, glints, *times)
@@ -107,6 +109,7 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
         reply.confidence,
         glints,
         *times,
+        found,
     )
 
 

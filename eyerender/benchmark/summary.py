@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -87,11 +88,19 @@ def failures(scores: Sequence[Score], images: Sequence[LabelledImage]) -> list[d
     for s, image in zip(scores, images, strict=True):
         if s.outcome in ("right", "absent"):
             continue
-        reason = "another ellipse than the pupil's" if s.outcome == "wrong" else s.reason or "gave no reason"
+        reason = failure_kind(s)
         entry = seen.setdefault((s.outcome, reason), {"outcome": s.outcome, "reason": reason, "count": 0})
         entry["count"] += 1
         entry.setdefault("first", image.name)
     return sorted(seen.values(), key=lambda e: (-e["count"], e["outcome"], e["reason"]))
+
+
+def failure_kind(score: Score) -> str:
+    """Reason of a failure, as it is counted; of a missing pupil without numbers, which differ from image to image."""
+    if score.outcome == "wrong":
+        return "another ellipse than the pupil's"
+    reason = score.reason or "gave no reason"
+    return re.sub(r"-?\d+(\.\d+)?", "#", reason) if score.outcome == "none" else reason
 
 
 def bins(values: Sequence[float | None], name: str) -> list[tuple[float, float, list[int]]]:

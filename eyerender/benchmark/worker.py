@@ -15,7 +15,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from ..errors import InputError
-from ..imagefile import read_image
+from ..imagefile import read_any_image
 from ..references import load_reference
 from .conventions import Conventions
 from .protocol import FEATURES, SCHEMA, Extractor
@@ -52,7 +52,7 @@ def main(argv: list[str]) -> int:
     for line in sys.stdin:
         request = json.loads(line)
         try:
-            image, _ = read_image(request["image"])
+            image, _, _ = read_any_image(request["image"])
             if not warm:
                 extractor(image, request)  # the first call loads libraries and tables
                 warm = True

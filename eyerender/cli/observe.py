@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json as json_module
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +14,7 @@ from ..errors import InputError
 from ..observation import EYES, MAX_BOUNDARY_POINTS, RECORD, SCHEMAS, Observations
 from ..status import Status
 from .app import app
-from .options import EyeModel, Result, Strict
+from .options import EyeModel, Result, Strict, positive
 from .output import Heed, emit, progress
 
 
@@ -68,35 +70,70 @@ def extract(
     *images: Path,
     scene: str | None = None,
     gamma: float = 1.0,
+    eyes: int = 1,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    overlay: Path | None = None,
+    processes: int | None = None,
     record: int = RECORD,
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Find the pupil ellipse and the glints in images.
+    """Find the pupil ellipse and the glints in images or in a video.
 
-    An image without a detected pupil is a result with a reason, not an error.
+    An image without a detected pupil is a result with a reason, not an error. In a video the pupil is looked for first
+    where it was in the frame before.
 
     Args:
-        images: Greyscale images, or one folder of images that this package wrote.
-        scene: A scene; its rig assigns the glints to lights.
+        images: Greyscale images, one folder of images that this package wrote, or one video.
+        scene: A scene; its rig assigns the glints to lights, and they are listed in the order of its lights.
         gamma: Encoding gamma of the pixel values; 1 is linear.
+        eyes: 2 for images of both eyes. The eye on the image's left is then called the right eye.
+        output: File for the records, one per line (JSON lines).
+        overlay: Draw what was found: a folder for images (PNG), or a file for a video (.mp4, .avi or .mkv).
+        processes: Number of images that are worked on at the same time (default: one for each processor).
         record: Version of the records in the JSON, 1 or 2.
     """
+    from ..extraction.video import is_video
+    from ..files import make_folder, written
     from ..imageobserver import ImageObserver
     from ..scene import load_scene
+    from ..videoobserver import observe_video
 
     if not images:
         raise InputError("give at least one image", source="extract")
     if not (np.isfinite(gamma) and 0.1 <= gamma <= 10):
         raise InputError("must be between 0.1 and 10", source="--gamma")
+    if eyes not in (1, 2):
+        raise InputError("must be 1 or 2", source="--eyes")
+    positive("--processes", processes)
     _check_record(record)
     heed = Heed(strict)
     loaded = load_scene(scene) if scene is not None else None
     heed(loaded.warnings() if loaded is not None else ())
+    observer = ImageObserver(gamma=gamma)
+    if is_video(images[0]):
+        if len(images) > 1:
+            raise InputError("give one video at a time", source=str(images[1]))
+        with progress("extracting") as steps:
+            result = observe_video(
+                images[0], observer, scene=loaded, eyes=eyes, output=output, overlay=overlay, record=record,
+                progress=steps, warn=heed,
+            )  # fmt: skip
+        emit(result.to_mapping(), result.to_text(), json, heed)
+        return 0
+    if overlay is not None:
+        make_folder(overlay)
     with progress("extracting") as steps:
-        observed = ImageObserver(gamma=gamma).observe_files(images, scene=loaded, progress=steps)
-    data = {"schema": "eyerender/features/1", "rig": None, "records": list(observed.records(record))}
-    names = [str(path) for path in images]
+        observed = observer.observe_files(
+            images, scene=loaded, progress=steps, eyes=eyes, pictures=overlay, warn=heed,
+            processes=processes or len(os.sched_getaffinity(0)),
+        )  # fmt: skip
+    records = list(observed.records(record))
+    if output is not None:
+        with written(output, sync=False) as file:
+            file.writelines(json_module.dumps(one, allow_nan=False).encode() + b"\n" for one in records)
+    data = {"schema": "eyerender/features/1", "rig": None, "records": records}
+    names = [str(path) for path in images for _ in range(eyes)]
     emit(data, _feature_table(observed, names if len(names) == len(observed) else None), json, heed)
     return 0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .glints.matching import Assignment, assign_lights, identify, predict_glints
+from .pair import extract_eyes
 from .pipeline import extract
 from .result import Extraction, GlintResult, Goodness, PupilResult
 from .settings import FAST, REFINED, ExtractionSettings
@@ -18,6 +19,7 @@ __all__ = [
     "PupilResult",
     "assign_lights",
     "extract",
+    "extract_eyes",
     "identify",
     "predict_glints",
 ]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bytes
-
 RotatedRect = tuple[tuple[float, float], tuple[float, float], float]
 
 _RADIUS_PX = (7.0, 160.0)
+LEVELS, FILLED = 10, 0.85
 
 
 def contour_pupil(
@@ -21,13 +21,13 @@ def contour_pupil(
 ) -> RotatedRect | str:
     """Find the pupil as OpenCV's rotated rectangle (centre, full axes, degrees); a string gives the reason for failure.
 
-    The image is smoothed with a 5 x 5 Gaussian. Otsu's threshold is applied, and again to the part below it, which
-    separates the pupil from the iris. Dark regions of a likely size are kept if they do not touch the frame and fill at
-    least 0.7 of their hull. `cv2.fitEllipse` is applied to the contour of the largest one. The contour runs through the
-    centres of the outermost dark pixels, so the axes are about half a pixel too short. This error belongs to the
-    baseline and is not corrected.
+    The image is smoothed with a 5 x 5 Gaussian after glints are closed by a morphological opening. It is cut at
+    `LEVELS` thresholds below Otsu's. Dark regions of a likely size are kept if they do not touch the frame and fill at
+    least `FILLED` of their hull; `cv2.fitEllipse` is applied to the hull. The one with the steepest outline for its
+    level is the pupil, because lids and shadows are softer. The contour runs through the centres of the
+    outermost dark pixels, so half a pixel is added to the semi-axes.
 
-    Source of the threshold: Otsu (1979).
+    Source of the first threshold: Otsu (1979).
 
     Args:
         image: (h, w) image.
@@ -40,34 +40,34 @@ def contour_pupil(
     grey = np.clip(np.rint(image.astype(np.float32) * np.float32(255.0 / full)), 0, 255).astype(np.uint8)
     if min(grey.shape) < 16:
         return f"the image is {grey.shape[1]} x {grey.shape[0]}"
-    smooth = np.asarray(cv2.GaussianBlur(grey, (5, 5), 0.0), dtype=np.uint8)
+    opened = cv2.morphologyEx(grey, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9)))
+    smooth = np.asarray(cv2.GaussianBlur(opened, (5, 5), 0.0), dtype=np.uint8)
     low, high = radius_px or _RADIUS_PX
-    height, width = grey.shape
-    best, most = None, 0.0
-    for level in _levels(smooth):
+    slope = cv2.magnitude(*(cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)))
+    otsu = float(cv2.threshold(smooth, 0, 255, cv2.THRESH_OTSU)[0])
+    best, steepest = None, 0.0
+    for level in np.linspace(float(np.percentile(smooth, 0.5)), otsu, LEVELS + 1)[1:]:
         contours, _ = cv2.findContours((smooth <= level).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         for contour in contours:
-            area = cv2.contourArea(contour)
-            x, y, w, h = cv2.boundingRect(contour)
-            cut = x == 0 or y == 0 or x + w == width or y + h == height
-            if cut or len(contour) < 8 or area <= most or not 0.5 * low**2 < area / math.pi < high**2:
+            if not _likely(contour, grey.shape, low, high):
                 continue
-            if area > 0.7 * cv2.contourArea(cv2.convexHull(contour)):
-                best, most = contour, area
-        if best is not None:
-            break
-    if best is None:
+            # Divided by the level: an iris may have a steeper outline than its pupil, but is brighter.
+            steepness = float(np.median(slope[contour[:, 0, 1], contour[:, 0, 0]])) / (1.0 + float(level))
+            if steepness > steepest:
+                best, steepest = cv2.convexHull(contour), steepness
+    if best is None or len(best) < 5:
         return "no dark region of a likely size"
     (cx, cy), (first, second), degrees = cv2.fitEllipse(best)
     if not (min(first, second) > 0.0 and math.isfinite(cx + cy + first + second + degrees)):
         return "no ellipse fits the contour"
-    return (float(cx), float(cy)), (float(first), float(second)), float(degrees)
+    return (float(cx), float(cy)), (float(first) + 1.0, float(second) + 1.0), float(degrees)
 
 
-def _levels(smooth: Bytes) -> list[float]:
-    """Otsu's threshold of everything below Otsu's threshold, then the first threshold."""
-    first = float(cv2.threshold(smooth, 0, 255, cv2.THRESH_OTSU)[0])
-    dark = smooth[smooth <= first]
-    if dark.size < 16 or dark.min() == dark.max():
-        return [first]
-    return [float(cv2.threshold(dark.reshape(-1, 1), 0, 255, cv2.THRESH_OTSU)[0]), first]
+def _likely(contour: NDArray[Any], shape: tuple[int, ...], low: float, high: float) -> bool:
+    """Whether a contour has the size and the shape of a pupil and does not touch the frame."""
+    x, y, w, h = cv2.boundingRect(contour)
+    cut = x == 0 or y == 0 or x + w == shape[1] or y + h == shape[0]
+    area = cv2.contourArea(contour)
+    if cut or len(contour) < 8 or not 0.5 * low**2 < area / math.pi < high**2:
+        return False
+    return area > FILLED * cv2.contourArea(cv2.convexHull(contour))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from ..arrays import Bools, Floats
 from ..geometry.ellipse import signed_distance
+from .glints.bloomed import bloomed_glints
 from .glints.classification import classify_spots
 from .glints.deblending import give_edges, split_blends
 from .glints.detection import Spots, detect_spots, widest
@@ -21,12 +23,11 @@ from .preprocessing import DN, Image, Prepared, invert, prepare
 from .pupil.consensus import relative_to
 from .pupil.covariance import boundary_deviation
 from .pupil.edge_model import EdgeModel
-from .pupil.fallback import FALLBACK_CONFIDENCE, fallback_search
 from .pupil.refinement import PixelFit, refine
 from .pupil.scoring import pupil_of
-from .pupil.search import Found, search
+from .pupil.search import SURE, Found, search
 from .result import Extraction, PupilResult
-from .settings import ExtractionSettings
+from .settings import ExtractionSettings, Shape
 from .statistics import median
 
 SAME_LIGHT = 0.5  # in noise standard deviations; a smaller change of the spots' light does not move the boundary
@@ -38,14 +39,18 @@ def extract(
     bit_depth: int | None = None,
     gamma: float = 1.0,
     settings: ExtractionSettings | None = None,
+    prior: PupilResult | None = None,
 ) -> Extraction:
-    """Find the pupil ellipse and the glints of a single-channel image.
+    """Find the pupil ellipse and the glints of an image.
 
     Args:
-        image: (h, w) array of unsigned integers (full scale 2^bit_depth - 1, or that of the type) or floats.
+        image: (h, w) array of unsigned integers (full scale 2^bit_depth - 1, or that of the type) or floats. Of a
+            colour image (h, w, 3 or 4; red first) the luminance is taken, with a warning.
         bit_depth: bits of an integer image; None: those of its type.
         gamma: the image stores intensity^(1 / gamma); 1 for linear data.
         settings: settings of the extractor.
+        prior: the pupil of the previous frame. It is looked for there first, and elsewhere too unless it is certain
+            there. A missing pupil is no prior.
 
     Returns:
         What was found. Whatever an image shows, even nothing, gives a result with a status and a reason.
@@ -59,20 +64,41 @@ def extract(
     size = (int(shape[0]), int(shape[1]))
     if isinstance(prepared, str):
         return Extraction(PupilResult.missing("input", prepared), (), (), 0.0, size)
-    noise = prepared.noise_dn / DN
-    work = invert(prepared) if settings.polarity == "bright" else prepared
-    found = search(work, settings)
+    limits = Shape.of(settings, size)
+    found = _searched(prepared, limits, settings.polarity, prior)
     if isinstance(found, PupilResult):
-        return Extraction(found, (), (), noise, size)
-    first = _explained(prepared, found, settings)
-    if first.pupil.ok or work.inverted:
-        return first
-    other = fallback_search(work, found, settings)
-    again = None if other is None else _explained(prepared, other, settings)
-    return again if again is not None and again.pupil.confidence >= FALLBACK_CONFIDENCE else first
+        return Extraction(found, (), (), prepared.noise_dn / DN, size)
+    return explained(prepared, found, settings)
 
 
-def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -> Extraction:
+def _searched(
+    prepared: Prepared, limits: Shape, polarity: Literal["auto", "dark", "bright"], prior: PupilResult | None
+) -> Found | PupilResult:
+    """Find the boundary of a dark pupil; if its middle is bright, it may be an iris with a bright pupil in it."""
+    before = None if prior is None else prior.ellipse
+    if prior is not None and prior.bright and polarity == "auto":
+        found = search(invert(prepared), limits, before)
+        if isinstance(found, Found) and found.confidence >= SURE:
+            return found
+    if polarity == "bright":
+        return search(invert(prepared), limits, before)
+    dark = search(prepared, limits, before)
+    if polarity == "dark" or not isinstance(dark, Found) or dark.core_dn >= 0.0:
+        return dark
+    bright = search(invert(prepared), limits, before)
+    if isinstance(bright, Found) and bright.confidence >= SURE and _holds(dark, bright):
+        return bright
+    return dark
+
+
+def _holds(outer: Found, inner: Found) -> bool:
+    """Whether a boundary lies inside a larger one."""
+    apart = float(np.hypot(*(outer.boundary.ellipse.centre_px - inner.boundary.ellipse.centre_px)))
+    smaller = inner.boundary.ellipse.area_px2 < outer.boundary.ellipse.area_px2
+    return smaller and apart < float(outer.boundary.ellipse.semi_axes_px[1])
+
+
+def explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -> Extraction:
     """Complete a boundary to a result: the pupil, with the glints around it."""
     size = (int(prepared.linear.shape[0]), int(prepared.linear.shape[1]))
     noise = prepared.noise_dn / DN
@@ -89,7 +115,9 @@ def _explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -
         pupil = pupil_of(found, pixel_fit, settings)
     if not pupil.ok:
         return Extraction(pupil, (), (), noise, size)
-    accepted, rejected = classify_spots(spots, fit, prepared, abs(model.step_dn), model.sigma_px, settings)
+    step = abs(model.step_dn)
+    large = bloomed_glints(prepared, model.ellipse, step)
+    accepted, rejected = classify_spots(spots, fit, prepared, step, model.sigma_px, settings, large)
     return Extraction(pupil, accepted, rejected, noise, size)
 
 
@@ -156,7 +184,7 @@ def _agrees(fit: PixelFit, found: Found) -> bool:
     """
     by_edges = boundary_deviation(found.boundary.ellipse, found.covariance)
     # Both are estimates from a few dozen sectors, which scatter by a fifth or more.
-    if boundary_deviation(fit.ellipse, fit.covariance) > 2.0 * by_edges:
+    if boundary_deviation(fit.ellipse, fit.covariance) > 3.0 * by_edges:
         return False
     boundary = found.boundary
     points = found.edges.points_px[boundary.inliers]

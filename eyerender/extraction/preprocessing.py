@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import cv2
@@ -84,13 +85,23 @@ def _checked(image: object) -> NDArray[np.generic]:
     array = np.asarray(image)
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
-    if array.ndim == 3 and array.shape[2] in (2, 3, 4):
-        raise InputError(f"is a colour image of {array.shape[2]} channels; expected one channel (near-infrared grey)")
+    if array.ndim == 3 and array.shape[2] in (3, 4) and array.dtype.kind in "uif" and array.size:
+        warnings.warn("the image is in colour; its luminance is taken", UserWarning, stacklevel=4)
+        return luminance(array)
     if array.ndim != 2:
         raise InputError(f"has the shape {array.shape}; expected a single-channel image (height, width)")
     if array.dtype.kind not in "uif" or array.size == 0:
         raise InputError(f"holds {array.size} values of type {array.dtype}; expected integers or floats")
     return array
+
+
+def luminance(colour: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Luminance (h, w) of an image (h, w, 3 or more; red first), of the same type; equal channels stay as they are.
+
+    Source of the weights: ITU-R BT.601.
+    """
+    grey = np.asarray(colour[..., :3], dtype=np.float64) @ np.array([0.299, 0.587, 0.114])
+    return np.asarray(grey if colour.dtype.kind == "f" else np.rint(grey), dtype=colour.dtype)
 
 
 def _from_integers(array: NDArray[np.generic], bit_depth: int | None, gamma: float) -> tuple[Image, float, float]:
@@ -160,3 +171,8 @@ def invert(prepared: Prepared) -> Prepared:
     ceiling = quantile(smooth[::2, ::2].ravel(), 0.999) + 3.0 * prepared.noise_dn
     negative = np.maximum(np.subtract(np.float32(ceiling), prepared.linear), np.float32(0.0))
     return Prepared(negative, float("inf"), prepared.noise_dn, inverted=True)
+
+
+def single_threaded() -> None:
+    """Let OpenCV use one thread, where several processes share the work."""
+    cv2.setNumThreads(1)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from ..spec import Positive, Spec
 
+# A pupil of 3 px has a boundary of 19 px. A pupil is at most 8 mm x 1.2 wide; beyond 0.4 of the side, the iris around
+# it (12 mm) would not be in the image.
+LEAST_PX, MOST_OF_SIDE = 3.0, 0.4
+
 
 class ExtractionSettings(Spec):
-    """Settings of `extract`; the defaults suit dark pupils in 320 x 240 to 1280 x 1024 images.
+    """Settings of `extract`.
 
     Nothing here is tuned to a data set: thresholds adapt to the image's own noise and contrast.
     """
@@ -18,11 +23,13 @@ class ExtractionSettings(Spec):
     method: Literal["fast", "refined"] = Field(
         default="refined", description="fast: edges and an algebraic fit; refined: also a maximum-likelihood fit"
     )
-    polarity: Literal["dark", "bright"] = Field(
-        default="dark", description="whether the pupil is darker or brighter than the iris"
+    polarity: Literal["auto", "dark", "bright"] = Field(
+        default="auto", description="whether the pupil is darker or brighter than the iris; auto: the image decides"
     )
-    radius_min_px: Positive = Field(default=7.0, description="smallest semi-axis b to search for")
-    radius_max_px: Positive = Field(default=160.0, description="largest semi-axis a to search for")
+    radius_min_px: Positive | None = Field(default=None, description="smallest semi-axis b to search for; null: 3 px")
+    radius_max_px: Positive | None = Field(
+        default=None, description="largest semi-axis a to search for; null: 0.4 of the image's shorter side"
+    )
     aspect_min: Annotated[float, Field(gt=0, le=1)] = Field(default=0.3, description="smallest accepted b / a")
     min_support: Annotated[float, Field(gt=0, le=1)] = Field(
         default=0.2, description="smallest visible share of the pupil boundary"
@@ -37,9 +44,35 @@ class ExtractionSettings(Spec):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        if self.radius_max_px <= self.radius_min_px:
+        low, high = self.radius_min_px, self.radius_max_px
+        if low is not None and high is not None and high <= low:
             raise ValueError("radius_max_px must be > radius_min_px")
         return self
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """Sizes and shapes of a pupil that a search accepts.
+
+    Attributes:
+        least_px: smallest semi-axis b.
+        most_px: largest semi-axis a.
+        aspect: smallest b / a.
+        support: smallest visible share of the boundary.
+    """
+
+    least_px: float
+    most_px: float
+    aspect: float
+    support: float
+
+    @staticmethod
+    def of(settings: ExtractionSettings, shape: tuple[int, int]) -> Shape:
+        """Derive the sizes from the settings and the (h, w) of the image."""
+        low, high = settings.radius_min_px, settings.radius_max_px
+        least = LEAST_PX if low is None else low
+        most = max(MOST_OF_SIDE * min(shape), 2.0 * least) if high is None else high
+        return Shape(least, most, settings.aspect_min, settings.min_support)
 
 
 FAST = ExtractionSettings(method="fast")

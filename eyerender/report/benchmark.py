@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..geometry.ellipse import Ellipse
 from .page import Card, Figure, Page, Section, Table, write_page
 from .style import TARGET, figure, svg
 
@@ -20,14 +25,26 @@ _LOOK = (
 )  # fmt: skip
 _OUTCOMES = (("right", "#0072B2"), ("wrong", "#D55E00"), ("none", "#bbbbbb"), ("error", "#222222"))
 _PANELS = 4
+_MOST = 24  # thumbnails of an extractor
 
 
-def write_bench_report(path: Path, data: Row, rows: Sequence[Row]) -> None:
-    """Write one self-contained HTML file from the bench's JSON and its rows, one per extractor and image."""
-    write_page(path, bench_page(data, rows))
+@dataclass(frozen=True, slots=True, eq=False)
+class Thumbnail:
+    """A failure: the extractor, what failed, the image (h, w), the true pupil and the reported one."""
+
+    extractor: str
+    text: str
+    image: NDArray[Any]
+    truth: Ellipse | None
+    found: Ellipse | None
 
 
-def bench_page(data: Row, rows: Sequence[Row]) -> Page:
+def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: Sequence[Thumbnail] = ()) -> None:
+    """Write one self-contained HTML file from the bench's JSON, its rows (per extractor and image), and thumbnails."""
+    write_page(path, bench_page(data, rows, thumbnails))
+
+
+def bench_page(data: Row, rows: Sequence[Row], thumbnails: Sequence[Thumbnail] = ()) -> Page:
     """Make the page."""
     entries, edge = data["extractors"], data["edge"]
     best = [e for e in entries if e["summary"]["right"]]
@@ -62,13 +79,50 @@ def bench_page(data: Row, rows: Sequence[Row]) -> Page:
             [f for name in data["factors"] for f in _factor_figure(data, name)],
             [_factor_table(data, name) for name in data["factors"] if _has(entries, name)],
         ),
-        Section("Failures", tables=(_failure_table(entries),)),
+        Section("Failures", figures=_thumbnail_figures(thumbnails), tables=(_failure_table(entries),)),
         Section("How this was made", _how(data), tables=(_convention_table(entries),)),
     ]
     if data["not_run"]:
         table = Table(("extractor", "why"), [(e["name"], e["reason"]) for e in data["not_run"]], "Not run", wide=(1,))
-        sections[3] = Section("Failures", tables=(_failure_table(entries), table))
+        sections[3] = replace(sections[3], tables=(_failure_table(entries), table))
     return Page(f"{data['folder']}: extractors compared", lead, cards, sections)
+
+
+def _thumbnail_figures(thumbnails: Sequence[Thumbnail]) -> list[Figure]:
+    names = dict.fromkeys(one.extractor for one in thumbnails)
+    caption = (
+        "{}: the first images of every kind of failure, the most frequent kinds first. The true pupil is green, the "
+        "reported one dashed and orange; the contrast is stretched."
+    )
+    return [
+        Figure(thumbnail_figure([t for t in thumbnails if t.extractor == name][:_MOST]), caption.format(name))
+        for name in names
+    ]
+
+
+def thumbnail_figure(thumbnails: Sequence[Thumbnail]) -> str:
+    """Draw failures side by side, each cut to a few sizes of the pupil."""
+    columns = min(len(thumbnails), _PANELS)
+    rows = math.ceil(len(thumbnails) / columns)
+    with figure(11.0, 3.2 * rows, columns, rows) as (fig, axes):
+        for ax, one in zip(np.ravel(axes), thumbnails, strict=False):
+            image = np.asarray(one.image, dtype=np.float64)
+            (height, width), shown = image.shape, one.truth or one.found
+            x0, y0, x1, y1 = 0, 0, width, height
+            if shown is not None:
+                (cx, cy), reach = shown.centre_px, 3.0 * float(shown.semi_axes_px[0]) + 10.0
+                x0, x1 = (round(float(np.clip(cx + side * reach, 0, width))) for side in (-1, 1))
+                y0, y1 = (round(float(np.clip(cy + side * reach, 0, height))) for side in (-1, 1))
+            part = image[y0:y1, x0:x1] if x1 > x0 and y1 > y0 else image
+            low, high = np.percentile(part, (0.5, 99.5))
+            extent = (x0 - 0.5, x0 + part.shape[1] - 0.5, y0 + part.shape[0] - 0.5, y0 - 0.5)
+            ax.imshow(part, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), extent=extent, interpolation="nearest")
+            for ellipse, colour, style in ((one.truth, "#3ddc5a", "-"), (one.found, "#E69F00", "--")):
+                if ellipse is not None:
+                    ax.plot(*ellipse.points(120).T, style, color=colour, lw=1.2)
+            ax.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
+            ax.set_title("\n".join(textwrap.wrap(one.text, 40)[:4]), fontsize=7)
+        return svg(fig)
 
 
 def look(names: Sequence[str], name: str) -> tuple[str, str]:

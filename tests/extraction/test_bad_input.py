@@ -69,8 +69,8 @@ def test_images_without_content_are_missing_with_the_reason(image, reason):
 @pytest.mark.parametrize(
     ("image", "options", "message"),
     [
-        (np.zeros((40, 40, 3), np.uint8), {}, "colour image of 3 channels; expected one channel"),
-        (np.zeros((40, 40, 4), np.uint8), {}, "colour image of 4 channels"),
+        (np.zeros((40, 40, 2), np.uint8), {}, r"has the shape \(40, 40, 2\)"),
+        (np.zeros((40, 40, 3), bool), {}, r"has the shape \(40, 40, 3\)"),
         (np.zeros(40, np.uint8), {}, r"has the shape \(40,\)"),
         (np.zeros((4, 40, 40, 1), np.uint8), {}, "has the shape"),
         (np.zeros((0, 40), np.uint8), {}, "holds 0 values"),

@@ -99,7 +99,10 @@ def test_bright_pupil_is_the_negative_of_a_dark_one():
     drawing = ideal.draw("bright-pupil", SEEDS[0])
     found = extract(drawing.image, settings=ExtractionSettings(polarity="bright")).pupil
     assert np.hypot(*(found.ellipse.centre_px - _truth(drawing).centre_px)) < 0.05
-    dark = extract(drawing.image).pupil
+    dark = extract(drawing.image, settings=ExtractionSettings(polarity="dark")).pupil
+    undeclared = extract(drawing.image).pupil
+    assert undeclared.bright
+    assert iou(undeclared.ellipse, found.ellipse) > 0.999
     assert not dark.ok or iou(dark.ellipse, _truth(drawing)) < 0.9
 
 

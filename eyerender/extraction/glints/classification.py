@@ -3,35 +3,47 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import frozen
+from ...arrays import Floats, frozen
 from ...status import Status
 from ..preprocessing import DN, Prepared
 from ..result import GlintResult
 from ..settings import ExtractionSettings
 from ..statistics import quantile
+from .bloomed import Patch
 from .detection import Spots, optics_sigma, widest
 from .fits import SpotFit
 
 # Largest ratio of length to width of a glint's bright patch, and largest product of that ratio and the fit's. True
 # glints of the development images are below 1.99 and 2.2.
 LONG, LONG_TWICE = 2.0, 2.4
+# The cornea mirrors 2 % of a lamp, a point; wet lid margins and skin spread it. Lamps of one rig differ less than this.
+FAINTEST = 0.1
 
 _PIXEL = 1.0 / 12.0  # variance of a pixel; without it a spot of one row of pixels would be a line
 
 
 def classify_spots(
-    spots: Spots, fit: SpotFit, prepared: Prepared, step_dn: float, blur_px: float, settings: ExtractionSettings
+    spots: Spots,
+    fit: SpotFit,
+    prepared: Prepared,
+    step_dn: float,
+    blur_px: float,
+    settings: ExtractionSettings,
+    large: Sequence[Patch] = (),
 ) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
-    """Divide spots into (accepted, rejected), brightest first."""
-    accepted: list[GlintResult] = []
+    """Divide spots into (accepted, rejected), brightest first; spots of `large` patches are part of those."""
+    accepted: list[GlintResult] = [patch.glint for patch in large]
     rejected: list[GlintResult] = []
     looks = _Look.of_all(spots, fit)
     for i in np.argsort(-fit.amplitude_dn, kind="stable").tolist():
         look = looks[i]
+        if any(_in_patch(patch, spots.xy_px[i]) for patch in large):
+            continue
         reason = _objection(look, fit, i, prepared, step_dn, blur_px)
         result = GlintResult(
             status=Status.OK if reason is None else Status.REJECTED,
@@ -43,13 +55,31 @@ def classify_spots(
             saturated=bool(fit.clipped[i] > 0),
         )
         (accepted if reason is None else rejected).append(result)
+    faint, rejected_faint = "much fainter than the brightest glint, as highlights of skin and lid margins are", []
+    brightest = max((glint.amplitude for glint in accepted), default=0.0)
+    for glint in accepted:
+        if glint.amplitude < FAINTEST * brightest and not glint.saturated:
+            rejected_faint.append(replace(glint, status=Status.REJECTED, reason=faint))
+    accepted = [glint for glint in accepted if glint.amplitude >= FAINTEST * brightest or glint.saturated]
+    rejected += rejected_faint
     reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
     surplus = [replace(glint, status=Status.REJECTED, reason=reason) for glint in accepted[settings.max_glints :]]
     strip = "a strip or a broad patch, as reflections off the sclera and wet lid margins are"
     places = np.array([glint.xy_px for glint in accepted]).reshape(-1, 2)
     far = (((spots.patches_px[:, None] - places) ** 2).sum(axis=-1) > 4.0**2).all(axis=1)
-    patches = [GlintResult(status=Status.REJECTED, reason=strip, xy_px=frozen(xy)) for xy in spots.patches_px[far]]
+    patches = [
+        GlintResult(status=Status.REJECTED, reason=strip, xy_px=frozen(xy))
+        for xy in spots.patches_px[far]
+        if not any(_in_patch(patch, xy) for patch in large)
+    ]
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
+
+
+def _in_patch(patch: Patch, xy: Floats) -> bool:
+    """Whether a bright pixel belongs to a large glint."""
+    height, width = patch.pixels.shape
+    column, row = (int(v) for v in np.rint(xy))
+    return 0 <= row < height and 0 <= column < width and bool(patch.pixels[row, column])
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,13 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Floats
+from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse, points_on_ellipse
 from ..preprocessing import Image, Prepared, as_image
-from ..settings import ExtractionSettings
+from ..settings import Shape
 from ..statistics import median, quantile
 
 LEVELS = 20  # thresholds at even grey levels
+# A blob that fills less than this share of its convex hull has notches, as reflections at the boundary make them. The
+# hull is then a blob too.
+NOTCHED = 0.93
 ANGLES = 48  # samples around a blob
 # Share of the thresholds, darkest first, that is tried first. The others are tried if these give no candidate.
 DARKER = 0.6
@@ -45,44 +48,45 @@ class Candidate:
 
 
 def find_candidates(
-    prepared: Prepared, settings: ExtractionSettings, most: int = 4, *, without_lines: bool = False
+    prepared: Prepared, shape: Shape, most: int = 4, *, without_lines: bool = False, spot_px: float = 5.0
 ) -> list[Candidate]:
     """Find up to `most` candidates, best first; the list is empty if nothing dark and round stands out.
 
     Args:
         prepared: the image.
-        settings: sizes and shapes to look for.
+        shape: sizes and shapes to look for.
         most: number of candidates.
         without_lines: fill dark lines thinner than the smallest pupil first. Lid shadows and lashes that touch the
             pupil are as dark as the pupil and form one blob with it at every threshold.
+        spot_px: radius of the glints that are removed first.
     """
     linear, noise_dn = prepared.linear, prepared.noise_dn
-    factor = int(np.clip(settings.radius_min_px // 3.5, 1, 4))
+    factor = int(np.clip(shape.least_px // 3.5, 1, 4))
     while factor < 8 and linear.size / factor**2 > 160_000:
         factor += 1
-    small = _reduced(linear, factor, cv2.MORPH_CLOSE if prepared.inverted else cv2.MORPH_OPEN)
+    small = _reduced(linear, factor, cv2.MORPH_CLOSE if prepared.inverted else cv2.MORPH_OPEN, spot_px)
     if without_lines:
-        width = 2 * max(1, round(0.7 * settings.radius_min_px / factor)) + 1
+        width = 2 * max(1, round(0.7 * shape.least_px / factor)) + 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
         small = as_image(cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel))
     noise = noise_dn / (1.5 * factor) + 0.1  # after averaging factor^2 pixels and a 3 x 3 Gaussian
     levels = _levels(small)
     dark = round(DARKER * levels.size)
-    blobs = _sweep(small, levels[:dark], factor, settings)
+    blobs = _sweep(small, levels[:dark], factor, shape)
     found = _ranked(small, noise, factor, blobs, most) if blobs.size else []
     if found:
         return found
-    blobs = np.concatenate([blobs, _sweep(small, levels[dark:], factor, settings)])
+    blobs = np.concatenate([blobs, _sweep(small, levels[dark:], factor, shape)])
     return _ranked(small, noise, factor, blobs, most) if blobs.size else []
 
 
-def _reduced(linear: Image, factor: int, removal: int) -> Image:
+def _reduced(linear: Image, factor: int, removal: int, spot_px: float) -> Image:
     """Reduce, smooth, and remove glints by a morphological opening (by a closing in a negative)."""
     height, width = linear.shape
     size = (max(1, width // factor), max(1, height // factor))
     small = cv2.resize(linear[: size[1] * factor, : size[0] * factor], size, interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (3, 3), 0.8)
-    spot = 2 * math.ceil(5.0 / factor) + 1
+    spot = 2 * math.ceil(spot_px / factor) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (spot, spot))
     return as_image(cv2.morphologyEx(small, removal, kernel))
 
@@ -106,11 +110,11 @@ def _levels(small: Image) -> Floats:
     return np.asarray(levels[keep], dtype=np.float64)
 
 
-def _sweep(small: Image, levels: Floats, factor: int, settings: ExtractionSettings) -> Floats:
+def _sweep(small: Image, levels: Floats, factor: int, shape: Shape) -> Floats:
     """Find blobs (n, 6) that could be a pupil: ellipse (x, y, a, b, angle) in reduced pixels, and filled share."""
     height, width = small.shape
-    least = max(0.5 * settings.radius_min_px, settings.radius_min_px - 2.0 * factor) / factor
-    most = 1.3 * settings.radius_max_px / factor
+    least = max(0.5 * shape.least_px, shape.least_px - 2.0 * factor) / factor
+    most = 1.3 * shape.most_px / factor
     # The length of a contour in pixels is at least half the perimeter of its ellipse.
     shortest, longest = 3.0 * least, 15.0 * most
     blobs: list[tuple[float, ...]] = []
@@ -130,9 +134,12 @@ def _sweep(small: Image, levels: Floats, factor: int, settings: ExtractionSettin
                 or (sides == 1 and _on_border(contour, width, height) > 0.15)
             ):
                 continue
-            blob = _blob_ellipse(cv2.moments(contour), least, most, settings)
-            if blob is not None:
-                blobs.append(blob)
+            hull = cv2.convexHull(contour)
+            outlines = [contour]
+            if cv2.contourArea(contour) < NOTCHED * cv2.contourArea(hull):
+                outlines.append(hull)
+            found = (_blob_ellipse(cv2.moments(outline), least, most, shape) for outline in outlines)
+            blobs.extend(blob for blob in found if blob is not None)
     return np.array(blobs, dtype=np.float64).reshape(-1, 6)
 
 
@@ -142,9 +149,7 @@ def _on_border(contour: NDArray[Any], width: int, height: int) -> float:
     return np.count_nonzero((x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)) / len(contour)
 
 
-def _blob_ellipse(
-    m: dict[str, float], least: float, most: float, settings: ExtractionSettings
-) -> tuple[float, ...] | None:
+def _blob_ellipse(m: dict[str, float], least: float, most: float, shape: Shape) -> tuple[float, ...] | None:
     """Ellipse with the second moments of a filled contour, and its filled share; None if it is not elliptical."""
     area = m["m00"]
     if area < math.pi * least**2 * 0.5:
@@ -158,7 +163,7 @@ def _blob_ellipse(
     filled = area / (math.pi * a * b)
     # The contour runs through the centres of the outermost pixels.
     a, b = a + 0.5, b + 0.5
-    if b / a < 0.7 * settings.aspect_min or filled < 0.8 or a * b < least**2 or a * b > most**2:
+    if b / a < 0.7 * shape.aspect or filled < 0.8 or a * b < least**2 or a * b > most**2:
         return None
     return m["m10"] / area, m["m01"] / area, a, b, 0.5 * math.atan2(2.0 * c12, c11 - c22), filled
 
@@ -206,6 +211,17 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -
     ]  # fmt: skip
 
 
+def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
+    """Make a candidate of a known place, with the levels of the image there; None where it is no darker inside."""
+    centre, axes, angle = ellipse.centre_px[None], ellipse.semi_axes_px[None], np.array([ellipse.angle_rad])
+    inside = float(np.median(_sample(prepared.linear, centre, axes * 0.55, angle)))
+    outside = float(np.median(_sample(prepared.linear, centre, axes * 1.15 + 1.5, angle)))
+    step = outside - inside
+    if step <= 2.0 * prepared.noise_dn:
+        return None
+    return Candidate(ellipse=ellipse, inside_dn=inside, step_dn=step, enclosed=1.0, score=1.0)
+
+
 def _sample(small: Image, centre: Floats, axes: Floats, angle: Floats) -> Image:
     """Levels (n, ANGLES) along n ellipses at the nearest pixels; outside the frame its border is repeated."""
     points = np.rint(points_on_ellipse(centre, axes, angle, ANGLES)).astype(np.intp)
@@ -235,11 +251,13 @@ class Interior:
     spread_dn: float
 
 
-def inspect_interior(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: float) -> Interior:
+def inspect_interior(
+    linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: float, glare: Bools | None = None
+) -> Interior:
     """Statistics of the pixels inside an ellipse, up to where the blur of the boundary begins.
 
-    The interior of a pupil is even. An iris has the pupil in its middle, and other objects have structure. Medians and
-    quartiles are used because of glints.
+    The interior of a pupil is even. An iris has the pupil in its middle, and other objects have structure. Pixels of
+    `glare` (h, w) do not count. Medians and quartiles are used because of fainter reflections.
     """
     a, b = ellipse.semi_axes_px
     cx, cy = ellipse.centre_px
@@ -249,6 +267,11 @@ def inspect_interior(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: 
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
     radius2 = ((dx * cos + dy * sin) / a) ** 2 + ((dy * cos - dx * sin) / b) ** 2
     crop = linear[y0:y1, x0:x1]
+    if glare is not None:
+        hidden = glare[y0:y1, x0:x1]
+        # Where glints cover most of the middle, the level around them must do.
+        if np.count_nonzero(hidden & (radius2 < 0.35**2)) < 0.5 * np.count_nonzero(radius2 < 0.35**2):
+            radius2 = np.where(hidden, np.inf, radius2)
     end = min(0.85, 1.0 - 2.5 * blur_px / float(b))
     core, ring = crop[radius2 < 0.35**2], crop[(radius2 > (end - 0.25) ** 2) & (radius2 < end**2)]
     inside = crop[radius2 < max(end, 0.5) ** 2]
@@ -262,7 +285,7 @@ def inspect_interior(linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: 
     return Interior(median(ring) - median(core), error, spread)
 
 
-def find_inside(prepared: Prepared, ellipse: Ellipse, settings: ExtractionSettings) -> list[Candidate]:
+def find_inside(prepared: Prepared, ellipse: Ellipse, shape: Shape) -> list[Candidate]:
     """Candidates inside an ellipse (an iris), from a smoothed image because the step may be below the noise."""
     linear = prepared.linear
     a, b = ellipse.semi_axes_px
@@ -273,7 +296,7 @@ def find_inside(prepared: Prepared, ellipse: Ellipse, settings: ExtractionSettin
     smooth = as_image(cv2.GaussianBlur(cv2.medianBlur(np.ascontiguousarray(linear[y0:y1, x0:x1]), 5), (0, 0), sigma))
     noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * sigma)
     inner = Prepared(smooth, prepared.clip_dn, noise, prepared.inverted)
-    found = find_candidates(inner, settings)
+    found = find_candidates(inner, shape)
     moved = [
         Candidate(
             ellipse=c.ellipse.shifted((x0, y0)),

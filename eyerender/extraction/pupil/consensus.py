@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse, EllipseFit, fit_ellipse_direct, from_cv2, signed_distance
-from ..settings import ExtractionSettings
+from ..settings import Shape
 from ..statistics import median
 from .candidates import Candidate
 from .edges import EdgePoints
@@ -51,15 +51,13 @@ class BoundaryFit:
 UNEVEN = 0.01
 
 
-def fit_boundary(
-    edges: EdgePoints, candidate: Candidate, settings: ExtractionSettings, expected_noise_px: float
-) -> BoundaryFit | str:
+def fit_boundary(edges: EdgePoints, candidate: Candidate, shape: Shape, expected_noise_px: float) -> BoundaryFit | str:
     """Fit the boundary of the pupil, or give the reason why there is none.
 
     Args:
         edges: edge points around the candidate.
         candidate: the dark blob.
-        settings: sizes and shapes that are accepted.
+        shape: sizes and shapes that are accepted.
         expected_noise_px: standard deviation of an edge point along its normal.
     """
     if edges.points_px.shape[0] < 8:
@@ -67,60 +65,36 @@ def fit_boundary(
     uneven = UNEVEN * float(np.sqrt(np.prod(candidate.ellipse.semi_axes_px)))
     expected_px = float(np.hypot(expected_noise_px, uneven))
     tolerance = float(np.clip(3.5 * expected_px, 0.35, 2.5))
-    start = _consensus(edges, candidate, settings, tolerance)
+    start = _consensus(edges, candidate, shape, tolerance)
     if start is None:
         return "no ellipse passes through the edges around the darkest blob"
-    boundary = _polished(edges, start, settings, tolerance)
-    if isinstance(boundary, str) or boundary.residual_px < 1.3 * expected_noise_px:
-        return boundary
-    # A part of an uneven boundary fits an ellipse better than the whole, but not as well as the noise of the edges
-    # allows.
-    cuts = Cuts.of(edges.points_px[boundary.inliers], boundary.ellipse, 12, (0.12, 0.2, 0.3, 0.42), 1.6)
-    freed, allowed = _without_lid(cuts, boundary, expected_noise_px, 0.7 * expected_noise_px), expected_noise_px
-    if not freed and boundary.residual_px >= 1.3 * expected_px:
-        freed, allowed = _without_lid(cuts, boundary, expected_px), expected_px
-    again = (_polished(edges, one, settings, max(0.35, 3.5 * allowed), free=True) for one in freed)
-    better = [one for one in again if isinstance(one, BoundaryFit) and one.residual_px <= 0.8 * boundary.residual_px]
-    return min(better, key=lambda one: one.residual_px, default=boundary)
-
-
-def _without_lid(cuts: Cuts, boundary: BoundaryFit, noise_px: float, within_px: float = np.inf) -> list[Ellipse]:
-    """Up to two ellipses fitted without a stretch of edge points that may be a lid margin.
-
-    A lid margin that crosses the pupil gives edge points inside the true boundary. An ellipse through both fits
-    neither. `cuts` leaves out each stretch of 12 to 42 % of the outline in turn. A fit qualifies if its residual is 1.4
-    times smaller than before and below `within_px`, and if the points left out lie inside the new ellipse.
-    """
-    good = cuts.residual_px < min(boundary.residual_px / 1.4, within_px)
-    return list(islice(cuts.inside(good, lambda residual: max(2.0 * residual, noise_px)), 2))
+    return _polished(edges, start, shape, tolerance)
 
 
 def boundaries_without_stretch(
-    edges: EdgePoints, boundary: BoundaryFit, settings: ExtractionSettings, expected_noise_px: float
+    edges: EdgePoints, boundary: BoundaryFit, shape: Shape, expected_noise_px: float
 ) -> list[BoundaryFit]:
-    """Alternative boundaries after a rejection: the best fit for each width of the stretch that is left out.
+    """Alternative boundaries: the best fit for each width of the stretch that is left out.
 
     The points left out must lie inside the new ellipse, as those of a lid margin that crosses the pupil do.
     """
     cuts = Cuts.of(edges.points_px[boundary.inliers], boundary.ellipse, 8, (0.2, 0.3, 0.42, 0.52), 2.0)
     of_width = (cuts.inside(cuts.width == width, lambda residual: 2.0 * residual) for width in np.unique(cuts.width))
     tolerance = max(0.35, 3.5 * expected_noise_px)
-    boundaries = (_polished(edges, one, settings, tolerance, free=True) for some in of_width for one in islice(some, 1))
+    boundaries = (_polished(edges, one, shape, tolerance, free=True) for some in of_width for one in islice(some, 1))
     return [one for one in boundaries if isinstance(one, BoundaryFit)]
 
 
-def _consensus(
-    edges: EdgePoints, candidate: Candidate, settings: ExtractionSettings, tolerance: float
-) -> Ellipse | None:
+def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance: float) -> Ellipse | None:
     """Choose the ellipse with the most support among those through all points and through random triples of arc pieces.
 
     If all points are about as close to their ellipse as noise allows, no others are tried.
     """
     points = edges.points_px
-    whole = _sane(fit_ellipse_direct(points[None]), candidate, settings)
+    whole = _sane(fit_ellipse_direct(points[None]), candidate, shape)
     if whole.shape[0] and _support(points, edges.normals, whole, tolerance)[0] > ALL_AGREE * _most(points, whole)[0]:
         return _ellipse(whole[0])
-    fits = np.concatenate([whole, _sane(_random_fits(edges, candidate), candidate, settings)])
+    fits = np.concatenate([whole, _sane(_random_fits(edges, candidate), candidate, shape)])
     if fits.shape[0] == 0:
         return None
     # Every third point suffices to choose the ellipses that are worth counting with all points.
@@ -151,13 +125,13 @@ def _random_fits(edges: EdgePoints, candidate: Candidate) -> EllipseFit:
     return fit_ellipse_direct(points[index])
 
 
-def _sane(fit: EllipseFit, candidate: Candidate, settings: ExtractionSettings) -> Floats:
+def _sane(fit: EllipseFit, candidate: Candidate, shape: Shape) -> Floats:
     """Centre, semi-axes and angle (m, 5) of the fits with plausible size and shape."""
     a, b = fit.semi_axes_px[:, 0], fit.semi_axes_px[:, 1]
     a0, b0 = candidate.ellipse.semi_axes_px
     with np.errstate(invalid="ignore"):
-        sane = (a < 2.2 * a0) & (b > 0.4 * b0) & (b > settings.aspect_min * a)
-        sane &= (a <= settings.radius_max_px) & (b >= 0.8 * settings.radius_min_px)
+        sane = (a < 2.2 * a0) & (b > 0.4 * b0) & (b > shape.aspect * a)
+        sane &= (a <= shape.most_px) & (b >= 0.8 * shape.least_px)
     return np.asarray(np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[sane])
 
 
@@ -191,7 +165,7 @@ def _most(points: Floats, fits: Floats) -> Floats:
 
 
 def _polished(
-    edges: EdgePoints, start: Ellipse, settings: ExtractionSettings, tolerance: float, *, free: bool = False
+    edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float, *, free: bool = False
 ) -> BoundaryFit | str:
     """Select points and refit with AMS until the selection settles.
 
@@ -223,12 +197,12 @@ def _polished(
     distance = signed_distance(ellipse, points[inliers])
     support, gap = outline_support(ellipse, points[inliers])
     a, b = ellipse.semi_axes_px
-    if support < settings.min_support:
-        return f"only {100 * support:.0f} % of the outline is seen, less than {100 * settings.min_support:.0f} %"
-    if b < settings.radius_min_px or a > settings.radius_max_px:
+    if support < shape.support:
+        return f"only {100 * support:.0f} % of the outline is seen, less than {100 * shape.support:.0f} %"
+    if b < shape.least_px or a > shape.most_px:
         return f"its semi-axes {a:.1f} x {b:.1f} px are outside the sizes looked for"
-    if b < settings.aspect_min * a:
-        return f"its axes' ratio {b / a:.2f} is below {settings.aspect_min:g}"
+    if b < shape.aspect * a:
+        return f"its axes' ratio {b / a:.2f} is below {shape.aspect:g}"
     return BoundaryFit(ellipse, inliers, points[inliers], support, gap, float(np.sqrt(np.mean(distance**2))))
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ...arrays import Floats, Indices
+from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse
 from ..preprocessing import Image, as_image
 from ..statistics import median, quantile
@@ -37,7 +37,14 @@ class EdgePoints:
 
 
 def find_edges(
-    linear: Image, candidate: Candidate, noise_dn: float, bright_dn: float, filter_px: float, *, band: float
+    linear: Image,
+    candidate: Candidate,
+    noise_dn: float,
+    bright_dn: float,
+    filter_px: float,
+    *,
+    band: float,
+    glare: Bools | None = None,
 ) -> EdgePoints:
     """Find edge points within `band` times the semi-axes of the candidate's outline (and at least 4 px).
 
@@ -54,6 +61,7 @@ def find_edges(
         bright_dn: level of a bright spot.
         filter_px: sigma of the derivative filter.
         band: width of the search, in semi-axes.
+        glare: (h, w) pixels that glints covered; no edge point is taken beside them.
     """
     ellipse = candidate.ellipse
     b = float(ellipse.semi_axes_px[1])
@@ -65,6 +73,10 @@ def find_edges(
     # The coarse tests come first, so that the others work on few pixels.
     floor = 3.5 * noise_dn / (2.0 * math.sqrt(2.0 * math.pi) * sigma**2)
     strong = magnitude > floor
+    if glare is not None:
+        beside = 2 * math.ceil(sigma) + 1
+        covered = glare[y0 : y0 + crop.shape[0], x0 : x0 + crop.shape[1]].astype(np.uint8)
+        strong &= cv2.dilate(covered, np.ones((beside, beside), np.uint8)) == 0
     strong[[0, -1], :] = False
     strong[:, [0, -1]] = False
     at = np.flatnonzero(strong)

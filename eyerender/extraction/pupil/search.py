@@ -1,36 +1,58 @@
-"""Search for the pupil boundary: which candidate is the pupil, judged by its edges at full resolution."""
+"""Search for the pupil boundary: hypotheses in the order of their cost, until one is certain.
+
+A hypothesis is a candidate with the boundary through the edges around it. Its certainty is the calibrated confidence of
+the boundary from its edges alone (`scoring`).
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 
 from ...arrays import Bools, Floats
-from ..preprocessing import Prepared
+from ...geometry.ellipse import Ellipse, iou
+from ..preprocessing import Image, Prepared, as_image
 from ..result import PupilResult
-from ..settings import ExtractionSettings
-from .candidates import Candidate, Interior, find_candidates, find_inside, inspect_interior
-from .consensus import BoundaryFit, fit_boundary
+from ..settings import Shape
+from .candidates import Candidate, Interior, candidate_at, find_candidates, find_inside, inspect_interior
+from .consensus import BoundaryFit, boundaries_without_stretch, fit_boundary
 from .covariance import edge_covariance
 from .edge_model import SECTORS, EdgeModel, Place, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
+from .glare import without_glare
+from .scoring import edge_confidence
+
+SURE = 0.9  # a hypothesis of this confidence ends the search
+LATE_CONFIDENCE = 0.5  # least confidence of a hypothesis of a later look
+USUAL_PX = 7.0  # smaller pupils are looked for at full resolution and last; lashes and shadows are as small
+# Between two frames a pupil moves by up to a few of its own sizes (a saccade of 500 deg/s covers 4 mm in 1/30 s). Its
+# size changes by less than a third.
+MOVED, GROWN = 4.0, 0.7
+SAME = 0.95  # candidates of at least this overlap have the same boundary
+LIKELY = 0.5  # share of the best candidate's score below which no later look starts from a candidate
+TOUCHING_PX = 10.0  # radius of glints that touch each other
+MOST_CUT = 2  # boundaries that are also tried without a stretch
+FLAT = 0.8  # ratio of axes below which a blob may be a pupil that lids cut
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
     """A candidate, the edge points around it, and the boundary through them; derived values are computed on demand.
 
-    `quality` combines how much of the boundary is visible and how well the candidate was ranked.
+    `cleared` is the image without glints near the candidate, and `glare` the mask of the pixels that they covered.
     """
 
     image: Prepared
+    cleared: Image
+    glare: Bools | None
     candidate: Candidate
     edges: EdgePoints
     boundary: BoundaryFit
-    quality: float
 
     @cached_property
     def model(self) -> EdgeModel:
@@ -48,7 +70,11 @@ class Found:
     @cached_property
     def interior(self) -> Interior:
         """Statistics of the pixels inside the boundary."""
-        return inspect_interior(self.image.linear, self.boundary.ellipse, self.model.sigma_px, self.image.noise_dn)
+        return self.inside(self.boundary.ellipse, self.model.sigma_px)
+
+    def inside(self, ellipse: Ellipse, blur_px: float) -> Interior:
+        """Statistics of the pixels inside an ellipse about the candidate."""
+        return inspect_interior(self.cleared, ellipse, blur_px, self.image.noise_dn, self.glare)
 
     @cached_property
     def sectors(self) -> Bools:
@@ -58,80 +84,221 @@ class Found:
         grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
         return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
 
+    @cached_property
+    def confidence(self) -> float:
+        """Probability that this is the pupil, from the edges alone."""
+        return edge_confidence(self)
+
     @property
-    def has_core(self) -> bool:
-        """Whether the middle is darker than the outer part, as inside the outline of an iris."""
+    def core_dn(self) -> float:
+        """How much darker the middle is than the outer part, 0 where that is not significant.
+
+        It is positive inside the outline of an iris, and negative if the pupil in it is bright.
+        """
         inside = self.interior
-        return not inside.darker_dn < max(4.0 * inside.error_dn, 0.15 * self.candidate.step_dn)
+        limit = max(4.0 * inside.error_dn, 0.15 * self.candidate.step_dn)
+        return inside.darker_dn if abs(inside.darker_dn) > limit else 0.0
 
 
-def search(work: Prepared, settings: ExtractionSettings) -> Found | PupilResult:
-    """Find the best candidate, judged by its edges; if there is none, the search repeats without dark lines."""
-    found = _searched(work, settings, without_lines=False)
-    if isinstance(found, Found) or work.inverted:
-        return found
-    again = _searched(work, settings, without_lines=True)
-    return again if isinstance(again, Found) and again.boundary.support > 0.5 else found
+def search(work: Prepared, shape: Shape, prior: Ellipse | None = None) -> Found | PupilResult:
+    """Find the most likely boundary.
+
+    The first one that is certain ends the search. Otherwise the likeliest one of the first look is taken, unless a
+    later look finds one of `LATE_CONFIDENCE` that is likelier.
+
+    Args:
+        work: the image, in which the pupil is dark.
+        shape: accepted sizes and shapes.
+        prior: where the pupil was before. It only decides where is looked first.
+    """
+    if prior is not None:
+        for near in _near(work, shape, prior):
+            if isinstance(near, Found) and near.core_dn <= 0.0 and near.confidence >= SURE:
+                return near
+    return _likeliest(hypotheses(work, shape))
 
 
-def _searched(work: Prepared, settings: ExtractionSettings, *, without_lines: bool) -> Found | PupilResult:
-    candidates = find_candidates(work, settings, without_lines=without_lines)
-    if not candidates:
-        return PupilResult.missing("coarse search", "no dark round region stands out of its surroundings")
-    found, reason = _first_good(work, candidates, settings)
-    if found is None:
-        return PupilResult.missing("edges", reason)
-    return _without_core(work, found, settings)
-
-
-def _first_good(work: Prepared, candidates: list[Candidate], settings: ExtractionSettings) -> tuple[Found | None, str]:
-    """First candidate whose boundary is well visible, else the most visible one; and why the first one failed."""
-    poor: list[Found] = []
+def _likeliest(looks: Iterator[tuple[bool, Found | str]]) -> Found | PupilResult:
+    best: Found | None = None
     reason = ""
-    for candidate in candidates:
-        found = boundary_about(work, candidate, settings)
+    for late, found in looks:
         if isinstance(found, str):
             reason = reason or found
             continue
-        # The ranking considers nesting, so a later candidate only replaces one that failed.
-        if found.boundary.support > 0.45:
-            return next((earlier for earlier in poor if _holds(found, earlier)), found), reason
-        poor.append(found)
-    return max(poor, key=lambda one: one.quality, default=None), reason
-
-
-def _holds(outer: Found, inner: Found) -> bool:
-    """Whether a smaller boundary that was found earlier lies inside, even if little of it is visible."""
-    ratio = inner.boundary.ellipse.area_px2 / outer.boundary.ellipse.area_px2
-    apart = math.dist(inner.boundary.ellipse.centre_px, outer.boundary.ellipse.centre_px)
-    return ratio < 0.7 and apart < 0.7 * float(outer.boundary.ellipse.semi_axes_px[1])
-
-
-def _without_core(work: Prepared, found: Found, settings: ExtractionSettings) -> Found | PupilResult:
-    """Boundary itself if its interior is even; the boundary inside it if it has a darker core, as an iris has."""
-    for _ in range(2):
-        if not found.has_core:
+        if found.core_dn > 0.0:
+            late = True  # an iris, or a pupil with a reflection in it
+        elif found.confidence >= SURE:
             return found
-        inner, _ = _first_good(work, find_inside(work, found.boundary.ellipse, settings), settings)
-        if inner is None or inner.boundary.ellipse.area_px2 > 0.8 * found.boundary.ellipse.area_px2:
-            reason = "the dark region has a darker core, as an iris has, but no boundary was found in it"
-            return PupilResult.missing("edges", reason)
-        found = inner
-    return found
+        if found.confidence > (0.0 if best is None else best.confidence) and not (
+            late and found.confidence < LATE_CONFIDENCE
+        ):
+            best = found
+    if best is not None:
+        return best
+    if not reason:
+        return PupilResult.missing("coarse search", "no dark round region stands out of its surroundings")
+    return PupilResult.missing("edges", reason)
 
 
-def boundary_about(work: Prepared, candidate: Candidate, settings: ExtractionSettings) -> Found | str:
+def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, Found | str]]:
+    """Boundaries, or why a candidate has none, and whether they are of a later look.
+
+    1. the candidates of a reduced image, and those inside each that has a dark core
+    2. pupils that lids cut: each boundary without the stretch that may be a lid, and rounder starts
+    3. the image without larger bright spots, and without dark lines, which lashes and the shadows of lids are
+    4. the image at half scale, where block compression and texture are finer than the edges
+    5. pupils smaller than USUAL_PX
+    """
+    usual = replace(shape, least_px=max(shape.least_px, min(USUAL_PX, 0.5 * shape.most_px)))
+    tried: list[Candidate] = []
+    found: list[Found] = []
+
+    def bounded(candidates: Sequence[Candidate]) -> Iterator[Found | str]:
+        for candidate in candidates:
+            if all(iou(candidate.ellipse, one.ellipse) < SAME for one in tried):
+                tried.append(candidate)
+                for boundary in _with_inner(work, candidate, shape):
+                    if isinstance(boundary, Found):
+                        found.append(boundary)
+                    yield boundary
+
+    yield from ((False, one) for one in bounded(find_candidates(work, usual)))
+    likely = sorted((one for one in found if one.core_dn <= 0.0), key=lambda one: -one.confidence)[:MOST_CUT]
+    for one in likely:
+        yield from ((True, replace(one, boundary=boundary)) for boundary in _without_stretch(one, shape))
+    yield from ((True, one) for one in bounded(list(_rounder(_best(tried), shape))))
+    if not work.inverted:
+        yield from ((True, one) for one in bounded(_best(find_candidates(work, usual, spot_px=TOUCHING_PX))))
+        lineless = _best(find_candidates(work, usual, without_lines=True))
+        yield from ((True, one) for one in bounded([*lineless, *_rounder(lineless, shape)]))
+    yield from ((True, one) for one in _at_half_scale(work, shape))
+    if shape.least_px < usual.least_px:
+        small = replace(shape, most_px=2.0 * usual.least_px)
+        yield from ((True, one) for one in bounded(find_candidates(work, small)))
+
+
+def _near(work: Prepared, shape: Shape, prior: Ellipse) -> Iterator[Found | str]:
+    """Boundaries where the pupil was before, then those of dark blobs of its size around there."""
+    candidate = candidate_at(work, prior)
+    if candidate is not None:
+        yield boundary_about(work, candidate, shape)
+    a, b = prior.semi_axes_px.tolist()
+    (cx, cy), (height, width) = prior.centre_px.tolist(), work.linear.shape
+    reach = MOVED * a + 8.0
+    x0, x1 = max(0, math.floor(cx - reach)), min(width, math.ceil(cx + reach) + 1)
+    y0, y1 = max(0, math.floor(cy - reach)), min(height, math.ceil(cy + reach) + 1)
+    if min(x1 - x0, y1 - y0) < 16:
+        return
+    alike = replace(shape, least_px=max(shape.least_px, GROWN * b), most_px=min(shape.most_px, a / GROWN))
+    crop = replace(work, linear=np.ascontiguousarray(work.linear[y0:y1, x0:x1]))
+    for found in find_candidates(crop, alike):
+        yield boundary_about(work, replace(found, ellipse=found.ellipse.shifted((x0, y0))), shape)
+
+
+def _with_inner(work: Prepared, candidate: Candidate, shape: Shape) -> Iterator[Found | str]:
+    """The boundary about a candidate, and those inside it if it has a darker core."""
+    found = boundary_about(work, candidate, shape)
+    yield found
+    if isinstance(found, Found) and found.core_dn > 0.0:
+        cleared = replace(work, linear=found.cleared)
+        for inner in find_inside(cleared, found.boundary.ellipse, shape):
+            yield boundary_about(work, inner, shape)
+
+
+def _best(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Candidates that are not much worse than the best of them."""
+    least = LIKELY * max((one.score for one in candidates), default=0.0)
+    return [one for one in candidates if one.score >= least]
+
+
+def _rounder(candidates: Sequence[Candidate], shape: Shape) -> Iterator[Candidate]:
+    """Circles as wide as each flat blob, about its middle and to either side of it.
+
+    Half a disc of radius r has the second moments of an ellipse of semi-axes r and 0.53 r, 0.42 r from the middle of
+    the disc: 0.9 of the difference. A disc that two lids cut alike has its middle in the middle of the blob.
+    """
+    for candidate in candidates:
+        a, b = candidate.ellipse.semi_axes_px.tolist()
+        if b > FLAT * a or a > shape.most_px:
+            continue
+        across = np.array([-math.sin(candidate.ellipse.angle_rad), math.cos(candidate.ellipse.angle_rad)])
+        for side in (0.0, 1.0, -1.0):
+            centre = candidate.ellipse.centre_px + side * 0.9 * (a - b) * across
+            yield replace(candidate, ellipse=Ellipse(centre, np.array([a, a]), 0.0))
+
+
+def _without_stretch(found: Found, shape: Shape) -> list[BoundaryFit]:
+    edges, candidate = found.edges, found.candidate
+    noise = edge_noise_px(
+        candidate.step_dn,
+        noise_dn=found.image.noise_dn,
+        sigma_filter=edges.filter_px,
+        sigma_total=edges.sigma_px,
+    )
+    return boundaries_without_stretch(edges, found.boundary, shape, noise)
+
+
+def _at_half_scale(work: Prepared, shape: Shape) -> Iterator[Found | str]:
+    """Boundaries in the image at half scale, in the pixels of the whole image."""
+    height, width = work.linear.shape
+    if min(height, width) < 64:
+        return
+    half = as_image(cv2.resize(work.linear[: height // 2 * 2, : width // 2 * 2], None, fx=0.5, fy=0.5,
+                               interpolation=cv2.INTER_AREA))  # fmt: skip
+    small = replace(work, linear=half, noise_dn=max(0.5 * work.noise_dn, 1e-3))
+    limits = replace(shape, least_px=max(0.5 * shape.least_px, 3.0), most_px=0.5 * shape.most_px)
+    for candidate in find_candidates(small, replace(limits, least_px=max(limits.least_px, 0.5 * USUAL_PX))):
+        for found in _with_inner(small, candidate, limits):
+            yield found if isinstance(found, str) else _doubled(found, work)
+
+
+def _doubled(found: Found, work: Prepared) -> Found:
+    """A boundary of the image at half scale in the pixels of the whole one."""
+    edges, boundary, candidate = found.edges, found.boundary, found.candidate
+    size = (work.linear.shape[1], work.linear.shape[0])
+    glare = None if found.glare is None else cv2.resize(found.glare.astype(np.uint8), size).astype(bool)
+    return Found(
+        work,
+        as_image(cv2.resize(found.cleared, size)),
+        glare,
+        replace(candidate, ellipse=_double(candidate.ellipse)),
+        replace(
+            edges,
+            points_px=2.0 * edges.points_px + 0.5,
+            strength=0.5 * edges.strength,
+            sigma_px=2.0 * edges.sigma_px,
+            filter_px=2.0 * edges.filter_px,
+        ),
+        replace(
+            boundary,
+            ellipse=_double(boundary.ellipse),
+            points_px=2.0 * boundary.points_px + 0.5,
+            residual_px=2.0 * boundary.residual_px,
+        ),
+    )
+
+
+def _double(ellipse: Ellipse) -> Ellipse:
+    return Ellipse(2.0 * ellipse.centre_px + 0.5, 2.0 * ellipse.semi_axes_px, ellipse.angle_rad)
+
+
+def boundary_about(work: Prepared, candidate: Candidate, shape: Shape) -> Found | str:
     """Find the boundary around a candidate, or give the reason why there is none."""
+    cleared, glare = work.linear, None
+    if not work.inverted:
+        cleared, glare = without_glare(
+            work.linear, candidate.ellipse, candidate.inside_dn, candidate.step_dn, work.noise_dn
+        )
     bright = candidate.inside_dn + 4.0 * candidate.step_dn
     b = float(candidate.ellipse.semi_axes_px[1])
     sigma = filter_sigma(candidate.step_dn, work.noise_dn, b)
-    edges = find_edges(work.linear, candidate, work.noise_dn, bright, sigma, band=0.4)
+    edges = find_edges(cleared, candidate, work.noise_dn, bright, sigma, band=0.4, glare=glare)
     blur = math.sqrt(max(edges.sigma_px**2 - sigma**2, 0.0))
     if blur > 1.7 * sigma:  # a filter much sharper than the image only adds noise
         sigma = min(blur, max(1.0, 0.2 * b))
-        edges = find_edges(work.linear, candidate, work.noise_dn, bright, sigma, band=0.4)
+        edges = find_edges(cleared, candidate, work.noise_dn, bright, sigma, band=0.4, glare=glare)
     expected = edge_noise_px(candidate.step_dn, noise_dn=work.noise_dn, sigma_filter=sigma, sigma_total=edges.sigma_px)
-    boundary = fit_boundary(edges, candidate, settings, expected)
+    boundary = fit_boundary(edges, candidate, shape, expected)
     if isinstance(boundary, str):
         return boundary
-    return Found(work, candidate, edges, boundary, boundary.support * min(1.0, 4.0 * candidate.score))
+    return Found(work, cleared, glare, candidate, edges, boundary)

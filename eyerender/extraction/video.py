@@ -1,0 +1,150 @@
+"""Videos: grey frames of a file one by one, the pupil followed from frame to frame, and videos of what was found.
+
+OpenCV's FFmpeg decodes and encodes. A frame is grey where the file has no colour, else its luminance.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+
+from ..arrays import Bytes
+from ..errors import EyerenderError, InputError
+from ..files import opened
+from .pair import extract_eyes
+from .pipeline import extract
+from .preprocessing import MAX_PIXELS
+from .result import Extraction, PupilResult
+from .settings import ExtractionSettings
+
+SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
+MAX_VIDEO_BYTES = 1 << 40
+# Codec of each kind of file that is written: one that OpenCV's own FFmpeg can encode.
+CODECS = {".mp4": "mp4v", ".avi": "MJPG", ".mkv": "FFV1"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """A frame: its number, its time in s (NaN where there is none), the grey image (h, w), whether it has colour."""
+
+    number: int
+    time_s: float
+    image: Bytes
+    colour: bool
+
+
+def is_video(path: str | Path) -> bool:
+    """Whether a name is that of a video."""
+    return Path(path).suffix.lower() in SUFFIXES
+
+
+class VideoReader:
+    """The frames of a video file, once from first to last.
+
+    Attributes:
+        frames_per_s: as the file states it, else 25.
+        count: number of frames as the file states it, 0 where it does not.
+
+    Raises:
+        InputError: it is missing, not a regular file, not a video, or its frames are too large.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.source = str(path)
+        with opened(path, limit=MAX_VIDEO_BYTES) as file:  # a missing file, a folder or a pipe has its own message
+            if os.fstat(file.fileno()).st_size == 0:
+                raise InputError("is empty", source=self.source)
+        # The name is absolute, so that it cannot be taken for the address of a stream.
+        self._capture = cv2.VideoCapture(os.path.abspath(path), cv2.CAP_FFMPEG)
+        if not self._capture.isOpened():
+            raise InputError("is not a video that can be read", source=self.source)
+        size = [self._capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        if not 0 < size[0] * size[1] <= MAX_PIXELS:
+            raise InputError(f"has frames of {size[0]:.0f} x {size[1]:.0f} px", source=self.source)
+        rate = float(self._capture.get(cv2.CAP_PROP_FPS))
+        self.frames_per_s = rate if math.isfinite(rate) and 0.0 < rate <= 1e6 else 25.0
+        count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        self.count = int(count) if 0 < count < 1e9 else 0
+
+    def __iter__(self) -> Iterator[Frame]:
+        number = 0
+        while True:
+            good, picture = self._capture.read()
+            if not good or picture is None:
+                break
+            time_s = float(self._capture.get(cv2.CAP_PROP_POS_MSEC)) * 1e-3
+            colour = picture.ndim == 3 and bool(
+                (picture[..., 0] != picture[..., 1]).any() or (picture[..., 1] != picture[..., 2]).any()
+            )
+            grey = (
+                cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if colour else picture.reshape(*picture.shape[:2], -1)[..., 0]
+            )
+            yield Frame(number, time_s, np.ascontiguousarray(grey, dtype=np.uint8), colour)
+            number += 1
+        self._capture.release()
+        if number == 0:
+            raise InputError("holds no frame that can be read", source=self.source)
+
+
+def follow(
+    frames: Iterator[Frame] | VideoReader,
+    *,
+    gamma: float = 1.0,
+    settings: ExtractionSettings | None = None,
+    eyes: int = 1,
+) -> Iterator[tuple[Frame, tuple[Extraction, ...]]]:
+    """Extract the features of each frame; where a pupil was found, it is looked for first in the next frame.
+
+    Args:
+        frames: frames in the order of time.
+        gamma: encoding gamma of the levels.
+        settings: settings of the extractor.
+        eyes: 1, or 2 for frames with both eyes: that on the image's left, then that on its right.
+    """
+    before: list[PupilResult | None] = [None] * eyes
+    for frame in frames:
+        if eyes == 1:
+            found: tuple[Extraction, ...] = (extract(frame.image, gamma=gamma, settings=settings, prior=before[0]),)
+        else:
+            found = extract_eyes(frame.image, gamma=gamma, settings=settings, prior=(before[0], before[1]))
+        before = [one.pupil if one.pupil.ok else None for one in found]
+        yield frame, found
+
+
+class VideoWriter:
+    """A video of colour pictures (h, w, 3) of one size; the name's ending chooses the format (.mp4, .avi, .mkv)."""
+
+    def __init__(self, path: str | Path, width: int, height: int, frames_per_s: float) -> None:
+        self.path = Path(path)
+        name = self.path.suffix.lower()
+        if name not in CODECS:
+            raise InputError(f"must end with {', '.join(CODECS)}", source=str(path))
+        # A video is written under another name first, so that a broken one is not taken for a whole one.
+        self._part = self.path.with_name(f".{self.path.stem}.part{name}")
+        even = (width + width % 2, height + height % 2)  # OpenCV cuts off the last row or column of odd sizes
+        code = cv2.VideoWriter.fourcc(*CODECS[name])
+        self._writer = cv2.VideoWriter(str(self._part), cv2.CAP_FFMPEG, code, frames_per_s, even)
+        if not self._writer.isOpened():
+            raise EyerenderError(f"{path}: cannot be written")
+
+    def add(self, picture: Bytes) -> None:
+        """Add a picture."""
+        height, width = picture.shape[:2]
+        self._writer.write(np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._writer.release()
+        if kind is None:
+            self._part.replace(self.path)
+        else:
+            self._part.unlink(missing_ok=True)

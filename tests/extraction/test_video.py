@@ -1,0 +1,125 @@
+"""Videos, both eyes of a frame, colour, and pictures of what was found."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+import make_ideal_images as ideal
+from eyerender.cli.main import run
+from eyerender.errors import InputError
+from eyerender.extraction import REFINED, extract, extract_eyes
+from eyerender.extraction.video import Frame, VideoReader, VideoWriter, follow
+from eyerender.geometry.ellipse import Ellipse, iou
+
+SEEDS = range(20_300, 20_306)
+SMALL = ideal.Condition(size=(320, 240), semi_axis=(18, 30), noise=(2, 2), aspect=(0.8, 1.0))
+
+
+def _truth(drawing) -> Ellipse:
+    pupil = drawing.label["pupil"]
+    return Ellipse(pupil["centre_px"], pupil["semi_axes_px"], pupil["angle_rad"])
+
+
+@pytest.fixture(scope="module")
+def drawings():
+    return [ideal.draw(SMALL, seed) for seed in SEEDS]
+
+
+@pytest.fixture(scope="module")
+def video(drawings, tmp_path_factory):
+    path = tmp_path_factory.mktemp("video") / "eyes.mkv"
+    with VideoWriter(path, 320, 240, 50.0) as writer:
+        for drawing in drawings:
+            writer.add(np.repeat(drawing.image[..., None], 3, axis=2))
+    return path
+
+
+def test_a_followed_pupil_is_that_of_single_frames(drawings):
+    # The pupil jumps by several of its sizes from frame to frame, and one frame shows none.
+    images = [drawing.image for drawing in drawings]
+    images.insert(3, np.full_like(images[0], 120) + np.arange(320, dtype=np.uint8) // 8)
+    frames = (Frame(k, k / 50.0, image, False) for k, image in enumerate(images))
+    for frame, (found,) in follow(frames, settings=REFINED):
+        single = extract(frame.image, settings=REFINED).pupil
+        assert found.pupil.ok == single.ok
+        if single.ok:
+            apart = np.hypot(*(found.pupil.ellipse.centre_px - single.ellipse.centre_px))
+            # Both fits end with a step below 0.001 px; the edges that they start from were chosen about other starts.
+            assert apart < 0.2 * math.sqrt(np.trace(single.covariance[:2, :2]))
+
+
+def test_a_wrong_prior_does_no_harm(drawings):
+    elsewhere = extract(drawings[0].image).pupil
+    found = extract(drawings[1].image, prior=elsewhere).pupil
+    assert iou(found.ellipse, _truth(drawings[1])) > 0.95
+
+
+def test_frames_of_a_lossless_video(video, drawings):
+    frames = list(VideoReader(video))
+    assert [frame.number for frame in frames] == list(range(len(drawings)))
+    assert [frame.time_s for frame in frames] == pytest.approx(np.arange(len(drawings)) / 50.0, abs=1e-3)
+    for frame, drawing in zip(frames, drawings, strict=True):
+        assert not frame.colour
+        np.testing.assert_array_equal(frame.image, drawing.image)
+
+
+def test_the_command_writes_records_and_a_picture_of_each_frame(video, drawings, tmp_path, capsys):
+    records, shown = tmp_path / "records.jsonl", tmp_path / "shown.avi"
+    assert run(["extract", str(video), "-o", str(records), "--overlay", str(shown)]) == 0
+    assert "pupil found in 6 of 6" in capsys.readouterr().out
+    lines = [json.loads(line) for line in records.read_text().splitlines()]
+    assert [line["frame"] for line in lines] == list(range(len(drawings)))
+    for line, drawing in zip(lines, drawings, strict=True):
+        assert math.dist(line["pupil"]["centre_px"], _truth(drawing).centre_px) < 0.1
+        assert line["confidence"] > 0.9
+    assert lines[2]["time_s"] == pytest.approx(0.04, abs=1e-3)
+    picture = next(iter(VideoReader(shown)))
+    assert picture.colour
+    assert picture.image.shape == (240, 320)
+
+
+def test_both_eyes_by_the_image_side(drawings):
+    first, second = drawings[0], drawings[1]
+    both = np.hstack([first.image, second.image])
+    left, right = extract_eyes(both)
+    assert iou(left.pupil.ellipse, _truth(first)) > 0.95
+    assert iou(right.pupil.ellipse, _truth(second).shifted((320.0, 0.0))) > 0.95
+    blank = np.full_like(first.image, 100)
+    left, right = extract_eyes(np.hstack([blank, first.image]))
+    assert not left.pupil.ok
+    assert iou(right.pupil.ellipse, _truth(first).shifted((320.0, 0.0))) > 0.95
+
+
+def test_colour_is_taken_with_one_warning(drawings, tmp_path, capsys):
+    drawing = drawings[0]
+    colour = np.repeat(drawing.image[..., None], 3, axis=2)
+    colour[..., 2] //= 2
+    for k in range(2):
+        assert cv2.imwrite(str(tmp_path / f"{k}.png"), colour)
+    assert run(["extract", str(tmp_path / "0.png"), str(tmp_path / "1.png"), "--overlay", str(tmp_path / "seen")]) == 0
+    assert capsys.readouterr().err.count("warning") == 1
+    assert sorted(p.name for p in (tmp_path / "seen").iterdir()) == ["0.png", "1.png"]
+    with pytest.warns(UserWarning, match="in colour"):
+        found = extract(colour)
+    assert iou(found.pupil.ellipse, _truth(drawing)) > 0.95
+
+
+@pytest.mark.parametrize(("content", "message"), [(b"", "is empty"), (b"no video" * 99, "not a video")])
+def test_a_broken_video_is_one_line(content, message, tmp_path, capsys):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        list(VideoReader(path))
+    assert run(["extract", str(path), "-o", str(tmp_path / "records.jsonl")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert not (tmp_path / "records.jsonl").exists()
+
+
+def test_a_video_cannot_be_an_address(tmp_path):
+    with pytest.raises(InputError):
+        VideoReader("http://localhost:1/a.mp4")
