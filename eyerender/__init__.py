@@ -26,13 +26,17 @@ if TYPE_CHECKING:
     from .errors import BackendError, EyerenderError, InputError
     from .extraction import ExtractionSettings, extract
     from .eye.catalogue import load_eye
+    from .eye.kappa import kappa_deg, with_kappa
     from .eye.margin import PupilMargin
     from .eye.model import EyeModel
+    from .eye.parts import TopographySpec
     from .eye.spec import EyeSpec
+    from .eye.topography import read_topography
     from .imagefolder import ImageFolder
     from .imageobserver import ImageObserver, detect
     from .images import LabelledImage, auto_exposed, export_scene, render, render_folder
     from .observation import Observations
+    from .population.synteyes import SyntEye, SyntEyes
     from .quickstart import compare_folder, run_quickstart
     from .region.anatomy import Brow, Face, Fissure, Lashes, Lid, Region, Skin, TearFilm
     from .region.headspec import Head, HeadParts
@@ -105,8 +109,11 @@ _HOMES = {
     "Skin": "region.anatomy",
     "Status": "status",
     "Subject": "scene.subject",
+    "SyntEye": "population.synteyes",
+    "SyntEyes": "population.synteyes",
     "Targets": "scene.spec",
     "TearFilm": "region.anatomy",
+    "TopographySpec": "eye.parts",
     "bench_extractors": "benchmark.run",
     "compare": "comparison",
     "compare_folder": "quickstart",
@@ -117,9 +124,11 @@ _HOMES = {
     "export_scene": "images",
     "extract": "extraction",
     "generate": "dataset.run",
+    "kappa_deg": "eye.kappa",
     "load_eye": "eye.catalogue",
     "load_scene": "scene",
     "preview": "dataset.sheet",
+    "read_topography": "eye.topography",
     "render": "images",
     "render_folder": "images",
     "render_windows": "capture",
@@ -128,6 +137,7 @@ _HOMES = {
     "shipped_scenes": "scene",
     "trace": "analytic.observer",
     "validate": "dataset.validate",
+    "with_kappa": "eye.kappa",
     "write_report": "report.comparison",
 }
 
@@ -185,8 +195,11 @@ __all__ = [
     "Skin",
     "Status",
     "Subject",
+    "SyntEye",
+    "SyntEyes",
     "Targets",
     "TearFilm",
+    "TopographySpec",
     "__version__",
     "auto_exposed",
     "bench_extractors",
@@ -199,9 +212,11 @@ __all__ = [
     "extract",
     "gaze",
     "generate",
+    "kappa_deg",
     "load_eye",
     "load_scene",
     "preview",
+    "read_topography",
     "render",
     "render_folder",
     "render_windows",
@@ -210,6 +225,7 @@ __all__ = [
     "shipped_scenes",
     "trace",
     "validate",
+    "with_kappa",
     "write_report",
 ]
 

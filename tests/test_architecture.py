@@ -218,10 +218,11 @@ def test_public_names_are_pinned():
         "ImageObserver", "InputError", "LabelledImage", "Lashes", "Led", "LedRing", "Lens", "Lid", "Look", "Motion",
         "Observations", "Observer", "Opening", "Panel", "Picture", "PinholeCamera", "Population", "PupilMargin",
         "RadianceMap", "Region", "Rig", "RigGeometry", "Scene", "SceneSpec", "Screen", "Sensor", "Skin", "Status",
-        "Subject", "Targets", "TearFilm", "__version__", "auto_exposed", "bench_extractors", "compare",
-        "compare_folder", "detect", "estimate", "export", "export_scene", "extract", "gaze", "generate", "load_eye",
-        "load_scene", "preview", "render", "render_folder", "render_windows", "run_quickstart", "sample",
-        "shipped_scenes", "trace", "validate", "write_report",
+        "Subject", "SyntEye", "SyntEyes", "Targets", "TearFilm", "TopographySpec", "__version__", "auto_exposed",
+        "bench_extractors", "compare", "compare_folder", "detect", "estimate", "export", "export_scene", "extract",
+        "gaze", "generate", "kappa_deg", "load_eye", "load_scene", "preview", "read_topography", "render",
+        "render_folder", "render_windows", "run_quickstart", "sample", "shipped_scenes", "trace", "validate",
+        "with_kappa", "write_report",
     ]  # fmt: skip
     for name in eyerender.__all__:
         assert getattr(eyerender, name) is not None

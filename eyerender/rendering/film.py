@@ -88,6 +88,8 @@ def _sums(
 ) -> tuple[list[Floats], int]:
     """Sums over the samples of each pixel, (height, width): radiance; or radiance, weight, nearness of each part."""
     width, height = window[2:]
+    if shown.lights.on_iris is not None:
+        shown.lights.on_iris.make()
     grouped = shown.values.structure.region and integrator.bounces == 0
     size = group_size(spp) if grouped else 1
     totals: list[Floats] = []

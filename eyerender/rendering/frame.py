@@ -128,6 +128,9 @@ def parameters_of(job: RenderJob) -> Parameters:
     front, stop, sclera = eye.front[0], eye.stop, eye.sclera
     angle = np.linspace(0, 2 * np.pi, 64)
     edge = front.sag(eye.limbus_radius_mm * np.cos(angle), eye.limbus_radius_mm * np.sin(angle))
+    ring = eye.limbus_radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rim = front.origin_mm + np.column_stack([edge, ring]) @ np.asarray(front.rotation).T
+    bulge = 0.5 * (rim.mean(axis=0) + apex_of(front))
     cornea_reach = float(np.linalg.norm(apex_of(front) - sclera.centre_mm))
     return Parameters(
         surfaces=surfaces,
@@ -145,6 +148,8 @@ def parameters_of(job: RenderJob) -> Parameters:
             floor=float(np.min(edge)) - 2.0,
             gain=1 / max(look.limbus_width_mm, 1e-6),
             albedo=look.limbus_albedo,
+            bulge=bulge,
+            bulge_radius=float(np.max(np.linalg.norm(rim - bulge, axis=1))) + 0.05,
         ),
         sclera=ScleraParameters(sclera.centre_mm, sclera.radius_mm, look.sclera_albedo, look.sclera_contrast),
         image=ImageParameters(*_image(eye.front, indices, float(stop.centre_mm[0]))),

@@ -60,7 +60,8 @@ class LampViews:
         return inside & (dr.gather(mi.UInt32, self._marks, cell, inside) == 0)
 
     def _view(self, lamp: mi.UInt32) -> _View:
-        row = [dr.gather(mi.Float, self._table, lamp * _WIDTH + k) for k in range(15)]
+        four = [dr.gather(mi.Vector4f, self._table, lamp * (_WIDTH // 4) + k) for k in range(_WIDTH // 4)]
+        row = [n for part in four for n in (part.x, part.y, part.z, part.w)]
         return _View(*(mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9)), *row[12:15])
 
     def _mark(self, skin: SkinGeometry, lamps: int) -> None:

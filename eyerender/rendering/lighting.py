@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -30,11 +30,16 @@ def lamp_blocked(
     distance = dr.norm(d)
     d /= distance
     r = x - values.sclera.centre
-    past = r - dr.dot(r, d) * d
+    along = dr.dot(r, d)
     reach = values.globe_reach
+    near = dr.squared_norm(r) - along * along < reach * reach
+    # Where only the bulge of the cornea can block, most rays pass the sphere about it.
+    way, bulge2 = values.limbus.bulge - x, dr.square(values.limbus.bulge_radius)
+    ahead, away2 = dr.dot(way, d), dr.squared_norm(way)
+    near &= mi.Bool(sphere) | ((away2 - ahead * ahead < bulge2) & ((ahead > 0) | (away2 < bulge2)))
     blocked = dr.if_stmt(
         (x, r, d, distance, mi.Bool(sphere), mi.Bool(cornea)),
-        dr.squared_norm(past) < reach * reach,
+        near & (mi.Bool(sphere) | mi.Bool(cornea)),
         lambda x, r, d, distance, sphere, cornea: _globe_blocks(values, x, r, d, distance, sphere, cornea),
         lambda x, r, d, distance, sphere, cornea: mi.Bool(False),
     )
@@ -118,12 +123,21 @@ def light(
         bent, failures = through_cornea(values, lights, scene, view.inner, view.lit_inside, u, v)
         return direct * share, shine * share, bent, failures
 
-    def onto_matte(lamp: Lamp, source: mi.Vector3f) -> mi.Float:
+    sine, cosine = dr.sincos(v * (2 * dr.pi))
+
+    def onto_matte(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        lamp: Lamp = lights[i]
+        source = lamp.point(u, sine, cosine)
         direct, _ = straight(lamp, source, view)
         blocked = lamp_blocked(values, scene, view.point, source, view.other, ~view.cornea, direct > 0)
-        return dr.select(blocked, 0, direct)
+        return i + 1, total + dr.select(blocked, 0, direct)
 
-    direct, bent, failures = _all_lamps(values, lights, scene, view.inner, view.lit_inside, u, v, onto_matte)
+    matte = view.matte
+    state = (mi.UInt32(0), mi.Float(0))
+    _, direct = dr.while_loop(
+        state, lambda i, _: matte & (i < lights.count), onto_matte, labels=("i", "direct"), label="lamps"
+    )
+    bent, failures = through_cornea(values, lights, scene, view.inner, view.lit_inside, u, v)
     return direct, mi.Float(0), bent, failures
 
 
@@ -134,61 +148,56 @@ def through_cornea(
 
     u, v: place on each lamp's disc, [0, 1).
     """
-    _, bent, failures = _all_lamps(values, lights, scene, inner, inside, u, v, None)
+    bent, rest = mi.Float(0), inside
+    if lights.on_iris is not None:
+        bent, known = lights.on_iris.at(inner, inside)
+        rest = inside & ~known
+    sine, cosine = dr.sincos(v * (2 * dr.pi))
+
+    def more(i: mi.UInt32, *_: object) -> mi.Bool:
+        return rest & (i < lights.count)
+
+    def body(i: mi.UInt32, bent: mi.Float, failures: mi.UInt32) -> tuple[mi.UInt32, mi.Float, mi.UInt32]:
+        lamp: Lamp = lights[i]
+        path = LampPath.to(values, scene, lamp, lamp.point(u, sine, cosine), inner, rest)
+        failed = dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
+        return i + 1, bent + dr.select(path.blocked, 0, path.gain), failures + failed
+
+    state = (mi.UInt32(0), bent, mi.UInt32(0))
+    _, bent, failures = dr.while_loop(state, more, body, labels=("i", "bent", "failures"), label="lamps")
     return bent, failures
 
 
-def _all_lamps(
-    values: Values,
-    lights: Lights,
-    scene: mi.Scene,
-    inner: mi.Vector3f,
-    inside: mi.Bool,
-    u: mi.Float,
-    v: mi.Float,
-    onto_matte: Callable[[Lamp, mi.Vector3f], mi.Float] | None,
-) -> tuple[mi.Float, mi.Float, mi.UInt32]:
-    """Sum over the lamps of `onto_matte` (lamp, its points) and of the irradiance behind the cornea; failed paths."""
-    n = values.stop.normal
-    # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
-    scale, shift = values.image.scale, values.image.shift
-    aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
+@dataclass(frozen=True, slots=True)
+class LampPath:
+    """Light path from a point of a lamp through the cornea to a point behind it.
 
-    sine, cosine_v = dr.sincos(v * (2 * dr.pi))
+    Attributes:
+        gain: irradiance (mW/mm^2) if nothing is in the way.
+        entry: where the path enters the front surface (eye frame).
+        enters: whether there is a path, through the clear part of the cornea.
+        blocked: whether anything is in its way.
+        failed: whether the search for it did not converge.
+    """
 
-    def more(i: mi.UInt32, *_: object) -> mi.Bool:
-        return i < lights.count
+    gain: mi.Float
+    entry: mi.Vector3f
+    enters: mi.Bool
+    blocked: mi.Bool
+    failed: mi.Bool
 
-    def body(
-        i: mi.UInt32, direct: mi.Float, bent: mi.Float, failures: mi.UInt32
-    ) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.UInt32]:
-        lamp: Lamp = lights[i]
-        source = lamp.point(u, sine, cosine_v)
-        if onto_matte is not None:
-            direct += onto_matte(lamp, source)
-
-        def bend(
-            source: mi.Vector3f, inner: mi.Vector3f, aim: mi.Vector3f, bent: mi.Float, failures: mi.UInt32
-        ) -> tuple[mi.Float, mi.UInt32]:
-            path = connect(values.surfaces, source, inner, n, aim, values.limbus.radius, inside)
-            local = values.surfaces[0].point_in(path.entry)
-            clear = 1 - opacity(values, dr.sqrt(local.y * local.y + local.z * local.z))
-            enters = path.found & (clear > 0)
-            blocked = lamp_blocked(values, scene, path.entry, source, True, False, enters)
-            gain = lamp.radiant_intensity(path.leaving) * path.transfer * clear
-            bent += dr.select(enters & ~blocked, gain, 0)
-            return bent, failures + dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
-
-        bent, failures = dr.if_stmt(
-            (source, inner, aim, bent, failures),
-            inside,
-            bend,
-            lambda source, inner, aim, bent, failures: (bent, failures),
-        )
-        return i + 1, direct, bent, failures
-
-    state = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.UInt32(0))
-    _, direct, bent, failures = dr.while_loop(
-        state, more, body, labels=("i", "direct", "bent", "failures"), label="lamps"
-    )
-    return direct, bent, failures
+    @classmethod
+    def to(
+        cls, values: Values, scene: mi.Scene, lamp: Lamp, source: mi.Vector3f, inner: mi.Vector3f, active: mi.Bool
+    ) -> LampPath:
+        """Find the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame)."""
+        # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
+        scale, shift = values.image.scale, values.image.shift
+        aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
+        path = connect(values.surfaces, source, inner, values.stop.normal, aim, values.limbus.radius, active)
+        local = values.surfaces[0].point_in(path.entry)
+        clear = 1 - opacity(values, dr.sqrt(local.y * local.y + local.z * local.z))
+        enters = path.found & (clear > 0)
+        blocked = lamp_blocked(values, scene, path.entry, source, True, False, enters)
+        gain = dr.select(enters, lamp.radiant_intensity(path.leaving) * path.transfer * clear, 0)
+        return cls(gain, path.entry, enters, blocked, path.failed)

@@ -60,12 +60,23 @@ class IrisParameters:
 
 @dataclass(frozen=True, slots=True)
 class LimbusParameters:
-    """The limbus: radius about the front surface's axis (mm), lowest x of the cornea (mm), 1 / width (1/mm), albedo."""
+    """The limbus and the cornea before it.
+
+    Attributes:
+        radius: radius about the front surface's axis, mm.
+        floor: lowest x of the cornea in that surface's frame, mm.
+        gain: 1 / width, 1/mm.
+        albedo: of the limbus.
+        bulge: (3,) middle of a sphere that contains the cornea's front.
+        bulge_radius: its radius, mm.
+    """
 
     radius: mi.Float
     floor: mi.Float
     gain: mi.Float
     albedo: mi.Float
+    bulge: mi.Vector3f
+    bulge_radius: mi.Float
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from .environment import Ambience, Maps
 from .film import Exposed
 from .frame import RenderJob, boundary_waves, globe_of, kinds, light_table, panel_table, parameters_of, tables
 from .head import place_scene
+from .irislight import IrisLight
 from .lampviews import LampViews
 from .lidshade import LidShade
 from .plain import plain_tiles
@@ -68,6 +69,8 @@ class Stage:
         if region is not None:
             views = LampViews(job.lights, anchor, _reach_mm(job), region.skin if region.skin.is_sheet else None)
             textures = replace(textures, region=region.skin, lamp_views=views)
+        if not place.obstructed or (region is not None and region.skin.is_sheet):
+            lights.on_iris = IrisLight(values, lights, place.scene, textures.lamp_views)
         return Exposed(place.scene, values, lights, textures, plain), place
 
     def _place(self, job: RenderJob) -> Surround | RegionScene:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 from .parameters import Kind, Parameters, packed, rebuilt
 from .surfaces import Surface
 
+if TYPE_CHECKING:
+    from .irislight import IrisLight
+
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
-LIGHT_WIDTH = 10  # position 3, axis 3, radius, intensity, lobe exponent, inner radius
+_LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner radius, 2 unused
 
 
 def aligned(values: NDArray[Any]) -> NDArray[Any]:
@@ -138,24 +141,28 @@ class PupilBoundary:
 class Lights:
     """The lamps in the eye frame, (n, 10) numbers in one buffer; kernels do not depend on their number.
 
-    `widest` is the largest radius over the distance from the eye.
+    `widest` is the largest radius over the distance from the eye, `rings` whether any lamp is a ring, and `on_iris`
+    their light in the plane of the iris where a grid of it is used.
     """
 
     def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
         self._len = len(table)
+        self.on_iris: IrisLight | None = None
         away = np.linalg.norm(table[:, :3], axis=1)
         self.widest = float(np.max(table[:, 6] / np.maximum(away, 1e-3), initial=0.0))
+        self.rings = bool(np.any(table[:, 9] > 0))
         self.count = dr.opaque(mi.UInt32, len(table))
-        self._buffer = mi.Float(np.ascontiguousarray(table, dtype=np.float32).reshape(-1))
+        rows = np.zeros((max(len(table), 1), _LIGHT_ROW), np.float32)
+        rows[: len(table), : table.shape[1]] = table
+        self._buffer = mi.Float(aligned(rows.ravel()))
 
     def __len__(self) -> int:
         return self._len
 
     def __getitem__(self, i: mi.UInt32) -> Lamp:
-        base = i * LIGHT_WIDTH
-        row = [dr.gather(mi.Float, self._buffer, base + k) for k in range(LIGHT_WIDTH)]
-        radius, intensity, exponent, inner_radius = row[6:10]
-        return Lamp(mi.Vector3f(*row[0:3]), mi.Vector3f(*row[3:6]), radius, intensity, exponent, inner_radius, i)
+        # Four numbers are gathered at once.
+        a, b, c = (dr.gather(mi.Vector4f, self._buffer, i * (_LIGHT_ROW // 4) + k) for k in range(3))
+        return Lamp(mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(a.w, b.x, b.y), b.z, b.w, c.x, c.y, i)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ from tests.support.corneas import (
 LIGHTS = np.array([[580.0, -60.0, -150.0], [590.0, 80.0, -140.0], [600.0, 5.0, 160.0]])
 
 
-def camera():
+def camera() -> PinholeCamera:
     """A remote camera 600 mm before the eye; 1 mm is some 20 px."""
     K = np.array([[12000.0, 0.0, 639.5], [0.0, 12000.0, 511.5], [0.0, 0.0, 1.0]])
     R = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])

@@ -25,7 +25,10 @@ pytestmark = pytest.mark.render
 def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_mm, pose, blink):
     import mitsuba as mi
 
+    from eyerender.rendering import stage
     from eyerender.rendering.lampviews import LampViews
+
+    monkeypatch.setattr(stage, "IrisLight", lambda *_: None)  # which uses the views too
 
     rig = rigs.RIGS[name](radius_mm=radius_mm)
     eye = rigs.eye_of(model, side)
