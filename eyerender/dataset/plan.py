@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, InputWarning
 from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
+from ..eye.topography import topography_files
 from ..observation import EYES
 from ..population.model import SIDES
 from ..population.people import PersonChoice
@@ -154,6 +155,8 @@ class Plan:
                     # The checksum is computed before the file is read, so that a change in between is detected when the
                     # run checks its files.
                     sums[name] = sum_of_file(Path(file))
+                    for points in topography_files(file):
+                        sums[str(Path(name).parent / points)] = sum_of_file(Path(file).parent / points)
                 eyes[name] = load_eye(file).to_mapping()
             except InputError as error:
                 if error.source == file and error.reason.startswith("no such"):

@@ -10,8 +10,9 @@ import numpy as np
 from ..arrays import Bools, Floats
 from ..errors import InputError, Refuse
 from ..geometry.surfaces import Surface, components
+from ..geometry.surfaces_measured import Measured
 from .build import gradient_geometry, stop_of, stop_reach_mm
-from .corneas import WINDOW
+from .corneas import WINDOW, grid_surface, misfit_mm, zernike_surface
 from .model import Stop
 from .parts import (
     BiconicSpec,
@@ -30,6 +31,9 @@ from .parts import (
 _TOUCH_MM = 1e-6
 _BULGE_MM = 0.5
 _FAR_MM = 60.0
+_SMALLEST_RADIUS_MM, _SMALLEST_HALF_MM = 2.0, 1.0
+# The corneas of severe keratoconus are within a tenth of this.
+_MISFIT_MM = 0.5
 
 
 def check_eye(spec: EyeParts, *, source: str = "") -> None:
@@ -172,13 +176,23 @@ def _shape_problem(placed: PlacedSpec) -> tuple[str, str] | None:
         first, second = shape.radii_mm
         if first * second <= 0.0:
             return "shape.radii_mm", "must both be > 0 or both be < 0"
-    if isinstance(shape, ZernikeSpec) and shape.base_radius_mm == 0.0:
-        return "shape.base_radius_mm", "must not be 0"
+    if isinstance(shape, ZernikeSpec):
+        if shape.base_radius_mm is not None and abs(shape.base_radius_mm) < _SMALLEST_RADIUS_MM:
+            return "shape.base_radius_mm", f"must not lie within {_SMALLEST_RADIUS_MM:g} of 0"
+        return _continued(zernike_surface(shape))
     if isinstance(shape, GridSpec):
-        return _grid_problem(shape)
+        return _grid_problem(shape) or _continued(grid_surface(shape))
     if isinstance(shape, QuadricSpec) and not any(shape.coefficients[:9]):
         return "shape.coefficients", "must not all be 0"
     return None
+
+
+def _continued(surface: Measured) -> tuple[str, str] | None:
+    """Problem of a measured surface that its outer biconic does not continue."""
+    away = misfit_mm(surface)
+    if away < _MISFIT_MM:
+        return None
+    return "shape", f"is no surface of an eye: at the end of its zone it is {away:.3g} mm from any biconic"
 
 
 def _grid_problem(shape: GridSpec) -> tuple[str, str] | None:
@@ -193,6 +207,8 @@ def _grid_problem(shape: GridSpec) -> tuple[str, str] | None:
     if wrong:
         return f"shape.heights_mm.{wrong[0]}", f"must have {count} values, as there are rows"
     half = 0.5 * (count - 1) * shape.spacing_mm
+    if half < _SMALLEST_HALF_MM:
+        return "shape.spacing_mm", f"the grid must reach at least {_SMALLEST_HALF_MM:g} mm from the axis"
     if shape.zone_radius_mm is not None and WINDOW[1] * shape.zone_radius_mm > half * (1.0 + 1e-9):
         return "shape.zone_radius_mm", f"must be <= {half / WINDOW[1]:.6g}, so that the grid covers the transition"
     return None

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..arrays import Floats
-from ..geometry.surfaces_measured import GridSurface, ZernikeSurface
+from ..geometry.surfaces_measured import GridSurface, Measured, ZernikeSurface
 from ..geometry.topography import outer_biconic, spline_coefficients
 from ..geometry.zernike import order_of, terms
 from .parts import GridSpec, ZernikeSpec
@@ -60,6 +60,15 @@ def grid_surface(shape: GridSpec) -> GridSurface:
     surface = on_biconic(outer, np.where(base.inside, heights - base.x, 0.0))
     apex = surface.measured(np.zeros(1), np.zeros(1), False)[0][0]
     return surface.with_outer(outer - apex * np.eye(8)[5])
+
+
+def misfit_mm(surface: Measured) -> float:
+    """Root mean square of the deviation from the outer biconic, on a circle in the middle of the window."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
+    radius = float(np.mean(surface.window_mm))
+    y, z = radius * np.cos(angle), radius * np.sin(angle)
+    away = surface.measured(y, z, False)[0] - surface.outer_slopes(y, z).x
+    return float(np.sqrt(np.mean(away**2)))
 
 
 def _window(zone_mm: float) -> Floats:

@@ -18,6 +18,9 @@ from ..spec import FileSpec, Number, Positive, Spec, Vec2, Vec3
 MAX_SURFACES = 400
 # Zernike terms of radial order 14, and nodes of a grid in a row: a grid of 201 x 201 takes some seconds to fit.
 MAX_TERMS, MAX_NODES = 120, 201
+# Discs and zones of measured corneas, and their depths: any eye's are well within.
+Reach = Annotated[float, Field(ge=0.5, le=20.0)]
+Depth = Annotated[float, Field(ge=-30.0, le=30.0)]
 # Germanium has the highest index of all materials that are transparent somewhere in the infrared: 4.
 LARGEST_INDEX = 5.0
 # Cauchy's coefficients grow with the sixth power of nanometres.
@@ -80,15 +83,18 @@ class ZernikeSpec(Spec):
     """
 
     kind: Literal["zernike"] = Field(description="the shape")
-    radius_mm: Positive = Field(description="r, the radius of the disc on which the terms are orthonormal")
-    coefficients_mm: tuple[Number, ...] = Field(
+    radius_mm: Reach = Field(description="r, the radius of the disc on which the terms are orthonormal")
+    coefficients_mm: tuple[Depth, ...] = Field(
         min_length=1, max_length=MAX_TERMS, description="c_0, c_1, ..., depths; order 14 at most"
     )
-    base_radius_mm: Number | None = Field(
-        default=None, description="signed radius of curvature of the conic at its apex; default: a plane"
+    base_radius_mm: float | None = Field(
+        default=None,
+        ge=-1000.0,
+        le=1000.0,
+        description="signed radius of curvature of the conic at its apex; default: a plane",
     )
-    base_conic_constant: Number = Field(default=0.0, description="Q of the conic")
-    zone_radius_mm: Positive | None = Field(
+    base_conic_constant: float = Field(default=0.0, ge=-20.0, le=20.0, description="Q of the conic")
+    zone_radius_mm: Reach | None = Field(
         default=None,
         description="radius of the measured zone; between 0.75 and 1.15 of it a biconic takes over; default: r",
     )
@@ -131,10 +137,10 @@ class GridSpec(Spec):
 
     kind: Literal["grid"] = Field(description="the shape")
     spacing_mm: float | None = Field(default=None, ge=0.02, le=2.0, description="spacing of the grid")
-    heights_mm: tuple[tuple[Number, ...], ...] | None = Field(
+    heights_mm: tuple[tuple[Depth, ...], ...] | None = Field(
         default=None, min_length=5, max_length=MAX_NODES, description="x of the surface, row by row"
     )
-    zone_radius_mm: Positive | None = Field(
+    zone_radius_mm: Reach | None = Field(
         default=None,
         description="radius of the measured zone; between 0.75 and 1.15 of it a biconic takes over; default: so that "
         "1.15 of it is half of the grid's width",

@@ -18,6 +18,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..files import read_bytes, read_text, shown
 from ..geometry.topography import smooth_heights
+from ..spec import read_yaml
 from .parts import MAX_NODES, GridSpec, TopographySpec
 
 MAX_FILE_BYTES, MAX_POINTS, MIN_POINTS = 64 * 2**20, 200_000, 50
@@ -81,6 +82,29 @@ def read_topography(spec: TopographySpec, folder: str | Path = ".") -> GridSpec:
     # A hundredth of a nanometre is far below any measurement, and keeps the file short.
     rows = tuple(tuple(float(v) for v in row) for row in np.round(heights.T, 8))
     return GridSpec(kind="grid", spacing_mm=spec.spacing_mm, heights_mm=rows)
+
+
+def topography_files(path: str | Path) -> tuple[str, ...]:
+    """Paths of the measured points that an eye file names, relative to its folder.
+
+    Raises:
+        InputError: the eye file cannot be read.
+    """
+    found: list[str] = []
+
+    def walk(node: Any) -> None:
+        if isinstance(node, Mapping):
+            file = node.get("file")
+            if node.get("kind") == "grid" and isinstance(file, Mapping) and isinstance(file.get("path"), str):
+                found.append(file["path"])
+            for value in node.values():
+                walk(value)
+        elif isinstance(node, list):
+            for value in node:
+                walk(value)
+
+    walk(read_yaml(path))
+    return tuple(found)
 
 
 def with_topographies(data: Mapping[str, Any], folder: Path) -> dict[str, Any]:

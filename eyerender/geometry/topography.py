@@ -61,7 +61,7 @@ def biconic_through(y: Floats, z: Floats, x: Floats) -> Floats:
     free = np.array([np.inf, np.inf, np.inf])
     bounds = (np.concatenate([low, [turn - 1.6], -free]), np.concatenate([high, [turn + 1.6], free]))
     first, fine = [*start, turn, a, b, c], 1e-14
-    found = least_squares(rest, first, bounds=bounds, x_scale="jac", xtol=fine, ftol=fine, gtol=fine)
+    found = least_squares(rest, first, bounds=bounds, x_scale="jac", xtol=fine, ftol=fine, gtol=fine, max_nfev=100)
     outer = np.array(found.x)
     outer[:2] *= sign
     return outer

@@ -293,10 +293,12 @@ def test_bad_topographies_end_with_one_line(name, tmp_path, capfd):
         ({"kind": "zernike", "radius_mm": 3.0, "coefficients_mm": [0.0] * 121}, "coefficients_mm"),
         ({"kind": "zernike", "radius_mm": 3.0, "coefficients_mm": []}, "coefficients_mm"),
         ({"kind": "zernike", "radius_mm": 3.0, "coefficients_mm": [0.1], "base_radius_mm": 0.0}, "base_radius_mm"),
+        ({"kind": "zernike", "radius_mm": 3.0, "coefficients_mm": [0.0, 0.0, 0.0, 0.0, 99.0]}, "coefficients_mm.4"),
+        ({"kind": "zernike", "radius_mm": 3.0, "coefficients_mm": [0.0] * 15 + [1.0]}, "no surface of an eye"),
         ({"kind": "grid", "spacing_mm": 0.2}, "shape"),
         ({"kind": "grid", "spacing_mm": 0.2, "heights_mm": [[0.0] * 6] * 6}, "heights_mm"),
         ({"kind": "grid", "spacing_mm": 0.2, "heights_mm": [[0.0] * 7] * 6 + [[0.0]]}, "heights_mm.6"),
-        ({"kind": "grid", "spacing_mm": 0.2, "heights_mm": [[0.0] * 7] * 7, "zone_radius_mm": 3.0}, "zone_radius_mm"),
+        ({"kind": "grid", "spacing_mm": 0.5, "heights_mm": [[0.0] * 7] * 7, "zone_radius_mm": 3.0}, "zone_radius_mm"),
         ({"kind": "grid", "file": {"path": "a.csv", "layout": "points", **AXES}}, "file"),
         ({"kind": "zernike", "radius_mm": 3.0, "coefficients_mm": [0.0, 0.0, 0.0, 0.0, 9.0]}, "cornea"),
     ],
@@ -306,3 +308,17 @@ def test_wrong_shapes_are_named(shape, key):
     data["cornea"][0]["shape"] = shape
     with pytest.raises(InputError, match=key.replace(".", r"\.")):
         er.EyeSpec.from_mapping(data)
+
+
+def test_a_dataset_counts_the_points_that_its_eyes_name(tmp_path):
+    """A changed table is another dataset."""
+    from eyerender.dataset.plan import Plan
+    from eyerender.dataset.spec import shipped_datasets
+
+    written(tmp_path, {"od.dat": FILES["points"][0]}, file={"path": "od.dat", "spacing_mm": 0.25, **FILES["points"][1]})
+    data = yaml.safe_load(shipped_datasets()["dataset_quick"].read_text(encoding="utf-8"))
+    data["scene"]["eye"] = {"model": "own.yaml"}
+    data["eye_parameters"] = {}
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(data), encoding="utf-8")
+    plan = Plan.of(er.DatasetSpec.load(tmp_path / "spec.yaml"), base=tmp_path)
+    assert set(plan.files) == {"own.yaml", "od.dat"}

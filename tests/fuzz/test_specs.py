@@ -19,6 +19,7 @@ from eyerender.eye.catalogue import FOLDER, catalogue_names, load_eye
 from eyerender.eye.spec import EyeSpec
 from eyerender.scene import Scene, load_scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec
+from tests.support.corneas import eye_with, grid_of, keratoconus, measured_shapes
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
 FEW = 8  # observations: more cost time and show nothing new
@@ -44,7 +45,11 @@ def datasets() -> list[dict[str, Any]]:
 
 @cache
 def eyes() -> list[dict[str, Any]]:
-    return [load_eye(name).to_mapping() for name in catalogue_names()]
+    measured = [measured_shapes()["zernike"], grid_of(keratoconus, 4.5, 1.5)]
+    return [
+        *(load_eye(name).to_mapping() for name in catalogue_names()),
+        *(eye_with(shape).to_mapping() for shape in measured),
+    ]
 
 
 def use_scene(scene: Scene) -> None:
