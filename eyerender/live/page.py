@@ -387,7 +387,8 @@ class Tab:
         if self._found.value and shown.found is not None:
             marks += feature_marks(shown.found, 0, shift, analytic=False, scale=scale)
         self._image.set_content(marks)
-        if current:
+        waits = self._found.value and shown.found is None  # what was found comes a moment after the picture
+        if current and not waits:
             self._table.set_content(feature_table(truth, shown.found if self._found.value else None, shown.hidden))
 
     def _complain(self, text: str) -> None:

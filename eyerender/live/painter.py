@@ -15,8 +15,9 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -222,12 +223,12 @@ class Painter:
         while (work := self._next()) is not None:
             tab, canvas, fresh = work
             try:
-                shown = self._preview(renderer, canvas) if fresh else self._pass(renderer, tab, canvas)
+                for shown in self._preview(renderer, canvas) if fresh else self._pass(renderer, tab, canvas):
+                    if not self._stopped:
+                        tab.deliver(shown)
             except Exception as error:
-                shown = Shown(canvas.order.number, problem=line_of(error))
+                tab.deliver(Shown(canvas.order.number, problem=line_of(error)))
                 canvas.samples = self.goal
-            if shown is not None and not self._stopped:
-                tab.deliver(shown)
             if fresh:
                 canvas.since = time.monotonic()
 
@@ -255,7 +256,8 @@ class Painter:
         with self._changed:
             return self._stopped or tab.canvas is not canvas or any(other.fresh for other in self._tabs.values())
 
-    def _preview(self, renderer: Renderer, canvas: _Canvas) -> Shown:
+    def _preview(self, renderer: Renderer, canvas: _Canvas) -> Iterator[Shown]:
+        """The first picture of an order at once, and then with what was found in it."""
         frame = canvas.order.frame
         check_windows(frame.scene)
         job = _job(frame, 0)
@@ -268,10 +270,14 @@ class Painter:
         self._pace.took(seconds)
         canvas.hidden = done.glint_reasons
         irradiance = enlarged(done.irradiance, coarse, (width, height))
-        return _shown(canvas, job, done, irradiance, PREVIEW_SPP, seconds, coarse=coarse)
+        image = _image(canvas, job, done, irradiance)
+        shown = _shown(canvas, image, PREVIEW_SPP, seconds, coarse=coarse)
+        yield shown
+        if canvas.order.extract:
+            yield replace(shown, found=detect(image))
 
-    def _pass(self, renderer: Renderer, tab: _Tab, canvas: _Canvas) -> Shown | None:
-        """One pass over the window, in bands; None where it was interrupted."""
+    def _pass(self, renderer: Renderer, tab: _Tab, canvas: _Canvas) -> Iterator[Shown]:
+        """One pass over the window, in bands; nothing where it was interrupted."""
         frame = canvas.order.frame
         job = _job(frame, canvas.samples + 1)
         x0, y0, width, height = job.window
@@ -281,7 +287,7 @@ class Painter:
         began = time.perf_counter()
         for top in range(0, height, rows):
             if self._busy(tab, canvas):
-                return None
+                return
             band = replace(job, window=(x0, y0 + top, width, min(rows, height - top)))
             start = time.perf_counter()
             done = renderer.render(band, spp=spp, moments=moments(frame, 0, band))
@@ -291,7 +297,9 @@ class Painter:
         share = spp / (canvas.samples + spp)
         canvas.mean = taken if canvas.mean is None else canvas.mean + share * (taken - canvas.mean)
         canvas.samples += spp
-        return _shown(canvas, job, done, canvas.mean, canvas.samples, seconds, last=canvas.samples >= self.goal)
+        image = _image(canvas, job, done, canvas.mean)
+        shown = _shown(canvas, image, canvas.samples, seconds, last=canvas.samples >= self.goal)
+        yield replace(shown, found=detect(image)) if canvas.order.extract else shown
 
 
 def coarser(job: RenderJob, side: int) -> RenderJob:
@@ -348,48 +356,48 @@ def developed(job: RenderJob, irradiance: Floats) -> tuple[Floats, NDArray[np.ui
     return behind, recorded(job.sensor, job.camera, job.window, behind, job.wavelength_nm, job.seed)
 
 
-def _shown(
-    canvas: _Canvas,
-    job: RenderJob,
-    done: RenderedWindow,
-    irradiance: Floats,
-    samples: int,
-    seconds: float,
-    *,
-    coarse: int = 1,
-    last: bool = False,
-) -> Shown:
-    """Expose the sensor, find the features and make a file of the picture."""
-    frame, order = canvas.order.frame, canvas.order
-    scene, sensor = frame.scene, frame.scene.spec.sensor
-    irradiance, codes = developed(render_job(frame, 0), irradiance)
-    counts = stored(scene, codes)
-    image = EyeImage(
+def _image(canvas: _Canvas, job: RenderJob, done: RenderedWindow, irradiance: Floats) -> EyeImage:
+    """The picture of a canvas as the sensor stores it, for the extractor."""
+    frame = canvas.order.frame
+    behind, codes = developed(render_job(frame, 0), irradiance)
+    return EyeImage(
         frame=frame,
         row=0,
         window=job.window,
-        counts=counts,
-        irradiance=np.asarray(irradiance, dtype=np.float32),
-        parts=np.zeros(counts.shape, np.uint8),
+        counts=stored(frame.scene, codes),
+        irradiance=behind.astype(np.float32),
+        parts=np.zeros(codes.shape, np.uint8),
         eye=job.eye,
         M=job.M,
         t=job.t,
         rendered=done,
     )
+
+
+def _shown(
+    canvas: _Canvas, image: EyeImage, samples: int, seconds: float, *, coarse: int = 1, last: bool = False
+) -> Shown:
+    """Make a file of a picture, without loss for the last one."""
+    sensor = image.scene.spec.sensor
     kind = "PNG" if last else "JPEG"
     return Shown(
-        number=order.number,
+        number=canvas.order.number,
         samples=samples,
         coarse=coarse,
-        size_px=(job.window[2], job.window[3]),
-        window=job.window,
-        data=_encoded(preview(counts, sensor.full_scale_dn, 2.2 / sensor.gamma), kind),
+        size_px=image.window[2:],
+        window=image.window,
+        data=_encoded(_tones(sensor.full_scale_dn, sensor.gamma)[image.counts], kind),
         kind=f"image/{kind.lower()}",
-        found=detect(image) if order.extract else None,
         hidden=canvas.hidden,
-        saturated=is_saturated(counts, sensor),
+        saturated=is_saturated(image.counts, sensor),
         seconds=seconds,
     )
+
+
+@lru_cache(maxsize=4)
+def _tones(full_scale: int, gamma: float) -> Bytes:
+    """The grey level of the screen for each code of a sensor."""
+    return preview(np.arange(full_scale + 1), full_scale, 2.2 / gamma)
 
 
 def _encoded(pixels: Bytes, kind: str) -> bytes:

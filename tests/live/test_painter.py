@@ -81,7 +81,8 @@ def test_a_picture_is_shown_at_once_and_grows_better(painter, setup):
     while sent[-1].samples < 16:
         sent.append(tab.next())
     painter.drop("a")
-    assert [shown.samples for shown in sent] == [4, 4, 8, 16]
+    assert [shown.samples for shown in sent] == [4, 4, 4, 8, 16]
+    assert [shown.found is not None for shown in sent] == [False, True, True, True, True]
     assert {shown.number for shown in sent} == {1}
     assert sent[-1].kind == "image/png"
     assert all(pixels(shown).shape == (120, 160) for shown in sent)
