@@ -24,6 +24,7 @@ from eyerender.analytic.features import Features, features
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.fixation import fixations
 from eyerender.scene import load_scene
+from eyerender.scene.people import Population
 
 EYES = ("E2", "E4", "E5")
 # Best published time of a Python simulator of such eyes, ms a frame without fixation; quoted, not measured here.
@@ -73,6 +74,7 @@ def measure(quick: bool) -> Iterator[Row]:
         yield row(f"E2, {n} frames", c, "us/frame and eye")
     spread = max(growth.values()) / min(growth.values())
     yield row(f"E2, slowest / fastest, 1000 to {most} frames", spread, "ratio", 1.2)
+    yield row("1000 different eyes / the same eye 1000 times", different_eyes(1_000, runs), "ratio", 2.0)
     yield memory("E2")
     yield memory("E5")
     for name in EYES:
@@ -84,6 +86,25 @@ def measure(quick: bool) -> Iterator[Row]:
         yield row(f"{name}, worst residual of a fixation", fixation, "mm", 1e-6)
     for quoted in QUOTED_MS:
         yield row(f"quoted {quoted} ms of another Python simulator / E2", quoted * 1e3 / cost["E2"], "ratio")
+
+
+def different_eyes(count: int, runs: int) -> float:
+    """Cost of fixation and features of `count` drawn eyes over that of one of them as often; best of runs in turns."""
+    population = Population("adults")
+    eyes = [population.person(k).eye("right").build() for k in range(count)]
+    scene = load_scene("blignaut2014")
+    rng = np.random.default_rng(0)
+    target = np.column_stack([np.full(count, 600.0), rng.uniform(-200, 200, (count, 2))])
+    place, zero = np.zeros((count, 3)), np.zeros(count, dtype=int)
+    lights = np.array([light.position_mm for light in scene.rig.lights])
+    best: dict[str, float] = {}
+    for _ in range(2 * runs):
+        for name, which in (("same", zero), ("different", np.arange(count))):
+            start = time.process_time()
+            found = fixations(eyes, which, target, place)
+            features(eyes, which, found.poses, place, scene.rig.cameras, zero, lights)
+            best[name] = min(best.get(name, np.inf), time.process_time() - start)
+    return best["different"] / best["same"]
 
 
 def memory(name: str) -> Row:

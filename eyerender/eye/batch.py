@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from operator import is_
 from typing import TypeVar
 
 import numpy as np
@@ -122,8 +123,22 @@ def groups(eyes: Sequence[EyeModel], which: Indices) -> list[tuple[tuple[EyeMode
             place = np.full(len(eyes), -1, dtype=np.intp)
             place[members] = np.arange(len(members))
             rows = np.flatnonzero(place[which] >= 0)
-            out.append(((stack_eyes([eyes[k] for k in members]), place[which]), rows))
+            out.append(((_stacked_once(tuple(eyes[k] for k in members)), place[which]), rows))
     return out
+
+
+class _Last:
+    """The eyes that were stacked last, and their stack."""
+
+    held: tuple[tuple[EyeModel, ...], EyeModel] | None = None
+
+
+def _stacked_once(eyes: tuple[EyeModel, ...]) -> EyeModel:
+    """Stack of eyes; fixation and features of the same eyes share one, because stacking takes a third of either."""
+    held = _Last.held
+    if held is None or len(held[0]) != len(eyes) or not all(map(is_, held[0], eyes)):
+        held = _Last.held = eyes, stack_eyes(eyes)
+    return held[1]
 
 
 def chunks(group: tuple[EyeModel, Indices | None], rows: Indices, size: int) -> list[tuple[Indices, EyeModel]]:

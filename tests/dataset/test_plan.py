@@ -20,9 +20,11 @@ from eyerender.eye.catalogue import load_eye
 from eyerender.scene.spec import SceneSpec
 from tests.support.dataset_specs import plan, write
 
+PEOPLE = ("people_eyelink", "people_nvgaze", "people_openeds", "people_pupil_core")
+
 
 def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
-    assert sorted(shipped_datasets()) == ["dataset_quick", "dataset_region"]
+    assert sorted(shipped_datasets()) == ["dataset_quick", "dataset_region", *PEOPLE]
     for name, path in shipped_datasets().items():
         spec = DatasetSpec.load(path)
         spec.dump(tmp_path / "copy.yaml")
