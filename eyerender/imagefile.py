@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import io
 import os
+import struct
 import warnings
 import zlib
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +33,9 @@ FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "GIF", "WEBP", "JPEG2000")
 COLOURED = ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr", "HSV", "LAB")
 
 
+_WAITING = 8  # images of a `Writer`
+
+
 def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> None:
     """Write (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour, completely or not at all.
 
@@ -42,9 +48,65 @@ def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> N
 
 def encode_png(target: Path | BinaryIO, image: NDArray[Any]) -> None:
     """Write an image like `write_png`, to a file or a buffer."""
-    # Noise does not compress, and writing must not cost more than rendering. Run lengths alone are faster and, for
-    # noise and for masks, smaller than zlib's search for repetitions.
-    Image.fromarray(np.ascontiguousarray(image)).save(target, format="PNG", compress_level=1, compress_type=zlib.Z_RLE)
+    data = png_bytes(image)
+    if isinstance(target, Path):
+        target.write_bytes(data)
+    else:
+        target.write(data)
+
+
+def png_bytes(image: NDArray[Any]) -> bytes:
+    """PNG file of (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour (ISO/IEC 15948).
+
+    Noise does not compress, and writing must not cost more than rendering. So there is no search for the best filter
+    of each row, which takes most of the time elsewhere, nor one for repetitions other than runs.
+    """
+    if image.dtype not in (np.uint8, np.uint16) or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
+        raise ValueError(f"no PNG holds {image.shape} of {image.dtype}")
+    height, width = image.shape[:2]
+    pixels = np.ascontiguousarray(image, dtype=image.dtype.newbyteorder(">")).view(np.uint8).reshape(height, -1)
+    step = pixels.shape[1] // max(width, 1)
+    rows = np.empty((height, 1 + pixels.shape[1]), np.uint8)
+    if image.dtype == np.uint8 and image.ndim == 2:
+        rows[:, 0], rows[:, 1:] = 0, pixels
+    else:  # differences to the pixel on the left
+        rows[:, 0], rows[:, 1 : 1 + step] = 1, pixels[:, :step]
+        np.subtract(pixels[:, step:], pixels[:, :-step], out=rows[:, 1 + step :])
+    packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, 9, zlib.Z_RLE)
+    header = struct.pack(">IIBBBBB", width, height, 8 * image.itemsize, 0 if image.ndim == 2 else 2, 0, 0, 0)
+    parts = ((b"IHDR", header), (b"IDAT", packer.compress(rows.data) + packer.flush()), (b"IEND", b""))
+    chunks = (
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(name)))
+        for name, data in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+class Writer:
+    """Writes PNG files in a second thread, while the next image is rendered; a context manager.
+
+    At most a few images wait. An error of a write is raised by the next call, or at the end of the block.
+    """
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, "png")
+        self._waiting: deque[Future[None]] = deque()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            while self._waiting and kind is None:
+                self._waiting.popleft().result()
+        finally:
+            self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def png(self, path: Path, image: NDArray[Any]) -> None:
+        """Write an image like `write_png`, later."""
+        while len(self._waiting) >= _WAITING:
+            self._waiting.popleft().result()
+        self._waiting.append(self._thread.submit(write_png, path, image))
 
 
 def compressed(image: Bytes, quality: int) -> Bytes:

@@ -14,7 +14,7 @@ from .analytic.observer import trace
 from .backends.choose import BackendChoice
 from .capture import EyeImage, check_windows, make_renderer, render_job, render_windows
 from .errors import InputError, Warn
-from .imagefile import encode_png, preview, write_png
+from .imagefile import Writer, encode_png, preview
 from .imagefolder import FRAME, write_dataset
 from .labels import image_labels, seen_labels
 from .observation import EYES
@@ -139,7 +139,7 @@ def render_folder(
     lines: list[dict[str, Any]] = []
     saturated = 0
     spec = scene.spec
-    with staged(path, overwrite=overwrite) as folder:
+    with staged(path, overwrite=overwrite) as folder, Writer() as writer:
         (folder / "images").mkdir()
         (folder / "masks").mkdir()
         for image in render_windows(frames, backend=backend, threads=threads, progress=progress):
@@ -161,8 +161,8 @@ def render_folder(
                     **scene.person_numbers(records[image.row]["eye"]),
                 },
             }
-            write_png(folder / line["file_name"], image.counts)
-            write_png(folder / line["mask_file_name"], image.parts)
+            writer.png(folder / line["file_name"], image.counts)
+            writer.png(folder / line["mask_file_name"], image.parts)
             if exr:
                 from .rendering.exr import write_exr
 

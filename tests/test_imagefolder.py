@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from pathlib import Path
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from eyerender.errors import InputError
-from eyerender.imagefile import preview, read_image, write_png
+from eyerender.errors import EyerenderError, InputError
+from eyerender.imagefile import Writer, png_bytes, preview, read_image, write_png
 from eyerender.imagefolder import ImageFolder, same_run, write_dataset
 from eyerender.outfolder import staged
 
@@ -340,3 +341,36 @@ def test_labels_that_are_no_mapping_are_refused(tmp_path):
     (entry,) = ImageFolder.load(out)
     with pytest.raises(InputError, match=r"line 1\.labels: must be a mapping"):
         _ = entry.labels
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("shape", [(1, 1), (7, 5), (40, 33)])
+def test_a_png_holds_every_pixel(dtype, shape):
+    image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+    with Image.open(io.BytesIO(png_bytes(image))) as file:
+        assert file.mode == ("L" if dtype == np.uint8 else "I;16")
+        assert np.array_equal(np.asarray(file), image)
+
+
+def test_a_colour_png_holds_every_pixel():
+    image = np.random.default_rng(1).integers(0, 256, (9, 11, 3), np.uint8)
+    with Image.open(io.BytesIO(png_bytes(image))) as file:
+        assert file.mode == "RGB"
+        assert np.array_equal(np.asarray(file), image)
+
+
+@pytest.mark.parametrize("image", [np.zeros((4, 4)), np.zeros((4, 4, 2), np.uint8), np.zeros(4, np.uint8)])
+def test_what_no_png_holds_is_refused(image):
+    with pytest.raises(ValueError, match="no PNG"):
+        png_bytes(image)
+
+
+def test_a_writer_writes_all_and_tells_its_errors(tmp_path):
+    images = [np.full((5, 6), k, np.uint8) for k in range(30)]
+    with Writer() as writer:
+        for k, image in enumerate(images):
+            writer.png(tmp_path / f"{k}.png", image)
+    for k, image in enumerate(images):
+        assert np.array_equal(read_image(tmp_path / f"{k}.png")[0], image)
+    with pytest.raises(EyerenderError, match="cannot be written"), Writer() as writer:
+        writer.png(tmp_path / "missing" / "a.png", images[0])

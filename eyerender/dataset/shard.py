@@ -22,7 +22,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..files import MAX_FILE_BYTES, inside, make_folder, read_json, remove_file, sync_folder, sync_tree, write_json
-from ..imagefile import write_png
+from ..imagefile import Writer
 from ..imagefolder import IMAGE_SCHEMA, STAGE
 from .maker import MadeImage, Maker
 
@@ -107,14 +107,14 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
             (stage / kind).mkdir(parents=True)
         (stage / "shard").mkdir()
         count, saturated, rejections, given_up = 0, 0, [], []
-        with open(stage / "shard" / LINES, "w", encoding="utf-8") as lines:
+        with open(stage / "shard" / LINES, "w", encoding="utf-8") as lines, Writer() as writer:
             for k, index in enumerate(samples):
                 made = maker.make(index)
                 rejections += [asdict(r) for r in made.rejections]
                 if not made.images:
                     given_up.append(index)
                 for image in made.images:
-                    names = _write_image(stage, shard, image)
+                    names = _write_image(writer, stage, shard, image)
                     lines.write(json.dumps({"schema": IMAGE_SCHEMA, **names, **image.line}, allow_nan=False) + "\n")
                 count += len(made.images)
                 saturated += sum(image.saturated for image in made.images)
@@ -154,11 +154,11 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
     )
 
 
-def _write_image(stage: Path, shard: int, image: MadeImage) -> dict[str, str]:
+def _write_image(writer: Writer, stage: Path, shard: int, image: MadeImage) -> dict[str, str]:
     """Write an image's files and return their names in the dataset."""
     file = f"{image.name}.png"
     for kind, picture in image.pictures.items():
-        write_png(stage / kind / file, picture)
+        writer.png(stage / kind / file, picture)
     return {KINDS[kind]: _place(kind, shard, file) for kind in image.pictures}
 
 

@@ -11,10 +11,12 @@ what glare carries over the border comes back from the continuation.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy import fft, ndimage, special
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, frozen
 from .camera import PinholeCamera, Window
 from .imaging import Lens, Opening
 from .sensor import Sensor
@@ -39,10 +41,15 @@ def scattered(picture: Floats, lens: Lens, camera: PinholeCamera, window: Window
 
 def transmission(opening: Opening, camera: PinholeCamera, window: Window) -> Floats:
     """Share (h, w) of the light that an opening lets through to each pixel of a window."""
-    half = camera.resolution_px[0] / 2
+    return _transmission(opening, tuple(camera.resolution_px), tuple(window))
+
+
+@lru_cache(maxsize=8)  # it is the same in every frame of a camera
+def _transmission(opening: Opening, resolution_px: tuple[int, int], window: Window) -> Floats:
+    half = resolution_px[0] / 2
     x0, y0, width, height = window
-    x = (np.arange(x0, x0 + width) + 0.5 - camera.resolution_px[0] / 2) / half - opening.centre[0]
-    y = (np.arange(y0, y0 + height) + 0.5 - camera.resolution_px[1] / 2) / half - opening.centre[1]
+    x = (np.arange(x0, x0 + width) + 0.5 - resolution_px[0] / 2) / half - opening.centre[0]
+    y = (np.arange(y0, y0 + height) + 0.5 - resolution_px[1] / 2) / half - opening.centre[1]
     cos, sin = np.cos(np.radians(opening.turn_deg)), np.sin(np.radians(opening.turn_deg))
     u = np.abs(x[None, :] * cos + y[:, None] * sin) / opening.half_size[0]
     v = np.abs(y[:, None] * cos - x[None, :] * sin) / opening.half_size[1]
@@ -54,8 +61,8 @@ def transmission(opening: Opening, camera: PinholeCamera, window: Window) -> Flo
     slope = np.hypot((u / size) ** (p - 1) / opening.half_size[0], (v / size) ** (p - 1) / opening.half_size[1])
     inside_px = half * (1 - most * size) / slope
     if opening.edge_px == 0:
-        return np.asarray((inside_px >= 0).astype(float))
-    return np.asarray(special.ndtr(inside_px / opening.edge_px))
+        return frozen(inside_px >= 0)
+    return frozen(special.ndtr(inside_px / opening.edge_px))
 
 
 def ghost(picture: Floats, lens: Lens, camera: PinholeCamera, window: Window) -> Floats:
@@ -74,9 +81,14 @@ def ghost(picture: Floats, lens: Lens, camera: PinholeCamera, window: Window) ->
 
 def veil(picture: Floats, radius_px: float) -> Floats:
     """The picture (h, w) convolved with the glare's kernel, continued by its mirror image."""
-    rows, columns = (np.pi * np.arange(n) / n for n in picture.shape)
-    damped = fft.dctn(picture, type=2) * np.exp(-radius_px * np.hypot(rows[:, None], columns[None, :]))
+    damped = fft.dctn(picture, type=2) * _damping(picture.shape, radius_px)
     return np.asarray(np.maximum(fft.idctn(damped, type=2), 0))
+
+
+@lru_cache(maxsize=8)
+def _damping(shape: tuple[int, ...], radius_px: float) -> Floats:
+    rows, columns = (np.pi * np.arange(n) / n for n in shape)
+    return frozen(np.exp(-radius_px * np.hypot(rows[:, None], columns[None, :])))
 
 
 def covered(lens: Lens, sensor: Sensor, camera: PinholeCamera, window: Window) -> Bools | None:
