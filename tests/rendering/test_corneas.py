@@ -117,6 +117,7 @@ def test_glints_on_measured_corneas_are_where_the_path_is_shortest(renderer, nam
         checked += 1
 
 
+@pytest.mark.slow  # 2.4 million rays each
 @pytest.mark.parametrize("name", SHAPES)
 def test_flux_and_place_of_a_glint_against_backward_tracing(renderer, name):
     """Camera rays are mirrored at the cornea and counted where they end on a disc of 60 mm before the tracker."""
