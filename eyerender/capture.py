@@ -139,7 +139,16 @@ def render_job(frames: Frames, row: int) -> RenderJob:
         wavelength_nm=scene.spec.wavelength_nm,
         seed=image_seed(scene.spec.seed, int(index.frame[row]), int(index.eye[row])),
         apex_mm=index.eye_position_mm[row] + index.head_mm[row],
+        focus_dpt=focus_dpt(frames, row),
     )
+
+
+def focus_dpt(frames: Frames, row: int) -> float:
+    """Vergence at which the eye of one row is focused: on its target, or far away, unless it is too short-sighted."""
+    index = frames.index
+    gap = index.target_mm[row] - (index.eye_position_mm[row] + index.head_mm[row])
+    target = 1e3 / float(np.linalg.norm(gap)) if np.isfinite(gap).all() else 0.0
+    return max(target, -frames.scene.spec.look.fundus.refraction_d)
 
 
 def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:

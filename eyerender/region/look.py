@@ -1,10 +1,10 @@
 """Appearance of the eye and its surround at 850 nm: diffuse albedos and the contrast of their textures.
 
-All values are chosen. Spectra of skin are published (Cooksey, Allen and Tsai 2017, J. Res. NIST 122, 26: forearms). The
-backdrop is darker than that, because a surround without lids would otherwise outshine the eye. No measured diffuse
-albedo at 850 nm was available for iris, sclera and fundus. Their values give grey levels with the ratios of
-near-infrared photographs (apparent iris about half of the sclera, pupil a few per cent). The cornea transmits (1 - F)^2
-/ n^2, about 0.53, of an iris' albedo to the camera.
+Values without a source are chosen. Spectra of skin are published (Cooksey, Allen and Tsai 2017, J. Res. NIST 122, 26:
+forearms). The backdrop is darker than that, because a surround without lids would otherwise outshine the eye. No
+measured diffuse albedo at 850 nm was available for iris and sclera. Their values give grey levels with the ratios of
+near-infrared photographs (apparent iris about half of the sclera). The cornea transmits (1 - F)^2 / n^2, about 0.53, of
+an iris' albedo to the camera.
 """
 
 from __future__ import annotations
@@ -19,6 +19,34 @@ Albedo = Annotated[float, Field(ge=0, le=0.95)]
 Contrast = Annotated[float, Field(ge=0, le=1.5)]
 
 
+class Fundus(Spec):
+    """Light that comes back from the fundus through the pupil; a lamp near the camera's axis makes the pupil bright."""
+
+    reflectance: Annotated[float, Field(ge=0, le=0.5)] = Field(
+        default=0.115,
+        description="share of the light that returns (Delori and Pflibsen 1989, table I, at 805 nm: 10 to 13 %, with a "
+        "coefficient of variation of 35 % between people)",
+    )
+    halo_share: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.7, description="share of that light which retina and choroid first carry sideways (chosen)"
+    )
+    halo_deg: Annotated[float, Field(gt=0, le=20)] = Field(
+        default=1.2, description="angle between lamp and camera over which this part falls by e (chosen)"
+    )
+    blur_deg: Annotated[float, Field(gt=0, le=5)] = Field(
+        default=0.05,
+        description="standard deviation of the spread of the rest, by aberrations and diffraction (chosen)",
+    )
+    disc_gain: Annotated[float, Field(ge=1, le=5)] = Field(
+        default=2.0, description="reflectance of the optic disc over that of the fundus beside it (chosen)"
+    )
+    refraction_d: Annotated[float, Field(ge=-30, le=20)] = Field(
+        default=0.0,
+        description="spectacle refraction, for the focus only: a myope is out of focus beyond the far point; "
+        "everybody else focuses on the target, or far away without one",
+    )
+
+
 class Look(Spec):
     """Albedos (diffuse reflectance, 0 to 1) and textures; contrast 0 is a uniform surface, 1 the natural texture."""
 
@@ -27,10 +55,9 @@ class Look(Spec):
         default=1.0, description="contrast of fibres, collarette, crypts and furrows (chosen)"
     )
     iris_seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="selects the iris")
+    fundus: Fundus = Field(default=Fundus(), description="the light that comes back through the pupil")
     pupil_albedo: Albedo = Field(
-        default=0.02,
-        description="light that lens and fundus return off the axis of the light, as a diffuse albedo in the pupil "
-        "(chosen)",
+        default=0.0, description="diffuse albedo of the pupil, besides the light of the fundus: a cloudy lens"
     )
     sclera_albedo: Albedo = Field(default=0.42, description="mean over the sclera (chosen)")
     sclera_contrast: Contrast = Field(default=1.0, description="contrast of vessels and unevenness (chosen)")

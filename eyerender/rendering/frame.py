@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Floats
 from ..errors import InputError
+from ..eye.fundus import FundusLight, Spread, fundus_light
 from ..eye.model import EyeModel
 from ..geometry.surfaces import Surface
 from ..geometry.surfaces_biconic import Biconic
@@ -62,6 +63,7 @@ class RenderJob(ArrayValue):
         region: the eye region; None for the bare eye.
         lens: focus and vignetting.
         ambient: light other than that of the lamps.
+        focus_dpt: vergence at which the eye is focused, 1 / distance in metres.
     """
 
     eye: EyeModel
@@ -80,6 +82,7 @@ class RenderJob(ArrayValue):
     region: Region | None = None
     lens: Lens = _LENS
     ambient: Ambient = _AMBIENT
+    focus_dpt: float = 0.0
 
     @property
     def anchor_mm(self) -> Floats:
@@ -215,6 +218,20 @@ def light_table(lights: Sequence[Lamp], M: Floats, t: Floats) -> Floats:
         for lamp in lights
     ]  # fmt: skip
     return np.reshape(rows, (-1, 10))
+
+
+def returned_light(job: RenderJob) -> FundusLight:
+    """Return factors of the fundus for the lamps of a job."""
+    fundus = job.look.fundus
+    spread = Spread(
+        reflectance=fundus.reflectance,
+        halo_share=fundus.halo_share,
+        halo_rad=float(np.radians(fundus.halo_deg)),
+        blur_rad=float(np.radians(fundus.blur_deg)),
+        disc_gain=fundus.disc_gain,
+    )
+    lamps = light_table(job.lights, job.M, job.t)[:, :3]
+    return fundus_light(job.eye, lamps, job.M.T @ (job.camera.nodal_point_mm - job.t), job.focus_dpt, spread)
 
 
 def ring_radius_mm(lamp: Lamp) -> float:

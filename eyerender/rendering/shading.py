@@ -16,7 +16,7 @@ import mitsuba as mi
 from .lighting import light
 from .region import film_normal, film_reflectance
 from .values import Lights, Values
-from .view import EPSILON_MM, Textures, View, iris_albedo, look, outer_albedo
+from .view import EPSILON_MM, Textures, View, iris_albedo, look, outer_albedo, stop_coordinates
 
 _THROUGH = 0.7  # share of the outer hemisphere that the iris sees, times transmittance; chosen
 
@@ -89,8 +89,11 @@ def indirect(
         lambda inner: iris_albedo(values, textures, inner),
         lambda inner: mi.Float(values.pupil_albedo),
     )
-    through = (1 - view.opacity) * view.passed * behind * inner * dr.inv_pi / (index * index)
-    rest += dr.select(view.cornea, through, 0)
+    leaving = behind * inner * dr.inv_pi / (index * index)
+    if textures.pupil is not None:
+        seen = view.cornea & view.pupil
+        leaving += dr.select(seen, textures.pupil.at(*stop_coordinates(values, view.inner), seen), 0)
+    rest += dr.select(view.cornea, (1 - view.opacity) * view.passed * leaving, 0)
     return dr.select(view.met, rest, 0)
 
 

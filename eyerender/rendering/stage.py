@@ -14,12 +14,23 @@ from ..rig.camera import Window
 from ..rig.imaging import Ambient
 from .environment import Ambience, Maps
 from .film import Exposed
-from .frame import RenderJob, boundary_waves, globe_of, kinds, light_table, panel_table, parameters_of, tables
+from .frame import (
+    RenderJob,
+    boundary_waves,
+    globe_of,
+    kinds,
+    light_table,
+    panel_table,
+    parameters_of,
+    returned_light,
+    tables,
+)
 from .head import place_scene
 from .irislight import IrisLight
 from .lampviews import LampViews
 from .lidshade import LidShade
 from .plain import plain_tiles
+from .pupillight import PupilLight
 from .region import RegionScene
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
@@ -66,6 +77,9 @@ class Stage:
                 return _NOTHING_PLAIN, max(window[2:])
             return plain_tiles(region.posed, job.camera, anchor, window)
 
+        pupil = PupilLight(values, lights, place.scene, returned_light(job))
+        pupil.make()
+        textures = replace(textures, pupil=pupil)
         if region is not None:
             views = LampViews(job.lights, anchor, _reach_mm(job), region.skin if region.skin.is_sheet else None)
             textures = replace(textures, region=region.skin, lamp_views=views)

@@ -21,6 +21,7 @@ from .values import Values
 if TYPE_CHECKING:
     from .environment import Ambience
     from .lampviews import LampViews
+    from .pupillight import PupilLight
     from .region import SkinGeometry
 
 EPSILON_MM = 2e-3  # points closer than this are the same in single precision
@@ -87,6 +88,7 @@ class Textures:
     region: SkinGeometry | None = None
     ambience: Ambience | None = None
     lamp_views: LampViews | None = None
+    pupil: PupilLight | None = None
 
     @classmethod
     def of_seed(cls, seed: int) -> Textures:
@@ -250,13 +252,13 @@ def _refracted(
     s = dr.dot(values.stop.centre - inside, n) / dr.dot(w, n)
     inner = inside + s * w
     reached &= s > 0
-    pu, pv = _stop_coordinates(values, inner)
+    pu, pv = stop_coordinates(values, inner)
     margin = values.boundary.radius(pu, pv)
     pupil = reached & (pu * pu + pv * pv < margin * margin)
     return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, pupil
 
 
-def _stop_coordinates(values: Values, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+def stop_coordinates(values: Values, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
     """Coordinates of points of the stop's plane along its semi-axes, in units of these."""
     q = x - values.stop.centre
     a, b = values.stop.axes
@@ -273,7 +275,7 @@ def meet_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Fl
 
 def iris_albedo(values: Values, textures: Textures, x: mi.Vector3f) -> mi.Float:
     """Albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
-    pu, pv = _stop_coordinates(values, x)
+    pu, pv = stop_coordinates(values, x)
     a, b = values.stop.axes
     beyond = (dr.sqrt(pu * pu + pv * pv) - values.boundary.radius(pu, pv)) * dr.sqrt(a * b)
     rho = dr.sqrt(x.y * x.y + x.z * x.z)

@@ -12,7 +12,7 @@ import numpy as np
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeModel
 from eyerender.eye.pose import Poses, rigid_motion
-from eyerender.region.look import Look
+from eyerender.region.look import Fundus, Look
 from eyerender.rig.camera import Camera, PinholeCamera
 from eyerender.rig.light import Lamp, Led, LedRing
 from eyerender.rig.sensor import Sensor
@@ -22,10 +22,17 @@ if TYPE_CHECKING:
     from eyerender.rendering.renderer import RenderedWindow
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
+NO_FUNDUS = Fundus(reflectance=0.0)
 BLACK = Look(
-    iris_albedo=0.0, pupil_albedo=0.0, sclera_albedo=0.0, limbus_albedo=0.0, backdrop_albedo=0.0, limbus_width_mm=0.0
+    fundus=NO_FUNDUS,
+    iris_albedo=0.0,
+    pupil_albedo=0.0,
+    sclera_albedo=0.0,
+    limbus_albedo=0.0,
+    backdrop_albedo=0.0,
+    limbus_width_mm=0.0,
 )
-PLAIN = Look(iris_contrast=0.0, sclera_contrast=0.0, backdrop_contrast=0.0)
+PLAIN = Look(fundus=NO_FUNDUS, pupil_albedo=0.02, iris_contrast=0.0, sclera_contrast=0.0, backdrop_contrast=0.0)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,75 @@
+"""What the pupil shows: the light of the lamps that the fundus returns, once per frame on a grid over the stop.
+
+The fundus mixes the light of the whole pupil and changes it slowly from place to place, so a small grid gives it. Each
+of its points sums over the lamps the irradiance of the stop times the return factor of `eye.fundus`.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..eye.fundus import CELLS, EDGE, FundusLight
+from .values import Lights, Values, aligned
+
+
+class PupilLight:
+    """Radiance in air (mW/mm^2/sr) that leaves the pupil, before the transmittance of the cornea."""
+
+    def __init__(self, values: Values, lights: Lights, scene: mi.Scene, returned: FundusLight) -> None:
+        """Prepare the grid.
+
+        Args:
+            values: the scene's numbers.
+            lights: the lamps.
+            scene: what may stand in the way.
+            returned: the return factors of the lamps.
+        """
+        self._values, self._lights, self._scene = values, lights, scene
+        self._factors = aligned(np.ascontiguousarray(returned.factors, dtype=np.float32).reshape(-1))
+        self._cells: mi.Float | None = None
+
+    def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> mi.Float:
+        """Radiance at coordinates of the stop in units of its semi-axes, bilinearly."""
+        assert self._cells is not None
+        x, y = (dr.clip((c * (1 / EDGE) + 1) * (CELLS / 2) - 0.5, 0, CELLS - 1.001) for c in (u, v))
+        i, j = mi.UInt32(x), mi.UInt32(y)
+        s, t = x - mi.Float(i), y - mi.Float(j)
+
+        def cell(di: int, dj: int) -> mi.Float:
+            return dr.gather(mi.Float, self._cells, (j + dj) * CELLS + i + di, active)
+
+        low, high = (dr.lerp(cell(0, k), cell(1, k), s) for k in (0, 1))
+        return dr.lerp(low, high, t)
+
+    def make(self) -> None:
+        """Fill the grid, once."""
+        if self._cells is not None:
+            return
+        if not len(self._lights) or not self._factors.any():
+            self._cells = dr.zeros(mi.Float, CELLS * CELLS)
+            dr.make_opaque(self._cells)
+            return
+        from .lighting import LampPath
+
+        values, lights, factors = self._values, self._lights, mi.Float(self._factors)
+        index = dr.arange(mi.UInt32, CELLS * CELLS)
+        row = index // CELLS
+        u, v = ((mi.Float(k) + 0.5) * (2 * EDGE / CELLS) - EDGE for k in (index - row * CELLS, row))
+        a, b = values.stop.axes
+        # Points beyond the margin get the light of the nearest point within it.
+        shrink = dr.rcp(dr.maximum(dr.sqrt(u * u + v * v), 1))
+        x = values.stop.centre + (u * shrink * a) * values.stop.u + (v * shrink * b) * values.stop.v
+
+        def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            factor = dr.gather(mi.Float, factors, i * (CELLS * CELLS) + index)
+            lamp = lights[i]
+            path = LampPath.to(values, self._scene, lamp, lamp.position, x, factor > 0)
+            return i + 1, total + dr.select(path.blocked, 0, path.gain * factor)
+
+        state = (mi.UInt32(0), mi.Float(0) * x.x)
+        labels = ("i", "total")
+        _, total = dr.while_loop(state, lambda i, _: i < lights.count, body, labels=labels, label="light of the fundus")
+        dr.eval(total)
+        self._cells = total
