@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Bench of the renderer: physics against independent oracles, cost against stock Mitsuba, memory, determinism.
+"""Bench of the renderer: physics against independent oracles, cost, first frames, new subjects, memory, determinism.
 
     bench_render.py [--quick] [--json F] [--backend llvm|cuda] [--threads N]
 
@@ -11,6 +11,7 @@ oracle then has no limit. The exit code is 1 if a `must` is missed.
 from __future__ import annotations
 
 import hashlib
+import resource
 import subprocess
 import sys
 import tempfile
@@ -59,8 +60,8 @@ class Bench:
         """All rows, as they are measured."""
         for part in (
             self.iris_against_path, self.iris_against_light_tracer, self.noise, self.glint_centroids, self.large_disc,
-            self.pupil_outline, self.cost, self.region_cost, self.recompiles, self.fixed_cost, self.memory,
-            self.determinism,
+            self.pupil_outline, self.cost, self.region_cost, self.region_noise, self.subjects,
+            self.first_frames, self.recompiles, self.fixed_cost, self.memory, self.determinism,
         ):  # fmt: skip
             yield from part()
 
@@ -280,33 +281,59 @@ class Bench:
                     errors.append(contour_error(1 - a / b, polygon, window))
             yield row(f"pupil outline {name}: largest of {len(errors)}", max(errors), "px rms", 0.01)
 
+    def _full_frame(self, model: str, lamps: int = 8) -> Any:
+        """Job of a bare eye that fills 640 x 480 px of a head-mounted camera."""
+        rig = self.rigs.head_rig(count=lamps)
+        return self.rigs.job_of(self.rigs.eye_of(model), rig, rig.window(640, 480), (5.0, 3.0), labels=False)
+
+    def _scene_job(self, name: str, row_: int, **image: Any) -> Any:
+        """Job of a row of a shipped scene."""
+        import yaml
+
+        from eyerender.capture import render_job
+        from eyerender.scene import Scene
+        from eyerender.scene.spec import SceneSpec
+
+        path = ROOT / "scenes" / f"{name}.yaml"
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data["image"] = {**data.get("image", {}), **image}
+        return render_job(Scene.of(SceneSpec.from_mapping(data, source=str(path)), source=str(path)).frames(), row_)
+
+    @staticmethod
+    def _turned(job: Any, k: int) -> Any:
+        """The same job with the eye in its k-th pose."""
+        from eyerender.eye.pose import Poses, rigid_motion
+
+        M, t = rigid_motion(Poses.from_degrees([12 * np.sin(1.7 * k)], [7 * np.cos(2.3 * k)]), job.eye)
+        return replace(job, M=M[0], t=t[0] + job.anchor_mm, apex_mm=job.anchor_mm)
+
+    def _in_turns(self, works: dict[str, Callable[[int], Any]]) -> dict[str, tuple[float, float]]:
+        """Median (CPU, wall) seconds of works that take turns, after one call of each."""
+        times: dict[str, list[tuple[float, float]]] = {name: [] for name in works}
+        for k in range(4 if self.small else 10):
+            for name, work in works.items():
+                c, w = time.process_time(), time.perf_counter()
+                work(k)
+                if k:
+                    times[name].append((time.process_time() - c, time.perf_counter() - w))
+        return {name: tuple(float(x) for x in np.median(found, axis=0)) for name, found in times.items()}  # type: ignore[misc]
+
     def cost(self) -> Iterable[Row]:
-        """CPU time at 640 x 480, 16 spp, 2 disc LEDs, remote, against stock path and against Embree alone."""
+        """CPU time of eyes that fill the frame (640 x 480, 8 LEDs, 16 samples), a new pose in each frame.
+
+        Stock `path` renders the exported scene of E2 at unlimited depth; three coherent Embree rays per sample are
+        what a mesh of the cornea would add.
+        """
         import drjit as dr
         import mitsuba as mi
 
-        from eyerender.rendering.renderer import Renderer
-        from eyerender.rendering.surround import Obstacle
-
-        rigs = self.rigs
-        rig = rigs.remote_rig()
-        lamps = (rig.lights[0], replace(rig.lights[0], position_mm=rig.lights[0].position_mm + np.array([0, 80.0, 0])))
-        runs = 3 if self.small else 6
-        cpu, wall = {}, {}
-        for model in ("E2", "E4", "E5"):
-            job = rigs.job_of(rigs.eye_of(model), rig, rig.window(640, 480), lights=lamps, labels=False)
-            self.renderer.render(job)
-            cpu[model], wall[model] = cpu_of(partial(self.renderer.render, job), runs)
-        job = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(640, 480), lights=lamps, labels=False)
-        # Anything but the surround's plane in the scene makes every shadow ray one of Embree's.
-        card = np.array([[40.0, y, z] for y, z in ((300, 300), (310, 300), (310, 310), (300, 310))])
-        shaded = Renderer(self.backend, spp=16, obstacles=[Obstacle(card, np.array([[0, 1, 2], [0, 2, 3]]))])
-        shaded.render(job)
-        with_rays, _ = cpu_of(lambda: shaded.render(job), runs)
+        jobs = {model: self._full_frame(model) for model in ("E2", "E4", "E5")}
+        works: dict[str, Callable[[int], Any]] = {
+            m: partial(lambda job, k: self.renderer.render(self._turned(job, k)), job) for m, job in jobs.items()
+        }
         with tempfile.TemporaryDirectory() as folder:
-            scene = self._stock(job, folder, max_depth=4)
-            np.array(mi.render(scene, spp=16))
-            stock, stock_wall = cpu_of(lambda: np.array(mi.render(scene, spp=16, seed=1)), runs)
+            scene = self._stock(jobs["E2"], folder, max_depth=-1)
+            works["path"] = lambda k: np.array(mi.render(scene, spp=16, seed=k))
             sensor = scene.sensors()[0]
             index = dr.arange(mi.UInt32, 640 * 480 * 16)
             pixel = index // 16
@@ -314,61 +341,134 @@ class Bench:
             ray, _ = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
             dr.eval(ray)
 
-            def embree() -> None:
-                hit = scene.ray_intersect_preliminary(ray, coherent=True)
-                dr.eval(hit.t)
+            def embree(_: int) -> None:
+                dr.eval(scene.ray_intersect_preliminary(ray, coherent=True).t)
                 dr.sync_thread()
 
-            embree()
-            limit, _ = cpu_of(embree, runs)
-        yield row("640x480, 16 spp, 2 LEDs, E2: CPU / stock path's", cpu["E2"] / stock, "ratio", 0.6)
-        yield row("the same with an obstacle, shadow rays by Embree", with_rays / stock, "ratio", 0.6)
-        yield row("640x480, 16 spp, 2 LEDs, E2: CPU", cpu["E2"], "s")
-        yield row("640x480, 16 spp, 2 LEDs, E2: wall", wall["E2"], "s", None, 0.25)
-        yield row("stock path, the same: CPU", stock, "s")
-        yield row("stock path, the same: wall", stock_wall, "s")
-        yield row("three coherent Embree rays a sample / our CPU", 3 * limit / cpu["E2"], "ratio")
-        yield row("E4 / E2, CPU", cpu["E4"] / cpu["E2"], "ratio", 1.6)
-        yield row("E5 / E2, CPU", cpu["E5"] / cpu["E2"], "ratio", 1.6)
+            works["embree"] = embree
+            found = self._in_turns(works)
+        cpu = {name: times[0] for name, times in found.items()}
+        yield row("full-frame E2, 8 LEDs, 16 spp, a new pose per frame: CPU", cpu["E2"], "s")
+        yield row("the same: wall", found["E2"][1], "s")
+        yield row("the same / stock path at unlimited depth, CPU", cpu["E2"] / cpu["path"], "ratio")
+        yield row("three coherent Embree rays a sample / our CPU", 3 * cpu["embree"] / cpu["E2"], "ratio")
+        yield row("full-frame E4 / E2, CPU", cpu["E4"] / cpu["E2"], "ratio", 1.3)
+        yield row("full-frame E5 / E2, CPU", cpu["E5"] / cpu["E2"], "ratio", 1.3)
 
     def region_cost(self) -> Iterable[Row]:
-        """CPU time of an eye in its lids over that of the bare eye, 640 x 480, 16 spp, in turns; what a move costs."""
-        import yaml
+        """CPU time of eyes in their lids with a new pose in each frame, and of the parts of a frame."""
+        from eyerender.imagefile import png_bytes
+        from eyerender.rendering import renderer as renderer_module
 
-        from eyerender.capture import render_job
-        from eyerender.eye.pose import Poses, rigid_motion
-        from eyerender.region.anatomy import Region
-        from eyerender.scene import Scene
-        from eyerender.scene.spec import SceneSpec
+        headset = self._scene_job("headset", 4)
+        desktop = self._scene_job("desktop_tracker", 0)
+        bare = replace(headset, region=None)
+        tracing = [0.0]
+        trace = {name: getattr(renderer_module, name) for name in ("mean_radiance", "mean_parts")}
 
-        rigs, region = self.rigs, Region(seed=11)
-        rig = rigs.remote_rig()
-        lamps = (rig.lights[0], replace(rig.lights[0], position_mm=rig.lights[0].position_mm + np.array([0, 80.0, 0])))
-        remote = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(640, 480), lights=lamps, labels=False)
-        spec = yaml.safe_load((ROOT / "scenes" / "headset.yaml").read_text(encoding="utf-8"))
-        spec["rig"]["lights"][0]["ring"]["count"] = 6
-        scene = Scene.of(SceneSpec.from_mapping(spec))
-        headset = replace(render_job(scene.frames(), 4), labels=False)
-        for name, job in (("2 lamps", remote), ("headset", headset)):
-            jobs = [replace(job, region=r) for r in (None, region)]
-            cpu: list[list[float]] = [[], []]
-            for k in range(4 if self.small else 9):
-                for times, one in zip(cpu, jobs, strict=True):
-                    start = time.process_time()
-                    self.renderer.render(one)
-                    if k:
-                        times.append(time.process_time() - start)
-            bare, whole = (float(np.median(times)) for times in cpu)
-            yield row(f"eye region against bare eye, {name}", whole / bare, "ratio", 1.5)
-            yield row(f"eye region, {name}: CPU", whole, "s")
-            moved = []
-            for k in range(6):
-                M, t = rigid_motion(Poses.from_degrees([2.0 * k], [1.0 * k]), job.eye)
-                turned = replace(jobs[1], M=M[0], t=t[0] + job.anchor_mm, apex_mm=job.anchor_mm)
+        def timed(real: Callable[..., Any]) -> Callable[..., Any]:
+            def call(*arguments: Any, **options: Any) -> Any:
                 start = time.process_time()
-                self.renderer.render(turned)
-                moved.append(time.process_time() - start)
-            yield row(f"eye region, {name}: more for a new pose, CPU", 1e3 * (np.median(moved) - whole), "ms")
+                try:
+                    return real(*arguments, **options)
+                finally:
+                    tracing[0] += time.process_time() - start
+
+            return call
+
+        def whole(k: int) -> None:
+            png_bytes(self.renderer.render(self._turned(headset, k), spp=4).dn.astype(np.uint8))
+
+        found = self._in_turns(
+            {
+                "headset": whole,
+                "the same pose": lambda _: self.renderer.render(headset, spp=4),
+                "desktop": lambda k: self.renderer.render(self._turned(desktop, k), spp=4),
+                "bare": lambda k: self.renderer.render(self._turned(bare, k), spp=4),
+            }
+        )
+        count = 3 if self.small else 10
+        try:
+            for name, real in trace.items():
+                setattr(renderer_module, name, timed(real))
+            start = time.process_time()
+            for k in range(count):
+                whole(k)
+            spent = time.process_time() - start
+        finally:
+            for name, real in trace.items():
+                setattr(renderer_module, name, real)
+        yield row("headset 640x480, 8 LEDs, 4 spp, a new pose, labels, PNG: CPU", 1e3 * found["headset"][0], "ms")
+        yield row("the same: wall", 1e3 * found["headset"][1], "ms")
+        yield row("the same: host time outside tracing, CPU", 1e3 * (spent - tracing[0]) / count, "ms")
+        yield row("the same / one pose without PNG", found["headset"][0] / found["the same pose"][0], "ratio")
+        yield row("the same / bare eye, a new pose each", found["headset"][0] / found["bare"][0], "ratio")
+        yield row("desktop window 400x300, 2 LEDs, 4 spp, a new pose: CPU", 1e3 * found["desktop"][0], "ms")
+
+    def region_noise(self) -> Iterable[Row]:
+        """Relative noise of the light on iris, sclera and skin at 4 samples with 8 lamps, before the sensor's."""
+        rigs = self.rigs
+        rig = rigs.head_rig(count=8)
+        job = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(380, 200), look=rigs.PLAIN, region=_plain_region())
+        few, many = (self.renderer.radiance(job, spp=spp) for spp in (4, 64 if self.small else 256))
+        part = self.renderer.labels(job).part
+        for name, which in (("skin", 0), ("sclera", 1), ("iris", 2)):
+            inside = part == which
+            for axis in (0, 1):
+                for shift in (1, -1, 2, -2):
+                    inside &= np.roll(part, shift, axis) == which
+            rest = (few / np.maximum(many, 1e-12))[inside]
+            yield row(
+                f"noise of the {name} in a region, 8 LEDs, 4 spp (median of |d| x 1.48)",
+                148 * np.median(np.abs(rest - np.median(rest))),
+                "%",
+            )
+
+    def subjects(self) -> Iterable[Row]:
+        """What a subject never seen adds to its first frame, without and with its maps on disk."""
+        from eyerender.region.mapcache import without_cache
+
+        headset = replace(self._scene_job("headset", 4), labels=False)
+
+        def subject(seed: int) -> Any:
+            look = headset.look.model_copy(update={"iris_seed": seed})
+            return replace(headset, region=headset.region.model_copy(update={"seed": seed}), look=look)
+
+        def more(seed: int) -> float:
+            cpu = [cpu_of(lambda: self.renderer.render(subject(seed), spp=4), 1)[0] for _ in range(2)]
+            return 1e3 * (cpu[0] - cpu[1])
+
+        count = 2 if self.small else 6
+        self.renderer.render(headset, spp=4)
+        with without_cache():
+            made = [more(9000 + k) for k in range(count)]
+        for seed in range(8000, 8000 + count + 4):  # onto the disk, and out of memory again
+            self.renderer.render(subject(seed), spp=4)
+        read = [more(8000 + k) for k in range(count)]
+        yield row("a subject never seen, empty map cache: more CPU", float(np.median(made)), "ms")
+        yield row("a subject whose maps are on disk: more CPU", float(np.median(read)), "ms")
+
+    def first_frames(self) -> Iterable[Row]:
+        """First frame of a fresh process from "renderer ready", kernels and maps on disk; kernels it compiles."""
+        for name in ("bare", "headset"):
+            code = (
+                f"import sys; sys.path[:0] = [{str(ROOT / 'scripts')!r}]; import bench_render as b\n"
+                f"import time; bench = b.Bench(b.choose_backend({self.backend.name!r}, 2), True)\n"
+                f"import drjit as dr; dr.set_flag(dr.JitFlag.KernelHistory, True); job = bench.first_job({name!r})\n"
+                "start = time.process_time(); bench.renderer.render(job, spp=4)\n"
+                "spent = time.process_time() - start\n"
+                "kernels = dr.kernel_history([dr.KernelType.JIT])\n"
+                "print(1e3 * spent, len({k['hash'] for k in kernels if not (k['cache_disk'] or k['cache_hit'])}))"
+            )
+            for _ in range(2):
+                done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+            spent, compiled = (float(x) for x in done.stdout.split()[-2:])
+            yield row(f"first frame of a fresh process, {name}: CPU", spent, "ms")
+            yield row(f"kernels that it compiles, {name}", compiled, "kernels", 0)
+
+    def first_job(self, name: str) -> Any:
+        """Job of a first frame."""
+        return self._full_frame("E2") if name == "bare" else self._scene_job("headset", 0)
 
     def _varied(self, count: int, seed: int = 0) -> Iterable[Any]:
         """Jobs of one structure whose every number varies."""
@@ -435,6 +535,7 @@ class Bench:
             if k == first:
                 at = resident_mib()
         yield row(f"resident memory, frame {last} - frame {first}", resident_mib() - at, "MB", 30)
+        yield row("peak memory of all of this", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "MiB")
 
     def determinism(self) -> Iterable[Row]:
         """Differing digests of one job: here, with other threads, and in a fresh process with two threads."""
@@ -458,6 +559,15 @@ class Bench:
         fresh = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         digests.append(fresh.stdout.strip())
         yield row("one seed, 1 or 2 threads, fresh process: digests beyond one", len(set(digests)) - 1, "digests", 0)
+
+
+def _plain_region() -> Any:
+    """Region of even skin, without hairs."""
+    from eyerender.region.anatomy import Region
+
+    hairless = {"upper_count": 0, "lower_count": 0}
+    even = {"relief_mm": 0.0, "wrinkles": 0.0, "pores": 0.0, "mottling": 0.0, "veins": 0.0, "sheen": 0.0}
+    return Region.from_mapping({"skin": even, "lashes": hairless, "brow": {"count": 0}})
 
 
 def _digest(done: Any) -> str:
