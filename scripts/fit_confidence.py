@@ -32,7 +32,7 @@ from eyerender.extraction import ExtractionSettings
 from eyerender.extraction.pipeline import explained
 from eyerender.extraction.preprocessing import prepare
 from eyerender.extraction.pupil import scoring, search
-from eyerender.extraction.pupil.scoring import FEATURES, TABLE, design, features, goodness_of
+from eyerender.extraction.pupil.scoring import FEATURES, TABLE, design, features
 from eyerender.extraction.settings import Shape
 from eyerender.geometry.ellipse import Ellipse, iou
 
@@ -91,7 +91,7 @@ def observe(task: Task, folder: Path) -> Observed:
     for late, found in search.hypotheses(prepared, Shape.of(rough, prepared.linear.shape)):
         if isinstance(found, str):
             continue
-        out.fast.append(features(found.boundary.ellipse, goodness_of(found, None)))
+        out.fast.append(features(found.boundary.ellipse, found.goodness))
         out.right.append(truth is not None and iou(found.boundary.ellipse, truth) > 0.9)
         out.late.append(late or found.core_dn > 0.0)
         out.core.append(found.core_dn > 0.0)

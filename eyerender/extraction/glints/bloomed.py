@@ -58,7 +58,7 @@ def bloomed_glints(prepared: Prepared, ellipse: Ellipse, step_dn: float) -> list
         inside = left > 0 and top > 0 and left + w < crop.shape[1] and top + h < crop.shape[0]
         if area < LEAST_PX or not inside or max(w, h) > LONGEST * b or min(w, h) > THICKEST * b:
             continue
-        patch = _patch(crop, labels == k, max(prepared.noise_dn, 1e-3), step_dn, bool(saturated >= prepared.clip_dn))
+        patch = _patch(crop, labels == k, max(prepared.noise_dn, 1e-3), step_dn, prepared.clip_dn)
         corner = np.array([x0, y0], dtype=np.float64)
         if patch is not None and np.hypot(*(patch.glint.xy_px + corner - ellipse.centre_px)) < REACH * a:
             pixels = np.zeros(prepared.linear.shape, dtype=bool)
@@ -68,7 +68,7 @@ def bloomed_glints(prepared: Prepared, ellipse: Ellipse, step_dn: float) -> list
     return out
 
 
-def _patch(crop: Image, core: Bools, noise_dn: float, step_dn: float, clipped: bool) -> Patch | None:
+def _patch(crop: Image, core: Bools, noise_dn: float, step_dn: float, clip_dn: float) -> Patch | None:
     """The glint of a saturated patch, None where its surroundings are nearly as bright."""
     near = cv2.dilate(core.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     ring = cv2.dilate(core.astype(np.uint8), np.ones((13, 13), np.uint8)).astype(bool) & ~near
@@ -91,6 +91,6 @@ def _patch(crop: Image, core: Bools, noise_dn: float, step_dn: float, clipped: b
         covariance=frozen(covariance),
         amplitude=(top - ground) / DN,
         sigma_px=float(np.linalg.det(moments) ** 0.25),
-        saturated=clipped,
+        saturated=bool(crop[core].max() >= clip_dn),
     )
     return Patch(glint, near)

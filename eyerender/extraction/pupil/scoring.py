@@ -23,6 +23,8 @@ from ..settings import ExtractionSettings
 from .covariance import boundary_deviation, leverage
 from .refinement import PixelFit
 
+UNEXPLAINED = 1.15  # reduced chi^2 above which the pixel model leaves more than noise
+
 if TYPE_CHECKING:
     from .search import Found
 
@@ -81,11 +83,6 @@ def calibrated(logit: Floats, bend: Floats) -> Floats:
     return np.asarray(bend[0] + bend[1] * logit + bend[2] * np.minimum(logit, 1.0))
 
 
-def edge_confidence(found: Found) -> float:
-    """Confidence of a boundary from its edges alone."""
-    return confidence(found.boundary.ellipse, goodness_of(found, None), "fast")
-
-
 def goodness_of(found: Found, fit: PixelFit | None) -> Goodness:
     """How well a boundary explains the image, from its edges or the pixel model."""
     boundary, image = found.boundary, found.image
@@ -107,7 +104,7 @@ def goodness_of(found: Found, fit: PixelFit | None) -> Goodness:
         spread=inside.spread_dn / model.step_dn,
         boundary_sd_px=boundary_deviation(ellipse, covariance),
         uneven_px=0.0 if fit is None else fit.uneven_px,
-        leverage=leverage(boundary.ellipse, boundary.points_px),
+        leverage=leverage(boundary.ellipse, boundary.points_px) if fit is None else found.goodness.leverage,
         refined=fit is not None,
     )
 
@@ -115,14 +112,17 @@ def goodness_of(found: Found, fit: PixelFit | None) -> Goodness:
 def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -> PupilResult:
     """Make the pupil of a boundary, from its edges or the pixel model; missing where it is too unlikely to be right."""
     ellipse = found.boundary.ellipse if fit is None else fit.ellipse
-    goodness = goodness_of(found, fit)
-    sure = confidence(ellipse, goodness, settings.method)
+    goodness = found.goodness if fit is None else goodness_of(found, fit)
+    sure = found.confidence if fit is None else confidence(ellipse, goodness, "refined")
     if sure < settings.min_confidence:
         return PupilResult.missing("fit", f"the ellipse found is the pupil with a probability of only {sure:.2f}")
+    # Texture and other misfits of the pixel model agree over longer stretches than its covariance accounts for. The
+    # scatter of the edge points contains them.
+    of_edges = fit is None or fit.reduced_chi2 > UNEXPLAINED
     return PupilResult(
         status=Status.OK,
         ellipse=ellipse,
-        covariance=frozen(found.covariance if fit is None else fit.covariance),
+        covariance=frozen(found.covariance if fit is None or of_edges else fit.covariance),
         confidence=sure,
         goodness=goodness,
         contour_px=frozen(found.edges.points_px[found.boundary.inliers]),

@@ -17,7 +17,7 @@ import numpy as np
 from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse, iou
 from ..preprocessing import Image, Prepared, as_image
-from ..result import PupilResult
+from ..result import Goodness, PupilResult
 from ..settings import Shape
 from .candidates import Candidate, Interior, candidate_at, find_candidates, find_inside, inspect_interior
 from .consensus import BoundaryFit, boundaries_without_stretch, fit_boundary
@@ -25,7 +25,7 @@ from .covariance import edge_covariance
 from .edge_model import SECTORS, EdgeModel, Place, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glare import without_glare
-from .scoring import edge_confidence
+from .scoring import confidence, goodness_of
 
 SURE = 0.9  # a hypothesis of this confidence ends the search
 LATE_CONFIDENCE = 0.5  # least confidence of a hypothesis of a later look
@@ -85,9 +85,14 @@ class Found:
         return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
 
     @cached_property
+    def goodness(self) -> Goodness:
+        """How well the boundary explains the image, from its edges."""
+        return goodness_of(self, None)
+
+    @cached_property
     def confidence(self) -> float:
         """Probability that this is the pupil, from the edges alone."""
-        return edge_confidence(self)
+        return confidence(self.boundary.ellipse, self.goodness, "fast")
 
     @property
     def core_dn(self) -> float:
