@@ -136,6 +136,7 @@ def render_job(frames: Frames, row: int) -> RenderJob:
         region=scene.region,
         lens=scene.spec.lens,
         ambient=scene.ambient,
+        mesh_edge_mm=scene.spec.image.mesh_edge_mm if scene.spec.image.surfaces == "mesh" else None,
         wavelength_nm=scene.spec.wavelength_nm,
         seed=image_seed(scene.spec.seed, int(index.frame[row]), int(index.eye[row])),
         apex_mm=index.eye_position_mm[row] + index.head_mm[row],

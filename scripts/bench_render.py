@@ -60,7 +60,7 @@ class Bench:
         """All rows, as they are measured."""
         for part in (
             self.iris_against_path, self.iris_against_light_tracer, self.noise, self.glint_centroids, self.large_disc,
-            self.pupil_outline, self.cost, self.region_cost, self.region_noise, self.subjects,
+            self.pupil_outline, self.cost, self.surfaces_cost, self.region_cost, self.region_noise, self.subjects,
             self.first_frames, self.recompiles, self.fixed_cost, self.memory, self.determinism,
         ):  # fmt: skip
             yield from part()
@@ -354,6 +354,28 @@ class Bench:
         yield row("three coherent Embree rays a sample / our CPU", 3 * cpu["embree"] / cpu["E2"], "ratio")
         yield row("full-frame E4 / E2, CPU", cpu["E4"] / cpu["E2"], "ratio", 1.3)
         yield row("full-frame E5 / E2, CPU", cpu["E5"] / cpu["E2"], "ratio", 1.3)
+
+    def surfaces_cost(self) -> Iterable[Row]:
+        """Meshed corneas and blur by depth, against exact surfaces and no blur."""
+        from eyerender.capture import render_job
+        from eyerender.rig.imaging import Lens
+        from eyerender.scene.shipped import load_scene
+
+        rig = self.rigs.head_rig()
+        for model in ("E2", "E5"):
+            exact = self.rigs.job_of(self.rigs.eye_of(model), rig, (0, 0, 640, 480), (4.0, -3.0))
+            mesh = replace(exact, mesh_edge_mm=0.1)
+            costs = []
+            for job in (exact, mesh):
+                self.renderer.render(job, spp=4)
+                costs.append(cpu_of(partial(self.renderer.render, job, spp=4), 3)[0])
+            yield row(f"{model} head-mounted, surfaces: mesh / exact, CPU", costs[1] / costs[0], "ratio")
+        sharp = render_job(load_scene("headset").frames(), 4)
+        costs = []
+        for job in (sharp, replace(sharp, lens=Lens(focus_mm=55.0))):
+            self.renderer.render(job, spp=4)
+            costs.append(cpu_of(partial(self.renderer.render, job, spp=4), 3)[0])
+        yield row("headset, 4 spp, blurred by depth / sharp, CPU", costs[1] / costs[0], "ratio")
 
     def region_cost(self) -> Iterable[Row]:
         """CPU time of eyes in their lids with a new pose in each frame, and of the parts of a frame."""

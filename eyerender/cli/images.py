@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -21,6 +21,7 @@ def render(
     eye: EyeModel = None,
     spp: int | None = None,
     seed: Seed = None,
+    surfaces: Literal["exact", "mesh"] | None = None,
     backend: Backend = "auto",
     threads: Threads = None,
     exr: bool = False,
@@ -35,6 +36,7 @@ def render(
         scene: A scene file, or the name of a shipped scene.
         output: The folder to write.
         spp: Replace the scene's samples per pixel.
+        surfaces: Render the cornea as exact surfaces or as triangles (image.surfaces).
         exr: Also write the noise-free linear irradiance as EXR.
         auto_exposure: Choose one exposure time for the whole run, so that 98 % of the pixels are at most at this share
             of full scale (0.7, for instance; more than 1 clips).
@@ -45,7 +47,7 @@ def render(
 
     positive("--threads", threads)
     heed = Heed(strict)
-    loaded = load_scene(scene, eye=eye, spp=spp, seed=seed)
+    loaded = load_scene(scene, eye=eye, spp=spp, seed=seed, surfaces=surfaces)
     heed(loaded.warnings())
     refuse_non_empty(output, overwrite)
     if auto_exposure is not None:

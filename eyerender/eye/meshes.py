@@ -13,8 +13,7 @@ patches, so they close without gaps:
 
 Where a model leaves a gap, it is closed as follows: the posterior cornea ends where it meets the plane of the iris or
 at the limbus; a lens without a rim of its own ends at 4.5 mm or where its surfaces meet; the retinal wall is a sphere 1
-mm inside the sclera. The renderer itself intersects the surfaces in closed form; these meshes are for other
-integrators.
+mm inside the sclera. The renderer itself intersects the surfaces in closed form unless a scene asks for meshes.
 """
 
 from __future__ import annotations
@@ -74,21 +73,19 @@ def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
     """Make all meshes of an eye, in the eye frame (mm); a gradient lens is made of shells."""
     eye = shelled(eye)
     angle = 2 * np.pi * np.arange(sectors) / sectors
-    limbus = np.full(sectors, float(eye.limbus_radius_mm))
-    indices = [1.0, *(float(n) for n in eye.front_indices)]
-    front = _cap("cornea_front", eye.front[0], limbus, rings, indices[0], indices[1])
+    cornea = cornea_patches(eye, rings, sectors)
+    front = cornea[0]
     patches = {"cornea_front": front}
     bodies: dict[str, Any] = {}
     rim = _rim(front, sectors)
 
     inner_rim = rim
     if len(eye.front) > 1:
-        rho = _chamber_rim(eye, eye.front[-1], angle)
-        back = _cap("cornea_back", eye.front[-1], rho, rings, indices[1], indices[2])
+        back = cornea[-1]
         inner_rim = _rim(back, sectors)
         patches |= {"cornea_back": back, "cornea_rim": _band("cornea_rim", rim, inner_rim)}
         bodies["cornea"] = _closed((front, 1), (patches["cornea_rim"], 1), (back, -1))
-    aqueous = indices[-1]
+    aqueous = float(eye.front_indices[-1])
 
     lenses = _lenses(eye, aqueous, rings, sectors, angle)
     behind = float(eye.back_indices[-1]) if lenses else aqueous
@@ -116,6 +113,17 @@ def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
     patches |= {"sclera": sclera, "iris": _iris(eye, sectors)}
     bodies["globe"] = _closed((front, 1), (sclera, 1))
     return EyeMeshes(patches, bodies)
+
+
+def cornea_patches(eye: EyeModel, rings: int, sectors: int) -> tuple[Patch, ...]:
+    """Patches of the cornea's refracting surfaces, from outside: the front, and the back if there is one."""
+    limbus = np.full(sectors, float(eye.limbus_radius_mm))
+    indices = [1.0, *(float(n) for n in eye.front_indices)]
+    patches = [_cap("cornea_front", eye.front[0], limbus, rings, indices[0], indices[1])]
+    if len(eye.front) > 1:
+        rho = _chamber_rim(eye, eye.front[-1], 2 * np.pi * np.arange(sectors) / sectors)
+        patches.append(_cap("cornea_back", eye.front[-1], rho, rings, indices[1], indices[2]))
+    return tuple(patches)
 
 
 def _cap(name: str, surface: Surface, rho: Floats, rings: int, exterior: float, interior: float,

@@ -64,6 +64,7 @@ class RenderJob(ArrayValue):
         lens: focus and vignetting.
         ambient: light other than that of the lamps.
         focus_dpt: vergence at which the eye is focused, 1 / distance in metres.
+        mesh_edge_mm: length of the edges of meshes that take the place of the cornea's surfaces; None: closed forms.
     """
 
     eye: EyeModel
@@ -83,6 +84,7 @@ class RenderJob(ArrayValue):
     lens: Lens = _LENS
     ambient: Ambient = _AMBIENT
     focus_dpt: float = 0.0
+    mesh_edge_mm: float | None = None
 
     @property
     def anchor_mm(self) -> Floats:

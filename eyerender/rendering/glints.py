@@ -17,21 +17,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..arrays import ArrayValue, Bools, Floats, frozen
-from ..geometry.surfaces import Surface, components, join
+from ..geometry.surfaces import Surface, Xyz, components, join
 from ..geometry.transforms import normalize
 from ..optics.interface import fresnel
 from ..optics.shooting import RESIDUAL_LIMIT_MM, ray_tube
-from ..optics.solve import mirrored_rays
+from ..optics.solve import Rays, mirrored_rays
 from ..optics.trace import Crossing
 from ..rig.camera import PinholeCamera
 from ..rig.light import Lamp
 from ..status import Status
 from .cut import POINT, Nodes, cut_nodes, quadrature, rim
 from .frame import ring_radius_mm
+
+if TYPE_CHECKING:
+    from .meshed import SurfaceMesh
 
 _PARALLAX_MM = 0.05
 _MAP_ERROR = 1e-3  # of the extent of a lamp's image
@@ -128,6 +132,7 @@ class GlintScene:
     t: Floats
     camera: PinholeCamera
     clear: Visibility
+    mesh: SurfaceMesh | None = None
 
     def glints(self, lights: Sequence[Lamp], sigma_px: float) -> list[Glint]:
         """Compute the glint of each lamp, as finely as its size, its edges and the point-spread function require."""
@@ -235,13 +240,13 @@ class GlintScene:
         found = np.asarray((rays.status == Status.OK) | (rays.status == Status.OUTSIDE_LIMBUS))
         found &= rays.residual_mm < RESIDUAL_LIMIT_MM
         there = found & (rays.status == Status.OK)
-        mirror = (Crossing(self.surface, 1.0, reflects=True),)
-        J = ray_tube(mirror, 1.0, node_xyz, rays.way, lamp_xyz).cross_section_mm2_sr
-        # The solver's ray runs from the camera to the lamp, the light in the other direction.
-        y, d, w = (
-            np.where(found[:, None], a, (1.0, 0.0, 0.0)) for a in (join(rays.exit), -join(rays.end), -join(rays.way))
-        )
-        F = fresnel(np.clip(-_dot(self.surface.normal(y), d), 0, 1), 1.0, self.index).unpolarized
+        y, d, w, N, J = self._mirrors(rays, lamp_xyz, node_xyz, found)
+        if self.mesh is not None:
+            seen = self.mesh.mirrored(y, sources, np.broadcast_to(eyepoint, sources.shape))
+            y, N, d, w, J = seen.point, seen.normal, seen.arrives, seen.leaves, seen.cross_section
+            found &= seen.found
+            there = found & (self.surface.axis_distance(components(y)) <= self.limbus_radius_mm)
+        F = fresnel(np.clip(-_dot(N, d), 0, 1), 1.0, self.index).unpolarized
         leaving = np.maximum(_dot(d, axes[which]), 0)
         power = exponent[which]
         lobe = np.where(power == 0, 1.0, np.where(leaving > 0, leaving ** np.where(power == 0, 1.0, power), 0.0))
@@ -256,6 +261,16 @@ class GlintScene:
         parts = np.cumsum(counts)[:-1]
         columns = (np.split(a, parts) for a in (points, mirrors, mirrors, xy, energy, there, found))
         return [Image(*c) for c in zip(*columns, strict=True)]
+
+    def _mirrors(self, rays: Rays, lamp: Xyz, node: Xyz, found: Bools) -> tuple[Floats, ...]:
+        """Mirror points of the closed form, directions of arriving and leaving light, normals, ray tubes."""
+        mirror = (Crossing(self.surface, 1.0, reflects=True),)
+        J = ray_tube(mirror, 1.0, node, rays.way, lamp).cross_section_mm2_sr
+        # The solver's ray runs from the camera to the lamp, the light in the other direction.
+        y, d, w = (
+            np.where(found[:, None], a, (1.0, 0.0, 0.0)) for a in (join(rays.exit), -join(rays.end), -join(rays.way))
+        )
+        return y, d, w, self.surface.normal(y), J
 
     def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
         """Whether the sclera's sphere blocks the way from points of the cornea (eye frame)."""

@@ -101,18 +101,19 @@ class Renderer:
         shots = moments or (job,)
         spp = max(1, (spp or self.spp) // len(shots))
         blur: Blur | None = None
+        front = None if job.mesh_edge_mm is None else self._stage.meshes.of(job.eye, job.mesh_edge_mm)[0]
         pictures, glints, failed = [], np.zeros((job.window[3], job.window[2])), 0
         for shot in shots:
             shown, place = self.bind(shot)
             blur = blur or Blur.of(job, place)
             picture, missed = self._pictures(shot, shown, blur, spp)
             pictures.append(picture)
-            mirrored = add_glints(shot, place, glints, blur)
+            mirrored = add_glints(shot, place, glints, blur, front)
             failed += missed
         assert blur is not None
         if moments:
             shown, place = self.bind(job)
-            mirrored = add_glints(job, place, np.zeros_like(glints), blur)
+            mirrored = add_glints(job, place, np.zeros_like(glints), blur, front)
         soft = blur.of_pictures(pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0))
         picture = psf.blur(soft, job.sensor.psf_sigma_px) + glints / len(shots)
         seen = (job.lens, job.camera, job.window)

@@ -13,6 +13,7 @@ from .blur import Blur
 from .cut import POINT, quadrature
 from .frame import RenderJob
 from .glints import Glint, GlintScene, GlintTable, Spots, glint_table
+from .meshed import SurfaceMesh
 from .occlusion import glint_reason
 from .purkinje import purkinje_images
 from .region import RegionScene, blockers
@@ -45,7 +46,9 @@ class Mirrored:
         return Mirrored(glints, self.others, reasons)
 
 
-def add_glints(job: RenderJob, place: Surround | RegionScene, image: Floats, blur: Blur) -> Mirrored:
+def add_glints(
+    job: RenderJob, place: Surround | RegionScene, image: Floats, blur: Blur, mesh: SurfaceMesh | None
+) -> Mirrored:
     """Add the mirror images of a job's lamps to its blurred image (height, width)."""
     eye, anchor, sigma = job.eye, job.anchor_mm, job.sensor.psf_sigma_px
 
@@ -54,7 +57,7 @@ def add_glints(job: RenderJob, place: Surround | RegionScene, image: Floats, blu
 
     scene = GlintScene(
         eye.front[0], float(eye.front_indices[0]), float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm),
-        float(eye.sclera.radius_mm), job.M, job.t, job.camera, clear,
+        float(eye.sclera.radius_mm), job.M, job.t, job.camera, clear, mesh,
     )  # fmt: skip
     tables = {}
     reasons: tuple[str, ...] = ()

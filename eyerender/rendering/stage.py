@@ -29,6 +29,7 @@ from .head import place_scene
 from .irislight import IrisLight
 from .lampviews import LampViews
 from .lidshade import LidShade
+from .meshed import Meshes, meshed
 from .plain import plain_tiles
 from .pupillight import PupilLight
 from .region import RegionScene
@@ -48,6 +49,7 @@ class Stage:
         self._textures: dict[int, Textures] = {}
         self._regions: dict[Any, RegionScene] = {}
         self._maps = Maps()
+        self.meshes = Meshes()
 
     def set(self, job: RenderJob) -> tuple[Exposed, Surround | RegionScene]:
         """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call."""
@@ -62,6 +64,8 @@ class Stage:
         )
         anchor = job.anchor_mm
         values = Values(structure, parameters_of(job), boundary_waves(job.eye), tables(job.eye))
+        if job.mesh_edge_mm is not None:
+            values.surfaces = meshed(values.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
         lights = Lights(light_table(job.lights, job.M, job.t))
         textures = self._textures_of(job)
         if structure.ambient:

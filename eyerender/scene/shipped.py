@@ -9,7 +9,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..spec import read_yaml
 from .scene import Scene
-from .spec import DATASET_KIND, NOT_A_SCENE, SceneSpec
+from .spec import DATASET_KIND, NOT_A_SCENE, SceneSpec, Surfaces
 
 
 def shipped_scenes() -> dict[str, Path]:
@@ -52,7 +52,14 @@ def refuse_folder(path: Path, wanted: str) -> None:
     raise InputError(f"is a folder; give {wanted}{hint}", source=str(path))
 
 
-def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = None, seed: int | None = None) -> Scene:
+def load_scene(
+    scene: str | Path,
+    *,
+    eye: str | None = None,
+    spp: int | None = None,
+    seed: int | None = None,
+    surfaces: Surfaces | None = None,
+) -> Scene:
     """Load a scene from a file, or by the bare name of a shipped one.
 
     Args:
@@ -60,6 +67,7 @@ def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = N
         eye: replaces the scene's eye model (a catalogue name or an eye file).
         spp: replaces the samples per pixel.
         seed: replaces the seed.
+        surfaces: replaces how the cornea is rendered.
 
     Raises:
         InputError: one line that names the file and the key, or the option whose value does not fit.
@@ -79,4 +87,6 @@ def load_scene(scene: str | Path, *, eye: str | None = None, spp: int | None = N
         spec = spec.with_spp(spp)
     if seed is not None:
         spec = spec.replaced("--seed", {"seed": seed})
+    if surfaces is not None:
+        spec = spec.with_surfaces(surfaces)
     return Scene.of(spec, base=path.parent, eye=eye, source=str(path))

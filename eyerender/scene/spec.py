@@ -157,6 +157,9 @@ class EyeDirection(Spec):
         return [cls(azimuth_deg=azimuth, elevation_deg=elevation) for azimuth, elevation in angles]
 
 
+Surfaces = Literal["exact", "mesh"]
+
+
 class Picture(Spec):
     """The part of the sensor that is rendered, and the number of samples."""
 
@@ -164,6 +167,13 @@ class Picture(Spec):
         default=None, description="width and height of one window per eye, centred on it; default: the whole sensor"
     )
     spp: Annotated[int, Field(ge=1, le=65536)] = Field(default=16, description="samples per pixel")
+    surfaces: Surfaces = Field(
+        default="exact",
+        description="the cornea of the picture: `exact` (in closed form) or `mesh` (triangles, interpolated normals)",
+    )
+    mesh_edge_mm: Annotated[float, Field(ge=0.02, le=2)] = Field(
+        default=0.1, description="length of the triangles' edges, with `surfaces: mesh`"
+    )
 
 
 NOT_A_SCENE = (
@@ -281,6 +291,10 @@ class SceneSpec(FileSpec):
             InputError: naming the option --spp.
         """
         return self.replaced("--spp", {"image": {**self.to_mapping()["image"], "spp": spp}})
+
+    def with_surfaces(self, surfaces: Surfaces) -> Self:
+        """Copy with the cornea in closed form or as a mesh."""
+        return self.replaced("--surfaces", {"image": {**self.to_mapping()["image"], "surfaces": surfaces}})
 
 
 def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -127,7 +127,12 @@ def coverage(polygon: np.ndarray, window: tuple[int, int, int, int], k: int = 40
 
 
 def contour_error(rendered: np.ndarray, polygon: np.ndarray, window: tuple[int, int, int, int]) -> float:
-    """RMS distance (px) of the smooth contour with 12 harmonics that explains the rendered coverage best.
+    """RMS distance (px) of the smooth contour with 12 harmonics that explains the rendered coverage best."""
+    return contour_shift(rendered - coverage(polygon, window), polygon, window)
+
+
+def contour_shift(difference: np.ndarray, polygon: np.ndarray, window: tuple[int, int, int, int]) -> float:
+    """RMS shift (px) of a contour with 12 harmonics that explains a difference of coverages (h, w) best.
 
     A shift of the contour by delta along its normal adds delta ds to the pixels it runs through; least squares over all
     pixels near the edge gives the harmonics of delta.
@@ -142,7 +147,7 @@ def contour_error(rendered: np.ndarray, polygon: np.ndarray, window: tuple[int, 
     for m in range(1, HARMONICS + 1):
         basis += [np.cos(m * angle), np.sin(m * angle)]
     pixel = np.round(dense).astype(int) - window[:2]
-    A = np.zeros((rendered.size, len(basis)))
+    A = np.zeros((difference.size, len(basis)))
     for k, b in enumerate(basis):
         np.add.at(A[:, k], pixel[:, 1] * window[2] + pixel[:, 0], b * ds)
 
@@ -154,7 +159,7 @@ def contour_error(rendered: np.ndarray, polygon: np.ndarray, window: tuple[int, 
 
     wide = np.stack([box(c) for c in A.T], axis=1)
     rows = np.abs(wide).sum(axis=1) > 0
-    missing = box(rendered - coverage(polygon, window))
+    missing = box(difference)
     delta = np.linalg.lstsq(wide[rows], missing[rows], rcond=None)[0]
     return float(np.sqrt(np.mean((np.stack(basis, axis=1) @ delta) ** 2)))
 
