@@ -13,7 +13,7 @@ class Opening(Spec):
     """An opening that the camera looks through: a lens barrel, an aperture, a hot mirror in its holder.
 
     It stands near the lens, so it is out of focus: its edge is blurred. Its shape is a superellipse in the picture,
-    |x / a|^p + |y / b|^p = 1. A straight edge is a rectangle whose other edges lie far outside the picture.
+    (abs(x) / a)^p + (abs(y) / b)^p = 1. A straight edge is a rectangle whose other edges lie far outside the picture.
     """
 
     centre: Vec2 = Field(
