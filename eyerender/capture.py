@@ -133,7 +133,7 @@ def render_job(frames: Frames, row: int) -> RenderJob:
         lights=scene.rig.lights,
         sensor=scene.spec.sensor,
         look=scene.spec.look,
-        region=scene.region,
+        region=None if scene.region is None else scene.region.of_side(EYES[index.eye[row]]),
         lens=scene.spec.lens,
         ambient=scene.ambient,
         mesh_edge_mm=scene.spec.image.mesh_edge_mm if scene.spec.image.surfaces == "mesh" else None,

@@ -43,9 +43,14 @@ class Fissure(Spec):
     width_mm: float = _number(28.5, 25.0, 33.0, "canthus to canthus (Knezi, van den Bosch)")
     lateral_share: float = _number(0.46, 0.42, 0.50, "share of the width that lies temporal of the pupil (chosen)")
     upper_mm: float = _number(3.7, 2.2, 6.0, "upper margin above the pupil's centre (with the lower one: Read, Knezi)")
-    lower_mm: float = _number(5.2, 4.0, 6.5, "lower margin below the pupil's centre (with the upper one: Read, Knezi)")
-    tilt_deg: float = _number(4.0, -3.0, 9.0, "lateral canthus above the medial one (chosen)")
+    lower_mm: float = _number(
+        5.2, 4.0, 7.2, "lower margin below the pupil's centre (with the upper one: Read, Knezi); above 6 sclera shows"
+    )
+    tilt_deg: float = _number(4.0, -5.0, 11.0, "lateral canthus above the medial one (chosen)")
     canthi_mm: float = _number(-2.2, -3.5, -0.5, "middle of the canthi above the pupil's centre (chosen)")
+    epicanthus_mm: float = _number(
+        0.0, 0.0, 3.5, "fold of skin from the upper lid that covers the medial canthus by this much (chosen)"
+    )
     peak: float = _number(0.02, -0.15, 0.15, "place of the upper margin's peak, -1 temporal to 1 nasal (chosen)")
 
 
@@ -63,6 +68,9 @@ class Lid(Spec):
     crease_mm: float = _number(8.0, 5.0, 11.0, "crease above the margin of the closed lid (Cartwright; others 8 to 10)")
     show_mm: float = _number(2.6, 1.2, 5.0, "lid visible below the fold when open (Cartwright)")
     fold_mm: float = _number(1.0, 0.0, 1.9, "how far the fold stands above the crease (chosen)")
+    hood_mm: float = _number(
+        0.0, 0.0, 2.5, "how much farther the fold hangs over the lid, most at the temple: hooded lids, age (chosen)"
+    )
     fill_mm: float = _number(2.1, 0.0, 3.5, "how far the hollow above the lid fills as it shuts (chosen)")
     bags_mm: float = _number(0.5, 0.0, 1.5, "fullness below the lower lid (chosen)")
 
@@ -73,7 +81,7 @@ class Lashes(Spec):
     upper_count: Annotated[int, Field(ge=0, le=180)] = Field(
         default=120, description="number on the upper lid (textbooks)"
     )
-    lower_count: Annotated[int, Field(ge=0, le=110)] = Field(default=58, description="number on the lower lid (chosen)")
+    lower_count: Annotated[int, Field(ge=0, le=110)] = Field(default=46, description="number on the lower lid (chosen)")
     upper_length_mm: float = _number(8.5, 5.0, 12.0, "longest lash of the upper lid (textbooks)")
     lower_length_mm: float = _number(5.0, 3.0, 8.0, "longest lash of the lower lid (chosen)")
     diameter_mm: float = _number(0.085, 0.05, 0.12, "diameter at the root (chosen)")
@@ -87,6 +95,12 @@ class Lashes(Spec):
     albedo: float = _number(
         0.05, 0.02, 0.5, "albedo at 850 nm; melanin absorbs little there, but hair is still dark (chosen)"
     )
+    tip_albedo: float = _number(
+        0.24, 0.02, 0.7, "albedo at the tips of upper lashes, which are thin and let light through (chosen)"
+    )
+    lower_albedo: float = _number(
+        0.16, 0.02, 0.6, "albedo of the lower lashes at the root, which are paler than the upper ones (chosen)"
+    )
 
 
 class Brow(Spec):
@@ -99,6 +113,7 @@ class Brow(Spec):
     arch_mm: float = _number(3.5, 0.0, 8.0, "rise from head to arch (chosen)")
     diameter_mm: float = _number(0.075, 0.05, 0.14, "diameter at the root (chosen)")
     albedo: float = _number(0.18, 0.02, 0.6, "albedo at 850 nm (chosen)")
+    asymmetry_mm: float = _number(0.0, -3.0, 3.0, "left brow above the right one (chosen)")
 
 
 class Face(Spec):
@@ -153,6 +168,15 @@ class Region(Spec):
                     f"{name}: cannot be combined with a head mesh, which does not move and has its own shape"
                 )
         return self
+
+    def of_side(self, side: str) -> Self:
+        """The region of the right or left eye: their brows may differ in height."""
+        if self.brow.asymmetry_mm == 0:
+            return self
+        half = 0.5 * self.brow.asymmetry_mm * (1 if side == "left" else -1)
+        height = float(np.clip(self.brow.height_mm + half, 10.0, 24.0))
+        brow = self.brow.model_copy(update={"height_mm": height, "asymmetry_mm": 0.0})
+        return self.model_copy(update={"brow": brow})
 
     @classmethod
     def drawn(cls, seed: int, *, spread: float = 1.0, blink: float = 0.0) -> Self:

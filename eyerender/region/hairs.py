@@ -51,7 +51,7 @@ def tube_faces(count: int, points: int) -> Ints:
     return frozen((one[None] + 3 * points * np.arange(count)[:, None, None]).reshape(-1, 3), np.int64)
 
 
-def taper(length: Floats, root_mm: float, points: int) -> Floats:
-    """Radii (n, k), which decrease from the root to a tenth at the tip."""
+def taper(length: Floats, root_mm: float, points: int, tip: float = 0.1) -> Floats:
+    """Radii (n, k), which decrease from the root to the share `tip` of it at the tip."""
     s = np.linspace(0, 1, points)
-    return np.asarray(np.broadcast_to(root_mm / 2 * (1 - 0.9 * s**1.4), (len(length), points)))
+    return np.asarray(np.broadcast_to(root_mm / 2 * (1 - (1 - tip) * s**1.4), (len(length), points)))

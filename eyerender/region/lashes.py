@@ -4,8 +4,9 @@ A lash starts in the lash line and turns in the plane of the lid's normal n and 
 
     d(s) = cos(f) (cos(b) n + sin(b) m) + sin(f) t,   b(s) = b0 + curl s,
 
-where b0 < 0 points towards the fissure. The fan f varies along the lid from one canthus to the other. Tips of
-neighbours lean together by `clumping`. A lash that would enter the skin is lifted out of it.
+where b0 < 0 points towards the fissure. The fan f varies along the lid from one canthus to the other. Lashes stand in
+tufts with gaps between them; those of a tuft have much in common, and their tips lean together by `clumping`. A lash
+that would enter the skin is lifted out of it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ _ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # of the points after th
 _REACH_ROWS = 16
 _CAUGHT_MM = 0.3  # a lash that is still this far inside is caught
 _NEAR_COLUMNS = 6
+_TIP = 0.3  # radius of the tip over that of the root; the map makes thin tips paler instead (`skin.lash_band`)
 _KINK = 0.45  # cosine of the sharpest bend between two pieces; no lash's curl is this sharp
 
 
@@ -34,8 +36,8 @@ _KINK = 0.45  # cosine of the sharpest bend between two pieces; no lash's curl i
 class LashPlan(ArrayValue):
     """Properties of the lashes that do not change with the pose.
 
-    Each lash has the angle of its column, its place across the margin (0 to 1), length, fan, start, curl and thickness
-    (1 for a full-grown upper lash).
+    Each lash has the angle of its column, its place across the margin (0 to 1), length, fan, start, curl, thickness (1
+    for a full-grown upper lash), and the turn sideways of its outer part.
     """
 
     angle: Floats
@@ -45,13 +47,14 @@ class LashPlan(ArrayValue):
     start: Floats
     curl: Floats
     stout: Floats
+    sway: Floats
 
 
 @lru_cache(maxsize=16)
 def plan(spec: Lashes, seed: int) -> LashPlan:
     """Plan the lashes of a subject; upper ones first."""
     parts = [_lid(spec, seed, True), _lid(spec, seed, False)]
-    return LashPlan(*(frozen(np.concatenate([p[i] for p in parts])) for i in range(7)))
+    return LashPlan(*(frozen(np.concatenate([p[i] for p in parts])) for i in range(8)))
 
 
 def _lid(spec: Lashes, seed: int, upper: bool) -> tuple[Floats, ...]:
@@ -59,43 +62,60 @@ def _lid(spec: Lashes, seed: int, upper: bool) -> tuple[Floats, ...]:
     count = spec.upper_count if upper else spec.lower_count
     # The margins have no lashes between the lacrimal puncta and the nose.
     low, high = (-0.955, 0.62) if upper else (-0.93, 0.58)
+    tuft = _tufts(rng, count)
     place = (np.arange(count) + 0.5 + rng.uniform(-0.45, 0.45, count)) / max(count, 1)
+    # The roots of a tuft stand closer, with gaps between tufts.
+    place += 0.55 * spec.clumping * (_means(place, tuft) - place)
     # Lashes are denser towards the temple.
-    a = low + (high - low) * place**1.08
+    a = low + (high - low) * np.clip(place, 0, 1) ** 1.08
     across = rng.choice([0.76, 0.87, 0.97], count, p=[0.25, 0.4, 0.35]) + rng.normal(0, 0.03, count)
     # They are longest slightly temporal of the middle and short at both ends.
     end = (a - low) / (high - low)
     profile = 0.45 + 0.55 * np.sin(np.pi * np.clip(end, 0, 1) ** 0.9) ** 0.6
     most = spec.upper_length_mm if upper else spec.lower_length_mm
     # Lashes of all ages stand side by side: most are full-grown, some are short.
-    length = most * profile * np.where(rng.uniform(size=count) < 0.22, rng.uniform(0.3, 0.7, count),
-                                       rng.triangular(0.6, 0.88, 1.0, count))  # fmt: skip
+    young = rng.uniform(size=count) < 0.25
+    length = np.where(young, rng.uniform(0.25, 0.65, count), rng.triangular(0.6, 0.88, 1.0, count))
+    length *= most * profile * _shared(rng.uniform(0.82, 1.0, count), tuft)
     spread = np.radians(spec.spread_deg)
-    fan = np.radians(42.0) * np.sin(1.3 * (a + 0.04)) + (1.0 if upper else 1.5) * spread * rng.normal(0, 1, count)
+
+    def both(common: float, own: float) -> Floats:
+        """Deviations that a tuft shares, and deviations of its members."""
+        return common * _shared(rng.normal(0, 1, count), tuft) + own * rng.normal(0, 1, count)
+
+    # A few lashes cross all others.
+    stray = np.where(rng.uniform(size=count) < 0.12, 2.2, 1.0) * (1.0 if upper else 1.4) * spread
+    fan = np.radians(42.0) * np.sin(1.3 * (a + 0.04)) + stray * both(0.8, 0.65)
+    sway = stray * both(0.9, 0.9)
     droop = np.radians(spec.upper_droop_deg if upper else -8.0)
-    start = -droop + 0.8 * spread * rng.normal(0, 1, count)
-    curl = np.radians(spec.upper_curl_deg if upper else spec.lower_curl_deg) * rng.uniform(0.7, 1.2, count)
-    # Groups of two to five lashes share fan and curl towards their tips.
-    group = np.cumsum((rng.uniform(size=count) < 0.36).astype(np.int64))
-    for values in (fan, start, curl):
-        for g in np.unique(group):
-            members = group == g
-            mean = values[members].mean()
-            values[members] += 0.8 * spec.clumping * (mean - values[members])
-    fan = fan + _lean(a, group, spec.clumping, float(np.mean(length)) if count else 1.0)
+    start = -droop + spread * both(0.6, 0.4)
+    curl = np.radians(spec.upper_curl_deg if upper else spec.lower_curl_deg)
+    curl = curl * np.clip(1 + both(0.16, 0.12), 0.4, 1.5)
+    # The tips of a tuft lean together, some just past each other.
+    offset_mm = 14.5 * (_means(a, tuft) - a)
+    tight = spec.clumping * _shared(rng.uniform(0.5, 1.4, count), tuft)
+    fan += tight * np.arctan(offset_mm / np.maximum(length, 1.0))
     angle = np.arccos(np.clip(a, -1, 1)) if upper else 2 * np.pi - np.arccos(np.clip(a, -1, 1))
-    stout = (1.0 if upper else 0.75) * np.clip(0.55 + 0.5 * length / most, 0.0, 1.0)
-    return angle, across, length, fan, start, curl, stout
+    stout = (1.0 if upper else 0.7) * np.clip(0.5 + 0.55 * length / most, 0.0, 1.0) * rng.uniform(0.75, 1.1, count)
+    return angle, across, length, fan, start, curl, stout, sway
 
 
-def _lean(a: Floats, group: Ints, clumping: float, length: float) -> Floats:
-    """Turn of each lash towards the middle of its clump, so that tips meet."""
-    out = np.zeros_like(a)
-    for g in np.unique(group):
-        members = group == g
-        offset_mm = (a[members].mean() - a[members]) * 14.5
-        out[members] = clumping * np.arctan(offset_mm / max(length, 1.0))
-    return out
+def _tufts(rng: np.random.Generator, count: int) -> Ints:
+    """Number of the tuft of each lash; a tuft has one to six."""
+    sizes = rng.choice([1, 2, 3, 4, 5, 6], max(count, 1), p=[0.24, 0.2, 0.2, 0.17, 0.12, 0.07])
+    return np.repeat(np.arange(len(sizes)), sizes)[:count].astype(np.int64)
+
+
+def _shared(values: Floats, tuft: Ints) -> Floats:
+    """One value for all lashes of a tuft: that of the first."""
+    first = np.searchsorted(tuft, tuft)
+    return np.asarray(values[first])
+
+
+def _means(values: Floats, tuft: Ints) -> Floats:
+    """Mean over the tuft of each lash."""
+    total, number = np.bincount(tuft, values, 1), np.bincount(tuft, minlength=1)
+    return np.asarray((total / np.maximum(number, 1))[tuft])
 
 
 def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
@@ -121,7 +141,7 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
     for j in range(1, k):
         s = 0.5 * (ends[j - 1] + ends[j])
         b = start + hang * min(s / 0.3, 1.0) + p.curl * s**1.15
-        f = p.fan * (0.5 + 0.7 * s)
+        f = p.fan * (0.5 + 0.7 * s) + p.sway * s * s
         d = np.cos(f)[:, None] * (np.cos(b)[:, None] * n + np.sin(b)[:, None] * m) + np.sin(f)[:, None] * t
         points[:, j] = points[:, j - 1] + (p.length_mm * (ends[j] - ends[j - 1]))[:, None] * d
     ahead = unit(n + 0.4 * np.array([1.0, 0.0, 0.0]))
@@ -133,7 +153,7 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
         corner = np.flatnonzero(np.abs(np.sin(p.angle)) < 0.75)
         stuck = corner[_through_skin(sheet, p.angle[corner], points[corner, 1:])] if len(corner) else corner
         points[stuck, 1:] = points[stuck, :1] + 0.0005 * (straight[stuck, 1:] - points[stuck, :1])
-    return Hairs(frozen(points), frozen(taper(p.length_mm, spec.lashes.diameter_mm, k) * p.stout[:, None]))
+    return Hairs(frozen(points), frozen(taper(p.length_mm, spec.lashes.diameter_mm, k, _TIP) * p.stout[:, None]))
 
 
 def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:

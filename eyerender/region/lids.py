@@ -188,6 +188,8 @@ def _skin(spec: Region, globe: Globe, c: Contour, edge: Floats, lash_line: Float
     lift, drop = _fold(spec, c, v, crease, strength)
     x = x + lift
     z = z - drop * c.upper
+    if spec.fissure.epicanthus_mm > 0:
+        x, y, z = _epicanthus(spec, c, v, x, y, z)
     rows = np.stack([x, y, z], axis=-1)
     return globe.pushed_out(rows, 0.4)
 
@@ -261,6 +263,12 @@ def _fold(spec: Region, c: Contour, v: Floats, crease: Floats, strength: Floats)
     swell = step(w, -0.2, 2.2) * np.exp(-(np.maximum(w - 1.6, 0) ** 2) / 30.0)
     lift = height * swell + groove * strength
     drop = 0.55 * height * step(w, 0.0, 0.7) * np.exp(-(np.maximum(w - 0.7, 0) ** 2) / 5.0)
+    if lids.hood_mm > 0:
+        # A hood hangs over the crease, most at the temple, but not over the lash line.
+        hood = lids.hood_mm * (0.6 - 0.4 * c.along) * step(np.sin(c.angle), 0.0, 0.95) * (c.upper > 0) * open_
+        hood = np.minimum(hood, np.maximum(crease - 1.3, 0.0))
+        drop = drop + hood * step(w, -0.3, 0.9) * np.exp(-(np.maximum(w - 0.9, 0) ** 2) / 12.0)
+        lift = lift + 0.5 * hood * step(w, -0.2, 1.6) * np.exp(-(np.maximum(w - 1.6, 0) ** 2) / 14.0)
     # When the lid is closed, the skin of the fold lies in shallow pleats above the crease.
     shut = max(1.0 - open_, 0.0)
     for place, depth in ((2.3, 0.16), (4.1, 0.11)) if shut > 0 else ():
@@ -269,6 +277,15 @@ def _fold(spec: Region, c: Contour, v: Floats, crease: Floats, strength: Floats)
     bags = np.where(c.upper < 0, 1.0, 0.0) * lids.bags_mm * np.exp(-(((v - 8.5) / 3.5) ** 2)) * np.abs(np.sin(c.angle))
     line = np.where(c.upper < 0, -0.22, 0.0) * np.exp(-(((v - crease) / 0.7) ** 2)) * np.abs(np.sin(c.angle))
     return lift + bags + line, drop
+
+
+def _epicanthus(spec: Region, c: Contour, v: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
+    """Skin drawn from the upper lid and the nose over the medial canthus, as a fold in front of the caruncle."""
+    reach = spec.fissure.epicanthus_mm * (1 - 0.5 * spec.blink)
+    along = np.where(c.upper > 0, step(c.along, 0.55, 0.97), step(c.along, 0.86, 1.0))
+    fold = along * step(v, 0.1, 1.5) * np.exp(-(np.maximum(v - 1.5, 0) ** 2) / 16.0)
+    rise = along * step(v, 0.0, 1.2) * np.exp(-(np.maximum(v - 1.2, 0) ** 2) / 9.0)
+    return x + 0.55 * reach * rise, y - reach * fold, z - 0.3 * reach * fold
 
 
 def _fullness(spec: Region, c: Contour, y: Floats, z: Floats) -> Floats:

@@ -20,11 +20,12 @@ from .globe import Globe
 from .hairs import SEGMENTS, Hairs, tube_faces
 from .lashes import lashes
 from .lids import ROWS, grid_normals, sheet
-from .skin import BROW, LASH, TEAR, band_row, sheet_v
+from .skin import BROW, LASH, LASH_U, TEAR, band_row, sheet_v
 from .tears import ROWS as TEAR_ROWS
 from .tears import meniscus
 
 PARTS = ("skin", "tears", "lashes", "brow")
+HAIRS = 2  # the first of a mesh's strands, which are hairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +100,7 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
         mirror = np.array([1.0, -1.0, 1.0])
         vertices, normals, curves = vertices * mirror, normals * mirror, [c * mirror for c in curves]
     upper, lower, border, *strands = (frozen(c) for c in curves)
-    layout = _layout(len(lash.points), len(hair.points), globe.mirrored)
+    layout = _layout(spec.lashes.upper_count, len(lash.points), len(hair.points), globe.mirrored)
     return RegionMesh(
         vertices=frozen(vertices),
         normals=frozen(normals),
@@ -139,11 +140,11 @@ def _margins(fissure: Contour) -> tuple[Floats, Floats]:
 
 
 @lru_cache(maxsize=16)
-def _layout(lash_count: int, brow_count: int, mirrored: bool) -> RegionLayout:
+def _layout(upper_count: int, lash_count: int, brow_count: int, mirrored: bool) -> RegionLayout:
     parts = [
         (_grid_faces(ROWS), _grid_uv(ROWS, None)),
         (_grid_faces(TEAR_ROWS), _grid_uv(TEAR_ROWS, band_row(TEAR))),
-        (tube_faces(lash_count, SEGMENTS + 1), _hair_uv(lash_count, SEGMENTS + 1, band_row(LASH))),
+        (tube_faces(lash_count, SEGMENTS + 1), _lash_uv(upper_count, lash_count)),
         (tube_faces(brow_count, 5), _hair_uv(brow_count, 5, band_row(BROW))),
     ]
     faces, uv, start = [], [], 0
@@ -181,6 +182,14 @@ def _grid_uv(rows: int, v: float | None) -> Floats:
     u = np.arange(COLUMNS + 1) / COLUMNS
     down = sheet_v(np.linspace(0, 1, rows)) if v is None else np.full(rows, v)
     return np.stack(np.meshgrid(u, down), axis=-1).reshape(-1, 2)
+
+
+def _lash_uv(upper_count: int, count: int) -> Floats:
+    """Coordinates of lashes, upper ones first: u runs from root to tip in the half of the band of its lid."""
+    along = LASH_U[0] + LASH_U[1] * np.arange(SEGMENTS + 1) / SEGMENTS
+    lower = np.where(np.arange(count) < upper_count, 0.0, 0.5)
+    u = np.repeat((lower[:, None] + along).reshape(-1), 3)
+    return np.stack([u, np.full_like(u, band_row(LASH))], axis=-1)
 
 
 def _hair_uv(count: int, points: int, v: float) -> Floats:

@@ -32,6 +32,7 @@ from .noise import Padded, Places, band, furrows
 SHEET_ROWS, BANDS = 960, 64
 _COLUMNS = 1536
 LASH, BROW, TEAR = 0, 1, 2
+LASH_U = (0.05, 0.4)  # coordinate u of an upper lash's root, and how far its tip is from there; lower ones add 1/2
 _LINE = CONJUNCTIVA + MARGIN - 1  # the lash line's row
 _TILE_MM, _TILE = 24.0, 640
 _COARSE = 8
@@ -84,9 +85,25 @@ def skin_map(spec: Region) -> Singles:
         ((spec.lashes.albedo, 0.08), (spec.brow.albedo, 0.12), (0.9 * spec.skin.wet_albedo, 1.0))
     ):
         middle = SHEET_ROWS + BANDS * (which + 1) / 4
-        out[int(middle - BANDS / 8) : int(middle + BANDS / 8)] = (a, 0, 0, g)
+        band_rows = slice(int(middle - BANDS / 8), int(middle + BANDS / 8))
+        out[band_rows] = (a, 0, 0, g)
+        if which == LASH:
+            out[band_rows, :, 0] = lash_band(spec)
     out.flags.writeable = False
     return out
+
+
+def lash_band(spec: Region) -> Singles:
+    """Albedo (columns,) of lashes: upper ones in the first half, lower ones in the second, each from root to tip.
+
+    Thin tips let light through, so they are paler; hairs much thinner than a pixel would be stippled.
+    """
+    s = np.clip((np.arange(_COLUMNS) + 0.5) / _COLUMNS % 0.5 - LASH_U[0], 0, LASH_U[1]) / LASH_U[1]
+    lower = np.arange(_COLUMNS) >= _COLUMNS // 2
+    lashes = spec.lashes
+    root = np.where(lower, lashes.lower_albedo, lashes.albedo)
+    tip = np.where(lower, 0.5 * (lashes.lower_albedo + lashes.tip_albedo) + 0.1, lashes.tip_albedo)
+    return np.asarray(root + (np.maximum(tip, root) - root) * s**1.5, dtype=np.float32)
 
 
 def _normalise(albedo: Singles, y: Singles, z: Singles, rows: Floats, wanted: float) -> None:

@@ -9,15 +9,17 @@ pixels to spare.
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 from ..arrays import Bools, Floats
-from ..region.mesh import RegionMesh
+from ..region.mesh import HAIRS, RegionMesh
 from ..rig.camera import PinholeCamera, Window
 
 _TILE_PX = 8
 _STEP_PX = 4.0  # between marked points of a curve
 _SPARE_PX = 1.0
 _HAIR_MM = 0.1  # no hair and no part of a margin is thicker
+_THICK_PX, _FINE_STEP_PX = 2.0, 0.5
 _NEAREST_MM = 3.0  # if hairs are closer to the camera, nothing is plain
 
 
@@ -49,6 +51,28 @@ def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, wi
             outlines.append(_winding(xy[0], shape))
         _mark(marked, _pieces(xy, shape), _STEP_PX / tile, reach / tile)
     return (outlines[1] != 0) & (outlines[0] == 0) & ~marked, tile
+
+
+def fine_pixels(region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> Bools:
+    """Pixels (height, width) of a window at hairs whose roots are at most two pixels thick, and their neighbours.
+
+    A pixel is marked or not, whatever the window.
+    """
+    x0, y0, width, height = window
+    marked = np.zeros((height + 2, width + 2), dtype=bool)
+    for curve in region.strands[:HAIRS] if region is not None else ():
+        z = (curve + anchor_mm - camera.nodal_point_mm) @ camera.R[2]
+        if not curve.size or z.min() < _NEAREST_MM or _HAIR_MM * float(camera.K[0, 0]) > _THICK_PX * z.min():
+            continue
+        xy = camera.project(curve + anchor_mm)[0]
+        start, way = xy[:, :-1].reshape(-1, 2), np.diff(xy, axis=1).reshape(-1, 2)
+        count = np.ceil(np.linalg.norm(way, axis=1) / _FINE_STEP_PX).astype(int) + 1
+        which = np.repeat(np.arange(len(count)), count)
+        share = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)) / count[which]
+        at = np.rint(start[which] + share[:, None] * way[which]).astype(int) - (x0 - 1, y0 - 1)
+        at = at[np.all((at >= 0) & (at < (width + 2, height + 2)), axis=1)]
+        marked[at[:, 1], at[:, 0]] = True
+    return np.asarray(ndimage.binary_dilation(marked)[1:-1, 1:-1])
 
 
 def _pieces(xy: Floats, shape: tuple[int, int]) -> Floats:

@@ -49,11 +49,17 @@ def lattice_generator(count: int) -> int:
 
 
 class Samples:
-    """The `count` samples of every pixel of a frame, for lanes with a place on the sensor (`pixel`)."""
+    """The `count` samples of the pixels of a frame, for lanes with a place on the sensor (`pixel`)."""
 
-    def __init__(self, pixel: mi.UInt32, count: int, seed: int, calls: int = 3) -> None:
+    def __init__(
+        self, pixel: mi.UInt32, count: int, seed: int, calls: int = 3, fine: mi.Bool | bool = False, times: int = 1
+    ) -> None:
         self.pixel = pixel
-        self._n, self._a = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, lattice_generator(count))
+        # Where `fine`, a pixel has `times` as many samples.
+        self.count, self._a = (
+            dr.select(fine, dr.opaque(mi.UInt32, f(count * times)), dr.opaque(mi.UInt32, f(count)))
+            for f in (int, lattice_generator)
+        )
         self._keys = [
             dr.opaque(mi.UInt32, int(np.random.SeedSequence([seed, call]).generate_state(1)[0]))
             for call in range(calls)
@@ -61,8 +67,8 @@ class Samples:
 
     def in_pixel(self, k: mi.UInt32) -> mi.Point2f:
         """Place of sample `k` in the pixel, [0, 1)^2."""
-        scale = dr.rcp(mi.Float(self._n))
-        return mi.Point2f((mi.Float(k) + 0.5) * scale, (mi.Float((k * self._a) % self._n) + 0.5) * scale)
+        scale = dr.rcp(mi.Float(self.count))
+        return mi.Point2f((mi.Float(k) + 0.5) * scale, (mi.Float((k * self._a) % self.count) + 0.5) * scale)
 
     def pair(self, k: mi.UInt32, call: int) -> mi.Point2f:
         """Two further numbers of sample `k`, [0, 1)^2: each call of a pixel has its own shift."""

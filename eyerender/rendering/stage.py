@@ -30,7 +30,7 @@ from .irislight import IrisLight
 from .lampviews import LampViews
 from .lidshade import LidShade
 from .meshed import Meshes, meshed
-from .plain import plain_tiles
+from .plain import fine_pixels, plain_tiles
 from .pupillight import PupilLight
 from .region import RegionScene
 from .surround import Obstacle, Surround
@@ -89,7 +89,11 @@ class Stage:
             textures = replace(textures, region=region.skin, lamp_views=views)
         if not place.obstructed or (region is not None and region.skin.is_sheet):
             lights.on_iris = IrisLight(values, lights, place.scene, textures.lamp_views)
-        return Exposed(place.scene, values, lights, textures, plain), place
+
+        def fine(window: Window) -> Bools:
+            return fine_pixels(None if region is None else region.posed, job.camera, anchor, window)
+
+        return Exposed(place.scene, values, lights, textures, plain, fine), place
 
     def _place(self, job: RenderJob) -> Surround | RegionScene:
         if job.region is None:

@@ -11,11 +11,13 @@ from scipy.spatial import cKDTree
 
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses, rigid_motion
-from eyerender.region.anatomy import Region
+from eyerender.region.anatomy import Lashes, Region
 from eyerender.region.globe import Globe
 from eyerender.region.hairs import SEGMENTS
-from eyerender.region.lids import CONJUNCTIVA, ROWS
+from eyerender.region.lashes import lashes, plan
+from eyerender.region.lids import CONJUNCTIVA, ROWS, sheet
 from eyerender.region.mesh import region_mesh
+from eyerender.region.skin import LASH, LASH_U, band_row, skin_map
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
 INTO_MM = 0.05  # the bar for any interpenetration
@@ -117,11 +119,11 @@ def check(i):
     assert over.min() > -INTO_MM, note
 
     # Lashes: beyond their roots none is under the skin or in the globe.
-    lashes = np.asarray(mesh.part("lashes").vertices)
-    if len(lashes):
-        shafts = lashes.reshape(-1, SEGMENTS + 1, 3, 3)[:, 1:].mean(axis=2).reshape(-1, 3)
+    hairs = np.asarray(mesh.part("lashes").vertices)
+    if len(hairs):
+        shafts = hairs.reshape(-1, SEGMENTS + 1, 3, 3)[:, 1:].mean(axis=2).reshape(-1, 3)
         assert signed_distance(eye, globe, shafts).min() > -INTO_MM, note
-        paths = lashes.reshape(-1, SEGMENTS + 1, 3, 3).mean(axis=2)
+        paths = hairs.reshape(-1, SEGMENTS + 1, 3, 3).mean(axis=2)
         assert not np.any(crossings(paths[:, 1:-1].reshape(-1, 3), paths[:, 2:].reshape(-1, 3), skin)), note
     assert np.all(np.isfinite(mesh.vertices)), note
     assert np.all(np.abs(np.linalg.norm(mesh.normals, axis=-1) - 1) < 1e-6), note
@@ -138,3 +140,77 @@ def test_seeded_instances_hold():
 def test_five_hundred_instances_hold():
     for i in range(500):
         check(i)
+
+
+def lash_plan(seed, **fields):
+    return plan(Lashes(**fields), seed)
+
+
+def test_lashes_stand_in_tufts_and_cross():
+    """Roots crowd in tufts, unlike a comb's, and neighbours cross, more with clumping."""
+    gaps, crossed = {}, {}
+    for clumping in (0.0, 0.9):
+        spread, pairs = [], []
+        for seed in range(30):
+            p = lash_plan(seed, clumping=clumping, lower_count=0)
+            a = np.cos(p.angle)
+            order = np.argsort(a)
+            step = np.diff(a[order])
+            spread.append(step.std() / step.mean())
+            # The tip's place along the lid, mm: neighbours that change sides have crossed.
+            tip = 14.5 * a + p.length_mm * np.sin(0.85 * p.fan + 0.35 * p.sway)
+            pairs.append(np.mean(np.diff(tip[order]) < 0))
+        gaps[clumping], crossed[clumping] = np.mean(spread), np.mean(pairs)
+    assert gaps[0.0] < 0.7
+    assert gaps[0.9] > 1.15 * gaps[0.0]
+    assert all(0.15 < share < 0.6 for share in crossed.values())
+
+
+def test_lower_lashes_are_thin_and_lashes_taper():
+    spec = Region(seed=4)
+    hairs = lashes(spec, Globe.sphere(), sheet(spec, Globe.sphere()))
+    upper, lower = hairs.radii[: spec.lashes.upper_count], hairs.radii[spec.lashes.upper_count :]
+    assert np.median(lower[:, 0]) < 0.8 * np.median(upper[:, 0])
+    assert np.all(np.diff(hairs.radii, axis=1) < 0)
+    assert hairs.radii[:, -1] == pytest.approx(0.3 * hairs.radii[:, 0])
+
+
+def test_the_lash_band_is_paler_at_tips_and_below():
+    spec = Region(seed=4)
+    made = skin_map(spec)
+    row = made[int(band_row(LASH) * len(made))][:, 0]
+
+    def at(u):
+        return float(row[int(u * len(row))])
+
+    root, tip = LASH_U[0], LASH_U[0] + LASH_U[1] - 1e-3
+    assert at(root) == pytest.approx(spec.lashes.albedo, abs=0.01)
+    assert at(tip) == pytest.approx(spec.lashes.tip_albedo, abs=0.01)
+    assert at(0.5 + root) == pytest.approx(spec.lashes.lower_albedo, abs=0.01)
+    assert at(0.5 + tip) > at(0.5 + root) > at(root)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"fissure": {"epicanthus_mm": 3.5}},
+        {"lids": {"hood_mm": 2.5, "fold_mm": 1.9, "show_mm": 4.0}},
+        {"lids": {"fold_mm": 0.0}, "fissure": {"epicanthus_mm": 2.5, "tilt_deg": 11.0}},
+        {"fissure": {"lower_mm": 7.2, "tilt_deg": -5.0}},
+    ],
+)
+def test_unusual_lids_change_the_contour_but_stay_off_the_globe(fields):
+    eye, globe = posed("E2", (8.0, -10.0))
+    spec, plain = Region.from_mapping(fields), Region()
+    mesh, usual = region_mesh(spec, globe), region_mesh(plain, globe)
+    skin = mesh.part("skin")
+    assert signed_distance(eye, globe, points_on(skin, skin.faces)).min() > -INTO_MM
+    assert np.linalg.norm(skin.vertices - usual.part("skin").vertices, axis=-1).max() > 1.0
+    assert np.abs(mesh.border - usual.border).max() < 0.05  # the face far from the lids stays
+
+
+def test_brows_of_the_two_eyes_may_differ():
+    spec = Region.from_mapping({"brow": {"asymmetry_mm": 2.0}})
+    right, left = spec.of_side("right"), spec.of_side("left")
+    assert left.brow.height_mm - right.brow.height_mm == pytest.approx(2.0)
+    assert Region().of_side("left") == Region()

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from eyerender.capture import make_renderer, render_windows
+from eyerender.capture import make_renderer, render_job, render_windows
 from eyerender.labels import visible_arcs_deg
 from eyerender.region.anatomy import Region
+from eyerender.rendering import film
 from eyerender.rendering.occlusion import glint_reason
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
@@ -209,3 +210,27 @@ def test_drawn_subjects_are_valid_and_differ():
     assert a == again
     assert a != b
     assert a.digest() == again.digest()
+
+
+def test_hairs_are_sampled_more_finely(renderer, monkeypatch):
+    """Pixels at thin hairs have less noise than with the samples of the others, against a picture of many samples."""
+    spec = {"skin": {"relief_mm": 0.0, "sheen": 0.0, "pores": 0.0}}
+    (many,) = images(renderer, region=spec, spp=256)
+    (few,) = images(renderer, region=spec, spp=8)
+    monkeypatch.setattr(film, "_TIMES", 1)
+    (plain,) = images(renderer, region=spec, spp=8)
+    job = render_job(scene(region=spec).frames(), 0)
+    fine = renderer.bind(job)[0].fine(job.window)
+    assert 0.02 < fine.mean() < 0.4
+    error = [np.std((p.irradiance - many.irradiance)[fine]) for p in (few, plain)]
+    assert error[0] < 0.75 * error[1]
+    same = ~ndimage.binary_dilation(fine, iterations=5)  # the lens blurs over a few pixels
+    assert np.allclose(few.irradiance[same], plain.irradiance[same], rtol=1e-4)
+
+
+def test_which_pixels_are_fine_does_not_depend_on_the_window(renderer):
+    job = render_job(scene(region={}).frames(), 0)
+    x0, y0 = job.window[:2]
+    shown = renderer.bind(job)[0]
+    whole, part = shown.fine(job.window), shown.fine((x0 + 30, y0 + 20, 90, 70))
+    assert np.array_equal(part, whole[20:90, 30:120])
