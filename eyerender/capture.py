@@ -137,6 +137,7 @@ def render_job(frames: Frames, row: int) -> RenderJob:
         lens=scene.spec.lens,
         ambient=scene.ambient,
         mesh_edge_mm=scene.spec.image.mesh_edge_mm if scene.spec.image.surfaces == "mesh" else None,
+        interreflection=scene.spec.image.interreflection,
         wavelength_nm=scene.spec.wavelength_nm,
         seed=image_seed(scene.spec.seed, int(index.frame[row]), int(index.eye[row])),
         apex_mm=index.eye_position_mm[row] + index.head_mm[row],

@@ -28,7 +28,6 @@ from ..rig.imaging import RadianceMap
 from ..rig.surroundings import paint
 from ..spec import file_digest
 from .exr import second_thread
-from .lidshade import LidShade
 from .panels import Panels
 
 _WIDTH, _HEIGHT = 1024, 512
@@ -237,7 +236,6 @@ class Ambience:
         panels: np.ndarray[Any, np.dtype[np.float64]],
         spec: RadianceMap | None,
         maps: Maps,
-        lids: LidShade | None = None,
     ) -> None:
         """Prepare the light.
 
@@ -246,9 +244,7 @@ class Ambience:
             panels: (n, 13) as from `frame.panel_table`.
             spec: the map, whose rays are in the world's axes; None for none.
             maps: the maps that are kept.
-            lids: shading by the lids, for a scene with an eye region.
         """
-        self.lids = lids
         self._panels = Panels(panels)
         self._texture, made = maps.of(spec)
         scale = 0.0 if spec is None else spec.scale_w_m2_sr * 1e-3
@@ -268,11 +264,18 @@ class Ambience:
 
         Overlapping panels add up, and they do not hide the map behind them.
         """
+        return self._panels.radiance(o, d, active) + self._mapped(d, active)
+
+    def far(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """Radiance (mW/mm^2/sr) of even light and map along directions of the scene's frame."""
+        return self._even * dr.inv_pi + self._mapped(d, active)
+
+    def _mapped(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         w = self._in_map(d)
         u = 0.5 - dr.atan2(w.y, w.x) * (0.5 * dr.inv_pi)
         v = dr.acos(dr.clip(w.z, -1, 1)) * dr.inv_pi
         place = mi.Point2f(u, (1 + v * self._rows) / (self._rows + 2))
-        return self._panels.radiance(o, d, active) + self._scale * self._texture.eval(place, active)[0]
+        return self._scale * self._texture.eval(place, active)[0]
 
     def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) of a matte surface at points x with unit normals n of the scene's frame, unshadowed."""

@@ -66,9 +66,11 @@ def export_scene(
         "retina": look.pupil_albedo,
         "cornea_rim": look.limbus_albedo,
         "chamber_wall": look.limbus_albedo,
+        "iris_root": look.limbus_albedo,
     }
     motion = np.vstack([np.column_stack([job.M, job.t]), [0, 0, 0, 1]])
-    for patch in eye_meshes(job.eye, rings, sectors).patches.values():
+    patches = eye_meshes(job.eye, rings, sectors).patches
+    for patch in (*patches.values(), _root(job.eye, patches["chamber_wall"], sectors)):
         _patch(root, folder, patch, motion, albedo.get(patch.name, 0.0))
     place = np.eye(4)
     place[:3, 3] = job.anchor_mm
@@ -220,6 +222,22 @@ def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
         for k, name in enumerate(HEAD_PARTS[: len(f) - 1])
         if f[k + 1] > f[k]
     ]
+
+
+def _root(eye: EyeModel, wall: Patch, sectors: int) -> Patch:
+    """Limbal tissue in the plane of the iris, from its root to the chamber's wall."""
+    (upper, lower), n, c = np.split(wall.vertices, 2), eye.stop.normal, eye.stop.centre_mm
+    above, below = ((ring - c) @ n for ring in (upper, lower))
+    share = np.clip(above / np.where(above > below, above - below, 1), 0, 1)[:, None]
+    outer = upper + share * (lower - upper)
+    angle = np.arctan2(outer[:, 2], outer[:, 1])
+    y, z = (float(eye.iris_root_radius_mm) * f(angle) for f in (np.cos, np.sin))
+    inner = np.stack([c[0] - (n[1] * (y - c[1]) + n[2] * (z - c[2])) / n[0], y, z], axis=1)
+    j = np.arange(sectors)
+    k = (j + 1) % sectors
+    faces = np.concatenate([np.stack([j, j + sectors, k + sectors], 1), np.stack([j, k + sectors, k], 1)])
+    vertices = np.concatenate([inner, outer])
+    return Patch("iris_root", vertices, np.tile(n, (len(vertices), 1)), faces)
 
 
 def _backdrop(distance_mm: float) -> Patch:

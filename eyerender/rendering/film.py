@@ -96,7 +96,7 @@ def _sums(
     width, height = window[2:]
     if shown.lights.on_iris is not None:
         shown.lights.on_iris.make()
-    grouped = shown.values.structure.region and integrator.bounces == 0
+    grouped = shown.values.structure.region
     size = group_size(spp) if grouped else 1
     totals: list[Floats] = []
     failed = 0

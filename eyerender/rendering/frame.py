@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayValue, Floats
+from ..arrays import ArrayValue, Floats, frozen
 from ..errors import InputError
 from ..eye.fundus import FundusLight, Spread, fundus_light
 from ..eye.model import EyeModel
@@ -38,6 +38,7 @@ from .parameters import (
 )
 
 _SENSOR, _LOOK, _LENS, _AMBIENT = Sensor(), Look(), Lens(), Ambient()
+_PANEL_PARTS = 4  # along each side
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
 
@@ -65,6 +66,7 @@ class RenderJob(ArrayValue):
         ambient: light other than that of the lamps.
         focus_dpt: vergence at which the eye is focused, 1 / distance in metres.
         mesh_edge_mm: length of the edges of meshes that take the place of the cornea's surfaces; None: closed forms.
+        interreflection: whether surfaces send light to each other.
     """
 
     eye: EyeModel
@@ -85,6 +87,7 @@ class RenderJob(ArrayValue):
     ambient: Ambient = _AMBIENT
     focus_dpt: float = 0.0
     mesh_edge_mm: float | None = None
+    interreflection: bool = True
 
     @property
     def anchor_mm(self) -> Floats:
@@ -210,6 +213,28 @@ def panel_table(ambient: Ambient, anchor: Floats) -> Floats:
         w, h = panel.size_mm
         rows.append([*centre, *normal, *(2 / w * right), *(2 / h * up), panel.radiance_w_m2_sr * 1e-3])
     return np.reshape(rows, (-1, 13))
+
+
+def panel_lamps(ambient: Ambient, anchor: Floats) -> tuple[Lamp, ...]:
+    """Parts of panels as lamps, which light the iris through the cornea: each part is Lambertian, at its centre."""
+    out = []
+    for panel, row in zip(ambient.panels, panel_table(ambient, anchor), strict=True):
+        centre, normal = row[0:3] + anchor, row[3:6]
+        right, up = (v / (v @ v) for v in (row[6:9], row[9:12]))
+        share = (2 * np.arange(_PANEL_PARTS) + 1) / _PANEL_PARTS - 1
+        intensity = panel.radiance_w_m2_sr * 1e-3 * np.prod(panel.size_mm) / _PANEL_PARTS**2
+        out += [
+            Lamp(
+                position_mm=frozen(centre + a * right + b * up),
+                axis=frozen(normal),
+                radius_mm=0.0,
+                intensity_mw_sr=float(intensity),
+                lobe_exponent=1.0,
+            )
+            for a in share
+            for b in share
+        ]
+    return tuple(out)
 
 
 def light_table(lights: Sequence[Lamp], M: Floats, t: Floats) -> Floats:

@@ -186,7 +186,9 @@ class _GroupShading:
         seen = replace(view, other=mi.Bool(False))
         inner, missed = through_cornea(values, lights, scene, seen.inner, seen.lit_inside, *group.spot(j))
         albedo = outer_albedo(values, textures, seen, mi.Bool(True))
-        rest = indirect(values, textures, scene, seen, d, albedo, inner)
+        assert textures.received is not None
+        received = textures.received.globe(values.point_to_scene(seen.point))
+        rest = indirect(values, textures, scene, seen, d, albedo, inner, received)
         return rest + self.lamps_on_globe(seen, albedo, -values.vector_to_eye(d), j), missed
 
     def lamps_on_globe(self, seen: View, albedo: mi.Float, back: mi.Vector3f, j: mi.UInt32) -> mi.Float:
@@ -245,7 +247,8 @@ class _GroupShading:
         values, group = self.values, self.group
         _, d, _ = group.ray(kept.j)
         view = look_at_skin(values, self.skin, kept.face, kept.uv, d, kept.weight > 0)
-        total += indirect(values, self.textures, self.scene, view, d, view.albedo, mi.Float(0)) * kept.weight
+        rest = indirect(values, self.textures, self.scene, view, d, view.albedo, mi.Float(0), view.received)
+        total += rest * kept.weight
 
         def more(k: mi.UInt32, *_: object) -> mi.Bool:
             return k < group.lamps

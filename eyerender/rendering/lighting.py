@@ -90,6 +90,40 @@ def straight(lamp: Lamp, source: mi.Vector3f, view: View, back: mi.Vector3f | No
     return received, mi.Float(0) if back is None else received * sheen(view.normal, to, back, view.gloss)
 
 
+def onto_points(
+    values: Values,
+    lights: Lights,
+    scene: mi.Scene,
+    x: mi.Vector3f,
+    normal: mi.Vector3f,
+    other: mi.Bool,
+    u: mi.Float,
+    v: mi.Float,
+) -> mi.Float:
+    """Irradiance (mW/mm^2) of points in air (eye frame) straight from all lamps; `other` marks those off the globe.
+
+    u, v: place on each lamp's disc, [0, 1).
+    """
+    sine, cosine_v = dr.sincos(v * (2 * dr.pi))
+
+    def more(i: mi.UInt32, _: mi.Float) -> mi.Bool:
+        return i < lights.count
+
+    def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        lamp: Lamp = lights[i]
+        source = lamp.point(u, sine, cosine_v)
+        to = source - x
+        inv2 = dr.rcp(dr.squared_norm(to))
+        to *= dr.sqrt(inv2)
+        cosine = dr.dot(to, normal)
+        lit = dr.select(cosine > 0, lamp.radiant_intensity(-to) * cosine * inv2, 0)
+        blocked = lamp_blocked(values, scene, x, source, other, True, lit > 0)
+        return i + 1, total + dr.select(blocked, 0, lit)
+
+    state = (mi.UInt32(0), mi.Float(0) * x.x)
+    return dr.while_loop(state, more, body, labels=("i", "total"), label="lamps on places")[1]
+
+
 def light(
     values: Values, lights: Lights, scene: mi.Scene, view: View, back: mi.Vector3f, u: mi.Float, v: mi.Float
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.UInt32]:
@@ -142,11 +176,18 @@ def light(
 
 
 def through_cornea(
-    values: Values, lights: Lights, scene: mi.Scene, inner: mi.Vector3f, inside: mi.Bool, u: mi.Float, v: mi.Float
+    values: Values,
+    lights: Lights,
+    scene: mi.Scene,
+    inner: mi.Vector3f,
+    inside: mi.Bool,
+    u: mi.Float,
+    v: mi.Float,
+    normal: mi.Vector3f | None = None,
 ) -> tuple[mi.Float, mi.UInt32]:
     """Irradiance (mW/mm^2) of all lamps at points `inner` in the plane of the iris, where `inside`; failed paths.
 
-    u, v: place on each lamp's disc, [0, 1).
+    u, v: place on each lamp's disc, [0, 1). normal: unit normals at the points; None for those of the plane.
     """
     bent, rest = mi.Float(0), inside
     if lights.on_iris is not None:
@@ -159,7 +200,7 @@ def through_cornea(
 
     def body(i: mi.UInt32, bent: mi.Float, failures: mi.UInt32) -> tuple[mi.UInt32, mi.Float, mi.UInt32]:
         lamp: Lamp = lights[i]
-        path = LampPath.to(values, scene, lamp, lamp.point(u, sine, cosine), inner, rest)
+        path = LampPath.to(values, scene, lamp, lamp.point(u, sine, cosine), inner, rest, normal)
         failed = dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
         return i + 1, bent + dr.select(path.blocked, 0, path.gain), failures + failed
 
@@ -188,13 +229,21 @@ class LampPath:
 
     @classmethod
     def to(
-        cls, values: Values, scene: mi.Scene, lamp: Lamp, source: mi.Vector3f, inner: mi.Vector3f, active: mi.Bool
+        cls,
+        values: Values,
+        scene: mi.Scene,
+        lamp: Lamp,
+        source: mi.Vector3f,
+        inner: mi.Vector3f,
+        active: mi.Bool,
+        normal: mi.Vector3f | None = None,
     ) -> LampPath:
         """Find the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame)."""
         # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
         scale, shift = values.image.scale, values.image.shift
         aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
-        path = connect(values.surfaces, source, inner, values.stop.normal, aim, values.limbus.radius, active)
+        normal = values.stop.normal if normal is None else normal
+        path = connect(values.surfaces, source, inner, normal, aim, values.limbus.radius, active)
         local = values.surfaces[0].point_in(path.entry)
         clear = 1 - opacity(values, dr.sqrt(local.y * local.y + local.z * local.z))
         enters = path.found & (clear > 0)

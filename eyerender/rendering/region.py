@@ -126,12 +126,13 @@ def _instance(name: str, mesh: mi.Mesh) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Points of the region: place, shading normal (scene's frame), albedo, gloss."""
+    """Points of the region: place, shading normal (scene's frame), albedo, gloss, received light (see `exchange`)."""
 
     point: mi.Vector3f
     normal: mi.Vector3f
     albedo: mi.Float
     gloss: mi.Float
+    received: mi.Vector4f
 
 
 class SkinGeometry:
@@ -154,7 +155,7 @@ class SkinGeometry:
         self._corners = mi.UInt32(aligned(corners.ravel()))
         self._records = np.zeros((len(layout.uv), 8), np.float32)
         self._records[:, 3], self._records[:, 7] = layout.uv.T
-        self._buffer = mi.Float(0)
+        self._buffer = self._received = mi.Float(0)
         self._moving, self._first_still = mi.ShapePtr(instance), mi.UInt32(moving)
         self._sheet, self._mirror = mi.UInt32(int(layout.face_ends[0])), mi.Float(mirror)
         dr.make_opaque(self._moving, self._first_still, self._sheet, self._mirror)
@@ -169,6 +170,10 @@ class SkinGeometry:
         corner = dr.gather(mi.Vector4u, self._corners, face)
         a, b, c = (dr.gather(mi.Vector4f, self._buffer, 2 * i) for i in (corner.x, corner.y, corner.z))
         return *(mi.Vector3f(p.x, p.y, p.z) for p in (a, b, c)), corner.w > 0
+
+    def shine(self, received: Floats) -> None:
+        """Set what every vertex receives from other surfaces, (n, 4) as in `exchange.Received`."""
+        self._received = mi.Float(aligned(received.astype(np.float32).ravel()))
 
     def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
         """Index of the layout's triangle that was hit."""
@@ -185,15 +190,16 @@ class SkinGeometry:
         """
         corner = dr.gather(mi.Vector4u, self._corners, face, active)
         weights = (1 - uv.x - uv.y, uv.x, uv.y)
-        place, turned = mi.Vector4f(0), mi.Vector4f(0)
+        place, turned, received = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
         for weight, i in zip(weights, (corner.x, corner.y, corner.z), strict=True):
             place += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i, active)
             turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i + 1, active)
+            received += weight * dr.gather(mi.Vector4f, self._received, i, active)
         albedo, slope_y, slope_z, gloss = (mi.Float(c) for c in self._map.eval(mi.Point2f(place.w, turned.w), active))
         n = dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
         g = mi.Vector3f(0, self._mirror * slope_y, slope_z)
         normal = dr.normalize(n - (g - n * dr.dot(n, g)))
-        return Surface(mi.Vector3f(place.x, place.y, place.z), normal, albedo, gloss)
+        return Surface(mi.Vector3f(place.x, place.y, place.z), normal, albedo, gloss, received)
 
 
 def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:

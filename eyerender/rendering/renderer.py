@@ -72,18 +72,13 @@ class Renderer:
     Args:
         backend: the backend.
         spp: samples per pixel.
-        bounces: how often light may continue between sclera, surround and the cornea's mirror. 0 allows only light
-            straight from a lamp; each further one adds some noise and the same cost again.
         obstacles: bodies in the scene's frame that hide and shade the eye.
     """
 
-    def __init__(
-        self, backend: Backend, *, spp: int = 16, bounces: int = 0, obstacles: Sequence[Obstacle] = ()
-    ) -> None:
+    def __init__(self, backend: Backend, *, spp: int = 16, obstacles: Sequence[Obstacle] = ()) -> None:
         self.backend = backend
         self.spp = spp
         self._integrator = integrator_class()()
-        self._integrator.bounces = bounces
         self._stage = Stage(obstacles)
 
     def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()) -> RenderedWindow:
@@ -163,7 +158,7 @@ class Renderer:
 
         A lamp of finite size is represented by its centre.
         """
-        shown, _ = self.bind(job)
+        shown, _ = self.bind(job, lit=False)
         shown.lights.on_iris = None
         x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
         corner = mi.Float(0)  # of the unit square, which is the disc's centre
@@ -173,13 +168,13 @@ class Renderer:
 
     def labels(self, job: RenderJob) -> PartLabels:
         """Compute the labels of a window alone."""
-        return part_labels(self.bind(job)[0], job.window)
+        return part_labels(self.bind(job, lit=False)[0], job.window)
 
-    def bind(self, job: RenderJob) -> tuple[Exposed, Surround | RegionScene]:
+    def bind(self, job: RenderJob, *, lit: bool = True) -> tuple[Exposed, Surround | RegionScene]:
         """Set up a job's frame on the device, with the surroundings of its eye.
 
-        The integrator uses it until the next call.
+        The integrator uses it until the next call. `lit`: whether radiance is wanted, not only what is seen where.
         """
-        shown, place = self._stage.set(job)
+        shown, place = self._stage.set(job, lit=lit)
         self._integrator.bind(shown.values, shown.lights, shown.textures)
         return shown, place

@@ -18,7 +18,7 @@ from .region import film_normal, film_reflectance
 from .values import Lights, Values
 from .view import EPSILON_MM, Textures, View, iris_albedo, look, outer_albedo, stop_coordinates
 
-_THROUGH = 0.7  # share of the outer hemisphere that the iris sees, times transmittance; chosen
+_FLAT_MM = 1e-2  # from the plane of a surround
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,11 @@ def shade(
     view = look(values, scene, o, d, active, textures.region)
     outer, shine, inner, failures = light(values, lights, scene, view, -values.vector_to_eye(d), u, v)
     albedo = outer_albedo(values, textures, view, active)
-    seen = indirect(values, textures, scene, view, d, albedo, inner) + direct(view, albedo, outer, shine)
+    received = of_surroundings(values, textures, view)
+    if values.structure.region:
+        assert textures.received is not None
+        received = dr.select(view.other, view.received, textures.received.globe(values.point_to_scene(view.point)))
+    seen = indirect(values, textures, scene, view, d, albedo, inner, received) + direct(view, albedo, outer, shine)
     return Shaded(seen, view, albedo, failures)
 
 
@@ -59,30 +63,50 @@ def direct(view: View, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi
     return dr.select(view.met, cover * (albedo * outer * dr.inv_pi + shine), 0)
 
 
+def of_surroundings(values: Values, textures: Textures, view: View) -> mi.Vector4f:
+    """What points of a bare globe and of its surround receive from other surfaces (see `exchange.Received`).
+
+    Obstacles receive nothing.
+    """
+    assert textures.received is not None
+    x = values.point_to_scene(view.point)
+    plane = dr.abs(x.x - values.backdrop_x) < _FLAT_MM
+    surround = dr.select(plane, textures.received.surround(x), mi.Vector4f(0, 1, 0, 0))
+    return dr.select(view.other, surround, textures.received.globe(x))
+
+
 def indirect(
-    values: Values, textures: Textures, scene: mi.Scene, view: View, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float
+    values: Values,
+    textures: Textures,
+    scene: mi.Scene,
+    view: View,
+    d: mi.Vector3f,
+    albedo: mi.Float,
+    inner: mi.Float,
+    received: mi.Vector4f,
 ) -> mi.Float:
-    """Radiance other than `direct`; `inner` is the lamps' irradiance in the plane of the iris."""
-    rest = mi.Float(0)
+    """Radiance other than `direct`.
+
+    Args:
+        values: the scene's numbers.
+        textures: its textures.
+        scene: what may stand in the way.
+        view: what is seen.
+        d: directions of the rays (scene's frame).
+        albedo: of what is matte.
+        inner: irradiance of the lamps in the plane of the iris.
+        received: what the first surface receives from other surfaces (see `exchange.Received`).
+    """
+    assert textures.received is not None
     index = values.inner_index
+    cover = dr.select(view.cornea, view.opacity, 1)
+    even = received.x
     if values.structure.ambient:
-        ambience = textures.ambience
-        assert ambience is not None
-        # This is even light from all sides. Through the cornea the iris sees n^2 times its radiance in a smaller cone.
-        cover = dr.select(view.cornea, view.opacity, 1)
-        scene_of = values.point_to_scene
-        axis = values.vector_to_scene(values.stop.normal)
-        even = ambience.irradiance(scene_of(view.point), values.vector_to_scene(view.normal))
-        within = ambience.irradiance(scene_of(view.inner), axis) * _THROUGH * index * index
-        if values.structure.region:
-            assert ambience.lids is not None
-            reaching = ambience.lids.share(scene_of(view.point))
-            # Only the wet parts of the region are between the lids.
-            even *= 1 - dr.clip(10 * view.gloss - 4.5, 0, 1) * (1 - reaching)
-            within *= reaching
-        rest += cover * albedo * even * dr.inv_pi
-        inner += within
-        rest += _mirrored(values, textures, scene, view, d, 1 - cover)
+        assert textures.ambience is not None
+        x, normal = values.point_to_scene(view.point), values.vector_to_scene(view.normal)
+        even += received.y * textures.ambience.irradiance(x, normal)
+    rest = cover * albedo * even * dr.inv_pi + _mirrored(values, textures, scene, view, d, 1 - cover)
+    inner += textures.received.iris(view.inner)
     behind = dr.if_stmt(
         (view.inner,),
         view.cornea & ~view.pupil,
@@ -100,24 +124,39 @@ def indirect(
 def _mirrored(
     values: Values, textures: Textures, scene: mi.Scene, view: View, d: mi.Vector3f, clear: mi.Float
 ) -> mi.Float:
-    """Radiance of the ambient light that wet surfaces mirror to the camera.
+    """Radiance that wet surfaces mirror to the camera, but for that of the lamps.
 
-    These are the front cornea where it is `clear`, and the film of tears elsewhere.
+    The front cornea, where it is `clear`, mirrors the ambient light and the surfaces about it. The film of tears
+    elsewhere mirrors the ambient light.
     """
-    back = -values.vector_to_eye(d)
+    received = textures.received
+    assert received is not None
     normal, share = view.normal, view.mirrored * clear
-    wet = view.cornea
-    if values.structure.region:
+    seen, wet = mi.Float(0), view.cornea & (clear > 0)
+    film = mi.Bool(False)
+    if values.structure.ambient and values.structure.region:
         film = ~view.cornea & view.met & (view.gloss > 0.5)
         normal = dr.select(film, film_normal(view.normal), view.normal)
-        share = dr.select(film, film_reflectance(dr.dot(normal, back), view.gloss), share)
-        wet |= film
-    assert textures.ambience is not None
+        cosine = -dr.dot(normal, values.vector_to_eye(d))
+        share = dr.select(film, film_reflectance(cosine, view.gloss), share)
     normal = values.vector_to_scene(normal)
     way = d - 2 * dr.dot(d, normal) * normal
     start = values.point_to_scene(view.point) + EPSILON_MM * normal
-    seen = values.ambient_irradiance * dr.inv_pi + textures.ambience.radiance(start, way, wet)
+    if values.structure.ambient:
+        assert textures.ambience is not None
+        seen = values.ambient_irradiance * dr.inv_pi + textures.ambience.radiance(start, way, wet | film)
+    else:
+        wet &= received.on
     if values.structure.obstacles:
-        barred = scene.ray_test(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet)
-        seen = dr.select(barred, 0, seen)
-    return dr.select(wet, share * seen, 0)
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet | film)
+        barred = hit.is_valid()
+        surface = mi.Float(0)
+        if textures.region is not None:
+            skin = textures.region.surface(textures.region.face(hit), hit.prim_uv, barred & wet)
+            surface = dr.select(wet, skin.albedo * skin.received.z * dr.inv_pi, 0)
+        seen = dr.select(barred, surface, seen)
+    else:
+        t = (values.backdrop_x - start.x) / dr.select(way.x < -1e-4, way.x, -1)
+        plane = received.surround(start + t * way).z * dr.inv_pi
+        seen = dr.select((way.x < -1e-4) & (t > 0), plane, seen)
+    return dr.select(wet | film, share * seen, 0)

@@ -13,6 +13,7 @@ from ..errors import InputError
 from ..rig.camera import Window
 from ..rig.imaging import Ambient
 from .environment import Ambience, Maps
+from .exchange import Exchange
 from .film import Exposed
 from .frame import (
     RenderJob,
@@ -20,6 +21,7 @@ from .frame import (
     globe_of,
     kinds,
     light_table,
+    panel_lamps,
     panel_table,
     parameters_of,
     returned_light,
@@ -28,7 +30,6 @@ from .frame import (
 from .head import place_scene
 from .irislight import IrisLight
 from .lampviews import LampViews
-from .lidshade import LidShade
 from .meshed import Meshes, meshed
 from .plain import fine_pixels, plain_tiles
 from .pupillight import PupilLight
@@ -50,9 +51,13 @@ class Stage:
         self._regions: dict[Any, RegionScene] = {}
         self._maps = Maps()
         self.meshes = Meshes()
+        self._exchange = Exchange()
 
-    def set(self, job: RenderJob) -> tuple[Exposed, Surround | RegionScene]:
-        """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call."""
+    def set(self, job: RenderJob, *, lit: bool = True) -> tuple[Exposed, Surround | RegionScene]:
+        """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call.
+
+        `lit`: whether radiance is wanted, not only what is seen where.
+        """
         place = self._place(job)
         region = place if isinstance(place, RegionScene) else None
         structure = Structure(
@@ -70,10 +75,7 @@ class Stage:
         textures = self._textures_of(job)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
-            lids = None
-            if region is not None and job.region is not None:
-                lids = LidShade(region.posed, job.region.lids.margin_mm)
-            ambience = Ambience(even, panel_table(job.ambient, anchor), job.ambient.map, self._maps, lids)
+            ambience = Ambience(even, panel_table(job.ambient, anchor), job.ambient.map, self._maps)
             textures = replace(textures, ambience=ambience)
 
         def plain(window: Window) -> tuple[Bools, int]:
@@ -87,6 +89,10 @@ class Stage:
         if region is not None:
             views = LampViews(job.lights, anchor, _reach_mm(job), region.skin if region.skin.is_sheet else None)
             textures = replace(textures, region=region.skin, lamp_views=views)
+        if lit:
+            panels = Lights(light_table(panel_lamps(job.ambient, anchor), job.M, job.t))
+            received = self._exchange.received(job, values, lights, panels, textures, place)
+            textures = replace(textures, received=received)
         if not place.obstructed or (region is not None and region.skin.is_sheet):
             lights.on_iris = IrisLight(values, lights, place.scene, textures.lamp_views)
 

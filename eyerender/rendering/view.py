@@ -20,6 +20,7 @@ from .values import Values
 
 if TYPE_CHECKING:
     from .environment import Ambience
+    from .exchange import Received
     from .lampviews import LampViews
     from .pupillight import PupilLight
     from .region import SkinGeometry
@@ -50,6 +51,7 @@ class View:
     amodal_sclera: mi.Bool
     albedo: mi.Float  # of the region's mesh, where there is one
     gloss: mi.Float  # likewise, and of the wet sclera
+    received: mi.Vector4f  # of the region's mesh: what it receives from other surfaces (see `exchange`)
 
     @property
     def matte(self) -> mi.Bool:
@@ -89,6 +91,7 @@ class Textures:
     ambience: Ambience | None = None
     lamp_views: LampViews | None = None
     pupil: PupilLight | None = None
+    received: Received | None = None
 
     @classmethod
     def of_seed(cls, seed: int) -> Textures:
@@ -116,6 +119,18 @@ def look(
     `region` is the skin of an eye region, whose normals and albedos are then used.
     """
     view, hit = meet(values, scene, o, d, active)
+    return appearance(values, view, hit, o, d, region)
+
+
+def appearance(
+    values: Values,
+    view: View,
+    hit: mi.PreliminaryIntersection3f,
+    o: mi.Vector3f,
+    d: mi.Vector3f,
+    region: SkinGeometry | None = None,
+) -> View:
+    """View of rays along which `meet` found `view` and `hit`, with the surface of what is not the eye."""
     if region is not None:
         there = look_at_skin(values, region, region.face(hit), hit.prim_uv, d, view.other)
     else:
@@ -127,13 +142,17 @@ def look(
         interaction=there.interaction,
         albedo=there.albedo,
         gloss=dr.select(view.other, there.gloss, view.gloss),
+        received=there.received,
     )
 
 
 def meet(
-    values: Values, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool
+    values: Values, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True
 ) -> tuple[View, mi.PreliminaryIntersection3f]:
-    """View of the globe along camera rays, and the hit of Embree or OptiX, whose surface is not evaluated yet."""
+    """View of the globe along rays, and the hit of Embree or OptiX, whose surface is not evaluated yet.
+
+    coherent: whether neighbouring rays are alike, as those of a camera.
+    """
     # In single precision the ray must start next to the eye.
     t0 = -dr.dot(o, d) - _NEAR_MM
     oe, de = values.point_to_eye(o + t0 * d), values.vector_to_eye(d)
@@ -153,7 +172,7 @@ def meet(
     on_eye = amodal_cornea | amodal_sclera
     ray = mi.Ray3f(mi.Point3f(o), d)
     ray.maxt = dr.select(on_eye, t_eye, _FAR)  # whatever is behind the eye does not matter
-    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    hit = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
     on_eye &= ~hit.is_valid() & active
     on_cornea &= on_eye
     on_sclera &= on_eye
@@ -181,6 +200,7 @@ def meet(
         amodal_sclera=amodal_sclera,
         albedo=mi.Float(0),
         gloss=mi.Float(_WET),
+        received=mi.Vector4f(0),
     )
     return view, hit
 
@@ -201,7 +221,7 @@ def look_at_skin(
     """View of rays that meet places on triangles of an eye region, where `other`."""
     skin = region.surface(face, uv, other)
     view = _matte(values, skin.point, skin.normal, d, other)
-    return replace(view, albedo=skin.albedo, gloss=skin.gloss)
+    return replace(view, albedo=skin.albedo, gloss=skin.gloss, received=skin.received)
 
 
 def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector3f, other: mi.Bool) -> View:
@@ -226,6 +246,7 @@ def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector
         amodal_sclera=no,
         albedo=nothing,
         gloss=mi.Float(_WET),
+        received=mi.Vector4f(0),
     )
 
 

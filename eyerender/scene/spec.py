@@ -174,6 +174,11 @@ class Picture(Spec):
     mesh_edge_mm: Annotated[float, Field(ge=0.02, le=2)] = Field(
         default=0.1, description="length of the triangles' edges, with `surfaces: mesh`"
     )
+    interreflection: bool = Field(
+        default=True,
+        description="whether surfaces send light to each other: iris and cornea, globe, lids, face and background; "
+        "off is faster and darker",
+    )
 
 
 NOT_A_SCENE = (

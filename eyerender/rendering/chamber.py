@@ -1,0 +1,328 @@
+"""Light inside the anterior chamber: what iris and chamber wall send to each other by way of the cornea.
+
+Light that the iris scatters is mirrored by the cornea (by Fresnel, totally beyond the critical angle) and returns to
+it. The irradiance that this adds varies slowly, so it is computed at a few places: points on rings in the plane of the
+iris, and points on the wall between this plane and the cornea's rim. From each, rays of a cosine-distributed pattern
+are traced through the exact surfaces:
+
+    E_i = E0_i + (1 / K) sum_k [ F_k rho_j E_j + n^2 (1 - F_k) pi L_k ]
+
+with F_k the share that the cornea mirrors, j the place where the mirrored ray arrives, and L_k the radiance that comes
+from outside along the ray that leaves the eye. Both sums depend on the eye alone, and they are linear in its lights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
+from ..eye.model import EyeModel
+from ..geometry.surfaces import Surface, components
+from ..optics.interface import fresnel
+
+IRIS_RINGS, TURNS = 16, 16  # points in the plane of the iris, over radius and angle
+IRIS = IRIS_RINGS * TURNS
+LEVELS = 2  # of points on the wall
+PLACES = IRIS + TURNS * LEVELS
+RAYS, LEAVING = 160, 32  # from each point; the first of them are followed out of the eye
+_MIRRORINGS = 6
+_NEAR_MM = 1e-6
+_BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
+_WALL_MM = 1.0  # thickness of the sclera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chamber(ArrayValue):
+    """The chamber of one eye, in the eye frame; arrays with PLACES rows list the rings from the middle, then the wall.
+
+    Attributes:
+        step_mm: distance between the rings; the first has half this radius.
+        points: (PLACES, 3) places, mm.
+        normals: (PLACES, 3) unit normals into the chamber.
+        valid: (PLACES,) whether a place is in the chamber.
+        exchange: (PLACES, PLACES) share of the radiosity of each place in the irradiance of each other.
+        leaving: (PLACES, LEAVING, 7) origin and direction of the rays that leave the eye, and n^2 (1 - F), 0 for none.
+    """
+
+    step_mm: float
+    points: Floats
+    normals: Floats
+    valid: Bools
+    exchange: Floats
+    leaving: Floats
+
+
+def chamber_of(eye: EyeModel) -> Chamber:
+    """Compute the chamber of an eye; pupil and albedos do not matter."""
+    plane = (*np.asarray(eye.stop.centre_mm).tolist(), *np.asarray(eye.stop.normal).tolist())
+    sclera = (*np.asarray(eye.sclera.centre_mm).tolist(), float(eye.sclera.radius_mm))
+    indices = tuple(float(n) for n in eye.front_indices)
+    return _chamber(tuple(eye.front), indices, plane, float(eye.limbus_radius_mm), sclera)
+
+
+def _in_plane(centre: Floats, normal: Floats, y: Floats, z: Floats) -> Floats:
+    """Points (..., 3) of the plane of the iris at (y, z)."""
+    x = centre[0] - (normal[1] * (y - centre[1]) + normal[2] * (z - centre[2])) / normal[0]
+    return np.stack([x, y, z], axis=-1)
+
+
+def shares(eye: EyeModel, chamber: Chamber, inside: float, iris: float, beyond: float) -> Floats:
+    """Mean albedo of each place, (PLACES,): of pupil (`inside`), iris, and limbal tissue (`beyond` and on the wall)."""
+    fine = (np.arange(4) + 0.5) / 4
+    ring, turn = np.arange(IRIS)[:, None] // TURNS, np.arange(IRIS)[:, None] % TURNS
+    part, side = (v.ravel() for v in np.meshgrid(fine, fine))
+    r, a = chamber.step_mm * (ring + part), 2 * np.pi * (turn + side) / TURNS
+    at = _in_plane(np.asarray(eye.stop.centre_mm), np.asarray(eye.stop.normal), r * np.cos(a), r * np.sin(a))
+    albedo = np.where(np.hypot(at[..., 1], at[..., 2]) < eye.iris_root_radius_mm, iris, beyond)
+    albedo = np.sum(np.where(eye.stop.contains(at), inside, albedo) * r, axis=1) / np.sum(r, axis=1)
+    return np.append(albedo, np.full(TURNS * LEVELS, beyond))
+
+
+@dataclass(frozen=True, slots=True)
+class _Walls:
+    """Surfaces about the chamber: refracting ones from outside inwards, their indices, the plane and the wall.
+
+    The wall is a cone about x with radius `rim` at x = `top`, which grows by `slope` per mm downwards.
+    """
+
+    front: tuple[Surface, ...]
+    indices: tuple[float, ...]
+    centre: Floats
+    normal: Floats
+    limbus: float
+    rim: float
+    top: float
+    slope: float
+
+    def height(self, p: Floats) -> Floats:
+        """Height (n,) mm of points above the plane of the iris."""
+        return np.asarray((p - self.centre) @ self.normal)
+
+    def to_plane(self, o: Floats, d: Floats) -> Floats:
+        """Distance (n,) to the plane of the iris, infinite for rays that leave it."""
+        down = d @ self.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -self.height(o) / down
+        return np.where((down < -1e-9) & (t > _NEAR_MM), t, np.inf)
+
+    def to_wall(self, o: Floats, d: Floats) -> Floats:
+        """Distance (n,) to the wall above the plane, infinite where it is not met."""
+        r, s = self.rim + self.slope * (self.top - o[:, 0]), -self.slope * d[:, 0]
+        a = d[:, 1] ** 2 + d[:, 2] ** 2 - s * s
+        b = o[:, 1] * d[:, 1] + o[:, 2] * d[:, 2] - r * s
+        c = o[:, 1] ** 2 + o[:, 2] ** 2 - r * r
+        with np.errstate(divide="ignore", invalid="ignore"):
+            root = np.sqrt(np.maximum(b * b - a * c, 0))
+            t = np.where(a > 0, (root - b) / a, -c / (b + root))
+        hit = o + np.where(np.isfinite(t), t, 0)[:, None] * d
+        there = (b * b > a * c) & (t > _NEAR_MM) & (hit[:, 0] < self.top) & (self.height(hit) > 0)
+        return np.where(there, t, np.inf)
+
+
+@lru_cache(maxsize=64)
+def _chamber(
+    front: tuple[Surface, ...], indices: tuple[float, ...], plane: tuple[float, ...], limbus: float,
+    sclera: tuple[float, ...],
+) -> Chamber:  # fmt: skip
+    walls = _walls(front, indices, plane, limbus, sclera)
+    step, points, normals, valid = _places(walls)
+    exchange = np.zeros((PLACES, PLACES))
+    leaving = np.zeros((PLACES, RAYS, 7))
+    rows = np.flatnonzero(valid)
+    o, d = _pattern(points[rows], normals[rows])
+    row = np.repeat(rows, RAYS)
+    left = leaving.reshape(-1, 7)
+    arrived = _traced(walls, o, d)
+    slot = (row * RAYS + np.tile(np.arange(RAYS), len(rows)))[arrived.out]
+    left[slot] = np.concatenate([arrived.origin, arrived.way, arrived.weight[:, None]], axis=1)
+    for index, weight in _onto(arrived.back, arrived.on_wall, step, points, valid):
+        np.add.at(exchange, (row[arrived.ray], index), weight * arrived.share / RAYS)
+    kept = frozen(leaving[:, :LEAVING])
+    return Chamber(step, frozen(points), frozen(normals), valid, frozen(exchange), kept)
+
+
+def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], plane: tuple[float, ...], limbus: float,
+           sclera: tuple[float, ...]) -> _Walls:  # fmt: skip
+    centre, normal = np.array(plane[:3]), np.array(plane[3:])
+    top = float(np.asarray(front[0].origin_mm)[0] + front[0].sag(np.array(limbus), np.array(0.0)))
+    bottom = centre[0] - _BELOW_MM
+    wide = np.sqrt(max((sclera[3] - _WALL_MM) ** 2 - (bottom - sclera[0]) ** 2, limbus**2))
+    return _Walls(front, indices, centre, normal, limbus, limbus, top, (wide - limbus) / (top - bottom))
+
+
+def _places(walls: _Walls) -> tuple[float, Floats, Floats, Bools]:
+    n, c = walls.normal, walls.centre
+    reach = walls.rim + walls.slope * max(walls.top - c[0], 0)
+    step = reach / IRIS_RINGS
+    ring, turn = np.arange(IRIS) // TURNS, np.arange(IRIS) % TURNS
+    radius, angle = step * (ring + 0.5), 2 * np.pi * (turn + 0.5) / TURNS
+    y, z = radius * np.cos(angle), radius * np.sin(angle)
+    grid = _in_plane(c, n, y, z)
+    inside = np.ones(IRIS, dtype=bool)
+    inner = walls.front[-1]
+    if len(walls.front) > 1:
+        inside &= inner.implicit(grid) * _sign(inner) < 0
+    angle = 2 * np.pi * (np.arange(TURNS * LEVELS) // LEVELS + 0.5) / TURNS
+    share = (np.arange(TURNS * LEVELS) % LEVELS + 0.5) / LEVELS
+    foot = c[0] - (n[1] * reach * np.cos(angle) + n[2] * reach * np.sin(angle)) / n[0]
+    x = walls.top + share * (foot - walls.top)
+    r = walls.rim + walls.slope * (walls.top - x)
+    wall = np.stack([x, r * np.cos(angle), r * np.sin(angle)], axis=-1)
+    steep = np.hypot(1.0, walls.slope)
+    across = np.stack([np.full_like(x, -walls.slope), -np.cos(angle), -np.sin(angle)], axis=-1) / steep
+    there = (walls.height(wall) > 0.02) & (walls.top - foot > 0.1) & (len(walls.front) == 1)
+    points = np.concatenate([grid, wall + 1e-4 * across])
+    return step, points, np.concatenate([np.tile(n, (IRIS, 1)), across]), np.append(inside, there)
+
+
+def _sign(surface: Surface) -> float:
+    """Sign of the implicit function of a surface on its air side."""
+    apex = np.asarray(surface.origin_mm) + np.asarray(surface.rotation)[:, 0]
+    return float(np.sign(surface.implicit(apex[None])[0]))
+
+
+def _pattern(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
+    """Origins and cosine-distributed directions (n RAYS, 3): an additive sequence, shifted from point to point."""
+    phi = 1.324717957244746
+    k = np.arange(RAYS)
+    shift = np.arange(len(points))[:, None]
+    u = (0.5 + k / phi + shift * 0.6180339887498949) % 1.0
+    v = (0.5 + k / phi**2 + shift * 0.7548776662466927) % 1.0
+    helper = np.where(np.abs(normals[:, :1]) < 0.6, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    e1 = np.cross(helper, normals)
+    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+    e2 = np.cross(normals, e1)
+    r, a = np.sqrt(u)[..., None], 2 * np.pi * v[..., None]
+    d = r * np.cos(a) * e1[:, None] + r * np.sin(a) * e2[:, None] + np.sqrt(1 - u)[..., None] * normals[:, None]
+    return np.repeat(points, RAYS, axis=0), d.reshape(-1, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrived:
+    """Where traced rays end: those that left (`out`: their numbers), and arrivals (`ray`: their numbers)."""
+
+    out: Ints
+    origin: Floats
+    way: Floats
+    weight: Floats
+    ray: Ints
+    share: Floats
+    back: Floats
+    on_wall: Bools
+
+
+def _traced(walls: _Walls, o: Floats, d: Floats) -> _Arrived:
+    """Follow rays until they return to the plane or the wall; what leaves at the first refraction is kept."""
+    number, weight = np.arange(len(o)), np.ones(len(o))
+    ends = []
+    for mirroring in range(_MIRRORINGS):
+        plane, wall = walls.to_plane(o, d), walls.to_wall(o, d)
+        low = np.minimum(plane, wall)
+        p, w, ok = _to_front(walls, o, d, low)
+        arrives = np.isfinite(low) & ~ok.met
+        ends.append((number[arrives], weight[arrives], (o + low[:, None] * d)[arrives], (wall < plane)[arrives]))
+        number, weight, p, w = number[ok.there], weight[ok.there], p[ok.there], w[ok.there]
+        n = walls.front[0].normal(p)
+        cosine = np.sum(n * w, axis=1)
+        mirrored = fresnel(cosine, walls.indices[0], 1.0).unpolarized
+        if mirroring == 0:
+            go = mirrored < 1
+            out, origin = number[go], p[go]
+            outward = _refracted(w[go], -n[go], walls.indices[0])
+            full = walls.indices[-1] ** 2 * (1 - mirrored[go])
+        d = w - 2 * cosine[:, None] * n
+        weight = weight * mirrored
+        keep = weight > 1e-3
+        number, weight, o, d = number[keep], weight[keep], p[keep], d[keep]
+        o, d, inside = _from_front(walls, o, d)
+        number, weight, o, d = number[inside], weight[inside], o[inside], d[inside]
+    rays, weights, places, walled = zip(*ends, strict=True)
+    arrived = np.concatenate(rays), np.concatenate(weights), np.concatenate(places), np.concatenate(walled)
+    return _Arrived(out, origin, outward, full, *arrived)
+
+
+@dataclass(frozen=True, slots=True)
+class _Reached:
+    """Rays that meet the innermost surface before plane and wall (`met`), and those that reach the front's inside."""
+
+    met: Bools
+    there: Bools
+
+
+def _to_front(walls: _Walls, o: Floats, d: Floats, limit: Floats) -> tuple[Floats, Floats, _Reached]:
+    """Trace outwards from the chamber to the inner side of the front surface; small mirrorings before are left out."""
+    p, w = o, d
+    met = there = np.ones(len(o), dtype=bool)
+    count = len(walls.front)
+    for k in range(count - 1, -1, -1):
+        surface = walls.front[k]
+        t = _outward(surface, p, w)
+        hit = p + np.where(np.isfinite(t), t, 0)[:, None] * w
+        good = np.isfinite(t)
+        if k == 0:
+            local = surface.to_local(hit)
+            good &= (np.hypot(local[:, 1], local[:, 2]) < walls.limbus) & (hit[:, 0] > walls.top - 1e-6)
+        if k == count - 1:
+            met = good & (t < limit)
+        there = there & good & met
+        p = hit
+        if k > 0:
+            n = surface.normal(hit)
+            w = _refracted(w, -n, walls.indices[k] / walls.indices[k - 1])
+    return p, w, _Reached(met, there)
+
+
+def _from_front(walls: _Walls, o: Floats, d: Floats) -> tuple[Floats, Floats, Bools]:
+    """Trace from the front's inner side back into the chamber: origins, directions, and which rays arrive."""
+    ok = np.ones(len(o), dtype=bool)
+    for k in range(1, len(walls.front)):
+        surface = walls.front[k]
+        hit = surface.hit(components(o), components(d), True)
+        t = np.where(hit.ok & (hit.distance > 0), hit.distance, 0)
+        ok &= hit.ok & (hit.distance > 0)
+        o = o + t[:, None] * d
+        n = surface.normal(o)
+        eta = walls.indices[k - 1] / walls.indices[k]
+        cosine = -np.sum(n * d, axis=1)
+        ok &= 1 - eta * eta * (1 - cosine * cosine) > 0
+        d = _refracted(d, n, eta)
+    return o, d, ok
+
+
+def _outward(surface: Surface, o: Floats, d: Floats) -> Floats:
+    """Distance (n,) to a surface from inside, infinite where it is not met."""
+    hit = surface.hit(components(o), components(d), False)
+    return np.where(hit.ok & (hit.distance > _NEAR_MM), hit.distance, np.inf)
+
+
+def _refracted(d: Floats, n: Floats, eta: float) -> Floats:
+    """Refract directions at normals against them; grazing beyond total reflection."""
+    c = -np.sum(n * d, axis=1)
+    c2 = np.sqrt(np.maximum(1 - eta * eta * (1 - c * c), 0))
+    w = eta * d + (eta * c - c2)[:, None] * n
+    return np.asarray(w / np.linalg.norm(w, axis=1, keepdims=True))
+
+
+def _onto(back: Floats, on_wall: Bools, step: float, points: Floats, valid: Bools) -> list[tuple[Ints, Floats]]:
+    """Places that stand for points of arrival, each with its weight (n,)."""
+    turn = np.arctan2(back[:, 2], back[:, 1]) / (2 * np.pi) * TURNS % TURNS
+    ring = np.clip(np.hypot(back[:, 1], back[:, 2]) / step - 0.5, 0, IRIS_RINGS - 1.000001)
+    before = np.floor(turn - 0.5).astype(int)
+    i, f, g = ring.astype(int), ring % 1, turn - 0.5 - before
+    index, weight = [], []
+    for a in (0, 1):
+        for b in (0, 1):
+            k = (i + a) * TURNS + (before + b) % TURNS
+            index.append(k)
+            weight.append(np.abs(1 - a - f) * np.abs(1 - b - g) * valid[k])
+    total = np.sum(weight, axis=0)
+    # Arrivals whose four neighbours are all outside the chamber are next to the rim.
+    best = [np.where(total > 0, w / np.where(total > 0, total, 1), 0) for w in weight]
+    wall, sector = points[IRIS:], turn.astype(int) % TURNS
+    first, last = wall[sector * LEVELS, 0], wall[sector * LEVELS + LEVELS - 1, 0]
+    level = np.where(np.abs(back[:, 0] - first) < np.abs(back[:, 0] - last), 0, LEVELS - 1)
+    out = [(np.where(on_wall, 0, k), np.where(on_wall, 0, w)) for k, w in zip(index, best, strict=True)]
+    return [*out, (IRIS + sector * LEVELS + level, np.where(on_wall, 1.0, 0.0))]

@@ -1,0 +1,470 @@
+"""Light that surfaces send to each other: globe, lids, face or surround, and the iris behind the cornea.
+
+It varies slowly, so its irradiance is computed at some hundred places per pose (`places`, `chamber`), and pixels
+interpolate between them. A place of albedo rho_j with irradiance E_j sends the radiance rho_j E_j / pi. From every
+place i, K rays of a cosine-distributed pattern find the places j that it sees:
+
+    E_i = E0_i + (1 / K) sum_k w_ik E_j(k)
+
+E0 is the light straight from lamps, panels and surroundings. w is the albedo, with the losses at the cornea where the
+ray goes through it. The rays of the iris are those that leave the eye; what the cornea mirrors back into the chamber
+comes from `chamber`. The equations are solved by iteration, so every number of reflections is included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..arrays import Bools, Floats, Ints
+from ..region.globe import Globe
+from .chamber import IRIS, IRIS_RINGS, LEAVING, PLACES, Chamber, chamber_of, shares
+from .chamber import TURNS as IRIS_TURNS
+from .frame import RenderJob, globe_of
+from .lighting import onto_points, through_cornea
+from .places import (
+    GLOBE_COLUMNS,
+    MAP_SIDE,
+    PLANE_FIRST_MM,
+    PLANE_MM,
+    RINGS,
+    TURNS,
+    WIDEST,
+    GlobePlaces,
+    SkinPlaces,
+    filled,
+    globe_places,
+    plane_places,
+    skin_places,
+)
+from .view import Textures, appearance, iris_albedo, meet, outer_albedo
+
+if TYPE_CHECKING:
+    from .region import RegionScene
+    from .surround import Surround
+    from .values import Lights, Values
+
+RAYS = 24  # from each place outside the eye
+_ROUNDS = 6
+_START_MM = 0.02
+_SMALL, _SPOTS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
+_TOUCHING_MM = 0.3  # a place most of whose rays are stopped this near is covered
+_ALPHA = (0.7548776662466927, 0.5698402909980532)
+
+
+class Received:
+    """What the places receive, for the kernels: irradiance by way of other surfaces, and the share of open sky.
+
+    Every surface has four numbers a place: irradiance from other surfaces, share of the sky that is open, whole
+    irradiance (what a mirror image of the place shows), and 0. Without exchange all of it is dark and open.
+    """
+
+    def __init__(
+        self,
+        on: bool,
+        globe: GlobePlaces,
+        chamber: Chamber,
+        plane: tuple[float, float, float],
+        tables: tuple[Floats, Floats, Floats],
+    ) -> None:
+        """Send the tables to the device.
+
+        Args:
+            on: whether surfaces send light to each other.
+            globe: the places on the globe.
+            chamber: the chamber of the eye.
+            plane: y and z of the middle of the surround's rings, and the radius of the first (mm).
+            tables: four numbers for each place of the globe, and for each place of the surround or vertex of the
+                region; one number for each place of the iris.
+        """
+        self.on = dr.opaque(mi.Bool, on)
+        self._between = globe.columns == GLOBE_COLUMNS
+        self._columns, self._rows = globe.columns, globe.rows
+        numbers = np.concatenate([globe.table, [chamber.step_mm], plane])
+        buffer = _sent(numbers)
+        tail = range(numbers.size - 4, numbers.size)
+        n = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in (*range(5), *tail)]
+        dr.eval(n)
+        self._centre, self._first, self._per_mm = mi.Vector3f(*n[:3]), n[3], n[4]
+        self._step, self._plane = n[5], n[6:]
+        self._ends = _sent(globe.table[5:])
+        self._globe, self._other, self._iris = (_sent(t.ravel()) for t in tables)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows of the grid of places on the globe."""
+        return self._columns, self._rows
+
+    def globe(self, x: mi.Vector3f) -> mi.Vector4f:
+        """Numbers of points of the globe, given in the scene's frame."""
+        return _bilinear(self._globe, *self.globe_place(x), self._columns, self._rows)
+
+    def globe_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Column and row of points of the globe in the grid of its places."""
+        if self._between:
+            column = dr.clip((x.y - self._first) * self._per_mm, 0, GLOBE_COLUMNS - 1)
+            i = mi.UInt32(dr.minimum(column, GLOBE_COLUMNS - 1.001))
+            w = column - mi.Float(i)
+            a, b = (dr.gather(mi.Vector2f, self._ends, i + k) for k in (0, 1))
+            low, high = a.x + w * (b.x - a.x), a.y + w * (b.y - a.y)
+            return column, (x.z - low) / (high - low) * self._rows - 0.5
+        r = dr.normalize(x - self._centre)
+        polar = dr.acos(dr.clip(r.x, -1, 1)) / WIDEST
+        inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
+        middle = 0.5 * (MAP_SIDE - 1)
+        return middle * (1 + polar * r.y * inv), middle * (1 + polar * r.z * inv)
+
+    def iris(self, x: mi.Vector3f) -> mi.Float:
+        """Irradiance of points in the plane of the iris (eye frame), without the light straight from the lamps."""
+        return _around(self._iris, *self.iris_place(x), IRIS_RINGS, IRIS_TURNS, mi.Float)
+
+    def iris_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Ring and turn of points in the plane of the iris among the places of the chamber."""
+        turn = dr.atan2(x.z, x.y) * (IRIS_TURNS * 0.5 * dr.inv_pi) - 0.5
+        ring = dr.sqrt(x.y * x.y + x.z * x.z) / self._step - 0.5
+        return ring, dr.select(turn < 0, turn + IRIS_TURNS, turn)
+
+    def surround(self, x: mi.Vector3f) -> mi.Vector4f:
+        """Numbers of points of the surround's plane, given in the scene's frame."""
+        return _around(self._other, *self.surround_place(x), RINGS, TURNS, mi.Vector4f)
+
+    def surround_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Ring and turn of points of the surround's plane among its places."""
+        y, z, inner = self._plane
+        dy, dz = x.y - y, x.z - z
+        out = dr.maximum(dr.sqrt(dy * dy + dz * dz) - inner, 0) / PLANE_FIRST_MM
+        ring = dr.log(1 + out) * ((RINGS - 1) / float(np.log1p(PLANE_MM / PLANE_FIRST_MM)))
+        turn = dr.atan2(dz, dy) * (TURNS * 0.5 * dr.inv_pi)
+        return ring, dr.select(turn < 0, turn + TURNS, turn)
+
+
+def _sent(values: Floats) -> mi.Float:
+    from .values import aligned
+
+    return mi.Float(aligned(np.ascontiguousarray(values, dtype=np.float32)))
+
+
+def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int) -> mi.Vector4f:
+    column, row = dr.clip(column, 0, columns - 1.001), dr.clip(row, 0, rows - 1.001)
+    i, j = mi.UInt32(column), mi.UInt32(row)
+    s, t = column - mi.Float(i), row - mi.Float(j)
+    a, b, c, d = (dr.gather(mi.Vector4f, buffer, j * columns + i + k) for k in (0, 1, columns, columns + 1))
+    low, high = a + s * (b - a), c + s * (d - c)
+    return low + t * (high - low)
+
+
+def _around(buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns: int, kind: Any) -> Any:
+    """Values between rings and turns; the turns close."""
+    ring, turn = dr.clip(ring, 0, rings - 1.001), dr.clip(turn, 0, turns - 0.001)
+    i, j = mi.UInt32(ring), mi.UInt32(turn)
+    s, t = ring - mi.Float(i), turn - mi.Float(j)
+    after = dr.select(j + 1 < turns, j + 1, 0)
+    a, b, c, d = (dr.gather(kind, buffer, p * turns + q) for p in (i, i + 1) for q in (j, after))
+    near, far = a + t * (b - a), c + t * (d - c)
+    return near + s * (far - near)
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What the rays of the places meet: numbers of places, weights, open rays, covered rays; all (places, rays)."""
+
+    target: Ints
+    weight: Floats
+    open_: Floats
+    near: Floats
+    sky: Floats
+
+
+class Exchange:
+    """Computes what the places of a frame receive; keeps what does not change between frames of a subject."""
+
+    def __init__(self) -> None:
+        self._skins: dict[int, tuple[Any, SkinPlaces]] = {}
+
+    def received(
+        self, job: RenderJob, values: Values, lights: Lights, panels: Lights, textures: Textures,
+        place: Surround | RegionScene,
+    ) -> Received:  # fmt: skip
+        """Compute what the places of a job's frame receive.
+
+        Args:
+            job: the job.
+            values: its numbers.
+            lights: its lamps.
+            panels: parts of its panels as lamps, which light the chamber's places.
+            textures: its textures, with the region and the ambient light.
+            place: its surroundings.
+        """
+        from .region import RegionScene
+
+        region = place if isinstance(place, RegionScene) else None
+        globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
+        grid = globe_places(globe, None if region is None else region.posed)
+        skin = None if region is None else self._skin(region)
+        points, normals, plane = _others(job, globe, region, skin)
+        frame = _Frame(job, grid, chamber_of(job.eye), skin, points, normals, plane)
+        if not job.interreflection and not values.structure.ambient:
+            return frame.dark(region)
+        numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
+        direct, even = _direct(values, lights, place.scene, textures, frame)
+        lamps, more = (_direct_inside(values, some, place.scene, frame.chamber) for some in (lights, panels))
+        seen = _seen(values, textures, place, numbers, frame)
+        return frame.solved(region, direct, even, lamps, more, seen)
+
+    def _skin(self, region: RegionScene) -> SkinPlaces:
+        key = id(region)
+        if key not in self._skins or self._skins[key][0] is not region:
+            if len(self._skins) >= 4:
+                self._skins.pop(next(iter(self._skins)))
+            self._skins[key] = (region, skin_places(region.posed))
+        return self._skins[key][1]
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """The places of a frame: on the globe, on skin or surround (`points`, `normals`), and in the chamber."""
+
+    job: RenderJob
+    grid: GlobePlaces
+    chamber: Chamber
+    skin: SkinPlaces | None
+    points: Floats
+    normals: Floats
+    plane: tuple[float, float, float]
+
+    @property
+    def on_globe(self) -> int:
+        """Number of places on the globe."""
+        return len(self.grid.points)
+
+    @property
+    def outside(self) -> int:
+        """Number of places outside the chamber."""
+        return len(self.grid.points) + len(self.points)
+
+    @property
+    def outer(self) -> Floats:
+        """Points and normals of the places outside the chamber, (n, 6)."""
+        points, normals = (self.grid.points, self.points), (self.grid.normals, self.normals)
+        return np.column_stack([np.concatenate(points), np.concatenate(normals)])
+
+    def received(self, tables: tuple[Floats, Floats, Floats]) -> Received:
+        """Tables for the kernels."""
+        return Received(self.job.interreflection, self.grid, self.chamber, self.plane, tables)
+
+    def dark(self, region: RegionScene | None) -> Received:
+        """Nothing but light straight from the lamps."""
+        other = np.tile([0.0, 1.0, 0.0, 0.0], (len(self.points) if region is None else len(region.posed.vertices), 1))
+        if region is not None:
+            region.skin.shine(other)
+        return self.received((np.tile([0.0, 1.0, 0.0, 0.0], (self.on_globe, 1)), other, np.zeros(IRIS)))
+
+    def _on_iris(self, values: Floats, along: float) -> Floats:
+        """Values of the places in the plane of the iris, filled where it is outside the chamber and smooth in turn."""
+        known = self.chamber.valid[:IRIS]
+        grids = (values[:IRIS].reshape(IRIS_RINGS, IRIS_TURNS), known.reshape(IRIS_RINGS, IRIS_TURNS))
+        closed = [np.concatenate([g[:, -2:], g, g[:, :2]], axis=1).ravel() for g in grids]
+        out = filled(closed[0], closed[1], IRIS_RINGS, IRIS_TURNS + 4, (along, 0.0))
+        return np.asarray(out.reshape(IRIS_RINGS, -1)[:, 2:-2].ravel())
+
+    def _stand_in(self, valid: Bools) -> Ints:
+        """Place that is used for each place: itself, or the nearest one on the globe that is not covered."""
+        out = np.arange(self.outside + PLACES)
+        points = self.grid.points
+        if np.any(valid) and not np.all(valid):
+            nearest = cKDTree(points[valid]).query(points[~valid])[1]
+            out[: len(points)][~valid] = np.flatnonzero(valid)[nearest]
+        return out
+
+    def solved(
+        self, region: RegionScene | None, direct: Floats, even: Floats, lamps: Floats, panels: Floats,
+        seen: tuple[_Seen, _Seen],
+    ) -> Received:  # fmt: skip
+        """Solve for the irradiance of all places."""
+        job, outside, inside = self.job, *seen
+        open_ = outside.open_.mean(axis=1)
+        valid = outside.near.mean(axis=1)[: self.on_globe] < 0.5
+        if region is None:
+            valid &= self.grid.points[:, 0] > -job.look.backdrop_distance_mm
+        stand_in = self._stand_in(valid)
+        targets = stand_in[outside.target], stand_in[inside.target]
+        start = np.concatenate([direct + even * open_, lamps + panels + inside.sky.mean(axis=1)])
+        total, entered, within = start, np.zeros(PLACES), np.zeros(PLACES)
+        if job.interreflection:
+            look = job.look
+            albedo = shares(job.eye, self.chamber, look.pupil_albedo, look.iris_albedo, look.limbus_albedo)
+            exchange = self.chamber.exchange * albedo
+            for _ in range(_ROUNDS):
+                arrived = (outside.weight * total[targets[0]]).mean(axis=1)
+                entered = (inside.weight * total[targets[1]]).mean(axis=1)
+                within = exchange @ total[self.outside :]
+                total = start + np.append(arrived, entered + within)
+        numbers = np.zeros((self.outside, 4))
+        numbers[:, 0] = (total - start)[: self.outside]
+        numbers[:, 1] = open_
+        numbers[:, 2] = total[: self.outside] if job.interreflection else 0
+        if region is None:
+            numbers[self.on_globe :, 2] *= job.look.backdrop_albedo
+        # Between lids the light changes fast from lid to lid, so it is averaged along them only.
+        across = (1.0, 1.0 if region is None else 0.0)
+        globe = filled(numbers[: self.on_globe], valid, self.grid.rows, self.grid.columns, across)
+        other = numbers[self.on_globe :]
+        if region is not None and self.skin is not None:
+            other = self.skin.spread @ other
+            region.skin.shine(other)
+        iris = self._on_iris(entered + inside.sky.mean(axis=1), 1.0) + self._on_iris(within + panels, 0.0)
+        return self.received((globe, other, iris))
+
+
+def _others(
+    job: RenderJob, globe: Globe, region: RegionScene | None, skin: SkinPlaces | None
+) -> tuple[Floats, Floats, tuple[float, float, float]]:
+    """Places that are not on the eye, their normals, and the rings of the surround."""
+    if region is not None and skin is not None:
+        posed = region.posed
+        return posed.vertices[skin.vertices], posed.normals[skin.vertices], (0.0, 0.0, 1.0)
+    points, inner = plane_places(globe, -job.look.backdrop_distance_mm)
+    centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    return points, np.tile([1.0, 0.0, 0.0], (len(points), 1)), (float(centre[1]), float(centre[2]), inner)
+
+
+def _rows(table: Floats) -> Any:
+    buffer, width = _sent(table.ravel()), table.shape[1]
+
+    def of(i: mi.UInt32, active: mi.Bool | bool = True) -> list[mi.Float]:
+        return [dr.gather(mi.Float, buffer, i * width + k, active) for k in range(width)]
+
+    return of
+
+
+def _spots(i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    """Places on the lamps' discs for lane i."""
+    u, v = ((mi.Float((i * mi.UInt32(round(a * 2**32))) >> 8) * 2.0**-24) for a in _ALPHA)
+    return u, v
+
+
+def _direct(
+    values: Values, lights: Lights, scene: mi.Scene, textures: Textures, frame: _Frame
+) -> tuple[Floats, Floats]:
+    """Irradiance of places outside the eye straight from the lamps, and from unshadowed ambient light."""
+    outer = frame.outer
+    index = dr.arange(mi.UInt32, len(outer))
+    n = _rows(outer)(index)
+    x, normal = mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:])
+    on_globe = index < dr.opaque(mi.UInt32, frame.on_globe)
+    start = values.point_to_eye(x + _START_MM * normal)
+    facing = values.vector_to_eye(normal)
+    lit = _over_lamps(lights, index, lambda u, v: onto_points(values, lights, scene, start, facing, ~on_globe, u, v))
+    even = mi.Float(0) * x.x
+    if values.structure.ambient:
+        assert textures.ambience is not None
+        even = textures.ambience.irradiance(x, normal)
+    dr.eval(even)
+    return lit, np.asarray(even.numpy(), dtype=float)
+
+
+def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, chamber: Chamber) -> Floats:
+    """Irradiance (PLACES,) of the chamber's places straight from lamps."""
+    if len(lights) == 0:
+        return np.zeros(PLACES)
+    index = dr.arange(mi.UInt32, PLACES)
+    n = _rows(np.column_stack([chamber.points, chamber.normals, chamber.valid]))(index)
+    x, inside, normal = mi.Vector3f(*n[:3]), n[6] > 0, mi.Vector3f(*n[3:6])
+    return _over_lamps(
+        lights, index, lambda u, v: through_cornea(values, lights, scene, x, inside, u, v, normal=normal)[0]
+    )
+
+
+def _over_lamps(lights: Lights, index: mi.UInt32, light: Callable[[mi.Float, mi.Float], mi.Float]) -> Floats:
+    """Mean of `light` (u, v) over places on the lamps' discs; one is enough for small lamps."""
+    count = 1 if lights.widest < _SMALL else _SPOTS
+    total = np.zeros(dr.width(index))
+    for k in range(count):
+        total += light(*_spots(index + dr.opaque(mi.UInt32, k * dr.width(index)))).numpy()
+    return total / count
+
+
+def _pattern(normal: mi.Vector3f, k: mi.UInt32, row: mi.UInt32) -> mi.Vector3f:
+    """Cosine-distributed directions about normals: ray k of place `row`."""
+    u, v = _spots(k + row * RAYS)
+    s, c = dr.sincos(v * (2 * dr.pi))
+    e1, e2 = mi.coordinate_system(normal)
+    r = dr.sqrt(u)
+    return (r * c) * e1 + (r * s) * e2 + dr.sqrt(1 - u) * normal
+
+
+def _seen(
+    values: Values, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame
+) -> tuple[_Seen, _Seen]:
+    """What the rays of the places outside and of those in the chamber meet."""
+    count = frame.outside
+    first = count * RAYS
+    lanes = first + PLACES * LEAVING
+    index = dr.arange(mi.UInt32, lanes)
+    split = dr.opaque(mi.UInt32, first)
+    outside = index < split
+    row = index // RAYS
+    n = _rows(frame.outer)(row, outside)
+    normal = mi.Vector3f(*n[3:])
+    o = mi.Vector3f(*n[:3]) + _START_MM * normal
+    d = _pattern(normal, index - row * RAYS, row)
+    rays = _rows(frame.chamber.leaving.reshape(-1, 7))(index - split, ~outside)
+    o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
+    d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
+    gain = dr.select(outside, 1, rays[6])
+    target, weight, open_, distance = _met(values, textures, place, numbers, o, d, gain > 0, frame)
+    sky = mi.Float(0) * o.x
+    if values.structure.ambient:
+        assert textures.ambience is not None
+        far = textures.ambience.far(d, open_ & ~outside)
+        sky = dr.select(open_ & ~outside, dr.pi * far * gain, 0)
+    results = (target, weight * gain, mi.Float(open_) * gain, mi.Float(distance < _TOUCHING_MM), sky)
+    dr.eval(results)
+    host = [r.numpy() for r in results]
+    return (
+        _Seen(*(h[:first].reshape(count, RAYS) for h in host)),
+        _Seen(*(h[first:].reshape(PLACES, LEAVING) for h in host)),
+    )
+
+
+def _met(
+    values: Values, textures: Textures, place: Surround | RegionScene, numbers: Received, o: mi.Vector3f,
+    d: mi.Vector3f, active: mi.Bool, frame: _Frame,
+) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float]:  # fmt: skip
+    """Along rays: the place met, the share of its irradiance that is sent back, whether nothing is met, distance."""
+    view, hit = meet(values, place.scene, o, d, active, coherent=False)
+    view = appearance(values, view, hit, o, d, textures.region)
+    albedo = outer_albedo(values, textures, view, active)
+    first = dr.opaque(mi.UInt32, frame.on_globe)
+    # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.
+    s, t = _spots(dr.arange(mi.UInt32, dr.width(o)) * mi.UInt32(0x9E3779B1))
+    at = values.point_to_scene(view.point)
+    if textures.region is not None and frame.skin is not None:
+        face = textures.region.face(hit)
+        other = first + dr.gather(mi.UInt32, mi.UInt32(frame.skin.faces.astype(np.uint32)), face, view.other)
+        matte = view.other
+    else:
+        ring, turn = numbers.surround_place(at)
+        ring = mi.UInt32(dr.clip(ring + s, 0, RINGS - 1))
+        turn = mi.UInt32(dr.clip(turn + t, 0, TURNS))
+        other = first + ring * TURNS + dr.select(turn < TURNS, turn, 0)
+        matte = view.other & (dr.abs(at.x - values.backdrop_x) < 1e-2)
+    column, row = numbers.globe_place(at)
+    columns, rows = numbers.size
+    on_globe = mi.UInt32(dr.clip(row + s, 0, rows - 1)) * columns + mi.UInt32(dr.clip(column + t, 0, columns - 1))
+    through = view.cornea & (view.opacity < 0.5)
+    depth, sector = numbers.iris_place(view.inner)
+    sector = mi.UInt32(dr.clip(sector + t, 0, IRIS_TURNS))
+    cell = mi.UInt32(dr.clip(depth + s, 0, IRIS_RINGS - 1)) * IRIS_TURNS + dr.select(sector < IRIS_TURNS, sector, 0)
+    behind = dr.select(view.pupil, values.pupil_albedo, iris_albedo(values, textures, view.inner))
+    inside = view.passed * behind / (values.inner_index * values.inner_index)
+    target = dr.select(through, dr.opaque(mi.UInt32, frame.outside) + cell, dr.select(view.other, other, on_globe))
+    back = dr.select(through, inside, dr.select(view.other & ~matte, 0, albedo))
+    back = dr.select(view.met, back, 0)
+    return dr.select(back > 0, target, 0), back, active & ~view.met, dr.select(view.met, view.distance, 1e9)
