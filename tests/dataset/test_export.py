@@ -72,9 +72,10 @@ def test_webdataset_reads_it(tiny, exported, lines):
         for sample in samples:
             line = json.loads(sample["json"])
             source = lines[sample["__key__"]]
-            own = {key: line[key] for key in ("bit_depth", "encoding", "gain", "source_bit_depth")}
+            own = {key: line[key] for key in ("bit_depth", "encoding", "gamma", "gain", "source_bit_depth")}
             assert line == {**source, **own}
-            assert (own["bit_depth"], own["encoding"], own["source_bit_depth"]) == (8, "gamma", 16)
+            assert (own["bit_depth"], own["encoding"], own["gamma"]) == (8, "gamma", 2.2)
+            assert own["source_bit_depth"] == 16
             assert line["split"] == split
             picture = np.asarray(Image.open(io.BytesIO(sample["png"])))
             np.testing.assert_array_equal(picture, eight_bit(tiny, source, folder))
