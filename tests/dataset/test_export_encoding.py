@@ -89,7 +89,11 @@ def pupil_codes(image, mask):
 
 @pytest.mark.render
 def test_common_loaders_show_the_images_as_they_are(tiny, tmp_path):
-    """The decoder "pil" of webdataset and `convert("L")`; linear copies without a gain have 3 codes in a pupil."""
+    """The decoder "pil" of webdataset and `convert("L")`.
+
+    The scene has no veiling glare, so its pupils are nearly black: the darker half has 4 codes or more with gamma and
+    gain, and 2 at most in linear copies without a gain.
+    """
     import webdataset as wds
 
     masks = {entry.path.stem: read_image(entry.mask_path)[0] for entry in ImageFolder.load(tiny).entries}
@@ -106,9 +110,9 @@ def test_common_loaders_show_the_images_as_they_are(tiny, tmp_path):
             np.testing.assert_array_equal(picture, np.asarray(grey))
             assert 40 < picture.mean() < 215
             assert np.mean(picture == 255) < 0.02
-            assert pupil_codes(picture, mask) >= 6
+            assert pupil_codes(picture, mask) >= 4
             plain = np.asarray(Image.open(tmp_path / "plain" / "images" / f"{name}.png"))
-            assert pupil_codes(plain, mask) <= 3
+            assert pupil_codes(plain, mask) <= 2
             seen += 1
     assert seen == 24
 
