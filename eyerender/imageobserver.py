@@ -94,6 +94,8 @@ class ImageObserver:
         few: list[Observations] = []  # observations of one row each take ten times the memory of joined ones
         row = 0
         for entry in followed(entries, progress):
+            if len(entry.records) == 0:
+                raise InputError("has no records", source=str(entry.path))
             image = entry.image()
             rows = np.arange(row, row + len(entry.records))
             depth = int(entry.line.get("bit_depth") or 8 * image.itemsize)
@@ -101,7 +103,7 @@ class ImageObserver:
             if len(few) == _BATCH:
                 parts.append(concatenate(few))
                 few = []
-            row = int(rows[-1]) + 1 if len(rows) else row
+            row = int(rows[-1]) + 1
         return concatenate([*parts, *few])
 
     def observe_files(
@@ -274,6 +276,8 @@ def _scene_of_samples(folder: ImageFolder) -> Scene:
         source = str(folder.path / entry.name)
         try:
             text, eye = entry.line["parameters"]["scene_json"], entry.line["parameters"]["eye_json"]
+            if not isinstance(text, str):
+                raise TypeError
             rig = parse_json(text)["rig"]
             key = json.dumps([rig["cameras"], [{**light, "intensity_mw_sr": 0} for light in rig["lights"]]])
         except (InputError, KeyError, TypeError, ValueError):

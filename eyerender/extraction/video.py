@@ -28,6 +28,7 @@ SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".
 MAX_VIDEO_BYTES = 1 << 40
 # Codec of each kind of file that is written: one that OpenCV's own FFmpeg can encode.
 CODECS = {".mp4": "mp4v", ".avi": "MJPG", ".mkv": "FFV1"}
+_TINT = 8  # codes between channels that lossy codecs leave in grey pictures
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,12 +81,10 @@ class VideoReader:
             if not good or picture is None:
                 break
             time_s = float(self._capture.get(cv2.CAP_PROP_POS_MSEC)) * 1e-3
-            colour = picture.ndim == 3 and bool(
-                (picture[..., 0] != picture[..., 1]).any() or (picture[..., 1] != picture[..., 2]).any()
-            )
-            grey = (
-                cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if colour else picture.reshape(*picture.shape[:2], -1)[..., 0]
-            )
+            tint = int(np.ptp(picture[..., :3].astype(np.int16), axis=-1).max()) if picture.ndim == 3 else 0
+            first = picture.reshape(*picture.shape[:2], -1)[..., 0]
+            grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if tint else first
+            colour = tint > _TINT
             yield Frame(number, time_s, np.ascontiguousarray(grey, dtype=np.uint8), colour)
             number += 1
         self._capture.release()

@@ -14,7 +14,7 @@ comes from `chamber`. The equations are solved by iteration, so every number of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -185,7 +185,7 @@ class Exchange:
     """Computes what the places of a frame receive; keeps what does not change between frames of a subject."""
 
     def __init__(self) -> None:
-        self._skins: dict[int, tuple[Any, SkinPlaces]] = {}
+        self._skins: list[tuple[RegionScene, Globe, SkinPlaces]] = []
 
     def received(
         self, job: RenderJob, values: Values, lights: Lights, panels: Lights, textures: Textures,
@@ -206,7 +206,7 @@ class Exchange:
         region = place if isinstance(place, RegionScene) else None
         globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
         grid = globe_places(globe, None if region is None else region.posed)
-        skin = None if region is None else self._skin(region)
+        skin = None if region is None else self._skin(region, globe)
         points, normals, plane = _others(job, globe, region, skin)
         frame = _Frame(job, grid, chamber_of(job.eye), skin, points, normals, plane)
         if not job.interreflection and not values.structure.ambient:
@@ -217,13 +217,15 @@ class Exchange:
         seen = _seen(values, textures, place, numbers, frame)
         return frame.solved(region, direct, even, lamps, more, seen)
 
-    def _skin(self, region: RegionScene) -> SkinPlaces:
-        key = id(region)
-        if key not in self._skins or self._skins[key][0] is not region:
-            if len(self._skins) >= 4:
-                self._skins.pop(next(iter(self._skins)))
-            self._skins[key] = (region, skin_places(region.posed))
-        return self._skins[key][1]
+    def _skin(self, region: RegionScene, globe: Globe) -> SkinPlaces:
+        """Places on the skin of a region, chosen with the eye straight ahead: no earlier pose may change a picture."""
+        rest = replace(globe, M=np.eye(3), t=np.zeros(3))
+        for known, still, places in self._skins:
+            if known is region and still == rest:
+                return places
+        places = skin_places(region.at_rest(rest))
+        self._skins = [*self._skins[-3:], (region, rest, places)]
+        return places
 
 
 @dataclass(frozen=True, slots=True)

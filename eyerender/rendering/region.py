@@ -77,6 +77,11 @@ class RegionScene:
             self._shown = (spec, globe)
         return self.posed
 
+    def at_rest(self, globe: Globe) -> RegionMesh:
+        """Mesh of the subject with open lids about a globe; the scene keeps its pose."""
+        assert self._shown is not None
+        return self._posed(self._shown[0].model_copy(update={"blink": 0.0}), globe)
+
     def _move(self, posed: RegionMesh) -> None:
         n, before, self.posed = self._vertices, self.posed, posed
         if self.moving:

@@ -276,6 +276,8 @@ def _refracted(
     pu, pv = stop_coordinates(values, inner)
     margin = values.boundary.radius(pu, pv)
     pupil = reached & (pu * pu + pv * pv < margin * margin)
+    # A ray that finds no way may have no place at all, and nothing may be computed from that.
+    inner = dr.select(reached, inner, values.stop.centre)
     return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, pupil
 
 

@@ -187,3 +187,17 @@ def compare(renderer, job, truth, error, parts, where) -> None:
         noise = np.sqrt(np.sum(error[m] ** 2)) / np.sum(truth[m])
         found[name] = (mine[m].mean() / truth[m].mean() - 1, noise)
     assert all(abs(away) < 0.01 + 2 * noise for away, noise in found.values()), found
+
+
+def test_picture_does_not_depend_on_earlier_ones(renderer):
+    """Bit for bit, although a renderer keeps much from frame to frame."""
+    from eyerender.capture import render_job
+    from eyerender.rendering.renderer import Renderer
+    from eyerender.scene.shipped import load_scene
+
+    frames = load_scene("headset").with_({"image.window_px": [160, 120]}).frames()
+    jobs = [render_job(frames, k) for k in (0, 8)]
+    later = Renderer(renderer.backend)
+    later.radiance(jobs[1], spp=1)
+    alone = Renderer(renderer.backend).radiance(jobs[0], spp=1)
+    np.testing.assert_array_equal(later.radiance(jobs[0], spp=1), alone)

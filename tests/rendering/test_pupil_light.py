@@ -28,7 +28,7 @@ def coaxial_job(angle_deg, look, **changes):
     aside = place + DISTANCE * np.tan(np.radians(angle_deg)) * np.array([0.0, 1.0, 0.0])
     lights = Led(position_mm=tuple(aside), radius_mm=1.0, intensity_mw_sr=100.0).build((camera,))
     job = job_of(eye_of("E2"), LampRig(camera, lights), (60, 60, 80, 80), look=look)
-    return replace(job, **changes)
+    return replace(job, **{"interreflection": False, **changes})
 
 
 def pupil_level(renderer, job):
