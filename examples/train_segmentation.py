@@ -151,7 +151,8 @@ def main() -> int:
     train(network, loaders["train"], options.epochs)
     iou = mean_iou(network, loaders["test"])
     print(f"{len(loaders['train'].dataset)} images for training, {time.monotonic() - start:.0f} s")
-    print("mean IoU of unseen subjects: " + ", ".join(f"{n} {v:.3f}" for n, v in zip(PARTS, iou.tolist(), strict=True)))
+    shown = [f"{n} {v:.3f}" for n, v in zip(PARTS, iou.tolist(), strict=True) if v == v]  # nan: in no image
+    print("mean IoU of unseen subjects: " + ", ".join(shown))
     if options.save is not None:
         torch.save(network.state_dict(), options.save)
     return int(not bool((iou[2:4] >= MUST).all()))
