@@ -22,7 +22,7 @@ from ..arrays import Bools, Floats
 from ..rig.camera import Window
 from .groups import Group, shade_group
 from .sampling import Sampler, Samples, camera_ray
-from .values import Lamp, Lights, Values
+from .values import Lamp, Lights, Values, aligned
 from .view import Textures, meet
 
 _LANES = 2**24  # samples at a time; more are rendered in several passes
@@ -255,4 +255,4 @@ def _plain(plain: tuple[Bools, int], window: Window, u: mi.Int32, v: mi.Int32) -
         dr.minimum((v - y) // size, rows - 1),
         dr.minimum((u - x) // size, columns - 1),
     )  # lanes may be outside
-    return dr.gather(mi.UInt32, mi.UInt32(tiles.ravel().astype(np.uint32)), row * columns + column) > 0
+    return dr.gather(mi.UInt32, mi.UInt32(aligned(tiles.ravel().astype(np.uint32))), row * columns + column) > 0

@@ -65,7 +65,7 @@ class Values:
         tables: Sequence[NDArray[np.float32] | None],
     ) -> None:
         numbers = packed(parameters)
-        buffer = mi.Float(numbers)
+        buffer = mi.Float(aligned(numbers))
         scalars = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in range(numbers.size)]
         dr.eval(scalars)
         left = iter(scalars)
@@ -118,7 +118,7 @@ class PupilBoundary:
         self.count = dr.opaque(mi.UInt32, len(waves))
         table = np.zeros((HARMONICS, 2), np.float32)
         table[: len(waves)] = waves
-        self._buffer = mi.Float(table.ravel())
+        self._buffer = mi.Float(aligned(table.ravel()))
 
     def radius(self, x: mi.Float, y: mi.Float) -> mi.Float:
         """Radius r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
