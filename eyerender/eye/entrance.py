@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.surfaces import Surface
 from ..optics.solve import apparent_points
@@ -32,6 +33,24 @@ def entrance_pupil_mm(eye: EyeModel, *, points: int = POINTS) -> float:
         InputError: a ray from the margin does not leave the eye.
     """
     return _diameter(eye.front, tuple(float(n) for n in eye.front_indices), eye.stop, points)
+
+
+def entrance_pupil(eye: EyeModel) -> tuple[Floats, float]:
+    """Centre (3,) mm and lateral magnification of the paraxial image of the stop, seen from air.
+
+    n / s - n' / s' = (n - n') / R at each surface, from the stop outwards; m = n s' / (n' s).
+    """
+    x, scale = float(eye.stop.centre_mm[0]), 1.0
+    indices = [1.0, *(float(n) for n in eye.front_indices)]
+    for k in range(len(eye.front) - 1, -1, -1):
+        surface, n, n_out = eye.front[k], indices[k + 1], indices[k]
+        apex = float(surface.origin_mm[0] + surface.rotation[0, 0] * surface.sag(0.0, 0.0))
+        R = 1 / _curvature(surface)
+        depth = apex - x
+        out = n_out / (n / depth - (n - n_out) / R)
+        scale *= n * out / (n_out * depth)
+        x = apex - out
+    return np.array([x, *(scale * eye.stop.centre_mm[1:])]), scale
 
 
 def stop_for_entrance(
@@ -78,3 +97,11 @@ def _diameter(front: tuple[Surface, ...], indices: tuple[float, ...], stop: Stop
     series = np.fft.fft(exits[:, 1] + 1j * exits[:, 2]) / points
     order = np.fft.fftfreq(points, 1.0 / points)
     return float(2.0 * np.sqrt(abs(np.sum(order * np.abs(series) ** 2))))
+
+
+def _curvature(surface: Surface) -> float:
+    """Mean curvature at the apex (1/mm), from the sag."""
+    h = 0.05
+    # A measured surface may lean at its apex, so both sides count.
+    ends = sum(surface.sag(s * h, 0.0) + surface.sag(0.0, s * h) for s in (1, -1))
+    return float((4 * surface.sag(0.0, 0.0) - ends) / (2 * h**2))

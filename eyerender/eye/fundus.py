@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import ArrayValue, Floats
+from .entrance import entrance_pupil
 from .model import EyeModel
 
 EDGE = 1.25  # half width of the grid, in semi-axes of the stop; uneven margins reach beyond 1
@@ -124,25 +125,6 @@ def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: 
     rho = spread.reflectance * _relative_reflectance(eye, out_of_pupil, plane, theta_c, spread.disc_gain)
     even = len(nodes) * weight * spread.reflectance / (1 - spread.reflectance) / _retina_area_mm2(eye)
     return FundusLight(rho * (factors / f**2 + even) / (np.pi * index**2))
-
-
-def entrance_pupil(eye: EyeModel) -> tuple[Floats, float]:
-    """Centre (3,) mm and lateral magnification of the paraxial image of the stop, seen from air.
-
-    n / s - n' / s' = (n - n') / R at each surface, from the stop outwards; m = n s' / (n' s).
-    """
-    x, scale = float(eye.stop.centre_mm[0]), 1.0
-    indices = [1.0, *(float(n) for n in eye.front_indices)]
-    for k in range(len(eye.front) - 1, -1, -1):
-        surface, n, n_out = eye.front[k], indices[k + 1], indices[k]
-        apex = float(surface.origin_mm[0] + surface.rotation[0, 0] * surface.sag(0.0, 0.0))
-        h = 0.05
-        R = h**2 / float(2 * surface.sag(0.0, 0.0) - surface.sag(h, 0.0) - surface.sag(0.0, h))
-        depth = apex - x
-        out = n_out / (n / depth - (n - n_out) / R)
-        scale *= n * out / (n_out * depth)
-        x = apex - out
-    return np.array([x, *(scale * eye.stop.centre_mm[1:])]), scale
 
 
 def retinal_scale_mm(eye: EyeModel) -> float:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Floats, frozen
 from ..errors import InputError
+from ..eye.entrance import entrance_pupil
 from ..eye.fundus import FundusLight, Spread, fundus_light
 from ..eye.model import EyeModel
 from ..geometry.surfaces import Surface
@@ -134,6 +135,7 @@ def parameters_of(job: RenderJob) -> Parameters:
         for surface, index, before in zip(eye.front, indices, [1.0, *indices[:-1]], strict=True)
     )
     front, stop, sclera = eye.front[0], eye.stop, eye.sclera
+    entrance_mm, magnification = entrance_pupil(eye)
     angle = np.linspace(0, 2 * np.pi, 64)
     edge = front.sag(eye.limbus_radius_mm * np.cos(angle), eye.limbus_radius_mm * np.sin(angle))
     ring = eye.limbus_radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -160,7 +162,7 @@ def parameters_of(job: RenderJob) -> Parameters:
             bulge_radius=float(np.max(np.linalg.norm(rim - bulge, axis=1))) + 0.05,
         ),
         sclera=ScleraParameters(sclera.centre_mm, sclera.radius_mm, look.sclera_albedo, look.sclera_contrast),
-        image=ImageParameters(*_image(eye.front, indices, float(stop.centre_mm[0]))),
+        image=ImageParameters(magnification, float(entrance_mm[0] - stop.centre_mm[0])),
         pose=PoseParameters((job.M[:, 0], job.M[:, 1], job.M[:, 2]), job.t - anchor),
         camera=CameraParameters(
             centre=camera.nodal_point_mm - anchor,
@@ -279,32 +281,6 @@ def _shape(surface: Surface, limbus_mm: float) -> Floats:
     return np.array([*np.diag(A), b[0], float(surface.constant)])
 
 
-def _image(front: Sequence[Surface], indices: Floats, stop_x: float) -> tuple[float, float]:
-    """Lateral magnification of the stop's Gaussian image seen from outside, and its shift along x (mm).
-
-    n / s - n' / s' = (n - n') / R at each surface, from the stop outwards; m = n s' / (n' s).
-    """
-    x, scale = stop_x, 1.0
-    behind = list(indices)
-    before = [1.0, *behind[:-1]]
-    for surface, n, n_out in reversed(list(zip(front, behind, before, strict=True))):
-        apex = float(apex_of(surface)[0])
-        R = 1 / _curvature(surface)
-        depth = apex - x
-        out = n_out / (n / depth - (n - n_out) / R)
-        scale *= n * out / (n_out * depth)
-        x = apex - out
-    return scale, x - stop_x
-
-
 def apex_of(surface: Surface) -> Floats:
     """Apex of a surface in the eye frame, (3,) mm."""
     return np.asarray(surface.origin_mm + surface.rotation[:, 0] * float(surface.sag(0.0, 0.0)))
-
-
-def _curvature(surface: Surface) -> float:
-    """Mean curvature at the apex (1/mm), from the sag."""
-    h = 0.05
-    # A measured surface may lean at its apex, so both sides count.
-    ends = sum(surface.sag(s * h, 0.0) + surface.sag(0.0, s * h) for s in (1, -1))
-    return float((4 * surface.sag(0.0, 0.0) - ends) / (2 * h**2))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from eyerender.eye.catalogue import load_eye
-from eyerender.eye.fundus import CELLS, EDGE, Spread, entrance_pupil, fundus_light, retinal_scale_mm
+from eyerender.eye.entrance import entrance_pupil
+from eyerender.eye.fundus import CELLS, EDGE, Spread, fundus_light, retinal_scale_mm
 
 RHO, HALO, BLUR = 0.115, np.radians(1.2), np.radians(0.05)
 LINE = (np.arange(CELLS) + 0.5) * 2 * EDGE / CELLS - EDGE
