@@ -46,6 +46,12 @@ Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 
 
+def kind_tag(value: object) -> str:
+    """Tag of a member of a union of specs that differ in `kind`: 'grid' is that of `GridSpec`."""
+    kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
+    return f"{str(kind).capitalize()}Spec"
+
+
 class KeyProblem(ValueError):
     """What a validator raises for a key inside its record."""
 

@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Discriminator, Field, Tag
 
-from ..spec import FileSpec, Number, Positive, Spec, Vec2, Vec3
+from ..spec import FileSpec, Number, Positive, Spec, Vec2, Vec3, kind_tag
 
 # This is the number of surfaces of the finest lens of shells.
 MAX_SURFACES = 400
@@ -154,11 +154,6 @@ class PlaneSpec(Spec):
     kind: Literal["plane"] = Field(description="the shape")
 
 
-def _shape_tag(value: object) -> str | None:
-    kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
-    return f"{str(kind).capitalize()}Spec"
-
-
 ShapeSpec = Annotated[
     Annotated[SphereSpec, Tag("SphereSpec")]
     | Annotated[ConicSpec, Tag("ConicSpec")]
@@ -169,7 +164,7 @@ ShapeSpec = Annotated[
     | Annotated[ZernikeSpec, Tag("ZernikeSpec")]
     | Annotated[GridSpec, Tag("GridSpec")],
     Discriminator(
-        _shape_tag,
+        kind_tag,
         custom_error_type="unknown_kind",
         custom_error_message="kind must be sphere, conic, biconic, ellipsoid, quadric, plane, zernike or grid",
     ),

@@ -5,7 +5,6 @@ The map is F^-1(Phi(z)), where F is the cumulative distribution of the quantity.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
@@ -14,7 +13,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
 from ..arrays import Floats
-from ..spec import Number, Positive, Spec
+from ..spec import Number, Positive, Spec, kind_tag
 
 # Gauss and Hermite's points for means over a standard normal number; smooth maps need few, kinked ones are off by 1e-4.
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(180)
@@ -245,11 +244,6 @@ class Mixture(_Marginal):
         return centre, float(np.sqrt(weight @ (sd**2 + (mean - centre) ** 2)))
 
 
-def _tag(value: object) -> str:
-    kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
-    return f"{str(kind).capitalize()}Spec"
-
-
 Marginal = Annotated[
     Annotated[Fixed, Tag("FixedSpec")]
     | Annotated[Normal, Tag("NormalSpec")]
@@ -258,7 +252,7 @@ Marginal = Annotated[
     | Annotated[Share, Tag("ShareSpec")]
     | Annotated[Mixture, Tag("MixtureSpec")],
     Discriminator(
-        _tag,
+        kind_tag,
         custom_error_type="unknown_kind",
         custom_error_message="kind must be fixed, normal, lognormal, uniform, share or mixture",
     ),

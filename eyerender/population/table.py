@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from ..spec import FileSpec, Number, Positive, Spec
+from ..spec import FileSpec, Number, Positive, Spec, kind_tag
 from .marginals import Fixed, Lognormal, Marginal, Mixture, Normal, Share, Uniform
 
 FOLDER = Path(__file__).parent / "tables"
@@ -54,11 +54,6 @@ class Regression(Spec):
         return self
 
 
-def _tag(value: object) -> str:
-    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
-    return f"{str(kind).capitalize()}Spec"
-
-
 Distribution = Annotated[
     Annotated[Fixed, Tag("FixedSpec")]
     | Annotated[Normal, Tag("NormalSpec")]
@@ -68,7 +63,7 @@ Distribution = Annotated[
     | Annotated[Mixture, Tag("MixtureSpec")]
     | Annotated[Regression, Tag("RegressionSpec")],
     Discriminator(
-        _tag,
+        kind_tag,
         custom_error_type="unknown_kind",
         custom_error_message="kind must be fixed, normal, lognormal, uniform, share, mixture or regression",
     ),
