@@ -28,6 +28,9 @@ SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".
 MAX_VIDEO_BYTES = 1 << 40
 # Codec of each kind of file that is written: one that OpenCV's own FFmpeg can encode.
 CODECS = {".mp4": "mp4v", ".avi": "MJPG", ".mkv": "FFV1"}
+# What is wrong with a file is said in one line of ours, without those of OpenCV and FFmpeg.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 _TINT = 8  # codes between channels that lossy codecs leave in grey pictures
 
 
