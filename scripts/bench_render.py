@@ -109,7 +109,7 @@ class Bench:
         values = shown.values
         u, v = pixels_of(dr.arange(mi.UInt32, n * n), job.window)
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
-        view = look(values, surround.scene, o, d, True)
+        view = look(values, shown.textures, surround.scene, o, d, True)
         inner = view.inner.numpy().T
         rho = np.hypot(inner[:, 1], inner[:, 2]).reshape(n, n)
         cornea = view.cornea.numpy().astype(bool).reshape(n, n)

@@ -441,8 +441,8 @@ def _met(
 ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float]:  # fmt: skip
     """Along rays: the place met, the share of its irradiance that is sent back, whether nothing is met, distance."""
     view, hit = meet(values, place.scene, o, d, active, coherent=False)
-    view = appearance(values, view, hit, o, d, textures.region)
-    albedo = outer_albedo(values, textures, view, active)
+    view = appearance(values, textures, view, hit, d)
+    albedo = outer_albedo(values, textures, view)
     first = dr.opaque(mi.UInt32, frame.on_globe)
     # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.
     s, t = _spots(dr.arange(mi.UInt32, dr.width(o)) * mi.UInt32(0x9E3779B1))

@@ -185,7 +185,7 @@ class _GroupShading:
         values, lights, textures, scene, group = self.values, self.lights, self.textures, self.scene, self.group
         seen = replace(view, other=mi.Bool(False))
         inner, missed = through_cornea(values, lights, scene, seen.inner, seen.lit_inside, *group.spot(j))
-        albedo = outer_albedo(values, textures, seen, mi.Bool(True))
+        albedo = outer_albedo(values, textures, seen)
         assert textures.received is not None
         received = textures.received.globe(values.point_to_scene(seen.point))
         rest = indirect(values, textures, scene, seen, d, albedo, inner, received)

@@ -145,7 +145,7 @@ class SurfaceMesh:
             Points (n, 3) and normals (n, 3) (not unit), their derivatives by y and z (n, 3, 2), and whether the mesh
             reaches there.
         """
-        hit = self.above(*(mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in q.T))
+        hit = self.above(*(mi.Float(aligned(c.astype(np.float32))) for c in q.T))
         valid, face = hit.is_valid(), hit.prim_index
         dr.eval(valid, face)
         there = np.asarray(valid.numpy(), dtype=bool)

@@ -46,9 +46,9 @@ def shade(
 
     u, v: place on each lamp's disc, [0, 1).
     """
-    view = look(values, scene, o, d, active, textures.region)
+    view = look(values, textures, scene, o, d, active)
     outer, shine, inner, failures = light(values, lights, scene, view, -values.vector_to_eye(d), u, v)
-    albedo = outer_albedo(values, textures, view, active)
+    albedo = outer_albedo(values, textures, view)
     received = of_surroundings(values, textures, view)
     if values.structure.region:
         assert textures.received is not None

@@ -86,6 +86,8 @@ class Stage:
         pupil = PupilLight(values, lights, place.scene, returned_light(job))
         pupil.make()
         textures = replace(textures, pupil=pupil)
+        if isinstance(place, Surround):
+            textures = replace(textures, surround=place.geometry)
         if region is not None:
             views = LampViews(job.lights, anchor, _reach_mm(job), region.skin if region.skin.is_sheet else None)
             textures = replace(textures, region=region.skin, lamp_views=views)

@@ -19,6 +19,7 @@ from ..arrays import ArrayValue, Bools, Floats, Ints
 from ..region.look import Look
 from ..region.mapcache import kept
 from ..region.texture import skin_texture
+from .values import aligned
 
 _HALF_MM = 500.0
 _TILE_MM = 60.0
@@ -33,17 +34,73 @@ class Obstacle(ArrayValue):
     albedo: float = 0.3
 
 
+@dataclass(frozen=True, slots=True)
+class Matte:
+    """Points of the surround: place, geometric normal (scene's frame), albedo."""
+
+    point: mi.Vector3f
+    normal: mi.Vector3f
+    albedo: mi.Float
+
+
+class SurroundGeometry:
+    """The triangles of the surround for the kernels, and the map of its plane.
+
+    Kernels read them from buffers and do not call methods of Mitsuba's shapes and materials: the code of such a call
+    depends on how many objects the process has made.
+    """
+
+    def __init__(self, faces: Ints) -> None:
+        corners = np.zeros((len(faces), 4), np.uint32)  # four entries, which are gathered together
+        corners[:, :3] = faces
+        self._corners = mi.UInt32(aligned(corners.ravel()))
+        self._vertices = mi.Float(0)
+        texture: Any = mi.Texture2f
+        self._map = texture(mi.TensorXf(np.zeros((2, 2, 1), np.float32)), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
+
+    def place(self, vertices: Floats, albedo: Floats) -> None:
+        """Set the vertices (n, 3) mm and their albedos (n,); negative ones stand for the map of the plane."""
+        self._vertices = mi.Float(aligned(np.column_stack([vertices, albedo]).astype(np.float32).ravel()))
+
+    def paint(self, tile: Floats) -> None:
+        """Set the map of the plane's albedo, which repeats."""
+        self._map.set_tensor(mi.TensorXf(tile.astype(np.float32)[..., None]))
+
+    def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Matte:
+        """Surface at barycentric coordinates `uv` of triangles."""
+        corner = dr.gather(mi.Vector4u, self._corners, face, active)
+        a, b, c = (dr.gather(mi.Vector4f, self._vertices, i, active) for i in (corner.x, corner.y, corner.z))
+        at = a + uv.x * (b - a) + uv.y * (c - a)
+        p, q, r = (mi.Vector3f(v.x, v.y, v.z) for v in (a, b, c))
+        around = mi.Point2f(at.y + _HALF_MM, at.z + _HALF_MM) / _TILE_MM
+        mapped = self._map.eval(around, active)[0]
+        normal = dr.normalize(dr.cross(q - p, r - p))
+        return Matte(mi.Vector3f(at.x, at.y, at.z), normal, dr.select(a.w < 0, mapped, a.w))
+
+
 class Surround:
     """The Mitsuba scene of the surround; `show` changes its look in place."""
 
     def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
+        places, faces, albedos = [_corners(10.0)], [np.array([[0, 1, 2], [0, 2, 3]])], [np.full(4, -1.0)]
+        for body in obstacles:
+            faces.append(np.asarray(body.faces) + sum(len(p) for p in places))
+            places.append(np.asarray(body.vertices_mm, dtype=np.float64))
+            albedos.append(np.full(len(places[-1]), body.albedo))
+        self._vertices, self._albedos, triangles = (
+            np.concatenate(places),
+            np.concatenate(albedos),
+            np.concatenate(faces),
+        )
+        mesh = mi.Mesh("surround", len(self._vertices), len(triangles))
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = mi.Float(self._vertices.astype(np.float32).ravel())
+        params["faces"] = mi.UInt32(triangles.astype(np.uint32).ravel())
+        params.update()
         # Without robust intersections rays slip between neighbouring triangles on some processors.
-        parts: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True, "backdrop": self._backdrop()}
-        for i, body in enumerate(obstacles):
-            material = _matte(mi.TensorXf(np.full((1, 1, 1), body.albedo, np.float32)))
-            parts[f"obstacle{i}"] = _mesh(f"obstacle{i}", body.vertices_mm, body.faces, None, material)
-        self.scene = mi.load_dict(parts)
+        self.scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surround": mesh})
         self._params: Any = mi.traverse(self.scene)
+        self.geometry = SurroundGeometry(triangles)
         self.obstructed = len(obstacles) > 0
         self._shown: tuple[float, float, float] | None = None
 
@@ -53,23 +110,17 @@ class Surround:
         if wanted == self._shown:
             return
         if self._shown is None or self._shown[0] != wanted[0]:
-            self._params["backdrop.vertex_positions"] = mi.Float(_corners(wanted[0]).ravel())
+            self._vertices[:4] = _corners(wanted[0])
+            self._params["surround.vertex_positions"] = mi.Float(self._vertices.astype(np.float32).ravel())
+            self._params.update()
+            self.geometry.place(self._vertices, self._albedos)
         tile = wanted[1] * (1 + wanted[2] * (kept(skin_texture, 1) - 1))
-        names: list[str] = list(self._params.keys())  # iterating over it would give pairs
-        (key,) = (k for k in names if k.startswith("backdrop") and k.endswith("reflectance.data"))
-        self._params[key] = mi.TensorXf(np.clip(tile, 0.0, 0.98).astype(np.float32)[..., None])
-        self._params.update()
+        self.geometry.paint(np.clip(tile, 0.0, 0.98))
         self._shown = wanted
 
     def clear(self, a: Floats, b: Floats) -> Bools:
         """Whether nothing of the surround stands between points (n, 3) of the scene's frame; ends not included."""
         return clear_between(self.scene, a, b)
-
-    @staticmethod
-    def _backdrop() -> mi.Mesh:
-        uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (2 * _HALF_MM / _TILE_MM)
-        material = _matte(mi.TensorXf(np.full((2, 2, 1), 0.4, np.float32)))
-        return _mesh("backdrop", _corners(10.0), np.array([[0, 1, 2], [0, 2, 3]]), uv, material)
 
 
 def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:
@@ -93,22 +144,3 @@ def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> mi.Ray3f:
 def _corners(distance_mm: float) -> Floats:
     h = _HALF_MM
     return np.array([[-distance_mm, y, z] for y, z in ((-h, -h), (h, -h), (h, h), (-h, h))])
-
-
-def _matte(data: mi.TensorXf) -> dict[str, Any]:
-    """A diffuse material; the integrator reads its albedo and turns normals to the viewer, so both sides are matte."""
-    return {"type": "diffuse", "reflectance": {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "repeat"}}
-
-
-def _mesh(name: str, vertices: Floats, faces: Ints, uv: Floats | None, material: dict[str, Any]) -> mi.Mesh:
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict(material)
-    mesh = mi.Mesh(name, len(vertices), len(faces), props=props, has_vertex_texcoords=uv is not None)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = mi.Float(np.asarray(vertices, dtype=np.float32).ravel())
-    params["faces"] = mi.UInt32(np.asarray(faces, dtype=np.uint32).ravel())
-    if uv is not None:
-        params["vertex_texcoords"] = mi.Float(np.asarray(uv, dtype=np.float32).ravel())
-    params.update()
-    dr.eval()
-    return mesh

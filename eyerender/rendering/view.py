@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .lampviews import LampViews
     from .pupillight import PupilLight
     from .region import SkinGeometry
+    from .surround import SurroundGeometry
 
 EPSILON_MM = 2e-3  # points closer than this are the same in single precision
 _NEAR_MM = 20.0
@@ -46,7 +47,6 @@ class View:
     passed: mi.Float  # transmittance of the refracted branch, 0 where it does not reach the plane of the iris
     inner: mi.Vector3f  # point in the plane of the iris
     pupil: mi.Bool  # the inner point lies in the pupil
-    interaction: mi.SurfaceInteraction3f | None  # with the scene
     amodal_cornea: mi.Bool  # as if the eye stood alone
     amodal_sclera: mi.Bool
     albedo: mi.Float  # of the region's mesh, where there is one
@@ -87,6 +87,7 @@ class Textures:
 
     iris: mi.Texture2f
     sclera: mi.Texture2f
+    surround: SurroundGeometry | None = None  # of frames without a region
     region: SkinGeometry | None = None
     ambience: Ambience | None = None
     lamp_views: LampViews | None = None
@@ -111,35 +112,27 @@ def opacity(values: Values, rho: mi.Float) -> mi.Float:
     return s * s * (3 - 2 * s)
 
 
-def look(
-    values: Values, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, region: SkinGeometry | None = None
-) -> View:
-    """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris.
-
-    `region` is the skin of an eye region, whose normals and albedos are then used.
-    """
+def look(values: Values, textures: Textures, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> View:
+    """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris."""
     view, hit = meet(values, scene, o, d, active)
-    return appearance(values, view, hit, o, d, region)
+    return appearance(values, textures, view, hit, d)
 
 
 def appearance(
-    values: Values,
-    view: View,
-    hit: mi.PreliminaryIntersection3f,
-    o: mi.Vector3f,
-    d: mi.Vector3f,
-    region: SkinGeometry | None = None,
+    values: Values, textures: Textures, view: View, hit: mi.PreliminaryIntersection3f, d: mi.Vector3f
 ) -> View:
     """View of rays along which `meet` found `view` and `hit`, with the surface of what is not the eye."""
+    region, surround = textures.region, textures.surround
     if region is not None:
         there = look_at_skin(values, region, region.face(hit), hit.prim_uv, d, view.other)
     else:
-        there = _look_around(values, hit, o, d, view.other)
+        assert surround is not None
+        matte = surround.surface(hit.prim_index, hit.prim_uv, view.other)
+        there = replace(_matte(values, matte.point, matte.normal, d, view.other), albedo=matte.albedo)
     return replace(
         view,
         point=dr.select(view.other, there.point, view.point),
         normal=dr.select(view.other, there.normal, view.normal),
-        interaction=there.interaction,
         albedo=there.albedo,
         gloss=dr.select(view.other, there.gloss, view.gloss),
         received=there.received,
@@ -195,7 +188,6 @@ def meet(
         passed=passed,
         inner=inner,
         pupil=pupil,
-        interaction=None,
         amodal_cornea=amodal_cornea,
         amodal_sclera=amodal_sclera,
         albedo=mi.Float(0),
@@ -203,16 +195,6 @@ def meet(
         received=mi.Vector4f(0),
     )
     return view, hit
-
-
-def _look_around(
-    values: Values, hit: mi.PreliminaryIntersection3f, o: mi.Vector3f, d: mi.Vector3f, other: mi.Bool
-) -> View:
-    """View of rays that meet something of the surround, where `other`."""
-    flags = mi.RayFlags.Minimal | mi.RayFlags.UV
-    interaction = hit.compute_surface_interaction(mi.Ray3f(mi.Point3f(o), d), flags, other)
-    view = _matte(values, mi.Vector3f(interaction.p), mi.Vector3f(interaction.n), d, other)
-    return replace(view, interaction=interaction)
 
 
 def look_at_skin(
@@ -241,7 +223,6 @@ def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector
         passed=nothing,
         inner=mi.Vector3f(0),
         pupil=no,
-        interaction=None,
         amodal_cornea=no,
         amodal_sclera=no,
         albedo=nothing,
@@ -311,15 +292,10 @@ def iris_albedo(values: Values, textures: Textures, x: mi.Vector3f) -> mi.Float:
     return dr.select(left > 0, albedo, values.limbus.albedo)
 
 
-def outer_albedo(values: Values, textures: Textures, view: View, active: mi.Bool) -> mi.Float:
+def outer_albedo(values: Values, textures: Textures, view: View) -> mi.Float:
     """Albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
-    other = view.albedo
-    if textures.region is None:
-        si = view.interaction
-        assert si is not None
-        other = si.bsdf().eval_diffuse_reflectance(si, active & view.other)[0]
     return dr.if_stmt(
-        (view.point, other),
+        (view.point, view.albedo),
         view.other,
         lambda point, other: other,
         lambda point, other: _sclera_albedo(values, textures, point),
