@@ -99,7 +99,7 @@ def iris_texture(seed: int, radial: int = 256, angular: int = 1024) -> Texture:
     ) * (0.035 * coarse + 0.075 * fine + 0.03 * medium)
 
     tone = 1.0 + 0.05 * _noise(rng, shape, (0, 2.0), (0, 5)) + 0.035 * _noise(rng, shape, (0, 14), (0, 60))
-    tone = tone + 0.10 * (1 - ciliary) - 0.16 * _step(s, 0.72, 1.0)
+    tone = tone + 0.10 * (1 - ciliary) - 0.05 * _step(s, 0.72, 1.0)
     crest = np.exp(-(((s - collarette) / 0.020) ** 2))
     tone = tone + 0.11 * crest * np.clip(1 + 0.9 * _noise(rng, (1, angular), (0, 1), (3, 30), True), 0, 2.6)
     tone = tone - 0.06 * np.exp(-(((s - collarette - 0.055) / 0.03) ** 2))

@@ -9,6 +9,13 @@ are traced through the exact surfaces:
 
 with F_k the share that the cornea mirrors, j the place where the mirrored ray arrives, and L_k the radiance that comes
 from outside along the ray that leaves the eye. Both sums depend on the eye alone, and they are linear in its lights.
+
+Limbal tissue is translucent. Of the light that falls on it, a share T goes through and leaves its inner side scattered.
+This side is that of the cornea's rim, as far as the rim has turned to sclera (opacity o), and the chamber's wall:
+
+    E_i += T sum_s (f_is + w_is) E_s,   f_is = integral over the rim's sector s of o cos_i cos / (pi r^2) dA
+
+with E_s the irradiance of the limbus in sector s from outside, and w_is the share of the wall in the view of place i.
 """
 
 from __future__ import annotations
@@ -61,6 +68,49 @@ def chamber_of(eye: EyeModel) -> Chamber:
     sclera = (*np.asarray(eye.sclera.centre_mm).tolist(), float(eye.sclera.radius_mm))
     indices = tuple(float(n) for n in eye.front_indices)
     return _chamber(tuple(eye.front), indices, plane, float(eye.limbus_radius_mm), sclera)
+
+
+def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
+    """Share (PLACES, TURNS) by which light that comes through each sector of the limbal tissue lights each place.
+
+    Args:
+        eye: the eye.
+        chamber: its chamber.
+        width_mm: width of the cornea's rim that turns to sclera.
+    """
+    return _through_limbus(chamber, eye.front[0], float(eye.limbus_radius_mm), float(width_mm))
+
+
+@lru_cache(maxsize=64)
+def _through_limbus(chamber: Chamber, front: Surface, limbus: float, width: float) -> Floats:
+    wall = chamber.exchange[:, IRIS:].reshape(PLACES, TURNS, LEVELS).sum(axis=2)
+    if width == 0:
+        return frozen(wall)
+    rows, fine = 8, 4
+    step, turn = width / rows, 2 * np.pi / (TURNS * fine)
+    share = (np.arange(rows) + 0.5) / rows
+    rho, angle = np.meshgrid(limbus - width * (1 - share), (np.arange(TURNS * fine) + 0.5) * turn, indexing="ij")
+    y, z = rho * np.cos(angle), rho * np.sin(angle)
+    rotation = np.asarray(front.rotation)
+    at = np.asarray(front.origin_mm) + np.stack([front.sag(y, z), y, z], axis=-1) @ rotation.T
+    normal = front.normal(at.reshape(-1, 3)).reshape(at.shape)
+    opacity = (share * share * (3 - 2 * share))[:, None]
+    area = opacity * rho * step * turn / np.abs(normal @ rotation[:, 0])
+    way = at - chamber.points[:, None, None]
+    r2 = np.sum(way * way, axis=-1)
+    here = np.einsum("ijkl,il->ijk", way, chamber.normals)
+    there = np.einsum("ijkl,jkl->ijk", way, normal)
+    seen = np.maximum(here, 0) * np.maximum(there, 0) / (np.pi * r2 * r2) * area
+    sectors = seen.reshape(PLACES, rows, TURNS, fine).sum(axis=(1, 3))
+    return frozen(wall + np.where(chamber.valid[:, None], sectors, 0))
+
+
+def limbus_points(eye: EyeModel) -> tuple[Floats, Floats]:
+    """Points of the limbus, one in the middle of each sector, and the unit normals there (TURNS, 3)."""
+    angle, r = 2 * np.pi * (np.arange(TURNS) + 0.5) / TURNS, float(eye.limbus_radius_mm)
+    front, y, z = eye.front[0], r * np.cos(angle), r * np.sin(angle)
+    at = np.asarray(front.origin_mm) + np.stack([front.sag(y, z), y, z], axis=-1) @ np.asarray(front.rotation).T
+    return at, np.asarray(front.normal(at))
 
 
 def _in_plane(centre: Floats, normal: Floats, y: Floats, z: Floats) -> Floats:

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 
 from ..arrays import Bools, Floats, Ints
 from ..region.globe import Globe
-from .chamber import IRIS, IRIS_RINGS, LEAVING, PLACES, Chamber, chamber_of, shares
+from .chamber import IRIS, IRIS_RINGS, LEAVING, PLACES, Chamber, chamber_of, limbus_points, shares, through_limbus
 from .chamber import TURNS as IRIS_TURNS
 from .frame import RenderJob, globe_of
 from .lighting import onto_points, through_cornea
@@ -230,7 +230,7 @@ class Exchange:
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """The places of a frame: on the globe, on skin or surround (`points`, `normals`), and in the chamber."""
+    """The places of a frame: on the globe, on skin or surround (`points`, `normals`), on the limbus, in the chamber."""
 
     job: RenderJob
     grid: GlobePlaces
@@ -247,14 +247,18 @@ class _Frame:
 
     @property
     def outside(self) -> int:
-        """Number of places outside the chamber."""
-        return len(self.grid.points) + len(self.points)
+        """Number of places outside the chamber; the last ones are on the limbus."""
+        return len(self.grid.points) + len(self.points) + IRIS_TURNS
 
     @property
     def outer(self) -> Floats:
         """Points and normals of the places outside the chamber, (n, 6)."""
-        points, normals = (self.grid.points, self.points), (self.grid.normals, self.normals)
-        return np.column_stack([np.concatenate(points), np.concatenate(normals)])
+        job = self.job
+        rim, facing = limbus_points(job.eye)
+        points = (self.grid.points, self.points, rim @ job.M.T + (job.t - job.anchor_mm))
+        return np.column_stack(
+            [np.concatenate(points), np.concatenate([self.grid.normals, self.normals, facing @ job.M.T])]
+        )
 
     def received(self, tables: tuple[Floats, Floats, Floats]) -> Received:
         """Tables for the kernels."""
@@ -302,10 +306,11 @@ class _Frame:
             look = job.look
             albedo = shares(job.eye, self.chamber, look.pupil_albedo, look.iris_albedo, look.limbus_albedo)
             exchange = self.chamber.exchange * albedo
+            limbus = through_limbus(job.eye, self.chamber, look.limbus_width_mm) * look.limbus_transmittance
             for _ in range(_ROUNDS):
                 arrived = (outside.weight * total[targets[0]]).mean(axis=1)
                 entered = (inside.weight * total[targets[1]]).mean(axis=1)
-                within = exchange @ total[self.outside :]
+                within = exchange @ total[self.outside :] + limbus @ total[self.outside - IRIS_TURNS : self.outside]
                 total = start + np.append(arrived, entered + within)
         numbers = np.zeros((self.outside, 4))
         numbers[:, 0] = (total - start)[: self.outside]
@@ -316,7 +321,7 @@ class _Frame:
         # Between lids the light changes fast from lid to lid, so it is averaged along them only.
         across = (1.0, 1.0 if region is None else 0.0)
         globe = filled(numbers[: self.on_globe], valid, self.grid.rows, self.grid.columns, across)
-        other = numbers[self.on_globe :]
+        other = numbers[self.on_globe : self.outside - IRIS_TURNS]
         if region is not None and self.skin is not None:
             other = self.skin.spread @ other
             region.skin.shine(other)
@@ -360,6 +365,7 @@ def _direct(
     n = _rows(outer)(index)
     x, normal = mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:])
     on_globe = index < dr.opaque(mi.UInt32, frame.on_globe)
+    on_globe |= index >= dr.opaque(mi.UInt32, frame.outside - IRIS_TURNS)
     start = values.point_to_eye(x + _START_MM * normal)
     facing = values.vector_to_eye(normal)
     lit = _over_lamps(lights, index, lambda u, v: onto_points(values, lights, scene, start, facing, ~on_globe, u, v))

@@ -51,11 +51,12 @@ class StopParameters:
 
 @dataclass(frozen=True, slots=True)
 class IrisParameters:
-    """The iris: radius of the root (mm), mean albedo and contrast of the texture."""
+    """The iris: radius of the root (mm), mean albedo, contrast of the texture, darkening at the root."""
 
     root_radius: mi.Float
     albedo: mi.Float
     contrast: mi.Float
+    ring: mi.Float
 
 
 @dataclass(frozen=True, slots=True)

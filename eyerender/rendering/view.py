@@ -30,6 +30,7 @@ EPSILON_MM = 2e-3  # points closer than this are the same in single precision
 _NEAR_MM = 20.0
 _FAR = float(np.finfo(np.float32).max)
 _WET = 0.8  # gloss of the sclera
+_RING = (0.62, 0.95)  # share of the way from the pupil to the root over which a limbal ring grows dark
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,6 +290,8 @@ def iris_albedo(values: Values, textures: Textures, x: mi.Vector3f) -> mi.Float:
     rows = textures.iris.shape[0]
     texture = textures.iris.eval(mi.Point2f(angle, (1 + s * (rows - 2)) / rows))[0]
     albedo = values.iris.albedo * dr.maximum(1 + values.iris.contrast * (texture - 1), 0.02)
+    edge = dr.clip((s - _RING[0]) / (_RING[1] - _RING[0]), 0, 1)
+    albedo *= 1 - values.iris.ring * edge * edge * (3 - 2 * edge)
     return dr.select(left > 0, albedo, values.limbus.albedo)
 
 

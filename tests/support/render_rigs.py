@@ -31,8 +31,16 @@ BLACK = Look(
     limbus_albedo=0.0,
     backdrop_albedo=0.0,
     limbus_width_mm=0.0,
+    limbus_transmittance=0.0,
 )
-PLAIN = Look(fundus=NO_FUNDUS, pupil_albedo=0.02, iris_contrast=0.0, sclera_contrast=0.0, backdrop_contrast=0.0)
+PLAIN = Look(
+    fundus=NO_FUNDUS,
+    pupil_albedo=0.02,
+    iris_contrast=0.0,
+    sclera_contrast=0.0,
+    backdrop_contrast=0.0,
+    limbus_transmittance=0.0,
+)
 
 
 @dataclass(frozen=True)
