@@ -63,8 +63,8 @@ class Look(Spec):
     sclera_contrast: Contrast = Field(default=1.0, description="contrast of vessels and unevenness (chosen)")
     limbus_albedo: Albedo = Field(
         default=0.34,
-        description="albedo of the tissue where the cornea merges into the sclera (chosen so that the limbus has no dark "
-        "ring, as in most near-infrared photographs)",
+        description="albedo of the tissue where the cornea merges into the sclera (chosen so that the limbus has no "
+        "dark ring, as in most near-infrared photographs)",
     )
     limbus_width_mm: Annotated[float, Field(ge=0, le=3)] = Field(
         default=0.8,
@@ -72,7 +72,7 @@ class Look(Spec):
     )
     limbus_transmittance: Annotated[float, Field(ge=0, le=0.9)] = Field(
         default=0.4,
-        description="share of the light on the limbal tissue that it lets through, scattered, into the eye (Vogel et al. "
+        description="share of the light on the limbal tissue that it lets through into the eye (Vogel et al. "
         "1991, Lasers Surg. Med. 11, 331: sclera of full thickness 35 % at 804 nm and 53 % at 1064 nm)",
     )
     limbal_ring: Annotated[float, Field(ge=0, le=1)] = Field(
