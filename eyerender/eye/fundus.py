@@ -113,18 +113,33 @@ def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: 
         aside = _direction(lamp / distance, out_of_pupil, plane)
         if np.linalg.norm(aside) > reach + np.abs(blur * q).max() * 1e-3:
             continue
-        theta_l = aside + blur * q * 1e-3
-        gap = np.linalg.norm(theta_c[..., None, :] - theta_l, axis=-1)
         # The light of a node comes from all over its cell.
         sigma = np.hypot(spread.blur_rad, abs(blur) * cell_mm * 1e-3 / np.sqrt(12))
-        core = np.exp(-0.5 * (gap / sigma) ** 2) / (2 * np.pi * sigma**2)
-        halo = np.exp(-gap / spread.halo_rad) / (2 * np.pi * spread.halo_rad**2)
-        kernel = (1 - spread.halo_share) * core + spread.halo_share * halo
-        factors[k] = kernel.sum(-1) * weight
+        core, halo = _sums(theta_c, aside + blur * q * 1e-3, sigma, spread.halo_rad)
+        core *= (1 - spread.halo_share) / (2 * np.pi * sigma**2)
+        halo *= spread.halo_share / (2 * np.pi * spread.halo_rad**2)
+        factors[k] = (core + halo) * weight
     f, index = retinal_scale_mm(eye), _inner_index(eye)
     rho = spread.reflectance * _relative_reflectance(eye, out_of_pupil, plane, theta_c, spread.disc_gain)
     even = len(nodes) * weight * spread.reflectance / (1 - spread.reflectance) / _retina_area_mm2(eye)
     return FundusLight(rho * (factors / f**2 + even) / (np.pi * index**2))
+
+
+def _sums(seen: Floats, lit: Floats, sigma: float, fall: float) -> tuple[Floats, Floats]:
+    """Sums over places `lit` (n, 2) of exp(-g^2 / 2 sigma^2) and exp(-g / fall), g their gap to places `seen` (..., 2).
+
+    In single precision, in which exponentials take a tenth of the time; sums of hundreds of them are good to 1e-6.
+    """
+    x, y = (np.subtract.outer(seen[..., k].astype(np.float32), lit[:, k].astype(np.float32)) for k in (0, 1))
+    x *= x
+    y *= y
+    square, ones = np.add(x, y, out=x), np.ones(len(lit), np.float32)
+    np.multiply(square, np.float32(-0.5 / sigma**2), out=y)
+    core = np.exp(y, out=y) @ ones
+    np.sqrt(square, out=square)
+    square *= np.float32(-1 / fall)
+    halo = np.exp(square, out=square) @ ones
+    return np.asarray(core, dtype=float), np.asarray(halo, dtype=float)
 
 
 def retinal_scale_mm(eye: EyeModel) -> float:

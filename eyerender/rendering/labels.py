@@ -13,7 +13,7 @@ from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..rig.camera import Window
 from .film import Exposed, pixels_of
 from .sampling import camera_ray
-from .view import meet
+from .view import hidden, meet, meet_globe
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,12 +23,10 @@ class PartLabels(ArrayValue):
     Attributes:
         part: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 what frames the camera's view.
         amodal: the same for the eye alone, without occluders.
-        depth_mm: distance from the nodal point to the first surface, infinite where there is none.
     """
 
     part: Bytes
     amodal: Bytes
-    depth_mm: Singles
 
     def behind(self, covered: Bools) -> PartLabels:
         """The labels where what frames the camera's view covers the pixels (height, width)."""
@@ -42,24 +40,28 @@ class PartLabels(ArrayValue):
 
 
 def part_labels(shown: Exposed, window: Window) -> PartLabels:
-    """Compute the labels of a window."""
-    width, height = window[2:]
-    u, v = pixels_of(dr.arange(mi.UInt32, width * height), window)
-    o, d, _ = camera_ray(shown.values, mi.Float(u), mi.Float(v))
+    """Compute the labels of a window. Rays that miss the globe are not traced."""
+    o, d = _centre_rays(shown, window)
+    alone = meet_globe(shown.values, o, d)
+    clear = alone.cornea & (alone.opacity < 0.5)
+    inside = dr.select(alone.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
+    amodal = dr.select(clear, inside, dr.select(alone.cornea | alone.sclera, mi.UInt8(SCLERA), mi.UInt8(BACKGROUND)))
+    part = dr.select(hidden(shown.scene, alone, o, d), mi.UInt8(BACKGROUND), amodal)
+    dr.eval(amodal, part)
+    shape = (window[3], window[2])
+    return PartLabels(*(frozen(x.numpy().reshape(shape), np.uint8) for x in (part, amodal)))
+
+
+def depths_mm(shown: Exposed, window: Window) -> Singles:
+    """Distances (height, width) of the first surfaces from the nodal point, infinite where there is none."""
+    o, d = _centre_rays(shown, window)
     view, _ = meet(shown.values, shown.scene, o, d, True)
-    clear = view.amodal_cornea & (view.opacity < 0.5)
-    amodal = dr.select(
-        view.amodal_cornea | view.amodal_sclera,
-        dr.select(clear, dr.select(view.pupil, mi.UInt32(PUPIL), mi.UInt32(IRIS)), mi.UInt32(SCLERA)),
-        mi.UInt32(BACKGROUND),
-    )
-    eye = view.cornea | view.sclera
-    part = dr.select(eye, amodal, mi.UInt32(BACKGROUND))
-    depth = dr.select(eye | view.other, view.distance, dr.inf)
-    dr.eval(amodal, part, depth)
-    shape = (height, width)
-    return PartLabels(
-        frozen(part.numpy().reshape(shape), np.uint8),
-        frozen(amodal.numpy().reshape(shape), np.uint8),
-        frozen(depth.numpy().reshape(shape), np.float32),
-    )
+    depth = dr.select(view.met, view.distance, dr.inf)
+    return frozen(depth.numpy().reshape(window[3], window[2]), np.float32)
+
+
+def _centre_rays(shown: Exposed, window: Window) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Camera rays through the centres of a window's pixels."""
+    u, v = pixels_of(dr.arange(mi.UInt32, window[2] * window[3]), window)
+    o, d, _ = camera_ray(shown.values, mi.Float(u), mi.Float(v))
+    return o, d

@@ -21,7 +21,7 @@ from .film import Exposed, mean_parts, mean_radiance
 from .frame import RenderJob
 from .glints import GlintTable
 from .integrator import integrator_class
-from .labels import PartLabels, part_labels
+from .labels import PartLabels, depths_mm, part_labels
 from .lighting import through_cornea
 from .occlusion import lid_margins_px
 from .region import RegionScene
@@ -169,6 +169,10 @@ class Renderer:
     def labels(self, job: RenderJob) -> PartLabels:
         """Compute the labels of a window alone."""
         return part_labels(self.bind(job, lit=False)[0], job.window)
+
+    def depths_mm(self, job: RenderJob) -> Singles:
+        """Distances (height, width) from the nodal point of what a window shows, infinite where that is nothing."""
+        return depths_mm(self.bind(job, lit=False)[0], job.window)
 
     def bind(self, job: RenderJob, *, lit: bool = True) -> tuple[Exposed, Surround | RegionScene]:
         """Set up a job's frame on the device, with the surroundings of its eye.

@@ -48,8 +48,6 @@ class View:
     passed: mi.Float  # transmittance of the refracted branch, 0 where it does not reach the plane of the iris
     inner: mi.Vector3f  # point in the plane of the iris
     pupil: mi.Bool  # the inner point lies in the pupil
-    amodal_cornea: mi.Bool  # as if the eye stood alone
-    amodal_sclera: mi.Bool
     albedo: mi.Float  # of the region's mesh, where there is one
     gloss: mi.Float  # likewise, and of the wet sclera
     received: mi.Vector4f  # of the region's mesh: what it receives from other surfaces (see `exchange`)
@@ -147,6 +145,34 @@ def meet(
 
     coherent: whether neighbouring rays are alike, as those of a camera.
     """
+    alone = meet_globe(values, o, d)
+    ray = _ray(alone, o, d)  # whatever is behind the eye does not matter
+    hit = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+    clear = ~hit.is_valid() & active
+    on_cornea, on_sclera = alone.cornea & clear, alone.sclera & clear
+    other = hit.is_valid() & active
+    return replace(
+        alone, cornea=on_cornea, sclera=on_sclera, other=other, distance=dr.select(other, hit.t, alone.distance)
+    ), hit
+
+
+def hidden(scene: mi.Scene, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
+    """Whether anything of the scene is in front of the globe, where the rays of `meet_globe` meet it."""
+    met = alone.cornea | alone.sclera
+    return dr.if_stmt(
+        (), met, lambda: scene.ray_test(_ray(alone, o, d), coherent=True, active=True), lambda: mi.Bool(False)
+    )
+
+
+def _ray(alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Ray3f:
+    """Rays as far as the globe."""
+    ray = mi.Ray3f(mi.Point3f(o), d)
+    ray.maxt = alone.distance
+    return ray
+
+
+def meet_globe(values: Values, o: mi.Vector3f, d: mi.Vector3f) -> View:
+    """View of the globe along rays, as if it stood alone; the distance of rays that miss it has no bound."""
     # In single precision the ray must start next to the eye.
     t0 = -dr.dot(o, d) - _NEAR_MM
     oe, de = values.point_to_eye(o + t0 * d), values.vector_to_eye(d)
@@ -162,40 +188,31 @@ def meet(
     on_cornea &= ~on_sclera | (tc < ts)
     on_sclera &= ~on_cornea
     t_eye = t0 + dr.select(on_cornea, tc, ts)
-    amodal_cornea, amodal_sclera = on_cornea & (t_eye > EPSILON_MM), on_sclera & (t_eye > EPSILON_MM)
-    on_eye = amodal_cornea | amodal_sclera
-    ray = mi.Ray3f(mi.Point3f(o), d)
-    ray.maxt = dr.select(on_eye, t_eye, _FAR)  # whatever is behind the eye does not matter
-    hit = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
-    on_eye &= ~hit.is_valid() & active
-    on_cornea &= on_eye
-    on_sclera &= on_eye
+    on_cornea &= t_eye > EPSILON_MM
+    on_sclera &= t_eye > EPSILON_MM
     normal, mirrored, passed, inner, pupil = dr.if_stmt(
         (facing, oe + tc * de, dl),
-        amodal_cornea,
+        on_cornea,
         lambda facing, y, dl: _refracted(values, facing, y, dl),
         lambda facing, y, dl: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Bool(False)),
     )
     xs = oe + ts * de
-    view = View(
+    return View(
         cornea=on_cornea,
         sclera=on_sclera,
-        other=hit.is_valid() & ~on_eye & active,
-        distance=dr.select(on_eye, t_eye, hit.t),
+        other=mi.Bool(False),
+        distance=dr.select(on_cornea | on_sclera, t_eye, _FAR),
         point=dr.select(on_cornea, oe + tc * de, xs),
         normal=dr.normalize(dr.select(on_cornea, normal, xs - values.sclera.centre)),
-        opacity=dr.select(amodal_cornea, opacity(values, rho), 1),
+        opacity=dr.select(on_cornea, opacity(values, rho), 1),
         mirrored=mirrored,
         passed=passed,
         inner=inner,
         pupil=pupil,
-        amodal_cornea=amodal_cornea,
-        amodal_sclera=amodal_sclera,
         albedo=mi.Float(0),
         gloss=mi.Float(_WET),
         received=mi.Vector4f(0),
     )
-    return view, hit
 
 
 def look_at_skin(
@@ -224,8 +241,6 @@ def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector
         passed=nothing,
         inner=mi.Vector3f(0),
         pupil=no,
-        amodal_cornea=no,
-        amodal_sclera=no,
         albedo=nothing,
         gloss=mi.Float(_WET),
         received=mi.Vector4f(0),

@@ -152,7 +152,7 @@ def test_the_opening_is_where_its_edge_projects(renderer, folder, side):
     pixels = np.column_stack([u[skin], v[skin]]) + image.window[:2]
     rays, node = camera.rays(pixels.astype(float)), camera.nodal_point_mm - apex
     distance = (X_MM - node[0]) / rays[:, 0]
-    np.testing.assert_allclose(image.rendered.labels.depth_mm[skin], distance, rtol=1e-5)
+    np.testing.assert_allclose(renderer.depths_mm(render_job(scene.frames(), 0))[skin], distance, rtol=1e-5)
     # The second lamp's glint lies high on the cornea, under the upper lid; the first stands free.
     labels = labels_of(image)
     assert [g["reason"] for g in labels["glints"]] == ["visible", "occluded by lid"]
