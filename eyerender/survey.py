@@ -38,12 +38,12 @@ MOST_FACES = 64
 _SHOWN = (
     "age_years", "refraction_d", "refraction_j0_d", "axial_length_mm", "corneal_radius_mm", "corneal_asphericity",
     "posterior_radius_mm", "corneal_thickness_mm", "chamber_depth_mm", "lens_thickness_mm", "lens_front_radius_mm",
-    "lens_back_radius_mm", "alpha_horizontal_deg", "alpha_vertical_deg", "iris_diameter_mm", "ipd_mm",
+    "lens_back_radius_mm", "kappa_horizontal_deg", "kappa_vertical_deg", "iris_diameter_mm", "ipd_mm",
     "entrance_pupil_mm", "rotation_azimuth_mm", "pupil_nasal_mm", "fissure.width_mm",
 )  # fmt: skip
 _MATRIX = (
     "refraction_d", "age_years", "axial_length_mm", "corneal_radius_mm", "posterior_radius_mm", "chamber_depth_mm",
-    "lens_thickness_mm", "lens_front_radius_mm", "alpha_horizontal_deg", "iris_diameter_mm", "entrance_pupil_mm",
+    "lens_thickness_mm", "lens_front_radius_mm", "kappa_horizontal_deg", "iris_diameter_mm", "entrance_pupil_mm",
     "lens_c0",
 )  # fmt: skip
 _FACE_RIG = {

@@ -8,20 +8,25 @@ is the direction of the line of sight from that axis (Le Grand called it lambda)
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.optimize import root
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..geometry.transforms import normalize
 from ..optics.trace import inward_path, trace
 from ..status import Status
+from .landmarks import field_direction, fovea_by_nodal_ray, path_to_retina
 from .model import EyeModel
 from .parts import FoveaSpec
 from .spec import EyeSpec
 
 _START_MM = 20.0
-_STEPS = 12
-_SETTLED_DEG = 1e-9
+_STEP_RAD = 1e-4
+_STEPS = 8
+_SETTLED_MM = 1e-9
 
 
 def pupillary_axis(eye: EyeModel) -> tuple[Floats, Floats]:
@@ -30,26 +35,7 @@ def pupillary_axis(eye: EyeModel) -> tuple[Floats, Floats]:
     Raises:
         InputError: the cornea has no such axis.
     """
-    front, stop = eye.front[0], eye.stop
-    path = inward_path(eye.front, eye.front_indices)
-
-    def ray(place: Floats) -> tuple[Floats, Floats]:
-        point = front.to_eye(np.array([float(front.sag(*place)), *place]))
-        return point, front.normal(point)
-
-    def miss(place: Floats) -> Floats:
-        point, normal = ray(place)
-        traced = trace(path, 1.0, point + _START_MM * normal, -normal)
-        if traced.status != Status.OK:
-            return np.full(2, 1e3)
-        end, way = traced.points_mm[-1], traced.directions[-1]
-        gap = end + way * (((stop.centre_mm - end) @ stop.normal) / (way @ stop.normal)) - stop.centre_mm
-        return np.asarray(stop.rotation[:, 1:].T @ gap)
-
-    found = root(miss, np.array(stop.centre_mm[1:]), tol=1e-14)
-    if not np.linalg.norm(miss(found.x)) < 1e-9:
-        raise InputError("the cornea has no pupillary axis", path="stop.position_mm")
-    return ray(found.x)
+    return _through_stop(eye, lambda point: np.asarray(eye.front[0].normal(point)), "the cornea has no pupillary axis")
 
 
 def kappa_deg(eye: EyeModel) -> tuple[float, float]:
@@ -59,13 +45,29 @@ def kappa_deg(eye: EyeModel) -> tuple[float, float]:
         InputError: the cornea has no pupillary axis.
     """
     _, axis = pupillary_axis(eye)
-    nasal = 1.0 if eye.side == "right" else -1.0
-
-    def angles(way: Floats) -> Floats:
-        return np.degrees([nasal * np.arctan2(way[1], way[0]), np.arctan2(way[2], way[0])])
-
-    horizontal, vertical = angles(eye.chief_ray.direction) - angles(axis)
+    horizontal, vertical = np.degrees(_angles(eye, eye.chief_ray.direction) - _angles(eye, axis))
     return float(horizontal), float(vertical)
+
+
+def fovea_of_kappa(eye: EyeModel, wanted_deg: tuple[float, float]) -> Floats:
+    """Where the fovea (3,) must lie for an angle kappa: the retina's point on that line of sight.
+
+    Args:
+        eye: the eye, whose own fovea does not matter.
+        wanted_deg: kappa (horizontal, vertical), nasal and up.
+
+    Raises:
+        InputError: the eye has no such line of sight.
+    """
+    reason = "no place of the fovea gives this angle"
+    _, axis = pupillary_axis(eye)
+    nasal, up = _angles(eye, axis) + np.radians(wanted_deg)
+    way = field_direction(np.array([_handed(eye) * nasal, up]))
+    point, _ = _through_stop(eye, lambda _: way, reason)
+    traced = trace(path_to_retina(eye), 1.0, point + _START_MM * way, -way)
+    if traced.status != Status.OK:
+        raise InputError(reason, path="kappa_deg")
+    return np.asarray(traced.points_mm[-1])
 
 
 def with_kappa(spec: EyeSpec, wanted_deg: tuple[float, float], *, wavelength_nm: float = 850.0) -> EyeSpec:
@@ -79,18 +81,78 @@ def with_kappa(spec: EyeSpec, wanted_deg: tuple[float, float], *, wavelength_nm:
     Raises:
         InputError: no place of the fovea gives this angle.
     """
-    field = np.array(spec.fovea.field_deg, dtype=np.float64)
+    eye = spec.build(wavelength_nm=wavelength_nm)
+    alpha = alpha_deg(eye, fovea_of_kappa(eye, wanted_deg), distance_mm=spec.fovea.distance_mm)
+    fovea = FoveaSpec(field_deg=alpha, distance_mm=spec.fovea.distance_mm)
+    return spec.replaced("kappa_deg", {"fovea": fovea.to_mapping()})
+
+
+def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: float = 1500.0) -> tuple[float, float]:
+    """Angles (horizontal, vertical) of the nodal ray that ends on the fovea, nasal and up, in degrees.
+
+    Args:
+        eye: the eye.
+        fovea_mm: (3,) a fovea; default: the eye's own.
+        distance_mm: distance of the nodal ray's object from the corneal apex.
+
+    Raises:
+        InputError: no nodal ray ends there.
+    """
+    wanted = eye.fovea_mm if fovea_mm is None else fovea_mm
+
+    def miss(field: Floats) -> Floats:
+        return (fovea_by_nodal_ray(eye, eye.incident_node_mm, field, distance_mm) - wanted)[1:]
+
+    # A nodal ray has the same direction on both sides, so it starts near that of the fovea from the node.
+    field = _angles(eye, normalize(eye.incident_node_mm - wanted)) * [_handed(eye), 1.0]
     for _ in range(_STEPS):
-        turned = spec.replaced("kappa_deg", {"fovea": _fovea(spec, field)})
-        error = np.array(wanted_deg) - kappa_deg(turned.build(wavelength_nm=wavelength_nm))
-        if np.abs(error).max() < _SETTLED_DEG:
-            return turned
-        # Alpha and kappa change by nearly the same angle.
-        field = field + error
-    raise InputError("no place of the fovea gives this angle", path="kappa_deg")
+        error = miss(field)
+        if np.abs(error).max() < _SETTLED_MM:
+            horizontal, vertical = np.degrees(field)
+            return float(_handed(eye) * horizontal), float(vertical)
+        slope = np.column_stack([(miss(field + _STEP_RAD * unit) - error) / _STEP_RAD for unit in np.eye(2)])
+        field = field - np.linalg.solve(slope, error)
+    raise InputError("no nodal ray ends there", path="fovea")
 
 
-def _fovea(spec: EyeSpec, field_deg: Floats) -> dict[str, object]:
-    return FoveaSpec(
-        field_deg=(float(field_deg[0]), float(field_deg[1])), distance_mm=spec.fovea.distance_mm
-    ).to_mapping()
+def _through_stop(eye: EyeModel, way: Callable[[Floats], Floats], reason: str) -> tuple[Floats, Floats]:
+    """Point of the cornea and outward direction of the ray that leads, refracted, through the centre of the stop.
+
+    Args:
+        eye: the eye.
+        way: outward unit direction (3,) of the ray that meets the cornea at a point (3,).
+        reason: what an error says.
+
+    Raises:
+        InputError: there is no such ray.
+    """
+    front, stop = eye.front[0], eye.stop
+    path = inward_path(eye.front, eye.front_indices)
+
+    def ray(place: Floats) -> tuple[Floats, Floats]:
+        point = front.to_eye(np.array([float(front.sag(*place)), *place]))
+        return point, way(point)
+
+    def miss(place: Floats) -> Floats:
+        point, direction = ray(place)
+        traced = trace(path, 1.0, point + _START_MM * direction, -direction)
+        if traced.status != Status.OK:
+            return np.full(2, 1e3)
+        end, inside = traced.points_mm[-1], traced.directions[-1]
+        gap = end + inside * (((stop.centre_mm - end) @ stop.normal) / (inside @ stop.normal)) - stop.centre_mm
+        return np.asarray(stop.rotation[:, 1:].T @ gap)
+
+    found = root(miss, np.array(stop.centre_mm[1:]), tol=1e-14)
+    if not np.linalg.norm(miss(found.x)) < _SETTLED_MM:
+        raise InputError(reason, path="stop.position_mm")
+    return ray(found.x)
+
+
+def _angles(eye: EyeModel, way: Floats) -> Floats:
+    """Angles (2,) rad of a direction from the optic axis, nasal and up: it is along (1, tan h, tan v)."""
+    return np.asarray(np.arctan2([_handed(eye) * way[1], way[2]], way[0]))
+
+
+def _handed(eye: EyeModel) -> float:
+    """1 for a right eye, whose +y is nasal, and -1 for a left one."""
+    return 1.0 if eye.side == "right" else -1.0

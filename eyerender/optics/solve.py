@@ -262,7 +262,7 @@ def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target
         few = [taken(crossing, rows[0][part]) for crossing in path]
         indices = [crossing.n_after for crossing in few]
         outward = outward_path([crossing.surface for crossing in few], indices, n_outside)
-        out = trace(outward, indices[-1], ends[part, None, :], _CONE)
+        out = trace(outward, indices[-1], ends[part, None, :], _CONE[None])
         gap = places[part, None, :] - out.points_mm[-1]
         with np.errstate(all="ignore"):
             cosine = np.sum(gap * out.directions[-1], axis=-1) / np.linalg.norm(gap, axis=-1)

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..eye.build import index_at, stop_of, surface_of
+from ..eye.build import bare_eye, index_at, stop_of, surface_of
 from ..eye.entrance import stop_for_entrance
+from ..eye.kappa import fovea_of_kappa
 from ..eye.margin import drawn_contour
 from ..eye.parts import EyeParts
 from ..eye.spec import EyeSpec
@@ -57,6 +58,7 @@ def eye_file(
     if not np.isfinite(eye["lens_c0"]):
         raise InputError("no lens of this shape gives the eye its refraction", path="lens.surfaces.0.medium")
     data = _mapping(name, eye, table, age_years, accommodation_d)
+    data["fovea"] = _fovea(eye, _mapping(name, eye, table, age_years, 0.0), table.constant("refraction_nm"))
     contour = drawn_contour(seed, eye["pupil_noncircularity"])
     data["stop"]["contour"] = contour.to_mapping()
     parts = EyeParts.from_mapping(data)
@@ -82,7 +84,7 @@ def eye_file(
 
 
 def _mapping(name: str, eye: Mapping[str, float], table: Table, age: float, accommodation: float) -> dict[str, Any]:
-    """The keys of the eye file, with the stop at the table's reference diameter."""
+    """The keys of the eye file, with the stop at the table's reference diameter, and the fovea on the optic axis."""
     constant = table.constant
     thicker = (LENS_MM_PER_D + LENS_MM_PER_D_YEAR * age) * accommodation
     lens_front = -(eye["chamber_depth_mm"] - FORWARD * thicker)
@@ -162,8 +164,21 @@ def _mapping(name: str, eye: Mapping[str, float], table: Table, age: float, acco
             "azimuth_centre_mm": [-eye["rotation_azimuth_mm"], constant("rotation_nasal_mm"), 0.0],
             "elevation_centre_mm": [-eye["rotation_elevation_mm"], 0.0, constant("rotation_up_mm")],
         },
-        "fovea": {"field_deg": [eye["alpha_horizontal_deg"], eye["alpha_vertical_deg"]]},
+        "fovea": {},
     }
+
+
+def _fovea(eye: Mapping[str, float], relaxed: dict[str, Any], wavelength_nm: float) -> dict[str, Any]:
+    """Place of the fovea, from the angle kappa of the relaxed eye with the stop at the table's reference diameter.
+
+    So it stays where it is when pupil and lens change. Numbers of people drawn with version 0.1 have the angle alpha.
+    """
+    if "kappa_horizontal_deg" not in eye:
+        return {"field_deg": [eye["alpha_horizontal_deg"], eye["alpha_vertical_deg"]]}
+    parts = EyeParts.from_mapping(relaxed)
+    bare = bare_eye(parts, wavelength_nm, stop_of(parts, parts.stop.diameter_mm))
+    kappa = (eye["kappa_horizontal_deg"], eye["kappa_vertical_deg"])
+    return {"position_mm": [float(v) for v in fovea_of_kappa(bare, kappa)]}
 
 
 def _toric(flat_mm: float, steep_mm: float, axis_deg: float, asphericity: float) -> dict[str, Any]:

@@ -22,11 +22,6 @@ FARTHEST = 8.0
 """Standard normal numbers are cut here; beyond it lies one of 1e15."""
 
 
-def nodes() -> tuple[Floats, Floats]:
-    """Points and weights of a mean over a standard normal number."""
-    return _NODES, _WEIGHTS
-
-
 class _Marginal(Spec):
     def at(self, z: Floats) -> Floats:
         """Values of standard normal numbers."""

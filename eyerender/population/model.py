@@ -23,7 +23,6 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..eye.parts import Side
 from .correlation import completed, nearest_correlation
-from .marginals import nodes
 from .table import ROOTS, Distribution, Pair, Quantity, Regression, Table, default_table
 
 SIDES: tuple[Side, Side] = ("right", "left")
@@ -139,7 +138,7 @@ class Model:
         assert isinstance(found, Regression)
         shape = (len(latent),) if len(places) == 1 else (len(latent), 2)
         roots: dict[str, Floats] = {}
-        for root in {*found.slopes, *(("refraction_d",) if found.tangent is not None else ())}:
+        for root in found.slopes:
             value = self.value(root, latent) if known is None else known[root]
             if value.ndim > len(shape):
                 value = value.mean(axis=1)
@@ -181,10 +180,6 @@ class Model:
 def regressed(found: Regression, roots: Mapping[str, Floats]) -> Floats:
     """Mean of a regression at values of its predictors."""
     mean: Floats = np.asarray(found.mean)
-    if found.tangent is not None:
-        t = found.tangent
-        scale = t.node_mm / (t.node_mm + t.slope * roots["refraction_d"])
-        mean = np.degrees(np.arctan(scale * np.tan(np.radians(found.mean))))
     for root, slope in found.slopes.items():
         mean = mean + slope * (roots[root] - found.about[root])
     return np.asarray(mean)
@@ -210,7 +205,6 @@ def _resolved(name: str, quantity: Quantity, table: Table, about: Mapping[str, f
         residual_sd=1.0 if quantity.residual_sd is None else quantity.residual_sd,
         slopes=quantity.slopes,
         about={root: about[root] for root in quantity.slopes},
-        tangent=quantity.tangent,
     )
     if quantity.residual_sd is not None:
         return bare
@@ -233,47 +227,17 @@ def _latent(pair: Pair, table: Table, found: Mapping[str, Distribution]) -> floa
     return float(np.clip(rest / (a.residual_sd * b.residual_sd), -0.999, 0.999))
 
 
-def _by_refraction(found: Regression, roots: Mapping[str, Distribution]) -> Floats:
-    """Mean of a regression at the refraction's nodes, with the other predictors where they have no effect."""
-    z, _ = nodes()
-    refraction = _at(roots["refraction_d"], z)
-    own = Regression(
-        mean=found.mean,
-        residual_sd=1.0,
-        tangent=found.tangent,
-        slopes={k: v for k, v in found.slopes.items() if k == "refraction_d"},
-        about={k: v for k, v in found.about.items() if k == "refraction_d"},
-    )
-    return np.broadcast_to(regressed(own, {"refraction_d": refraction}), z.shape)
-
-
 def _explained(a: Regression, b: Regression, roots: Mapping[str, Distribution]) -> float:
     """Covariance of the means of two regressions; the predictors are independent of each other."""
-    total = 0.0
-    for root in ("age_years", "male"):
-        marginal = roots[root]
-        assert not isinstance(marginal, Regression)
-        total += a.slopes.get(root, 0.0) * b.slopes.get(root, 0.0) * marginal.moments[1] ** 2
-    _, weight = nodes()
-    first, second = _by_refraction(a, roots), _by_refraction(b, roots)
-    return total + float(weight @ ((first - weight @ first) * (second - weight @ second)))
+    shared = a.slopes.keys() & b.slopes.keys()
+    return sum(a.slopes[root] * b.slopes[root] * _moments(roots[root])[1] ** 2 for root in sorted(shared))
 
 
 def _mean(found: Regression, roots: Mapping[str, Distribution]) -> float:
-    total = float(nodes()[1] @ _by_refraction(found, roots))
-    for root in ("age_years", "male"):
-        if root in found.slopes:
-            marginal = roots[root]
-            assert not isinstance(marginal, Regression)
-            total += found.slopes[root] * (marginal.moments[0] - found.about[root])
-    return total
+    shifts = (slope * (_moments(roots[root])[0] - found.about[root]) for root, slope in found.slopes.items())
+    return found.mean + sum(shifts)
 
 
 def _moments(found: Distribution) -> tuple[float, float]:
     assert not isinstance(found, Regression)
     return found.moments
-
-
-def _at(found: Distribution, z: Floats) -> Floats:
-    assert not isinstance(found, Regression)
-    return found.at(z)

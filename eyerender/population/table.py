@@ -27,13 +27,6 @@ class Source(Spec):
     text: str = Field(description="the source, and what it says")
 
 
-class Tangent(Spec):
-    """Mean of an angle that shrinks as the eye grows: atan(d / (d + s S) tan(mean)), S the refraction."""
-
-    node_mm: Positive = Field(description="distance d of the fovea from the node")
-    slope: Number = Field(description="change s of that distance per dioptre")
-
-
 class Regression(Spec):
     """Mean + sum of slopes (predictor - its `about`) + a normal residual."""
 
@@ -42,7 +35,6 @@ class Regression(Spec):
     residual_sd: Positive = Field(description="standard deviation about the regression")
     slopes: dict[str, Number] = Field(default_factory=dict, description="predictor -> change per unit")
     about: dict[str, Number] = Field(default_factory=dict, description="predictor -> value at which the mean holds")
-    tangent: Tangent | None = Field(default=None, description="for an angle: how its mean depends on the refraction")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -79,7 +71,6 @@ class Quantity(Spec):
     sd: Positive | None = Field(default=None, description="standard deviation of the reference population")
     residual_sd: Positive | None = Field(default=None, description="standard deviation about the regression")
     slopes: dict[str, Number] = Field(default_factory=dict, description="predictor -> change per unit")
-    tangent: Tangent | None = Field(default=None, description="for an angle: how its mean depends on the refraction")
     eyes: Correlation = Field(default=0.9, description="correlation of the two eyes' residuals")
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = Field(description="where the numbers come from")
 

@@ -8,6 +8,7 @@ import pytest
 import eyerender as er
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.entrance import entrance_pupil_mm
+from eyerender.eye.kappa import alpha_deg, kappa_deg
 from eyerender.eye.refraction import refraction_d
 from eyerender.population.people import biometry
 from eyerender.population.pupil import watson_yellott_mm
@@ -150,3 +151,39 @@ def test_an_eye_that_cannot_be_names_the_reason(people):
     shallow = {**person.numbers, "chamber_depth_mm": (0.6, 0.6)}
     with pytest.raises(er.InputError):
         person.model_copy(update={"numbers": shallow}).eye("right")
+
+
+def test_the_fovea_gives_the_drawn_kappa(people):
+    """The line of sight from the pupillary axis, by tracing outwards from the fovea, which was found inwards."""
+    for row in range(3):
+        person = people.person(row)
+        for side in ("right", "left"):
+            eye = person.eye(side).build(eye=side, wavelength_nm=555.0, pupil_diameter_mm=4.0)
+            wanted = [person.number(f"kappa_{way}_deg", side) for way in ("horizontal", "vertical")]
+            assert kappa_deg(eye) == pytest.approx(wanted, abs=1e-8)
+
+
+def test_the_fovea_stays_when_pupil_and_lens_change():
+    person = er.Population("adults", where={"age_years": 22}).person(1, 4)
+    far, near = person.eye("right", luminance_cd_m2=0.1), person.eye("right", luminance_cd_m2=500.0, demand_d=4.0)
+    assert far.lens != near.lens
+    assert far.fovea == near.fovea
+    # It lies on the retina.
+    assert abs(float(far.build().retina.implicit(np.array(far.fovea.position_mm)))) < 1e-9
+
+
+def test_alpha_of_drawn_eyes_is_that_of_the_literature(people):
+    """Kappa and the pupil's place are drawn; by Purkinje images of 9 emmetropes, alpha is 5.7 deg towards the nose."""
+    eyes = [people.person(row).eye("right").build() for row in range(25)]
+    horizontal, vertical = np.mean([alpha_deg(eye) for eye in eyes], axis=0)
+    # The standard error of 25 eyes is 0.3 deg.
+    assert horizontal == pytest.approx(5.6, abs=1.0)
+    assert abs(vertical) < 2.0
+
+
+def test_a_person_drawn_with_alpha_still_has_eyes(people):
+    person = people.person(0)
+    numbers = {k: v for k, v in person.numbers.items() if not k.startswith("kappa")}
+    numbers |= {"alpha_horizontal_deg": (5.0, 6.0), "alpha_vertical_deg": (2.0, 1.0)}
+    old = person.model_copy(update={"numbers": numbers})
+    assert alpha_deg(old.eye("left").build()) == pytest.approx((6.0, 1.0), abs=1e-8)

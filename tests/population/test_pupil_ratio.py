@@ -10,31 +10,49 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.analytic.features import features
+from eyerender.analytic.features import Features, features
 from eyerender.eye.fixation import fixations
+from eyerender.eye.model import EyeModel
 
 PEOPLE, AWAY_MM, PUPIL_MM = 40, 800.0, -3.0
 
 
+def wide_pupils(count: int, luminance: float) -> list[EyeModel]:
+    people = er.Population("adults").draw(count, 3)
+    return [people.person(k).eye("right", luminance_cd_m2=luminance).build() for k in range(count)]
+
+
+def seen_from(angle_deg: float, eyes: list[EyeModel]) -> Features:
+    """Features of eyes that fixate 3 m ahead, for a camera so far beside the line of sight."""
+    every, zero = np.arange(len(eyes)), np.zeros((len(eyes), 3))
+    poses = fixations(eyes, every, np.broadcast_to([3000.0, 0.0, 0.0], zero.shape), zero).poses
+    f = np.radians(angle_deg)
+    camera = er.Camera(
+        position_mm=(PUPIL_MM + AWAY_MM * np.cos(f), AWAY_MM * np.sin(f), 0.0),
+        look_at_mm=(PUPIL_MM, 0.0, 0.0),
+        focal_length_px=25 * AWAY_MM,
+        resolution_px=(2000, 2000),
+    ).build()
+    return features(eyes, every, poses, zero, [camera], np.zeros(len(eyes), dtype=int), np.zeros((0, 3)))
+
+
+def test_eyes_traced_together_give_what_each_gives_alone():
+    """So far to the side, some rays are only found by the search from the pupil, done for many eyes at once."""
+    eyes = wide_pupils(12, 0.003)
+    together = seen_from(75, eyes)
+    alone = [seen_from(75, [eye]).points_px[0] for eye in eyes]
+    np.testing.assert_allclose(together.points_px, alone, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_ratio_of_axes_follows_the_published_cosine():
-    people = er.Population("adults").draw(PEOPLE, 3)
     # Dilated pupils: 0.3 cd/m2.
-    eyes = [people.person(k).eye("right", luminance_cd_m2=0.3).build() for k in range(PEOPLE)]
-    every, zero = np.arange(PEOPLE), np.zeros((PEOPLE, 3))
-    poses = fixations(eyes, every, np.broadcast_to([3000.0, 0.0, 0.0], zero.shape), zero).poses
+    eyes = wide_pupils(PEOPLE, 0.3)
     misses = {}
     for angle in range(-70, 71, 10):
-        f = np.radians(angle)
-        camera = er.Camera(
-            position_mm=(PUPIL_MM + AWAY_MM * np.cos(f), AWAY_MM * np.sin(f), 0.0),
-            look_at_mm=(PUPIL_MM, 0.0, 0.0),
-            focal_length_px=25 * AWAY_MM,
-            resolution_px=(2000, 2000),
-        ).build()
-        seen = features(eyes, every, poses, zero, [camera], np.zeros(PEOPLE, dtype=int), np.zeros((0, 3)))
-        ratio = np.nanmean(np.ptp(seen.points_px[..., 0], axis=1) / np.ptp(seen.points_px[..., 1], axis=1))
-        misses[angle] = ratio - 0.99 * np.cos((f + np.radians(5.3)) / 1.121)
+        points = seen_from(angle, eyes).points_px
+        ratio = np.nanmean(np.ptp(points[..., 0], axis=1) / np.ptp(points[..., 1], axis=1))
+        misses[angle] = ratio - 0.99 * np.cos((np.radians(angle) + np.radians(5.3)) / 1.121)
     assert max(abs(miss) for angle, miss in misses.items() if abs(angle) <= 50) < 0.01
     assert abs(misses[-60]) < 0.02
     assert abs(misses[60]) < 0.025
