@@ -58,11 +58,28 @@ class FresnelShares(NamedTuple):
     unpolarized: Floats
 
 
-def fresnel(cosine_incidence: npt.ArrayLike, n_before: FloatLike, n_after: FloatLike) -> FresnelShares:
+def fresnel(
+    cosine_incidence: npt.ArrayLike, n_before: FloatLike, n_after: FloatLike, n_film: FloatLike | None = None
+) -> FresnelShares:
     """Fresnel's R_s = ((n1 c1 - n2 c2) / (n1 c1 + n2 c2))^2, R_p = ((n2 c1 - n1 c2) / (n2 c1 + n1 c2))^2.
 
     Both are 1 at total reflection. Source: Born & Wolf 1999, Principles of Optics, 1.5.2 eq. (21) and (33).
+
+    A film between the media has two such interfaces. Their light does not interfere, so intensities add up: R = R1 +
+    T1 R2 T1 (1 + R1 R2 + ...) = (R1 + R2 - 2 R1 R2) / (1 - R1 R2), for each polarization.
+
+    Args:
+        cosine_incidence: cosine of the angle before the interface.
+        n_before: index before it.
+        n_after: index behind it.
+        n_film: index of a film on it; None for a bare interface.
     """
+    if n_film is not None:
+        first = fresnel(cosine_incidence, n_before, n_film)
+        sine = (n_before / n_film) * np.sqrt(np.maximum(1.0 - np.square(np.asarray(cosine_incidence)), 0.0))
+        second = fresnel(np.sqrt(np.maximum(1.0 - sine * sine, 0.0)), n_film, n_after)
+        s, p = (_stacked(a, b) for a, b in zip(first[:2], second[:2], strict=True))
+        return FresnelShares(s, p, 0.5 * (s + p))
     c1 = np.abs(np.asarray(cosine_incidence, dtype=np.float64))
     eta = n_before / n_after
     square = 1.0 - eta * eta * (1.0 - c1 * c1)
@@ -71,6 +88,13 @@ def fresnel(cosine_incidence: npt.ArrayLike, n_before: FloatLike, n_after: Float
         s = np.where(square > 0.0, ((n_before * c1 - n_after * c2) / (n_before * c1 + n_after * c2)) ** 2, 1.0)
         p = np.where(square > 0.0, ((n_after * c1 - n_before * c2) / (n_after * c1 + n_before * c2)) ** 2, 1.0)
     return FresnelShares(s, p, 0.5 * (s + p))
+
+
+def _stacked(first: Floats, second: Floats) -> Floats:
+    """Reflected share of two parallel interfaces."""
+    both = first * second
+    through = np.where(both < 1.0, 1.0 - both, 1.0)
+    return np.asarray(np.where(both < 1.0, (first + second - 2.0 * both) / through, 1.0))
 
 
 def dot(a: Xyz, b: Xyz) -> Floats:

@@ -55,6 +55,11 @@ class Look(Spec):
         default=1.0, description="contrast of fibres, collarette, crypts and furrows (chosen)"
     )
     iris_seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="selects the iris")
+    tear_film: bool = Field(
+        default=True,
+        description="whether tears cover the cornea, which then mirrors as a film of index 1.331 (at 850 nm) does; "
+        "features keep their places",
+    )
     fundus: Fundus = Field(default=Fundus(), description="the light that comes back through the pupil")
     pupil_albedo: Albedo = Field(
         default=0.0, description="diffuse albedo of the pupil, besides the light of the fundus: a cloudy lens"

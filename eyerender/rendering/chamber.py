@@ -62,12 +62,12 @@ class Chamber(ArrayValue):
     leaving: Floats
 
 
-def chamber_of(eye: EyeModel) -> Chamber:
-    """Compute the chamber of an eye; pupil and albedos do not matter."""
+def chamber_of(eye: EyeModel, film: float) -> Chamber:
+    """Compute the chamber of an eye with a film of this index on its cornea; pupil and albedos do not matter."""
     plane = (*np.asarray(eye.stop.centre_mm).tolist(), *np.asarray(eye.stop.normal).tolist())
     sclera = (*np.asarray(eye.sclera.centre_mm).tolist(), float(eye.sclera.radius_mm))
     indices = tuple(float(n) for n in eye.front_indices)
-    return _chamber(tuple(eye.front), indices, plane, float(eye.limbus_radius_mm), sclera)
+    return _chamber(tuple(eye.front), indices, film, plane, float(eye.limbus_radius_mm), sclera)
 
 
 def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
@@ -133,13 +133,14 @@ def shares(eye: EyeModel, chamber: Chamber, inside: float, iris: float, beyond: 
 
 @dataclass(frozen=True, slots=True)
 class _Walls:
-    """Surfaces about the chamber: refracting ones from outside inwards, their indices, the plane and the wall.
+    """Surfaces about the chamber: refracting ones from outside inwards, their indices, film, plane and wall.
 
     The wall is a cone about x with radius `rim` at x = `top`, which grows by `slope` per mm downwards.
     """
 
     front: tuple[Surface, ...]
     indices: tuple[float, ...]
+    film: float
     centre: Floats
     normal: Floats
     limbus: float
@@ -174,10 +175,10 @@ class _Walls:
 
 @lru_cache(maxsize=64)
 def _chamber(
-    front: tuple[Surface, ...], indices: tuple[float, ...], plane: tuple[float, ...], limbus: float,
+    front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...], limbus: float,
     sclera: tuple[float, ...],
 ) -> Chamber:  # fmt: skip
-    walls = _walls(front, indices, plane, limbus, sclera)
+    walls = _walls(front, indices, film, plane, limbus, sclera)
     step, points, normals, valid = _places(walls)
     exchange = np.zeros((PLACES, PLACES))
     leaving = np.zeros((PLACES, RAYS, 7))
@@ -194,13 +195,13 @@ def _chamber(
     return Chamber(step, frozen(points), frozen(normals), valid, frozen(exchange), kept)
 
 
-def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], plane: tuple[float, ...], limbus: float,
-           sclera: tuple[float, ...]) -> _Walls:  # fmt: skip
+def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...],
+           limbus: float, sclera: tuple[float, ...]) -> _Walls:  # fmt: skip
     centre, normal = np.array(plane[:3]), np.array(plane[3:])
     top = float(np.asarray(front[0].origin_mm)[0] + front[0].sag(np.array(limbus), np.array(0.0)))
     bottom = centre[0] - _BELOW_MM
     wide = np.sqrt(max((sclera[3] - _WALL_MM) ** 2 - (bottom - sclera[0]) ** 2, limbus**2))
-    return _Walls(front, indices, centre, normal, limbus, limbus, top, (wide - limbus) / (top - bottom))
+    return _Walls(front, indices, film, centre, normal, limbus, limbus, top, (wide - limbus) / (top - bottom))
 
 
 def _places(walls: _Walls) -> tuple[float, Floats, Floats, Bools]:
@@ -277,7 +278,7 @@ def _traced(walls: _Walls, o: Floats, d: Floats) -> _Arrived:
         number, weight, p, w = number[ok.there], weight[ok.there], p[ok.there], w[ok.there]
         n = walls.front[0].normal(p)
         cosine = np.sum(n * w, axis=1)
-        mirrored = fresnel(cosine, walls.indices[0], 1.0).unpolarized
+        mirrored = fresnel(cosine, walls.indices[0], 1.0, walls.film).unpolarized
         if mirroring == 0:
             go = mirrored < 1
             out, origin = number[go], p[go]

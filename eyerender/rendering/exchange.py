@@ -208,7 +208,7 @@ class Exchange:
         grid = globe_places(globe, None if region is None else region.posed)
         skin = None if region is None else self._skin(region, globe)
         points, normals, plane = _others(job, globe, region, skin)
-        frame = _Frame(job, grid, chamber_of(job.eye), skin, points, normals, plane)
+        frame = _Frame(job, grid, chamber_of(job.eye, job.film_index), skin, points, normals, plane)
         if not job.interreflection and not values.structure.ambient:
             return frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))

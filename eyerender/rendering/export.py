@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from ..rig.imaging import Ambient
 from .frame import RenderJob, globe_of
 
 _BACKDROP_HALF_MM = 500.0
+_FILM_MM = 0.01  # three times the thickness of real ones, which single precision would not resolve
 
 
 def export_scene(
@@ -67,10 +69,15 @@ def export_scene(
         "cornea_rim": look.limbus_albedo,
         "chamber_wall": look.limbus_albedo,
         "iris_root": look.limbus_albedo,
+        "tear_film_rim": look.limbus_albedo,
     }
     motion = np.vstack([np.column_stack([job.M, job.t]), [0, 0, 0, 1]])
     patches = eye_meshes(job.eye, rings, sectors).patches
-    for patch in (*patches.values(), _root(job.eye, patches["chamber_wall"], sectors)):
+    more = [_root(job.eye, patches["chamber_wall"], sectors)]
+    if look.tear_film:
+        film, patches["cornea_front"], rim = _film(patches["cornea_front"], job.film_index, sectors)
+        more += [film, rim]
+    for patch in (*patches.values(), *more):
         _patch(root, folder, patch, motion, albedo.get(patch.name, 0.0))
     place = np.eye(4)
     place[:3, 3] = job.anchor_mm
@@ -135,6 +142,8 @@ def _notes(job: RenderJob) -> list[str]:
         notes.append("Lamps with a lobe other than cos^1 are shown as Lambertian discs.")
     if any(lamp.radius_mm == 0 for lamp in job.lights):
         notes.append("Point lamps: a path tracer cannot light what lies behind the cornea with them.")
+    if job.look.tear_film:
+        notes.append(f"The film of tears on the cornea is a dielectric layer of its own, {_FILM_MM} mm thick.")
     if job.ambient != Ambient():
         notes.append("Ambient light, panels and the surrounding's map are left out.")
     notes.append("Textures, the limbus' soft rim and the point-spread function are left out.")
@@ -222,6 +231,17 @@ def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
         for k, name in enumerate(HEAD_PARTS[: len(f) - 1])
         if f[k + 1] > f[k]
     ]
+
+
+def _film(front: Patch, index: float, sectors: int) -> tuple[Patch, Patch, Patch]:
+    """Film of tears on the front of the cornea, the front below it, and what closes the gap between their rims."""
+    below = replace(front, vertices=front.vertices - _FILM_MM * front.normals, exterior=index)
+    j = np.arange(sectors)
+    k = (j + 1) % sectors
+    faces = np.concatenate([np.stack([j, j + sectors, k + sectors], 1), np.stack([j, k + sectors, k], 1)])
+    edges = np.concatenate([p.vertices[-sectors:] for p in (front, below)])
+    rim = Patch("tear_film_rim", edges, np.tile(front.normals[-sectors:], (2, 1)), faces)
+    return replace(front, name="tear_film", interior=index), below, rim
 
 
 def _root(eye: EyeModel, wall: Patch, sectors: int) -> Patch:

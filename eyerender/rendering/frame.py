@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from ..geometry.surfaces import Surface
 from ..geometry.surfaces_biconic import Biconic
 from ..geometry.surfaces_measured import Measured
 from ..geometry.surfaces_quadric import Quadric
+from ..optics.media import TEARS
 from ..region.anatomy import Region
 from ..region.globe import Globe
 from ..region.look import Look
@@ -97,6 +98,16 @@ class RenderJob(ArrayValue):
             return np.asarray(self.apex_mm, dtype=float)
         return np.asarray(self.M @ _GLOBE_CENTRE_MM + self.t - _GLOBE_CENTRE_MM)
 
+    @property
+    def film_index(self) -> float:
+        """Index of what lies on the front cornea."""
+        return film_index(self.eye, self.look)
+
+
+def film_index(eye: EyeModel, look: Look) -> float:
+    """Index of what lies on the front cornea: tears, or the cornea itself where there is no film."""
+    return TEARS.index(eye.wavelength_nm) if look.tear_film else float(eye.front_indices[0])
+
 
 def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
     """Posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
@@ -134,6 +145,7 @@ def parameters_of(job: RenderJob) -> Parameters:
         _surface_parameters(surface, before / index, float(eye.limbus_radius_mm))
         for surface, index, before in zip(eye.front, indices, [1.0, *indices[:-1]], strict=True)
     )
+    surfaces = (replace(surfaces[0], film=1 / job.film_index), *surfaces[1:])
     front, stop, sclera = eye.front[0], eye.stop, eye.sclera
     entrance_mm, magnification = entrance_pupil(eye)
     angle = np.linspace(0, 2 * np.pi, 64)

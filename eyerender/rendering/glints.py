@@ -118,13 +118,14 @@ class Glint:
 
 @dataclass(frozen=True, slots=True)
 class GlintScene:
-    """Input of the glints: front cornea and rim, pose (x_world = M x + t), camera, and obstacles.
+    """Input of the glints: front cornea with its film and rim, pose (x_world = M x + t), camera, and obstacles.
 
     `clear` takes points (n, 3) and (n, 3) of the world and returns whether nothing of the scene stands between them.
     """
 
     surface: Surface
     index: float
+    film_index: float
     limbus_radius_mm: float
     sclera_centre_mm: Floats
     sclera_radius_mm: float
@@ -246,7 +247,7 @@ class GlintScene:
             y, N, d, w, J = seen.point, seen.normal, seen.arrives, seen.leaves, seen.cross_section
             found &= seen.found
             there = found & (self.surface.axis_distance(components(y)) <= self.limbus_radius_mm)
-        F = fresnel(np.clip(-_dot(N, d), 0, 1), 1.0, self.index).unpolarized
+        F = fresnel(np.clip(-_dot(N, d), 0, 1), 1.0, self.index, self.film_index).unpolarized
         leaving = np.maximum(_dot(d, axes[which]), 0)
         power = exponent[which]
         lobe = np.where(power == 0, 1.0, np.where(leaving > 0, leaving ** np.where(power == 0, 1.0, power), 0.0))

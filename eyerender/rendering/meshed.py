@@ -235,7 +235,7 @@ def resolution(radius_mm: float, edge_mm: float) -> tuple[int, int]:
 def meshed(surfaces: Sequence[Surface], meshes: Sequence[SurfaceMesh]) -> tuple[Surface, ...]:
     """Put meshes in the place of surfaces."""
     return tuple(
-        MeshedSurface(s.origin, s.axes, s.shape, s.eta, s.kind, s.table, mesh)
+        MeshedSurface(s.origin, s.axes, s.shape, s.eta, s.kind, s.table, s.film, mesh)
         for s, mesh in zip(surfaces, meshes, strict=True)
     )
 

@@ -30,12 +30,14 @@ class SurfaceParameters:
             row, 0) of a measured surface (see `surfaces`).
         eta: index of refraction before the surface over that behind it, for light that enters the eye.
         axes: the unit axes of its frame, three (3,); None if they are the eye's own.
+        film: index before the surface over that of a film on it; None where no film can be.
     """
 
     origin: mi.Vector3f
     shape: tuple[mi.Float, ...]
     eta: mi.Float
     axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f] | None
+    film: mi.Float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,7 @@ def purkinje_images(
             ok &= _through_pupil(eye, traced.points_mm, len(eye.front))
         rays = ray_tube(path, 1.0, components(eyepoint), components(out), components(sources))
         tube, towards = rays.cross_section_mm2_sr, join(rays.end)
-        passed = transmittance(path, traced, indices[-1])
+        passed = transmittance(path, traced, indices[-1], scene.film_index)
         leaving = np.maximum(np.einsum("ij,ij->i", -towards, np.broadcast_to(M.T @ lamp.axis, towards.shape)), 0)
         lobe = leaving ** float(lamp.lobe_exponent) if lamp.lobe_exponent else np.ones_like(leaving)
         cam = out @ M.T @ camera.R.T
@@ -65,10 +65,10 @@ def purkinje_images(
     return images
 
 
-def transmittance(path: Sequence[Crossing], traced: Traced, behind: float) -> Floats:
+def transmittance(path: Sequence[Crossing], traced: Traced, behind: float, film: float) -> Floats:
     """Transmittance of paths: F at the mirror, times 1 - F at every other crossing that the rays meet.
 
-    `behind` is the index behind the mirror.
+    `behind` is the index behind the mirror, `film` that of the film on the first surface, which is crossed twice.
     """
     share = np.ones(traced.points_mm.shape[1])
     index = np.ones_like(share)
@@ -81,7 +81,8 @@ def transmittance(path: Sequence[Crossing], traced: Traced, behind: float) -> Fl
         # A ray misses the shells of a gradient lens that do not extend to it.
         met = np.any(traced.directions[k + 1] != before, axis=1)
         after = float(np.asarray(crossing.n_after))
-        share *= np.where(met, 1 - np.asarray(fresnel(cosine, index, after).unpolarized), 1.0)
+        on_air = film if k in (0, len(path) - 1) else None
+        share *= np.where(met, 1 - np.asarray(fresnel(cosine, index, after, on_air).unpolarized), 1.0)
         index = np.where(met, after, index)
     return share
 

@@ -56,8 +56,8 @@ def add_glints(
         return place.clear(a - anchor, b - anchor)
 
     scene = GlintScene(
-        eye.front[0], float(eye.front_indices[0]), float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm),
-        float(eye.sclera.radius_mm), job.M, job.t, job.camera, clear, mesh,
+        eye.front[0], float(eye.front_indices[0]), job.film_index, float(eye.limbus_radius_mm),
+        np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), job.M, job.t, job.camera, clear, mesh,
     )  # fmt: skip
     tables = {}
     reasons: tuple[str, ...] = ()

@@ -57,6 +57,7 @@ class Surface:
         eta: index before over index behind, for light that enters the eye.
         kind: which of the three it is.
         table: the cells of a measured surface (see `lattice`).
+        film: index before over that of a film on the surface; None for a bare one.
     """
 
     origin: mi.Vector3f
@@ -65,6 +66,11 @@ class Surface:
     eta: mi.Float
     kind: Kind
     table: mi.Float | None = None
+    film: mi.Float | None = None
+
+    def mirrored(self, c1: mi.Float, c2: mi.Float) -> mi.Float:
+        """Share of the light that is mirrored, from the cosines before and behind the surface."""
+        return fresnel(c1, c2, self.eta, self.film)
 
     def point_in(self, x: mi.Vector3f) -> mi.Vector3f:
         """Transform a point from the eye frame to the surface's frame."""
@@ -209,7 +215,7 @@ class Surface:
         c = -dr.dot(N, dl)
         c2 = dr.sqrt(dr.maximum(1 - self.eta * self.eta * (1 - c * c), 0))
         w = self.eta * dl + (self.eta * c - c2) * N
-        return o + t * d, self.vector_out(w), 1 - fresnel(c, c2, self.eta), ok & (c > 0)
+        return o + t * d, self.vector_out(w), 1 - self.mirrored(c, c2), ok & (c > 0)
 
     def on_surface(self, x: mi.Vector3f) -> tuple[mi.Vector3f, NormalForm]:
         """Point of the surface (eye frame) at the same local (y, z) as a point near it, and its form for `bend`."""
@@ -256,7 +262,7 @@ class Surface:
             dc = -(dr.dot(e, N) + dr.dot(d, dN))
             moved.append(self.vector_out(dy))
             turned.append(self.vector_out(self.eta * e + dc * slope * N + k * dN))
-        return Bundle(b.y, self.vector_out(w), *moved, *turned), 1 - fresnel(c, c2, self.eta), c
+        return Bundle(b.y, self.vector_out(w), *moved, *turned), 1 - self.mirrored(c, c2), c
 
 
 def _form_of(jet: tuple[mi.Float, ...]) -> NormalForm:
@@ -277,11 +283,23 @@ def _slope(c: list[mi.Float], s: mi.Float) -> mi.Float:
     return (3 * c[3] * s + 2 * c[2]) * s + c[1]
 
 
-def fresnel(c1: mi.Float, c2: mi.Float, eta: mi.Float) -> mi.Float:
+def fresnel(c1: mi.Float, c2: mi.Float, eta: mi.Float, film: mi.Float | None = None) -> mi.Float:
     """Unpolarised Fresnel reflectance of a dielectric: cosines before and behind, eta = n_before / n_behind.
 
     F = (rs^2 + rp^2) / 2,  rs = (eta c1 - c2) / (eta c1 + c2),  rp = (c1 - eta c2) / (c1 + eta c2)   (Born & Wolf 1.5)
+
+    A film (n_before / n_film) has two such interfaces, whose intensities add up as in `optics.interface.fresnel`.
     """
+    if film is None:
+        s, p = _polarized(c1, c2, eta)
+        return 0.5 * (s + p)
+    inside = dr.sqrt(dr.maximum(1 - film * film * (1 - c1 * c1), 0))
+    shares = zip(_polarized(c1, inside, film), _polarized(inside, c2, eta / film), strict=True)
+    s, p = ((a + b - 2 * a * b) / dr.maximum(1 - a * b, 1e-9) for a, b in shares)
+    return 0.5 * (s + p)
+
+
+def _polarized(c1: mi.Float, c2: mi.Float, eta: mi.Float) -> tuple[mi.Float, mi.Float]:
     rs = (eta * c1 - c2) / (eta * c1 + c2)
     rp = (c1 - eta * c2) / (c1 + eta * c2)
-    return 0.5 * (rs * rs + rp * rp)
+    return rs * rs, rp * rp

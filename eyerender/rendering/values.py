@@ -77,9 +77,10 @@ class Values:
         found = rebuilt(parameters, leaf)
         self.structure = structure
         self.boundary = PupilBoundary(waves)
+        buffers = [None if table is None else mi.Float(aligned(table)) for table in tables]
         self.surfaces = tuple(
-            Surface(one.origin, one.axes, one.shape, one.eta, kind, None if table is None else mi.Float(aligned(table)))
-            for one, (kind, _), table in zip(found.surfaces, structure.surfaces, tables, strict=True)
+            Surface(one.origin, one.axes, one.shape, one.eta, kind, table, one.film)
+            for one, (kind, _), table in zip(found.surfaces, structure.surfaces, buffers, strict=True)
         )
         self.stop, self.iris, self.limbus, self.sclera = found.stop, found.iris, found.limbus, found.sclera
         self.image, self.pose, self.camera = found.image, found.pose, found.camera

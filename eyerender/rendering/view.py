@@ -15,7 +15,6 @@ import numpy as np
 
 from ..region.mapcache import kept
 from ..region.texture import iris_texture, sclera_texture
-from .surfaces import fresnel
 from .values import Values
 
 if TYPE_CHECKING:
@@ -257,7 +256,7 @@ def _refracted(
     front = values.surfaces[0]
     c = -dr.dot(N, dl)
     c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
-    mirrored = fresnel(c, c2, front.eta)
+    mirrored = front.mirrored(c, c2)
     passed = 1 - mirrored
     w = front.vector_out(front.eta * dl + (front.eta * c - c2) * N)
     inside = mi.Vector3f(y)

@@ -8,7 +8,7 @@ import pytest
 from eyerender.geometry.surfaces import components, join
 from eyerender.geometry.transforms import normalize
 from eyerender.optics.interface import fresnel, reflect, refract
-from eyerender.optics.media import CauchyMedium, ConstantMedium
+from eyerender.optics.media import TEARS, CauchyMedium, ConstantMedium
 from tests.support.paths import load
 
 
@@ -65,6 +65,28 @@ def test_fresnel_at_normal_incidence_brewster_and_total_reflection():
     assert fresnel(1.0, 1.0, 1.376).unpolarized == pytest.approx((0.376 / 2.376) ** 2, abs=1e-15)
     assert fresnel(np.cos(np.arctan(1.376)), 1.0, 1.376).p == pytest.approx(0.0, abs=1e-30)
     assert fresnel(np.cos(np.radians(60.0)), 1.376, 1.0).unpolarized == 1.0
+
+
+def test_a_film_adds_up_what_bounces_in_it():
+    """Intensities of a pile of two plates, summed bounce by bounce; and the same from either side (Stokes)."""
+    angle = np.linspace(0.0, 1.5, 50)
+    film, behind = 1.3314, 1.376
+    shares = fresnel(np.cos(angle), 1.0, behind, film)
+    in_film, inside = np.arcsin(np.sin(angle) / film), np.arcsin(np.sin(angle) / behind)
+    for k in (0, 1):
+        first, second = fresnel(np.cos(angle), 1.0, film)[k], fresnel(np.cos(in_film), film, behind)[k]
+        bounces = sum(second * (first * second) ** n for n in range(8))
+        assert np.allclose(shares[k], first + (1 - first) ** 2 * bounces, atol=1e-14)
+        assert np.allclose(fresnel(np.cos(inside), behind, 1.0, film)[k], shares[k], atol=1e-12)
+    assert fresnel(np.cos(1.2), behind, 1.0, film).unpolarized == 1.0
+    assert np.allclose(fresnel(np.cos(angle), 1.0, behind, behind), fresnel(np.cos(angle), 1.0, behind), atol=1e-15)
+    assert 0.81 < shares.unpolarized[0] / fresnel(1.0, 1.0, behind).unpolarized < 0.84
+
+
+def test_the_index_of_tears():
+    # Water at 24 deg C has 1.33299 at 589.3 nm (Daimon and Masumura) and 1.3274 at 850 nm.
+    assert TEARS.index(589.3) == pytest.approx(1.337, abs=1e-4)
+    assert TEARS.index(589.3) - TEARS.index(850.0) == pytest.approx(0.00556, abs=2e-5)
 
 
 def test_indices_agree_with_the_reference():

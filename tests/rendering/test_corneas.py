@@ -16,7 +16,7 @@ from eyerender.geometry.surfaces import components
 from eyerender.rendering.frame import parameters_of, tables
 from eyerender.rig.light import Lamp
 from tests.support.corneas import conic_depth, eye_with, grid_of, keratoconus, measured_shapes, zernike_of
-from tests.support.render_oracles import RINGS_MM, centroid, flux_on_rings, ring_points
+from tests.support.render_oracles import RINGS_MM, centroid, corneal_share, flux_on_rings, ring_points
 from tests.support.render_rigs import BLACK, PLAIN, RIGS, LampRig, eye_of, head_rig, job_of, remote_rig
 
 SHAPES = {name: shape for name, shape in measured_shapes().items() if "lens" not in name}
@@ -146,9 +146,7 @@ def test_flux_and_place_of_a_glint_against_backward_tracing(renderer, name):
     y = y @ job.M.T + job.t
     s = ((lamp.position_mm - y) @ lamp.axis) / (w @ lamp.axis)
     on = (np.linalg.norm(y + s[:, None] * w - lamp.position_mm, axis=1) < lamp.radius_mm) & (s > 0) & hit.ok
-    i = np.arccos(np.clip(c, -1.0, 1.0 - 1e-12))
-    t = np.arcsin(np.sin(i) / float(eye.front_indices[0]))
-    F = 0.5 * ((np.sin(i - t) / np.sin(i + t)) ** 2 + (np.tan(i - t) / np.tan(i + t)) ** 2)
+    F = corneal_share(c, eye)
     L = np.where(on, lamp.intensity_mw_sr / (np.pi * lamp.radius_mm**2) * F * (world @ job.camera.axis) ** 4, 0.0)
     truth = (L[:, None] * pixels).sum(axis=0) / L.sum()
     scale = 1e3 * np.pi * job.sensor.lens_transmission / (4 * job.sensor.f_number**2)

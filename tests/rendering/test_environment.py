@@ -13,7 +13,7 @@ from scipy import ndimage
 from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.rig.imaging import Ambient, Panel, RadianceMap
-from tests.support.render_oracles import mirror_pixel
+from tests.support.render_oracles import corneal_share, mirror_pixel
 from tests.support.render_rigs import BLACK, LampRig, eye_of, job_of, remote_rig
 
 WINDOW = (120, 120)
@@ -63,17 +63,17 @@ def test_an_even_map_is_even_light(renderer, tmp_path):
 
 
 def test_the_apex_mirrors_the_map_by_fresnel(renderer, tmp_path):
-    # A black eye shows nothing but the mirror: L ((n - 1) / (n + 1))^2 where the camera looks along the normal.
+    # A black eye shows nothing but the mirror: L F at normal incidence where the camera looks along the normal.
     look = {"look": BLACK}
     ambient = ambient_of(tmp_path / "even.npy", np.full((16, 32), 3.0))
     job, seen = radiance(renderer, ambient, **look)
-    n = float(job.eye.front_indices[0])
+    F = corneal_share(np.array(1.0), job.eye)
     # The point whose normal goes through the nodal point mirrors the camera into itself.
     u, v = mirror_pixel(job.eye, job, job.camera.nodal_point_mm)[0]
     column, row = round(u) - job.window[0], round(v) - job.window[1]
     ray = job.camera.rays(np.array([[float(round(u)), float(round(v))]]))[0]
     cosine = float(ray @ job.camera.axis)
-    assert seen[row, column] == pytest.approx(3e-3 * ((n - 1) / (n + 1)) ** 2 * cosine**4, rel=1e-3)
+    assert seen[row, column] == pytest.approx(3e-3 * F * cosine**4, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from eyerender.rendering.surround import Obstacle
 from eyerender.rig.sensor import Sensor
-from tests.support.render_oracles import centroid, mirror_pixel
+from tests.support.render_oracles import centroid, corneal_share, mirror_pixel
 from tests.support.render_rigs import BLACK, MODELS, RIGS, eye_of, head_rig, job_of, remote_rig
 
 
@@ -63,9 +63,7 @@ def test_flux_and_place_of_a_large_disc_against_backward_tracing(renderer, rig_n
     y = y @ job.M.T + job.t
     s = ((lamp.position_mm - y) @ lamp.axis) / (w @ lamp.axis)
     on = (np.linalg.norm(y + s[:, None] * w - lamp.position_mm, axis=1) < radius_mm) & (s > 0) & hit.ok
-    i = np.arccos(c)
-    t = np.arcsin(np.sin(i) / float(eye.front_indices[0]))
-    F = 0.5 * ((np.sin(i - t) / np.sin(i + t)) ** 2 + (np.tan(i - t) / np.tan(i + t)) ** 2)
+    F = corneal_share(c, eye)
     cos4 = (world @ job.camera.axis) ** 4
     L = np.where(on, lamp.intensity_mw_sr / (np.pi * radius_mm**2) * F * cos4, 0.0)  # Lambertian: L = I / area
     truth = (L[:, None] * pixels).sum(axis=0) / L.sum()

@@ -48,7 +48,7 @@ def test_light_through_the_rim_reaches_the_places_of_the_chamber_as_traced_rays_
     # Cosine-distributed rays from a place meet the rim's tissue as often as the form factor says; E4 has a posterior
     # cornea, which the straight lines ignore: its refraction moves them by .3 %.
     eye, width = eye_of("E4"), 0.8
-    chamber = chamber_of(eye)
+    chamber = chamber_of(eye, 1.3314)
     share = (through_limbus(eye, chamber, width) - through_limbus(eye, chamber, 0.0)).sum(axis=1)
     rng, front = np.random.default_rng(1), eye.front[0]
     for place in (0, 7 * TURNS, 12 * TURNS + 5):

@@ -60,13 +60,31 @@ def test_iris_under_large_lamps_against_path(renderer, tmp_path):
     look = BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
     job = job_of(eye, LampRig(camera, lights), (0, 0, n, n), look=look, interreflection=False)
     mine = renderer.radiance(job, spp=512) / cos4(job)
-    truth = stock(job, tmp_path, 4, 8192, rings=128, sectors=256)
+    truth = stock(job, tmp_path, 6, 8192, rings=128, sectors=256)
     iris = renderer.labels(job).part == 2
     v, u = np.mgrid[:n, :n] - (n - 1) / 2
     # The lamps' mirror images lie left and right; above and below the iris shows itself alone.
     iris &= np.abs(u) < 0.45 * np.abs(v)
     assert iris.sum() > 200
     assert mine[iris].mean() == pytest.approx(truth[iris].mean(), rel=0.01)  # the oracle's standard error is .4 %
+
+
+def test_mirror_image_of_a_large_lamp_in_the_film_of_tears_against_path(renderer, tmp_path):
+    # The path tracer meets the mirrored lamp by itself. The exported film is a layer of its own.
+    camera = Camera(
+        resolution_px=(48, 48), position_mm=(600.0, 0.0, 0.0), look_at_mm=(0.0, 0.0, 0.0), focal_length_px=2526.0
+    ).build()
+    place = 300 * np.array([np.cos(0.6), np.sin(0.6), 0.0])
+    lamp = Lamp(
+        position_mm=frozen(place), axis=frozen(-place / 300), radius_mm=150.0, intensity_mw_sr=1000.0, lobe_exponent=1.0
+    )
+    job = job_of(eye_of("E1"), LampRig(camera, (lamp,)), (0, 0, 48, 48), look=BLACK, interreflection=False)
+    found = renderer.render(job, spp=1).glints
+    x, y = found.xy_px[0]
+    job = replace(job, window=(round(x) - 9, round(y) - 9, 18, 18))
+    seen = stock(job, tmp_path, 8, 32768, rings=96, sectors=192).sum()
+    # Without the film the lamp would be 22 % brighter. The oracle's standard error is 0.4 %.
+    assert found.energy[0] == pytest.approx(seen, rel=0.012)
 
 
 @dataclass(frozen=True)

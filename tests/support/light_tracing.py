@@ -15,6 +15,8 @@ from eyerender.optics.solve import mirror_points
 from eyerender.rendering.frame import RenderJob
 from eyerender.rig.light import Lamp
 
+from .render_oracles import corneal_share
+
 WIDE = 1.25
 
 
@@ -93,9 +95,7 @@ def trace_light(
         nearest = min(nearest, 1 - float(np.max(np.abs(off[on]), initial=0.0)))
         on &= ~hidden
         x, d, w, c, length, slant = x[on], d[on], w[on], c[on], length[on], slant[on]
-        i = np.arccos(c)
-        t = np.arcsin(np.sin(i) / float(eye.front_indices[0]))
-        F = 0.5 * ((np.sin(i - t) / np.sin(i + t)) ** 2 + (np.tan(i - t) / np.tan(i + t)) ** 2)
+        F = corneal_share(c, eye)
         leaving = np.maximum(d @ lamp.axis, 0) ** float(lamp.lobe_exponent)
         power = float(lamp.intensity_mw_sr) * leaving * c / slant / length**2 * F  # of an area dy dz of the cornea
         cosine = -(w @ camera.axis)

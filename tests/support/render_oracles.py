@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from eyerender.arrays import Floats
 from eyerender.eye.model import EyeModel
+from eyerender.optics.media import TEARS
 from eyerender.optics.solve import apparent_points
 
 if TYPE_CHECKING:
@@ -18,6 +19,28 @@ if TYPE_CHECKING:
 
 RINGS_MM = ((2.1, 3.1), (3.1, 4.1), (4.1, 5.1))
 HARMONICS = 12
+
+
+def mirrored_share(cosine: np.ndarray, before: float, behind: float, film: float | None = None) -> np.ndarray:
+    """Unpolarised reflectance by Born & Wolf's sines and tangents; a film adds up what bounces in it."""
+    i = np.maximum(np.arccos(np.clip(cosine, -1.0, 1.0)), 1e-6)
+
+    def shares(i: np.ndarray, a: float, b: float) -> np.ndarray:
+        t = np.arcsin(np.sin(i) * a / b)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            F = np.stack([(np.sin(i - t) / np.sin(i + t)) ** 2, (np.tan(i - t) / np.tan(i + t)) ** 2])
+        return np.where(a == b, 0.0, F)
+
+    if film is None:
+        return np.asarray(shares(i, before, behind).mean(axis=0))
+    first, second = shares(i, before, film), shares(np.arcsin(np.sin(i) * before / film), film, behind)
+    bounces = [second * (first * second) ** k for k in range(6)]
+    return np.asarray((first + (1 - first) ** 2 * np.sum(bounces, axis=0)).mean(axis=0))
+
+
+def corneal_share(cosine: np.ndarray, eye: EyeModel) -> np.ndarray:
+    """Reflectance of an eye's front under its film of tears."""
+    return mirrored_share(cosine, 1.0, float(eye.front_indices[0]), TEARS.index(eye.wavelength_nm))
 
 
 def flux_on_rings(eye: EyeModel, lamp_mm: np.ndarray, intensity: float, rays: int = 800) -> np.ndarray:
@@ -45,11 +68,7 @@ def flux_on_rings(eye: EyeModel, lamp_mm: np.ndarray, intensity: float, rays: in
             ok &= surface.axis_distance(tuple(y.T)) < eye.limbus_radius_mm
         y, N, c, d, power = y[ok], N[ok], c[ok], d[ok], power[ok]
         t = np.arcsin(np.sqrt(1 - c * c) * before / index)
-        i = np.arccos(np.clip(c, -1, 1))
-        with np.errstate(divide="ignore", invalid="ignore"):  # Fresnel by Born & Wolf's sines and tangents
-            F = 0.5 * ((np.sin(i - t) / np.sin(i + t)) ** 2 + (np.tan(i - t) / np.tan(i + t)) ** 2)
-        normal = ((before - index) / (before + index)) ** 2
-        power = power * (1 - np.where(i < 1e-4, normal, F))
+        power = power * (1 - (corneal_share(c, eye) if k == 0 else mirrored_share(c, before, float(index))))
         along = d + c[:, None] * N
         size = np.linalg.norm(along, axis=1, keepdims=True)
         along = np.divide(along, size, out=np.zeros_like(along), where=size > 0)

@@ -23,7 +23,7 @@ from ...imagefolder import DATASET, RESULTS, ImageFolder, versions
 from ...labels import EyeInWindow, known_labels, limbus_px
 from ...observation import EYES, Observations, version_of
 from ...region.mesh import lid_margins
-from ...rendering.frame import globe_of
+from ...rendering.frame import film_index, globe_of
 from ...rendering.glints import GlintScene, glint_table
 from ...rendering.occlusion import lid_margins_px
 from ...scene import Frames, Scene
@@ -229,8 +229,8 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
     """Check the spots of the glints: each is the mean of the lamp's image, or within it where a part is hidden."""
     eye, camera = view.eye, scene.rig.cameras[view.camera]
     mirror = GlintScene(
-        eye.front[0], float(eye.front_indices[0]), float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm),
-        float(eye.sclera.radius_mm), view.M, view.t, camera, _all_clear,
+        eye.front[0], float(eye.front_indices[0]), film_index(eye, scene.spec.look), float(eye.limbus_radius_mm),
+        np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), view.M, view.t, camera, _all_clear,
     )  # fmt: skip
     glints = mirror.glints(scene.rig.lights, scene.spec.sensor.psf_sigma_px)
     picture = scene.spec.image
