@@ -14,6 +14,7 @@ from .backends.choose import BackendChoice, choose_backend
 from .errors import InputError
 from .eye.model import EyeModel
 from .eye.pose import Poses, rigid_motion
+from .eye.refraction import at_cornea_d
 from .imagefile import MAX_PIXELS, compressed
 from .observation import EYES
 from .progress import Progress, followed
@@ -146,11 +147,18 @@ def render_job(frames: Frames, row: int) -> RenderJob:
 
 
 def focus_dpt(frames: Frames, row: int) -> float:
-    """Vergence at which the eye of one row is focused: on its target, or far away, unless it is too short-sighted."""
-    index = frames.index
+    """Vergence at which the eye of one row is focused.
+
+    Where the scene tells how far the lens accommodates, as for drawn people, it is that much nearer than the far point.
+    Else the eye is focused on its target, or far away without one, unless it is too short-sighted.
+    """
+    scene, index = frames.scene, frames.index
+    far = -at_cornea_d(scene.refraction_d(EYES[index.eye[row]]))
+    if (accommodation := scene.accommodation_d) is not None:
+        return far + accommodation
     gap = index.target_mm[row] - (index.eye_position_mm[row] + index.head_mm[row])
     target = 1e3 / float(np.linalg.norm(gap)) if np.isfinite(gap).all() else 0.0
-    return max(target, -frames.scene.spec.look.fundus.refraction_d)
+    return max(target, far)
 
 
 def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:

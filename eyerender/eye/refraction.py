@@ -21,6 +21,11 @@ _HEIGHT_MM = 2e-3
 _SLOPE = 1e-4
 
 
+def at_cornea_d(spectacles_d: float, vertex_mm: float = VERTEX_MM) -> float:
+    """Refraction at the cornea of eyes that need spectacles of a power: F / (1 - d F)."""
+    return spectacles_d / (1.0 - vertex_mm * spectacles_d / 1000.0)
+
+
 def refraction_d(eye: EyeModel, *, vertex_mm: float = VERTEX_MM) -> tuple[float, float, float]:
     """Spectacle refraction (D) about the optic axis as a power vector: sphere equivalent M, J0, J45.
 

@@ -16,7 +16,7 @@ from ..observation import EYES
 from ..rig.camera import Camera
 from ..scene import Frames, Scene
 from ..scene.scene import demand_d
-from ..scene.spec import EyeDirection, SceneSpec
+from ..scene.spec import MOST_ACCOMMODATION_D, EyeDirection, SceneSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +45,10 @@ class Setup:
     def of(cls, scene: Scene) -> Self:
         """The first frame of a scene."""
         spec = scene.spec
-        if spec.person is not None:  # the eyes of a drawn person depend on all targets, not on the one that is shown
-            scene = scene.with_({"subject.accommodation_d": demand_d(spec, scene.targets_mm)})
+        # Eyes that respond to all targets must not respond to the one that is shown.
+        if spec.person is not None or spec.subject.accommodation_d == "targets":
+            demand = min(demand_d(spec, scene.targets_mm), MOST_ACCOMMODATION_D)
+            scene = scene.with_({"subject.accommodation_d": demand})
         start = cls(spec, scene, spec.subject.eyes[0])
         return start.following(0).with_head(0)
 

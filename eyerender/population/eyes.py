@@ -31,6 +31,16 @@ _LIMBUS_GAP_MM = 0.35
 _DESIGN_NM = 850.0
 
 
+def amplitude_d(table: Table, age_years: float) -> float:
+    """Largest accommodation at an age."""
+    return max(table.constant("amplitude_d") + table.constant("amplitude_d_per_year") * age_years, 0.0)
+
+
+def thickening_mm(age_years: float, accommodation_d: float) -> float:
+    """By how much the lens is thicker when it is accommodated."""
+    return (LENS_MM_PER_D + LENS_MM_PER_D_YEAR * age_years) * accommodation_d
+
+
 def eye_file(
     name: str,
     eye: Mapping[str, float],
@@ -86,7 +96,7 @@ def eye_file(
 def _mapping(name: str, eye: Mapping[str, float], table: Table, age: float, accommodation: float) -> dict[str, Any]:
     """The keys of the eye file, with the stop at the table's reference diameter, and the fovea on the optic axis."""
     constant = table.constant
-    thicker = (LENS_MM_PER_D + LENS_MM_PER_D_YEAR * age) * accommodation
+    thicker = thickening_mm(age, accommodation)
     lens_front = -(eye["chamber_depth_mm"] - FORWARD * thicker)
     lens_back = -(eye["chamber_depth_mm"] + eye["lens_thickness_mm"] + (1.0 - FORWARD) * thicker)
     front_radius = 1.0 / (1.0 / eye["lens_front_radius_mm"] + FRONT_PER_D * accommodation)

@@ -19,7 +19,7 @@ from ..region.anatomy import Region
 from ..region.look import Look
 from ..spec import KeyProblem, Number, Spec
 from .draw import Conditions, latent_numbers
-from .eyes import eye_file
+from .eyes import amplitude_d, eye_file
 from .marginals import Fixed
 from .model import SIDES, Model, default_reference
 from .pupil import watson_yellott_mm
@@ -141,9 +141,7 @@ class Person(Spec):
     @property
     def amplitude_d(self) -> float:
         """Largest accommodation by age; 0 at the least."""
-        table = default_table()
-        age = self.number("age_years")
-        return max(table.constant("amplitude_d") + table.constant("amplitude_d_per_year") * age, 0.0)
+        return amplitude_d(default_table(), self.number("age_years"))
 
     def accommodation_d(self, demand_d: float) -> float:
         """Accommodation to a demand: the demand itself, as far as the age allows."""

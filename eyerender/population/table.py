@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..spec import FileSpec, Number, Positive, Spec, kind_tag
@@ -143,6 +144,12 @@ class Table(FileSpec):
     def constant(self, name: str) -> float:
         """Value of a constant."""
         return self.constants[name].value
+
+    def median(self, name: str) -> float:
+        """Median of a quantity with a marginal."""
+        marginal = self.quantities[name].marginal
+        assert marginal is not None
+        return float(marginal.at(np.zeros(())))
 
 
 @cache

@@ -40,10 +40,11 @@ class Fundus(Spec):
     disc_gain: Annotated[float, Field(ge=1, le=5)] = Field(
         default=2.0, description="reflectance of the optic disc over that of the fundus beside it (chosen)"
     )
-    refraction_d: Annotated[float, Field(ge=-30, le=20)] = Field(
-        default=0.0,
+    refraction_d: Annotated[float, Field(ge=-30, le=20)] | None = Field(
+        default=None,
         description="spectacle refraction, for the focus only: a myope is out of focus beyond the far point; "
-        "everybody else focuses on the target, or far away without one",
+        "everybody else focuses on the target, or far away without one; default: that of each eye of a drawn person, "
+        "else 0",
     )
 
 

@@ -25,11 +25,15 @@ from ..eye.fixation import fixations
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.pose import listing_torsion
+from ..eye.refraction import at_cornea_d
 from ..eye.spec import EyeSpec
 from ..observation import EYES, Index, PoseTruth
 from ..plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
+from ..population.eyes import amplitude_d
 from ..population.model import SIDES
 from ..population.people import Person
+from ..population.response import REFERENCE_AGE, responding
+from ..population.table import default_table
 from ..region.anatomy import Region
 from ..rig.camera import Window
 from ..rig.imaging import Ambient
@@ -372,9 +376,25 @@ class Scene:
 
     def eye(self, side: Literal["right", "left"] | str) -> EyeModel:
         """Numeric eye of one side at the scene's wavelength, with the scene's pupil size and margin."""
-        eye = self.spec.eye
-        same = _Same(self.eye_file(side))
+        eye, same = self.spec.eye, _Same(self.eye_file(side))
+        if self.spec.person is None and (state := _state_of(self.spec, self.rig)) is not None:
+            same = _responded(same, state, self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
         return _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
+
+    @property
+    def accommodation_d(self) -> float | None:
+        """Dioptres to which the eyes accommodate; None where each frame's target is in focus, as far as it can be."""
+        person, state = self.spec.person, _state_of(self.spec, self.rig)
+        if person is not None:
+            return person.accommodation_d(demand_d(self.spec, self.targets_mm))
+        return None if state is None or self.spec.subject.accommodation_d is None else state.accommodation_d
+
+    def refraction_d(self, side: str) -> float:
+        """Spectacle refraction of one eye, for its focus: the look's, or that of a drawn person; else 0."""
+        given, person = self.spec.look.fundus.refraction_d, self.spec.person
+        if given is None and person is not None:
+            return person.number("refraction_d", "left" if side == "left" else "right")
+        return given or 0.0
 
     def eye_position_mm(self, side: str) -> Floats:
         """Apex of the unrotated eye in the world, (3,) mm, head at its reference position."""
@@ -523,16 +543,42 @@ def _put(data: dict[str, Any], path: str, value: Any) -> None:
 
 
 def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
-    """Accommodation that a scene asks of a drawn person: its own value, or the mean vergence of its targets (D).
+    """Accommodation (D) that a scene asks of its eyes: the given one, or what its targets ask for without glasses.
 
-    The vergence of a target is 1 / its distance from the point midway between the eyes, at the first head position.
+    The vergence of a target is 1 / its distance from the point midway between the eyes, at the first head position. A
+    drawn person needs as much more as both eyes are hyperopic on average, or less; nobody relaxes below 0.
     """
-    if spec.subject.accommodation_d is not None:
-        return spec.subject.accommodation_d
+    given = spec.subject.accommodation_d
+    if given is not None and given != "targets":
+        return given
     if targets_mm is None:
         return 0.0
     distance = np.linalg.norm(targets_mm - np.array(spec.subject.head_positions_mm[0]), axis=-1)
-    return float(np.mean(1000.0 / np.maximum(distance, 1.0)))
+    vergence = float(np.mean(1000.0 / np.maximum(distance, 1.0)))
+    if spec.person is not None:
+        vergence += float(np.mean([at_cornea_d(spec.person.number("refraction_d", side)) for side in SIDES]))
+    return max(vergence, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """What eyes that are not drawn respond to."""
+
+    age_years: float
+    luminance_cd_m2: float | None
+    field_deg: float | None
+    accommodation_d: float
+
+
+def _state_of(spec: SceneSpec, rig: RigGeometry) -> _State | None:
+    """What the eyes of a scene respond to; None for an eye as its file has it."""
+    subject = spec.subject
+    if subject.luminance_cd_m2 is None and subject.accommodation_d is None:
+        return None
+    demand = 0.0 if subject.accommodation_d is None else demand_d(spec, targets_of(spec, rig))
+    age = REFERENCE_AGE if subject.age_years is None else subject.age_years
+    response = min(demand, amplitude_d(default_table(), age))
+    return _State(age, subject.luminance_cd_m2, subject.field_deg, response)
 
 
 def targets_of(spec: SceneSpec, rig: RigGeometry) -> Floats | None:
@@ -590,6 +636,27 @@ class _Same:
 
     def __hash__(self) -> int:
         return id(self.spec)
+
+
+@lru_cache(maxsize=32)
+def _responded(
+    eye: _Same, state: _State, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMargin | None
+) -> _Same:
+    """Eye file in the light and at the distance of a scene."""
+    spec = eye.spec if margin is None else margin.applied(eye.spec)
+    try:
+        found = responding(
+            spec,
+            age_years=state.age_years,
+            accommodation_d=state.accommodation_d,
+            luminance_cd_m2=state.luminance_cd_m2,
+            field_deg=state.field_deg,
+            own_pupil=pupil_diameter_mm is not None,
+            wavelength_nm=wavelength_nm,
+        )
+    except InputError as error:
+        raise error if error.path.startswith("subject.") else error.placed(under="eye.model") from None
+    return _Same(found)
 
 
 @lru_cache(maxsize=32)

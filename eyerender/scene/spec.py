@@ -23,7 +23,7 @@ from ..region.look import Look
 from ..rig.imaging import Ambient, Lens, Motion
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
-from ..spec import FileSpec, Positive, Spec, Vec2, Vec3
+from ..spec import FileSpec, KeyProblem, Positive, Spec, Vec2, Vec3
 
 DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
@@ -88,6 +88,20 @@ class Eye(Spec):
         return spec.build(eye=side, wavelength_nm=wavelength_nm, pupil_diameter_mm=self.pupil_diameter_mm)
 
 
+MOST_ACCOMMODATION_D = 20.0
+
+
+def _accommodation_tag(value: Any) -> str:
+    return "TextSpec" if isinstance(value, str) else "NumberSpec"
+
+
+Accommodation = Annotated[
+    Annotated[Literal["targets"], Tag("TextSpec")]
+    | Annotated[float, Field(ge=0, le=MOST_ACCOMMODATION_D), Tag("NumberSpec")],
+    Discriminator(_accommodation_tag),
+]
+
+
 class SubjectSpec(Spec):
     """The eyes of the subject, their distance, and the head positions."""
 
@@ -99,15 +113,22 @@ class SubjectSpec(Spec):
         default=((0.0, 0.0, 0.0),), description="displacements of the head in the world; each has frames of its own"
     )
     luminance_cd_m2: Positive | None = Field(
-        default=None, description="luminance of what a drawn person sees, which sets the pupil; default: 20"
+        default=None,
+        description="luminance of what the eyes see, which sets the pupil; default: 20 for a drawn person, else the "
+        "pupil of the eye model",
     )
     field_deg: Annotated[float, Field(gt=0, le=180)] | None = Field(
-        default=None, description="diameter of the lit field of a drawn person; default: 60"
+        default=None, description="diameter of the lit field; default: 60"
     )
-    accommodation_d: Annotated[float, Field(ge=0, le=20)] | None = Field(
+    accommodation_d: Accommodation | None = Field(
         default=None,
-        description="dioptres to which a drawn person is asked to accommodate; default: the mean vergence of the "
-        "targets, 0 with poses",
+        description="dioptres to which the eyes are asked to accommodate, or `targets`: what the mean vergence of the "
+        "targets asks of them without glasses, 0 with poses; default: `targets` for a drawn person, else 0",
+    )
+    age_years: Annotated[float, Field(ge=5, le=100)] | None = Field(
+        default=None,
+        description="age of eyes that are not drawn, for light and accommodation; default: 28.58, about which the "
+        "formula of the pupil turns",
     )
 
     @model_validator(mode="after")
@@ -236,11 +257,24 @@ class SceneSpec(FileSpec):
         if self.targets is not None and self.targets.world_mm is None and self.rig.screen is None:
             raise ValueError("targets on a screen need rig.screen")
         self._check_size()
+        self._check_response()
         if self.image.window_px is not None:
             for i, camera in enumerate(self.rig.cameras):
                 if any(w > r for w, r in zip(self.image.window_px, camera.resolution_px, strict=True)):
                     raise ValueError(f"image.window_px: is larger than the sensor of rig.cameras.{i}")
         return self
+
+    def _check_response(self) -> None:
+        subject = self.subject
+        if self.person is not None:
+            if subject.age_years is not None:
+                raise KeyProblem("subject.age_years", "cannot stand beside a drawn person, who has an age")
+            return
+        if subject.luminance_cd_m2 is None:
+            if subject.field_deg is not None:
+                raise KeyProblem("subject.field_deg", "needs subject.luminance_cd_m2")
+        elif self.eye.pupil_diameter_mm is not None:
+            raise KeyProblem("subject.luminance_cd_m2", "cannot stand beside eye.pupil_diameter_mm; both set the pupil")
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:

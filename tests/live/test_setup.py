@@ -80,7 +80,7 @@ def test_the_shown_frame_is_that_of_the_whole_scene(desk):
 
 
 def test_a_drawn_person_has_the_same_eyes_as_in_the_whole_scene():
-    scene = er.load_scene("desktop_tracker").with_({"population": {"preset": "adults"}})
+    scene = er.load_scene("desktop_tracker").with_({"population": {"where": {"refraction_d": 0.0, "age_years": 25}}})
     scene = scene.with_(targets={"world_mm": [[300, 0, 0], [900, 50, 0]]})
     start = Setup.of(scene)
     assert start.scene.eye("left") == scene.eye("left")

@@ -12,6 +12,7 @@ from eyerender.dataset.line import image_line
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import realise, windows_of
 from eyerender.eye.entrance import entrance_pupil_mm
+from eyerender.eye.refraction import at_cornea_d
 from eyerender.scene.scene import demand_d
 
 RIG = {
@@ -89,11 +90,12 @@ def test_what_the_scene_says_stays():
 def test_light_and_distance_set_pupil_and_lens(scene):
     person = scene.spec.person
     near = scene.with_(target_mm=(250.0, 0.0, 0.0))
-    assert demand_d(near.spec, near.targets_mm) == pytest.approx(4.0)
+    own = np.mean([at_cornea_d(person.number("refraction_d", side)) for side in ("right", "left")])
+    assert demand_d(near.spec, near.targets_mm) == pytest.approx(4.0 + own)
     dark, bright = (scene.with_({"subject.luminance_cd_m2": value}) for value in (0.5, 500.0))
     assert dark.stop_diameter_mm("left") > bright.stop_diameter_mm("left") + 1.0
     for one, luminance in ((dark, 0.5), (bright, 500.0)):
-        wanted = person.entrance_pupil_mm(luminance, demand_d=1000 / 600)
+        wanted = person.entrance_pupil_mm(luminance, demand_d=1000 / 600 + own)
         assert entrance_pupil_mm(one.eye("right")) == pytest.approx(wanted, abs=1e-6)
     assert near.stop_diameter_mm("right") <= scene.stop_diameter_mm("right")
     relaxed = scene.with_({"subject.accommodation_d": 0.0})

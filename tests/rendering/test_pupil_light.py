@@ -94,7 +94,8 @@ def test_eye_is_focused_on_its_target_or_at_its_far_point():
     distance = np.linalg.norm(index.target_mm[0] - index.eye_position_mm[0] - index.head_mm[0])
     assert focus_dpt(frames, 0) == pytest.approx(1e3 / distance)
     myope = scene.with_({"look.fundus.refraction_d": -4.0}).frames()
-    assert focus_dpt(myope, 0) == 4.0
+    # Spectacles of -4 D, 12 mm before the cornea.
+    assert focus_dpt(myope, 0) == pytest.approx(4.0 / 1.048)
     hyperope = scene.with_({"look.fundus.refraction_d": 3.0}).frames()
     assert focus_dpt(hyperope, 0) == pytest.approx(1e3 / distance)
     assert focus_dpt(scene.with_(gaze_deg=(5, 0)).frames(), 0) == 0.0

@@ -1,0 +1,100 @@
+"""Light and accommodation of eyes that are not drawn, and the focus of those that are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import eyerender as er
+from eyerender.capture import focus_dpt
+from eyerender.eye.catalogue import load_eye
+from eyerender.eye.entrance import entrance_pupil_mm
+from eyerender.eye.refraction import at_cornea_d, refraction_d
+from eyerender.population.model import SIDES
+from eyerender.population.pupil import watson_yellott_mm
+from eyerender.population.response import responding
+from eyerender.scene.scene import demand_d
+from tests.population.test_scenes import RIG, scene_mapping
+
+
+def plain(model="E4", *, eye=None, **subject):
+    scene = {"format": 1, "name": "x", "rig": RIG, "targets": {"world_mm": [[500, 0, 0]]}}
+    return er.Scene.of(er.SceneSpec.from_mapping({**scene, "eye": {"model": model, **(eye or {})}, "subject": subject}))
+
+
+@pytest.mark.parametrize("model", ["E1", "E2", "E3", "E4", "E5"])
+def test_light_sets_the_entrance_pupil_of_published_eyes(model):
+    scene = plain(model, luminance_cd_m2=10.0, age_years=50, field_deg=40)
+    wanted = float(watson_yellott_mm(10.0, 40.0, 50.0))
+    for side in ("right", "left"):
+        assert entrance_pupil_mm(scene.eye(side), points=90) == pytest.approx(wanted, abs=1e-6)
+    assert scene.eye_spec == load_eye(model)
+
+
+@pytest.mark.parametrize(("model", "gain"), [("E3", 0.73), ("E4", 0.73), ("E5", 1.43)])
+def test_published_lenses_accommodate(model, gain):
+    """Navarro's surfaces on another lens gain less than a dioptre per dioptre, on a strong gradient more."""
+    scene = plain(model, accommodation_d=4.0)
+    far, near = (refraction_d(spec.build(wavelength_nm=555.0))[0] for spec in
+                 (load_eye(model), responding(load_eye(model), accommodation_d=4.0)))  # fmt: skip
+    assert (far - near) / 4.0 == pytest.approx(gain, abs=0.02)
+    eye, relaxed = scene.eye("right"), load_eye(model).build()
+    assert eye.stop.centre_mm[0] > relaxed.stop.centre_mm[0] + 0.1
+    np.testing.assert_allclose(eye.fovea_mm, relaxed.fovea_mm, atol=1e-12)
+    # The median person's miosis.
+    assert entrance_pupil_mm(relaxed) - entrance_pupil_mm(eye) == pytest.approx(1.0, abs=1e-6)
+    assert focus_dpt(scene.frames(), 0) == 4.0
+
+
+def test_targets_ask_for_accommodation_as_far_as_the_age_allows():
+    young, old = (plain(accommodation_d="targets", age_years=age) for age in (20, 60))
+    assert young.accommodation_d == pytest.approx(2.0)
+    assert old.accommodation_d == pytest.approx(0.5)
+    assert plain().accommodation_d is None
+    assert plain("E1", accommodation_d=0).eye("right").back == ()
+
+
+def test_a_given_pupil_stays():
+    scene = plain(eye={"pupil_diameter_mm": 3.0}, accommodation_d=3.0)
+    assert scene.pupil_diameter_mm == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"model": "E2", "accommodation_d": 2}, "subject.accommodation_d: needs an eye whose lens has a front"),
+        ({"accommodation_d": "near"}, "subject.accommodation_d: "),
+        ({"field_deg": 40}, "subject.field_deg: needs subject.luminance_cd_m2"),
+        ({"luminance_cd_m2": 5, "eye": {"pupil_diameter_mm": 3}}, "subject.luminance_cd_m2: cannot stand beside"),
+    ],
+)
+def test_what_cannot_respond_names_the_key(more, message):
+    with pytest.raises(er.InputError, match=message):
+        plain(**more)
+
+
+def test_a_drawn_person_has_an_age():
+    with pytest.raises(er.InputError, match=r"subject.age_years: cannot stand beside a drawn person"):
+        er.SceneSpec.from_mapping(scene_mapping(subject={"age_years": 30}))
+
+
+def test_drawn_eyes_are_focused_by_their_own_refraction():
+    """A near-sighted person relaxes for a target beyond the far point, and each eye has its own far point."""
+    myope = er.Population("myopes", where={"refraction_d": [-9, -4]})
+    scene = er.Scene.of(er.SceneSpec.from_mapping(scene_mapping(population={**myope.to_mapping(), "subject": 2})))
+    person, frames = scene.spec.person, scene.frames()
+    assert demand_d(scene.spec, scene.targets_mm) == 0.0
+    for row, side in enumerate(SIDES):
+        # Spectacles 12 mm before the cornea.
+        far_point_mm = -1000.0 / person.number("refraction_d", side) + 12.0
+        assert focus_dpt(frames, row) == pytest.approx(1000.0 / far_point_mm)
+    young = er.Population("adults", where={"refraction_d": 2.0, "age_years": 20})
+    scene = er.Scene.of(er.SceneSpec.from_mapping(scene_mapping(population=young.to_mapping())))
+    assert scene.accommodation_d == pytest.approx(1000 / 600 + at_cornea_d(2.0))
+    assert focus_dpt(scene.frames(), 0) == pytest.approx(1000 / 600)
+    # An old one cannot, so the target is blurred.
+    old = er.Population("adults", where={"refraction_d": 2.0, "age_years": 65})
+    scene = er.Scene.of(er.SceneSpec.from_mapping(scene_mapping(population=old.to_mapping())))
+    assert focus_dpt(scene.frames(), 0) == pytest.approx(-at_cornea_d(2.0))
+    given = scene.with_({"look.fundus.refraction_d": 0.0})
+    assert focus_dpt(given.frames(), 0) == 0.0
