@@ -13,6 +13,7 @@ against a receiver at the distance b by r (1 / a - 1 / b) at most. The marks are
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -20,15 +21,17 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import Floats
+from ..region.mesh import HAIRS, RegionMesh
 from ..rig.light import Lamp
 from .values import aligned
 
 if TYPE_CHECKING:
-    from .region import SkinGeometry
+    from .region import RegionScene, SkinGeometry
 
 _CELLS = 512  # along each side of a map
 _WIDTH = 16  # numbers of a lamp
 _REACH_MM = 72.0  # of the sheet about the apex of the eye
+_HAIR_MM = 0.06  # half the thickness of hairs at most, with some to spare
 _LARGEST = 0.85  # half the width of a map: tan of half the angle to the axis
 
 
@@ -39,22 +42,24 @@ class LampViews:
         lights: the lamps.
         anchor_mm: origin of the scene's frame in the world.
         reach_mm: distance from this origin within which skin matters.
-        skin: the posed region; None for one whose sheet is not known to be one surface, where every cell is marked.
+        region: the posed region; None for one whose sheet is not known to be one surface, where every cell is marked.
     """
 
-    def __init__(self, lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float, skin: SkinGeometry | None) -> None:
+    def __init__(self, lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float, region: RegionScene | None) -> None:
         reach = min(reach_mm, _REACH_MM)
         table = np.array([_frame(lamp, anchor_mm, reach) for lamp in lights], dtype=np.float32).reshape(-1)
         self._table = mi.Float(aligned(table))
-        self._known = dr.opaque(mi.Bool, skin is not None)
-        self._marks = dr.zeros(mi.UInt32, max(len(lights), 1) * _CELLS * _CELLS if skin is not None else 1)
-        if skin is not None and len(lights):
-            self._mark(skin, len(lights))
+        self._known = dr.opaque(mi.Bool, region is not None)
+        self._marks = dr.zeros(mi.UInt32, max(len(lights), 1) * _CELLS * _CELLS if region is not None else 1)
+        if region is not None and len(lights):
+            self._mark_triangles(region.skin, len(lights))
+            self._mark_hairs(_pieces(region.posed), len(lights))
 
     def clear(self, lamp: mi.UInt32, x: mi.Vector3f, active: mi.Bool) -> mi.Bool:
         """Whether nothing of the region stands between points of the sheet (scene's frame) and any point of a lamp."""
         view = self._view(lamp)
-        u, v, _ = view.place(x)
+        place = view.place(x)
+        u, v = place.u, place.v
         inside = active & self._known & (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
         cell = (lamp * _CELLS + mi.UInt32(v)) * _CELLS + mi.UInt32(u)
         return inside & (dr.gather(mi.UInt32, self._marks, cell, inside) == 0)
@@ -64,10 +69,10 @@ class LampViews:
         row = [n for part in four for n in (part.x, part.y, part.z, part.w)]
         return _View(*(mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9)), *row[12:15])
 
-    def _mark(self, skin: SkinGeometry, lamps: int) -> None:
-        """Mark the cells that triangles may cover."""
-        faces = dr.opaque(mi.UInt32, skin.faces)
-        index = dr.arange(mi.UInt32, skin.faces * lamps)
+    def _mark_triangles(self, skin: SkinGeometry, lamps: int) -> None:
+        """Mark the cells that triangles of the sheet and of the line of tears may cover, where they can shade."""
+        faces = dr.opaque(mi.UInt32, skin.before_hairs)
+        index = dr.arange(mi.UInt32, skin.before_hairs * lamps)
         lamp = index // faces
         view = self._view(lamp)
         a, b, c, special = skin.corners(index - lamp * faces)
@@ -77,22 +82,42 @@ class LampViews:
             dr.minimum(dr.dot(normal, view.origin - a), dr.dot(normal, view.origin - b)),
             dr.dot(normal, view.origin - c),
         )
-        marked = special | (front <= limit)
         places = [view.place(p) for p in (a, b, c)]
-        us, vs, wide = ([p[k] for p in places] for k in range(3))
-        spread = dr.maximum(dr.maximum(wide[0], wide[1]), wide[2])
-        lowest = [dr.minimum(dr.minimum(k[0], k[1]), k[2]) for k in (us, vs)]
-        highest = [dr.maximum(dr.maximum(k[0], k[1]), k[2]) for k in (us, vs)]
+        edge = _Edge.longest([p.u for p in places], [p.v for p in places])
+        self._mark(lamp, places, mi.Float(0), edge, view.scale, special | (front <= limit))
+
+    def _mark_hairs(self, pieces: Floats, lamps: int) -> None:
+        """Mark the cells that straight pieces (n, 2, 3) of hairs may cover."""
+        if not len(pieces):
+            return
+        ends = np.zeros((len(pieces), 2, 4), np.float32)
+        ends[..., :3] = pieces
+        table, count = mi.Float(aligned(ends.ravel())), dr.opaque(mi.UInt32, len(pieces))
+        index = dr.arange(mi.UInt32, len(pieces) * lamps)
+        lamp = index // count
+        view = self._view(lamp)
+        four = [dr.gather(mi.Vector4f, table, 2 * (index - lamp * count) + k) for k in (0, 1)]
+        p, q = (view.place(mi.Vector3f(e.x, e.y, e.z)) for e in four)
+        thick = _HAIR_MM * dr.maximum(p.per_mm, q.per_mm)
+        edge = _Edge(p.u, p.v, q.u - p.u, q.v - p.v, thick)
+        self._mark(lamp, [p, q], thick, edge, view.scale, mi.Bool(True))
+
+    def _mark(
+        self, lamp: mi.UInt32, places: Sequence[_Place], thick: mi.Float, edge: _Edge, scale: mi.Float, marked: mi.Bool
+    ) -> None:
+        """Mark the cells within `thick` and the lamp's own size of bodies with these corners, where `marked`."""
+        lowest, highest, spread = [places[0].u, places[0].v], [places[0].u, places[0].v], places[0].wide
+        for p in places[1:]:
+            spread = dr.maximum(spread, p.wide)
+            lowest = [dr.minimum(k, x) for k, x in zip(lowest, (p.u, p.v), strict=True)]
+            highest = [dr.maximum(k, x) for k, x in zip(highest, (p.u, p.v), strict=True)]
         # Straight edges are arcs in a map, of a radius of one unit at least.
-        slack = (
-            spread + 0.02 + (dr.square(highest[0] - lowest[0]) + dr.square(highest[1] - lowest[1])) / (8 * view.scale)
-        )
-        first = [mi.Int32(dr.clip(dr.floor(k - slack), -1, _CELLS)) for k in lowest]
-        last = [mi.Int32(dr.clip(dr.floor(k + slack), -1, _CELLS)) for k in highest]
+        slack = spread + 0.02 + (dr.square(highest[0] - lowest[0]) + dr.square(highest[1] - lowest[1])) / (8 * scale)
+        first = [mi.Int32(dr.clip(dr.floor(k - slack - thick), -1, _CELLS)) for k in lowest]
+        last = [mi.Int32(dr.clip(dr.floor(k + slack + thick), -1, _CELLS)) for k in highest]
         columns = mi.UInt32(dr.maximum(last[0] - first[0] + 1, 0))
         count = dr.select(marked, columns * mi.UInt32(dr.maximum(last[1] - first[1] + 1, 0)), 0)
-        # Hairs are thin, so of the cells about them those near the longest edge matter.
-        edge = _Edge.longest(us, vs)
+        # What is thin covers few of the cells about it: those near the longest edge.
         reach = edge.width + slack + 0.71
         marks = self._marks
 
@@ -112,6 +137,23 @@ class LampViews:
         dr.eval(marks)
 
 
+def _pieces(region: RegionMesh) -> Floats:
+    """Straight pieces (n, 2, 3) of the hairs of a region."""
+    curves = [c for c in region.strands[:HAIRS] if c.size]
+    pieces = [np.stack([c[:, :-1], c[:, 1:]], axis=2).reshape(-1, 2, 3) for c in curves]
+    return np.concatenate(pieces) if pieces else np.zeros((0, 2, 3))
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Place of a point in a lamp's map: cells across and down, cells by which the lamp's size moves it, cells per mm."""
+
+    u: mi.Float
+    v: mi.Float
+    wide: mi.Float
+    per_mm: mi.Float
+
+
 class _View:
     """One lamp's view: its place, two axes across its axis, the axis, cells per unit, radius, and farthest distance."""
 
@@ -121,19 +163,19 @@ class _View:
         self.origin, self._e1, self._e2, self._axis = origin, e1, e2, axis
         self.scale, self.radius, self._farthest = scalars
 
-    def place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Place (u, v) in cells of points of the scene's frame, and by how many cells the lamp's size moves them."""
+    def place(self, x: mi.Vector3f) -> _Place:
+        """Place of points of the scene's frame. The map keeps angles, so its scale is the same in all directions."""
         p = x - self.origin
         distance = dr.norm(p)
         ahead = dr.maximum(dr.dot(p, self._axis) + distance, 1e-3 * distance)
         k = self.scale / ahead
         middle = 0.5 * _CELLS
         shift = self.radius * dr.maximum(1 / distance - 1 / self._farthest, 0) * distance * k
-        return middle + k * dr.dot(p, self._e1), middle + k * dr.dot(p, self._e2), shift
+        return _Place(middle + k * dr.dot(p, self._e1), middle + k * dr.dot(p, self._e2), shift, k)
 
 
 class _Edge:
-    """Longest edge of triangles in a map, and how far the third corner is from it."""
+    """A straight line in a map, like the longest edge of a triangle; `width` is how far the rest is from it."""
 
     def __init__(self, u: mi.Float, v: mi.Float, du: mi.Float, dv: mi.Float, width: mi.Float) -> None:
         self._u, self._v, self._du, self._dv, self.width = u, v, du, dv, width

@@ -156,7 +156,7 @@ class SkinGeometry:
         corners = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
         corners[:, :3] = layout.faces
         corners[: layout.face_ends[0], 3] = False if inner is None else ~inner
-        self.faces, self.is_sheet = len(corners), inner is not None
+        self.before_hairs, self.is_sheet = int(layout.face_ends[1]), inner is not None
         self._corners = mi.UInt32(aligned(corners.ravel()))
         self._records = np.zeros((len(layout.uv), 8), np.float32)
         self._records[:, 3], self._records[:, 7] = layout.uv.T

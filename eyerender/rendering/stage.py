@@ -89,7 +89,7 @@ class Stage:
         if isinstance(place, Surround):
             textures = replace(textures, surround=place.geometry)
         if region is not None:
-            views = LampViews(job.lights, anchor, _reach_mm(job), region.skin if region.skin.is_sheet else None)
+            views = LampViews(job.lights, anchor, _reach_mm(job), region if region.skin.is_sheet else None)
             textures = replace(textures, region=region.skin, lamp_views=views)
         if lit:
             panels = Lights(light_table(panel_lamps(job.ambient, anchor), job.M, job.t))
