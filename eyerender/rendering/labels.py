@@ -46,7 +46,7 @@ def part_labels(shown: Exposed, window: Window) -> PartLabels:
     clear = alone.cornea & (alone.opacity < 0.5)
     inside = dr.select(alone.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
     amodal = dr.select(clear, inside, dr.select(alone.cornea | alone.sclera, mi.UInt8(SCLERA), mi.UInt8(BACKGROUND)))
-    part = dr.select(hidden(shown.scene, alone, o, d), mi.UInt8(BACKGROUND), amodal)
+    part = dr.select(hidden(shown.values, shown.scene, alone, o, d), mi.UInt8(BACKGROUND), amodal)
     dr.eval(amodal, part)
     shape = (window[3], window[2])
     return PartLabels(*(frozen(x.numpy().reshape(shape), np.uint8) for x in (part, amodal)))

@@ -146,7 +146,7 @@ def _pieces(region: RegionMesh) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Place of a point in a lamp's map: cells across and down, cells by which the lamp's size moves it, cells per mm."""
+    """Place of a point in a map: cells across and down, cells by which the lamp's size moves it, cells per mm."""
 
     u: mi.Float
     v: mi.Float

@@ -21,7 +21,7 @@ from ..region.mapcache import kept
 from ..region.texture import skin_texture
 from .values import aligned
 
-_HALF_MM = 500.0
+HALF_MM = 500.0
 _TILE_MM = 60.0
 
 
@@ -72,7 +72,7 @@ class SurroundGeometry:
         a, b, c = (dr.gather(mi.Vector4f, self._vertices, i, active) for i in (corner.x, corner.y, corner.z))
         at = a + uv.x * (b - a) + uv.y * (c - a)
         p, q, r = (mi.Vector3f(v.x, v.y, v.z) for v in (a, b, c))
-        around = mi.Point2f(at.y + _HALF_MM, at.z + _HALF_MM) / _TILE_MM
+        around = mi.Point2f(at.y + HALF_MM, at.z + HALF_MM) / _TILE_MM
         mapped = self._map.eval(around, active)[0]
         normal = dr.normalize(dr.cross(q - p, r - p))
         return Matte(mi.Vector3f(at.x, at.y, at.z), normal, dr.select(a.w < 0, mapped, a.w))
@@ -142,5 +142,5 @@ def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> mi.Ray3f:
 
 
 def _corners(distance_mm: float) -> Floats:
-    h = _HALF_MM
+    h = HALF_MM
     return np.array([[-distance_mm, y, z] for y, z in ((-h, -h), (h, -h), (h, h), (-h, h))])

@@ -7,7 +7,7 @@ OptiX; the nearer hit is used. Through the clear cornea the ray continues to the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +15,7 @@ import numpy as np
 
 from ..region.mapcache import kept
 from ..region.texture import iris_texture, sclera_texture
+from .surround import HALF_MM
 from .values import Values
 
 if TYPE_CHECKING:
@@ -104,6 +105,31 @@ class Textures:
         return cls(iris, sclera)
 
 
+@dataclass(frozen=True, slots=True)
+class PlaneHit:
+    """Hit on the plane of the surround in closed form, as on its first triangle, extended."""
+
+    t: mi.Float
+    prim_index: mi.UInt32
+    prim_uv: mi.Point2f
+
+    @classmethod
+    def of(cls, plane_x: mi.Float, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> PlaneHit:
+        """Hits of rays with the plane at `plane_x` that are nearer than `nearest`."""
+        t = (plane_x - o.x) / d.x
+        y, z = o.y + t * d.y, o.z + t * d.z
+        met = (t > 0) & (t < nearest) & (dr.maximum(dr.abs(y), dr.abs(z)) < HALF_MM)
+        uv = mi.Point2f((y - z) / (2 * HALF_MM), (z + HALF_MM) / (2 * HALF_MM))
+        return cls(dr.select(met, t, dr.inf), mi.UInt32(0), uv)
+
+    def is_valid(self) -> mi.Bool:
+        """Whether the plane is hit."""
+        return self.t < dr.inf
+
+
+Hit: TypeAlias = "mi.PreliminaryIntersection3f | PlaneHit"
+
+
 def opacity(values: Values, rho: mi.Float) -> mi.Float:
     """Share by which the cornea's rim has turned to sclera at radius `rho` (mm): a smooth step up to the limbus."""
     s = dr.clip((rho - values.limbus.radius) * values.limbus.gain + 1, 0, 1)
@@ -116,9 +142,7 @@ def look(values: Values, textures: Textures, scene: mi.Scene, o: mi.Vector3f, d:
     return appearance(values, textures, view, hit, d)
 
 
-def appearance(
-    values: Values, textures: Textures, view: View, hit: mi.PreliminaryIntersection3f, d: mi.Vector3f
-) -> View:
+def appearance(values: Values, textures: Textures, view: View, hit: Hit, d: mi.Vector3f) -> View:
     """View of rays along which `meet` found `view` and `hit`, with the surface of what is not the eye."""
     region, surround = textures.region, textures.surround
     if region is not None:
@@ -139,14 +163,18 @@ def appearance(
 
 def meet(
     values: Values, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True
-) -> tuple[View, mi.PreliminaryIntersection3f]:
+) -> tuple[View, Hit]:
     """View of the globe along rays, and the hit of Embree or OptiX, whose surface is not evaluated yet.
 
     coherent: whether neighbouring rays are alike, as those of a camera.
     """
     alone = meet_globe(values, o, d)
-    ray = _ray(alone, o, d)  # whatever is behind the eye does not matter
-    hit = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+    hit: Hit
+    if values.structure.obstacles:
+        ray = _ray(alone, o, d)  # whatever is behind the eye does not matter
+        hit = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+    else:
+        hit = PlaneHit.of(values.backdrop_x, o, d, alone.distance)
     clear = ~hit.is_valid() & active
     on_cornea, on_sclera = alone.cornea & clear, alone.sclera & clear
     other = hit.is_valid() & active
@@ -155,9 +183,11 @@ def meet(
     ), hit
 
 
-def hidden(scene: mi.Scene, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
+def hidden(values: Values, scene: mi.Scene, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
     """Whether anything of the scene is in front of the globe, where the rays of `meet_globe` meet it."""
     met = alone.cornea | alone.sclera
+    if not values.structure.obstacles:
+        return met & PlaneHit.of(values.backdrop_x, o, d, alone.distance).is_valid()
     return dr.if_stmt(
         (), met, lambda: scene.ray_test(_ray(alone, o, d), coherent=True, active=True), lambda: mi.Bool(False)
     )
