@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Singles
 from ..errors import InputError
+from .buffers import image_buffer
 from .statistics import median, quantile
 
 Image = Singles
@@ -113,7 +114,8 @@ def _from_integers(array: NDArray[np.generic], bit_depth: int | None, gamma: flo
     if high > full or low < 0:
         raise InputError(f"holds levels {low} to {high}, outside the {bits} bits stated", path="bit_depth")
     if gamma == 1.0:
-        return np.multiply(array, np.float32(DN / full), dtype=np.float32), DN, DN / full
+        out = image_buffer(array.shape)
+        return np.multiply(array, np.float32(DN / full), out=out, dtype=np.float32), DN, DN / full
     table = (DN * (np.arange(full + 1) / full) ** gamma).astype(np.float32)
     linear = table[array.astype(np.intp, copy=False)]
     # This is the decoded step at the image's own middle level.

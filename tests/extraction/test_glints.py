@@ -100,17 +100,16 @@ def test_spot_jacobian_is_the_models_slope(blur):
         255.0,
     )
     assert pixels.count.tolist() == [np.count_nonzero(pixels.spot == i) for i in range(2)]
-    grid = windows.Grid.of(pixels.radius, pixels.spot, pixels.dx, pixels.dy)
     rest = np.zeros(pixels.data.size)
     theta = np.array([[20.2, 19.7, 4.0, 0.2, 0.4, 10.0, 0.3, -0.2], [11.6, 12.3, 5.0, 0.1, 0.3, 20.0, -0.1, 0.2]])
     if blur is not None:
         theta = np.concatenate([theta, [[40.0, 0.7, 1.2], [-25.0, 2.1, -0.4]]], axis=1)
     theta += rng.normal(0.0, 0.02, theta.shape)
-    slopes = gaussian_model.slopes(pixels, grid, theta, rest, blur)
+    slopes = gaussian_model.slopes(pixels, theta, rest, blur)
     for k in range(theta.shape[1]):
         step = np.zeros_like(theta)
         step[:, k] = 1e-5
-        less, more = (gaussian_model.slopes(pixels, grid, theta + d, rest, blur)[-1] for d in (-step, step))
+        less, more = (gaussian_model.slopes(pixels, theta + d, rest, blur)[-1] for d in (-step, step))
         slope = (less - more) / 2e-5  # the last row is the residual, -model
         np.testing.assert_allclose(slopes[k], slope, atol=1e-6 * max(1.0, np.abs(slope).max()))
 

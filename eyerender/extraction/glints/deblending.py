@@ -16,7 +16,7 @@ from ..preprocessing import DN, Image
 from .fits import SpotFit, joined
 from .fitting import UNEXPLAINED, FittedSpots, fit_spots, report
 from .gaussian_model import STEPS, Limits, descend, slopes
-from .windows import Grid, window_radius
+from .windows import window_radius
 
 Background = Callable[[Floats, Floats], Floats]
 Starts = tuple[Floats, Floats, Floats]
@@ -86,8 +86,7 @@ def _best_edge(fitted: FittedSpots, blur_px: float) -> tuple[Floats, Floats]:
         (n,) share of the squared residual that the edge explains, to first order; (n, 3) its height, direction, offset.
     """
     pixels, n = fitted.pixels, fitted.theta.shape[0]
-    grid = Grid.of(pixels.radius, pixels.spot, pixels.dx, pixels.dy)
-    rows = slopes(pixels, grid, fitted.theta, fitted.rest)
+    rows = slopes(pixels, fitted.theta, fitted.rest)
     share, edge = np.zeros(n), np.zeros((n, 3))
     for i, (part, clip) in enumerate(zip(pixels.parts(rows), pixels.parts(pixels.clip), strict=True)):
         if clip.any():

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import ndtr
 
-from ...arrays import Bools, Floats
+from ...arrays import Bools, Floats, Indices
+from ..compiled import twin
 from .windows import Grid, Others, SpotPixels
 
 PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; with an edge also h, p, o
@@ -85,34 +87,66 @@ def promising(theta: Floats, gram: Floats, used: Floats, noise: float) -> Bools:
     return np.asarray(misfit < np.maximum(ROUGH * noise, ROUGH_SHARE * np.exp(theta[:, 2])))
 
 
-def slopes(pixels: SpotPixels, grid: Grid, theta: Floats, rest: Floats, blur_px: float | None = None) -> Floats:
+def slopes(pixels: SpotPixels, theta: Floats, rest: Floats, blur_px: float | None = None) -> Floats:
     """Derivatives (K + 1, P) of the model at every pixel and, in the last row, the residual.
 
     Args:
         pixels: P pixels of n spots.
-        grid: their grid.
         theta: (n, K) parameters.
         rest: (P,) image minus everything that is not fitted.
         blur_px: blur of the edges, if the spots have edges of their own.
     """
-    across, along = grid.profiles(theta[:, :2] - pixels.centre, np.exp(theta[:, 3:5]), np.exp(theta[:, 2]))
+    about = (pixels.first, pixels.plane, pixels.centre, pixels.radius)
+    return _spot_rows(*about, theta, rest, 1.0 if blur_px is None else blur_px)
+
+
+@twin
+def _spot_rows(
+    first: Indices, plane: Floats, centre: Floats, radius: Floats, theta: Floats, rest: Floats, blur_px: float
+) -> Floats:
+    """Compute `slopes` from the parts of `SpotPixels`."""
+    spot = np.arange(radius.size).repeat(np.diff(first))
+    _, dx, dy = plane
+    across, along = Grid.of(radius, spot, dx, dy).profiles(
+        theta[:, :2] - centre, np.exp(theta[:, 3:5]), np.exp(theta[:, 2])
+    )
     out = np.empty((theta.shape[1] + 1, rest.size))
     np.multiply(across[0], along[1], out=out[0])
     np.multiply(across[1:], along[1], out=out[2:4])
     np.multiply(across[1], along[::2], out=out[1:5:3])
-    out[5:8] = pixels.plane
-    own = theta[:, 5:].T.take(pixels.spot, axis=1)
+    out[5:8] = plane
+    own = theta[:, 5:].T.take(spot, axis=1)
     np.subtract(rest, out[2], out=out[-1])
-    out[-1] -= np.einsum("kp,kp->p", own[:3], pixels.plane)
-    if blur_px is not None:
+    out[-1] -= np.einsum("kp,kp->p", own[:3], plane)
+    if theta.shape[1] == WITH_EDGE:
         cos, sin = np.cos(own[4]), np.sin(own[4])
-        t = (pixels.dx * cos + pixels.dy * sin - own[5]) / blur_px
+        t = (dx * cos + dy * sin - own[5]) / blur_px
         bell = own[3] * (_DENSITY / blur_px) * np.exp(-0.5 * t * t)
         out[8] = ndtr(t)
-        np.multiply(bell, pixels.dy * cos - pixels.dx * sin, out=out[9])
+        np.multiply(bell, dy * cos - dx * sin, out=out[9])
         np.negative(bell, out=out[10])
         out[-1] -= own[3] * out[8]
     return out
+
+
+@twin
+def _products(first: Indices, rows: Floats) -> Floats:
+    """Products (n, K + 1, K + 1) of rows (K + 1, P), summed over the pixels first[i] to first[i + 1] of each spot."""
+    out = np.empty((first.size - 1, rows.shape[0], rows.shape[0]))
+    for k, (begin, end) in enumerate(pairwise(first.tolist())):
+        np.matmul(rows[:, begin:end], rows[:, begin:end].T, out=out[k])
+    return out
+
+
+@twin
+def _solved(gram: Floats, damping: Floats) -> Floats:
+    """Damped steps (n, K) of the normal equations gram (n, K + 1, K + 1), whose last column is the right side."""
+    k = gram.shape[1] - 1
+    matrix = gram[:, :k, :k].copy()
+    diagonal = matrix.reshape(-1, k * k)[:, :: k + 1]
+    diagonal *= 1.0 + damping[:, None]
+    diagonal += 1e-9
+    return np.asarray(np.linalg.solve(matrix, gram[:, :k, k:])[..., 0])
 
 
 def prior(limits: Limits, edge: bool) -> Floats:
@@ -142,9 +176,7 @@ def _gram(pixels: SpotPixels, rows: Floats, theta: Floats, noise: float, penalty
         rows *= ~idle
         used = used - pixels.total(idle)
     k = theta.shape[1]
-    out = np.empty((theta.shape[0], k + 1, k + 1))
-    for product, part in zip(out, pixels.parts(rows), strict=True):
-        np.matmul(part, part.T, out=product)
+    out = _products(pixels.first, rows)
     out *= 1.0 / noise**2
     pull = theta @ penalty
     out[:, :k, :k] += penalty
@@ -188,8 +220,7 @@ def descend(
     """
     noise, penalty, k = limits.noise_dn, prior(limits, blur_px is not None), theta.shape[1]
     theta, start, middle, cost = theta.copy(), theta[:, :2], theta[:, :2], np.full(theta.shape[0], np.inf)
-    grid = Grid.of(pixels.radius, pixels.spot, pixels.dx, pixels.dy)
-    rows = slopes(pixels, grid, theta, rest, blur_px)
+    rows = slopes(pixels, theta, rest, blur_px)
     gram, used = _gram(pixels, rows, theta, noise, penalty)
     damping, over = np.full(theta.shape[0], 1e-2), np.zeros(theta.shape[0], dtype=bool)
     held = np.zeros(0) if others is None else others.light(theta, rest.size)
@@ -197,11 +228,7 @@ def descend(
     enough = SMALL_GAIN[0] if others is None else SMALL_GAIN[1]
     least, most, stride = _LEAST[:k], _MOST[:k], _STRIDE[:k]
     for turn in range(steps):
-        matrix = gram[:, :k, :k].copy()
-        diagonal = matrix.reshape(-1, k * k)[:, :: k + 1]
-        diagonal *= 1.0 + damping[:, None]
-        diagonal += 1e-9
-        step = np.linalg.solve(matrix, gram[:, :k, k:])[..., 0]
+        step = _solved(gram, damping)
         gain = (step * gram[:, :k, k]).sum(axis=1)
         step = np.minimum(np.maximum(step, -stride), stride)
         trial = np.minimum(np.maximum(theta + step, least), most)
@@ -212,7 +239,7 @@ def descend(
         if (over | stalled if turn >= STEPS // 2 else over).all():
             theta = np.where((np.abs(step) < 1.0).all(axis=1)[:, None], trial, theta)
             break
-        rows = slopes(pixels, grid, trial, rest, blur_px)
+        rows = slopes(pixels, trial, rest, blur_px)
         new, new_used = _gram(pixels, rows, trial, noise, penalty)
         better = new[:, k, k] <= gram[:, k, k] * (1.0 + 1e-12)
         stalled = better & (new[:, k, k] > STALLED * gram[:, k, k])

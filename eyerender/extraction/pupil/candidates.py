@@ -6,7 +6,7 @@ Of nested blobs the innermost is taken.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 
 from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse, points_on_ellipse
+from ..compiled import twin
 from ..preprocessing import Image, Prepared, as_image
 from ..settings import Shape
 from ..statistics import median, quantile
+from .glare import Cleared, around
 
 LEVELS = 20  # thresholds at even grey levels
 # A blob that fills less than this share of its convex hull has notches, as reflections at the boundary make them. The
@@ -170,14 +172,7 @@ def _blob_ellipse(m: dict[str, float], least: float, most: float, shape: Shape) 
 
 def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -> list[Candidate]:
     centre, axes, angle, filled = blobs[:, :2], blobs[:, 2:4], blobs[:, 4], blobs[:, 5]
-    near_in = _sample(small, centre, axes * 0.65, angle)
-    deep_in = _sample(small, centre, axes * 0.4, angle)
-    near_out = _sample(small, centre, axes * 1.15 + 1.5, angle)
-    step = near_out - near_in
-    within = np.concatenate([near_in, deep_in], axis=1)
-    inside, typical, edge_level = (np.median(part, axis=1) for part in (within, step, near_in))
-    enclosed = np.mean(step > np.maximum(0.35 * typical, 2.0 * noise)[:, None], axis=1)
-    spread = np.std(within, axis=1)
+    inside, typical, enclosed, edge_level, spread = _ring_levels(small, blobs, noise, ANGLES).T
     uniform = 1.0 / (1.0 + (spread / np.maximum(typical, 1e-6)) ** 2)
     strength = np.maximum(typical, 0.0) / (np.maximum(typical, 0.0) + 8.0 * noise + 4.0)
     score = enclosed**2 * strength * uniform * np.minimum(filled, 1.0) ** 2
@@ -211,6 +206,20 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -
     ]  # fmt: skip
 
 
+@twin
+def _ring_levels(small: Image, blobs: Floats, noise: float, angles: int) -> Floats:
+    """Levels (n, 5) of blobs (n, 6): inside, step to a ring outside, share of that ring, near the edge, scatter."""
+    centre, axes, angle = blobs[:, :2], blobs[:, 2:4], blobs[:, 4]
+    near_in = _sample(small, centre, axes * 0.65, angle, angles)
+    deep_in = _sample(small, centre, axes * 0.4, angle, angles)
+    near_out = _sample(small, centre, axes * 1.15 + 1.5, angle, angles)
+    step = near_out - near_in
+    within = np.concatenate([near_in, deep_in], axis=1)
+    inside, typical, edge_level = (np.median(part, axis=1) for part in (within, step, near_in))
+    enclosed = np.mean(step > np.maximum(0.35 * typical, 2.0 * noise)[:, None], axis=1)
+    return np.stack([inside, typical, enclosed, edge_level, np.std(within, axis=1)], axis=1)
+
+
 def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
     """Make a candidate of a known place, with the levels of the image there; None where it is no darker inside."""
     centre, axes, angle = ellipse.centre_px[None], ellipse.semi_axes_px[None], np.array([ellipse.angle_rad])
@@ -222,9 +231,9 @@ def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
     return Candidate(ellipse=ellipse, inside_dn=inside, step_dn=step, enclosed=1.0, score=1.0)
 
 
-def _sample(small: Image, centre: Floats, axes: Floats, angle: Floats) -> Image:
-    """Levels (n, ANGLES) along n ellipses at the nearest pixels; outside the frame its border is repeated."""
-    points = np.rint(points_on_ellipse(centre, axes, angle, ANGLES)).astype(np.intp)
+def _sample(small: Image, centre: Floats, axes: Floats, angle: Floats, count: int = ANGLES) -> Image:
+    """Levels (n, count) along n ellipses at the nearest pixels; outside the frame its border is repeated."""
+    points = np.rint(points_on_ellipse(centre, axes, angle, count)).astype(np.intp)
     column = np.minimum(np.maximum(points[..., 0], 0), small.shape[1] - 1)
     row = np.minimum(np.maximum(points[..., 1], 0), small.shape[0] - 1)
     return np.asarray(small[row, column])
@@ -251,61 +260,60 @@ class Interior:
     spread_dn: float
 
 
-def inspect_interior(
-    linear: Image, ellipse: Ellipse, blur_px: float, noise_dn: float, glare: Bools | None = None
-) -> Interior:
+def inspect_interior(cleared: Cleared, ellipse: Ellipse, blur_px: float, noise_dn: float) -> Interior:
     """Statistics of the pixels inside an ellipse, up to where the blur of the boundary begins.
 
-    The interior of a pupil is even. An iris has the pupil in its middle, and other objects have structure. Pixels of
-    `glare` (h, w) do not count. Medians and quartiles are used because of fainter reflections.
+    The interior of a pupil is even. An iris has the pupil in its middle, and other objects have structure. Pixels that
+    glints covered do not count. Medians and quartiles are used because of fainter reflections.
     """
-    a, b = ellipse.semi_axes_px
-    cx, cy = ellipse.centre_px
-    x0, x1 = max(0, math.floor(cx - a)), min(linear.shape[1], math.ceil(cx + a) + 1)
-    y0, y1 = max(0, math.floor(cy - a)), min(linear.shape[0], math.ceil(cy + a) + 1)
-    dx, dy = np.arange(x0, x1)[None, :] - cx, np.arange(y0, y1)[:, None] - cy
-    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+    a, b = ellipse.semi_axes_px.tolist()
+    columns, rows = around(ellipse, a, cleared.linear.shape)
+    crop, hidden = cleared.cut(columns, rows)
+    (cx, cy) = ellipse.centre_px.tolist()
+    end = min(0.85, 1.0 - 2.5 * blur_px / b)
+    about = (cx - columns.start, cy - rows.start, a, b, ellipse.angle_rad)
+    darker, core, ring, between = _interior(crop, hidden, about, end)
+    spread = math.sqrt(max((0.7413 * between) ** 2 - noise_dn**2, 0.0))
+    if end < 0.6 or core < 5 or ring < 5:
+        return Interior(0.0, math.inf, spread)
+    return Interior(darker, 1.2533 * noise_dn * math.sqrt(1.0 / core + 1.0 / ring), spread)
+
+
+@twin
+def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float) -> tuple[float, int, int, float]:
+    """Statistics of the pixels inside an ellipse (cx, cy, a, b, angle), up to the share `end` of its axes.
+
+    Returns:
+        Median of the ring below `end` minus that of the middle, the pixels of each, and the interquartile range of all.
+    """
+    cx, cy, a, b, angle = ellipse
+    dx, dy = np.arange(crop.shape[1])[None, :] - cx, np.arange(crop.shape[0])[:, None] - cy
+    cos, sin = math.cos(angle), math.sin(angle)
     radius2 = ((dx * cos + dy * sin) / a) ** 2 + ((dy * cos - dx * sin) / b) ** 2
-    crop = linear[y0:y1, x0:x1]
-    if glare is not None:
-        hidden = glare[y0:y1, x0:x1]
-        # Where glints cover most of the middle, the level around them must do.
-        if np.count_nonzero(hidden & (radius2 < 0.35**2)) < 0.5 * np.count_nonzero(radius2 < 0.35**2):
-            radius2 = np.where(hidden, np.inf, radius2)
-    end = min(0.85, 1.0 - 2.5 * blur_px / float(b))
+    # Where glints cover most of the middle, the level around them must do.
+    if np.count_nonzero(hidden & (radius2 < 0.35**2)) < 0.5 * np.count_nonzero(radius2 < 0.35**2):
+        radius2 = np.where(hidden, np.inf, radius2)
     core, ring = crop[radius2 < 0.35**2], crop[(radius2 > (end - 0.25) ** 2) & (radius2 < end**2)]
     inside = crop[radius2 < max(end, 0.5) ** 2]
-    spread = 0.0
-    if inside.size >= 8:
-        between = quantile(inside, 0.75) - quantile(inside, 0.25)
-        spread = math.sqrt(max((0.7413 * between) ** 2 - noise_dn**2, 0.0))
-    if end < 0.6 or core.size < 5 or ring.size < 5:
-        return Interior(0.0, math.inf, spread)
-    error = 1.2533 * noise_dn * math.sqrt(1.0 / core.size + 1.0 / ring.size)
-    return Interior(median(ring) - median(core), error, spread)
+    between = quantile(inside, 0.75) - quantile(inside, 0.25) if inside.size >= 8 else 0.0
+    return median(ring) - median(core), core.size, ring.size, between
 
 
-def find_inside(prepared: Prepared, ellipse: Ellipse, shape: Shape) -> list[Candidate]:
+def find_inside(prepared: Prepared, cleared: Cleared, ellipse: Ellipse, shape: Shape) -> list[Candidate]:
     """Candidates inside an ellipse (an iris), from a smoothed image because the step may be below the noise."""
-    linear = prepared.linear
-    a, b = ellipse.semi_axes_px
-    cx, cy = ellipse.centre_px
-    x0, x1 = max(0, math.floor(cx - a)), min(linear.shape[1], math.ceil(cx + a) + 1)
-    y0, y1 = max(0, math.floor(cy - a)), min(linear.shape[0], math.ceil(cy + a) + 1)
+    a, b = ellipse.semi_axes_px.tolist()
+    columns, rows = around(ellipse, a, cleared.linear.shape)
+    crop, _ = cleared.cut(columns, rows)
     sigma = float(np.clip(0.08 * b, 1.0, 4.0))
-    smooth = as_image(cv2.GaussianBlur(cv2.medianBlur(np.ascontiguousarray(linear[y0:y1, x0:x1]), 5), (0, 0), sigma))
+    smooth = as_image(cv2.GaussianBlur(cv2.medianBlur(crop, 5), (0, 0), sigma))
     noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * sigma)
     inner = Prepared(smooth, prepared.clip_dn, noise, prepared.inverted)
-    found = find_candidates(inner, shape)
-    moved = [
-        Candidate(
-            ellipse=c.ellipse.shifted((x0, y0)),
-            inside_dn=c.inside_dn,
-            step_dn=c.step_dn,
-            enclosed=c.enclosed,
-            score=c.score,
-        )
-        for c in found
-        if c.ellipse.area_px2 < 0.75 * ellipse.area_px2
+    found = (
+        replace(one, ellipse=one.ellipse.shifted((columns.start, rows.start))) for one in find_candidates(inner, shape)
+    )
+    return [
+        one
+        for one in found
+        if one.ellipse.area_px2 < 0.75 * ellipse.area_px2
+        and math.dist(one.ellipse.centre_px, ellipse.centre_px) < 0.5 * b
     ]
-    return [c for c in moved if math.dist(c.ellipse.centre_px, ellipse.centre_px) < 0.5 * float(b)]

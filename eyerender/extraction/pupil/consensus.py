@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 
 from ...arrays import Bools, Floats
-from ...geometry.ellipse import Ellipse, EllipseFit, fit_ellipse_direct, from_cv2, signed_distance
+from ...geometry.ellipse import Ellipse, from_cv2, signed_distance
+from ..compiled import twin
 from ..settings import Shape
 from ..statistics import median
 from .candidates import Candidate
 from .edges import EdgePoints
-from .stretches import Cuts, turn_of
+from .stretches import Cuts, direct_fits, turn_of
 
 SECTORS = 48  # sectors of the outline, to measure support
 PIECES = 16  # arcs are cut at these sectors, to separate a lid margin from the boundary it joins
@@ -91,20 +92,21 @@ def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance:
     If all points are about as close to their ellipse as noise allows, no others are tried.
     """
     points = edges.points_px
-    whole = _sane(fit_ellipse_direct(points[None]), candidate, shape)
+    whole = _sane(direct_fits(points[None]), candidate, shape)
     if whole.shape[0] and _support(points, edges.normals, whole, tolerance)[0] > ALL_AGREE * _most(points, whole)[0]:
         return _ellipse(whole[0])
     fits = np.concatenate([whole, _sane(_random_fits(edges, candidate), candidate, shape)])
     if fits.shape[0] == 0:
         return None
     # Every third point suffices to choose the ellipses that are worth counting with all points.
-    rough = _support(points[::3], edges.normals[::3], fits, tolerance)
+    some, facing = np.ascontiguousarray(points[::3]), np.ascontiguousarray(edges.normals[::3])
+    rough = _support(some, facing, fits, tolerance)
     fits = fits[np.argsort(-rough, kind="stable")[:FINALISTS]]
     return _ellipse(fits[int(np.argmax(_support(points, edges.normals, fits, tolerance)))])
 
 
-def _random_fits(edges: EdgePoints, candidate: Candidate) -> EllipseFit:
-    """Fit ellipses to the points of random triples of arc pieces."""
+def _random_fits(edges: EdgePoints, candidate: Candidate) -> Floats:
+    """Fit ellipses (m, 5) to the points of random triples of arc pieces."""
     points = edges.points_px
     offset = points - candidate.ellipse.centre_px
     bearing = np.arctan2(offset[:, 1], offset[:, 0])
@@ -113,7 +115,7 @@ def _random_fits(edges: EdgePoints, candidate: Candidate) -> EllipseFit:
     sizes = np.bincount(piece)
     usable = np.nonzero(sizes >= 4)[0]
     if usable.size < 3:
-        return fit_ellipse_direct(np.zeros((0, 5, 2)))
+        return np.zeros((0, 5))
     rng = np.random.default_rng(0)  # the same image must give the same result
     order = np.argsort(piece, kind="stable")
     first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
@@ -122,23 +124,24 @@ def _random_fits(edges: EdgePoints, candidate: Candidate) -> EllipseFit:
     chosen = usable[np.argsort(-keys, axis=1)[:, :3]]
     at = rng.random((SAMPLES, 3, POINTS_PER_PIECE)) * sizes[chosen][..., None]
     index = order[first[chosen][..., None] + at.astype(np.intp)].reshape(SAMPLES, -1)
-    return fit_ellipse_direct(points[index])
+    return direct_fits(points[index])
 
 
-def _sane(fit: EllipseFit, candidate: Candidate, shape: Shape) -> Floats:
-    """Centre, semi-axes and angle (m, 5) of the fits with plausible size and shape."""
-    a, b = fit.semi_axes_px[:, 0], fit.semi_axes_px[:, 1]
+def _sane(fits: Floats, candidate: Candidate, shape: Shape) -> Floats:
+    """Those of the fits (n, 5) that have a plausible size and shape."""
+    a, b = fits[:, 2], fits[:, 3]
     a0, b0 = candidate.ellipse.semi_axes_px
     with np.errstate(invalid="ignore"):
         sane = (a < 2.2 * a0) & (b > 0.4 * b0) & (b > shape.aspect * a)
         sane &= (a <= shape.most_px) & (b >= 0.8 * shape.least_px)
-    return np.asarray(np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[sane])
+    return np.asarray(fits[sane])
 
 
 def _ellipse(row: Floats) -> Ellipse:
     return Ellipse(row[:2], row[2:4], float(row[4]))
 
 
+@twin
 def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) -> Floats:
     """Score (m,) of every ellipse (m, 5).
 
@@ -167,33 +170,14 @@ def _most(points: Floats, fits: Floats) -> Floats:
 def _polished(
     edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float, *, free: bool = False
 ) -> BoundaryFit | str:
-    """Select points and refit with AMS until the selection settles.
-
-    Edge points are moved outward by the curvature shift. The steepest place of a blurred convex edge is sigma^2 kappa /
-    2 inside the true edge.
-    """
-    ellipse, inliers = start, np.zeros(edges.points_px.shape[0], dtype=bool)
-    points = edges.points_px
-    for turn in range(5):
-        distance, normals, curvature = relative_to(ellipse, edges.points_px)
-        shift = np.minimum(0.5 * edges.sigma_px**2 * curvature, 0.15 * float(ellipse.semi_axes_px[1]))
-        points, distance = edges.points_px + shift[:, None] * normals, distance + shift
-        agree = np.einsum("nk,nk->n", normals, edges.normals) > 0.9
-        reach = 2.0 * tolerance if turn == 0 and not free else tolerance
-        chosen = (np.abs(distance) < reach) & agree
-        if turn >= 1 and chosen.sum() >= 8:
-            spread = 1.4826 * median(np.abs(distance[chosen] - median(distance[chosen])))
-            chosen &= np.abs(distance) < max(3.5 * spread, 0.1)
-        if chosen.sum() < 8:
-            return f"only {int(chosen.sum())} edge points agree on one ellipse"
-        settled = bool((chosen == inliers).all()) and turn > 1
-        inliers = chosen
-        fitted = ams_fit(points[inliers])
-        if fitted is None:
-            return "the edge points that agree span no ellipse"
-        ellipse = fitted
-        if settled:
-            break
+    """Select points and refit with AMS until the selection settles."""
+    begun = np.array([*start.centre_px, *start.semi_axes_px, start.angle_rad])
+    count, found, inliers, points = _settled(edges.points_px, edges.normals, begun, edges.sigma_px, tolerance, free)
+    if 0 <= count < 8:
+        return f"only {count} edge points agree on one ellipse"
+    if count < 0:
+        return "the edge points that agree span no ellipse"
+    ellipse = _ellipse(found)
     distance = signed_distance(ellipse, points[inliers])
     support, gap = outline_support(ellipse, points[inliers])
     a, b = ellipse.semi_axes_px
@@ -204,6 +188,52 @@ def _polished(
     if b < shape.aspect * a:
         return f"its axes' ratio {b / a:.2f} is below {shape.aspect:g}"
     return BoundaryFit(ellipse, inliers, points[inliers], support, gap, float(np.sqrt(np.mean(distance**2))))
+
+
+@twin
+def _settled(
+    points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float, free: bool
+) -> tuple[int, Floats, Bools, Floats]:
+    """Select points and refit with AMS until the selection settles.
+
+    Edge points are moved outward by the curvature shift. The steepest place of a blurred convex edge is sigma^2 kappa /
+    2 inside the true edge.
+
+    Args:
+        points: (n, 2) edge points.
+        normals: (n, 2).
+        start: (5,) centre, semi-axes and angle.
+        sigma_px: width of the whole smoothing.
+        tolerance: largest distance of a selected point, px.
+        free: whether the first selection, too, is limited to the tolerance, not to twice that.
+
+    Returns:
+        How many points were selected (fewer than 8: too few; -1: they span no ellipse), the ellipse (5,), which points
+        (n,), and the points (n, 2) as moved.
+    """
+    ellipse, inliers, moved = _ellipse(start), np.zeros(points.shape[0], dtype=bool), points
+    for turn in range(5):
+        distance, outward, curvature = relative_to(ellipse, points)
+        shift = np.minimum(0.5 * sigma_px**2 * curvature, 0.15 * float(ellipse.semi_axes_px[1]))
+        moved, distance = points + shift[:, None] * outward, distance + shift
+        agree = np.einsum("nk,nk->n", outward, normals) > 0.9
+        reach = 2.0 * tolerance if turn == 0 and not free else tolerance
+        chosen = (np.abs(distance) < reach) & agree
+        if turn >= 1 and chosen.sum() >= 8:
+            spread = 1.4826 * median(np.abs(distance[chosen] - median(distance[chosen])))
+            chosen &= np.abs(distance) < max(3.5 * spread, 0.1)
+        if chosen.sum() < 8:
+            return int(chosen.sum()), start, chosen, moved
+        same = bool((chosen == inliers).all()) and turn > 1
+        inliers = chosen
+        fitted = ams_fit(moved[inliers])
+        if fitted is None:
+            return -1, start, inliers, moved
+        ellipse = fitted
+        if same:
+            break
+    found = np.array([*ellipse.centre_px, *ellipse.semi_axes_px, ellipse.angle_rad])
+    return int(inliers.sum()), found, inliers, moved
 
 
 def ams_fit(points: Floats) -> Ellipse | None:

@@ -7,14 +7,17 @@ defined for a circle too. The reported parameters are (cx, cy, a, b, angle).
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Floats
+from ...arrays import Floats, Indices
 from ...geometry.ellipse import Ellipse
+from ..compiled import twin
 from .edge_model import SECTORS, Place, sector_of
 
 SHAPE = 5  # number of parameters
+GROUPS = SECTORS // 3  # each is longer than the noise's correlation
 # Edge points are selected by their residual, so their scatter underestimates the noise; fitted on development images.
 SELECTION = 1.6
 
@@ -63,41 +66,72 @@ def sector_excess(plain: Floats, inverse: Floats, sums: Floats) -> float:
     return float(np.trace(np.linalg.solve(plain, summed @ summed.T))) / SHAPE
 
 
-def edge_covariance(ellipse: Ellipse, points: Floats, residual_px: float) -> Floats:
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeSums:
+    """Sums over edge points near an ellipse, over all and over each group of three sectors.
+
+    Attributes:
+        matrix: (5, 5) of the products of the distance's slopes.
+        scores: (5, GROUPS) of the slopes times the distance.
+        slopes: (5, GROUPS) of the slopes.
+        count: (GROUPS,) points.
+    """
+
+    matrix: Floats
+    scores: Floats
+    slopes: Floats
+    count: Indices
+
+    @staticmethod
+    def of(ellipse: Ellipse, points: Floats) -> EdgeSums:
+        """Sum over points (n, 2)."""
+        about = (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
+        return EdgeSums(*_edge_sums(about, points, GROUPS))
+
+    @property
+    def inverse(self) -> Floats:
+        """Inverse (5, 5) of the matrix, which a ridge keeps regular."""
+        matrix = self.matrix
+        return np.asarray(np.linalg.inv(matrix + 1e-9 * np.trace(matrix) * np.eye(SHAPE)), dtype=np.float64)
+
+
+@twin
+def _edge_sums(ellipse: tuple[float, ...], points: Floats, groups: int) -> tuple[Floats, Floats, Floats, Indices]:
+    """The sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle)."""
+    about = Ellipse(np.array(ellipse[:2]), np.array(ellipse[2:4]), ellipse[4])
+    place = Place.of(about, points[:, 0], points[:, 1])
+    slopes = distance_slopes(about, place)
+    group = sector_of(place) // (SECTORS // groups)
+
+    def sums(rows: Floats) -> Floats:
+        return np.array([np.bincount(group, weights=row, minlength=groups) for row in rows], dtype=np.float64)
+
+    return gram(slopes), sums(slopes * place.distance), sums(slopes), np.bincount(group, minlength=groups)
+
+
+def edge_covariance(ellipse: Ellipse, sums: EdgeSums, residual_px: float) -> Floats:
     """Covariance (5, 5) of (cx, cy, a, b, angle) of an ellipse fitted to edge points with this residual.
 
     Neighbouring edge points share noise (through the filter) and texture. `sector_excess` accounts for that.
     """
-    place = Place.of(ellipse, points[:, 0], points[:, 1])
-    slopes = distance_slopes(ellipse, place)
-    matrix = gram(slopes)
-    inverse = np.linalg.inv(matrix + 1e-9 * np.trace(matrix) * np.eye(SHAPE))
+    inverse = sums.inverse
     plain = inverse * max(residual_px, 1e-4) ** 2
-    # A third of the sectors: each is then longer than the noise's correlation. n / (n - 5) for the fitted parameters.
-    coarse = sector_of(place) // 3
-    scores = slopes * place.distance
-    sums = np.array([np.bincount(coarse, weights=row, minlength=SECTORS // 3) for row in scores], dtype=np.float64)
-    groups = max(int(np.count_nonzero(np.bincount(coarse))), SHAPE + 1)
-    excess = sector_excess(plain, inverse, sums)
-    excess *= groups / (groups - SHAPE)
+    # n / (n - 5) for the fitted parameters.
+    groups = max(int(np.count_nonzero(sums.count)), SHAPE + 1)
+    excess = sector_excess(plain, inverse, sums.scores) * groups / (groups - SHAPE)
     return to_axes(plain * max(excess, 1.0) * SELECTION, ellipse)
 
 
-def leverage(ellipse: Ellipse, points: Floats) -> float:
+def leverage(ellipse: Ellipse, sums: EdgeSums) -> float:
     """How far an ellipse through edge points follows displacements of parts of the outline.
 
     It is the root mean square, over the outline, of the boundary's standard deviation if groups of three sectors
     that hold points were displaced independently by 1 px. A real boundary is uneven, so the hidden
     part of an outline is the more uncertain the larger this is.
     """
-    place = Place.of(ellipse, points[:, 0], points[:, 1])
-    slopes = distance_slopes(ellipse, place)
-    matrix = gram(slopes)
-    inverse = np.linalg.inv(matrix + 1e-9 * np.trace(matrix) * np.eye(SHAPE))
-    coarse = sector_of(place) // 3
-    sums = inverse @ np.array([np.bincount(coarse, weights=row, minlength=SECTORS // 3) for row in slopes])
+    moved = sums.inverse @ sums.slopes
     outline = distance_slopes(ellipse, Place.middles(ellipse, 32))
-    return math.sqrt(max(float(np.sum(outline * ((sums @ sums.T) @ outline))) / outline.shape[1], 1e-6))
+    return math.sqrt(max(float(np.sum(outline * ((moved @ moved.T) @ outline))) / outline.shape[1], 1e-6))
 
 
 def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:

@@ -24,8 +24,10 @@ from scipy.special import ndtr
 
 from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse
+from ..compiled import twin
 
 SECTORS = 48  # equal steps of the ellipse's parameter u
+NEAR = 2  # steps to the nearest point; the band is within a few tenths of b, the boundary's own pixels closer
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 
@@ -52,6 +54,30 @@ class EdgeModel:
     kurtosis: float = 0.0
     lean: tuple[float, float] = (0.0, 0.0)
     displaced: Floats | None = None
+
+    def numbers(self) -> Floats:
+        """The parameters (11 + 1 + 2 K,) without the displacements.
+
+        They are the centre, the semi-axes and the angle, sigma, inner level, slope, kurtosis, lean (two) and `outer`.
+        """
+        ellipse = self.ellipse
+        head = (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
+        rest = (self.sigma_px, self.inner_dn, self.slope, self.kurtosis, *self.lean)
+        return np.array([*head, *rest, *self.outer.tolist()])
+
+    @staticmethod
+    def of(numbers: Floats) -> EdgeModel:
+        """Make the model of the parameters that `numbers` gives."""
+        sigma, inner, slope, kurtosis, lean_x, lean_y = numbers[5:11].tolist()
+        return EdgeModel(
+            ellipse=Ellipse(numbers[:2], numbers[2:4], float(numbers[4])),
+            inner_dn=inner,
+            outer=numbers[11:],
+            sigma_px=sigma,
+            slope=slope,
+            kurtosis=kurtosis,
+            lean=(lean_x, lean_y),
+        )
 
     @property
     def step_dn(self) -> float:
@@ -191,6 +217,13 @@ class Profile:
             ramp_by_distance=step,
             ramp_by_sigma=density,
         )
+
+
+@twin
+def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats, steps: int) -> Indices:
+    """Sector (n,) of each pixel (x, y) near an ellipse (cx, cy, a, b, angle)."""
+    about = Ellipse(np.array(ellipse[:2]), np.array(ellipse[2:4]), ellipse[4])
+    return sector_of(Place.of(about, x, y, steps))
 
 
 def sector_of(place: Place) -> Indices:

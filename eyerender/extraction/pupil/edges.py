@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices
-from ...geometry.ellipse import Ellipse
+from ...arrays import Bools, Bytes, Floats, Indices
+from ..compiled import twin
 from ..preprocessing import Image, as_image
 from ..statistics import median, quantile
 from .candidates import Candidate
+from .glare import Cleared, around
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,14 +38,13 @@ class EdgePoints:
 
 
 def find_edges(
-    linear: Image,
+    cleared: Cleared,
     candidate: Candidate,
     noise_dn: float,
     bright_dn: float,
     filter_px: float,
     *,
     band: float,
-    glare: Bools | None = None,
 ) -> EdgePoints:
     """Find edge points within `band` times the semi-axes of the candidate's outline (and at least 4 px).
 
@@ -55,34 +55,64 @@ def find_edges(
     of three magnitudes. It is exact for a Gaussian-blurred straight edge. Source: Devernay (1995), with the logarithm.
 
     Args:
-        linear: the image, DN.
+        cleared: the image; no edge point is taken beside the glints in it.
         candidate: the dark blob.
         noise_dn: standard deviation of a pixel's noise.
         bright_dn: level of a bright spot.
         filter_px: sigma of the derivative filter.
         band: width of the search, in semi-axes.
-        glare: (h, w) pixels that glints covered; no edge point is taken beside them.
     """
     ellipse = candidate.ellipse
     b = float(ellipse.semi_axes_px[1])
-    x0, y0, crop = _crop(linear, ellipse, 1.0 + band, 8.0)
+    columns, rows = around(ellipse, float(ellipse.semi_axes_px[0]) * (1.0 + band) + 8.0, cleared.linear.shape)
+    x0, y0 = columns.start, rows.start
+    crop, hidden = cleared.cut(columns, rows)
     sigma = filter_px
     gx, gy = _gradient(crop, sigma)
     magnitude = as_image(cv2.magnitude(gx, gy))
     half_band = max(band, 4.0 / b)
-    # The coarse tests come first, so that the others work on few pixels.
     floor = 3.5 * noise_dn / (2.0 * math.sqrt(2.0 * math.pi) * sigma**2)
-    strong = magnitude > floor
-    if glare is not None:
-        beside = 2 * math.ceil(sigma) + 1
-        covered = glare[y0 : y0 + crop.shape[0], x0 : x0 + crop.shape[1]].astype(np.uint8)
-        strong &= cv2.dilate(covered, np.ones((beside, beside), np.uint8)) == 0
+    beside = 2 * math.ceil(sigma) + 1
+    covered = np.asarray(cv2.dilate(hidden.view(np.uint8), np.ones((beside, beside), np.uint8)), dtype=np.uint8)
+    cx, cy = ellipse.centre_px.tolist()
+    about = (cx - x0, cy - y0, *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
+    points, normals, widths, row, column = _ridges(gx, gy, magnitude, covered, about, half_band, floor)
+    smooth = as_image(cv2.GaussianBlur(crop, (0, 0), max(0.7, 0.7 * sigma)))
+    depth = min(max(4.0, 2.5 * sigma), 0.6 * b)
+    noise_smooth = noise_dn / (2.0 * math.sqrt(math.pi) * max(0.7, 0.7 * sigma))
+    dark = candidate.inside_dn + max(0.5 * candidate.step_dn, 4.0 * noise_smooth)
+    keep = _on_the_dark_side(smooth, points, normals, depth, dark, bright_dn)
+    arc = _arcs(crop.shape, row, column)
+    spread = sigma * 1.1
+    if keep.sum() >= 8:
+        spread = math.sqrt(median(widths[keep]))
+    return EdgePoints(
+        points[keep] + np.array([x0, y0]),
+        normals[keep],
+        magnitude[row, column][keep].astype(np.float64),
+        arc[keep],
+        float(np.clip(spread, sigma, 8.0)),
+        sigma,
+    )
+
+
+@twin
+def _ridges(
+    gx: Image, gy: Image, magnitude: Image, covered: Bytes, ellipse: tuple[float, ...], half_band: float, floor: float
+) -> tuple[Floats, Floats, Floats, Indices, Indices]:
+    """Find the ridges of the gradient that point outward, near an ellipse (cx, cy, a, b, angle).
+
+    Returns:
+        Points (n, 2), normals (n, 2), squared widths of the profile along the normal (n,), rows and columns (n,).
+    """
+    strong = (magnitude > floor) & (covered == 0)
     strong[[0, -1], :] = False
     strong[:, [0, -1]] = False
+    # The coarse tests come first, so that the others work on few pixels.
     at = np.flatnonzero(strong)
-    row, column = at // crop.shape[1], at % crop.shape[1]
+    row, column = at // magnitude.shape[1], at % magnitude.shape[1]
     dx, dy, here = gx[row, column], gy[row, column], magnitude[row, column]
-    u, v, radius = _outward(ellipse, column + (x0 - ellipse.centre_px[0]), row + (y0 - ellipse.centre_px[1]))
+    u, v, radius = _outward(ellipse, column, row)
     gate = np.flatnonzero((np.abs(radius - 1.0) < half_band) & (dx * u + dy * v > 0.7 * here))
     row, column, dx, dy, here = row[gate], column[gate], dx[gate], dy[gate], here[gate]
     level = np.abs(dx) >= np.abs(dy)
@@ -96,28 +126,18 @@ def find_edges(
     offset = np.clip(0.5 * (logs[0] - logs[2]) / bend, -0.75, 0.75)
     points = np.stack([column + np.where(level, offset, 0.0), row + np.where(level, 0.0, offset)], axis=-1)
     normals = np.stack([dx, dy], axis=-1).astype(np.float64) / here[:, None]
-
-    smooth = as_image(cv2.GaussianBlur(crop, (0, 0), max(0.7, 0.7 * sigma)))
-    depth = min(max(4.0, 2.5 * sigma), 0.6 * b)
-    behind, ahead = _nearest(smooth, points - depth * normals), _nearest(smooth, points + 0.5 * depth * normals)
-    noise_smooth = noise_dn / (2.0 * math.sqrt(math.pi) * max(0.7, 0.7 * sigma))
-    dark = behind < candidate.inside_dn + max(0.5 * candidate.step_dn, 4.0 * noise_smooth)
-    plain = ahead < bright_dn
-    keep = dark & plain
-    arc = _arcs(crop.shape, row, column)
-    # Width of the profile: the logarithm of a Gaussian bends by -1 / sigma^2 along the normal, less along the axis.
+    # The logarithm of a Gaussian bends by -1 / sigma^2 along the normal, less along the axis.
     lean = np.where(level, np.abs(normals[:, 0]), np.abs(normals[:, 1]))
-    spread = sigma * 1.1
-    if keep.sum() >= 8:
-        spread = math.sqrt(median(lean[keep] ** 2 / -bend[keep]))
-    return EdgePoints(
-        points[keep] + np.array([x0, y0]),
-        normals[keep],
-        here[keep].astype(np.float64),
-        arc[keep],
-        float(np.clip(spread, sigma, 8.0)),
-        sigma,
-    )
+    return points, normals, lean**2 / -bend, row, column
+
+
+@twin
+def _on_the_dark_side(
+    smooth: Image, points: Floats, normals: Floats, depth: float, dark: float, bright: float
+) -> Bools:
+    """Whether the level `depth` px behind points is below `dark`, and half as far ahead of them below `bright`."""
+    behind, ahead = _nearest(smooth, points - depth * normals), _nearest(smooth, points + 0.5 * depth * normals)
+    return np.asarray((behind < dark) & (ahead < bright))
 
 
 def filter_sigma(step_dn: float, noise_dn: float, b: float) -> float:
@@ -137,15 +157,6 @@ def edge_noise_px(step_dn: float, *, noise_dn: float, sigma_filter: float, sigma
     return slope_noise / max(curvature, 1e-9)
 
 
-def _crop(linear: Image, ellipse: Ellipse, scale: float, margin: float) -> tuple[int, int, Image]:
-    reach = float(ellipse.semi_axes_px[0]) * scale + margin
-    cx, cy = ellipse.centre_px
-    height, width = linear.shape
-    x0, x1 = max(0, math.floor(cx - reach)), min(width, math.ceil(cx + reach) + 1)
-    y0, y1 = max(0, math.floor(cy - reach)), min(height, math.ceil(cy + reach) + 1)
-    return x0, y0, linear[y0:y1, x0:x1]
-
-
 def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
     """Derivatives of a Gaussian, normalised so that a ramp of 1 DN per px gives 1."""
     t = np.arange(-math.ceil(4.0 * sigma), math.ceil(4.0 * sigma) + 1, dtype=np.float64)
@@ -159,13 +170,10 @@ def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
     )
 
 
-def _outward(ellipse: Ellipse, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-    """Unit outward normal of the concentric ellipses at pixels (n,), and the radius in units of the semi-axes.
-
-    x and y are counted from the ellipse's centre.
-    """
-    a, b = ellipse.semi_axes_px.tolist()
-    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+def _outward(ellipse: tuple[float, ...], column: Indices, row: Indices) -> tuple[Floats, Floats, Floats]:
+    """Unit outward normal of the concentric ellipses at pixels (n,), and the radius in units of the semi-axes."""
+    cx, cy, a, b, angle = ellipse
+    cos, sin, x, y = math.cos(angle), math.sin(angle), column - cx, row - cy
     p, q = (x * cos + y * sin) / a, (y * cos - x * sin) / b
     u, v = p * (cos / a) - q * (sin / b), p * (sin / a) + q * (cos / b)
     length = np.maximum(np.sqrt(u * u + v * v), 1e-12)

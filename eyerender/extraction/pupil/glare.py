@@ -7,6 +7,7 @@ pupil are theirs. A morphological opening gives the level around them.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -24,9 +25,58 @@ NOISE = 6.0  # in standard deviations: what noise alone does not reach in any pi
 FLANK_PX = 3
 
 
-def without_glare(
-    linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: float, noise_dn: float
-) -> tuple[Image, Bools | None]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Cleared:
+    """An image in which glints near a candidate are replaced by the level around them.
+
+    Attributes:
+        linear: (h, w) the image as it is, DN.
+        corner: column and row of the part that differs.
+        patch: (k, l) that part, DN.
+        mask: (k, l) which of its pixels are replaced.
+    """
+
+    linear: Image
+    corner: tuple[int, int] = (0, 0)
+    patch: Image | None = None
+    mask: Bools | None = None
+
+    def cut(self, columns: slice, rows: slice) -> tuple[Image, Bools]:
+        """Cut out a part: its levels, and which of its pixels are replaced."""
+        crop = self.linear[rows, columns]
+        hidden = np.zeros(crop.shape, dtype=bool)
+        if self.patch is None or self.mask is None:
+            return np.ascontiguousarray(crop), hidden
+        crop, (x, y), (height, width) = crop.copy(), self.corner, self.patch.shape
+        x0, x1 = max(columns.start, x), min(columns.stop, x + width)
+        y0, y1 = max(rows.start, y), min(rows.stop, y + height)
+        if x0 < x1 and y0 < y1:
+            to = (slice(y0 - rows.start, y1 - rows.start), slice(x0 - columns.start, x1 - columns.start))
+            part = (slice(y0 - y, y1 - y), slice(x0 - x, x1 - x))
+            crop[to], hidden[to] = self.patch[part], self.mask[part]
+        return crop, hidden
+
+    def doubled(self, linear: Image) -> Cleared:
+        """The same at twice the scale, of the image `linear` at that scale."""
+        if self.patch is None or self.mask is None:
+            return Cleared(linear)
+        size = (2 * self.patch.shape[1], 2 * self.patch.shape[0])
+        mask = cv2.resize(self.mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
+        patch = as_image(cv2.resize(self.patch, size))
+        x, y = 2 * self.corner[0], 2 * self.corner[1]
+        patch[~mask] = linear[y : y + size[1], x : x + size[0]][~mask]
+        return Cleared(linear, (x, y), patch, mask)
+
+
+def around(ellipse: Ellipse, reach: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Columns and rows of an image (h, w) up to `reach` px from an ellipse's centre."""
+    (cx, cy), (height, width) = ellipse.centre_px.tolist(), shape
+    x0, x1 = max(0, math.floor(cx - reach)), min(width, math.ceil(cx + reach) + 1)
+    y0, y1 = max(0, math.floor(cy - reach)), min(height, math.ceil(cy + reach) + 1)
+    return slice(x0, max(x0, x1)), slice(y0, max(y0, y1))
+
+
+def without_glare(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: float, noise_dn: float) -> Cleared:
     """Replace glints near an ellipse by the level around them.
 
     Args:
@@ -35,30 +85,21 @@ def without_glare(
         inside_dn: level inside.
         step_dn: step from inside to outside.
         noise_dn: standard deviation of a pixel's noise.
-
-    Returns:
-        The image (h, w) and the mask (h, w) of the pixels that were replaced. Without glints: the image and None.
     """
     a, b = ellipse.semi_axes_px.tolist()
-    reach = 1.4 * a + 8.0
-    (cx, cy), (height, width) = ellipse.centre_px.tolist(), linear.shape
-    x0, x1 = max(0, math.floor(cx - reach)), min(width, math.ceil(cx + reach) + 1)
-    y0, y1 = max(0, math.floor(cy - reach)), min(height, math.ceil(cy + reach) + 1)
-    crop = linear[y0:y1, x0:x1]
+    columns, rows = around(ellipse, 1.4 * a + 8.0, linear.shape)
+    crop = linear[rows, columns]
     bright = inside_dn + (1.0 + ABOVE_IRIS) * step_dn + NOISE * noise_dn
     if crop.shape[0] < 4 or crop.shape[1] < 4 or not crop.max() > bright:
-        return linear, None
+        return Cleared(linear)
     # Half resolution is enough for the level around glints.
     half = as_image(cv2.resize(crop, (crop.shape[1] // 2, crop.shape[0] // 2), interpolation=cv2.INTER_AREA))
     side = 2 * math.ceil(max(11.0, b) / 4.0) + 1
     opened = cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
-    around = as_image(cv2.resize(opened, (crop.shape[1], crop.shape[0]), interpolation=cv2.INTER_LINEAR))
-    glint = (crop > bright) & (crop - around > STANDS_OUT * step_dn + NOISE * noise_dn)
+    level = as_image(cv2.resize(opened, (crop.shape[1], crop.shape[0]), interpolation=cv2.INTER_LINEAR))
+    glint = (crop > bright) & (crop - level > STANDS_OUT * step_dn + NOISE * noise_dn)
     if not glint.any():
-        return linear, None
+        return Cleared(linear)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * FLANK_PX + 1, 2 * FLANK_PX + 1))
     wide = cv2.dilate(glint.astype(np.uint8), disc).astype(bool)
-    cleared, mask = linear.copy(), np.zeros(linear.shape, dtype=bool)
-    cleared[y0:y1, x0:x1][wide] = around[wide]
-    mask[y0:y1, x0:x1] = wide
-    return cleared, mask
+    return Cleared(linear, (columns.start, rows.start), np.where(wide, level, crop), wide)

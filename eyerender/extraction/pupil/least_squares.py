@@ -14,8 +14,9 @@ import numpy as np
 
 from ...arrays import Floats, Indices
 from ...geometry.ellipse import Ellipse
-from .covariance import SHAPE, distance_slopes, gram, project
-from .edge_model import EdgeModel, Place, Profile, harmonics
+from ..compiled import twin
+from .covariance import SHAPE, distance_slopes, gram
+from .edge_model import NEAR, EdgeModel, Place, Profile, harmonics
 
 # Parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, lean (two), mean outer level.
 FIXED = SHAPE + 7
@@ -25,7 +26,6 @@ FIXED = SHAPE + 7
 # lean).
 HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
 KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond them the edge would not be monotonic
-NEAR = 2  # steps to the nearest point; the band is within a few tenths of b, the boundary's own pixels closer
 STILL_PX = 1e-3  # a fit ends with a step smaller than this
 
 
@@ -38,7 +38,6 @@ class Pixels:
         y: (n,) px.
         level: (n,) DN.
         index: (n,) which of the k sectors that have pixels each pixel is in.
-        first: (k,) where each of these sectors begins.
         sector: (k,) which of all sectors it is.
     """
 
@@ -46,19 +45,13 @@ class Pixels:
     y: Floats
     level: Floats
     index: Indices
-    first: Indices
     sector: Indices
 
     @staticmethod
     def of(x: Floats, y: Floats, level: Floats, sector: Indices) -> Pixels:
         """Sort pixels by their sector; sector (n,) ascends."""
         new = np.diff(sector, prepend=-1) > 0
-        first = np.flatnonzero(new)
-        return Pixels(x, y, level, np.cumsum(new) - 1, first, sector[first])
-
-    def sums(self, values: Floats) -> Floats:
-        """Sums (..., k) of values (..., n) over each sector's pixels."""
-        return np.asarray(np.add.reduceat(values, self.first, axis=-1), dtype=np.float64)
+        return Pixels(x, y, level, np.cumsum(new) - 1, sector[new])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,25 +83,55 @@ class Prior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
-    """Linearised model at the pixels.
+class Sums:
+    """Sums over the pixels of the linearised model's products; p parameters, k sectors that have pixels.
+
+    "Slopes" are the derivatives of a pixel's level by the parameters, "steepness" is that by the distance.
 
     Attributes:
-        residual: (n,).
-        jacobian: (p, n).
-        slope: (n,) derivative of the level by the distance.
+        matrix: (p, p) of the slopes' products.
+        cost: of the squared residuals.
+        pull: (p, k) of the slopes times the residual, in each sector.
+        across: (p, k) of the slopes times the steepness.
+        along: (k,) of the steepness times the residual.
+        square: (k,) of the squared steepness.
     """
 
-    residual: Floats
-    jacobian: Floats
-    slope: Floats
+    matrix: Floats
+    cost: float
+    pull: Floats
+    across: Floats
+    along: Floats
+    square: Floats
 
     @staticmethod
-    def of(pixels: Pixels, model: EdgeModel, place: Place, displaced: Floats) -> Rows:
-        """Compute the residuals and slopes at sectors that lie `displaced` (k,) px inside the ellipse."""
-        at = replace(place, distance=place.distance + displaced[pixels.index]) if displaced.any() else place
-        level, jacobian_, slope = jacobian(model, at)
-        return Rows(pixels.level - level, jacobian_, slope)
+    def of(pixels: Pixels, model: EdgeModel, displaced: Floats) -> Sums:
+        """Sum with sectors that lie `displaced` (k,) px inside the ellipse."""
+        return Sums(*_pixel_sums(pixels.x, pixels.y, pixels.level, pixels.index, model.numbers(), displaced))
+
+
+@twin
+def _pixel_sums(
+    x: Floats, y: Floats, level: Floats, index: Indices, numbers: Floats, displaced: Floats
+) -> tuple[Floats, float, Floats, Floats, Floats, Floats]:
+    """Compute the parts of `Sums` for the model of these numbers (see `EdgeModel.numbers`)."""
+    model = EdgeModel.of(numbers)
+    place = Place.of(model.ellipse, x, y, steps=NEAR)
+    expected, slopes, steepness = jacobian(model, replace(place, distance=place.distance + displaced[index]))
+    residual = level - expected
+    first = np.searchsorted(index, np.arange(displaced.size))
+
+    def sums(values: Floats) -> Floats:
+        return np.asarray(np.add.reduceat(values, first, axis=-1), dtype=np.float64)
+
+    return (
+        gram(slopes),
+        float(residual @ residual),
+        sums(slopes * residual),
+        sums(slopes * steepness),
+        sums(steepness * residual),
+        sums(steepness * steepness),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -136,30 +159,21 @@ class Normal:
         return np.asarray((self.along - step @ self.across) * self.inverse)
 
     @staticmethod
-    def of(pixels: Pixels, rows: Rows, displaced: Floats, prior: Prior) -> Normal:
-        """Sum over the pixels and eliminate the displacements (k,)."""
-        residual, slopes = rows.residual, rows.jacobian
-        matrix, vector, cost = gram(slopes), project(slopes, residual), float(np.sum(residual * residual))
+    def of(sums: Sums, displaced: Floats, prior: Prior) -> Normal:
+        """Eliminate the displacements (k,) from the sums."""
+        matrix, vector, cost = sums.matrix, sums.pull.sum(axis=1), sums.cost
         if math.isinf(prior.displacement):
             none = np.zeros(displaced.size)
-            return Normal(
-                matrix=matrix,
-                vector=vector,
-                cost=cost,
-                across=np.zeros((vector.size, none.size)),
-                along=none,
-                inverse=none,
-            )
-        along = pixels.sums(rows.slope * residual) - prior.displacement * displaced
-        across = pixels.sums(slopes * rows.slope)
-        inverse = 1.0 / (pixels.sums(rows.slope * rows.slope) + prior.displacement)
-        taken = across * inverse
-        cost += prior.displacement * float(displaced @ displaced)
+            across = np.zeros(sums.across.shape)
+            return Normal(matrix=matrix, vector=vector, cost=cost, across=across, along=none, inverse=none)
+        along = sums.along - prior.displacement * displaced
+        inverse = 1.0 / (sums.square + prior.displacement)
+        taken = sums.across * inverse
         return Normal(
-            matrix=matrix - taken @ across.T,
+            matrix=matrix - taken @ sums.across.T,
             vector=vector - taken @ along,
-            cost=cost,
-            across=across,
+            cost=cost + prior.displacement * float(displaced @ displaced),
+            across=sums.across,
             along=along,
             inverse=inverse,
         )
@@ -167,16 +181,11 @@ class Normal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Result of the fit.
-
-    It holds the model, the displacements (k,) px, and rows and place (n,). The rows and the place, except for the
-    residual, do not include the last tiny step.
-    """
+    """Result of the fit: the model, the displacements (k,) px, and the sums at it, up to a last tiny step."""
 
     model: EdgeModel
     displaced: Floats
-    rows: Rows
-    place: Place
+    sums: Sums
 
 
 def jacobian(model: EdgeModel, place: Place) -> tuple[Floats, Floats, Floats]:
@@ -232,17 +241,15 @@ def moved(model: EdgeModel, step: Floats) -> EdgeModel:
     )
 
 
-def gauss_newton(
-    pixels: Pixels, model: EdgeModel, displaced: Floats, place: Place, prior: Prior, steps: int
-) -> Solution:
+def gauss_newton(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
     """Fit the model with at most `steps` Gauss-Newton steps with Levenberg's damping.
 
     The cost is sum r^2 plus the priors' part. displaced (k,) is the start of the sectors' displacements.
     """
-    rows = Rows.of(pixels, model, place, displaced)
-    held = prior.of_all(rows.jacobian.shape[0])
+    sums = Sums.of(pixels, model, displaced)
+    held = prior.of_all(sums.matrix.shape[0])
     diagonal = np.arange(held.size)
-    normal = Normal.of(pixels, rows, displaced, prior)
+    normal = Normal.of(sums, displaced, prior)
     cost = normal.cost + float(held @ _values(model) ** 2)
     damping = 1e-4
     for _ in range(steps):
@@ -258,19 +265,17 @@ def gauss_newton(
         further = normal.displaced_by(step)
         trial, trial_displaced = moved(model, step), displaced + further
         if largest < STILL_PX and abs(float(step[SHAPE])) < 10.0 * STILL_PX and damping < 1e-3:
-            # For so small a step the linear prediction holds, and another step would be several times smaller.
-            left = rows.residual - project(rows.jacobian.T, step) - rows.slope * further[pixels.index]
-            return Solution(trial, trial_displaced, replace(rows, residual=left), place)
-        trial_place = Place.of(trial.ellipse, pixels.x, pixels.y, steps=NEAR)
-        trial_rows = Rows.of(pixels, trial, trial_place, trial_displaced)
-        trial_normal = Normal.of(pixels, trial_rows, trial_displaced, prior)
+            # Another step would be several times smaller, and so small a step changes no sum.
+            return Solution(trial, trial_displaced, sums)
+        trial_sums = Sums.of(pixels, trial, trial_displaced)
+        trial_normal = Normal.of(trial_sums, trial_displaced, prior)
         trial_cost = trial_normal.cost + float(held @ _values(trial) ** 2)
         if trial_cost <= cost:
-            model, displaced, place, rows, normal = trial, trial_displaced, trial_place, trial_rows, trial_normal
+            model, displaced, sums, normal = trial, trial_displaced, trial_sums, trial_normal
             gained, cost = cost - trial_cost, trial_cost
             damping *= 0.1
             if gained < 1e-7 * cost:
                 break
         else:
             damping = min(max(damping * 30.0, 1e-3), 1e6)
-    return Solution(model, displaced, rows, place)
+    return Solution(model, displaced, sums)

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import Bools, Floats
+from ...arrays import Bools, Floats, Indices
+from ..compiled import twin
 from ..statistics import median
 from .consensus import UNEVEN
-from .edge_model import SECTORS, EdgeModel, Place, sector_of
+from .edge_model import NEAR, SECTORS, EdgeModel, Place, sector_of
 
 OUTLIER = 5.0  # pixels with a larger residual, in standard deviations, are left out
 LINEAR = 0.1  # a displacement below this share of the blur changes the levels linearly
@@ -26,19 +27,22 @@ class Visible:
         explained: (SECTORS,) sectors that the model explains.
         uneven_px: standard deviation of the sectors' displacements from the ellipse.
         displaced: (SECTORS,) most likely displacements, px inward.
+        bins: (n,) sector of each pixel.
     """
 
     use: Bools
     explained: Bools
     uneven_px: float
     displaced: Floats
+    bins: Indices
 
 
 def visible_part(
     model: EdgeModel,
     displaced: Floats,
+    x: Floats,
+    y: Floats,
     level: Floats,
-    place: Place,
     use: Bools,
     seen: Bools,
     sectors: Bools,
@@ -54,26 +58,15 @@ def visible_part(
     Args:
         model: the fitted model.
         displaced: (SECTORS,) displacements that the fit found, px inward.
+        x: (n,) px.
+        y: (n,) px.
         level: (n,) grey levels.
-        place: their positions relative to the ellipse.
         use: (n,) pixels that the fit used.
         seen: (SECTORS,) sectors that the fit used.
         sectors: (SECTORS,) sectors with edge points.
         noise_dn: standard deviation of a pixel's noise.
     """
-    bins = sector_of(place)
-    whole = displaced
-    for _ in range(2):  # the levels are not linear in a displacement as large as the blur
-        expected, slope = model.level_and_slope(replace(place, distance=place.distance + whole[bins]))
-        residual = level - expected
-        counted = slope * use
-        weight = np.bincount(bins, weights=counted * slope, minlength=SECTORS)
-        further = np.bincount(bins, weights=counted * residual, minlength=SECTORS) / np.maximum(weight, 1e-9)
-        further = np.where(weight > 1e-9, np.minimum(np.maximum(further, -model.sigma_px), model.sigma_px), 0.0)
-        whole = whole + further
-        if float(np.abs(further).max()) < LINEAR * model.sigma_px:
-            break
-    residual = residual - slope * further[bins]
+    bins, residual, whole, weight = _displacements(x, y, level, use, model.numbers(), displaced)
     told = seen & (weight > 0.1 * float(weight.max(initial=0.0)))
     by_noise = noise_dn**2 / np.maximum(weight, 1e-9)
     uneven2 = 0.0
@@ -90,9 +83,33 @@ def visible_part(
     radius = math.sqrt(float(model.ellipse.semi_axes_px.prod()))
     likely2 = np.where(sectors, max(uneven2, (UNEVEN * radius) ** 2), uneven2) + by_noise
     explained &= np.abs(whole) < FARTHEST * np.sqrt(likely2)
-    return Visible(
-        new_use, explained, math.sqrt(uneven2), np.where(explained, whole * uneven2 / (uneven2 + by_noise), 0.0)
-    )
+    likely = np.where(explained, whole * uneven2 / (uneven2 + by_noise), 0.0)
+    return Visible(new_use, explained, math.sqrt(uneven2), likely, bins)
+
+
+@twin
+def _displacements(
+    x: Floats, y: Floats, level: Floats, use: Bools, numbers: Floats, displaced: Floats
+) -> tuple[Indices, Floats, Floats, Floats]:
+    """Find the displacement of every sector that its pixels show.
+
+    Returns:
+        The sector of each pixel (n,), its residual (n,), the displacements (SECTORS,) and their weights (SECTORS,).
+    """
+    model = EdgeModel.of(numbers)
+    place = Place.of(model.ellipse, x, y, steps=NEAR)
+    bins, whole = sector_of(place), displaced
+    for _ in range(2):  # the levels are not linear in a displacement as large as the blur
+        expected, slope = model.level_and_slope(replace(place, distance=place.distance + whole[bins]))
+        residual = level - expected
+        counted = slope * use
+        weight = np.bincount(bins, weights=counted * slope, minlength=SECTORS).astype(np.float64)
+        further = np.bincount(bins, weights=counted * residual, minlength=SECTORS) / np.maximum(weight, 1e-9)
+        further = np.where(weight > 1e-9, np.minimum(np.maximum(further, -model.sigma_px), model.sigma_px), 0.0)
+        whole = whole + further
+        if float(np.abs(further).max()) < LINEAR * model.sigma_px:
+            break
+    return bins, residual - slope * further[bins], whole, weight
 
 
 def clear_of_lids(seen: Bools, model: EdgeModel) -> Bools:

@@ -11,8 +11,8 @@ from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse, fit_ellipse_direct
 from ..preprocessing import Image
 from .covariance import SHAPE, distance_slopes, sector_excess, to_axes
-from .edge_model import SECTORS, EdgeModel, Place, sector_of
-from .least_squares import FIXED, NEAR, Normal, Pixels, Prior, Rows, Solution, gauss_newton
+from .edge_model import NEAR, SECTORS, EdgeModel, Place, sectors_at
+from .least_squares import FIXED, Normal, Pixels, Prior, Solution, Sums, gauss_newton
 from .occlusion import clear_of_lids, visible_part
 
 # Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
@@ -68,26 +68,25 @@ def refine(
     model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before.model
     prior = Prior.of(start, noise_dn, 0.0 if before is None else before.uneven_px)
     x, y, level = _band(linear, model, masked)
-    place = Place.of(model.ellipse, x, y, steps=NEAR)
+    about = (*model.ellipse.centre_px.tolist(), *model.ellipse.semi_axes_px.tolist(), model.ellipse.angle_rad)
+    bins = sectors_at(about, x, y, NEAR)
     use = np.ones(x.size, dtype=bool)
     # A lid must not decide the order of the outer level.
     seen = clear_of_lids(sectors, start) if before is None else before.sectors
     displaced = np.zeros(SECTORS) if model.displaced is None else model.displaced.copy()
     for turn in range(TURNS):
-        bins = sector_of(place)
         chosen = np.nonzero(use & seen[bins])[0]
         if chosen.size < 60:
             return "too few pixels on the boundary are free of glints and lids"
         chosen = chosen[np.argsort(bins[chosen].astype(np.uint8), kind="stable")]  # a radix sort
         pixels = Pixels.of(x[chosen], y[chosen], level[chosen], bins[chosen])
         begun = displaced[pixels.sector]
-        found = gauss_newton(pixels, model, begun, place.taken(chosen), prior, steps=6 if turn == 0 else 4)
+        found = gauss_newton(pixels, model, begun, prior, steps=6 if turn == 0 else 4)
         model = found.model
         if not _sane(model, start):
             return "the pixel model's fit ran away from the edges"
-        place = Place.of(model.ellipse, x, y, steps=NEAR)
         displaced[pixels.sector] = found.displaced
-        visible = visible_part(model, displaced, level, place, use, seen, sectors, noise_dn)
+        visible = visible_part(model, displaced, x, y, level, use, seen, sectors, noise_dn)
         new_seen = clear_of_lids(visible.explained, model)
         same = bool((visible.use == use).all() and (new_seen == seen).all())
         same &= abs(visible.uneven_px - prior.uneven_px) < max(0.2 * prior.uneven_px, 0.01)
@@ -100,7 +99,7 @@ def refine(
             same &= order == ORDERS[0]
         if same or turn + 1 == TURNS:
             break
-        use, seen, displaced = visible.use, new_seen, visible.displaced
+        use, seen, displaced, bins = visible.use, new_seen, visible.displaced, visible.bins
         if seen.sum() < 0.15 * SECTORS:
             return "too little of the boundary fits the pixel model"
     return _report(pixels, found, prior, noise_dn, new_seen)
@@ -144,10 +143,9 @@ def _padded(outer: Floats, order: int) -> Floats:
 def _best_order(pixels: Pixels, found: Solution, prior: Prior) -> int:
     """Fourier order of the outer level by BIC, from one linear step with the largest order's columns."""
     full = replace(found.model, outer=_padded(found.model.outer, ORDERS[-1]))
-    rows = Rows.of(pixels, full, found.place, found.displaced)
-    normal = Normal.of(pixels, rows, found.displaced, prior)
+    normal = Normal.of(Sums.of(pixels, full, found.displaced), found.displaced, prior)
     matrix, vector, total = normal.matrix, normal.vector, normal.cost - float(normal.along**2 @ normal.inverse)
-    count = rows.residual.size
+    count = pixels.level.size
     scale = 1.0 / np.sqrt(np.diag(matrix) + 1e-9)
     # The first columns of a Cholesky factor are the factor of the first columns: one serves all orders.
     lower = np.linalg.cholesky(matrix * (scale[:, None] * scale) + 1e-9 * np.eye(scale.size))
@@ -170,11 +168,10 @@ def _sane(model: EdgeModel, start: EdgeModel) -> bool:
 
 
 def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen: Bools) -> PixelFit:
-    model, rows = found.model, found.rows
-    residual, slopes = rows.residual, rows.jacobian
-    variance = float(np.sum(residual * residual)) / max(residual.size - slopes.shape[0], 1)
-    normal = Normal.of(pixels, rows, found.displaced, prior)
-    matrix = normal.matrix + np.diag(prior.of_all(slopes.shape[0]))
+    model, of_pixels, count = found.model, found.sums, pixels.level.size
+    variance = of_pixels.cost / max(count - of_pixels.matrix.shape[0], 1)
+    normal = Normal.of(of_pixels, found.displaced, prior)
+    matrix = normal.matrix + np.diag(prior.of_all(of_pixels.matrix.shape[0]))
     inverse = np.asarray(np.linalg.inv(matrix + 1e-12 * np.diag(np.diag(matrix))), dtype=np.float64)
     influence, own = inverse[:SHAPE], np.zeros((SHAPE, SHAPE))
     ellipse = model.ellipse
@@ -191,7 +188,7 @@ def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen
         own = (by_displaced * errors) @ by_displaced.T
     plain = variance * influence @ matrix @ influence.T
     # Texture leaves residuals that agree within a sector; their excess over white noise scales the covariance.
-    sums = pixels.sums(slopes * residual) - normal.across * (normal.inverse * pixels.sums(rows.slope * residual))
+    sums = of_pixels.pull - normal.across * (normal.inverse * of_pixels.along)
     excess = sector_excess(plain, influence, sums)
     covariance = plain * (excess if excess > 1.25 else 1.0) + own
     return PixelFit(
@@ -200,7 +197,7 @@ def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen
         to_axes(covariance, ellipse),
         variance / noise_dn**2,
         math.sqrt(variance),
-        residual.size,
+        count,
         seen,
         prior.uneven_px,
     )

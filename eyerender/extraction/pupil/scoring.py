@@ -104,7 +104,7 @@ def goodness_of(found: Found, fit: PixelFit | None) -> Goodness:
         spread=inside.spread_dn / model.step_dn,
         boundary_sd_px=boundary_deviation(ellipse, covariance),
         uneven_px=0.0 if fit is None else fit.uneven_px,
-        leverage=leverage(boundary.ellipse, boundary.points_px) if fit is None else found.goodness.leverage,
+        leverage=leverage(boundary.ellipse, found.sums) if fit is None else found.goodness.leverage,
         refined=fit is not None,
     )
 

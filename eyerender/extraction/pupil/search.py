@@ -16,15 +16,15 @@ import numpy as np
 
 from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse, iou
-from ..preprocessing import Image, Prepared, as_image
+from ..preprocessing import Prepared, as_image
 from ..result import Goodness, PupilResult
 from ..settings import Shape
 from .candidates import Candidate, Interior, candidate_at, find_candidates, find_inside, inspect_interior
 from .consensus import BoundaryFit, boundaries_without_stretch, fit_boundary
-from .covariance import edge_covariance
+from .covariance import EdgeSums, edge_covariance
 from .edge_model import SECTORS, EdgeModel, Place, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
-from .glare import without_glare
+from .glare import Cleared, without_glare
 from .scoring import confidence, goodness_of
 
 SURE = 0.9  # a hypothesis of this confidence ends the search
@@ -44,12 +44,11 @@ FLAT = 0.8  # ratio of axes below which a blob may be a pupil that lids cut
 class Found:
     """A candidate, the edge points around it, and the boundary through them; derived values are computed on demand.
 
-    `cleared` is the image without glints near the candidate, and `glare` the mask of the pixels that they covered.
+    `cleared` is the image without glints near the candidate.
     """
 
     image: Prepared
-    cleared: Image
-    glare: Bools | None
+    cleared: Cleared
     candidate: Candidate
     edges: EdgePoints
     boundary: BoundaryFit
@@ -65,7 +64,12 @@ class Found:
     @cached_property
     def covariance(self) -> Floats:
         """Covariance (5, 5) of centre, semi-axes and angle, from the scatter of the edge points."""
-        return edge_covariance(self.boundary.ellipse, self.boundary.points_px, self.boundary.residual_px)
+        return edge_covariance(self.boundary.ellipse, self.sums, self.boundary.residual_px)
+
+    @cached_property
+    def sums(self) -> EdgeSums:
+        """Sums over the edge points, for covariance and leverage."""
+        return EdgeSums.of(self.boundary.ellipse, self.boundary.points_px)
 
     @cached_property
     def interior(self) -> Interior:
@@ -74,7 +78,7 @@ class Found:
 
     def inside(self, ellipse: Ellipse, blur_px: float) -> Interior:
         """Statistics of the pixels inside an ellipse about the candidate."""
-        return inspect_interior(self.cleared, ellipse, blur_px, self.image.noise_dn, self.glare)
+        return inspect_interior(self.cleared, ellipse, blur_px, self.image.noise_dn)
 
     @cached_property
     def sectors(self) -> Bools:
@@ -160,7 +164,7 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, Found | str
 
     def bounded(candidates: Sequence[Candidate]) -> Iterator[Found | str]:
         for candidate in candidates:
-            if all(iou(candidate.ellipse, one.ellipse) < SAME for one in tried):
+            if not any(_same(candidate.ellipse, one.ellipse) for one in tried):
                 tried.append(candidate)
                 for boundary in _with_inner(work, candidate, shape):
                     if isinstance(boundary, Found):
@@ -205,9 +209,16 @@ def _with_inner(work: Prepared, candidate: Candidate, shape: Shape) -> Iterator[
     found = boundary_about(work, candidate, shape)
     yield found
     if isinstance(found, Found) and found.core_dn > 0.0:
-        cleared = replace(work, linear=found.cleared)
-        for inner in find_inside(cleared, found.boundary.ellipse, shape):
+        for inner in find_inside(work, found.cleared, found.boundary.ellipse, shape):
             yield boundary_about(work, inner, shape)
+
+
+def _same(first: Ellipse, second: Ellipse) -> bool:
+    """Whether two ellipses overlap by SAME; most pairs differ too much in size or place for a closer look."""
+    ratio = first.area_px2 / second.area_px2
+    apart = float(np.abs(first.centre_px - second.centre_px).max())
+    near = apart < (1.0 - SAME) * math.pi * float(first.semi_axes_px[0])
+    return near and SAME <= ratio <= 1.0 / SAME and iou(first, second) >= SAME
 
 
 def _best(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -260,12 +271,9 @@ def _at_half_scale(work: Prepared, shape: Shape) -> Iterator[Found | str]:
 def _doubled(found: Found, work: Prepared) -> Found:
     """A boundary of the image at half scale in the pixels of the whole one."""
     edges, boundary, candidate = found.edges, found.boundary, found.candidate
-    size = (work.linear.shape[1], work.linear.shape[0])
-    glare = None if found.glare is None else cv2.resize(found.glare.astype(np.uint8), size).astype(bool)
     return Found(
         work,
-        as_image(cv2.resize(found.cleared, size)),
-        glare,
+        found.cleared.doubled(work.linear),
         replace(candidate, ellipse=_double(candidate.ellipse)),
         replace(
             edges,
@@ -289,21 +297,19 @@ def _double(ellipse: Ellipse) -> Ellipse:
 
 def boundary_about(work: Prepared, candidate: Candidate, shape: Shape) -> Found | str:
     """Find the boundary around a candidate, or give the reason why there is none."""
-    cleared, glare = work.linear, None
+    cleared = Cleared(work.linear)
     if not work.inverted:
-        cleared, glare = without_glare(
-            work.linear, candidate.ellipse, candidate.inside_dn, candidate.step_dn, work.noise_dn
-        )
+        cleared = without_glare(work.linear, candidate.ellipse, candidate.inside_dn, candidate.step_dn, work.noise_dn)
     bright = candidate.inside_dn + 4.0 * candidate.step_dn
     b = float(candidate.ellipse.semi_axes_px[1])
     sigma = filter_sigma(candidate.step_dn, work.noise_dn, b)
-    edges = find_edges(cleared, candidate, work.noise_dn, bright, sigma, band=0.4, glare=glare)
+    edges = find_edges(cleared, candidate, work.noise_dn, bright, sigma, band=0.4)
     blur = math.sqrt(max(edges.sigma_px**2 - sigma**2, 0.0))
     if blur > 1.7 * sigma:  # a filter much sharper than the image only adds noise
         sigma = min(blur, max(1.0, 0.2 * b))
-        edges = find_edges(cleared, candidate, work.noise_dn, bright, sigma, band=0.4, glare=glare)
+        edges = find_edges(cleared, candidate, work.noise_dn, bright, sigma, band=0.4)
     expected = edge_noise_px(candidate.step_dn, noise_dn=work.noise_dn, sigma_filter=sigma, sigma_total=edges.sigma_px)
     boundary = fit_boundary(edges, candidate, shape, expected)
     if isinstance(boundary, str):
         return boundary
-    return Found(work, cleared, glare, candidate, edges, boundary)
+    return Found(work, cleared, candidate, edges, boundary)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse, fit_ellipse_direct, iou, signed_distance
+from ..compiled import twin
 from ..statistics import median
 
 STARTS = 24  # positions around the outline at which a stretch begins
@@ -70,11 +71,11 @@ class Cuts:
         # The points that are kept follow the stretch.
         share = np.arange(CUT_POINTS) / CUT_POINTS
         taken = points[(first[:, None] + count[:, None] + (share * left[:, None]).astype(np.intp)) % n]
-        fit = fit_ellipse_direct(taken)
+        fits = direct_fits(taken)
         a, b = ellipse.semi_axes_px
         with np.errstate(invalid="ignore"):
-            alike = fit.ok & (fit.semi_axes_px[:, 0] <= largest * a) & (fit.semi_axes_px[:, 1] >= 0.7 * b)
-        fits = np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])[alike]
+            alike = (fits[:, 2] <= largest * a) & (fits[:, 3] >= 0.7 * b)
+        fits = fits[alike]
         distance = _distances(taken[alike], fits)
         residual = np.sqrt(np.einsum("mn,mn->m", distance, distance) / CUT_POINTS)
         return Cuts(
@@ -96,6 +97,13 @@ class Cuts:
             ):
                 given.append(ellipse)
                 yield ellipse
+
+
+@twin
+def direct_fits(points: Floats) -> Floats:
+    """Direct ellipses (m, 5) through points (m, k, 2): centre, semi-axes and angle; NaN where there is none."""
+    fit = fit_ellipse_direct(points)
+    return np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])
 
 
 def turn_of(points: Floats, ellipse: Ellipse) -> Floats:

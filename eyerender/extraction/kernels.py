@@ -1,0 +1,696 @@
+"""The compiled functions (see `compiled`). Each has the name, arguments and results of its twin, documented there.
+
+They are written as loops over pixels or points, and use no memory but for their results. Numba keeps the machine code
+in $XDG_CACHE_HOME/eyerender/kernels.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from numba import njit
+from numba.core import config
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+Array = Any  # numba has types of its own
+SECTORS, NEAR = 48, 2  # as in edge_model
+
+_ROOT_HALF = math.sqrt(0.5)
+_DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
+
+
+def _compiled(function: Function) -> Function:
+    """Compile at the first call; the machine code is kept on disk if a folder there can be written."""
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eyerender" / "kernels")
+    try:
+        return cast(Function, njit(cache=True, nogil=True, error_model="numpy")(function))
+    except (RuntimeError, OSError):  # numba found no folder to write to
+        return cast(Function, njit(nogil=True, error_model="numpy")(function))
+    finally:
+        config.CACHE_DIR = before
+
+
+def _summing(function: Function) -> Function:
+    """Compile a helper whose sums may be taken in any order, so that they use vector instructions."""
+    return cast(Function, njit(error_model="numpy", fastmath={"reassoc", "contract"})(function))
+
+
+def _inlined(function: Function) -> Function:
+    return cast(Function, njit(inline="never", error_model="numpy")(function))
+
+
+@_inlined
+def _place(cx, cy, a, b, cos, sin, x, y, steps):
+    """`Place.of` of one point: distance, cos t, sin t, normal (2), curvature, cos u, sin u."""
+    dx, dy = x - cx, y - cy
+    p, q = dx * cos + dy * sin, dy * cos - dx * sin
+    c, s = p / a, q / b
+    scale = 1.0 / max(math.sqrt(c * c + s * s), 1e-300)
+    c, s = c * scale, s * scale
+    eccentric = a * a - b * b
+    if eccentric > 1e-9 * a * a:
+        ap, bq = a * p, b * q
+        for _ in range(steps):
+            value = eccentric * c * s - ap * s + bq * c
+            slope = eccentric * (c * c - s * s) - ap * c - bq * s
+            turn = min(max(value / min(slope, -1e-9), -0.3), 0.3)
+            c, s = c + turn * s, s - turn * c
+            scale = 1.0 / math.sqrt(c * c + s * s)
+            c, s = c * scale, s * scale
+    nx, ny = b * c, a * s
+    scale = 1.0 / math.sqrt(nx * nx + ny * ny)
+    nx, ny = nx * scale, ny * scale
+    distance = (p - a * c) * nx + (q - b * s) * ny
+    return distance, c, s, nx, ny, a * b * scale * scale * scale, c * cos - s * sin, s * cos + c * sin
+
+
+@_inlined
+def _sector(cos_u, sin_u, sectors):
+    share = math.atan2(sin_u, cos_u) / (2.0 * math.pi) + 0.5
+    return int(share * sectors) % sectors
+
+
+@_compiled
+def edge_sums(ellipse, points, sectors):
+    cx, cy, a, b, angle = ellipse
+    cos, sin = math.cos(angle), math.sin(angle)
+    matrix, scores, slopes = np.zeros((5, 5)), np.zeros((5, sectors)), np.zeros((5, sectors))
+    count, row = np.zeros(sectors, dtype=np.int64), np.empty(5)
+    for i in range(points.shape[0]):
+        distance, c, s, nx, ny, _, cos_u, sin_u = _place(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], 3)
+        row[0], row[1] = ny * sin - nx * cos, -nx * sin - ny * cos
+        row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
+        k = _sector(cos_u, sin_u, 3 * sectors) // 3
+        count[k] += 1
+        for j in range(5):
+            scores[j, k] += row[j] * distance
+            slopes[j, k] += row[j]
+            for m in range(j + 1):
+                matrix[j, m] += row[j] * row[m]
+    for j in range(5):
+        for m in range(j):
+            matrix[m, j] = matrix[j, m]
+    return matrix, scores, slopes, count
+
+
+@_compiled
+def support(points, normals, fits, tolerance):
+    out = np.zeros(fits.shape[0])
+    for m in range(fits.shape[0]):
+        cx, cy, a, b, angle = fits[m]
+        cos, sin = math.cos(angle), math.sin(angle)
+        total = 0.0
+        for i in range(points.shape[0]):
+            dx, dy = points[i, 0] - cx, points[i, 1] - cy
+            p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
+            radius2 = p * p + q * q
+            nx, ny = p / a, q / b
+            slope2 = nx * nx + ny * ny
+            # The distance is (radius - 1) radius / slope.
+            radius = math.sqrt(radius2)
+            distance2 = (radius - 1.0) ** 2 * radius2 / slope2
+            if distance2 >= tolerance * tolerance:
+                continue
+            along = (nx * cos - ny * sin) * normals[i, 0] + (nx * sin + ny * cos) * normals[i, 1]
+            if along > 0.9 * math.sqrt(slope2):
+                total += 1.0 - distance2 / (tolerance * tolerance)
+        out[m] = total / math.sqrt(math.pi * (a + b))
+    return out
+
+
+@_inlined
+def _select(points, normals, ellipse, sigma_px, reach, clipped, moved, distance, chosen):
+    """Move points by the curvature shift and choose those near an ellipse; returns how many were chosen."""
+    cx, cy, a, b, angle = ellipse[0], ellipse[1], ellipse[2], ellipse[3], ellipse[4]
+    cos, sin = math.cos(angle), math.sin(angle)
+    n, count = points.shape[0], 0
+    for i in range(n):
+        dx, dy = points[i, 0] - cx, points[i, 1] - cy
+        p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
+        radius = max(math.sqrt(p * p + q * q), 1e-12)
+        u, v = p / a, q / b
+        slope = max(math.sqrt(u * u + v * v), 1e-12)
+        nx, ny = (u * cos - v * sin) / slope, (u * sin + v * cos) / slope
+        curvature = (radius / slope) ** 3 / (a * b) ** 2
+        shift = min(0.5 * sigma_px * sigma_px * curvature, 0.15 * b)
+        moved[i, 0], moved[i, 1] = points[i, 0] + shift * nx, points[i, 1] + shift * ny
+        distance[i] = (radius - 1.0) * radius / slope + shift
+        chosen[i] = abs(distance[i]) < reach and nx * normals[i, 0] + ny * normals[i, 1] > 0.9
+        count += chosen[i]
+    if clipped and count >= 8:
+        some = distance[chosen]
+        limit = max(3.5 * 1.4826 * np.median(np.abs(some - np.median(some))), 0.1)
+        count = 0
+        for i in range(n):
+            chosen[i] = chosen[i] and abs(distance[i]) < limit
+            count += chosen[i]
+    return count
+
+
+@_inlined
+def _axes(g11, g12, g22):
+    """`_axes_from_shape_matrix` of the geometry, for one ellipse: a, b, angle."""
+    mean, half = 0.5 * (g11 + g22), 0.5 * (g11 - g22)
+    major = mean + math.sqrt(half * half + g12 * g12)
+    minor = (g11 * g22 - g12 * g12) / major
+    if not (major > 0.0 and minor > 0.0):
+        return math.nan, math.nan, math.nan
+    return math.sqrt(major), math.sqrt(minor), 0.5 * math.atan2(g12, half)
+
+
+@_inlined
+def _unit(points, chosen):
+    """Mean and largest offset of the chosen points: what makes them small numbers about 0."""
+    n, x, y, scale = chosen.sum(), 0.0, 0.0, 0.0
+    for i in range(chosen.size):
+        if chosen[i]:
+            x, y = x + points[i, 0] / n, y + points[i, 1] / n
+    for i in range(chosen.size):
+        if chosen[i]:
+            scale = max(scale, abs(points[i, 0] - x), abs(points[i, 1] - y))
+    return x, y, scale
+
+
+@_inlined
+def _scatter(points, chosen, mean_x, mean_y, scale):
+    """Mean (5,) of (x^2, x y, y^2, x, y), its covariance (5, 5), and that of its derivatives by x and y."""
+    n = chosen.sum()
+    mean, scatter, gradient = np.zeros(5), np.zeros((5, 5)), np.zeros((5, 5))
+    z, by_x, by_y = np.empty(5), np.zeros(5), np.zeros(5)
+    by_x[3] = by_y[4] = 1.0
+    for i in range(chosen.size):
+        if chosen[i]:
+            x, y = (points[i, 0] - mean_x) / scale, (points[i, 1] - mean_y) / scale
+            z[0], z[1], z[2], z[3], z[4] = x * x, x * y, y * y, x, y
+            by_x[0], by_x[1], by_y[1], by_y[2] = 2.0 * x, y, x, 2.0 * y
+            for j in range(5):
+                mean[j] += z[j] / n
+                for m in range(5):
+                    scatter[j, m] += z[j] * z[m] / n
+                    gradient[j, m] += (by_x[j] * by_x[m] + by_y[j] * by_y[m]) / n
+    for j in range(5):
+        for m in range(5):
+            scatter[j, m] -= mean[j] * mean[m]
+        gradient[j, j] += 1e-12
+    return mean, scatter, gradient
+
+
+@_inlined
+def _taubin(points, chosen, out):
+    """Taubin's approximate mean square fit, as `cv2.fitEllipseAMS`, in double precision; False where it is none."""
+    mean_x, mean_y, scale = _unit(points, chosen)
+    if not scale > 0.0:
+        return False
+    mean, scatter, gradient = _scatter(points, chosen, mean_x, mean_y, scale)
+    inverse = np.linalg.inv(np.linalg.cholesky(gradient))
+    _, vectors = np.linalg.eigh(inverse @ scatter @ inverse.T)
+    conic = inverse.T @ np.ascontiguousarray(vectors[:, 0])
+    a, b, c, d, e = conic[0], conic[1], conic[2], conic[3], conic[4]
+    f = 0.0
+    for j in range(5):
+        f -= conic[j] * mean[j]
+    det = 4.0 * a * c - b * b
+    if not det > 0.0:
+        return False
+    x, y = (b * e - 2.0 * c * d) / det, (b * d - 2.0 * a * e) / det
+    factor = -4.0 * (f + 0.5 * (d * x + e * y)) / det
+    major, minor, angle = _axes(factor * c, -0.5 * factor * b, factor * a)
+    if not (minor > 0.0 and major < 25.0):
+        return False
+    out[0], out[1], out[2], out[3], out[4] = x * scale + mean_x, y * scale + mean_y, major * scale, minor * scale, angle
+    return True
+
+
+@_compiled
+def settled(points, normals, start, sigma_px, tolerance, free):
+    n = points.shape[0]
+    ellipse, moved = start.copy(), np.empty((n, 2))
+    distance, chosen, inliers = np.empty(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+    for turn in range(5):
+        reach = 2.0 * tolerance if turn == 0 and not free else tolerance
+        count = _select(points, normals, ellipse, sigma_px, reach, turn >= 1, moved, distance, chosen)
+        if count < 8:
+            return count, ellipse, chosen, moved
+        same = turn > 1
+        for i in range(n):
+            same = same and chosen[i] == inliers[i]
+            inliers[i] = chosen[i]
+        if not _taubin(moved, inliers, ellipse):
+            return -1, ellipse, inliers, moved
+        if same:
+            break
+    return count, ellipse, inliers, moved
+
+
+@_compiled
+def direct_fits(points):
+    out = np.full((points.shape[0], 5), np.nan)
+    k = points.shape[1]
+    for m in range(points.shape[0]):
+        mean_x, mean_y = 0.0, 0.0
+        for i in range(k):
+            mean_x += points[m, i, 0] / k
+            mean_y += points[m, i, 1] / k
+        sxx, sxy, syy = 0.0, 0.0, 0.0
+        for i in range(k):
+            x, y = points[m, i, 0] - mean_x, points[m, i, 1] - mean_y
+            sxx, sxy, syy = sxx + x * x / k, sxy + x * y / k, syy + y * y / k
+        if not sxx > 0.0:
+            continue
+        l11 = math.sqrt(sxx)
+        l21 = sxy / l11
+        rest = syy - l21 * l21
+        if not (rest > 0.0 and math.sqrt(rest) * l11 > 1e-10 * (sxx + syy)):
+            continue
+        l22 = math.sqrt(rest)
+        # The moments of the whitened points give those of the basis (p, q, r) without its linear part (u, v).
+        pu = pv = qu = qv = ru = rv = 0.0
+        pp = pq = pr = qq = qr = rr = 0.0
+        for i in range(k):
+            u = (points[m, i, 0] - mean_x) / l11
+            v = (points[m, i, 1] - mean_y - l21 * u) / l22
+            p, q, r = u * u + v * v - 2.0, u * u - v * v, 2.0 * u * v
+            pu, pv, qu, qv, ru, rv = pu + p * u, pv + p * v, qu + q * u, qv + q * v, ru + r * u, rv + r * v
+            pp, pq, pr = pp + p * p, pq + p * q, pr + p * r
+            qq, qr, rr = qq + q * q, qr + q * r, rr + r * r
+        pu, pv, qu, qv, ru, rv = pu / k, pv / k, qu / k, qv / k, ru / k, rv / k
+        pp, pq, pr = pp / k - pu * pu - pv * pv, pq / k - pu * qu - pv * qv, pr / k - pu * ru - pv * rv
+        qq, qr, rr = qq / k - qu * qu - qv * qv, qr / k - qu * ru - qv * rv, rr / k - ru * ru - rv * rv
+        trace = pp - qq - rr
+        sums = pq * pq + pr * pr - pp * (qq + rr) + qq * rr - qr * qr
+        det = pp * (qq * rr - qr * qr) - pq * (pq * rr - qr * pr) + pr * (pq * qr - qq * pr)
+        third = trace / 3.0
+        spread = math.sqrt(max(third * third - sums / 3.0, 0.0))
+        half = third**3 - 0.5 * third * sums + 0.5 * det
+        cosine = min(max(half / max(spread**3, 1e-300), -1.0), 1.0)
+        value = third + 2.0 * spread * math.cos(math.acos(cosine) / 3.0)
+        wp = wq = wr = 0.0
+        for turn in range(3):
+            if turn > 0:
+                energy = pp * wp * wp + qq * wq * wq + rr * wr * wr
+                energy += 2.0 * (pq * wp * wq + pr * wp * wr + qr * wq * wr)
+                value = energy / (wp * wp - wq * wq - wr * wr)
+            d, f = qq + value, rr + value
+            wp, wq, wr = d * f - qr * qr, pr * qr - pq * f, pq * qr - pr * d
+            norm = math.copysign(math.sqrt(wp * wp + wq * wq + wr * wr), wp)
+            wp, wq, wr = wp / norm, wq / norm, wr / norm
+        a2, h2, c2 = wp + wq, wr, wp - wq
+        d, e = wp * pu + wq * qu + wr * ru, wp * pv + wq * qv + wr * rv
+        det = a2 * c2 - h2 * h2
+        cu, cv = 0.5 * (c2 * d - h2 * e) / det, 0.5 * (a2 * e - h2 * d) / det
+        scale = (2.0 * wp + 0.5 * (d * cu + e * cv)) / det
+        p11, p12, p22 = scale * c2, -scale * h2, scale * a2
+        g11 = l11 * l11 * p11
+        g12 = l11 * (l21 * p11 + l22 * p12)
+        g22 = l21 * l21 * p11 + 2.0 * l21 * l22 * p12 + l22 * l22 * p22
+        a, b, angle = _axes(g11, g12, g22)
+        if b > 0.0 and math.isfinite(cu + cv):
+            out[m, 0], out[m, 1], out[m, 2], out[m, 3] = l11 * cu + mean_x, l21 * cu + l22 * cv + mean_y, a, b
+            out[m, 4] = angle % math.pi
+    return out
+
+
+@_inlined
+def _quantile(values, share):
+    """`statistics.quantile`; the values change their order."""
+    n = values.size
+    if n == 0:
+        return math.nan
+    at = share * (n - 1)
+    low = math.floor(at)
+    parted = np.partition(values, low)
+    first = float(parted[low])
+    if low == at:
+        return first
+    second = float(parted[low + 1])
+    for i in range(low + 2, n):
+        second = min(second, float(parted[i]))
+    return first + (at - low) * (second - first)
+
+
+@_compiled
+def ridges(gx, gy, magnitude, covered, ellipse, half_band, floor):
+    cx, cy, a, b, angle = ellipse
+    cos, sin = math.cos(angle), math.sin(angle)
+    height, width = magnitude.shape
+    reach_x = (1.0 + half_band) * math.sqrt((a * cos) ** 2 + (b * sin) ** 2) + 1.0
+    reach_y = (1.0 + half_band) * math.sqrt((a * sin) ** 2 + (b * cos) ** 2) + 1.0
+    x0, x1 = max(1, int(cx - reach_x)), min(width - 1, int(cx + reach_x) + 2)
+    y0, y1 = max(1, int(cy - reach_y)), min(height - 1, int(cy + reach_y) + 2)
+    inner2, outer2 = max(1.0 - half_band, 0.0) ** 2, (1.0 + half_band) ** 2
+    size = max(x1 - x0, 0) * max(y1 - y0, 0)
+    row, column, here = np.empty(size, dtype=np.int32), np.empty(size, dtype=np.int32), np.empty(size, dtype=np.float32)
+    n = 0
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            strength = magnitude[y, x]
+            if not strength > floor or covered[y, x]:
+                continue
+            p, q = ((x - cx) * cos + (y - cy) * sin) / a, ((y - cy) * cos - (x - cx) * sin) / b
+            radius2 = p * p + q * q
+            if (radius2 <= inner2 and half_band < 1.0) or radius2 >= outer2:
+                continue
+            u, v = p * (cos / a) - q * (sin / b), p * (sin / a) + q * (cos / b)
+            if gx[y, x] * u + gy[y, x] * v > 0.7 * strength * max(math.sqrt(u * u + v * v), 1e-12):
+                row[n], column[n], here[n] = y, x, strength
+                n += 1
+    least = 0.35 * _quantile(here[:n], 0.9) if n else 0.0
+    found = 0
+    for i in range(n):
+        y, x, strength = row[i], column[i], here[i]
+        if abs(gx[y, x]) >= abs(gy[y, x]):
+            before, after = magnitude[y, x - 1], magnitude[y, x + 1]
+        else:
+            before, after = magnitude[y - 1, x], magnitude[y + 1, x]
+        if strength > before and strength >= after and strength > least:
+            row[found], column[found] = y, x
+            found += 1
+    points, normals, widths = np.empty((found, 2)), np.empty((found, 2)), np.empty(found)
+    for i in range(found):
+        widths[i] = _vertex(gx, gy, magnitude, row[i], column[i], points[i], normals[i])
+    return points, normals, widths, row[:found].copy(), column[:found].copy()
+
+
+@_inlined
+def _vertex(gx, gy, magnitude, y, x, point, normal):
+    """Write the sub-pixel place of a ridge and its normal; returns the squared width of the profile."""
+    level = abs(gx[y, x]) >= abs(gy[y, x])
+    if level:
+        before, after = magnitude[y, x - 1], magnitude[y, x + 1]
+    else:
+        before, after = magnitude[y - 1, x], magnitude[y + 1, x]
+    strength = magnitude[y, x]
+    first, middle, last = math.log(max(before, 1e-3)), math.log(max(strength, 1e-3)), math.log(max(after, 1e-3))
+    bend = min(first - 2.0 * middle + last, -1e-4)
+    offset = min(max(0.5 * (first - last) / bend, -0.75), 0.75)
+    point[0], point[1] = (x + offset, float(y)) if level else (float(x), y + offset)
+    normal[0], normal[1] = float(gx[y, x]) / strength, float(gy[y, x]) / strength
+    lean = abs(normal[0]) if level else abs(normal[1])
+    return lean * lean / -bend
+
+
+@_inlined
+def _nearest(image, x, y):
+    column = min(max(int(np.rint(x)), 0), image.shape[1] - 1)
+    return image[min(max(int(np.rint(y)), 0), image.shape[0] - 1), column]
+
+
+@_compiled
+def on_the_dark_side(smooth, points, normals, depth, dark, bright):
+    out = np.empty(points.shape[0], dtype=np.bool_)
+    for i in range(out.size):
+        x, y, u, v = points[i, 0], points[i, 1], depth * normals[i, 0], depth * normals[i, 1]
+        out[i] = _nearest(smooth, x - u, y - v) < dark and _nearest(smooth, x + 0.5 * u, y + 0.5 * v) < bright
+    return out
+
+
+@_inlined
+def _between(crop, squares, hidden, low, high):
+    """Levels of the pixels that are not hidden and whose squared radius lies between two limits."""
+    out, n = np.empty(crop.size, dtype=np.float32), 0
+    for y in range(crop.shape[0]):
+        for x in range(crop.shape[1]):
+            if low < squares[y, x] < high and not hidden[y, x]:
+                out[n] = crop[y, x]
+                n += 1
+    return out[:n]
+
+
+@_compiled
+def interior(crop, hidden, ellipse, end):
+    cx, cy, a, b, angle = ellipse
+    cos, sin = math.cos(angle), math.sin(angle)
+    squares = np.empty(crop.shape)
+    middle = covered = 0
+    for y in range(crop.shape[0]):
+        for x in range(crop.shape[1]):
+            p, q = ((x - cx) * cos + (y - cy) * sin) / a, ((y - cy) * cos - (x - cx) * sin) / b
+            squares[y, x] = p * p + q * q
+            if squares[y, x] < 0.35**2:
+                middle += 1
+                covered += hidden[y, x]
+    hidden = hidden if covered < 0.5 * middle else np.zeros_like(hidden)
+    core = _between(crop, squares, hidden, -1.0, 0.35**2)
+    ring = _between(crop, squares, hidden, (end - 0.25) ** 2, end**2)
+    inside = _between(crop, squares, hidden, -1.0, max(end, 0.5) ** 2)
+    spread = _quantile(inside, 0.75) - _quantile(inside, 0.25) if inside.size >= 8 else 0.0
+    return _quantile(ring, 0.5) - _quantile(core, 0.5), core.size, ring.size, spread
+
+
+@_compiled
+def ring_levels(small, blobs, noise, angles):
+    n = blobs.shape[0]
+    out = np.empty((n, 5))
+    near, deep, step = np.empty(angles), np.empty(angles), np.empty(angles)
+    within = np.empty(2 * angles)
+    turn_cos = np.array([math.cos(2.0 * math.pi * i / angles) for i in range(angles)])
+    turn_sin = np.array([math.sin(2.0 * math.pi * i / angles) for i in range(angles)])
+    for k in range(n):
+        x, y, a, b, angle = blobs[k, 0], blobs[k, 1], blobs[k, 2], blobs[k, 3], blobs[k, 4]
+        cos, sin = math.cos(angle), math.sin(angle)
+        for i in range(angles):
+            p, q = a * turn_cos[i], b * turn_sin[i]
+            near[i] = _nearest(small, x + 0.65 * (p * cos - q * sin), y + 0.65 * (p * sin + q * cos))
+            deep[i] = _nearest(small, x + 0.4 * (p * cos - q * sin), y + 0.4 * (p * sin + q * cos))
+            p, q = (1.15 * a + 1.5) * turn_cos[i], (1.15 * b + 1.5) * turn_sin[i]
+            step[i] = _nearest(small, x + p * cos - q * sin, y + p * sin + q * cos) - near[i]
+        within[:angles], within[angles:] = near, deep
+        typical = np.median(step)
+        limit, count = max(0.35 * typical, 2.0 * noise), 0
+        for i in range(angles):
+            count += step[i] > limit
+        out[k, 0], out[k, 1], out[k, 2] = np.median(within), typical, count / angles
+        out[k, 3], out[k, 4] = np.median(near), np.std(within)
+    return out
+
+
+@_inlined
+def _profile(low, sigma, out):
+    """`windows.profile` of one pixel from `low` to `low` + 1 (from the centre): by the centre, value, by ln sigma."""
+    first, last = low / sigma, (low + 1.0) / sigma
+    tail_first, tail_last = math.exp(-0.5 * first * first), math.exp(-0.5 * last * last)
+    value = sigma * math.sqrt(0.5 * math.pi) * (math.erf(last * _ROOT_HALF) - math.erf(first * _ROOT_HALF))
+    out[0], out[1] = tail_first - tail_last, value
+    out[2] = value + sigma * (first * tail_first - last * tail_last)
+
+
+@_compiled
+def spot_rows(first, plane, centre, radius, theta, rest, blur_px):
+    n, size = theta.shape
+    out = np.empty((size + 1, rest.size))
+    for k in range(n):
+        half = math.ceil(radius[k] + 0.5)
+        across, along = np.empty((2 * half + 1, 3)), np.empty((2 * half + 1, 3))
+        x, y, height = theta[k, 0] - centre[k, 0], theta[k, 1] - centre[k, 1], math.exp(theta[k, 2])
+        wide, high = math.exp(theta[k, 3]), math.exp(theta[k, 4])
+        for j in range(2 * half + 1):
+            _profile(j - half - 0.5 - x, wide, across[j])
+            _profile(j - half - 0.5 - y, high, along[j])
+        for i in range(first[k], first[k + 1]):
+            dx, dy = plane[1, i], plane[2, i]
+            p, q = across[int(dx) + half], along[int(dy) + half]
+            light = height * p[1] * q[1]
+            out[0, i], out[1, i], out[2, i] = height * p[0] * q[1], height * p[1] * q[0], light
+            out[3, i], out[4, i] = height * p[2] * q[1], height * p[1] * q[2]
+            out[5, i], out[6, i], out[7, i] = 1.0, dx, dy
+            left = rest[i] - light - theta[k, 5] - theta[k, 6] * dx - theta[k, 7] * dy
+            if size > 8:
+                cos, sin = math.cos(theta[k, 9]), math.sin(theta[k, 9])
+                t = (dx * cos + dy * sin - theta[k, 10]) / blur_px
+                bell = theta[k, 8] * (_DENSITY / blur_px) * math.exp(-0.5 * t * t)
+                out[8, i] = 0.5 * math.erfc(-t * _ROOT_HALF)
+                out[9, i], out[10, i] = bell * (dy * cos - dx * sin), -bell
+                left -= theta[k, 8] * out[8, i]
+            out[size, i] = left
+    return out
+
+
+@_summing
+def _add_products(rows, begin, end, out):
+    """Add the products of rows (k, n), over the columns from `begin` to `end`, to the lower half of out (k, k)."""
+    for j in range(rows.shape[0]):
+        for m in range(j + 1):
+            total = 0.0
+            for i in range(begin, end):
+                total += rows[j, i] * rows[m, i]
+            out[j, m] += total
+
+
+@_compiled
+def products(first, rows):
+    n, size = first.size - 1, rows.shape[0]
+    out = np.zeros((n, size, size))
+    for k in range(n):
+        _add_products(rows, first[k], first[k + 1], out[k])
+        for j in range(size):
+            for m in range(j):
+                out[k, m, j] = out[k, j, m]
+    return out
+
+
+@_compiled
+def solved(gram, damping):
+    n, size = gram.shape[0], gram.shape[1] - 1
+    out, lower = np.empty((n, size)), np.empty((size, size))
+    for k in range(n):
+        for j in range(size):
+            for m in range(j + 1):
+                total = gram[k, j, m]
+                if j == m:
+                    total = total * (1.0 + damping[k]) + 1e-9
+                for i in range(m):
+                    total -= lower[j, i] * lower[m, i]
+                lower[j, m] = math.sqrt(max(total, 1e-300)) if j == m else total / lower[m, m]
+            total = gram[k, j, size]
+            for i in range(j):
+                total -= lower[j, i] * out[k, i]
+            out[k, j] = total / lower[j, j]
+        for j in range(size - 1, -1, -1):
+            total = out[k, j]
+            for i in range(j + 1, size):
+                total -= lower[i, j] * out[k, i]
+            out[k, j] = total / lower[j, j]
+    return out
+
+
+@_compiled
+def sectors_at(ellipse, x, y, steps):
+    cx, cy, a, b, angle = ellipse
+    cos, sin = math.cos(angle), math.sin(angle)
+    out = np.empty(x.size, dtype=np.int64)
+    for i in range(x.size):
+        place = _place(cx, cy, a, b, cos, sin, x[i], y[i], steps)
+        out[i] = _sector(place[6], place[7], SECTORS)
+    return out
+
+
+@_inlined
+def _edge(distance, curvature, sigma, kurtosis):
+    """`Profile.of` of one pixel."""
+    z = distance / sigma
+    z2 = z * z
+    density = _DENSITY * math.exp(-0.5 * z2)
+    step = 0.5 * math.erfc(-z * _ROOT_HALF)
+    half = 0.5 * curvature
+    tails = z * (3.0 - z2) * density / 24.0
+    bend = density * (1.0 + (kurtosis / 24.0) * (z2 * (z2 - 6.0) + 3.0))
+    edge = step + half * sigma * density + kurtosis * tails
+    by_distance = bend / sigma - half * z * density
+    by_sigma = half * (1.0 + z2) * density - z * bend / sigma
+    return edge, by_distance, by_sigma, tails, distance * step + sigma * density, step, density
+
+
+@_inlined
+def _outer_level(outer, cos_u, sin_u, basis):
+    """The outer level, with the harmonics written to `basis`."""
+    basis[0] = 1.0
+    level, c, s = outer[0], 1.0, 0.0
+    for k in range(1, outer.size, 2):
+        c, s = c * cos_u - s * sin_u, s * cos_u + c * sin_u
+        basis[k], basis[k + 1] = c, s
+        level += outer[k] * c + outer[k + 1] * s
+    return level
+
+
+BLOCK = 128  # pixels whose rows stay in the first-level cache
+
+
+@_compiled
+def pixel_sums(x, y, level, index, numbers, displaced):
+    cx, cy, a, b, angle, sigma, inner_dn, slope, kurtosis, lean_x, lean_y = numbers[:11]
+    cos, sin = math.cos(angle), math.sin(angle)
+    outer, sectors = numbers[11:], displaced.size
+    size = 11 + outer.size
+    matrix, basis = np.zeros((size, size)), np.empty(outer.size)
+    rows, residual, steep = np.empty((size, BLOCK)), np.empty(BLOCK), np.empty(BLOCK)
+    pull, across = np.zeros((size, sectors)), np.zeros((size, sectors))
+    along, square, cost = np.zeros(sectors), np.zeros(sectors), 0.0
+    for start in range(0, x.size, BLOCK):
+        count = min(BLOCK, x.size - start)
+        for i in range(count):
+            k = index[start + i]
+            distance, c, s, nx, ny, bend, cu, su = _place(cx, cy, a, b, cos, sin, x[start + i], y[start + i], NEAR)
+            edge, by_d, by_s, tails, ramp, ramp_d, ramp_s = _edge(distance + displaced[k], bend, sigma, kurtosis)
+            inner = inner_dn + lean_x * cu + lean_y * su
+            step = _outer_level(outer, cu, su, basis) - inner
+            steepness = step * by_d + slope * ramp_d
+            left = level[start + i] - (inner + step * edge + slope * ramp)
+            rows[0, i], rows[1, i] = (ny * sin - nx * cos) * steepness, (-nx * sin - ny * cos) * steepness
+            rows[2, i], rows[3, i], rows[4, i] = (
+                -nx * c * steepness,
+                -ny * s * steepness,
+                (-nx * s - ny * c) * steepness,
+            )
+            rows[5, i], rows[6, i] = step * by_s + slope * ramp_s, 1.0 - edge
+            rows[7, i], rows[8, i], rows[9, i], rows[10, i] = ramp, step * tails, (1.0 - edge) * cu, (1.0 - edge) * su
+            for j in range(outer.size):
+                rows[11 + j, i] = basis[j] * edge
+            cost += left * left
+            along[k] += steepness * left
+            square[k] += steepness * steepness
+            residual[i], steep[i] = left, steepness
+        _add_products(rows, 0, count, matrix)
+        begin = 0
+        while begin < count:  # the pixels of a sector follow each other
+            k, end = index[start + begin], begin + 1
+            while end < count and index[start + end] == k:
+                end += 1
+            _add_weighted(rows, begin, end, residual, k, pull)
+            _add_weighted(rows, begin, end, steep, k, across)
+            begin = end
+    for j in range(size):
+        for m in range(j):
+            matrix[m, j] = matrix[j, m]
+    return matrix, cost, pull, across, along, square
+
+
+@_summing
+def _add_weighted(rows, begin, end, weight, k, out):
+    """Add the weighted sums of rows (p, n), over the columns from `begin` to `end`, to column k of out (p, q)."""
+    for j in range(rows.shape[0]):
+        total = 0.0
+        for i in range(begin, end):
+            total += rows[j, i] * weight[i]
+        out[j, k] += total
+
+
+@_compiled
+def displacements(x, y, level, use, numbers, displaced):
+    cx, cy, a, b, angle, sigma, inner_dn, slope, kurtosis, lean_x, lean_y = numbers[:11]
+    cos, sin = math.cos(angle), math.sin(angle)
+    outer, n = numbers[11:], x.size
+    bins, residual, basis = np.empty(n, dtype=np.int64), np.empty(n), np.empty(outer.size)
+    place, steepness = np.empty((n, 4)), np.empty(n)
+    whole, weight, further = displaced.copy(), np.empty(SECTORS), np.empty(SECTORS)
+    for i in range(n):
+        distance, _, _, _, _, curvature, cu, su = _place(cx, cy, a, b, cos, sin, x[i], y[i], NEAR)
+        inner = inner_dn + lean_x * cu + lean_y * su
+        place[i, 0], place[i, 1], place[i, 2] = distance, curvature, inner
+        place[i, 3] = _outer_level(outer, cu, su, basis) - inner
+        bins[i] = _sector(cu, su, SECTORS)
+    for _ in range(2):
+        weight[:], further[:] = 0.0, 0.0
+        for i in range(n):
+            k = bins[i]
+            edge, by_d, _, _, ramp, ramp_d, _ = _edge(place[i, 0] + whole[k], place[i, 1], sigma, kurtosis)
+            residual[i] = level[i] - (place[i, 2] + place[i, 3] * edge + slope * ramp)
+            steepness[i] = place[i, 3] * by_d + slope * ramp_d
+            if use[i]:
+                weight[k] += steepness[i] ** 2
+                further[k] += steepness[i] * residual[i]
+        largest = 0.0
+        for k in range(SECTORS):
+            further[k] = min(max(further[k] / weight[k], -sigma), sigma) if weight[k] > 1e-9 else 0.0
+            whole[k] += further[k]
+            largest = max(largest, abs(further[k]))
+        if largest < 0.1 * sigma:
+            break
+    for i in range(n):
+        residual[i] -= steepness[i] * further[bins[i]]
+    return bins, residual, whole, weight

@@ -1,0 +1,78 @@
+"""The compiled functions against their NumPy twins, on what extraction calls them with."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+import make_ideal_images as ideal
+from eyerender.extraction import compiled, extract
+from eyerender.extraction.compiled import TWINS, kernel
+
+CONDITIONS = ("eight-glints", "lid", "texture6")
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """Extraction without compiled functions."""
+    monkeypatch.setenv("EYERENDER_COMPILED", "0")
+    kernel.cache_clear()
+    yield
+    kernel.cache_clear()
+
+
+def images():
+    for condition in CONDITIONS:
+        drawing = ideal.draw(condition, 3)
+        yield drawing.image, drawing.parameters["bit_depth"]
+
+
+def same(ours, theirs, name):
+    """Compare results; an ellipse from OpenCV's single precision differs by some 1e-5 px."""
+    if isinstance(ours, tuple):
+        assert len(ours) == len(theirs), name
+        for one, other in zip(ours, theirs, strict=True):
+            same(one, other, name)
+        return
+    ours, theirs = np.asarray(ours), np.asarray(theirs)
+    assert ours.shape == theirs.shape, name
+    if ours.dtype.kind in "bi":
+        assert (ours == theirs).mean() > 0.999, name
+        return
+    scale = float(np.nanmax(np.abs(theirs), initial=1e-3))
+    limit = 1e-4 if name in ("settled", "ring_levels", "ridges") else 1e-8  # single precision in one of the two
+    np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=limit * scale, err_msg=name)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra `fast`")
+def test_every_compiled_function_gives_what_its_twin_gives(monkeypatch):
+    called = dict.fromkeys(TWINS, 0)
+
+    def compared(name):
+        function = getattr(__import__("eyerender.extraction.kernels", fromlist=[name]), name)
+
+        def both(*args):
+            called[name] += 1
+            result = function(*args)
+            same(result, TWINS[name](*args), name)
+            return result
+
+        return both
+
+    monkeypatch.setattr(compiled, "kernel", compared)
+    for image, depth in images():
+        assert extract(image, bit_depth=depth).pupil.ok
+    assert min(called.values()) > 0, called
+
+
+def test_extraction_is_the_same_with_and_without(without, monkeypatch):
+    results = [extract(image, bit_depth=depth).pupil for image, depth in images()]
+    monkeypatch.setenv("EYERENDER_COMPILED", "1")
+    kernel.cache_clear()
+    for (image, depth), pupil in zip(images(), results, strict=True):
+        other = extract(image, bit_depth=depth).pupil
+        np.testing.assert_allclose(other.ellipse.centre_px, pupil.ellipse.centre_px, atol=1e-4)
+        np.testing.assert_allclose(other.ellipse.semi_axes_px, pupil.ellipse.semi_axes_px, atol=1e-4)
+        assert other.confidence == pytest.approx(pupil.confidence, abs=1e-4)
