@@ -94,8 +94,9 @@ def _sums(
 ) -> tuple[list[Floats], int]:
     """Sums over the samples of each pixel, (height, width): radiance; or radiance, weight, nearness of each part."""
     width, height = window[2:]
-    if shown.lights.on_iris is not None:
-        shown.lights.on_iris.make()
+    for grid in (shown.lights.on_iris, shown.lights.on_matte):
+        if grid is not None:
+            grid.make()
     grouped = shown.values.structure.region
     size = group_size(spp) if grouped else 1
     totals: list[Floats] = []

@@ -90,6 +90,15 @@ def straight(lamp: Lamp, source: mi.Vector3f, view: View, back: mi.Vector3f | No
     return received, mi.Float(0) if back is None else received * sheen(view.normal, to, back, view.gloss)
 
 
+def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vector3f) -> mi.Float:
+    """Irradiance (mW/mm^2) that a lamp's point `source` gives to points x when nothing stands in the way."""
+    to = source - x
+    inv2 = dr.rcp(dr.squared_norm(to))
+    to *= dr.sqrt(inv2)
+    cosine = dr.dot(to, normal)
+    return dr.select(cosine > 0, lamp.radiant_intensity(-to) * cosine * inv2, 0)
+
+
 def onto_points(
     values: Values,
     lights: Lights,
@@ -112,11 +121,7 @@ def onto_points(
     def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         lamp: Lamp = lights[i]
         source = lamp.point(u, sine, cosine_v)
-        to = source - x
-        inv2 = dr.rcp(dr.squared_norm(to))
-        to *= dr.sqrt(inv2)
-        cosine = dr.dot(to, normal)
-        lit = dr.select(cosine > 0, lamp.radiant_intensity(-to) * cosine * inv2, 0)
+        lit = irradiance(lamp, source, x, normal)
         blocked = lamp_blocked(values, scene, x, source, other, True, lit > 0)
         return i + 1, total + dr.select(blocked, 0, lit)
 
@@ -125,7 +130,14 @@ def onto_points(
 
 
 def light(
-    values: Values, lights: Lights, scene: mi.Scene, view: View, back: mi.Vector3f, u: mi.Float, v: mi.Float
+    values: Values,
+    lights: Lights,
+    scene: mi.Scene,
+    view: View,
+    back: mi.Vector3f,
+    u: mi.Float,
+    v: mi.Float,
+    known: mi.Bool | None = None,
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.UInt32]:
     """Light on the eye.
 
@@ -139,6 +151,7 @@ def light(
         back: unit direction of the viewer (eye frame).
         u: place on each lamp's disc, [0, 1).
         v: the same, second coordinate.
+        known: where the light at the first surface is not wanted.
 
     Returns:
         Irradiance (mW/mm^2) at the first surface where it is matte, the radiance of its sheen towards `back`, the
@@ -166,7 +179,7 @@ def light(
         blocked = lamp_blocked(values, scene, view.point, source, view.other, ~view.cornea, direct > 0)
         return i + 1, total + dr.select(blocked, 0, direct)
 
-    matte = view.matte
+    matte = view.matte if known is None else view.matte & ~known
     state = (mi.UInt32(0), mi.Float(0))
     _, direct = dr.while_loop(
         state, lambda i, _: matte & (i < lights.count), onto_matte, labels=("i", "direct"), label="lamps"

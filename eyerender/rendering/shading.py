@@ -47,9 +47,13 @@ def shade(
     u, v: place on each lamp's disc, [0, 1).
     """
     view = look(values, textures, scene, o, d, active)
-    outer, shine, inner, failures = light(values, lights, scene, view, -values.vector_to_eye(d), u, v)
+    known, outer_known = mi.Bool(False), mi.Float(0)
+    if lights.on_matte is not None:
+        outer_known, known = lights.on_matte.at(view)
+    outer, shine, inner, failures = light(values, lights, scene, view, -values.vector_to_eye(d), u, v, known)
+    outer += outer_known
     albedo = outer_albedo(values, textures, view)
-    received = of_surroundings(values, textures, view)
+    received = of_surroundings(values, textures, view, known)
     if values.structure.region:
         assert textures.received is not None
         received = dr.select(view.other, view.received, textures.received.globe(values.point_to_scene(view.point)))
@@ -63,16 +67,24 @@ def direct(view: View, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi
     return dr.select(view.met, cover * (albedo * outer * dr.inv_pi + shine), 0)
 
 
-def of_surroundings(values: Values, textures: Textures, view: View) -> mi.Vector4f:
+def of_surroundings(values: Values, textures: Textures, view: View, known: mi.Bool) -> mi.Vector4f:
     """What points of a bare globe and of its surround receive from other surfaces (see `exchange.Received`).
 
-    Obstacles receive nothing.
+    Obstacles receive nothing. The light from other surfaces on the globe is left out where it is `known`.
     """
-    assert textures.received is not None
-    x = values.point_to_scene(view.point)
-    plane = dr.abs(x.x - values.backdrop_x) < _FLAT_MM
-    surround = dr.select(plane, textures.received.surround(x), mi.Vector4f(0, 1, 0, 0))
-    return dr.select(view.other, surround, textures.received.globe(x))
+    received, nothing = textures.received, mi.Vector4f(0, 1, 0, 0)
+    assert received is not None
+
+    def of_plane(x: mi.Vector3f) -> mi.Vector4f:
+        return dr.select(dr.abs(x.x - values.backdrop_x) < _FLAT_MM, received.surround(x), nothing)
+
+    def of_either(x: mi.Vector3f) -> mi.Vector4f:
+        return dr.if_stmt((x,), view.other, of_plane, received.globe)
+
+    known &= ~view.other
+    wanted = view.matte if values.structure.ambient else view.matte & ~known
+    found = dr.if_stmt((values.point_to_scene(view.point),), wanted, of_either, lambda x: nothing)
+    return mi.Vector4f(dr.select(known, 0, found.x), found.y, found.z, found.w)
 
 
 def indirect(
@@ -106,19 +118,30 @@ def indirect(
         x, normal = values.point_to_scene(view.point), values.vector_to_scene(view.normal)
         even += received.y * textures.ambience.irradiance(x, normal)
     rest = cover * albedo * even * dr.inv_pi + _mirrored(values, textures, scene, view, d, 1 - cover)
-    inner += textures.received.iris(view.inner)
-    behind = dr.if_stmt(
-        (view.inner,),
-        view.cornea & ~view.pupil,
-        lambda inner: iris_albedo(values, textures, inner),
-        lambda inner: mi.Float(values.pupil_albedo),
+    leaving = (
+        dr.if_stmt(
+            (view.inner, inner),
+            view.lit_inside,
+            lambda x, lit: _leaving(values, textures, view.pupil, x, lit),
+            lambda x, lit: mi.Float(0),
+        )
+        * dr.inv_pi
+        / (index * index)
     )
-    leaving = behind * inner * dr.inv_pi / (index * index)
     if textures.pupil is not None:
         seen = view.cornea & view.pupil
         leaving += dr.select(seen, textures.pupil.at(*stop_coordinates(values, view.inner), seen), 0)
     rest += dr.select(view.cornea, (1 - view.opacity) * view.passed * leaving, 0)
     return dr.select(view.met, rest, 0)
+
+
+def _leaving(values: Values, textures: Textures, pupil: mi.Bool, x: mi.Vector3f, lit: mi.Float) -> mi.Float:
+    """Radiosity of points in the plane of the iris that have the irradiance `lit` from the lamps."""
+    assert textures.received is not None
+    albedo = dr.if_stmt(
+        (x,), ~pupil, lambda x: iris_albedo(values, textures, x), lambda x: mi.Float(values.pupil_albedo)
+    )
+    return albedo * (lit + textures.received.iris(x))
 
 
 def _mirrored(
@@ -157,6 +180,10 @@ def _mirrored(
         seen = dr.select(barred, surface, seen)
     else:
         t = (values.backdrop_x - start.x) / dr.select(way.x < -1e-4, way.x, -1)
-        plane = received.surround(start + t * way).z * dr.inv_pi
-        seen = dr.select((way.x < -1e-4) & (t > 0), plane, seen)
+        seen = dr.if_stmt(
+            (start + t * way, seen),
+            wet & (way.x < -1e-4) & (t > 0),
+            lambda x, _: received.surround(x).z * dr.inv_pi,
+            lambda _, seen: seen,
+        )
     return dr.select(wet | film, share * seen, 0)

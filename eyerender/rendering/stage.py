@@ -30,6 +30,7 @@ from .frame import (
 from .head import place_scene
 from .irislight import IrisLight
 from .lampviews import LampViews
+from .mattelight import MatteLight
 from .meshed import Meshes, meshed
 from .plain import fine_pixels, plain_tiles
 from .pupillight import PupilLight
@@ -39,6 +40,7 @@ from .values import Lights, Structure, Values
 from .view import Textures
 
 _REGIONS, _TEXTURES = 4, 8  # kept
+_FARTHEST_MM = 60.0  # of places in the plane of a surround that have a grid
 _NOTHING_PLAIN = frozen(np.zeros((1, 1)), np.bool_)
 
 
@@ -95,8 +97,7 @@ class Stage:
             panels = Lights(light_table(panel_lamps(job.ambient, anchor), job.M, job.t))
             received = self._exchange.received(job, values, lights, panels, textures, place)
             textures = replace(textures, received=received)
-        if not place.obstructed or (region is not None and region.skin.is_sheet):
-            lights.on_iris = IrisLight(values, lights, place.scene, textures.lamp_views)
+        _spread(job, values, lights, textures, place)
 
         def fine(window: Window) -> Bools:
             return fine_pixels(None if region is None else region.posed, job.camera, anchor, window)
@@ -126,6 +127,15 @@ class Stage:
                 self._textures.pop(next(iter(self._textures)))
             self._textures[seed] = Textures.of_seed(seed)
         return self._textures[seed]
+
+
+def _spread(job: RenderJob, values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene) -> None:
+    """Prepare the grids of the lamps' light that a frame can use."""
+    if not place.obstructed or (isinstance(place, RegionScene) and place.skin.is_sheet):
+        lights.on_iris = IrisLight(values, lights, place.scene, textures.lamp_views)
+    if textures.received is not None and not place.obstructed:
+        reach = min(_reach_mm(job), _FARTHEST_MM)
+        lights.on_matte = MatteLight(values, lights, place.scene, textures.received, reach)
 
 
 def _reach_mm(job: RenderJob) -> float:

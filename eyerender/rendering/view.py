@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 EPSILON_MM = 2e-3  # points closer than this are the same in single precision
 _NEAR_MM = 20.0
+GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of maps of the globe
 _FAR = float(np.finfo(np.float32).max)
 _WET = 0.8  # gloss of the sclera
 _RING = (0.62, 0.95)  # share of the way from the pupil to the root over which a limbal ring grows dark
@@ -349,13 +350,16 @@ def outer_albedo(values: Values, textures: Textures, view: View) -> mi.Float:
     )
 
 
-def _sclera_albedo(values: Values, textures: Textures, point: mi.Vector3f) -> mi.Float:
+def globe_map(values: Values, point: mi.Vector3f) -> mi.Point2f:
+    """Place in [0, 1]^2 of points of the globe (eye frame) in the azimuthal equidistant map of its front."""
     r = point - values.sclera.centre
-    # The map of the globe's front is azimuthal equidistant, from the pole out to 108 degrees.
-    polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / (0.6 * dr.pi)
+    polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / GLOBE_EDGE
     inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
-    uv = mi.Point2f(0.5 + 0.5 * polar * r.y * inv, 0.5 + 0.5 * polar * r.z * inv)
-    texture = textures.sclera.eval(uv)[0]
+    return mi.Point2f(0.5 + 0.5 * polar * r.y * inv, 0.5 + 0.5 * polar * r.z * inv)
+
+
+def _sclera_albedo(values: Values, textures: Textures, point: mi.Vector3f) -> mi.Float:
+    texture = textures.sclera.eval(globe_map(values, point))[0]
     sclera = values.sclera.albedo * dr.maximum(1 + values.sclera.contrast * (texture - 1), 0.02)
     # The grey ring of the limbus fades into the white over its width, on the side of the sclera.
     local = values.surfaces[0].point_in(point)

@@ -1,0 +1,76 @@
+"""Light on a square grid, interpolated by cubics where these are good to a thousandth.
+
+A cell of the grid is used where the light is known at its sixteen neighbours and third differences say that cubic
+interpolation is good: not at the edge of a shadow, nor where a lamp sets.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+_BENT = 0.004  # largest third difference of a cell over its irradiance
+
+
+class LightGrid:
+    """Irradiance at the nodes of a grid of `side` by `side`."""
+
+    def __init__(self, side: int) -> None:
+        self.side = side
+        self._rows = dr.full(mi.Float, -1, 4 * side * side)
+        dr.make_opaque(self._rows)
+
+    def nodes(self) -> tuple[mi.UInt32, mi.UInt32]:
+        """Column and row of all nodes, in row order."""
+        index = dr.arange(mi.UInt32, self.side * self.side)
+        row = index // self.side
+        return index - row * self.side, row
+
+    def fill(self, irradiance: mi.Float, more: mi.Float | None = None) -> None:
+        """Set the irradiance of the nodes, negative where it is not known.
+
+        `more` is added. It is known to change slowly, so it does not decide which cells are used.
+        """
+        side = self.side
+        dr.eval(irradiance, more)
+        column, row = self.nodes()
+        index = row * side + column
+        places = [
+            [mi.UInt32(dr.clip(mi.Int32(index) + dv * side + du, 0, side**2 - 1)) for du in range(-1, 3)]
+            for dv in range(-1, 3)
+        ]
+        near = [[dr.gather(mi.Float, irradiance, place) for place in line] for line in places]
+        bent, least, most = mi.Float(0), mi.Float(dr.inf), mi.Float(0)
+        for e in (*near, *zip(*near, strict=True)):
+            bent = dr.maximum(bent, dr.abs(e[0] - 3 * e[1] + 3 * e[2] - e[3]))
+        for value in (v for line in near for v in line):
+            least, most = dr.minimum(least, value), dr.maximum(most, value)
+        good = (least > 0) & (bent <= _BENT * most)
+        good &= (column > 0) & (row > 0) & (column < side - 2) & (row < side - 2)
+        four = near[1]
+        if more is not None:
+            four = [value + dr.gather(mi.Float, more, place) for value, place in zip(four, places[1], strict=True)]
+        first = dr.abs(four[0])
+        for k, value in enumerate((dr.select(good, first, -first), *four[1:])):
+            dr.scatter(self._rows, value, 4 * index + k)
+        dr.eval(self._rows)
+
+    def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Bool]:
+        """Irradiance at places in units of cells, and whether it is known there."""
+        side = self.side
+        inside = active & (u >= 0) & (v >= 0) & (u < side - 1) & (v < side - 1)
+        i, j = mi.UInt32(u), mi.UInt32(v)
+        wu, wv = _weights(u - mi.Float(i)), _weights(v - mi.Float(j))
+        total, known = mi.Float(0), mi.Bool(inside)
+        for k, weight in enumerate(wv):
+            row = dr.gather(mi.Vector4f, self._rows, (j + k - 1) * side + i, inside)
+            if k == 1:
+                known &= row.x > 0
+            total += weight * (wu[0] * dr.abs(row.x) + wu[1] * row.y + wu[2] * row.z + wu[3] * row.w)
+        return dr.select(known, dr.maximum(total, 0), 0), known
+
+
+def _weights(s: mi.Float) -> tuple[mi.Float, ...]:
+    """Weights of four neighbours at the place s, 0 to 1 between the second and the third."""
+    r = 1 - s
+    return -0.5 * s * r * r, 1 + s * s * (1.5 * s - 2.5), 1 + r * r * (1.5 * r - 2.5), -0.5 * r * s * s
