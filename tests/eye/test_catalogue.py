@@ -19,13 +19,13 @@ from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.optics.trace import trace
 from eyerender.status import Status
 
-NAMES = ("E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop")
+NAMES = ("E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop", "keratoconus")
 
 
 def test_the_catalogue_is_complete():
     assert catalogue_names() == NAMES
     # Eyes of a study's software are the study's.
-    assert sorted(path.stem for path in FOLDER.glob("*.yaml")) == ["E1", "E2", "E3", "E4", "E5"]
+    assert sorted(path.stem for path in FOLDER.glob("*.yaml")) == ["E1", "E2", "E3", "E4", "E5", "keratoconus"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -197,3 +197,18 @@ def test_unknown_names_are_refused_with_the_catalogue():
         load_eye("E9")
     with pytest.raises(InputError, match="no such file"):
         load_eye("nowhere.yaml")
+
+
+@pytest.mark.parametrize(("surface", "height", "radius", "q"), [(0, 0.032, 7.72, -0.26), (1, 0.1, 6.5, 0.0)])
+def test_the_keratoconus_is_a_cone_on_the_cornea_of_e4(surface, height, radius, q):
+    """The expansion of order 10 has the Gaussian cone within 2 % inside the zone, whose blend starts at 3.4 mm."""
+    cornea = load_eye("keratoconus").build().front[surface]
+    y, z = np.meshgrid(*[np.linspace(-3.0, 3.0, 41)] * 2)
+    y, z = (v[np.hypot(y, z) < 3.0] for v in (y, z))
+    conic = Quadric.conic(radius, q, cornea.origin_mm, cornea.rotation)
+
+    def cone(y, z):
+        return height * np.exp(-((y + 0.85) ** 2 + (z + 0.85) ** 2) / (2 * 1.2**2))
+
+    wanted = conic.sag(y, z) + cone(y, z) - cone(0.0, 0.0)
+    assert np.abs(cornea.sag(y, z) - wanted).max() < 0.02 * height
