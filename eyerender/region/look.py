@@ -1,10 +1,12 @@
 """Appearance of the eye and its surround at 850 nm: diffuse albedos and the contrast of their textures.
 
 Values without a source are chosen. Spectra of skin are published (Cooksey, Allen and Tsai 2017, J. Res. NIST 122, 26:
-forearms). The backdrop is darker than that, because a surround without lids would otherwise outshine the eye. No
-measured diffuse albedo at 850 nm was available for iris and sclera. Their values give grey levels with the ratios of
-near-infrared photographs (apparent iris about half of the sclera). The cornea transmits (1 - F)^2 / n^2, about 0.53, of
-an iris' albedo to the camera.
+forearms). The backdrop is darker than that, because a surround without lids would otherwise outshine the eye. The
+sclera is a scattering slab over dark uvea. No measured diffuse albedo of the iris at 850 nm was available. Its value
+gives the ratios of near-infrared photographs, in which the iris has two thirds to nine tenths of the sclera's level.
+The cornea transmits (1 - F)^2 / n^2, about 0.53, of an iris' albedo to the camera. The grey of a pupil, a fifth to a
+half of the iris in photographs, is for the most part light that strays in the camera (`lens.glare`) and the sensor's
+black level.
 """
 
 from __future__ import annotations
@@ -51,7 +53,11 @@ class Fundus(Spec):
 class Look(Spec):
     """Albedos (diffuse reflectance, 0 to 1) and textures; contrast 0 is a uniform surface, 1 the natural texture."""
 
-    iris_albedo: Albedo = Field(default=0.30, description="mean over the iris (chosen)")
+    iris_albedo: Albedo = Field(
+        default=0.36,
+        description="mean over the iris (chosen so that its level is 0.56 to 1 of the sclera's, as in near-infrared "
+        "photographs)",
+    )
     iris_contrast: Contrast = Field(
         default=1.0, description="contrast of fibres, collarette, crypts and furrows (chosen)"
     )
@@ -65,10 +71,14 @@ class Look(Spec):
     pupil_albedo: Albedo = Field(
         default=0.0, description="diffuse albedo of the pupil, besides the light of the fundus: a cloudy lens"
     )
-    sclera_albedo: Albedo = Field(default=0.42, description="mean over the sclera (chosen)")
+    sclera_albedo: Albedo = Field(
+        default=0.38,
+        description="mean over the sclera (a slab 1 mm thick with a reduced scattering of 2 to 3 per mm over dark uvea "
+        "reflects 0.34 to 0.44; one of 0.6 mm 0.25 to 0.33)",
+    )
     sclera_contrast: Contrast = Field(default=1.0, description="contrast of vessels and unevenness (chosen)")
     limbus_albedo: Albedo = Field(
-        default=0.34,
+        default=0.40,
         description="albedo of the tissue where the cornea merges into the sclera (chosen so that the limbus has no "
         "dark ring, as in most near-infrared photographs)",
     )

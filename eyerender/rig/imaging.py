@@ -51,8 +51,9 @@ class Lens(Spec):
 
     glare: Annotated[float, Field(ge=0, le=0.3)] = Field(
         default=0.0,
-        description="share of the light that the lens scatters widely over the picture (veiling glare, ISO 9358; a few "
-        "hundredths for lenses of cameras, chosen)",
+        description="share of the light that the lens scatters widely over the picture (veiling glare, ISO 9358). "
+        "Coatings for visible light fail at 850 nm: eight surfaces that reflect 0.02 to 0.04 and a sensor that "
+        "reflects 0.15 lead 0.035 to 0.09 astray by two reflections",
     )
     glare_radius_px: Positive = Field(
         default=80.0, description="radius r0 of the scatter, whose irradiance falls as (1 + (r / r0)^2)^(-3/2) (chosen)"

@@ -41,7 +41,10 @@ class Sensor(Spec):
     gain_dn_per_e: Positive | None = Field(
         default=None, description="system gain K; default: full scale at 98 % of the full well"
     )
-    black_level_dn: NonNegative | None = Field(default=None, description="default: 1/256 of full scale")
+    black_level_dn: NonNegative | None = Field(
+        default=None,
+        description="code of no light; default: 1/256 of full scale (an OV9281 has 16/256)",
+    )
     bit_depth: Literal[8, 10, 12, 16] = Field(default=16, description="bits of the stored numbers")
     psf_sigma_px: Annotated[float, Field(ge=0, le=20)] = Field(
         default=0.7, description="standard deviation of the Gaussian point-spread function, pixel area not included"
