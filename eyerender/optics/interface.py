@@ -91,10 +91,11 @@ def fresnel(
 
 
 def _stacked(first: Floats, second: Floats) -> Floats:
-    """Reflected share of two parallel interfaces."""
+    """Reflected share of two parallel interfaces; exactly 1 where either reflects all."""
     both = first * second
-    through = np.where(both < 1.0, 1.0 - both, 1.0)
-    return np.asarray(np.where(both < 1.0, (first + second - 2.0 * both) / through, 1.0))
+    total = (first >= 1.0) | (second >= 1.0)
+    through = np.where(total, 1.0, 1.0 - both)
+    return np.asarray(np.where(total, 1.0, (first + second - 2.0 * both) / through))
 
 
 def dot(a: Xyz, b: Xyz) -> Floats:

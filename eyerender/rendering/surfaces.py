@@ -293,6 +293,8 @@ def fresnel(c1: mi.Float, c2: mi.Float, eta: mi.Float, film: mi.Float | None = N
     if film is None:
         s, p = _polarized(c1, c2, eta)
         return 0.5 * (s + p)
+    # Rounding may bring a ray that grazes the surface from behind it, where two shares above 1 would have a huge sum.
+    c1 = dr.maximum(c1, 0)
     inside = dr.sqrt(dr.maximum(1 - film * film * (1 - c1 * c1), 0))
     shares = zip(_polarized(c1, inside, film), _polarized(inside, c2, eta / film), strict=True)
     s, p = ((a + b - 2 * a * b) / dr.maximum(1 - a * b, 1e-9) for a, b in shares)

@@ -113,3 +113,17 @@ def test_a_ring_is_a_disc_without_its_middle(renderer):
     both = done["ring"] + done["middle"]
     assert np.max(np.abs(both - done["disc"])) < 1e-3 * np.max(done["disc"])
     assert both.sum() == pytest.approx(done["disc"].sum(), rel=1e-3)
+
+
+def test_the_film_mirrors_all_light_that_grazes_it(backend):
+    """Rounding may bring the ray from behind the surface; its share must not become a huge negative number."""
+    import mitsuba as mi
+
+    from eyerender.optics.interface import fresnel
+    from eyerender.rendering.surfaces import fresnel as in_kernels
+
+    index, film = 1.376, 1.3314
+    c1 = np.array([-1e-3, -1e-5, -1e-7, 0.0, 1e-7, 1e-5, 0.01, 0.3, 1.0])
+    c2 = np.sqrt(1 - (1 - c1**2) / index**2)
+    shares = np.asarray(in_kernels(mi.Float(c1), mi.Float(c2), mi.Float(1 / index), mi.Float(1 / film)))
+    np.testing.assert_allclose(shares, fresnel(np.maximum(c1, 0), 1.0, index, film).unpolarized, atol=2e-6)
