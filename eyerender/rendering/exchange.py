@@ -456,7 +456,8 @@ def _met(
     if textures.region is not None and frame.skin is not None:
         face = textures.region.face(hit)
         other = first + dr.gather(mi.UInt32, mi.UInt32(frame.skin.faces.astype(np.uint32)), face, view.other)
-        matte = view.other
+        # It is dark between a lid and the globe.
+        matte = view.other & ~textures.region.from_behind(face, hit.prim_uv, d, view.other)
     else:
         ring, turn = numbers.surround_place(at)
         ring = mi.UInt32(dr.clip(ring + s, 0, RINGS - 1))

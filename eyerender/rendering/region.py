@@ -188,6 +188,19 @@ class SkinGeometry:
         """Whether a triangle belongs to the sheet of skin, not to what is in front of it."""
         return face < self._sheet
 
+    def from_behind(self, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Bool:
+        """Whether rays along d (scene's frame) meet triangles on their inner side, such as a lid's from within it."""
+        corner = dr.gather(mi.Vector4u, self._corners, face, active)
+        corners = (corner.x, corner.y, corner.z)
+        a, b, c = (
+            mi.Vector3f(p.x, p.y, p.z) for p in (dr.gather(mi.Vector4f, self._buffer, 2 * i, active) for i in corners)
+        )
+        turned = mi.Vector4f(0)
+        for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), corners, strict=True):
+            turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i + 1, active)
+        n = dr.cross(b - a, c - a)
+        return dr.dot(n, d) * dr.dot(n, mi.Vector3f(turned.x, turned.y, turned.z)) > 0
+
     def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Surface:
         """Surface at barycentric coordinates `uv` of triangles.
 
