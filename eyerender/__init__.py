@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from .region.look import Look
     from .report.comparison import write_report
     from .rig.camera import CalibrationFile, Camera, CameraCalibration, PinholeCamera
-    from .rig.imaging import Ambient, Lens, Motion, Opening, Panel, RadianceMap
+    from .rig.imaging import Ambient, Lens, Motion, Opening, Panel, RadianceMap, Sun
     from .rig.light import Led, LedRing
     from .rig.rig import Rig, RigGeometry
     from .rig.screen import Screen
@@ -109,6 +109,7 @@ _HOMES = {
     "Skin": "region.anatomy",
     "Status": "status",
     "Subject": "scene.subject",
+    "Sun": "rig.imaging",
     "SyntEye": "population.synteyes",
     "SyntEyes": "population.synteyes",
     "Targets": "scene.spec",
@@ -195,6 +196,7 @@ __all__ = [
     "Skin",
     "Status",
     "Subject",
+    "Sun",
     "SyntEye",
     "SyntEyes",
     "Targets",

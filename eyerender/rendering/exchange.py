@@ -43,6 +43,7 @@ from .places import (
     plane_places,
     skin_places,
 )
+from .values import aligned
 from .view import Textures, appearance, iris_albedo, meet, outer_albedo
 
 if TYPE_CHECKING:
@@ -223,7 +224,7 @@ class Exchange:
         for known, still, places in self._skins:
             if known is region and still == rest:
                 return places
-        places = skin_places(region.at_rest(rest))
+        places = skin_places(region.at_rest(rest), rest)
         self._skins = [*self._skins[-3:], (region, rest, places)]
         return places
 
@@ -323,7 +324,7 @@ class _Frame:
         globe = filled(numbers[: self.on_globe], valid, self.grid.rows, self.grid.columns, across)
         other = numbers[self.on_globe : self.outside - IRIS_TURNS]
         if region is not None and self.skin is not None:
-            other = self.skin.spread @ other
+            other = self.skin.spread @ other[: len(self.skin.vertices)]
             region.skin.shine(other)
         iris = self._on_iris(entered + inside.sky.mean(axis=1), 1.0) + self._on_iris(within + panels, 0.0)
         return self.received((globe, other, iris))
@@ -334,8 +335,9 @@ def _others(
 ) -> tuple[Floats, Floats, tuple[float, float, float]]:
     """Places that are not on the eye, their normals, and the rings of the surround."""
     if region is not None and skin is not None:
-        posed = region.posed
-        return posed.vertices[skin.vertices], posed.normals[skin.vertices], (0.0, 0.0, 1.0)
+        vertices, normals = (a[skin.vertices] for a in (region.posed.vertices, region.posed.normals))
+        both = np.concatenate([vertices, vertices[skin.lids]]), np.concatenate([normals, -normals[skin.lids]])
+        return *both, (0.0, 0.0, 1.0)
     points, inner = plane_places(globe, -job.look.backdrop_distance_mm)
     centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
     return points, np.tile([1.0, 0.0, 0.0], (len(points), 1)), (float(centre[1]), float(centre[2]), inner)
@@ -449,15 +451,17 @@ def _met(
     view, hit = meet(values, place.scene, o, d, active, coherent=False)
     view = appearance(values, textures, view, hit, d)
     albedo = outer_albedo(values, textures, view)
-    first = dr.opaque(mi.UInt32, frame.on_globe)
     # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.
     s, t = _spots(dr.arange(mi.UInt32, dr.width(o)) * mi.UInt32(0x9E3779B1))
+    first = dr.opaque(mi.UInt32, frame.on_globe)
     at = values.point_to_scene(view.point)
     if textures.region is not None and frame.skin is not None:
-        face = textures.region.face(hit)
-        other = first + dr.gather(mi.UInt32, mi.UInt32(frame.skin.faces.astype(np.uint32)), face, view.other)
-        # It is dark between a lid and the globe.
-        matte = view.other & ~textures.region.from_behind(face, hit.prim_uv, d, view.other)
+        face, count = textures.region.face(hit), len(frame.skin.vertices)
+        table = np.stack([frame.skin.faces, frame.skin.behind + count], axis=1).astype(np.int32)
+        inner = textures.region.from_behind(face, hit.prim_uv, d, view.other)
+        which = dr.gather(mi.Int32, mi.Int32(aligned(table.ravel())), 2 * face + dr.select(inner, 1, 0), view.other)
+        other = first + mi.UInt32(which)
+        matte = view.other & (~inner | (which >= dr.opaque(mi.Int32, count)))
     else:
         ring, turn = numbers.surround_place(at)
         ring = mi.UInt32(dr.clip(ring + s, 0, RINGS - 1))

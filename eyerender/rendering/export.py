@@ -3,8 +3,8 @@
     mitsuba -m scalar_rgb scene.xml        (or llvm_ad_rgb, cuda_ad_rgb)
 
 Lengths are mm, radiance is mW/mm^2/sr. What stock Mitsuba lacks is left out, and the file says so: textures, the
-limbus' soft rim, lens distortion, the point-spread function, ambient light, and lamps that are neither Lambertian discs
-nor isotropic points.
+limbus' soft rim, lens distortion, the point-spread function, ambient light but the sun, and lamps that are neither
+Lambertian discs nor isotropic points.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..region.anatomy import Region
 from ..region.head import HEAD_PARTS, load_head, placed
 from ..region.mesh import region_mesh
 from ..rig.imaging import Ambient
-from .frame import RenderJob, globe_of
+from .frame import RenderJob, globe_of, sun_lamps
 
 _BACKDROP_HALF_MM = 500.0
 _FILM_MM = 0.01  # three times the thickness of real ones, which single precision would not resolve
@@ -86,7 +86,7 @@ def export_scene(
     else:
         for patch, matte in _region(job, job.region):
             _patch(root, folder, patch, place, matte)
-    for k, lamp in enumerate(job.lights):
+    for k, lamp in enumerate((*job.lights, *sun_lamps(job.ambient, job.anchor_mm))):
         _lamp(root, k, lamp.position_mm, lamp.axis, float(lamp.radius_mm), float(lamp.intensity_mw_sr))
     ET.indent(root)
     path = folder / "scene.xml"
@@ -144,8 +144,8 @@ def _notes(job: RenderJob) -> list[str]:
         notes.append("Point lamps: a path tracer cannot light what lies behind the cornea with them.")
     if job.look.tear_film:
         notes.append(f"The film of tears on the cornea is a dielectric layer of its own, {_FILM_MM} mm thick.")
-    if job.ambient != Ambient():
-        notes.append("Ambient light, panels and the surrounding's map are left out.")
+    if job.ambient.model_copy(update={"sun": None}) != Ambient():
+        notes.append("Even light, panels and the surrounding's map are left out.")
     notes.append("Textures, the limbus' soft rim and the point-spread function are left out.")
     return notes
 

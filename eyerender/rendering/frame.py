@@ -40,6 +40,7 @@ from .parameters import (
 )
 
 _SENSOR, _LOOK, _LENS, _AMBIENT = Sensor(), Look(), Lens(), Ambient()
+_SUN_MM = 1e6
 _PANEL_PARTS = 4  # along each side
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
@@ -249,6 +250,24 @@ def panel_lamps(ambient: Ambient, anchor: Floats) -> tuple[Lamp, ...]:
             for b in share
         ]
     return tuple(out)
+
+
+def sun_lamps(ambient: Ambient, anchor: Floats) -> tuple[Lamp, ...]:
+    """Return the sun, if there is one, as a lamp: a disc of even radiance a kilometre from the eye."""
+    if ambient.sun is None or ambient.sun.irradiance_w_m2 == 0:
+        return ()
+    sun = ambient.sun
+    az, el, half = np.radians([sun.azimuth_deg, sun.elevation_deg, sun.diameter_deg / 2])
+    way = np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
+    return (
+        Lamp(
+            position_mm=frozen(anchor + _SUN_MM * way),
+            axis=frozen(-way),
+            radius_mm=float(_SUN_MM * np.tan(half)),
+            intensity_mw_sr=float(sun.irradiance_w_m2 * 1e-3 * (_SUN_MM / np.cos(half)) ** 2),
+            lobe_exponent=1.0,
+        ),
+    )
 
 
 def light_table(lights: Sequence[Lamp], M: Floats, t: Floats) -> Floats:

@@ -171,7 +171,8 @@ class _View:
         k = self.scale / ahead
         middle = 0.5 * _CELLS
         shift = self.radius * dr.maximum(1 / distance - 1 / self._farthest, 0) * distance * k
-        return _Place(middle + k * dr.dot(p, self._e1), middle + k * dr.dot(p, self._e2), shift, k)
+        # The origin is on the axis through the middle of the scene, and far lamps leave x no digits in p.
+        return _Place(middle + k * dr.dot(x, self._e1), middle + k * dr.dot(x, self._e2), shift, k)
 
 
 class _Edge:

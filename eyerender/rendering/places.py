@@ -19,6 +19,8 @@ WIDEST = 0.55 * np.pi  # polar angle of the edge of that map
 _HALF_MM, _HIGH_MM = 14.0, 8.0  # of the opening of a head mesh, whose margins are unknown
 _FINE_MM, _NEAR_MM = 1.5, 12.0  # distance of places on skin this far from the middle of the fissure, and in proportion
 _NEIGHBOURS = 12
+_LEV = 2
+_LID_MM = 4.0  # from the sclera's sphere to the outside of a lid over the cornea
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,22 +30,36 @@ class SkinPlaces(ArrayValue):
     Attributes:
         vertices: (n,) indices of the vertices.
         faces: (m,) place that stands for each triangle.
+        lids: (l,) places on the skin right in front of the globe, whose inner sides close a space about the cornea.
+        behind: (m,) index in `lids` of what stands for the inner side of each triangle; -1 for none.
         spread: (all vertices, n) weights of the places at every vertex.
     """
 
     vertices: Ints
     faces: Ints
+    lids: Ints
+    behind: Ints
     spread: Any
 
 
-def skin_places(mesh: RegionMesh) -> SkinPlaces:
-    """Choose places on a region's mesh: one for each cell of a grid that grows with the distance from the eye."""
+def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
+    """Choose places on a region's mesh: one for each cell of a grid that grows with the distance from the eye.
+
+    Args:
+        mesh: the region with the eye straight ahead and open lids.
+        globe: the globe there.
+    """
     ends = mesh.layout.vertex_ends
     solid = np.arange(ends[0])
     if len(ends) > 4:  # a head mesh: what is neither hair nor tears
         solid = np.append(solid, np.arange(ends[3], ends[4]))
     p, n = mesh.vertices[solid], mesh.normals[solid]
     level = np.maximum(np.round(2 * np.log2(np.maximum(np.linalg.norm(p, axis=1), 1e-3) / _NEAR_MM)), 0)
+    out = p - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    margin = (np.linalg.norm(out, axis=1) < globe.radius_mm + 4) & (
+        np.sum(out * n, axis=1) < 0.6 * np.linalg.norm(out, axis=1)
+    )
+    level = np.where(margin, -_LEV, level)
     size = _FINE_MM * 2 ** (level / 2)
     keys = np.column_stack([level, np.floor(p / size[:, None]), np.round(1.2 * n)]).astype(np.int64)
     _, first, group, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
@@ -54,7 +70,15 @@ def skin_places(mesh: RegionMesh) -> SkinPlaces:
     chosen = solid[order[np.searchsorted(group[order], np.arange(len(first)))]]
     spread = _spread(mesh, chosen, size[first])
     strongest = np.asarray(spread.tocsr().argmax(axis=1)).reshape(-1)
-    return SkinPlaces(chosen, strongest[mesh.layout.faces[:, 0]], spread)
+    faces = strongest[mesh.layout.faces[:, 0]]
+    out = mesh.vertices[chosen] - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    away = np.linalg.norm(out, axis=1)
+    over = (away < globe.radius_mm + _LID_MM) & (np.sum(out * mesh.normals[chosen], axis=1) > 0.2 * away)
+    over &= out[:, 0] > 0
+    lids = np.flatnonzero(over)
+    index = np.full(len(chosen), -1)
+    index[lids] = np.arange(len(lids))
+    return SkinPlaces(chosen, faces, lids, index[faces], spread)
 
 
 def _spread(mesh: RegionMesh, chosen: Ints, size: Floats) -> Any:

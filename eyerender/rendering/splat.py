@@ -11,7 +11,7 @@ from ..rig import defocus, psf
 from ..rig.camera import Window
 from .blur import Blur
 from .cut import POINT, quadrature
-from .frame import RenderJob
+from .frame import RenderJob, sun_lamps
 from .glints import Glint, GlintScene, GlintTable, Spots, glint_table
 from .meshed import SurfaceMesh
 from .occlusion import glint_reason
@@ -49,7 +49,10 @@ class Mirrored:
 def add_glints(
     job: RenderJob, place: Surround | RegionScene, image: Floats, blur: Blur, mesh: SurfaceMesh | None
 ) -> Mirrored:
-    """Add the mirror images of a job's lamps to its blurred image (height, width)."""
+    """Add the mirror images of a job's lamps and of the sun to its blurred image (height, width).
+
+    The tables and reasons are those of the lamps alone.
+    """
     eye, anchor, sigma = job.eye, job.anchor_mm, job.sensor.psf_sigma_px
 
     def clear(a: Floats, b: Floats) -> Bools:
@@ -59,21 +62,22 @@ def add_glints(
         eye.front[0], float(eye.front_indices[0]), job.film_index, float(eye.limbus_radius_mm),
         np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), job.M, job.t, job.camera, clear, mesh,
     )  # fmt: skip
+    count, lamps = len(job.lights), (*job.lights, *sun_lamps(job.ambient, anchor))
     tables = {}
     reasons: tuple[str, ...] = ()
     for order in sorted({1, *job.purkinje}):
         if order == 1:
-            glints = scene.glints(job.lights, sigma)
-            reasons = tuple(_reason(job, place, glint) for glint in glints)
+            glints = scene.glints(lamps, sigma)
+            reasons = tuple(_reason(job, place, glint) for glint in glints[:count])
         else:
             # These images are small, because their mirrors are strongly curved, or concave with a short focus.
-            nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in job.lights]
-            glints = scene.seen(purkinje_images(scene, eye, order, job.lights, nodes))
-        tables[order] = glint_table(glints)
+            nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in lamps]
+            glints = scene.seen(purkinje_images(scene, eye, order, lamps, nodes))
+        tables[order] = glint_table(glints[:count])
         if order in job.purkinje:
             # The further images are about as far as the iris.
             own = order == 1 and job.lens.focus_mm is not None
-            nearness = scene.nearness(job.lights) if own else np.full((len(glints), 2), np.nan)
+            nearness = scene.nearness(lamps) if own else np.full((len(glints), 2), np.nan)
             for glint, near in zip(glints, nearness, strict=True):
                 _splat(job, image, glint.spots, defocus.disc(blur.of_image(near)))
     return Mirrored(tables[1], tuple((order, table) for order, table in tables.items() if order > 1), reasons)

@@ -25,6 +25,7 @@ from .frame import (
     panel_table,
     parameters_of,
     returned_light,
+    sun_lamps,
     tables,
 )
 from .head import place_scene
@@ -61,13 +62,14 @@ class Stage:
         `lit`: whether radiance is wanted, not only what is seen where.
         """
         place = self._place(job)
+        job = replace(job, lights=(*job.lights, *sun_lamps(job.ambient, job.anchor_mm)))
         region = place if isinstance(place, RegionScene) else None
         structure = Structure(
             kinds(job.eye),
             bool(np.any(job.camera.distortion)),
             place.obstructed,
             region is not None,
-            job.ambient != Ambient(),
+            job.ambient.model_copy(update={"sun": None}) != Ambient(),
         )
         anchor = job.anchor_mm
         values = Values(structure, parameters_of(job), boundary_waves(job.eye), tables(job.eye))

@@ -132,8 +132,26 @@ class RadianceMap(Spec):
         return self
 
 
+class Sun(Spec):
+    """The sun, a small bright disc infinitely far away: its shadows are sharp, and the cornea mirrors it as a glint."""
+
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
+        default=0.0, description="azimuth of its middle, from straight ahead (+x) to the subject's left"
+    )
+    elevation_deg: Annotated[float, Field(ge=-90, le=90)] = Field(
+        default=30.0, description="elevation of its middle above the horizon"
+    )
+    irradiance_w_m2: NonNegative = Field(
+        description="irradiance of a matte surface that faces it, within the camera's filter (about 0.8 W/m^2 for each "
+        "nm of the filter's width under a clear sky)"
+    )
+    diameter_deg: Annotated[float, Field(ge=0.05, le=40)] = Field(
+        default=0.533, description="diameter of the disc, of even radiance"
+    )
+
+
 class Ambient(Spec):
-    """Light other than that of the lamps: even light from all sides, surroundings, and panels that face the head."""
+    """Light other than that of the lamps: even light, surroundings, the sun, and panels that face the head."""
 
     irradiance_w_m2: NonNegative = Field(
         default=0.0, description="even light from all sides: irradiance of a matte surface, within the camera's filter"
@@ -142,3 +160,4 @@ class Ambient(Spec):
         default=(), description="rectangles that emit light, such as screens and windows"
     )
     map: RadianceMap | None = Field(default=None, description="an HDR picture of the surroundings of the head")
+    sun: Sun | None = Field(default=None, description="the sun, in addition to the rest")
