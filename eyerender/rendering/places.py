@@ -19,7 +19,7 @@ WIDEST = 0.55 * np.pi  # polar angle of the edge of that map
 _HALF_MM, _HIGH_MM = 14.0, 8.0  # of the opening of a head mesh, whose margins are unknown
 _FINE_MM, _NEAR_MM = 1.5, 12.0  # distance of places on skin this far from the middle of the fissure, and in proportion
 _NEIGHBOURS = 12
-_LEV = 2
+_MARGIN_LEVEL = -2  # of the lids' margins: half the distance
 _LID_MM = 4.0  # from the sclera's sphere to the outside of a lid over the cornea
 
 
@@ -55,11 +55,11 @@ def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
         solid = np.append(solid, np.arange(ends[3], ends[4]))
     p, n = mesh.vertices[solid], mesh.normals[solid]
     level = np.maximum(np.round(2 * np.log2(np.maximum(np.linalg.norm(p, axis=1), 1e-3) / _NEAR_MM)), 0)
-    out = p - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
-    margin = (np.linalg.norm(out, axis=1) < globe.radius_mm + 4) & (
-        np.sum(out * n, axis=1) < 0.6 * np.linalg.norm(out, axis=1)
-    )
-    level = np.where(margin, -_LEV, level)
+    out = _from_globe(globe, p)
+    away = np.linalg.norm(out, axis=1)
+    # The margins of the lids, which do not face away from the globe: light changes fast there.
+    margin = (away < globe.radius_mm + _LID_MM) & (np.sum(out * n, axis=1) < 0.6 * away)
+    level = np.where(margin, _MARGIN_LEVEL, level)
     size = _FINE_MM * 2 ** (level / 2)
     keys = np.column_stack([level, np.floor(p / size[:, None]), np.round(1.2 * n)]).astype(np.int64)
     _, first, group, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
@@ -71,14 +71,18 @@ def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
     spread = _spread(mesh, chosen, size[first])
     strongest = np.asarray(spread.tocsr().argmax(axis=1)).reshape(-1)
     faces = strongest[mesh.layout.faces[:, 0]]
-    out = mesh.vertices[chosen] - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    out = _from_globe(globe, mesh.vertices[chosen])
     away = np.linalg.norm(out, axis=1)
     over = (away < globe.radius_mm + _LID_MM) & (np.sum(out * mesh.normals[chosen], axis=1) > 0.2 * away)
-    over &= out[:, 0] > 0
-    lids = np.flatnonzero(over)
+    lids = np.flatnonzero(over & (out[:, 0] > 0))
     index = np.full(len(chosen), -1)
     index[lids] = np.arange(len(lids))
     return SkinPlaces(chosen, faces, lids, index[faces], spread)
+
+
+def _from_globe(globe: Globe, points: Floats) -> Floats:
+    """Points (n, 3) of the scene's frame relative to the centre of a globe at rest."""
+    return np.asarray(points - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
 
 
 def _spread(mesh: RegionMesh, chosen: Ints, size: Floats) -> Any:
