@@ -219,7 +219,7 @@ def test_public_names_are_pinned():
         "ImageObserver", "InputError", "LabelledImage", "Lashes", "Led", "LedRing", "Lens", "Lid", "Look", "Motion",
         "Observations", "Observer", "Opening", "Panel", "Picture", "PinholeCamera", "Population", "PupilMargin",
         "RadianceMap", "Region", "Rig", "RigGeometry", "Scene", "SceneSpec", "Screen", "Sensor", "Skin", "Status",
-        "Subject", "SyntEye", "SyntEyes", "Targets", "TearFilm", "TopographySpec", "__version__", "auto_exposed",
+        "Subject", "Sun", "SyntEye", "SyntEyes", "Targets", "TearFilm", "TopographySpec", "__version__", "auto_exposed",
         "bench_extractors", "compare", "compare_folder", "detect", "estimate", "export", "export_scene", "extract",
         "gaze", "generate", "kappa_deg", "load_eye", "load_scene", "preview", "read_topography", "render",
         "render_folder", "render_windows", "run_quickstart", "sample", "shipped_scenes", "trace", "validate",
