@@ -16,6 +16,7 @@ from typing import Annotated
 from pydantic import Field
 
 from ..spec import NonNegative, Spec
+from .iris import IrisPattern
 
 Albedo = Annotated[float, Field(ge=0, le=0.95)]
 Contrast = Annotated[float, Field(ge=0, le=1.5)]
@@ -61,6 +62,7 @@ class Look(Spec):
     iris_contrast: Contrast = Field(
         default=1.0, description="contrast of fibres, collarette, crypts and furrows (chosen)"
     )
+    iris: IrisPattern = Field(default=IrisPattern(), description="the pattern of the iris and its relief")
     iris_seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="selects the iris")
     tear_film: bool = Field(
         default=True,

@@ -27,6 +27,7 @@ from ..backends.libraries import cache_folder
 from ..errors import EyerenderError, InputError
 from ..files import PART, read_bytes, written
 from .anatomy import Region
+from .iris import DrawnPattern
 
 LIMIT = "EYERENDER_MAP_CACHE_MB"
 """Environment variable: megabytes of maps that are kept; 0 keeps none and reads none."""
@@ -37,7 +38,7 @@ _DTYPES = ("float16", "float32")
 _LARGEST_HEADER, _ALIGNMENT = 4096, 64
 _STALE_S = 3600.0  # a temporary file of this age was left by a process that ended
 _KEPT_SHARE = 0.9  # of the limit, after files were removed
-_Argument = TypeVar("_Argument", int, Region)
+_Argument = TypeVar("_Argument", int, Region, DrawnPattern)
 
 
 @contextmanager
@@ -59,7 +60,7 @@ def kept(make: Callable[[_Argument], NDArray[Any]], argument: _Argument) -> NDAr
 
     Args:
         make: a function of the module's top level that depends on its argument alone.
-        argument: a seed or a region.
+        argument: a seed, or a record with everything that matters.
     """
     file = _place(make.__name__, argument)
     if file is None:
@@ -87,11 +88,11 @@ def _limit_bytes() -> float:
     return limit * 1e6
 
 
-def _place(name: str, argument: int | Region) -> Path | None:
+def _place(name: str, argument: int | Region | DrawnPattern) -> Path | None:
     place = folder()
     if place is None:
         return None
-    said = argument.to_mapping() if isinstance(argument, Region) else int(argument)
+    said = argument.to_mapping() if isinstance(argument, Region | DrawnPattern) else int(argument)
     key = json.dumps([SCHEMA, name, said, _code()], sort_keys=True)
     return place / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:32]}{_ENDING}"
 

@@ -94,7 +94,7 @@ def _sums(
 ) -> tuple[list[Floats], int]:
     """Sums over the samples of each pixel, (height, width): radiance; or radiance, weight, nearness of each part."""
     width, height = window[2:]
-    for grid in (shown.lights.on_iris, shown.lights.on_matte):
+    for grid in (shown.lights.on_iris, shown.lights.on_matte, shown.lights.relief):
         if grid is not None:
             grid.make()
     grouped = shown.values.structure.region

@@ -165,7 +165,14 @@ def parameters_of(job: RenderJob) -> Parameters:
             v=stop.rotation[:, 2],
             axes=tuple(stop.semi_axes_mm),
         ),
-        iris=IrisParameters(eye.iris_root_radius_mm, look.iris_albedo, look.iris_contrast, look.limbal_ring),
+        iris=IrisParameters(
+            eye.iris_root_radius_mm,
+            look.iris_albedo,
+            look.iris_contrast,
+            look.limbal_ring,
+            look.iris.relief,
+            look.iris.convexity_mm,
+        ),
         limbus=LimbusParameters(
             radius=eye.limbus_radius_mm,
             floor=float(np.min(edge)) - 2.0,

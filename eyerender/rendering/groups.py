@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from .lighting import lamp_blocked, straight, through_cornea
+from .lighting import lamp_blocked, on_relief, straight, through_cornea
 from .shading import direct, indirect
 from .values import Lamp, Lights, Values
 from .view import Textures, View, look_at_skin, meet, outer_albedo
@@ -183,7 +183,7 @@ class _GroupShading:
     def globe_radiance(self, view: View, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
         """Radiance of the globe along sample j's ray, and failed light paths."""
         values, lights, textures, scene, group = self.values, self.lights, self.textures, self.scene, self.group
-        seen = replace(view, other=mi.Bool(False))
+        seen = on_relief(lights, replace(view, other=mi.Bool(False)))
         inner, missed = through_cornea(values, lights, scene, seen.inner, seen.lit_inside, *group.spot(j))
         albedo = outer_albedo(values, textures, seen)
         assert textures.received is not None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -219,7 +219,17 @@ def through_cornea(
 
     state = (mi.UInt32(0), bent, mi.UInt32(0))
     _, bent, failures = dr.while_loop(state, more, body, labels=("i", "bent", "failures"), label="lamps")
+    if normal is None and lights.relief is not None:
+        bent *= lights.relief.share(inner, inside)
     return bent, failures
+
+
+def on_relief(lights: Lights, view: View) -> View:
+    """The view with the places on the relief of the iris that the rays meet, as their feet in its plane."""
+    if lights.relief is None:
+        return view
+    seen = view.cornea & ~view.pupil & (view.passed > 0)
+    return replace(view, inner=lights.relief.hit(view.inner, view.slant, seen))
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,12 +53,18 @@ class StopParameters:
 
 @dataclass(frozen=True, slots=True)
 class IrisParameters:
-    """The iris: radius of the root (mm), mean albedo, contrast of the texture, darkening at the root."""
+    """The iris.
+
+    Radius of the root (mm), mean albedo, contrast of the texture, darkening at the root, scale of the heights, and
+    convexity (mm).
+    """
 
     root_radius: mi.Float
     albedo: mi.Float
     contrast: mi.Float
     ring: mi.Float
+    relief: mi.Float
+    convexity: mi.Float
 
 
 @dataclass(frozen=True, slots=True)

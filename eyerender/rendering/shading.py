@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .lighting import light
+from .lighting import light, on_relief
 from .region import film_normal, film_reflectance
 from .values import Lights, Values
 from .view import EPSILON_MM, Textures, View, iris_albedo, look, outer_albedo, stop_coordinates
@@ -46,7 +46,7 @@ def shade(
 
     u, v: place on each lamp's disc, [0, 1).
     """
-    view = look(values, textures, scene, o, d, active)
+    view = on_relief(lights, look(values, textures, scene, o, d, active))
     known, outer_known = mi.Bool(False), mi.Float(0)
     if lights.on_matte is not None:
         outer_known, known = lights.on_matte.at(view)

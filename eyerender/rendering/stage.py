@@ -30,6 +30,7 @@ from .frame import (
 )
 from .head import place_scene
 from .irislight import IrisLight
+from .irisrelief import IrisRelief
 from .lampviews import LampViews
 from .mattelight import MatteLight
 from .meshed import Meshes, meshed
@@ -50,7 +51,7 @@ class Stage:
 
     def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
         self._surround = Surround(obstacles)
-        self._textures: dict[int, Textures] = {}
+        self._textures: dict[Any, Textures] = {}
         self._regions: dict[Any, RegionScene] = {}
         self._maps = Maps()
         self.meshes = Meshes()
@@ -99,6 +100,8 @@ class Stage:
             panels = Lights(light_table(panel_lamps(job.ambient, anchor), job.M, job.t))
             received = self._exchange.received(job, values, lights, panels, textures, place)
             textures = replace(textures, received=received)
+            px_per_mm = float(job.camera.scale_at(job.t))
+            lights.relief = IrisRelief(values, lights, place.scene, textures, px_per_mm)
         _spread(job, values, lights, textures, place)
 
         def fine(window: Window) -> Bools:
@@ -123,12 +126,12 @@ class Stage:
         return place
 
     def _textures_of(self, job: RenderJob) -> Textures:
-        seed = job.look.iris_seed
-        if seed not in self._textures:
+        key = (job.look.iris_seed, job.look.iris)
+        if key not in self._textures:
             if len(self._textures) >= _TEXTURES:
                 self._textures.pop(next(iter(self._textures)))
-            self._textures[seed] = Textures.of_seed(seed)
-        return self._textures[seed]
+            self._textures[key] = Textures.of(job.look)
+        return self._textures[key]
 
 
 def _spread(job: RenderJob, values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene) -> None:

@@ -20,6 +20,7 @@ from .surfaces import Surface
 
 if TYPE_CHECKING:
     from .irislight import IrisLight
+    from .irisrelief import IrisRelief
     from .mattelight import MatteLight
 
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
@@ -144,13 +145,15 @@ class Lights:
     """The lamps in the eye frame, (n, 10) numbers in one buffer; kernels do not depend on their number.
 
     `widest` is the largest radius over the distance from the eye, `rings` whether any lamp is a ring, `on_iris` and
-    `on_matte` their light in the plane of the iris and on matte surfaces where grids of it are used.
+    `on_matte` their light in the plane of the iris and on matte surfaces where grids of it are used, and `relief` the
+    iris' relief in their light.
     """
 
     def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
         self._len = len(table)
         self.on_iris: IrisLight | None = None
         self.on_matte: MatteLight | None = None
+        self.relief: IrisRelief | None = None
         away = np.linalg.norm(table[:, :3], axis=1)
         self.widest = float(np.max(table[:, 6] / np.maximum(away, 1e-3), initial=0.0))
         self.rings = bool(np.any(table[:, 9] > 0))

@@ -13,8 +13,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..region.iris import WIDTH_MM, DrawnPattern, iris_maps
+from ..region.look import Look
 from ..region.mapcache import kept
-from ..region.texture import iris_texture, sclera_texture
+from ..region.texture import sclera_texture
 from .surround import HALF_MM
 from .values import Values
 
@@ -31,6 +33,7 @@ _NEAR_MM = 20.0
 GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of maps of the globe
 _FAR = float(np.finfo(np.float32).max)
 _WET = 0.8  # gloss of the sclera
+_WIDE_MM = 2.5  # width of an iris whose relief has its full height
 _RING = (0.62, 0.95)  # share of the way from the pupil to the root over which a limbal ring grows dark
 
 
@@ -48,6 +51,7 @@ class View:
     mirrored: mi.Float  # reflectance of the front cornea
     passed: mi.Float  # transmittance of the refracted branch, 0 where it does not reach the plane of the iris
     inner: mi.Vector3f  # point in the plane of the iris
+    slant: mi.Vector3f  # lateral motion of the ray per mm of height above that plane
     pupil: mi.Bool  # the inner point lies in the pupil
     albedo: mi.Float  # of the region's mesh, where there is one
     gloss: mi.Float  # likewise, and of the wet sclera
@@ -83,9 +87,14 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Textures:
-    """Relative albedos with mean 1: the iris over (angle, pupil to root), the sclera over its front, the surround."""
+    """Maps of the eye: relative albedo (mean 1) and height (mm) of the iris over (angle, pupil to root), the sclera's.
+
+    `raised` tells whether the iris has any heights.
+    """
 
     iris: mi.Texture2f
+    heights: mi.Texture2f
+    raised: bool
     sclera: mi.Texture2f
     surround: SurroundGeometry | None = None  # of frames without a region
     region: SkinGeometry | None = None
@@ -95,15 +104,17 @@ class Textures:
     received: Received | None = None
 
     @classmethod
-    def of_seed(cls, seed: int) -> Textures:
+    def of(cls, look: Look) -> Textures:
         """Make the textures of one eye."""
-        rows = kept(iris_texture, seed)
+        maps = kept(iris_maps, DrawnPattern.of(look.iris_seed, look.iris))
         # The texture repeats so that the angle wraps. Additional rows separate the ends along the radius.
-        rows = np.concatenate([rows[:1], rows, rows[-1:]])
+        maps = np.concatenate([maps[:, :1], maps, maps[:, -1:]], axis=1)
         texture: Any = mi.Texture2f
-        iris = texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
-        sclera = texture(mi.TensorXf(kept(sclera_texture, seed)[..., None]), use_accel=False)
-        return cls(iris, sclera)
+        iris, heights = (
+            texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat) for rows in maps
+        )
+        sclera = texture(mi.TensorXf(kept(sclera_texture, look.iris_seed)[..., None]), use_accel=False)
+        return cls(iris, heights, look.iris.relief > 0 or look.iris.convexity_mm > 0, sclera)
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,11 +231,11 @@ def meet_globe(values: Values, o: mi.Vector3f, d: mi.Vector3f) -> View:
     t_eye = t0 + dr.select(on_cornea, tc, ts)
     on_cornea &= t_eye > EPSILON_MM
     on_sclera &= t_eye > EPSILON_MM
-    normal, mirrored, passed, inner, pupil = dr.if_stmt(
+    normal, mirrored, passed, inner, slant, pupil = dr.if_stmt(
         (facing, oe + tc * de, dl),
         on_cornea,
         lambda facing, y, dl: _refracted(values, facing, y, dl),
-        lambda facing, y, dl: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Bool(False)),
+        lambda *_: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Vector3f(0), mi.Bool(False)),
     )
     xs = oe + ts * de
     return View(
@@ -238,6 +249,7 @@ def meet_globe(values: Values, o: mi.Vector3f, d: mi.Vector3f) -> View:
         mirrored=mirrored,
         passed=passed,
         inner=inner,
+        slant=slant,
         pupil=pupil,
         albedo=mi.Float(0),
         gloss=mi.Float(_WET),
@@ -270,6 +282,7 @@ def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector
         mirrored=nothing,
         passed=nothing,
         inner=mi.Vector3f(0),
+        slant=mi.Vector3f(0),
         pupil=no,
         albedo=nothing,
         gloss=mi.Float(_WET),
@@ -279,8 +292,10 @@ def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector
 
 def _refracted(
     values: Values, N: mi.Vector3f, y: mi.Vector3f, dl: mi.Vector3f
-) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Vector3f, mi.Bool]:
-    """From the front cornea to the plane of the iris: normal, reflectance, transmittance, point, whether in the pupil.
+) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Vector3f, mi.Vector3f, mi.Bool]:
+    """From the front cornea to the plane of the iris.
+
+    Normal, reflectance, transmittance, point, lateral motion per mm above the plane, whether in the pupil.
 
     N, dl: normal and direction in the front surface's frame; y: the point in the eye frame.
     """
@@ -297,7 +312,8 @@ def _refracted(
         passed *= share
         reached &= ok
     n = values.stop.normal
-    s = dr.dot(values.stop.centre - inside, n) / dr.dot(w, n)
+    down = dr.dot(w, n)
+    s = dr.dot(values.stop.centre - inside, n) / down
     inner = inside + s * w
     reached &= s > 0
     pu, pv = stop_coordinates(values, inner)
@@ -305,7 +321,8 @@ def _refracted(
     pupil = reached & (pu * pu + pv * pv < margin * margin)
     # A ray that finds no way may have no place at all, and nothing may be computed from that.
     inner = dr.select(reached, inner, values.stop.centre)
-    return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, pupil
+    slant = dr.select(reached & (down < -0.05), w / down - n, 0)
+    return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, slant, pupil
 
 
 def stop_coordinates(values: Values, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
@@ -323,17 +340,36 @@ def meet_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Fl
     return c / q, (disc > 0) & (q > 0) & (c > 0)
 
 
-def iris_albedo(values: Values, textures: Textures, x: mi.Vector3f) -> mi.Float:
-    """Albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
+def _iris_place(values: Values, x: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+    """Place of points of the iris' plane: share of the way from margin to root, turn, distance to the root, width."""
     pu, pv = stop_coordinates(values, x)
     a, b = values.stop.axes
     beyond = (dr.sqrt(pu * pu + pv * pv) - values.boundary.radius(pu, pv)) * dr.sqrt(a * b)
-    rho = dr.sqrt(x.y * x.y + x.z * x.z)
-    left = values.iris.root_radius - rho
-    s = dr.clip(beyond / dr.maximum(beyond + dr.maximum(left, 0), 1e-4), 0, 1)
-    angle = dr.atan2(pv, pu) / (2 * dr.pi)
-    rows = textures.iris.shape[0]
-    texture = textures.iris.eval(mi.Point2f(angle, (1 + s * (rows - 2)) / rows))[0]
+    left = values.iris.root_radius - dr.sqrt(x.y * x.y + x.z * x.z)
+    width = dr.maximum(beyond + dr.maximum(left, 0), 1e-4)
+    return dr.clip(beyond / width, 0, 1), dr.atan2(pv, pu) / (2 * dr.pi), left, width
+
+
+def _on_iris(texture: mi.Texture2f, s: mi.Float, turn: mi.Float) -> mi.Float:
+    rows = texture.shape[0]
+    return texture.eval(mi.Point2f(turn, (1 + s * (rows - 2)) / rows))[0]
+
+
+def iris_height(values: Values, textures: Textures, x: mi.Vector3f) -> mi.Float:
+    """Height (mm) of the iris above points of its plane, 0 in the pupil and beyond the root.
+
+    The pattern stretches with the iris. A narrow iris is as steep as a wide one, so its heights are less.
+    """
+    s, turn, left, width = _iris_place(values, x)
+    bulge = values.iris.convexity * dr.minimum(width / WIDTH_MM, 1) * 4 * s * (1 - s)
+    pattern = values.iris.relief * dr.minimum(width / _WIDE_MM, 1) * _on_iris(textures.heights, s, turn)
+    return dr.select((s > 0) & (left > 0), bulge + pattern, 0)
+
+
+def iris_albedo(values: Values, textures: Textures, x: mi.Vector3f) -> mi.Float:
+    """Albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
+    s, turn, left, _ = _iris_place(values, x)
+    texture = _on_iris(textures.iris, s, turn)
     albedo = values.iris.albedo * dr.maximum(1 + values.iris.contrast * (texture - 1), 0.02)
     edge = dr.clip((s - _RING[0]) / (_RING[1] - _RING[0]), 0, 1)
     albedo *= 1 - values.iris.ring * edge * edge * (3 - 2 * edge)

@@ -1,0 +1,216 @@
+"""The pattern of an iris at 850 nm: relative albedo and height of its front layer, seeded and deterministic.
+
+The iris follows its anatomy, as textbooks describe it, from the pupil's margin outwards: the pigment ruff; the
+pupillary zone, a thinner part with fine radial fibres; the collarette, a wavy ridge at about a third of the width; the
+ciliary zone with coarser, wavy fibres; Fuchs' crypts (gaps of the front layer with a paler rim), mostly along the
+collarette; and concentric contraction furrows. People differ in how much of each they have: the front layer may be
+closed and nearly featureless, or open with deep crypts. At 850 nm melanin hardly absorbs, so relief is visible in every
+eye colour. Albedo varies little; where light does not leave (crypts), the map is darker.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy import ndimage
+
+from ..arrays import Singles
+from ..spec import Spec
+from .noise import nearest_two, passed
+
+RADIAL, ANGULAR = 256, 1024
+WIDTH_MM, MARGIN_MM = 3.8, 2.0  # of the iris that strengths and means refer to: from margin to root, and the margin
+_SOFT = (1.5, 1.5)  # standard deviation of the smoothing of heights, rows and columns
+_Strength = Annotated[float, Field(ge=0, le=1.5)]
+
+
+class IrisPattern(Spec):
+    """What the front of the iris looks like; strengths that are not given follow from `look.iris_seed`."""
+
+    crypts: _Strength | None = Field(default=None, description="depth and number of the crypts")
+    furrows: _Strength | None = Field(default=None, description="depth of the contraction furrows")
+    collarette: _Strength | None = Field(default=None, description="height of the collarette and of the step at it")
+    fibres: _Strength | None = Field(default=None, description="height and contrast of the radial fibres")
+    relief: Annotated[float, Field(ge=0, le=2)] = Field(
+        default=1.0, description="scale of all heights but that of the convexity; 0 is flat"
+    )
+    convexity_mm: Annotated[float, Field(ge=0, le=0.5)] = Field(
+        default=0.15,
+        description="how far the middle of the iris, pushed by the lens, stands before the plane of margin and root "
+        "(chosen; tomography shows 0 to 0.3 mm)",
+    )
+
+
+class DrawnPattern(Spec):
+    """One iris: its seed and all its strengths, which determine its maps."""
+
+    seed: int
+    crypts: float
+    furrows: float
+    collarette: float
+    fibres: float
+
+    @classmethod
+    def of(cls, seed: int, pattern: IrisPattern) -> DrawnPattern:
+        """Draw the strengths that a pattern leaves open.
+
+        Four kinds of irises are equally frequent: closed ones with little but furrows, fibrous ones, ones with crypts,
+        and mixtures.
+        """
+        rng = np.random.default_rng((0x1125, seed))
+        ranges = (
+            {"crypts": (0, 0.12), "furrows": (0.1, 1.1), "collarette": (0.05, 0.5), "fibres": (0.1, 0.35)},
+            {"crypts": (0, 0.35), "furrows": (0, 0.6), "collarette": (0.3, 1.0), "fibres": (0.6, 1.1)},
+            {"crypts": (0.6, 1.3), "furrows": (0, 0.6), "collarette": (0.6, 1.3), "fibres": (0.25, 0.7)},
+            {"crypts": (0.1, 0.8), "furrows": (0, 1.2), "collarette": (0.2, 1.2), "fibres": (0.15, 0.8)},
+        )[rng.integers(4)]
+        drawn = {name: round(float(rng.uniform(*ends)), 3) for name, ends in ranges.items()}
+        given = {name: getattr(pattern, name) for name in drawn if getattr(pattern, name) is not None}
+        return cls(seed=seed, **{**drawn, **given})
+
+
+def _noise(
+    rng: np.random.Generator, shape: tuple[int, int], rows: tuple[float, float], columns: tuple[float, float],
+    periodic_rows: bool = False,
+) -> Singles:  # fmt: skip
+    """Gaussian noise of unit variance, band-passed: `rows`, `columns` are (low, high) cycles over the whole extent."""
+    h, w = shape
+    if periodic_rows:
+        return passed(rng.standard_normal(shape), columns, rows)
+    field = passed(rng.standard_normal((2 * h, w)), columns, (2 * rows[0], 2 * rows[1]))[:h]
+    return np.asarray(field / field.std(dtype=float).astype(np.float32))
+
+
+def _step(x: Any, low: float, high: float) -> Any:
+    s = np.clip((x - low) / (high - low), 0, 1)
+    return s * s * (3 - 2 * s)
+
+
+def iris_maps(iris: DrawnPattern) -> Singles:
+    """Relative albedo and height (mm) of an iris, (2, RADIAL, ANGULAR).
+
+    Rows run from the pupil's margin (0) to the root (1), columns once around. The mean albedo over the iris' area is 1;
+    heights are above the plane of the iris, 0 at margin and root.
+    """
+    # Every part has its own numbers, so that it stays when the strength of another changes.
+    rng, fibrous, furrowed, holed = (np.random.default_rng((0x1815, k, iris.seed)) for k in range(4))
+    shape = (RADIAL, ANGULAR)
+    s = ((np.arange(RADIAL, dtype=np.float32) + 0.5) / RADIAL)[:, None]
+    turn = ((np.arange(ANGULAR, dtype=np.float32) + 0.5) / ANGULAR)[None, :]
+    place, ragged = rng.uniform(0.24, 0.44), rng.uniform(0.5, 1.8)
+    collarette = place + ragged * (
+        0.026 * _noise(rng, (1, ANGULAR), (0, 1), (0, 7), True)
+        + 0.019 * _noise(rng, (1, ANGULAR), (0, 1), (9, 30), True)
+    )
+    off = s - collarette
+    ciliary = _step(off, -0.02, 0.05)
+    # Fibres are angular noise that is elongated along the radius; a slow sideways warp bends its columns.
+    warp = 3.0 * _noise(rng, shape, (0, 2.2), (0, 14)) + 0.8 * _noise(rng, shape, (0, 6), (0, 60))
+    albedo, height = _fibres(fibrous, np.float32(rng.uniform(0.3, 1.6)) * warp, ciliary, iris.fibres)
+
+    # The stroma is thinner inside the collarette, which is a ridge of varying height.
+    along = np.clip(1 + 0.8 * _noise(rng, (1, ANGULAR), (0, 1), (3, 30), True), 0, 2.4)
+    crest = np.exp(-((off / rng.uniform(0.015, 0.04)) ** 2)) * along
+    height += iris.collarette * (0.045 * crest - 0.05 * (1 - ciliary) + 0.03 * np.exp(-((off / 0.12) ** 2)))
+    albedo += iris.collarette * (0.06 * crest + 0.05 * (1 - ciliary))
+    slow = _noise(rng, shape, (0, 2.0), (0, 5))
+    albedo += 0.045 * slow + 0.02 * _noise(rng, shape, (0, 14), (0, 60)) - 0.04 * _step(s, 0.72, 1.0)
+    height += 0.02 * slow
+
+    grooves = iris.furrows * _furrows(furrowed, s, turn)
+    depth, trabeculae = _crypts(holed, iris.crypts, s=s, off=off, turn=turn, warp=warp)
+    height += 0.02 * trabeculae - 0.055 * grooves - 0.22 * depth
+    albedo = albedo * (1 + 0.45 * trabeculae) * (1 - 0.10 * grooves) * (1 - 0.75 * depth)
+
+    # The ruff is the pigment epithelium turned over the margin, a dark beaded seam.
+    beads = np.maximum(0.018 * (1 + 0.35 * _noise(rng, (1, ANGULAR), (0, 1), (30, 75), True)), 0.006)
+    albedo = np.clip(albedo * (1 - 0.45 * np.exp(-((s / beads) ** 2))), 0.30, 1.9)
+    area = (MARGIN_MM + s * WIDTH_MM).astype(float)
+    albedo /= np.sum(albedo * area) / np.sum(np.broadcast_to(area, shape))
+    # Tissue has no edges as sharp as those between cells of the lattice.
+    height = ndimage.gaussian_filter(height, _SOFT, mode=("nearest", "wrap"))
+    height *= _step(s, 0.0, 0.10) * (1 - _step(s, 0.90, 1.0))
+    return np.stack([albedo, height]).astype(np.float32)
+
+
+def _fibres(rng: np.random.Generator, warp: Singles, ciliary: Singles, strength: float) -> tuple[Singles, Singles]:
+    """Relative albedo and height (mm) of the radial fibres."""
+    shape = (RADIAL, ANGULAR)
+
+    def bent(field: Singles, share: float) -> Singles:
+        place = np.arange(ANGULAR, dtype=np.float32) + np.float32(share) * warp
+        left = np.floor(place)
+        column, part = left.astype(np.intp) % ANGULAR, place - left
+        low = np.take_along_axis(field, column, axis=1)
+        return np.asarray(low + part * (np.take_along_axis(field, (column + 1) % ANGULAR, axis=1) - low))
+
+    fine_by, long_by = rng.uniform(0.6, 1.35), rng.uniform(1.0, 3.0)
+    coarse = bent(_noise(rng, shape, (0, 1.6), (22 * fine_by, 60 * fine_by)), 1.0)
+    medium = bent(_noise(rng, shape, (0, 2.5 * long_by), (50 * fine_by, 120 * fine_by)), 1.0)
+    fine = bent(_noise(rng, shape, (0, 3.0), (80, 150)), 0.7)
+    ridges = 0.8 - np.abs(medium)  # bright strands between darker gaps
+    # Some strands protrude from the stroma, thick and pale, each over a part of the radius; sectors have more of them.
+    sector = np.clip(1 + 0.7 * _noise(rng, (1, ANGULAR), (0, 1), (0, 4), True), 0, 2)
+    strands = np.maximum(bent(_noise(rng, shape, (0, 2.6 * long_by), (30 * fine_by, 85 * fine_by)), 1.2) - 0.9, 0)
+    strands = (strands - 0.08) * sector
+    outer = ciliary * (0.055 * coarse + 0.05 * ridges + 0.02 * fine + 0.16 * strands)
+    inner = (1 - ciliary) * (0.03 * coarse + 0.05 * fine + 0.03 * medium)
+    height = ciliary * (0.012 * coarse + 0.012 * ridges + 0.03 * strands)
+    height += (1 - ciliary) * (0.006 * coarse + 0.006 * fine)
+    return 1 + strength * (outer + inner), strength * height
+
+
+def _furrows(rng: np.random.Generator, s: NDArray[Any], turn: NDArray[Any]) -> Singles:
+    """Depth 0 to 1 of the contraction furrows: arcs in the outer half, each over a part of the circle."""
+    out = np.zeros(np.broadcast_shapes(s.shape, turn.shape), np.float32)
+    count = int(rng.integers(2, 6))
+    for place in np.linspace(rng.uniform(0.5, 0.64), rng.uniform(0.82, 0.93), count) + rng.uniform(-0.03, 0.03, count):
+        start, span = rng.uniform(0, 1), rng.uniform(0.35, 0.95)
+        wave = 0.008 * np.sin(2 * np.pi * (turn * rng.integers(2, 6) + rng.uniform()))
+        along = np.mod(turn - start, 1.0)
+        mask = _step(along, 0.0, 0.08) * (1 - _step(along, span - 0.08, span))
+        d = (s - place - wave) / rng.uniform(0.010, 0.024)
+        out += mask * rng.uniform(0.4, 1.0) * (np.exp(-(d**2)) - 0.4 * np.exp(-((d - 1.8) ** 2)))
+    return out
+
+
+def _crypts(
+    rng: np.random.Generator, strength: float, *, s: NDArray[Any], off: NDArray[Any], turn: NDArray[Any], warp: Singles
+) -> tuple[Singles, Singles]:
+    """Fuchs' crypts, lens-shaped gaps in the front layer, as depth 0 to 1, and the trabeculae between them.
+
+    They form a lattice along the collarette that is deep in some sectors and closed in others, with a few single crypts
+    towards the root.
+    """
+    out = np.zeros(np.broadcast_shapes(s.shape, turn.shape), np.float32)
+    if strength == 0:
+        return out, out.copy()
+    # The lattice is in mm of an iris of 3.8 mm from margin to root, elongated along the radius.
+    long_by = rng.uniform(1.5, 2.6)
+    around, along = 2 * np.pi * 3.2, WIDTH_MM / long_by
+    count = int(rng.integers(180, 520))
+    seeds = np.stack([rng.uniform(0, around, count), rng.uniform(0, along, count)], axis=-1)
+    copies = np.concatenate([seeds + np.array([shift, 0.0]) for shift in (-around, 0.0, around)])
+    share = rng.uniform(0.2, 0.55)
+    deep = np.where(rng.uniform(size=count) < share, rng.uniform(0.2, 0.65, count), rng.uniform(0, 0.06, count))
+    pale = rng.uniform(0.05, 0.42, count) * (rng.uniform(size=count) < 0.7)
+    deep, pale = deep.astype(np.float32), pale.astype(np.float32)
+    rows = np.flatnonzero((s[:, 0] > 0.12) & (s[:, 0] < 0.88))
+    # Trabeculae bend like the fibres beside them.
+    some = slice(rows[0], rows[0] + -(-len(rows) // 8) * 8)  # a few rows more, as `nearest_two` requires
+    x = (turn + 0.0035 * warp[some]) * around
+    y = np.broadcast_to(s[some] * along, x.shape) + 0.02 * np.roll(warp[some], 97, axis=1)
+    first, second, one, two = (v[: len(rows)] for v in nearest_two(copies, x, y, which=True))
+    gap = second - first
+    sector = np.clip(0.72 + 0.5 * _noise(rng, (1, turn.shape[1]), (0, 1), (0, 5), True), 0.05, 1.35)
+    away, spread = off[rows], rng.uniform(0.07, 0.2)
+    zone = np.exp(-(((away - 0.05) / spread) ** 2)) * sector + 0.2 * _step(away, 0.08, 0.2) * (s[rows] < 0.8)
+    nearest, next_ = one.astype(np.intp) % count, two.astype(np.intp) % count
+    trabeculae = np.maximum(pale[nearest], pale[next_]) * np.exp(-((gap / 0.055) ** 2))
+    depth = out.copy()
+    depth[rows] = np.clip(strength * zone * deep[nearest] * _step(gap, 0.02, 0.16), 0, 0.85)
+    out[rows] = min(strength, 1.0) * zone * trabeculae
+    return depth, out

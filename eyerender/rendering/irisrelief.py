@@ -1,0 +1,212 @@
+"""The relief of the iris: heights above its plane, parallax of camera rays, and the lamps' light on its slopes.
+
+The height h(y, z) above the plane of the stop is that of the pattern (`region.iris`), which stretches with the iris
+when the pupil changes, and of a gentle convexity. It is 0 at the pupil's margin and at the root, so outlines and labels
+are those of the plane. Once per frame it is put on a square grid. A ray meets it where X(z) = X(0) + z t, with t its
+lateral motion per mm of height, has the height z = h(X(z)); fixed-point steps find the place.
+
+The irradiance of a slope is that of the plane times
+
+    q = sum_l E_l V_l max(0, 1 - t_l . grad h) / (sqrt(1 + |grad h|^2) sum_l E_l)
+
+with E_l the lamp's irradiance of the plane, t_l its direction behind the cornea as lateral motion per mm of height, and
+V_l whether it is seen over the heights beside. E_l and t_l change slowly and are computed on a coarse grid.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .surfaces import Surface
+from .values import Lights, Values
+from .view import Textures, iris_height
+
+_COARSE = 20  # places across, at which the lamps' directions are computed
+_CELL_PX, _LEAST, _MOST = 0.8, 64, 448  # size of a cell in the picture, cells across
+_STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for what stands before a lamp
+_FIXED_POINT_STEPS = 4
+_SPARE_MM = 0.1
+_SMALL = 0.015  # radius over distance of lamps of which one point is enough
+
+
+class IrisRelief:
+    """Height of the iris above its plane and the lamps' light on it, on a grid over the plane."""
+
+    def __init__(self, values: Values, lights: Lights, scene: mi.Scene, textures: Textures, px_per_mm: float) -> None:
+        """Prepare the grid.
+
+        Args:
+            values: the scene's numbers.
+            lights: the lamps.
+            scene: what may stand in the way.
+            textures: the maps of the iris.
+            px_per_mm: pixels of the picture per mm.
+        """
+        self._values, self._lights, self._scene, self._textures = values, lights, scene, textures
+        self._half = values.iris.root_radius + _SPARE_MM
+        across = 2 * float(self._half.numpy()[0]) * px_per_mm / _CELL_PX
+        self._side = int(min(max(across, _LEAST), _MOST))
+        self._count = dr.opaque(mi.UInt32, self._side)
+        self._on = dr.opaque(mi.Bool, textures.raised)
+        self._heights: mi.Float | None = None
+        self._shades: mi.Float | None = None
+
+    def hit(self, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+        """Foot in the plane (eye frame) of the place that rays meet.
+
+        Args:
+            x: where they would meet the plane.
+            slant: their lateral motion per mm of height above it.
+            active: the lanes that matter.
+        """
+        assert self._heights is not None
+        active &= self._on
+        z = mi.Float(0)
+        for _ in range(_FIXED_POINT_STEPS):
+            z = self._on_grid(self._heights, x + z * slant, active)
+        return dr.select(active, x + z * slant, x)
+
+    def share(self, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """The q of the module's docstring at feet `x`."""
+        assert self._shades is not None
+        active &= self._on
+        return dr.select(active, self._on_grid(self._shades, x, active), 1)
+
+    def make(self) -> None:
+        """Fill the grids, once."""
+        if self._heights is not None:
+            return
+        if not self._textures.raised:
+            self._heights = self._shades = dr.zeros(mi.Float, 4)
+            dr.make_opaque(self._heights)
+            return
+        index = dr.arange(mi.UInt32, self._side * self._side)
+        row = index // self._count
+        column = index - row * self._count
+        x = self._place(mi.Float(column), mi.Float(row), self._count)
+        heights = iris_height(self._values, self._textures, x)
+        dr.eval(heights)
+        self._heights = self._packed(heights, column, row)
+        dr.eval(self._heights)
+        shades = self._lit(heights, column, row, x)
+        dr.eval(shades)
+        self._shades = self._packed(shades, column, row)
+        dr.eval(self._shades)
+
+    def _place(self, column: mi.Float, row: mi.Float, count: mi.UInt32) -> mi.Vector3f:
+        """Point of the plane at a place of a grid with `count` places across."""
+        stop, per = self._values.stop, 2 * self._half / mi.Float(count - 1)
+        return stop.centre + (column * per - self._half) * stop.u + (row * per - self._half) * stop.v
+
+    def _cell(self, x: mi.Vector3f, count: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float]:
+        """Column and row of the cell of a point, and the place in it."""
+        stop = self._values.stop
+        q, most = x - stop.centre, mi.Float(count) - 1.001
+        scale = 0.5 * mi.Float(count - 1) / self._half
+        u, v = (dr.clip((dr.dot(q, axis) + self._half) * scale, 0, most) for axis in (stop.u, stop.v))
+        i, j = mi.UInt32(u), mi.UInt32(v)
+        return i, j, u - mi.Float(i), v - mi.Float(j)
+
+    def _on_grid(self, packed: mi.Float, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        i, j, s, t = self._cell(x, self._count)
+        c = dr.gather(mi.Vector4f, packed, j * self._count + i, active)
+        return dr.lerp(dr.lerp(c.x, c.y, s), dr.lerp(c.z, c.w, s), t)
+
+    def _packed(self, values: mi.Float, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
+        """The four corners of every cell, side by side."""
+        last = self._count - 1
+        right, below = dr.minimum(column + 1, last), dr.minimum(row + 1, last)
+        out = dr.zeros(mi.Float, 4 * self._side * self._side)
+        index = 4 * (row * self._count + column)
+        for k, (i, j) in enumerate(((column, row), (right, row), (column, below), (right, below))):
+            dr.scatter(out, dr.gather(mi.Float, values, j * self._count + i), index + k)
+        return out
+
+    def _lamps(self) -> tuple[mi.Float, mi.UInt32]:
+        """E, E t_u and E t_v of points of the lamps at coarse places, as rows of four numbers; the number of points."""
+        from .lighting import LampPath
+
+        values, lights = self._values, self._lights
+        points = 1 if lights.widest < _SMALL and not lights.rings else 4
+        count = dr.opaque(mi.UInt32, _COARSE)
+        index = dr.arange(mi.UInt32, _COARSE * _COARSE * points * max(len(lights), 1))
+        spot = index // (_COARSE * _COARSE)
+        place = index - spot * (_COARSE * _COARSE)
+        row = place // count
+        x = self._place(mi.Float(place - row * count), mi.Float(row), count)
+        each = dr.opaque(mi.UInt32, points)
+        lamp = lights[spot // each]
+        turn = (mi.Float(spot - (spot // each) * each) + 0.5) * (0.5 * dr.pi)
+        source = lamp.point(dr.select(each > 1, 0.5, 0), *dr.sincos(turn))
+        path = LampPath.to(values, self._scene, lamp, source, x, lights.count > 0)
+        lit = dr.select(path.blocked, 0, path.gain)
+        lateral = _arrival(values.surfaces, source, path.entry, values.stop.normal)
+        out = dr.zeros(mi.Float, 4 * dr.width(index))
+        for k, value in enumerate((lit, lit * dr.dot(lateral, values.stop.u), lit * dr.dot(lateral, values.stop.v))):
+            dr.scatter(out, dr.select(lit > 0, value, 0), 4 * index + k)
+        dr.eval(out)
+        return out, lights.count * each
+
+    def _lit(self, heights: mi.Float, column: mi.UInt32, row: mi.UInt32, x: mi.Vector3f) -> mi.Float:
+        """The q of the module's docstring at points of the grid."""
+        last, stop = self._count - 1, self._values.stop
+        per = mi.Float(last) / (2 * self._half)
+
+        def slope(high: mi.UInt32, low: mi.UInt32, apart: mi.UInt32) -> mi.Float:
+            return (dr.gather(mi.Float, heights, high) - dr.gather(mi.Float, heights, low)) * per / mi.Float(apart)
+
+        left, right = dr.maximum(column, 1) - 1, dr.minimum(column + 1, last)
+        above, below = dr.maximum(row, 1) - 1, dr.minimum(row + 1, last)
+        hu = slope(row * self._count + right, row * self._count + left, right - left)
+        hv = slope(below * self._count + column, above * self._count + column, below - above)
+        h = dr.gather(mi.Float, heights, row * self._count + column)
+        steep = dr.max(dr.sqrt(hu * hu + hv * hv))
+        lamps, spots = self._lamps()
+        coarse = dr.opaque(mi.UInt32, _COARSE)
+        i, j, s, t = self._cell(x, coarse)
+        place = j * coarse + i
+
+        def lamp(k: mi.UInt32, whole: mi.Float, seen: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+            first = k * (_COARSE * _COARSE) + place
+            a, b, c, d = (dr.gather(mi.Vector4f, lamps, first + off) for off in (0, 1, coarse, coarse + 1))
+            both = dr.lerp(dr.lerp(a, b, s), dr.lerp(c, d, s), t)
+            inv = dr.rcp(dr.maximum(both.x, 1e-20))
+            tu, tv = both.y * inv, both.z * inv
+            facing = dr.maximum(1 - tu * hu - tv * hv, 0)
+            way = tu * stop.u + tv * stop.v
+            asked = (both.x > 0) & (facing > 0) & (dr.norm(way) * steep > 1)
+            return k + 1, whole + both.x, seen + both.x * facing * (1 - self._hidden(x, h, way, asked))
+
+        state = (mi.UInt32(0), mi.Float(0) * h, mi.Float(0) * h)
+        labels = ("k", "whole", "seen")
+        _, whole, seen = dr.while_loop(state, lambda k, *_: k < spots, lamp, labels=labels, label="relief")
+        return dr.select(whole > 0, seen / whole * dr.rsqrt(1 + hu * hu + hv * hv), 1)
+
+    def _hidden(self, x: mi.Vector3f, h: mi.Float, way: mi.Vector3f, asked: mi.Bool) -> mi.Float:
+        """Share by which heights beside points hide what lies in the direction `way`, 0 to 1."""
+        assert self._heights is not None
+        packed = self._heights
+
+        def step(k: mi.UInt32, hidden: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            part = mi.Float(k + 1) / _STEPS
+            up = _REACH_MM * part * part
+            over = self._on_grid(packed, x + up * way, asked) - h - up
+            return k + 1, dr.maximum(hidden, dr.clip(over / (_SOFT * up + 0.004), 0, 1))
+
+        state = (mi.UInt32(0), mi.Float(0) * h)
+        return dr.while_loop(
+            state, lambda k, _: asked & (k < _STEPS), step, labels=("k", "hidden"), label="shadows of the relief"
+        )[1]
+
+
+def _arrival(
+    surfaces: tuple[Surface, ...], source: mi.Vector3f, entry: mi.Vector3f, normal: mi.Vector3f
+) -> mi.Vector3f:
+    """Direction to a lamp behind the surfaces, as lateral motion per mm along `normal`, of light from `entry`."""
+    w = dr.normalize(entry - source)
+    x = entry - w
+    for surface in surfaces:
+        x, w, _, _ = surface.refract(x, w)
+    down = dr.dot(w, normal)
+    return w / dr.select(down < -0.05, down, -1) - normal
