@@ -7,10 +7,11 @@ lateral motion per mm of height, has the height z = h(X(z)); fixed-point steps f
 
 The irradiance of a slope is that of the plane times
 
-    q = sum_l E_l V_l max(0, 1 - t_l . grad h) / (sqrt(1 + |grad h|^2) sum_l E_l)
+    q = sum_l (E_l + h E'_l) V_l max(0, 1 - t_l . grad h) / (sqrt(1 + |grad h|^2) sum_l E_l)
 
-with E_l the lamp's irradiance of the plane, t_l its direction behind the cornea as lateral motion per mm of height, and
-V_l whether it is seen over the heights beside. E_l and t_l change slowly and are computed on a coarse grid.
+with E_l the lamp's irradiance of the plane, E'_l its change per mm of height (light converges behind the cornea), t_l
+the lamp's direction there as lateral motion per mm of height, and V_l whether it is seen over the heights beside. E_l,
+E'_l and t_l change slowly and are computed on a coarse grid.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from .values import Lights, Values
 from .view import Textures, iris_height
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
-_CELL_PX, _LEAST, _MOST = 0.8, 64, 448  # size of a cell in the picture, cells across
+_CELL_PX, _LEAST, _MOST = 0.5, 128, 448  # size of a cell in the picture, cells across
 _STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for what stands before a lamp
 _FIXED_POINT_STEPS = 4
-_SPARE_MM = 0.1
+_SPARE_MM, _RAISED_MM = 0.1, 0.2
 _SMALL = 0.015  # radius over distance of lamps of which one point is enough
 
 
@@ -124,7 +125,7 @@ class IrisRelief:
         return out
 
     def _lamps(self) -> tuple[mi.Float, mi.UInt32]:
-        """E, E t_u and E t_v of points of the lamps at coarse places, as rows of four numbers; the number of points."""
+        """E, E t_u, E t_v and E' of points of the lamps at coarse places, in rows; the number of these points."""
         from .lighting import LampPath
 
         values, lights = self._values, self._lights
@@ -139,11 +140,15 @@ class IrisRelief:
         lamp = lights[spot // each]
         turn = (mi.Float(spot - (spot // each) * each) + 0.5) * (0.5 * dr.pi)
         source = lamp.point(dr.select(each > 1, 0.5, 0), *dr.sincos(turn))
+        normal = values.stop.normal
         path = LampPath.to(values, self._scene, lamp, source, x, lights.count > 0)
+        above = LampPath.to(values, self._scene, lamp, source, x + _RAISED_MM * normal, lights.count > 0)
         lit = dr.select(path.blocked, 0, path.gain)
-        lateral = _arrival(values.surfaces, source, path.entry, values.stop.normal)
+        more = dr.select(above.gain > 0, (above.gain - path.gain) / _RAISED_MM, 0)
+        lateral = _arrival(values.surfaces, source, path.entry, normal)
+        rows = (lit, lit * dr.dot(lateral, values.stop.u), lit * dr.dot(lateral, values.stop.v), more)
         out = dr.zeros(mi.Float, 4 * dr.width(index))
-        for k, value in enumerate((lit, lit * dr.dot(lateral, values.stop.u), lit * dr.dot(lateral, values.stop.v))):
+        for k, value in enumerate(rows):
             dr.scatter(out, dr.select(lit > 0, value, 0), 4 * index + k)
         dr.eval(out)
         return out, lights.count * each
@@ -176,7 +181,8 @@ class IrisRelief:
             facing = dr.maximum(1 - tu * hu - tv * hv, 0)
             way = tu * stop.u + tv * stop.v
             asked = (both.x > 0) & (facing > 0) & (dr.norm(way) * steep > 1)
-            return k + 1, whole + both.x, seen + both.x * facing * (1 - self._hidden(x, h, way, asked))
+            here = dr.maximum(both.x + h * both.w, 0)
+            return k + 1, whole + both.x, seen + here * facing * (1 - self._hidden(x, h, way, asked))
 
         state = (mi.UInt32(0), mi.Float(0) * h, mi.Float(0) * h)
         labels = ("k", "whole", "seen")

@@ -12,6 +12,7 @@ import numpy as np
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeModel
 from eyerender.eye.pose import Poses, rigid_motion
+from eyerender.region.iris import IrisPattern
 from eyerender.region.look import Fundus, Look
 from eyerender.rig.camera import Camera, PinholeCamera
 from eyerender.rig.light import Lamp, Led, LedRing
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
 NO_FUNDUS = Fundus(reflectance=0.0)
+FLAT_IRIS = IrisPattern(relief=0.0, convexity_mm=0.0)
 BLACK = Look(
     fundus=NO_FUNDUS,
     iris_albedo=0.0,
@@ -32,6 +34,7 @@ BLACK = Look(
     backdrop_albedo=0.0,
     limbus_width_mm=0.0,
     limbus_transmittance=0.0,
+    iris=FLAT_IRIS,
 )
 PLAIN = Look(
     fundus=NO_FUNDUS,
@@ -40,6 +43,7 @@ PLAIN = Look(
     sclera_contrast=0.0,
     backdrop_contrast=0.0,
     limbus_transmittance=0.0,
+    iris=FLAT_IRIS,
 )
 
 
