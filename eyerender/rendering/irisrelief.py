@@ -19,6 +19,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .irislight import SMALL
 from .surfaces import Surface
 from .values import Lights, Values
 from .view import Textures, iris_height
@@ -28,7 +29,6 @@ _CELL_PX, _LEAST, _MOST = 0.5, 128, 448  # size of a cell in the picture, cells 
 _STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for what stands before a lamp
 _FIXED_POINT_STEPS = 4
 _SPARE_MM, _RAISED_MM = 0.1, 0.2
-_SMALL = 0.015  # radius over distance of lamps of which one point is enough
 
 
 class IrisRelief:
@@ -129,7 +129,7 @@ class IrisRelief:
         from .lighting import LampPath
 
         values, lights = self._values, self._lights
-        points = 1 if lights.widest < _SMALL and not lights.rings else 4
+        points = 1 if lights.widest < SMALL and not lights.rings else 4
         count = dr.opaque(mi.UInt32, _COARSE)
         index = dr.arange(mi.UInt32, _COARSE * _COARSE * points * max(len(lights), 1))
         spot = index // (_COARSE * _COARSE)

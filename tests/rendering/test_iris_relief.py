@@ -45,7 +45,8 @@ def relief_mesh(eye: EyeModel, pattern: IrisPattern) -> bytes:
     k = (j + 1) % ANGULAR
     faces = [np.stack(f, axis=-1).reshape(-1, 3) for f in (
         (i + j, i + j + ANGULAR, i + k + ANGULAR), (i + j, i + k + ANGULAR, i + k))]  # fmt: skip
-    return bytes(trimesh.Trimesh(p.reshape(-1, 3), np.concatenate(faces), process=False).export(file_type="ply"))
+    mesh = trimesh.Trimesh(p.reshape(-1, 3), np.concatenate(faces), process=False)
+    return bytes(trimesh.exchange.ply.export_ply(mesh))
 
 
 def seen_from(azimuth_deg: float, side: int, lamps: tuple[Lamp, ...]) -> LampRig:
