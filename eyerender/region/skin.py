@@ -53,6 +53,11 @@ def sheet_v(row: Floats) -> Floats:
     return np.asarray((0.5 + np.interp(row * (ROWS - 1), np.arange(ROWS), _texels())) / (SHEET_ROWS + BANDS))
 
 
+def sheet_place(texel: Floats) -> Floats:
+    """Row of the sheet, 0 to ROWS - 1, at rows of the map in texels: the inverse of `sheet_v`."""
+    return np.asarray(np.interp(texel, _texels(), np.arange(ROWS)))
+
+
 @lru_cache(maxsize=1)
 def _texels() -> Floats:
     """Row of the map, in texels, for each row of the sheet; wider rows of the sheet get more texels."""

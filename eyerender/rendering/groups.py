@@ -17,6 +17,7 @@ from .view import Textures, View, look_at_skin, meet, outer_albedo
 if TYPE_CHECKING:
     from .region import SkinGeometry
 
+_FAINT = 1e-3  # highlights so weak, relative to the other light, need no ray for their shadow
 _LIDS_MM = 18.0  # about the axis of the unrotated eye: the region of the lids, where lashes cast shadows
 
 
@@ -112,6 +113,11 @@ class _GroupShading:
     scene: mi.Scene
     group: Group
 
+    @property
+    def soft(self) -> bool:
+        """Whether light spreads inside skin and sclera."""
+        return self.values.structure.scattering
+
     def number(self, i: mi.UInt32) -> mi.UInt32:
         """Index of the i-th sample to trace: the middle one first, then the others in turn."""
         middle = self.group.count >> 1
@@ -163,7 +169,11 @@ class _GroupShading:
 
         total, failures = dr.if_stmt((total, failures), view.cornea | view.sclera, globe, lambda *unchanged: unchanged)
         at = o + hit.t * d
-        alone = view.other & group.fine & (~on_sheet | (at.y * at.y + at.z * at.z < _LIDS_MM * _LIDS_MM))
+        alone = view.other & group.fine
+        if self.soft:
+            alone &= ~on_sheet
+        else:
+            alone &= ~on_sheet | (at.y * at.y + at.z * at.z < _LIDS_MM * _LIDS_MM)
 
         # Two samples share one ray.
         known &= (i & 1) == 1
@@ -198,20 +208,28 @@ class _GroupShading:
         """
         values, lights, group = self.values, self.lights, self.group
 
+        # What went through the tissue is known, and what remains is the film's highlight.
+        matte = mi.Float(0) if self.soft else albedo
+        inside = mi.Float(0)
+        if self.soft:
+            assert self.textures.tissues is not None
+            inside = direct(seen, albedo, self.textures.tissues.on_globe(seen.point), mi.Float(0))
+        faint = _FAINT * inside
+
         def lit_by(lamp: Lamp) -> tuple[mi.Vector3f, mi.Float]:
             source = self.lamp_point(lamp, j)
-            return source, direct(seen, albedo, *straight(lamp, source, seen, back))
+            return source, direct(seen, matte, *straight(lamp, source, seen, back))
 
         def add(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             return i + 1, total + lit_by(lights[i])[1]
 
-        state = (mi.UInt32(0), mi.Float(0))
+        state = (mi.UInt32(0), inside)
         _, total = dr.while_loop(state, lambda i, _: i < lights.count, add, labels=("i", "total"), label="all lamps")
 
         def subtract(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             lamp, share = group.lamp(j, k)
             source, lit = lit_by(lamp)
-            barred = lamp_blocked(values, self.scene, seen.point, source, False, ~seen.cornea, lit > 0)
+            barred = lamp_blocked(values, self.scene, seen.point, source, False, ~seen.cornea, lit > faint)
             return k + 1, total - dr.select(barred, lit * share, 0)
 
         state, asked = (mi.UInt32(0), total), group.asked(j)
@@ -248,7 +266,14 @@ class _GroupShading:
         _, d, _ = group.ray(kept.j)
         view = look_at_skin(values, self.skin, kept.face, kept.uv, d, kept.weight > 0)
         rest = indirect(values, self.textures, self.scene, view, d, view.albedo, mi.Float(0), view.received)
-        total += rest * kept.weight
+        inside, matte = mi.Float(0), view.albedo
+        soft = self.soft and on_sheet
+        if soft:
+            assert self.textures.tissues is not None
+            on_skin = self.textures.tissues.on_skin(*self.skin.map_place(kept.face, kept.uv, kept.weight > 0))
+            inside, matte = direct(view, view.albedo, on_skin, mi.Float(0)), mi.Float(0)
+        total += (rest + inside) * kept.weight
+        faint = _FAINT * inside
 
         def more(k: mi.UInt32, *_: object) -> mi.Bool:
             return k < group.lamps
@@ -258,8 +283,8 @@ class _GroupShading:
             spot = group.shared_spot
             source = lamp.point(spot.x, *dr.sincos(spot.y * (2 * dr.pi)))
             outer, shine = straight(lamp, source, view, -values.vector_to_eye(d))
-            lit = direct(view, view.albedo, outer, shine) * share
-            asked = (kept.shared > 0) & (lit > 0)
+            lit = direct(view, matte, outer, shine) * share
+            asked = (kept.shared > 0) & (lit > faint)
             blocked = self.skin_blocked(lamp, source, view.point, on_sheet, asked)
             return k + 1, total + lit * (kept.clear + dr.select(blocked, 0, kept.shared))
 

@@ -16,16 +16,20 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, Singles
 from ..region.anatomy import Region
+from ..region.contour import COLUMNS
 from ..region.globe import Globe
 from ..region.head import file_states
+from ..region.lids import ROWS
 from ..region.mapcache import kept
 from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh, sheet_ends
-from ..region.skin import skin_texels
+from ..region.skin import SHEET_ROWS, skin_texels
 from .surround import clear_between, rays_between
 from .values import aligned
 
+GRID_ROWS, GRID_COLUMNS = 160, 512  # of the grid over the sheet on which its light is computed (see `subsurface`)
+SHEET_COLUMNS = COLUMNS + 1  # of vertices, because the first column is repeated
 _F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, which is about the same (n 1.40 and 1.33)
 _ROUGH_SKIN, _ROUGH_WET = 0.19, 0.04
 _RIPPLE = 0.032  # slope of wet tissue
@@ -57,7 +61,7 @@ class RegionScene:
         pixels = aligned(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         moving = next((s for s in self.scene.shapes() if s.id() == "shown_moving"), None)
-        self.skin = SkinGeometry(look, layout, faces, moving, -1.0 if globe.mirrored else 1.0, self._inner())
+        self.skin = SkinGeometry(look, pixels, layout, faces, moving, -1.0 if globe.mirrored else 1.0, self._inner())
         self.skin.pose(posed)
         self._shown: tuple[Region, Globe] | None = (spec, globe)
         self.posed = posed
@@ -108,6 +112,14 @@ class RegionScene:
         return clear_between(self.scene, a, b)
 
 
+def _mean_slopes(pixels: NDArray[np.float16]) -> Singles:
+    """Means (rows, columns, 2) of the slopes of a map over the cells of the grid on which light spreads."""
+    slopes = pixels[:SHEET_ROWS, :, 1:3]
+    down, across = len(slopes) // GRID_ROWS, slopes.shape[1] // GRID_COLUMNS
+    parts = [slopes[i::down, j::across].astype(np.float32) for i in range(down) for j in range(across)]
+    return np.asarray(sum(parts) / len(parts), dtype=np.float32)
+
+
 def _floats(values: Floats) -> mi.Float:
     return mi.Float(values.astype(np.float32).ravel())
 
@@ -146,6 +158,7 @@ class SkinGeometry:
     def __init__(
         self,
         look: mi.Texture2f,
+        pixels: NDArray[np.float16],
         layout: RegionLayout,
         moving: int,
         instance: mi.Shape | None,
@@ -153,6 +166,7 @@ class SkinGeometry:
         inner: Bools | None,
     ) -> None:
         self._map = look
+        self.relief = mi.Float(0 if inner is None else aligned(_mean_slopes(pixels).ravel()))
         corners = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
         corners[:, :3] = layout.faces
         corners[: layout.face_ends[0], 3] = False if inner is None else ~inner
@@ -175,6 +189,34 @@ class SkinGeometry:
         corner = dr.gather(mi.Vector4u, self._corners, face)
         a, b, c = (dr.gather(mi.Vector4f, self._buffer, 2 * i) for i in (corner.x, corner.y, corner.z))
         return *(mi.Vector3f(p.x, p.y, p.z) for p in (a, b, c)), corner.w > 0
+
+    def sheet_point(self, row: mi.Float, column: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """Points of the sheet's triangles at fractional rows and columns of its vertices, and the smooth normals."""
+        i, j = mi.UInt32(dr.clip(row, 0, ROWS - 1.001)), mi.UInt32(dr.clip(column, 0, SHEET_COLUMNS - 1.001))
+        s, t = column - mi.Float(j), row - mi.Float(i)
+        first = i * SHEET_COLUMNS + j
+        # Each cell has two triangles, whose common edge runs from its first corner to the opposite one.
+        weights = (1 - dr.maximum(s, t), dr.abs(s - t), dr.minimum(s, t))
+        corners = (first, first + dr.select(s > t, 1, SHEET_COLUMNS), first + SHEET_COLUMNS + 1)
+        place, turned = mi.Vector4f(0), mi.Vector4f(0)
+        for weight, corner in zip(weights, corners, strict=True):
+            place += weight * dr.gather(mi.Vector4f, self._buffer, 2 * corner)
+            turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * corner + 1)
+        return mi.Vector3f(place.x, place.y, place.z), dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
+
+    def map_place(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """Coordinates of the map at barycentric coordinates `uv` of triangles."""
+        corner = dr.gather(mi.Vector4u, self._corners, face, active)
+        u, v = mi.Float(0), mi.Float(0)
+        for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), (corner.x, corner.y, corner.z), strict=True):
+            u += weight * dr.gather(mi.Float, self._buffer, 8 * i + 3, active)
+            v += weight * dr.gather(mi.Float, self._buffer, 8 * i + 7, active)
+        return u, v
+
+    def tilted(self, normal: mi.Vector3f, slope_y: mi.Float, slope_z: mi.Float) -> mi.Vector3f:
+        """Normals of a relief: n - (g - n (n . g)) for the slope g over the tangent plane of the normal n."""
+        g = mi.Vector3f(0, self._mirror * slope_y, slope_z)
+        return dr.normalize(normal - (g - normal * dr.dot(normal, g)))
 
     def shine(self, received: Floats) -> None:
         """Set what every vertex receives from other surfaces, (n, 4) as in `exchange.Received`."""
@@ -202,10 +244,7 @@ class SkinGeometry:
         return dr.dot(n, d) * dr.dot(n, mi.Vector3f(turned.x, turned.y, turned.z)) > 0
 
     def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Surface:
-        """Surface at barycentric coordinates `uv` of triangles.
-
-        The relief tilts the normal n by its slope g over the tangent plane: n - (g - n (n . g)).
-        """
+        """Surface at barycentric coordinates `uv` of triangles."""
         corner = dr.gather(mi.Vector4u, self._corners, face, active)
         weights = (1 - uv.x - uv.y, uv.x, uv.y)
         place, turned, received = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
@@ -214,9 +253,7 @@ class SkinGeometry:
             turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i + 1, active)
             received += weight * dr.gather(mi.Vector4f, self._received, i, active)
         albedo, slope_y, slope_z, gloss = (mi.Float(c) for c in self._map.eval(mi.Point2f(place.w, turned.w), active))
-        n = dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
-        g = mi.Vector3f(0, self._mirror * slope_y, slope_z)
-        normal = dr.normalize(n - (g - n * dr.dot(n, g)))
+        normal = self.tilted(dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z)), slope_y, slope_z)
         return Surface(mi.Vector3f(place.x, place.y, place.z), normal, albedo, gloss, received)
 
 

@@ -11,7 +11,9 @@ import numpy as np
 from ..arrays import Bools, frozen
 from ..errors import InputError
 from ..rig.camera import Window
+from ..rig import psf
 from ..rig.imaging import Ambient
+from .blur import Blur
 from .environment import Ambience, Maps
 from .exchange import Exchange
 from .film import Exposed
@@ -37,6 +39,7 @@ from .meshed import Meshes, meshed
 from .plain import fine_pixels, plain_tiles
 from .pupillight import PupilLight
 from .region import RegionScene
+from .subsurface import tissue_light
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
 from .view import Textures
@@ -71,6 +74,7 @@ class Stage:
             place.obstructed,
             region is not None,
             job.ambient.model_copy(update={"sun": None}) != Ambient(),
+            region is not None and region.skin.is_sheet and job.look.scattering is not None,
         )
         anchor = job.anchor_mm
         values = Values(structure, parameters_of(job), boundary_waves(job.eye), tables(job.eye))
@@ -96,6 +100,11 @@ class Stage:
         if region is not None:
             views = LampViews(job.lights, anchor, _reach_mm(job), region if region.skin.is_sheet else None)
             textures = replace(textures, region=region.skin, lamp_views=views)
+            if structure.scattering and lit:
+                tissues = tissue_light(
+                    job, values, lights, region, views, Blur.of(job, region).reach + psf.margin(job.sensor.psf_sigma_px)
+                )  # fmt: skip
+                textures = replace(textures, tissues=tissues)
         if lit:
             panels = Lights(light_table(panel_lamps(job.ambient, anchor), job.M, job.t))
             received = self._exchange.received(job, values, lights, panels, textures, place)

@@ -46,7 +46,7 @@ class Structure:
 
     It holds (kind, tilted) of each surface, whether the camera's lens distorts, whether anything can stand in the
     way of light (the surround's plane cannot: it hides no lamp before it), whether the scene is an eye region instead
-    of a surround, and whether there is other light than that of the lamps.
+    of a surround, whether there is other light than that of the lamps, and whether light spreads inside the tissues.
     """
 
     surfaces: tuple[tuple[Kind, bool], ...]
@@ -54,6 +54,7 @@ class Structure:
     obstacles: bool = True
     region: bool = False
     ambient: bool = False
+    scattering: bool = False
 
 
 class Values:

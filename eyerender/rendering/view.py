@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .lampviews import LampViews
     from .pupillight import PupilLight
     from .region import SkinGeometry
+    from .subsurface import TissueLight
     from .surround import SurroundGeometry
 
 EPSILON_MM = 2e-3  # points closer than this are the same in single precision
@@ -102,6 +103,7 @@ class Textures:
     lamp_views: LampViews | None = None
     pupil: PupilLight | None = None
     received: Received | None = None
+    tissues: TissueLight | None = None
 
     @classmethod
     def of(cls, look: Look) -> Textures:

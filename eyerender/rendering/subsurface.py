@@ -1,0 +1,472 @@
+"""Light of all lamps on skin and sclera after its way through the tissue, once per frame on grids over their surfaces.
+
+Light enters the skin at one point and leaves it around there. What leaves is the irradiance, averaged about each point
+with the weights of `optics.diffusion`, times the albedo. So even light is reflected as by a matte surface, shadows have
+soft edges, and the finest relief is seen in the sheen alone.
+
+The irradiance is computed with its shadows at points within each cell of a grid that is fixed to the tissue (skin) or
+to the head (globe). It is then averaged over rings of a few places in the tangent plane, each ring a sixth of the
+light. Places of wide rings read grids that were reduced by factors of two. On the skin the way out to the rings is
+walked in steps, because the size of a cell changes along it.
+
+Where a lid lies on the globe, the globe receives what the lid transmits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import ndimage
+
+from ..arrays import Bools, Floats, Ints
+from ..optics.diffusion import half_space_length_mm, rings, slab_length_mm, transmitted
+from ..region.globe import Globe
+from ..region.mesh import RegionMesh
+from ..region.skin import BANDS, SHEET_ROWS, sheet_place
+from .frame import globe_of
+from .lighting import lamp_blocked
+from .region import GRID_COLUMNS as COLUMNS
+from .region import GRID_ROWS as ROWS
+from .region import SHEET_COLUMNS
+from .values import Lights, Values, aligned
+from .view import EPSILON_MM
+
+if TYPE_CHECKING:
+    from .frame import RenderJob
+    from .lampviews import LampViews
+    from .region import RegionScene, SkinGeometry
+
+
+_SIDE = 192  # of the grid over the front of the globe
+_LEVELS = 5  # each half as fine as the one before
+_RINGS, _TURNS = 6, 6
+_FOOTPRINT = 0.8  # size of the cells that a ring reads, in units of its radius
+_RAYS = 8  # to the lamps from each cell, and at least one to each
+_SPARE, _SPARE_MM = 13.0, 10.0  # beyond the window, from where light still arrives: in units of d, and at least
+_FINEST_MM = 0.02  # of a cell; about the corners of the eye they are smaller
+_LID_MM = 4.5  # thicker than any lid
+_BETWEEN_MM = 0.05  # between the two surfaces of a lid, at least
+_EDGE_MM = 0.4  # about the lids' margins, where the globe may be seen
+_WIDTH = 2.5  # of the grid over the globe in units of its radius, in Lambert's equal-area projection
+_KEYS = (0x51CA, 0x1A3B)
+_ALPHA = (0.7548776662466927, 0.5698402909980532)
+
+
+class Pyramid:
+    """A grid of numbers with its reductions by 2, 4, ..., read bilinearly; `around` says whether the columns close."""
+
+    def __init__(self, rows: int, columns: int, around: bool) -> None:
+        self.rows, self.columns, self._around = rows, columns, around
+        self._cells: mi.Float | None = None
+
+    def fill(self, values: Floats) -> None:
+        """Set the numbers (rows, columns)."""
+        levels, level = [], np.asarray(values, dtype=np.float32).reshape(self.rows, self.columns)
+        for k in range(_LEVELS):
+            if k:
+                level = level.reshape(len(level) // 2, 2, -1, 2).mean(axis=(1, 3))
+            right = np.roll(level, -1, axis=1)
+            if not self._around:
+                right[:, -1] = level[:, -1]
+            below = slice(1, None)
+            four = np.empty((*level.shape, 4), np.float32)
+            four[..., 0], four[..., 1] = level, right
+            four[:-1, :, 2], four[:-1, :, 3] = level[below], right[below]
+            four[-1, :, 2:] = four[-1, :, :2]
+            levels.append(four.reshape(-1, 4))
+        self._cells = mi.Float(aligned(np.concatenate(levels).ravel()))
+
+    def at(self, row: mi.Float, column: mi.Float, level: mi.UInt32 | int, active: mi.Bool | bool = True) -> mi.Float:
+        """Numbers at places in units of the finest cells, whose middles are at integers."""
+        level = mi.UInt32(level)
+        scale = dr.rcp(mi.Float(mi.UInt32(1) << level))
+        rows, columns = mi.UInt32(self.rows) >> level, mi.UInt32(self.columns) >> level
+        first = (self.rows * self.columns - rows * columns) // 3 * 4
+        v = dr.clip((row + 0.5) * scale - 0.5, 0, mi.Float(rows) - 1)
+        u = (column + 0.5) * scale - 0.5
+        if self._around:
+            u -= dr.floor(u / mi.Float(columns)) * mi.Float(columns)
+        else:
+            u = dr.clip(u, 0, mi.Float(columns) - 1)
+        i, j = mi.UInt32(v), dr.minimum(mi.UInt32(u), columns - 1)
+        s, t = u - mi.Float(j), v - mi.Float(i)
+        four = dr.gather(mi.Vector4f, self._cells, first + i * columns + j, active)
+        high, low = four.x + s * (four.y - four.x), four.z + s * (four.w - four.z)
+        return high + t * (low - high)
+
+
+def _level(size_mm: mi.Float, cell_mm: mi.Float) -> mi.UInt32:
+    """Reduction whose cells are about so large."""
+    return mi.UInt32(dr.clip(dr.log2(dr.maximum(size_mm / cell_mm, 1)) + 0.5, 0, _LEVELS - 1))
+
+
+@dataclass(frozen=True, slots=True)
+class _Rings:
+    """Radii (mm) of rings of places that stand for equal shares of the light."""
+
+    radii: mi.Float
+
+    @classmethod
+    def of(cls, length_mm: float) -> _Rings:
+        return cls(mi.Float(aligned((rings(_RINGS) * length_mm).astype(np.float32))))
+
+    def mean(self, start: tuple[Any, ...], step: Callable[..., tuple[Any, ...]]) -> mi.Float:
+        """Mean over places on the rings.
+
+        Args:
+            start: where a walk begins.
+            step: called with the sine and cosine of the walk's direction, its radius before and after, and where it
+                is; returns the number there and where it has come.
+        """
+
+        def more(k: mi.UInt32, *_: object) -> mi.Bool:
+            return k < _RINGS * _TURNS
+
+        def body(k: mi.UInt32, total: mi.Float, before: mi.Float, *at: Any) -> tuple[Any, ...]:
+            turn = k // _RINGS
+            ring = k - turn * _RINGS
+            inner = ring == 0
+            at = tuple(dr.select(inner, a, b) for a, b in zip(start, at, strict=True))
+            sine, cosine = dr.sincos((mi.Float(turn) + 0.5) * (2 * np.pi / _TURNS))
+            radius = dr.gather(mi.Float, self.radii, ring)
+            value, *at = step(sine, cosine, dr.select(inner, 0, before), radius, *at)
+            return k + 1, total + value, radius, *at
+
+        state = (mi.UInt32(0), mi.Float(0) * start[0], mi.Float(0) * start[0], *start)
+        names = ("k", "total", "before", *(f"at{n}" for n in range(len(start))))
+        return dr.while_loop(state, more, body, labels=names, label="rings")[1] * (1 / (_RINGS * _TURNS))
+
+
+class TissueLight:
+    """Light of the lamps on skin and globe, each after its way through the tissue."""
+
+    def __init__(self, skin: Pyramid, globe: Pyramid, values: Values) -> None:
+        self._skin, self._globe, self._values = skin, globe, values
+
+    def on_skin(self, u: mi.Float, v: mi.Float) -> mi.Float:
+        """Irradiance (mW/mm^2) at coordinates of the map of the skin."""
+        return self._skin.at(*_grid_place(u, v), 0)
+
+    def on_globe(self, x: mi.Vector3f) -> mi.Float:
+        """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
+        return self._globe.at(*_globe_place(self._values.vector_to_scene(x - self._values.sclera.centre)), 0)
+
+
+def tissue_light(
+    job: RenderJob, values: Values, lights: Lights, place: RegionScene, views: LampViews, spare_px: int
+) -> TissueLight:  # fmt: skip
+    """Compute the light on the tissues of a frame.
+
+    Args:
+        job: the job.
+        values: its numbers.
+        lights: its lamps.
+        place: the posed region.
+        views: the lamps' views of it.
+        spare_px: pixels beyond the window that are rendered.
+    """
+    scattering = job.look.scattering
+    assert scattering and job.region is not None
+    make = _Maker(values, lights, place.scene, place.skin, views)
+    thick = half_space_length_mm(job.region.skin.albedo, scattering.skin_per_mm)
+    thin = slab_length_mm(job.look.sclera_albedo, scattering.sclera_per_mm)
+    sheet = make.sheet(_SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px), thick)
+    loss = transmitted(job.region.skin.albedo, scattering.skin_per_mm)
+    grid = _GlobeGrid.of(place.posed, globe_of(job.eye, job.M, job.t - job.anchor_mm), _SPARE * thin)
+    return TissueLight(sheet, make.globe(grid, sheet, thin, loss), values)
+
+
+@dataclass(frozen=True, slots=True)
+class _Maker:
+    """What the grids of a frame are computed from."""
+
+    values: Values
+    lights: Lights
+    scene: mi.Scene
+    skin: SkinGeometry
+    views: LampViews
+
+    def sheet(self, grid: _SheetGrid, length_mm: float) -> Pyramid:
+        """Light on the skin after its way through the tissue."""
+        straight = Pyramid(ROWS, COLUMNS, True)
+        straight.fill(grid.whole(self._on_sheet(grid)))
+        row, column = mi.Float(grid.sent // COLUMNS), mi.Float(grid.sent % COLUMNS)
+        reached = _Rings.of(length_mm)
+
+        def step(
+            sine: mi.Float, cosine: mi.Float, before: mi.Float, radius: mi.Float, v: mi.Float, u: mi.Float
+        ) -> tuple[mi.Float, mi.Float, mi.Float]:
+            v, u, cell = grid.step(v, u, (radius - before) * cosine, (radius - before) * sine)
+            return straight.at(v, u, _level(_FOOTPRINT * radius, cell)), v, u
+
+        spread = reached.mean((row, column), step)
+        dr.eval(spread)
+        out = Pyramid(ROWS, COLUMNS, True)
+        out.fill(grid.whole(spread))
+        return out
+
+    def _on_sheet(self, grid: _SheetGrid) -> mi.Float:
+        """Irradiance of the cells of the grid over the skin straight from the lamps."""
+        values, skin = self.values, self.skin
+        index = grid.sent
+        row, column = index // COLUMNS, index % COLUMNS
+        relief = dr.gather(mi.Vector2f, skin.relief, index)
+
+        def place(shift: tuple[mi.Float, mi.Float]) -> tuple[mi.Vector3f, mi.Vector3f]:
+            across = (mi.Float(column) + shift[0]) * ((SHEET_COLUMNS - 1) / COLUMNS)
+            x, n = skin.sheet_point(grid.vertex_row(row, shift[1]), across)
+            return x, skin.tilted(n, relief.x, relief.y)
+
+        def blocked(lamp: Any, source: mi.Vector3f, x: mi.Vector3f, at: mi.Vector3f, lit: mi.Bool) -> mi.Bool:
+            clear = self.views.clear(lamp.number, at, lit)
+            return lamp_blocked(values, self.scene, x, source, True, True, lit & ~clear)
+
+        return self._lit(index, place, blocked)
+
+    def _lit(self, index: mi.UInt32, place: Callable[..., Any], blocked: Callable[..., mi.Bool]) -> mi.Float:
+        """Mean irradiance of cells straight from all lamps, over points of the cell and of the lamps.
+
+        `place` gives point and normal (scene's frame) for a place in the cell; `blocked` says whether a lamp is hidden.
+        """
+        values, lights = self.values, self.lights
+        if not len(lights):
+            return dr.zeros(mi.Float, dr.width(index))
+        points = dr.opaque(mi.UInt32, -(-_RAYS // len(lights)))
+        shifts = [mi.sample_tea_32(index, mi.UInt32(key)) for key in _KEYS]
+
+        def pair(which: int, k: mi.UInt32) -> tuple[mi.Float, ...]:
+            return tuple(
+                mi.Float((shift + k * mi.UInt32(round(a * 2**32))) >> 8) * (2.0**-24)
+                for shift, a in zip(shifts[which], _ALPHA, strict=True)
+            )
+
+        def at_point(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            at, normal = place(pair(0, k))
+            x, facing = values.point_to_eye(at), values.vector_to_eye(normal)
+            u, v = pair(1, k)
+            sine, cosine_v = dr.sincos(v * (2 * dr.pi))
+
+            def of_lamp(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+                lamp = lights[i]
+                source = lamp.point(u, sine, cosine_v)
+                to = source - x
+                inv2 = dr.rcp(dr.squared_norm(to))
+                to *= dr.sqrt(inv2)
+                cosine = dr.dot(to, facing)
+                lit = dr.select(cosine > 0, lamp.radiant_intensity(-to) * cosine * inv2, 0)
+                return i + 1, total + dr.select(blocked(lamp, source, x, at, lit > 0), 0, lit)
+
+            state = (mi.UInt32(0), total)
+            labels = ("i", "total")
+            return k + 1, dr.while_loop(state, lambda i, _: i < lights.count, of_lamp, labels=labels, label="lamps")[1]
+
+        state = (mi.UInt32(0), mi.Float(0) * mi.Float(index))
+        _, total = dr.while_loop(state, lambda k, _: k < points, at_point, labels=("k", "total"), label="in cells")
+        total *= dr.rcp(mi.Float(points))
+        dr.eval(total)
+        return total
+
+    def globe(self, grid: _GlobeGrid, sheet: Pyramid, length_mm: float, loss_per_mm: float) -> Pyramid:
+        """Light on the globe between the lids after its way through the sclera."""
+        values = self.values
+        cells = np.zeros(_SIDE * _SIDE, np.float32)
+        cells[grid.under] = self._through_lids(_numbers(grid.under), sheet, loss_per_mm).numpy()
+        cells[grid.between] += self._on_globe(_numbers(grid.between)).numpy()
+        straight, out = Pyramid(_SIDE, _SIDE, False), Pyramid(_SIDE, _SIDE, False)
+        straight.fill(cells)
+        index = _numbers(grid.between)
+        n = _globe_direction(mi.Float(index // _SIDE), mi.Float(index % _SIDE))
+        across = dr.normalize(mi.Vector3f(-n.y, n.x, 0))
+        up = dr.cross(n, across)
+        cell = _WIDTH / _SIDE * values.sclera.radius
+
+        def step(sine: mi.Float, cosine: mi.Float, _: mi.Float, radius: mi.Float, at: mi.Float) -> tuple[Any, ...]:
+            far_sine, far_cosine = dr.sincos(radius / values.sclera.radius)
+            row, column = _globe_place(far_cosine * n + far_sine * (cosine * across + sine * up))
+            return straight.at(row, column, _level(_FOOTPRINT * radius, cell)), at
+
+        spread = _Rings.of(length_mm).mean((mi.Float(0) * n.x,), step)
+        cells = np.zeros(_SIDE * _SIDE, np.float32)
+        cells[grid.between] = spread.numpy()
+        out.fill(cells)
+        return out
+
+    def _on_globe(self, index: mi.UInt32) -> mi.Float:
+        """Irradiance of cells of the grid over the globe straight from the lamps."""
+        values = self.values
+
+        def place(shift: tuple[mi.Float, mi.Float]) -> tuple[mi.Vector3f, mi.Vector3f]:
+            n = _globe_direction(mi.Float(index // _SIDE) + shift[1] - 0.5, mi.Float(index % _SIDE) + shift[0] - 0.5)
+            x, normal = self._globe_surface(n)
+            return values.point_to_scene(x), values.vector_to_scene(normal)
+
+        def blocked(lamp: Any, source: mi.Vector3f, x: mi.Vector3f, at: mi.Vector3f, lit: mi.Bool) -> mi.Bool:
+            del lamp, at
+            local = values.surfaces[0].point_in(x)
+            outside = local.y * local.y + local.z * local.z > dr.square(values.limbus.radius)
+            return lamp_blocked(values, self.scene, x, source, False, outside, lit)
+
+        return self._lit(index, place, blocked)
+
+    def _globe_surface(self, n: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """Point and normal (eye frame) of the globe along directions (scene's frame) from its centre."""
+        values, away = self.values, 8.0
+        d = values.vector_to_eye(n)
+        o = values.sclera.centre + (values.sclera.radius + away) * d
+        front = values.surfaces[0]
+        ol, dl = front.point_in(o), front.vector_in(-d)
+        t, met, facing = front.meet(ol, dl)
+        y = ol + t * dl
+        met &= (y.y * y.y + y.z * y.z < dr.square(values.limbus.radius)) & (y.x > values.limbus.floor) & (t < away)
+        return o - dr.select(met, t, away) * d, dr.normalize(dr.select(met, front.vector_out(facing), d))
+
+    def _through_lids(self, index: mi.UInt32, sheet: Pyramid, loss_per_mm: float) -> mi.Float:
+        """Irradiance of cells of the globe by way of lids that lie on them: exp(-k t) of that on the lid's skin."""
+        values, skin = self.values, self.skin
+        n = _globe_direction(mi.Float(index // _SIDE), mi.Float(index % _SIDE))
+        start = values.point_to_scene(self._globe_surface(n)[0])
+        inner = self._next(start, n, mi.Float(EPSILON_MM), mi.Bool(True))
+        outer = self._next(start, n, inner.t + _BETWEEN_MM, inner.is_valid())
+        last = dr.select(outer.is_valid(), outer.t, inner.t)
+        face = skin.face(inner)
+        face = dr.select(outer.is_valid(), skin.face(outer), face)
+        uv = dr.select(outer.is_valid(), outer.prim_uv, inner.prim_uv)
+        under = inner.is_valid() & skin.on_sheet(face)
+        lit = sheet.at(*_grid_place(*skin.map_place(face, uv, under)), 0, under)
+        return dr.select(under, lit * dr.exp(-loss_per_mm * last), 0)
+
+    def _next(self, o: mi.Vector3f, d: mi.Vector3f, first: mi.Float, active: mi.Bool) -> mi.PreliminaryIntersection3f:
+        """First hit along rays beyond a distance and within a lid's thickness; its t counts from the start."""
+        ray = mi.Ray3f(mi.Point3f(o + first * d), d)
+        ray.maxt = _LID_MM - first
+        hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        hit.t += first
+        return hit
+
+
+@dataclass(frozen=True, slots=True)
+class _SheetGrid:
+    """The grid over a posed sheet of skin.
+
+    Attributes:
+        cells: numbers of its cells that matter.
+        sent: the same on the device.
+        edges: row of the sheet's vertices at the edges of the grid's rows.
+        metric: for each row and column of vertices: columns per mm along the row, a, rows per mm across it, size of a
+            cell (mm). A place x mm along and y mm across is y per-mm rows and (x - a rows) per-mm columns away.
+    """
+
+    cells: Ints
+    sent: mi.UInt32
+    edges: mi.Float
+    metric: mi.Float
+
+    @classmethod
+    def of(cls, posed: RegionMesh, job: RenderJob, spare_mm: float, spare_px: int) -> _SheetGrid:
+        """Make the grid of a pose; what matters is shown in the window or is so close that its light gets there."""
+        texels = SHEET_ROWS // ROWS
+        edges = sheet_place(np.arange(ROWS + 1) * texels - 0.5)
+        sheet = posed.vertices[: posed.layout.vertex_ends[0]].reshape(-1, SHEET_COLUMNS, 3)[:, :-1]
+        near = _in_window(sheet + job.anchor_mm, job, spare_mm, spare_px)
+        sheet = sheet.astype(np.float32)
+        middle = sheet_place((np.arange(ROWS) + 0.5) * texels - 0.5)
+        i = np.minimum(middle.astype(int), len(sheet) - 2)
+        share = (middle - i).astype(np.float32)
+        x = sheet[i] + share[:, None, None] * (sheet[i + 1] - sheet[i])
+        along = (np.roll(x, -1, axis=1) - np.roll(x, 1, axis=1)) * (0.5 * x.shape[1] / COLUMNS)
+        down = np.gradient(x, axis=0)
+        width = np.maximum(np.linalg.norm(along, axis=-1), 1e-6)
+        a = np.sum(along * down, axis=-1) / width
+        height = np.sqrt(np.maximum(np.sum(down * down, axis=-1) - a * a, 0))
+        width, height = np.maximum(width, _FINEST_MM), np.maximum(height, _FINEST_MM)
+        metric = np.stack([1 / width, a, 1 / height, np.maximum(width, height)], axis=-1)
+        columns = np.arange(COLUMNS) * near.shape[1] // COLUMNS
+        cells = np.flatnonzero(near[i + (share > 0.5)][:, columns])
+        if cells.size == 0:
+            cells = np.zeros(1, dtype=np.int64)
+        return cls(cells, _numbers(cells), *(mi.Float(aligned(t.astype(np.float32).ravel())) for t in (edges, metric)))
+
+    def whole(self, values: mi.Float) -> Floats:
+        """Numbers (ROWS, COLUMNS) of all cells, 0 for those that do not matter."""
+        out = np.zeros(ROWS * COLUMNS, np.float32)
+        out[self.cells] = values.numpy()
+        return out.reshape(ROWS, COLUMNS)
+
+    def vertex_row(self, row: mi.UInt32, share: mi.Float) -> mi.Float:
+        """Row of the sheet's vertices at a share of the grid's rows."""
+        a, b = (dr.gather(mi.Float, self.edges, row + k) for k in (0, 1))
+        return a + share * (b - a)
+
+    def step(self, row: mi.Float, column: mi.Float, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Go x mm along a row and y mm across: the new row and column, and the size of a cell (mm)."""
+        columns = SHEET_COLUMNS - 1
+        i = mi.UInt32(row + 0.5)
+        j = mi.UInt32((column + 0.5) * (columns / COLUMNS) + 0.5)
+        m = dr.gather(mi.Vector4f, self.metric, i * columns + dr.select(j < columns, j, 0))
+        down = y * m.z
+        column += (x - m.y * down) * m.x
+        column -= dr.floor(column / COLUMNS) * COLUMNS
+        return dr.clip(row + down, 0, ROWS - 1.0), dr.minimum(column, COLUMNS - 0.51), m.w
+
+
+@dataclass(frozen=True, slots=True)
+class _GlobeGrid:
+    """Cells of the grid over the globe: those between the lids, and those under the lids whose light gets there."""
+
+    between: Ints
+    under: Ints
+
+    @classmethod
+    def of(cls, posed: RegionMesh, globe: Globe, reach_mm: float) -> _GlobeGrid:
+        row, column = np.divmod(np.arange(_SIDE * _SIDE), _SIDE)
+        a, b = ((k - 0.5 * (_SIDE - 1)) * (_WIDTH / _SIDE) for k in (column, row))
+        centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+        scale = globe.radius_mm * np.sqrt(np.maximum(1 - 0.25 * (a * a + b * b), 0))
+        y, z = a * scale + centre[1], b * scale + centre[2]
+        upper, lower = (m[np.argsort(m[:, 1])] for m in (posed.upper_margin, posed.lower_margin))
+        over = np.maximum(z - np.interp(y, upper[:, 1], upper[:, 2]), np.interp(y, lower[:, 1], lower[:, 2]) - z)
+        beside = np.maximum(upper[0, 1] - y, y - upper[-1, 1])
+        away = np.maximum(over, beside)
+        between = np.flatnonzero(away < _EDGE_MM)
+        return cls(between if between.size else np.zeros(1, dtype=np.int64), np.flatnonzero((away > 0) & (away < reach_mm)))
+
+
+def _numbers(cells: Ints) -> mi.UInt32:
+    return mi.UInt32(aligned(cells.astype(np.uint32)))
+
+
+def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -> Bools:
+    """Which points (rows, columns, 3) of a grid, whose columns close, or neighbours of them a window shows."""
+    camera, (x0, y0, width, height) = job.camera, job.window
+    xy, front = camera.project(points)
+    depth = np.maximum((points - camera.nodal_point_mm) @ camera.R[2], 1.0)
+    spare = spare_px + spare_mm * float(max(camera.K[0, 0], camera.K[1, 1])) / depth
+    with np.errstate(invalid="ignore"):
+        inside = np.abs(xy - (x0 + 0.5 * width, y0 + 0.5 * height)) < 0.5 * np.array([width, height]) + spare[..., None]
+    shown = np.pad(front & inside.all(axis=-1), ((0, 0), (1, 1)), "wrap")
+    return np.asarray(ndimage.binary_dilation(shown, np.ones((3, 3)))[:, 1:-1])
+
+
+def _grid_place(u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """Row and column of the grid over the skin at coordinates of the map."""
+    return v * ((SHEET_ROWS + BANDS) * ROWS / SHEET_ROWS) - 0.5, u * COLUMNS - 0.5
+
+
+def _globe_place(n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    """Row and column of the grid over the globe in directions (scene's frame) from its centre, of any length."""
+    n = dr.normalize(n)
+    scale = dr.sqrt(2 * dr.rcp(dr.maximum(1 + n.x, 0.1))) * (_SIDE / _WIDTH)
+    return scale * n.z + 0.5 * (_SIDE - 1), scale * n.y + 0.5 * (_SIDE - 1)
+
+
+def _globe_direction(row: mi.Float, column: mi.Float) -> mi.Vector3f:
+    """Directions (scene's frame) of places of the grid over the globe."""
+    a, b = ((k - 0.5 * (_SIDE - 1)) * (_WIDTH / _SIDE) for k in (column, row))
+    q = a * a + b * b
+    k = dr.sqrt(dr.maximum(1 - 0.25 * q, 0))
+    return mi.Vector3f(1 - 0.5 * q, a * k, b * k)
