@@ -38,7 +38,6 @@ _TILE_MM, _TILE = 24.0, 640
 _COARSE = 8
 _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
 _STRIP = 32  # rows of the map that are made together, so that they stay in the processor's cache
-_SHOWN = 0.5  # of the furrows' slope: light scattered under the skin blurs structures finer than half a millimetre
 _SHOWN_MM = 25.0  # about the middle of the fissure: the skin whose mean albedo is that of the spec
 _REFERENCE_BLINK = 0.3  # at which the tissue is laid out: neither stretched nor hidden in the fold
 
@@ -244,8 +243,8 @@ class _Strip:
         height = (self.relief(cells) - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases) * self.lid
         if np.any(self.flesh):
             height = height + 0.02 * self.flesh * self.field(6, (18, 45), (18, 45))
-        # Furrows are darker because little light leaves them.
-        open_ = 1 + 0.13 * (cells - 0.5) - 0.16 * pores - 0.32 * spec.skin.wrinkles * creases
+        # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
+        open_ = 1 + 0.10 * (cells - 0.5) - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
         wet = (0.78 - 0.21 * self.flesh) * (1 - step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN - 1.0))
         # Oil forms films of varying thickness. It shines in points where the skin is smooth and swollen, in short
         # streaks along the lids.
@@ -281,7 +280,7 @@ class _Strip:
         lines = self.tiles.at(11, _places(y, self.level + sway), (0, 6), (22, 60))
         under = _bell(z, -11.0, 6.0) + 0.7 * _bell(z, 8.0, 4.0) + _bell(y, -21.0, 5.0)
         amount = 0.025 * skin.wrinkles * _hill(y, z, 26.0, 20.0) * under
-        return np.asarray(_SHOWN * skin.relief_mm * (cells + 0.15 * grain) - amount * np.abs(lines))
+        return np.asarray(skin.relief_mm * (cells + 0.15 * grain) - amount * np.abs(lines))
 
     def creases(self) -> Singles:
         """Depth, 0 to about 1, of the creases of the lids' thin skin.

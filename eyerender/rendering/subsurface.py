@@ -51,6 +51,7 @@ _SPARE, _SPARE_MM = 13.0, 10.0  # beyond the window, from where light still arri
 _FINEST_MM = 0.02  # of a cell; about the corners of the eye they are smaller
 _LID_MM = 4.5  # thicker than any lid
 _BETWEEN_MM = 0.05  # between the two surfaces of a lid, at least
+_JOINT_MM, _ABOVE_MM = 0.05, 0.15  # above the globe, where the light on conjunctiva and globe is found
 _EDGE_MM = 0.4  # about the lids' margins, where the globe may be seen
 _WIDTH = 2.5  # of the grid over the globe in units of its radius, in Lambert's equal-area projection
 _KEYS = (0x51CA, 0x1A3B)
@@ -213,13 +214,16 @@ class _Maker:
     def _on_sheet(self, grid: _SheetGrid) -> mi.Float:
         """Irradiance of the cells of the grid over the skin straight from the lamps."""
         values, skin = self.values, self.skin
-        index = grid.sent
+        index, centre = grid.sent, values.point_to_scene(values.sclera.centre)
         row, column = index // COLUMNS, index % COLUMNS
         relief = dr.gather(mi.Vector2f, skin.relief, index)
 
         def place(shift: tuple[mi.Float, mi.Float]) -> tuple[mi.Vector3f, mi.Vector3f]:
             across = (mi.Float(column) + shift[0]) * ((SHEET_COLUMNS - 1) / COLUMNS)
             x, n = skin.sheet_point(grid.vertex_row(row, shift[1]), across)
+            # The conjunctiva dips into the globe where both join. Neither shades the other there.
+            out = x - centre
+            x = centre + out * dr.maximum(1, (values.sclera.radius + _JOINT_MM) * dr.rcp(dr.norm(out)))
             return x, skin.tilted(n, relief.x, relief.y)
 
         def blocked(lamp: Any, source: mi.Vector3f, x: mi.Vector3f, at: mi.Vector3f, lit: mi.Bool) -> mi.Bool:
@@ -303,7 +307,7 @@ class _Maker:
         def place(shift: tuple[mi.Float, mi.Float]) -> tuple[mi.Vector3f, mi.Vector3f]:
             n = _globe_direction(mi.Float(index // _SIDE) + shift[1] - 0.5, mi.Float(index % _SIDE) + shift[0] - 0.5)
             x, normal = self._globe_surface(n)
-            return values.point_to_scene(x), values.vector_to_scene(normal)
+            return values.point_to_scene(x + _ABOVE_MM * normal), values.vector_to_scene(normal)
 
         def blocked(lamp: Any, source: mi.Vector3f, x: mi.Vector3f, at: mi.Vector3f, lit: mi.Bool) -> mi.Bool:
             del lamp, at
