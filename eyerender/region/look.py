@@ -59,8 +59,8 @@ class Scattering(Spec):
 
     skin_per_mm: Annotated[float, Field(ge=0.5, le=10)] = Field(
         default=2.04,
-        description="reduced scattering coefficient of the skin (850 nm: 2.04, the table of Mignon et al. 2018; 2.2, "
-        "the mean of Jacques 2013)",
+        description="reduced scattering coefficient of the skin (2.04 in the table of PMC6366475, 2.2 as the mean of "
+        "Jacques 2013, 1.2 in 3809 living subjects, J. Biomed. Opt. 28, 115001)",
     )
     sclera_per_mm: Annotated[float, Field(ge=0.5, le=10)] = Field(
         default=2.5, description="reduced scattering coefficient of the sclera (chosen; 2 to 3 in the near infrared)"

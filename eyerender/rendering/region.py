@@ -28,7 +28,7 @@ from ..region.skin import SHEET_ROWS, skin_texels
 from .surround import clear_between, rays_between
 from .values import aligned
 
-GRID_ROWS, GRID_COLUMNS = 160, 512  # of the grid over the sheet on which its light is computed (see `subsurface`)
+GRID_ROWS, GRID_COLUMNS = 160, 768  # of the grid over the sheet on which its light is computed (see `subsurface`)
 SHEET_COLUMNS = COLUMNS + 1  # of vertices, because the first column is repeated
 _F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, which is about the same (n 1.40 and 1.33)
 _ROUGH_SKIN, _ROUGH_WET = 0.19, 0.04
@@ -143,10 +143,11 @@ def _instance(name: str, mesh: mi.Mesh) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Points of the region: place, shading normal (scene's frame), albedo, gloss, received light (see `exchange`)."""
+    """Points of the region: place, normals with and without relief, albedo, gloss, received light (see `exchange`)."""
 
     point: mi.Vector3f
     normal: mi.Vector3f
+    smooth: mi.Vector3f
     albedo: mi.Float
     gloss: mi.Float
     received: mi.Vector4f
@@ -253,8 +254,9 @@ class SkinGeometry:
             turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i + 1, active)
             received += weight * dr.gather(mi.Vector4f, self._received, i, active)
         albedo, slope_y, slope_z, gloss = (mi.Float(c) for c in self._map.eval(mi.Point2f(place.w, turned.w), active))
-        normal = self.tilted(dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z)), slope_y, slope_z)
-        return Surface(mi.Vector3f(place.x, place.y, place.z), normal, albedo, gloss, received)
+        smooth = dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
+        normal = self.tilted(smooth, slope_y, slope_z)
+        return Surface(mi.Vector3f(place.x, place.y, place.z), normal, smooth, albedo, gloss, received)
 
 
 def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:

@@ -115,7 +115,8 @@ def indirect(
     even = received.x
     if values.structure.ambient:
         assert textures.ambience is not None
-        x, normal = values.point_to_scene(view.point), values.vector_to_scene(view.normal)
+        facing = view.normal if view.level is None else view.level
+        x, normal = values.point_to_scene(view.point), values.vector_to_scene(facing)
         even += received.y * textures.ambience.irradiance(x, normal)
     rest = cover * albedo * even * dr.inv_pi + _mirrored(values, textures, scene, view, d, 1 - cover)
     leaving = (

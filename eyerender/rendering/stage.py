@@ -10,8 +10,8 @@ import numpy as np
 
 from ..arrays import Bools, frozen
 from ..errors import InputError
-from ..rig.camera import Window
 from ..rig import psf
+from ..rig.camera import Window
 from ..rig.imaging import Ambient
 from .blur import Blur
 from .environment import Ambience, Maps
@@ -39,7 +39,7 @@ from .meshed import Meshes, meshed
 from .plain import fine_pixels, plain_tiles
 from .pupillight import PupilLight
 from .region import RegionScene
-from .subsurface import tissue_light
+from .subsurface import TissueLight, tissue_light
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
 from .view import Textures
@@ -99,12 +99,8 @@ class Stage:
             textures = replace(textures, surround=place.geometry)
         if region is not None:
             views = LampViews(job.lights, anchor, _reach_mm(job), region if region.skin.is_sheet else None)
-            textures = replace(textures, region=region.skin, lamp_views=views)
-            if structure.scattering and lit:
-                tissues = tissue_light(
-                    job, values, lights, region, views, Blur.of(job, region).reach + psf.margin(job.sensor.psf_sigma_px)
-                )  # fmt: skip
-                textures = replace(textures, tissues=tissues)
+            tissues = _tissues(job, values, lights, region, views) if structure.scattering and lit else None
+            textures = replace(textures, region=region.skin, lamp_views=views, tissues=tissues)
         if lit:
             panels = Lights(light_table(panel_lamps(job.ambient, anchor), job.M, job.t))
             received = self._exchange.received(job, values, lights, panels, textures, place)
@@ -150,6 +146,11 @@ def _spread(job: RenderJob, values: Values, lights: Lights, textures: Textures, 
     if textures.received is not None and not place.obstructed:
         reach = min(_reach_mm(job), _FARTHEST_MM)
         lights.on_matte = MatteLight(values, lights, place.scene, textures.received, reach)
+
+
+def _tissues(job: RenderJob, values: Values, lights: Lights, region: RegionScene, views: LampViews) -> TissueLight:
+    spare_px = Blur.of(job, region).reach + psf.margin(job.sensor.psf_sigma_px)
+    return tissue_light(job, values, lights, region, views, spare_px)
 
 
 def _reach_mm(job: RenderJob) -> float:

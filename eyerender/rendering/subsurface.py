@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, Singles
 from ..optics.diffusion import half_space_length_mm, rings, slab_length_mm, transmitted
 from ..region.globe import Globe
 from ..region.mesh import RegionMesh
@@ -46,7 +46,7 @@ _SIDE = 192  # of the grid over the front of the globe
 _LEVELS = 5  # each half as fine as the one before
 _RINGS, _TURNS = 6, 6
 _FOOTPRINT = 0.8  # size of the cells that a ring reads, in units of its radius
-_RAYS = 8  # to the lamps from each cell, and at least one to each
+_RAYS = 6  # to the lamps from each cell, and at least one to each
 _SPARE, _SPARE_MM = 13.0, 10.0  # beyond the window, from where light still arrives: in units of d, and at least
 _FINEST_MM = 0.02  # of a cell; about the corners of the eye they are smaller
 _LID_MM = 4.5  # thicker than any lid
@@ -65,7 +65,7 @@ class Pyramid:
         self.rows, self.columns, self._around = rows, columns, around
         self._cells: mi.Float | None = None
 
-    def fill(self, values: Floats) -> None:
+    def fill(self, values: Singles) -> None:
         """Set the numbers (rows, columns)."""
         levels, level = [], np.asarray(values, dtype=np.float32).reshape(self.rows, self.columns)
         for k in range(_LEVELS):
@@ -107,40 +107,47 @@ def _level(size_mm: mi.Float, cell_mm: mi.Float) -> mi.UInt32:
 
 
 @dataclass(frozen=True, slots=True)
-class _Rings:
-    """Radii (mm) of rings of places that stand for equal shares of the light."""
+class _Places:
+    """Places in the tangent plane that stand for equal shares of the light: (x, y, dx, dy) in mm, row by row.
 
-    radii: mi.Float
+    Walks go out from the middle over places of growing distance; dx and dy are the steps. Places of a walk alternate
+    in direction, so that neighbouring rings fill each other's gaps.
+    """
+
+    table: mi.Float
 
     @classmethod
-    def of(cls, length_mm: float) -> _Rings:
-        return cls(mi.Float(aligned((rings(_RINGS) * length_mm).astype(np.float32))))
+    def of(cls, length_mm: float) -> _Places:
+        turn = 2 * np.pi * (np.arange(_TURNS)[:, None] + 0.5 + 0.5 * (np.arange(_RINGS) % 2)) / _TURNS
+        place = rings(_RINGS)[:, None] * length_mm * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        steps = np.diff(place, axis=1, prepend=np.zeros((_TURNS, 1, 2)))
+        return cls(mi.Float(aligned(np.concatenate([place, steps], axis=-1).astype(np.float32).ravel())))
 
-    def mean(self, start: tuple[Any, ...], step: Callable[..., tuple[Any, ...]]) -> mi.Float:
-        """Mean over places on the rings.
+    def mean(
+        self, start: tuple[mi.Float, mi.Float], read: Callable[..., tuple[mi.Float, mi.Float, mi.Float]]
+    ) -> mi.Float:
+        """Mean over the places.
 
         Args:
-            start: where a walk begins.
-            step: called with the sine and cosine of the walk's direction, its radius before and after, and where it
-                is; returns the number there and where it has come.
+            start: row and column where walks begin.
+            read: called with a row of the table, the distance, and the row and column of the place before; returns the
+                number at the place, and its row and column.
         """
 
         def more(k: mi.UInt32, *_: object) -> mi.Bool:
             return k < _RINGS * _TURNS
 
-        def body(k: mi.UInt32, total: mi.Float, before: mi.Float, *at: Any) -> tuple[Any, ...]:
-            turn = k // _RINGS
-            ring = k - turn * _RINGS
-            inner = ring == 0
-            at = tuple(dr.select(inner, a, b) for a, b in zip(start, at, strict=True))
-            sine, cosine = dr.sincos((mi.Float(turn) + 0.5) * (2 * np.pi / _TURNS))
-            radius = dr.gather(mi.Float, self.radii, ring)
-            value, *at = step(sine, cosine, dr.select(inner, 0, before), radius, *at)
-            return k + 1, total + value, radius, *at
+        def body(k: mi.UInt32, total: mi.Float, row: mi.Float, column: mi.Float) -> tuple[Any, ...]:
+            first = k % _RINGS == 0
+            row, column = dr.select(first, start[0], row), dr.select(first, start[1], column)
+            place = dr.gather(mi.Vector4f, self.table, k)
+            distance = dr.sqrt(place.x * place.x + place.y * place.y)
+            value, row, column = read(place, distance, row, column)
+            return k + 1, total + value, row, column
 
-        state = (mi.UInt32(0), mi.Float(0) * start[0], mi.Float(0) * start[0], *start)
-        names = ("k", "total", "before", *(f"at{n}" for n in range(len(start))))
-        return dr.while_loop(state, more, body, labels=names, label="rings")[1] * (1 / (_RINGS * _TURNS))
+        state = (mi.UInt32(0), mi.Float(0) * start[0], *start)
+        labels = ("k", "total", "row", "column")
+        return dr.while_loop(state, more, body, labels=labels, label="places")[1] * (1 / (_RINGS * _TURNS))
 
 
 class TissueLight:
@@ -172,13 +179,14 @@ def tissue_light(
         spare_px: pixels beyond the window that are rendered.
     """
     scattering = job.look.scattering
-    assert scattering and job.region is not None
+    assert scattering is not None
+    assert job.region is not None
     make = _Maker(values, lights, place.scene, place.skin, views)
     thick = half_space_length_mm(job.region.skin.albedo, scattering.skin_per_mm)
     thin = slab_length_mm(job.look.sclera_albedo, scattering.sclera_per_mm)
-    sheet = make.sheet(_SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px), thick)
+    sheet = make.sheet(SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px), thick)
     loss = transmitted(job.region.skin.albedo, scattering.skin_per_mm)
-    grid = _GlobeGrid.of(place.posed, globe_of(job.eye, job.M, job.t - job.anchor_mm), _SPARE * thin)
+    grid = GlobeGrid.of(place.posed, globe_of(job.eye, job.M, job.t - job.anchor_mm), _SPARE * thin)
     return TissueLight(sheet, make.globe(grid, sheet, thin, loss), values)
 
 
@@ -192,26 +200,11 @@ class _Maker:
     skin: SkinGeometry
     views: LampViews
 
-    def sheet(self, grid: _SheetGrid, length_mm: float) -> Pyramid:
+    def sheet(self, grid: SheetGrid, length_mm: float) -> Pyramid:
         """Light on the skin after its way through the tissue."""
-        straight = Pyramid(ROWS, COLUMNS, True)
-        straight.fill(grid.whole(self._on_sheet(grid)))
-        row, column = mi.Float(grid.sent // COLUMNS), mi.Float(grid.sent % COLUMNS)
-        reached = _Rings.of(length_mm)
+        return grid.spread(grid.whole(self._on_sheet(grid)), length_mm)
 
-        def step(
-            sine: mi.Float, cosine: mi.Float, before: mi.Float, radius: mi.Float, v: mi.Float, u: mi.Float
-        ) -> tuple[mi.Float, mi.Float, mi.Float]:
-            v, u, cell = grid.step(v, u, (radius - before) * cosine, (radius - before) * sine)
-            return straight.at(v, u, _level(_FOOTPRINT * radius, cell)), v, u
-
-        spread = reached.mean((row, column), step)
-        dr.eval(spread)
-        out = Pyramid(ROWS, COLUMNS, True)
-        out.fill(grid.whole(spread))
-        return out
-
-    def _on_sheet(self, grid: _SheetGrid) -> mi.Float:
+    def _on_sheet(self, grid: SheetGrid) -> mi.Float:
         """Irradiance of the cells of the grid over the skin straight from the lamps."""
         values, skin = self.values, self.skin
         index, centre = grid.sent, values.point_to_scene(values.sclera.centre)
@@ -275,30 +268,12 @@ class _Maker:
         dr.eval(total)
         return total
 
-    def globe(self, grid: _GlobeGrid, sheet: Pyramid, length_mm: float, loss_per_mm: float) -> Pyramid:
+    def globe(self, grid: GlobeGrid, sheet: Pyramid, length_mm: float, loss_per_mm: float) -> Pyramid:
         """Light on the globe between the lids after its way through the sclera."""
-        values = self.values
         cells = np.zeros(_SIDE * _SIDE, np.float32)
         cells[grid.under] = self._through_lids(_numbers(grid.under), sheet, loss_per_mm).numpy()
         cells[grid.between] += self._on_globe(_numbers(grid.between)).numpy()
-        straight, out = Pyramid(_SIDE, _SIDE, False), Pyramid(_SIDE, _SIDE, False)
-        straight.fill(cells)
-        index = _numbers(grid.between)
-        n = _globe_direction(mi.Float(index // _SIDE), mi.Float(index % _SIDE))
-        across = dr.normalize(mi.Vector3f(-n.y, n.x, 0))
-        up = dr.cross(n, across)
-        cell = _WIDTH / _SIDE * values.sclera.radius
-
-        def step(sine: mi.Float, cosine: mi.Float, _: mi.Float, radius: mi.Float, at: mi.Float) -> tuple[Any, ...]:
-            far_sine, far_cosine = dr.sincos(radius / values.sclera.radius)
-            row, column = _globe_place(far_cosine * n + far_sine * (cosine * across + sine * up))
-            return straight.at(row, column, _level(_FOOTPRINT * radius, cell)), at
-
-        spread = _Rings.of(length_mm).mean((mi.Float(0) * n.x,), step)
-        cells = np.zeros(_SIDE * _SIDE, np.float32)
-        cells[grid.between] = spread.numpy()
-        out.fill(cells)
-        return out
+        return grid.spread(cells, self.values.sclera.radius, length_mm)
 
     def _on_globe(self, index: mi.UInt32) -> mi.Float:
         """Irradiance of cells of the grid over the globe straight from the lamps."""
@@ -354,7 +329,7 @@ class _Maker:
 
 
 @dataclass(frozen=True, slots=True)
-class _SheetGrid:
+class SheetGrid:
     """The grid over a posed sheet of skin.
 
     Attributes:
@@ -371,14 +346,14 @@ class _SheetGrid:
     metric: mi.Float
 
     @classmethod
-    def of(cls, posed: RegionMesh, job: RenderJob, spare_mm: float, spare_px: int) -> _SheetGrid:
+    def of(cls, posed: RegionMesh, job: RenderJob, spare_mm: float, spare_px: int) -> SheetGrid:
         """Make the grid of a pose; what matters is shown in the window or is so close that its light gets there."""
         texels = SHEET_ROWS // ROWS
-        edges = sheet_place(np.arange(ROWS + 1) * texels - 0.5)
+        edges = sheet_place(np.arange(ROWS + 1.0) * texels - 0.5)
         sheet = posed.vertices[: posed.layout.vertex_ends[0]].reshape(-1, SHEET_COLUMNS, 3)[:, :-1]
         near = _in_window(sheet + job.anchor_mm, job, spare_mm, spare_px)
         sheet = sheet.astype(np.float32)
-        middle = sheet_place((np.arange(ROWS) + 0.5) * texels - 0.5)
+        middle = sheet_place((np.arange(ROWS, dtype=float) + 0.5) * texels - 0.5)
         i = np.minimum(middle.astype(int), len(sheet) - 2)
         share = (middle - i).astype(np.float32)
         x = sheet[i] + share[:, None, None] * (sheet[i + 1] - sheet[i])
@@ -395,7 +370,20 @@ class _SheetGrid:
             cells = np.zeros(1, dtype=np.int64)
         return cls(cells, _numbers(cells), *(mi.Float(aligned(t.astype(np.float32).ravel())) for t in (edges, metric)))
 
-    def whole(self, values: mi.Float) -> Floats:
+    def spread(self, irradiance: Singles, length_mm: float) -> Pyramid:
+        """What leaves the skin of the light that falls on it (ROWS, COLUMNS)."""
+        straight, out = Pyramid(ROWS, COLUMNS, True), Pyramid(ROWS, COLUMNS, True)
+        straight.fill(irradiance)
+
+        def read(place: mi.Vector4f, distance: mi.Float, row: mi.Float, column: mi.Float) -> tuple[mi.Float, ...]:
+            row, column, cell = self.step(row, column, place.z, place.w)
+            return straight.at(row, column, _level(_FOOTPRINT * distance, cell)), row, column
+
+        start = mi.Float(self.sent // COLUMNS), mi.Float(self.sent % COLUMNS)
+        out.fill(self.whole(_Places.of(length_mm).mean(start, read)))
+        return out
+
+    def whole(self, values: mi.Float) -> Singles:
         """Numbers (ROWS, COLUMNS) of all cells, 0 for those that do not matter."""
         out = np.zeros(ROWS * COLUMNS, np.float32)
         out[self.cells] = values.numpy()
@@ -419,14 +407,15 @@ class _SheetGrid:
 
 
 @dataclass(frozen=True, slots=True)
-class _GlobeGrid:
+class GlobeGrid:
     """Cells of the grid over the globe: those between the lids, and those under the lids whose light gets there."""
 
     between: Ints
     under: Ints
 
     @classmethod
-    def of(cls, posed: RegionMesh, globe: Globe, reach_mm: float) -> _GlobeGrid:
+    def of(cls, posed: RegionMesh, globe: Globe, reach_mm: float) -> GlobeGrid:
+        """Make the grid of a pose; light gets as far as `reach_mm` from under a lid."""
         row, column = np.divmod(np.arange(_SIDE * _SIDE), _SIDE)
         a, b = ((k - 0.5 * (_SIDE - 1)) * (_WIDTH / _SIDE) for k in (column, row))
         centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
@@ -436,8 +425,29 @@ class _GlobeGrid:
         over = np.maximum(z - np.interp(y, upper[:, 1], upper[:, 2]), np.interp(y, lower[:, 1], lower[:, 2]) - z)
         beside = np.maximum(upper[0, 1] - y, y - upper[-1, 1])
         away = np.maximum(over, beside)
-        between = np.flatnonzero(away < _EDGE_MM)
-        return cls(between if between.size else np.zeros(1, dtype=np.int64), np.flatnonzero((away > 0) & (away < reach_mm)))
+        between, under = np.flatnonzero(away < _EDGE_MM), np.flatnonzero((away > 0) & (away < reach_mm))
+        return cls(*(cells if cells.size else np.zeros(1, dtype=np.int64) for cells in (between, under)))
+
+    def spread(self, irradiance: Singles, radius_mm: mi.Float, length_mm: float) -> Pyramid:
+        """What leaves the globe between the lids of the light that falls on it (side * side,)."""
+        straight, out = Pyramid(_SIDE, _SIDE, False), Pyramid(_SIDE, _SIDE, False)
+        straight.fill(irradiance)
+        index = _numbers(self.between)
+        start = mi.Float(index // _SIDE), mi.Float(index % _SIDE)
+        n = _globe_direction(*start)
+        across = dr.normalize(mi.Vector3f(-n.y, n.x, 0))
+        up = dr.cross(n, across)
+
+        def read(place: mi.Vector4f, distance: mi.Float, *_: mi.Float) -> tuple[mi.Float, ...]:
+            sine, cosine = dr.sincos(distance / radius_mm)
+            out = (sine / distance) * (place.x * across + place.y * up)
+            row, column = _globe_place(cosine * n + out)
+            return straight.at(row, column, _level(_FOOTPRINT * distance, _WIDTH / _SIDE * radius_mm)), row, column
+
+        cells = np.zeros(_SIDE * _SIDE, np.float32)
+        cells[self.between] = _Places.of(length_mm).mean(start, read).numpy()
+        out.fill(cells)
+        return out
 
 
 def _numbers(cells: Ints) -> mi.UInt32:

@@ -57,6 +57,7 @@ class View:
     albedo: mi.Float  # of the region's mesh, where there is one
     gloss: mi.Float  # likewise, and of the wet sclera
     received: mi.Vector4f  # of the region's mesh: what it receives from other surfaces (see `exchange`)
+    level: mi.Vector3f | None = None  # normal without the relief of skin in which light spreads
 
     @property
     def matte(self) -> mi.Bool:
@@ -265,13 +266,12 @@ def look_at_skin(
     """View of rays that meet places on triangles of an eye region, where `other`."""
     skin = region.surface(face, uv, other)
     view = _matte(values, skin.point, skin.normal, d, other)
-    return replace(view, albedo=skin.albedo, gloss=skin.gloss, received=skin.received)
+    level = _facing(values, skin.smooth, d) if values.structure.scattering else None
+    return replace(view, albedo=skin.albedo, gloss=skin.gloss, received=skin.received, level=level)
 
 
 def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector3f, other: mi.Bool) -> View:
     """View of matte points of the scene; normals are turned to the viewer."""
-    normal = values.vector_to_eye(facing)
-    normal = dr.select(dr.dot(normal, values.vector_to_eye(d)) > 0, -normal, normal)
     no, nothing = mi.Bool(False), mi.Float(0)
     return View(
         cornea=no,
@@ -279,7 +279,7 @@ def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector
         other=other,
         distance=nothing,
         point=values.point_to_eye(point),
-        normal=dr.normalize(normal),
+        normal=_facing(values, facing, d),
         opacity=mi.Float(1),
         mirrored=nothing,
         passed=nothing,
@@ -290,6 +290,12 @@ def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector
         gloss=mi.Float(_WET),
         received=mi.Vector4f(0),
     )
+
+
+def _facing(values: Values, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
+    """Normals (eye frame) turned to the viewer; normals and rays are given in the scene's frame."""
+    normal = values.vector_to_eye(normal)
+    return dr.normalize(dr.select(dr.dot(normal, values.vector_to_eye(d)) > 0, -normal, normal))
 
 
 def _refracted(

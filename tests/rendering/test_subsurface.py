@@ -1,0 +1,129 @@
+"""Light inside skin and sclera: even light stays even, shadows have the edges of the theory, lids let light through."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eyerender.optics import diffusion
+from eyerender.region.anatomy import Brow, Lashes, Region, Skin
+from tests.optics.test_diffusion import edge
+from tests.support import render_rigs as rigs
+
+pytestmark = pytest.mark.render
+
+BARE = Region(
+    seed=3,
+    lashes=Lashes(upper_count=0, lower_count=0),
+    brow=Brow(count=0),
+    skin=Skin(sheen=0.0, relief_mm=0.0, wrinkles=0.0, pores=0.0),
+)
+
+
+def job(name: str = "remote", pose=(0.0, 0.0), **options):
+    rig = rigs.RIGS[name]()
+    return rigs.job_of(rigs.eye_of("E2"), rig, rig.window(320, 240), pose, labels=False, **options)
+
+
+def grids(renderer, bound):
+    """Grids over skin and globe of a job's frame, and the middles (mm, scene's frame) of their cells."""
+    import mitsuba as mi
+
+    from eyerender.rendering import subsurface as light
+    from eyerender.rendering.frame import globe_of
+    from eyerender.rendering.region import GRID_COLUMNS, GRID_ROWS, SHEET_COLUMNS
+
+    shown, place = renderer.bind(bound)
+    sheet = light.SheetGrid.of(place.posed, bound, 100.0, 0)
+    row, column = sheet.sent // GRID_COLUMNS, sheet.sent % GRID_COLUMNS
+    across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / GRID_COLUMNS)
+    x, _ = place.skin.sheet_point(sheet.vertex_row(row, mi.Float(0.5)), across)
+    on_sheet = np.zeros((GRID_ROWS * GRID_COLUMNS, 3), np.float32)
+    on_sheet[sheet.cells] = x.numpy().T
+    globe = light.GlobeGrid.of(place.posed, globe_of(bound.eye, bound.M, bound.t - bound.anchor_mm), 8.0)
+    n = light._globe_direction(*(mi.Float(k) for k in np.divmod(np.arange(light._SIDE**2), light._SIDE)))
+    on_globe = float(bound.eye.sclera.radius_mm) * n.numpy().T
+    return sheet, on_sheet.reshape(GRID_ROWS, GRID_COLUMNS, 3), globe, on_globe, shown.values.sclera.radius
+
+
+def cells(pyramid, rows: int, columns: int) -> np.ndarray:
+    import mitsuba as mi
+
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    return pyramid.at(mi.Float(row), mi.Float(column), 0).numpy().reshape(rows, columns)
+
+
+def test_even_light_stays_even(renderer):
+    sheet, at, globe, _, radius = grids(renderer, job(region=BARE))
+    out = cells(sheet.spread(np.ones(at.shape[:2], np.float32), 0.7), *at.shape[:2]).ravel()
+    assert len(sheet.cells) > 0.9 * out.size
+    assert out[sheet.cells] == pytest.approx(1.0, abs=1e-5)
+    side = 192
+    out = cells(globe.spread(np.ones(side * side, np.float32), radius, 0.4), side, side).ravel()
+    assert out[globe.between] == pytest.approx(1.0, abs=1e-5)
+
+
+def lit_share(away: np.ndarray, width: np.ndarray | float) -> np.ndarray:
+    """Share of cells of a width that is lit, at a distance from the edge of a shadow."""
+    return np.clip(away / np.maximum(width, 1e-6) + 0.5, 0, 1).astype(np.float32)
+
+
+def test_shadow_edges_have_their_shape_on_skin_and_globe(renderer):
+    sheet, at, globe, on_globe, radius = grids(renderer, job(region=BARE))
+    # The edge of a shadow runs up and down the cheek and the lower lid, and up and down the sclera.
+    away, along = at[..., 1] - 2.0, np.gradient(at, axis=1)
+    level = np.abs(along[..., 1]) / np.maximum(np.linalg.norm(along, axis=-1), 1e-6) > 0.95
+    known = np.zeros(away.size, bool)
+    known[sheet.cells] = True
+    near = level & known.reshape(away.shape) & (np.abs(away) < 2.5) & (at[..., 2] < -9.0) & (at[..., 2] > -14.0)
+    assert near.sum() > 300
+    lit = lit_share(away, np.abs(along[..., 1]))
+    out = cells(sheet.spread(lit, 0.65), *away.shape)[near]
+    # Six rings of six places are good to 0.017 on a plane; the rows of cells are bent and of unequal width.
+    worst = np.abs(out - edge(away[near], 0.65)).max()
+    assert worst < 0.03
+    side = 192
+    away = on_globe[:, 1] - 1.0
+    inside = np.zeros(side * side, bool)
+    inside[globe.between] = True
+    inside &= np.abs(away) < 2.0
+    assert inside.sum() > 500
+    out = cells(globe.spread(lit_share(away, 0.16), radius, 0.38), side, side).ravel()[inside]
+    worst = np.abs(out - edge(away[inside], 0.38)).max()
+    assert worst < 0.03
+
+
+@pytest.mark.parametrize("name", ["remote", "head"])
+def test_smooth_skin_and_sclera_reflect_as_much_as_before(renderer, name):
+    spread = job(name, region=BARE)
+    matte = replace(spread, look=spread.look.model_copy(update={"scattering": None}))
+    soft, hard = (renderer.radiance(j, spp=4) for j in (spread, matte))
+    part = renderer.labels(spread).part
+    edges = np.s_[:20, :], np.s_[-20:, :]  # forehead or upper lid, and cheek
+    if name == "remote":
+        for skin in edges:
+            assert soft[skin].sum() == pytest.approx(hard[skin].sum(), rel=0.01)
+    # Near the lids the sclera loses light to what lies under them.
+    assert 0.9 * hard[part == 1].sum() < soft[part == 1].sum() < hard[part == 1].sum()
+    assert soft[part == 2].sum() == pytest.approx(hard[part == 2].sum(), rel=2e-3)
+    # Shadows are softer: the sum of squared differences of neighbours is smaller.
+    assert np.square(np.diff(soft, axis=0)).sum() < np.square(np.diff(hard, axis=0)).sum()
+
+
+def test_shut_lids_transmit_light(renderer):
+    import mitsuba as mi
+
+    shut = job("remote", region=BARE.model_copy(update={"blink": 1.0}))
+    shown, place = renderer.bind(shut)
+    assert shown.textures.tissues is not None
+    upper = place.posed.upper_margin
+    up = upper[np.argmin(np.abs(upper[:, 1]))]  # where the lids meet before the eye
+    inside = float(shown.textures.tissues.on_globe(mi.Vector3f(*(float(v) for v in up))).numpy()[0])
+    lamp = shut.lights[0]
+    way = lamp.position_mm - up
+    outside = lamp.intensity_mw_sr / float(way @ way)  # more than what falls on the slope of the lid
+    # The lids are 2 to 3.5 mm thick there.
+    k = diffusion.transmitted(BARE.skin.albedo, 2.04)
+    assert 0.5 * np.exp(-3.5 * k) < inside / outside < np.exp(-2.0 * k)
