@@ -9,7 +9,6 @@ pixels to spare.
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
 from ..arrays import Bools, Floats
 from ..region.mesh import HAIRS, RegionMesh
@@ -64,15 +63,24 @@ def fine_pixels(region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Flo
         z = (curve + anchor_mm - camera.nodal_point_mm) @ camera.R[2]
         if not curve.size or z.min() < _NEAREST_MM or _HAIR_MM * float(camera.K[0, 0]) > _THICK_PX * z.min():
             continue
-        xy = camera.project(curve + anchor_mm)[0]
-        start, way = xy[:, :-1].reshape(-1, 2), np.diff(xy, axis=1).reshape(-1, 2)
-        count = np.ceil(np.linalg.norm(way, axis=1) / _FINE_STEP_PX).astype(int) + 1
-        which = np.repeat(np.arange(len(count)), count)
-        share = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)) / count[which]
-        at = np.rint(start[which] + share[:, None] * way[which]).astype(int) - (x0 - 1, y0 - 1)
-        at = at[np.all((at >= 0) & (at < (width + 2, height + 2)), axis=1)]
-        marked[at[:, 1], at[:, 0]] = True
-    return np.asarray(ndimage.binary_dilation(marked)[1:-1, 1:-1])
+        xy = camera.project(curve + anchor_mm)[0] - (x0 - 1, y0 - 1)
+        ends = np.stack([xy[:, :-1], xy[:, 1:]], axis=-2).reshape(-1, 2, 2)
+        # Pieces beside the window need no points.
+        near = (ends.max(axis=1) > -1) & (ends.min(axis=1) < (width + 3, height + 3))
+        ends = ends[near[:, 0] & near[:, 1]]
+        start, way = ends[:, 0], ends[:, 1] - ends[:, 0]
+        count = np.ceil(np.hypot(way[:, 0], way[:, 1]) / _FINE_STEP_PX).astype(int) + 1
+        step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        column, row = (
+            np.rint(np.repeat(start[:, k], count) + step * np.repeat(way[:, k] / count, count)).astype(int)
+            for k in (0, 1)
+        )
+        inside = (column >= 0) & (column < width + 2) & (row >= 0) & (row < height + 2)
+        marked[row[inside], column[inside]] = True
+    out = marked[1:-1, 1:-1].copy()
+    for beside in (marked[:-2, 1:-1], marked[2:, 1:-1], marked[1:-1, :-2], marked[1:-1, 2:]):
+        out |= beside
+    return out
 
 
 def _pieces(xy: Floats, shape: tuple[int, int]) -> Floats:
