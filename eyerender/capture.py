@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from .eye.pose import Poses, rigid_motion
 from .eye.refraction import at_cornea_d
 from .imagefile import MAX_PIXELS, compressed
 from .observation import EYES
-from .progress import Progress, followed
+from .progress import Progress, followed_by, one_behind
 from .rig.camera import Window
 from .scene import Frames, Scene
 
@@ -99,15 +100,28 @@ def render_windows(
     check_windows(scene)
     if renderer is None:
         renderer = make_renderer(backend, threads)
-    for row in followed(range(len(frames)), progress):
-        job = render_job(frames, row)
-        done = renderer.render(job, spp=scene.spec.image.spp, moments=moments(frames, row, job))
+    images = (begun.image() for begun in one_behind(begin_windows(frames, renderer)))
+    yield from followed_by(images, len(frames), progress)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BegunImage:
+    """A row of `frames` that has been traced by `job`; a second thread makes its image."""
+
+    frames: Frames
+    row: int
+    job: RenderJob
+    made: Future[RenderedWindow]
+
+    def image(self) -> EyeImage:
+        """Wait for the image."""
+        done, job = self.made.result(), self.job
         assert done.labels is not None
-        yield EyeImage(
-            frame=frames.take([row]),
-            row=row,
+        return EyeImage(
+            frame=self.frames.take([self.row]),
+            row=self.row,
             window=done.window,
-            counts=stored(scene, done.dn),
+            counts=stored(self.frames.scene, done.dn),
             irradiance=done.irradiance,
             parts=done.labels.part,
             eye=job.eye,
@@ -115,6 +129,22 @@ def render_windows(
             t=job.t,
             rendered=done,
         )
+
+
+def begin_windows(frames: Frames, renderer: Renderer) -> Iterator[BegunImage]:
+    """Trace the rows of `frames` in order; their images are made in a second thread, beside the tracing of the next.
+
+    Raises:
+        InputError: the scene's windows cannot be rendered.
+    """
+    check_windows(frames.scene)
+    spp = frames.scene.spec.image.spp
+    after = render_job(frames, 0) if len(frames) else None
+    for row in range(len(frames)):
+        assert after is not None
+        job, after = after, render_job(frames, row + 1) if row + 1 < len(frames) else None
+        made = renderer.begin(job, spp=spp, moments=moments(frames, row, job), after=after)
+        yield BegunImage(frames, row, job, made)
 
 
 def render_job(frames: Frames, row: int) -> RenderJob:

@@ -18,6 +18,26 @@ def followed(items: Sequence[T], progress: Progress | None) -> Iterator[T]:
     return followed_by(items, len(items), progress)
 
 
+def one_behind(items: Iterable[T]) -> Iterator[T]:
+    """Yield items, each after the next has been fetched, so that what was begun for it goes on meanwhile.
+
+    Where fetching fails, the item before is still yielded first.
+    """
+    held: list[T] = []
+    rest = iter(items)
+    while True:
+        try:
+            item = next(rest)
+        except StopIteration:
+            break
+        except Exception:
+            yield from held
+            raise
+        yield from held
+        held = [item]
+    yield from held
+
+
 def followed_by(items: Iterable[T], total: int, progress: Progress | None) -> Iterator[T]:
     """Yield `total` items that come one by one, and report like `followed`."""
     if progress is not None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +11,10 @@ from numpy.typing import NDArray
 
 from ..arrays import Bytes
 from ..backends.choose import BackendChoice
-from ..capture import EyeImage, make_renderer, noiseless, render_windows
+from ..capture import BegunImage, EyeImage, begin_windows, make_renderer, noiseless
 from ..labels import image_labels
 from ..plausibility import is_saturated
+from ..progress import one_behind
 from .line import image_line
 from .plan import Plan
 from .realise import Realised, Rejection, realise
@@ -54,6 +56,7 @@ class Maker:
         self.plan = plan
         self.frames = frames
         self.renderer: Renderer = make_renderer(backend, threads)
+        self._beside = ThreadPoolExecutor(1, "sample")
 
     @property
     def backend(self) -> dict[str, Any]:
@@ -63,13 +66,22 @@ class Maker:
 
     def make(self, index: int) -> MadeSample:
         """Make sample `index` with its images."""
-        found = realise(self.plan, index, self.frames)
-        return MadeSample(index, tuple(self._images(found)), found.rejections)
+        return self._begun(index).result()
 
-    def _images(self, found: Realised) -> Iterator[MadeImage]:
-        if found.frames is None or found.observations is None:
-            return
-        for image in render_windows(found.frames, renderer=self.renderer):
+    def make_all(self, indices: Iterable[int]) -> Iterator[MadeSample]:
+        """Make samples in order. What is left to do for one besides tracing is done while the next is traced."""
+        for begun in one_behind(self._begun(index) for index in indices):
+            yield begun.result()
+
+    def _begun(self, index: int) -> Future[MadeSample]:
+        """Trace a sample's frames; a second thread makes the rest."""
+        found = realise(self.plan, index, self.frames)
+        begun = () if found.frames is None else tuple(begin_windows(found.frames, self.renderer))
+        return self._beside.submit(lambda: MadeSample(index, tuple(self._images(found, begun)), found.rejections))
+
+    def _images(self, found: Realised, begun: tuple[BegunImage, ...]) -> Iterator[MadeImage]:
+        for image in (b.image() for b in begun):
+            assert found.observations is not None
             labels = image_labels(image, found.observations)
             name, line = image_line(found, image.row, self.frames, image.window, labels)
             kinds = self.plan.spec.labels.pictures

@@ -108,11 +108,10 @@ def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int
         (stage / "shard").mkdir()
         count, saturated, rejections, given_up = 0, 0, [], []
         with open(stage / "shard" / LINES, "w", encoding="utf-8") as lines, Writer() as writer:
-            for k, index in enumerate(samples):
-                made = maker.make(index)
+            for k, made in enumerate(maker.make_all(samples)):
                 rejections += [asdict(r) for r in made.rejections]
                 if not made.images:
-                    given_up.append(index)
+                    given_up.append(made.index)
                 for image in made.images:
                     names = _write_image(writer, stage, shard, image)
                     lines.write(json.dumps({"schema": IMAGE_SCHEMA, **names, **image.line}, allow_nan=False) + "\n")

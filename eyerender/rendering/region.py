@@ -8,8 +8,9 @@ appearance of a hit is read from buffers of our own (`SkinGeometry`), so kernels
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -35,12 +36,17 @@ _ROUGH_SKIN, _ROUGH_WET = 0.19, 0.04
 _RIPPLE = 0.032  # slope of wet tissue
 
 
+Expected: TypeAlias = tuple[Region, Globe, "Future[RegionMesh]"]
+"""A region about a globe, and its mesh, which another thread makes."""
+
+
 class RegionScene:
     """The Mitsuba scene of one subject's eye region; `show` moves it."""
 
     obstructed = True
     parts: tuple[str, ...] = PARTS
     moving = 3  # the first parts, which the eye moves
+    expected: Expected | None = None
 
     def __init__(self, spec: Region, globe: Globe) -> None:
         posed = self._posed(spec, globe)
@@ -75,7 +81,9 @@ class RegionScene:
     def show(self, spec: Region, globe: Globe) -> RegionMesh:
         """Move lids and lashes to a pose and a blink."""
         if self._shown != (spec, globe):
-            posed = self._posed(spec, globe)
+            expected, self.expected = self.expected, None
+            known = expected is not None and expected[:2] == (spec, globe)
+            posed = expected[2].result() if expected is not None and known else self._posed(spec, globe)
             if posed is not self.posed:
                 self._move(posed)
             self._shown = (spec, globe)

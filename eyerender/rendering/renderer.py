@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import ArrayValue, Floats, Singles, frozen
-from ..errors import InputError
+from ..arrays import Floats, Singles
 from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
-from ..rig import defocus, exposure, psf, stray
-from ..rig.camera import Window
+from ..rig import psf
 from .blur import Blur
 from .film import Exposed, mean_parts, mean_radiance
 from .frame import RenderJob
-from .glints import GlintTable
 from .integrator import integrator_class
 from .labels import PartLabels, depths_mm, part_labels
 from .lighting import through_cornea
@@ -28,40 +24,12 @@ from .region import RegionScene
 from .splat import add_glints
 from .stage import Stage
 from .surround import Obstacle, Surround
+from .window import RenderedWindow, Traced
 
 if TYPE_CHECKING:
     from ..backends.choose import Backend
 
 __all__ = ["BACKGROUND", "FRAME", "IRIS", "PUPIL", "SCLERA", "PartLabels", "RenderJob", "RenderedWindow", "Renderer"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RenderedWindow(ArrayValue):
-    """A rendered window.
-
-    Attributes:
-        window: (x0, y0, width, height) in full-sensor pixels.
-        irradiance: (height, width) W/m^2 of the sensor.
-        dn: (height, width) digital numbers of the sensor.
-        bit_depth: bits of `dn`.
-        labels: raster labels, if they were requested.
-        glints: the first images.
-        purkinje: (order, table) of the further mirror images that were requested.
-        failed_paths: number of light paths that did not converge; they are missing from the irradiance.
-        glint_reasons: for each glint, whether it is visible or what hides it.
-        lid_margins_px: landmarks along the lids, where there are any.
-    """
-
-    window: Window
-    irradiance: Singles
-    dn: NDArray[np.uint16]
-    bit_depth: int
-    labels: PartLabels | None
-    glints: GlintTable
-    purkinje: tuple[tuple[int, GlintTable], ...]
-    failed_paths: int
-    glint_reasons: tuple[str, ...] = ()
-    lid_margins_px: dict[str, list[list[float]]] | None = None
 
 
 class Renderer:
@@ -80,6 +48,7 @@ class Renderer:
         self.spp = spp
         self._integrator = integrator_class()()
         self._stage = Stage(obstacles)
+        self._beside = ThreadPoolExecutor(1, "develop")
 
     def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()) -> RenderedWindow:
         """Render one window.
@@ -93,6 +62,24 @@ class Renderer:
         Raises:
             InputError: numbers so extreme that the image is not finite.
         """
+        return self._traced(job, spp, moments, None).developed()
+
+    def begin(
+        self,
+        job: RenderJob,
+        *,
+        spp: int | None = None,
+        moments: Sequence[RenderJob] = (),
+        after: RenderJob | None = None,
+    ) -> Future[RenderedWindow]:
+        """Trace one window now, and develop it in a second thread, beside the tracing of the next.
+
+        The arguments are those of `render`. `after` is the job that comes next, if it is known: the mesh of its region
+        is made in the second thread, too. The results do not depend on it.
+        """
+        return self._beside.submit(self._traced(job, spp, moments, after).developed)
+
+    def _traced(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob], after: RenderJob | None) -> Traced:
         shots = moments or (job,)
         spp = max(1, (spp or self.spp) // len(shots))
         blur: Blur | None = None
@@ -100,6 +87,8 @@ class Renderer:
         pictures, glints, failed = [], np.zeros((job.window[3], job.window[2])), 0
         for shot in shots:
             shown, place = self.bind(shot)
+            if after is not None and shot is shots[-1] and not moments:
+                self._stage.expect(after, self._beside)
             blur = blur or Blur.of(job, place)
             picture, missed = self._pictures(shot, shown, blur, spp)
             pictures.append(picture)
@@ -109,36 +98,10 @@ class Renderer:
         if moments:
             shown, place = self.bind(job)
             mirrored = add_glints(job, place, np.zeros_like(glints), blur, front)
-        soft = blur.of_pictures(pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0))
-        picture = psf.blur(soft, job.sensor.psf_sigma_px) + glints / len(shots)
-        seen = (job.lens, job.camera, job.window)
-        picture = stray.framed(picture * defocus.vignette(job.lens, job.camera, job.window), *seen)
-        blurred = stray.scattered(picture, *seen)
-        irradiance = frozen(blurred * exposure.radiance_to_irradiance(job.sensor), np.float32)
-        if not np.all(np.isfinite(irradiance)):
-            raise InputError("the numbers of the scene are too extreme: its image is not finite")
-        # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
-        dn = exposure.recorded(
-            job.sensor, job.camera, job.window, irradiance.astype(float), job.wavelength_nm, job.seed
-        )
         margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
         labels = part_labels(shown, job.window) if job.labels else None
-        covered = stray.covered(job.lens, job.sensor, job.camera, job.window)
-        if covered is not None:
-            labels = labels.behind(covered) if labels is not None else None
-            mirrored = mirrored.behind(covered, job.window)
-        return RenderedWindow(
-            job.window,
-            irradiance,
-            frozen(dn, np.uint16),
-            job.sensor.bit_depth,
-            labels,
-            mirrored.glints,
-            mirrored.others,
-            failed,
-            mirrored.reasons,
-            margins,
-        )
+        radiance = pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0)
+        return Traced(job, radiance, glints / len(shots), blur, mirrored, labels, failed, margins)
 
     def _pictures(self, job: RenderJob, shown: Exposed, blur: Blur, spp: int) -> tuple[Floats, int]:
         """Radiance of a window, or its parts, with the border that the lens needs, and failed light paths."""

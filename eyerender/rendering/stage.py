@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from ..arrays import Bools, frozen
 from ..errors import InputError
+from ..region.mesh import region_mesh
 from ..rig import psf
 from ..rig.camera import Window
 from ..rig.imaging import Ambient
@@ -38,7 +40,7 @@ from .mattelight import MatteLight
 from .meshed import Meshes, meshed
 from .plain import fine_pixels, plain_tiles
 from .pupillight import PupilLight
-from .region import RegionScene
+from .region import Expected, RegionScene
 from .subsurface import TissueLight, tissue_light
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
@@ -59,6 +61,14 @@ class Stage:
         self._maps = Maps()
         self.meshes = Meshes()
         self._exchange = Exchange()
+        self._expected: Expected | None = None
+
+    def expect(self, job: RenderJob, beside: Executor) -> None:
+        """Have the mesh made that the region of a later job needs."""
+        if job.region is None or job.region.head is not None:
+            return
+        globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
+        self._expected = job.region, globe, beside.submit(region_mesh, job.region, globe)
 
     def set(self, job: RenderJob, *, lit: bool = True) -> tuple[Exposed, Surround | RegionScene]:
         """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call.
@@ -127,6 +137,7 @@ class Stage:
                 self._regions.pop(next(iter(self._regions)))
             self._regions[key] = place_scene(job.region, globe)
         place = self._regions[key]
+        place.expected, self._expected = self._expected, None
         place.show(job.region, globe)
         return place
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from eyerender.capture import make_renderer, noiseless, render_windows
+from eyerender.capture import make_renderer, noiseless, render_job, render_windows
 from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.imagefolder import FRAME, IMAGE_SCHEMAS, PUPIL, ImageFolder
@@ -53,6 +53,33 @@ def scene(poses=((0.0, 0.0),), **fields):
 def picture(renderer, **fields):
     (image,) = render_windows(scene(**fields).frames(), renderer=renderer)
     return image
+
+
+def test_windows_that_overlap_are_those_rendered_one_by_one(renderer):
+    fields = {"region": {"seed": 3}, "lens": {"glare": 0.02}}
+    frames = scene([(0.0, 0.0), (9.0, -4.0), (-6.0, 5.0)], **fields).frames()
+    together = list(render_windows(frames, renderer=renderer))
+    for image in together:
+        alone = renderer.render(render_job(frames, image.row), spp=4)
+        assert np.array_equal(image.rendered.dn, alone.dn)
+        assert np.array_equal(image.parts, alone.labels.part)
+        np.testing.assert_array_equal(image.rendered.glints.xy_px, alone.glints.xy_px)
+
+
+def test_an_image_before_one_that_fails_is_still_given(renderer, monkeypatch):
+    frames, trace, traced = scene([(0.0, 0.0), (9.0, -4.0)]).frames(), renderer._traced, list[object]()
+
+    def failing(job, *rest):
+        if traced:
+            raise InputError("broken")
+        traced.append(job)
+        return trace(job, *rest)
+
+    monkeypatch.setattr(renderer, "_traced", failing)
+    images = render_windows(frames, renderer=renderer)
+    assert next(images).row == 0
+    with pytest.raises(InputError, match="broken"):
+        next(images)
 
 
 def test_an_edge_darkens_the_picture_and_has_its_own_class(renderer):
