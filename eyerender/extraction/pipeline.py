@@ -113,7 +113,7 @@ def explained(prepared: Prepared, found: Found, settings: ExtractionSettings) ->
         pixel_fit, fit = _refined(prepared, found, spots, fit)
         model = model if pixel_fit is None else pixel_fit.model
         pupil = pupil_of(found, pixel_fit, settings)
-        if not pupil.ok and pixel_fit is not None and found.confidence >= SURE:
+        if pixel_fit is not None and pupil.confidence < min(found.confidence, SURE):
             model, pupil = found.model, pupil_of(found, None, settings)  # the edges are more certain than the pixels
     if not pupil.ok:
         return Extraction(pupil, (), (), noise, size)

@@ -34,6 +34,9 @@ class Goodness:
         refined: whether the ellipse comes from the pixel model.
         leverage: standard deviation of the boundary, averaged along it, if every sixteenth of the visible outline were
             displaced independently by 1 px: 0.5 to 0.6 for a whole outline, 5 and more for a short arc.
+        open: share of the outline without edge points that is dark on both sides, as no boundary is.
+        beyond: edge points outside the ellipse, per point that it fits.
+        within: edge points inside it, per point that it fits.
     """
 
     support: float
@@ -50,6 +53,9 @@ class Goodness:
     uneven_px: float
     refined: bool
     leverage: float
+    open: float = 0.0
+    beyond: float = 0.0
+    within: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

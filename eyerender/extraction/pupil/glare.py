@@ -15,6 +15,7 @@ import numpy as np
 from ...arrays import Bools
 from ...geometry.ellipse import Ellipse
 from ..preprocessing import Image, as_image
+from .edge_model import Place
 
 # A glint is brighter than the iris by this share of the step and stands out of its surroundings by that share of it.
 # The texture of an iris reaches a third of the step.
@@ -55,6 +56,22 @@ class Cleared:
             part = (slice(y0 - y, y1 - y), slice(x0 - x, x1 - x))
             crop[to], hidden[to] = self.patch[part], self.mask[part]
         return crop, hidden
+
+    def levels(self, ellipse: Ellipse, away_px: float, count: int) -> Image:
+        """Levels (count,) at the pixels `away_px` outside an ellipse, in the middle of each of `count` sectors."""
+        place = Place.middles(ellipse, count)
+        cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+        normal = np.stack([place.nx * cos - place.ny * sin, place.nx * sin + place.ny * cos], axis=-1)
+        x, y = np.rint(ellipse.points_at(place.cos_t, place.sin_t) + away_px * normal).astype(np.intp).T
+        height, width = self.linear.shape
+        x, y = np.minimum(np.maximum(x, 0), width - 1), np.minimum(np.maximum(y, 0), height - 1)
+        out = self.linear[y, x]
+        if self.patch is None:
+            return out
+        column, row = x - self.corner[0], y - self.corner[1]
+        here = (column >= 0) & (row >= 0) & (column < self.patch.shape[1]) & (row < self.patch.shape[0])
+        out[here] = self.patch[row[here], column[here]]
+        return out
 
     def doubled(self, linear: Image) -> Cleared:
         """The same at twice the scale, of the image `linear` at that scale."""

@@ -174,7 +174,9 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, Found | str
     yield from ((False, one) for one in bounded(find_candidates(work, usual)))
     likely = sorted((one for one in found if one.core_dn <= 0.0), key=lambda one: -one.confidence)[:MOST_CUT]
     for one in likely:
-        yield from ((True, replace(one, boundary=boundary)) for boundary in _without_stretch(one, shape))
+        for cut in _without_stretch(one, shape):
+            yield True, replace(one, boundary=cut)
+            yield from ((True, found) for found in bounded([replace(one.candidate, ellipse=cut.ellipse)]))
     yield from ((True, one) for one in bounded(list(_rounder(_best(tried), shape))))
     if not work.inverted:
         yield from ((True, one) for one in bounded(_best(find_candidates(work, usual, spot_px=TOUCHING_PX))))
