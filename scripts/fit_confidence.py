@@ -29,16 +29,17 @@ from scipy.optimize import minimize
 import hard_eyes
 import make_ideal_images as ideal
 from eyerender.extraction import ExtractionSettings
-from eyerender.extraction.pipeline import explained
+from eyerender.extraction.pipeline import pixel_fit
 from eyerender.extraction.preprocessing import prepare
 from eyerender.extraction.pupil import scoring, search
-from eyerender.extraction.pupil.scoring import FEATURES, TABLE, design, features
+from eyerender.extraction.pupil.scoring import FEATURES, TABLE, design, features, goodness_of, scale_design
 from eyerender.extraction.settings import Shape
 from eyerender.geometry.ellipse import Ellipse, iou
 
 Array = NDArray[np.float64]
 METHODS: tuple[Literal["fast", "refined"], ...] = ("fast", "refined")
 PRIOR_VARIANCE = 20.0
+TAILS = 4.0  # degrees of freedom
 FOLDS = 10
 REFINED_OF_IMAGE = 3  # hypotheses of an image to which the pixel model is fitted
 HARD = ("ring-light", "jpeg", "grey-pupil", "any-size", "eight-glints")
@@ -49,12 +50,15 @@ Task = tuple[str, int]
 class Observed:
     """All hypotheses of one image: features by each method (n, f), which are right, late, or with a dark core.
 
-    `refined` are the numbers of those to which the pixel model was fitted.
+    `refined` are the numbers of those to which the pixel model was fitted. `away` is the squared distance from the true
+    centre in standard deviations.
     """
 
     fast: list[Array] = field(default_factory=list)
     pixel: list[Array] = field(default_factory=list)
     refined: list[int] = field(default_factory=list)
+    away: list[float] = field(default_factory=list)
+    away_refined: list[float] = field(default_factory=list)
     right: list[bool] = field(default_factory=list)
     right_refined: list[bool] = field(default_factory=list)
     late: list[bool] = field(default_factory=list)
@@ -93,18 +97,27 @@ def observe(task: Task, folder: Path) -> Observed:
             continue
         out.fast.append(features(found.boundary.ellipse, found.goodness))
         out.right.append(truth is not None and iou(found.boundary.ellipse, truth) > 0.9)
+        out.away.append(_away(found.boundary.ellipse, found.covariance, truth))
         out.late.append(late or found.core_dn > 0.0)
         out.core.append(found.core_dn > 0.0)
         boundaries.append(found)
-    # The right ones and the most visible ones: those that may be chosen.
-    order = sorted(range(len(boundaries)), key=lambda i: -boundaries[i].boundary.support)
+    # Those that may be chosen.
+    order = sorted(range(len(boundaries)), key=lambda i: -boundaries[i].confidence)
     for i in order[:REFINED_OF_IMAGE]:
-        pupil = explained(prepared, boundaries[i], rough).pupil
-        if pupil.ellipse is not None and pupil.goodness is not None:
+        fit = pixel_fit(prepared, boundaries[i], rough)
+        if fit is not None:
             out.refined.append(i)
-            out.pixel.append(features(pupil.ellipse, pupil.goodness))
-            out.right_refined.append(truth is not None and iou(pupil.ellipse, truth) > 0.9)
+            out.pixel.append(features(fit.ellipse, goodness_of(boundaries[i], fit)))
+            out.right_refined.append(truth is not None and iou(fit.ellipse, truth) > 0.9)
+            out.away_refined.append(_away(fit.ellipse, fit.covariance, truth))
     return out
+
+
+def _away(ellipse: Ellipse, covariance: Array, truth: Ellipse | None) -> float:
+    if truth is None:
+        return math.nan
+    off = ellipse.centre_px - truth.centre_px
+    return float(off @ np.linalg.solve(covariance[:2, :2], off))
 
 
 def chosen(observed: Observed, logit: Array) -> int | None:
@@ -135,7 +148,7 @@ def fit(rows: Array, right: Array, group: Array, observed: list[Observed] | None
     for k in range(FOLDS):
         train = fold != k
         logit[~train] = columns[~train] @ _weights(columns[train], right[train], weight[train], PRIOR_VARIANCE)
-    told = np.arange(right.size)
+    told = np.flatnonzero(np.diff(group, prepend=-1))  # of the pixel model: the first of each image
     if observed is not None:
         first = np.concatenate([[0], np.cumsum([len(one.fast) for one in observed])])
         picks = [(k, chosen(one, logit[first[k] : first[k + 1]])) for k, one in enumerate(observed)]
@@ -144,6 +157,27 @@ def fit(rows: Array, right: Array, group: Array, observed: list[Observed] | None
     columns_of_bend = np.stack([np.ones_like(taken), taken, np.minimum(taken, 1.0)], axis=-1)
     bend = _weights(columns_of_bend, right[told], np.ones(told.size), math.inf)
     return low, high, _weights(columns, right, weight, PRIOR_VARIANCE), bend
+
+
+def scale_of(rows: Array, away: Array, low: Array, high: Array) -> Array:
+    """Weights of the covariance's factor f.
+
+    The squared distances of two coordinates in standard deviations are f times those of a Student distribution of 4
+    degrees of freedom, so that single large errors do not decide. Then f is multiplied so that it holds 68 %.
+    """
+    columns = scale_design(rows, low, high)
+
+    def cost(weights: Array) -> tuple[float, Array]:
+        ratio = away * np.exp(-columns @ weights) / TAILS
+        prior = np.concatenate([[0.0], weights[1:]]) / PRIOR_VARIANCE
+        value = np.sum(columns @ weights + (0.5 * TAILS + 1.0) * np.log1p(ratio)) + 0.5 * float(prior @ weights)
+        slope = 1.0 - (0.5 * TAILS + 1.0) * ratio / (1.0 + ratio)
+        return float(value), columns.T @ slope + prior
+
+    found = minimize(cost, np.zeros(columns.shape[1]), jac=True, method="L-BFGS-B", options={"maxiter": 5000})
+    weights = np.asarray(found.x)
+    weights[0] += math.log(float(np.quantile(away * np.exp(-columns @ weights), 0.68)) / (-2.0 * math.log(1.0 - 0.68)))
+    return weights
 
 
 def _weights(columns: Array, right: Array, weight: Array, variance: float) -> Array:
@@ -178,7 +212,10 @@ def table_of(observed: list[Observed]) -> str:
         )
         group = np.array([k for k, one in enumerate(observed) for _ in (one.fast if fast else one.pixel)])
         text.append(f'    "{method}": (')
-        text += [lines(values) for values in fit(rows, right, group, observed if fast else None)]
+        fitted = fit(rows, right, group, observed if fast else None)
+        away = np.array([value for one in observed for value in (one.away if fast else one.away_refined)])
+        some = (right > 0.5) & (design(rows, *fitted[:2]) @ fitted[2] > 0.0)
+        text += [lines(values) for values in (*fitted, scale_of(rows[some], away[some], *fitted[:2]))]
         text.append(f"    ),  # {right.size} hypotheses, {100 * right.mean():.1f} % of them right")
     return "\n".join([*text, "}  # fmt: skip", ""])
 
@@ -194,10 +231,11 @@ def main() -> None:
     if not 0 < options.count <= 10_000:
         raise SystemExit("error: --count: must be between 1 and 10,000 (the seeds for development)")
     options.rendered.mkdir(parents=True, exist_ok=True)
-    # The table of other features would not fit; extraction needs one to report a number.
+    # The table decides which hypotheses are likely. One of other features would not fit.
     size = len(FEATURES)
     for method in METHODS:
-        TABLE[method] = ((0.0,) * size, (1.0,) * size, (0.0,) * (1 + 3 * size), (0.0, 1.0, 0.0))
+        if len(TABLE[method][0]) != size:
+            TABLE[method] = ((0.0,) * size, (1.0,) * size, (0.0,) * (1 + 3 * size), (0.0, 1.0, 0.0), (0.0,) * (1 + size))
     tasks: list[Task] = [("mixed", seed) for seed in range(options.count)]
     tasks += [("no eye", seed) for seed in range(options.count // 6)]
     tasks += [(row, seed) for row in HARD for seed in range(options.count // 10)]

@@ -110,10 +110,10 @@ def explained(prepared: Prepared, found: Found, settings: ExtractionSettings) ->
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     spots, fit = _fit_spots(prepared, found, spots)
     if pupil is None:
-        pixel_fit, fit = _refined(prepared, found, spots, fit)
-        model = model if pixel_fit is None else pixel_fit.model
-        pupil = pupil_of(found, pixel_fit, settings)
-        if pixel_fit is not None and pupil.confidence < min(found.confidence, SURE):
+        pixels, fit = _refined(prepared, found, spots, fit)
+        model = model if pixels is None else pixels.model
+        pupil = pupil_of(found, pixels, settings)
+        if pixels is not None and pupil.confidence < min(found.confidence, SURE):
             model, pupil = found.model, pupil_of(found, None, settings)  # the edges are more certain than the pixels
     if not pupil.ok:
         return Extraction(pupil, (), (), noise, size)
@@ -121,6 +121,13 @@ def explained(prepared: Prepared, found: Found, settings: ExtractionSettings) ->
     large = bloomed_glints(prepared, model.ellipse, step)
     accepted, rejected = classify_spots(spots, fit, prepared, step, model.sigma_px, settings, large)
     return Extraction(pupil, accepted, rejected, noise, size)
+
+
+def pixel_fit(prepared: Prepared, found: Found, settings: ExtractionSettings) -> PixelFit | None:
+    """Fit the pixel model to a boundary; None where it contradicts the edges."""
+    model = found.model
+    spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
+    return _refined(prepared, found, *_fit_spots(prepared, found, spots))[0]
 
 
 def _refined(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[PixelFit | None, SpotFit]:
