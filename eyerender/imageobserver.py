@@ -38,8 +38,8 @@ from .scene.spec import SceneSpec
 # Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
 _PLACE_MM = 1.5
 _BATCH = 256
-# A process takes a second to start, as long as some thirty images take.
-LEAST_FOR_POOL = 32
+# A process takes 1 to 1.5 s to start. Two that share images of 20 ms gain that after 100 to 150.
+LEAST_FOR_POOL = 128
 
 
 @dataclass(frozen=True, slots=True)

@@ -235,7 +235,8 @@ def main() -> None:
     size = len(FEATURES)
     for method in METHODS:
         if len(TABLE[method][0]) != size:
-            TABLE[method] = ((0.0,) * size, (1.0,) * size, (0.0,) * (1 + 3 * size), (0.0, 1.0, 0.0), (0.0,) * (1 + size))
+            none = (0.0,) * size
+            TABLE[method] = (none, (1.0,) * size, (0.0,) * (1 + 3 * size), (0.0, 1.0, 0.0), (0.0, *none))
     tasks: list[Task] = [("mixed", seed) for seed in range(options.count)]
     tasks += [("no eye", seed) for seed in range(options.count // 6)]
     tasks += [(row, seed) for row in HARD for seed in range(options.count // 10)]

@@ -1,8 +1,8 @@
 """What the image shows along an ellipse where no edge points are, and edge points that it does not explain.
 
-A stretch of a pupil's outline without edge points is covered by a lid, lashes, or a reflection, few of which are as dark
-as the pupil. An ellipse that is too small or too far to one side has the pupil on both sides of its outline, and edge
-points beyond it.
+A stretch of a pupil's outline without edge points is covered by a lid, lashes, or a reflection, few of which are as
+dark as the pupil. An ellipse that is too small or too far to one side has the pupil on both sides of its outline, and
+edge points beyond it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from ...geometry.ellipse import Ellipse
 from .consensus import relative_to
-from .edge_model import SECTORS, Place, sector_of
+from .edge_model import NEAR, SECTORS, sectors_at
 
 if TYPE_CHECKING:
     from .search import Found
@@ -37,7 +37,9 @@ def outline_of(found: Found, ellipse: Ellipse) -> Outline:
     boundary, candidate, edges = found.boundary, found.candidate, found.edges
     b = float(ellipse.semi_axes_px[1])
     held = np.zeros(SECTORS, dtype=bool)
-    held[sector_of(Place.of(ellipse, *boundary.points_px.T))] = True
+    about = (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
+    x, y = np.ascontiguousarray(boundary.points_px.T)
+    held[sectors_at(about, x, y, NEAR)] = True
     away = min(1.5 * found.model.sigma_px + 1.0, 0.4 * b)
     inside, outside = (found.cleared.levels(ellipse, side * away, SECTORS) for side in (-1.0, 1.0))
     dark = candidate.inside_dn + DARK * candidate.step_dn

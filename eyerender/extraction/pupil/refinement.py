@@ -18,9 +18,9 @@ from .occlusion import clear_of_lids, visible_part
 # Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
 # side of the iris more, by a few hundredths of the step. Noise hides that from a test, but it shifts the centre.
 ORDERS = (1, 2, 4, 6, 8)
-# How far the band reaches beyond the boundary, in widths of the blur. Pixels farther out determine the outer level better,
-# but texture changes it with the distance. Where the reduced chi^2 shows texture, the narrower band moves the centre by a
-# fifth less on textured irises (rendered development images).
+# How far the band reaches beyond the boundary, in widths of the blur. Pixels farther out determine the outer level
+# better, but texture changes it with the distance. Where the reduced chi^2 shows texture, the narrower band moves the
+# centre by a fifth less on textured irises (rendered development images).
 WIDE, NARROW = 3.0, 1.5
 UNEXPLAINED = 1.5
 # Largest distance outside the boundary, px, however wide the blur: the light changes across the iris, and not linearly.
