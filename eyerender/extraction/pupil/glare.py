@@ -65,7 +65,7 @@ class Cleared:
         x, y = np.rint(ellipse.points_at(place.cos_t, place.sin_t) + away_px * normal).astype(np.intp).T
         height, width = self.linear.shape
         x, y = np.minimum(np.maximum(x, 0), width - 1), np.minimum(np.maximum(y, 0), height - 1)
-        out = self.linear[y, x]
+        out: Image = np.asarray(self.linear[y, x], dtype=np.float32)
         if self.patch is None:
             return out
         column, row = x - self.corner[0], y - self.corner[1]
