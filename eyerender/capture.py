@@ -131,8 +131,10 @@ class BegunImage:
         )
 
 
-def begin_windows(frames: Frames, renderer: Renderer) -> Iterator[BegunImage]:
+def begin_windows(frames: Frames, renderer: Renderer, *, highlights: bool = False) -> Iterator[BegunImage]:
     """Trace the rows of `frames` in order; their images are made in a second thread, beside the tracing of the next.
+
+    highlights: whether to find the highlights of wet and oily surfaces.
 
     Raises:
         InputError: the scene's windows cannot be rendered.
@@ -143,6 +145,7 @@ def begin_windows(frames: Frames, renderer: Renderer) -> Iterator[BegunImage]:
     for row in range(len(frames)):
         assert after is not None
         job, after = after, render_job(frames, row + 1) if row + 1 < len(frames) else None
+        job = replace(job, highlights=highlights)
         made = renderer.begin(job, spp=spp, moments=moments(frames, row, job), after=after)
         yield BegunImage(frames, row, job, made)
 

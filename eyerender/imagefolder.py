@@ -22,9 +22,10 @@ from .jsonlines import JsonLines
 from .observation import EYES, Observations, concatenate, count_heads
 from .rig.camera import Window
 
-IMAGE_SCHEMA = "eyerender/image/2"
-# Version 1 has neither `gamma` nor the class 4 of masks; it is read wherever version 2 is.
-IMAGE_SCHEMAS = (IMAGE_SCHEMA, "eyerender/image/1")
+IMAGE_SCHEMA = "eyerender/image/3"
+# Version 2 has no masks of highlights, version 1 neither `gamma` nor the class 4 of masks; they are read wherever
+# version 3 is.
+IMAGE_SCHEMAS = (IMAGE_SCHEMA, "eyerender/image/2", "eyerender/image/1")
 DATASET_SCHEMA = "eyerender/dataset/1"
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
 RUN = "run.json"  # in a folder that `generate` fills, from its start
@@ -47,7 +48,7 @@ CONVENTIONS = {
 
 
 # Keys of a line that name files of the folder.
-FILE_KEYS = ("file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name")
+FILE_KEYS = ("file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name", "highlight_mask_file_name")
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +124,10 @@ class ImageEntry:
     def amodal_mask(self) -> Bytes | None:
         """Read the mask of the eye without occluders; like `mask`."""
         return self._parts("amodal_mask_file_name")
+
+    def highlight_mask(self) -> Bytes | None:
+        """Read where wet and oily surfaces mirror a lamp (1, else 0); like `mask`."""
+        return self._parts("highlight_mask_file_name")
 
     def noiseless(self) -> NDArray[Any] | None:
         """Read the counts without the sensor's noise, like `image`; None where the line names no such file."""

@@ -34,11 +34,11 @@ _SIGNS = {
     "results.json": "eyerender/bench-extractors/",
 }
 _SIGN_BYTES = 2**30
-_FOLDERS = re.compile(r"(images/)?((images|masks|amodal_masks|noiseless|shards)(/[0-9]+)?)|images")
+_FOLDERS = re.compile(r"(images/)?((images|masks|amodal_masks|noiseless|highlights|shards)(/[0-9]+)?)|images")
 _FILES = re.compile(
     r"(images/)?("  # a study's images are a dataset of their own
     r"(dataset|run|croissant)\.json|(metadata|failures|log)\.jsonl|README\.md|report\.html|"
-    r"(images|masks|amodal_masks|noiseless)/([0-9]+/)?[^/]+\.(png|exr)|shards/[0-9]+/(lines\.jsonl|done\.json))"
+    r"(images|masks|amodal_masks|noiseless|highlights)/([0-9]+/)?[^/]+\.(png|exr)|shards/[0-9]+/(lines\.jsonl|done\.json))"
     r"|(study|summary|findings|results)\.json|(summary|findings|waterfall|results)\.csv|\.eyerender\.json"
 )
 # Names of files that are being written, with their final names.

@@ -8,6 +8,7 @@ Both datasets give an image as a mapping with the parts that are asked for:
 |---|---|
 | `image`, `noiseless` | float32 (1, h, w): linear counts as a share of the full scale, 0 to 1 |
 | `mask`, `amodal_mask` | int64 (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 what frames the view |
+| `highlight_mask` | int64 (h, w): 1 where wet and oily surfaces mirror a lamp |
 | `pupil`, `iris` | float32 (5,): ellipse of the amodal outline: x, y, a, b in px of the image, angle in rad; or nan |
 | `gaze` | float32 (3,): unit vector of the line of sight in the camera's frame, out of the eye |
 | `line` | the whole line of metadata, a dict |
@@ -45,7 +46,13 @@ Parts = Mapping[str, Any]
 Transform = Callable[[dict[str, Any]], Any]
 
 # Part -> kind of picture of a dataset.
-_PICTURES = {"image": "images", "noiseless": "noiseless", "mask": "masks", "amodal_mask": "amodal_masks"}
+_PICTURES = {
+    "image": "images",
+    "noiseless": "noiseless",
+    "mask": "masks",
+    "amodal_mask": "amodal_masks",
+    "highlight_mask": "highlights",
+}
 PARTS = (*_PICTURES, "pupil", "iris", "gaze", "line")
 _STATE = ("start", "batch_size", "lanes")  # what must be equal where a stream goes on
 
@@ -111,6 +118,7 @@ class FolderDataset(Dataset[Any]):
             "noiseless": entry.noiseless,
             "masks": entry.mask,
             "amodal_masks": entry.amodal_mask,
+            "highlights": entry.highlight_mask,
         }
         where = f"{self.folder.path / METADATA}: line {entry.number}"
         item = _item(self.parts, entry.line, lambda kind: pictures[kind](), where)
@@ -314,7 +322,7 @@ def _value(part: str, line: dict[str, Any], picture: Callable[[str], NDArray[Any
         pixels = picture(_PICTURES[part])
         if pixels is None:
             raise KeyError(_PICTURES[part])
-        if part in ("mask", "amodal_mask"):
+        if part.endswith("mask"):
             return torch.from_numpy(pixels.astype(np.int64))
         share = pixels.astype(np.float32)
         if pixels.dtype.kind == "u":

@@ -13,7 +13,7 @@ from PIL import Image
 
 from eyerender.errors import EyerenderError, InputError
 from eyerender.imagefile import Writer, png_bytes, preview, read_image, write_png
-from eyerender.imagefolder import ImageFolder, same_run, write_dataset
+from eyerender.imagefolder import FILE_KEYS, ImageFolder, same_run, write_dataset
 from eyerender.outfolder import staged
 
 
@@ -227,7 +227,7 @@ def test_hostile_lines_are_one_error(folder, text, words):
         list(ImageFolder.load(out).entries)
 
 
-@pytest.mark.parametrize("key", ["file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name"])
+@pytest.mark.parametrize("key", FILE_KEYS)
 @pytest.mark.parametrize("kind", ["link", "folder link", "pipe", "folder", "missing"])
 def test_only_regular_files_inside_the_folder_are_opened(folder, tmp_path, key, kind):
     out, change = folder

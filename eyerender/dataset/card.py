@@ -28,6 +28,7 @@ _LABELS = """\
 _MORE = {
     "amodal_masks": "\n- `amodal_mask_file_name`: the same without anything in front of the eye.",
     "noiseless": "\n- `noiseless_file_name`: the same rendering exposed without sensor noise.",
+    "highlights": "\n- `highlight_mask_file_name`: 1 where wet and oily surfaces mirror a lamp; these are no glints.",
 }
 
 

@@ -7,6 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bytes
@@ -76,7 +77,10 @@ class Maker:
     def _begun(self, index: int) -> Future[MadeSample]:
         """Trace a sample's frames; a second thread makes the rest."""
         found = realise(self.plan, index, self.frames)
-        begun = () if found.frames is None else tuple(begin_windows(found.frames, self.renderer))
+        highlights = self.plan.spec.labels.highlights
+        begun: tuple[BegunImage, ...] = ()
+        if found.frames is not None:
+            begun = tuple(begin_windows(found.frames, self.renderer, highlights=highlights))
         return self._beside.submit(lambda: MadeSample(index, tuple(self._images(found, begun)), found.rejections))
 
     def _images(self, found: Realised, begun: tuple[BegunImage, ...]) -> Iterator[MadeImage]:
@@ -95,9 +99,16 @@ def _amodal(image: EyeImage) -> Bytes:
     return labels.amodal
 
 
+def _highlights(image: EyeImage) -> Bytes:
+    found = image.rendered.highlights
+    assert found is not None
+    return found.astype(np.uint8)
+
+
 _PICTURES: dict[str, Callable[[EyeImage], NDArray[Any]]] = {
     "images": lambda image: image.counts,
     "masks": lambda image: image.parts,
     "amodal_masks": _amodal,
     "noiseless": noiseless,
+    "highlights": _highlights,
 }

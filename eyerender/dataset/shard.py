@@ -36,6 +36,7 @@ KINDS = {
     "masks": "mask_file_name",
     "amodal_masks": "amodal_mask_file_name",
     "noiseless": "noiseless_file_name",
+    "highlights": "highlight_mask_file_name",
 }
 
 

@@ -32,10 +32,16 @@ class LabelsSpec(Spec):
         default=False, description="also write each image without sensor noise, from the same rendering"
     )
 
+    highlights: bool = Field(
+        default=False,
+        description="also write masks of the highlights of wet and oily surfaces (lids, tears, skin, lashes), which "
+        "are no glints",
+    )
+
     @property
     def pictures(self) -> tuple[str, ...]:
         """Kinds of images that every sample has; each kind has a folder of its own."""
-        more = {"amodal_masks": self.amodal_masks, "noiseless": self.noiseless}
+        more = {"amodal_masks": self.amodal_masks, "noiseless": self.noiseless, "highlights": self.highlights}
         return ("images", "masks", *(kind for kind, wanted in more.items() if wanted))
 
 

@@ -141,9 +141,14 @@ class Skin(Spec):
 
 
 class TearFilm(Spec):
-    """The tear meniscus along both margins."""
+    """Tears on margins, caruncle and lash roots, and the meniscus along both margins."""
 
-    height_mm: float = _number(0.21, 0.0, 0.6, "height on the globe (Doughty)")
+    height_mm: float = _number(0.21, 0.0, 0.6, "height of the meniscus on the globe (Doughty)")
+    unevenness: Share = Field(
+        default=0.5,
+        description="how far the meniscus breaks up and the wet margins are rough (chosen so that highlights are "
+        "about as many as in photographs)",
+    )
 
 
 class Region(Spec):

@@ -200,7 +200,7 @@ def head_map(spec: Region, head: HeadMesh) -> Singles:
         "skin": (skin.albedo, 0.0),
         "lashes": (spec.lashes.albedo, _HAIR_GLOSS),
         "brow": (spec.brow.albedo, _HAIR_GLOSS),
-        "tears": (0.9 * skin.wet_albedo, 1.0),
+        "tears": (0.75 * skin.wet_albedo, 1.0),
         "head": (skin.albedo, 0.0),
     }
     for k, part in enumerate(HEAD_PARTS):

@@ -28,6 +28,7 @@ from .globe import Globe
 from .lids import CONJUNCTIVA, LID, MARGIN, ROWS, sheet, skin_depth
 from .look import Look
 from .noise import Padded, Places, band, furrows
+from .tears import waves
 
 SHEET_ROWS, BANDS = 960, 64
 _COLUMNS = 1536
@@ -38,6 +39,8 @@ _TILE_MM, _TILE = 24.0, 640
 _COARSE = 8
 _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
 _STRIP = 32  # rows of the map that are made together, so that they stay in the processor's cache
+_HAIR_GLOSS = 0.2
+_WET, _WET_ROOT = 0.93, 0.06  # gloss of wet tissue, and the share of a lash that is wet
 _SHOWN_MM = 25.0  # about the middle of the fissure: the skin whose mean albedo is that of the spec
 _REFERENCE_BLINK = 0.3  # at which the tissue is laid out: neither stretched nor hidden in the fold
 
@@ -86,28 +89,41 @@ def skin_map(spec: Region) -> Singles:
     _slopes(height, y, z, out[:SHEET_ROWS, :, 1:3])
     _normalise(out[:SHEET_ROWS, :, 0], y, z, rows, spec.skin.albedo)
     for which, (a, g) in enumerate(
-        ((spec.lashes.albedo, 0.08), (spec.brow.albedo, 0.12), (0.9 * spec.skin.wet_albedo, 1.0))
+        ((spec.lashes.albedo, _HAIR_GLOSS), (spec.brow.albedo, _HAIR_GLOSS), (0.75 * spec.skin.wet_albedo, 1.0))
     ):
         middle = SHEET_ROWS + BANDS * (which + 1) / 4
         band_rows = slice(int(middle - BANDS / 8), int(middle + BANDS / 8))
         out[band_rows] = (a, 0, 0, g)
         if which == LASH:
-            out[band_rows, :, 0] = lash_band(spec)
+            out[band_rows, :, 0], out[band_rows, :, 3] = lash_band(spec)
+        if which == TEAR:
+            out[band_rows, :, 1:3] = waves(spec, _COLUMNS)[:, None] * _along_lids(rest)
     out.flags.writeable = False
     return out
 
 
-def lash_band(spec: Region) -> Singles:
-    """Albedo (columns,) of lashes: upper ones in the first half, lower ones in the second, each from root to tip.
+def _along_lids(rest: Floats) -> Singles:
+    """Unit directions (columns, 2) over (y, z) along the margin's inner edge, counted with the columns."""
+    edge = np.concatenate([rest[CONJUNCTIVA], rest[CONJUNCTIVA, :1]])[:, 1:]
+    way = np.diff(edge, axis=0)
+    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+    return np.asarray(way[np.arange(_COLUMNS) * len(way) // _COLUMNS], dtype=np.float32)
 
-    Thin tips let light through, so they are paler; hairs much thinner than a pixel would be stippled.
+
+def lash_band(spec: Region) -> tuple[Singles, Singles]:
+    """Albedo and gloss (columns,) of lashes: upper ones in the first half, lower ones in the second, root to tip.
+
+    Thin tips let light through, so they are paler; hairs much thinner than a pixel would be stippled. Tears
+    creep up the roots.
     """
     s = np.clip((np.arange(_COLUMNS) + 0.5) / _COLUMNS % 0.5 - LASH_U[0], 0, LASH_U[1]) / LASH_U[1]
     lower = np.arange(_COLUMNS) >= _COLUMNS // 2
     lashes = spec.lashes
     root = np.where(lower, lashes.lower_albedo, lashes.albedo)
     tip = np.where(lower, 0.5 * (lashes.lower_albedo + lashes.tip_albedo) + 0.1, lashes.tip_albedo)
-    return np.asarray(root + (np.maximum(tip, root) - root) * s**1.5, dtype=np.float32)
+    albedo = root + (np.maximum(tip, root) - root) * s**1.5
+    gloss = np.where(s < _WET_ROOT, 0.93, _HAIR_GLOSS)
+    return np.asarray(albedo, dtype=np.float32), np.asarray(gloss, dtype=np.float32)
 
 
 def _normalise(albedo: Singles, y: Singles, z: Singles, rows: Floats, wanted: float) -> None:
@@ -242,17 +258,27 @@ class _Strip:
         cells, creases, pores = self.cells(), self.creases(), self.pores()
         height = (self.relief(cells) - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases) * self.lid
         if np.any(self.flesh):
-            height = height + 0.02 * self.flesh * self.field(6, (18, 45), (18, 45))
+            bumps = 0.02 + 0.06 * spec.tears.unevenness
+            height = height + bumps * self.flesh * self.field(6, (18, 60), (18, 60))
+        height = height + 0.05 * spec.tears.unevenness * self.margin_bumps()
         # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
         open_ = 1 + 0.10 * (cells - 0.5) - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
-        wet = (0.78 - 0.21 * self.flesh) * (1 - step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN - 1.0))
+        wet = _WET * (1 - step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN - 1.0))
         # Oil forms films of varying thickness. It shines in points where the skin is smooth and swollen, in short
         # streaks along the lids.
         oil = 0.55 + 0.2 * self.field(5, (0, 8), (0, 8))
-        points = np.maximum(self.tiles.at(8, _places(self.y, self.level), (30, 120), (70, 190)) - 0.7, 0.0)
-        sheen = 0.45 * spec.skin.sheen * np.clip(oil * (0.4 + 0.6 * cells) * (1 - pores) + 2.0 * points, 0.1, 2.2)
+        points = np.maximum(self.tiles.at(8, _places(self.y, self.level), (30, 120), (70, 190)) - 0.4, 0.0)
+        sheen = 0.45 * spec.skin.sheen * np.clip(oil * (0.4 + 0.6 * cells) * (1 - pores) + 3.0 * points, 0.1, 2.2)
         gloss = np.clip(np.minimum(sheen, 0.45) * self.lid + wet, 0, 1)
         return self.albedo(open_, spots), gloss, height
+
+    def margin_bumps(self) -> Singles:
+        """Bumps, about 1, of the wet margins: mouths of glands and the edge of the tissue that tears wet."""
+        at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0) * (1 - step(self.rows, _LINE - 2.0, _LINE))
+        out: Singles = np.zeros_like(self.y)
+        if np.any(at > 0):
+            out = at * self.tiles.at(9, _places(self.y, self.out_mm), (30, 75), (20, 60))
+        return out
 
     def cells(self) -> Singles:
         """Plateaus (about 1) separated by furrows (0).

@@ -2,7 +2,8 @@
 
 Its section is an arc that leaves the globe and the margin along their tangents, with the height `height_mm` on the
 globe. The upper one has two thirds of the lower one's height (Doughty et al. 2002 for the height). It is opaque here:
-it shows the line of light that it reflects, not what it would refract.
+it shows the line of light that it reflects, not what it would refract. Its height varies along the lids, and short
+waves bend its surface (`waves`), so lamps appear in it as broken rows of points.
 """
 
 from __future__ import annotations
@@ -15,7 +16,23 @@ from .contour import step
 from .globe import Globe
 from .lids import Sheet
 
-ROWS = 5
+ROWS = 7
+_OUT = 1.8  # width on the margin over the height on the globe, so that the radius is about 1.6 heights
+_LONG, _SHORT = (6, 40), (12, 45)  # waves once around the fissure, which is about 60 mm long
+_SLOPE = 0.35  # standard deviation of the slope of the short waves at an unevenness of 1
+
+
+def waves(spec: Region, count: int) -> Floats:
+    """Slope of the meniscus along the lids at `count` places once around the fissure."""
+    return _SLOPE * spec.tears.unevenness * _noise(spec.seed + 1, count, *_SHORT)
+
+
+def _noise(seed: int, count: int, low: int, high: int) -> Floats:
+    """Noise (count,) of mean 0 and variance 1 with `low` to `high` waves around the fissure."""
+    rng = np.random.default_rng((0x7EA2, seed))
+    turn = rng.uniform(0, 2 * np.pi, high - low)
+    angle = 2 * np.pi * np.arange(count)[:, None] / count
+    return np.asarray(np.cos(np.arange(low, high) * angle + turn).sum(axis=1) * np.sqrt(2 / (high - low)))
 
 
 def meniscus(spec: Region, globe: Globe, sheet: Sheet) -> Floats:
@@ -23,10 +40,12 @@ def meniscus(spec: Region, globe: Globe, sheet: Sheet) -> Floats:
     c = sheet.contour
     on_globe = step(np.abs(np.sin(c.angle)), 0.25, 0.6)
     height = spec.tears.height_mm * on_globe * np.where(c.upper > 0, 0.66, 1.0) * step(c.openness, 0.02, 0.25)
+    low = np.maximum(1 + 0.8 * spec.tears.unevenness * _noise(spec.seed, len(c.angle), *_LONG), 0.15)
+    height = height * low
     # The two menisci must not meet.
     height = height + 1e-3
     u = np.linspace(0, np.pi / 2, ROWS)[:, None]
-    down, out = height * (1 - np.sin(u)), height * (1 - np.cos(u))
+    down, out = height * (1 - np.sin(u)), _OUT * height * (1 - np.cos(u))
     rows = c.point - down[..., None] * c.away + out[..., None] * c.normal
     # The strip is far enough out of the globe that no chord between columns enters it.
     return globe.pushed_out(rows, np.where(np.arange(ROWS)[:, None] == 0, 0.010, 0.014) * np.ones_like(height))

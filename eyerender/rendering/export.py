@@ -216,7 +216,7 @@ def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
     globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
     mesh = region_mesh(spec, globe) if spec.head is None else placed(load_head(spec.head), globe)
     skin = spec.skin
-    albedo = {"lashes": spec.lashes.albedo, "brow": spec.brow.albedo, "tears": 0.9 * skin.wet_albedo}
+    albedo = {"lashes": spec.lashes.albedo, "brow": spec.brow.albedo, "tears": 0.75 * skin.wet_albedo}
     v, f = ([0, *ends.tolist()] for ends in (mesh.layout.vertex_ends, mesh.layout.face_ends))
     return [
         (

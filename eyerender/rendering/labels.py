@@ -1,4 +1,4 @@
-"""Raster labels: the parts of the eye that the pixels of a window show."""
+"""Raster labels: the parts of the eye that the pixels of a window show, and the highlights of wet and oily surfaces."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ from ..arrays import ArrayValue, Bools, Bytes, Singles, frozen
 from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..rig.camera import Window
 from .film import Exposed, pixels_of
+from .lighting import lamp_blocked, straight
 from .sampling import camera_ray
-from .view import hidden, meet, meet_globe
+from .view import View, hidden, look, meet, meet_globe, outer_albedo
+
+_HIGHLIGHT = 0.5  # of the scattered light
+_ACROSS = 3  # points of a pixel across and down that are looked at
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +56,41 @@ def part_labels(shown: Exposed, window: Window) -> PartLabels:
     return PartLabels(*(frozen(x.numpy().reshape(shape), np.uint8) for x in (part, amodal)))
 
 
+def highlights(shown: Exposed, window: Window) -> Bools:
+    """Pixels (height, width) whose skin, lids, lashes and tears mirror lamps: more than half of what they scatter.
+
+    Both are light of the lamps alone, with its shadows. Lens and sensor do not matter, nor do glints of the cornea.
+    Without an eye region nothing but the cornea mirrors lamps.
+    """
+    values, lights, textures = shown.values, shown.lights, shown.textures
+    mirrored = scattered = 0.0
+    for i in range(_ACROSS * _ACROSS if values.structure.region else 0):
+        place = ((i % _ACROSS + 0.5) / _ACROSS - 0.5, (i // _ACROSS + 0.5) / _ACROSS - 0.5)
+        o, d = _rays(shown, window, *(dr.opaque(mi.Float, c) for c in place))
+        view = look(values, textures, shown.scene, o, d, mi.Bool(True))
+        back = -values.vector_to_eye(d)
+
+        def add(
+            k: mi.UInt32, shine: mi.Float, even: mi.Float, view: View = view, back: mi.Vector3f = back
+        ) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+            lamp = lights[k]
+            received, sheen = straight(lamp, lamp.position, view, back)
+            barred = lamp_blocked(
+                values, shown.scene, view.point, lamp.position, view.other, ~view.cornea, received > 0
+            )
+            return k + 1, shine + dr.select(barred, 0, sheen), even + dr.select(barred, 0, received)
+
+        state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
+        _, shine, even = dr.while_loop(state, lambda k, *_: k < lights.count, add, label="highlights")
+        matte = outer_albedo(values, textures, view) * even * dr.inv_pi
+        there = view.other | view.sclera
+        shine, matte = dr.select(there, shine, 0), dr.select(there, matte, 0)
+        dr.eval(shine, matte)
+        mirrored, scattered = mirrored + shine.numpy(), scattered + matte.numpy()
+    marked = np.broadcast_to(np.asarray(mirrored) > _HIGHLIGHT * np.asarray(scattered), window[2] * window[3])
+    return frozen(marked.reshape(window[3], window[2]), np.bool_)
+
+
 def depths_mm(shown: Exposed, window: Window) -> Singles:
     """Distances (height, width) of the first surfaces from the nodal point, infinite where there is none."""
     o, d = _centre_rays(shown, window)
@@ -62,6 +101,11 @@ def depths_mm(shown: Exposed, window: Window) -> Singles:
 
 def _centre_rays(shown: Exposed, window: Window) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Camera rays through the centres of a window's pixels."""
+    return _rays(shown, window, mi.Float(0), mi.Float(0))
+
+
+def _rays(shown: Exposed, window: Window, right: mi.Float, down: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Camera rays through places beside the centres of a window's pixels (px)."""
     u, v = pixels_of(dr.arange(mi.UInt32, window[2] * window[3]), window)
-    o, d, _ = camera_ray(shown.values, mi.Float(u), mi.Float(v))
+    o, d, _ = camera_ray(shown.values, mi.Float(u) + right, mi.Float(v) + down)
     return o, d

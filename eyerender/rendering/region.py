@@ -31,9 +31,10 @@ from .values import aligned
 
 GRID_ROWS, GRID_COLUMNS = 160, 768  # of the grid over the sheet on which its light is computed (see `subsurface`)
 SHEET_COLUMNS = COLUMNS + 1  # of vertices, because the first column is repeated
-_F0 = 0.028  # reflectance at normal incidence of skin's oil and of water, which is about the same (n 1.40 and 1.33)
-_ROUGH_SKIN, _ROUGH_WET = 0.19, 0.04
-_RIPPLE = 0.032  # slope of wet tissue
+_F0_OIL, _F0_TEARS = 0.028, 0.0202  # reflectance at normal incidence (n 1.40 and 1.331)
+_ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.05, 0.035
+_OILY = 0.75  # share of skin's sheen in the narrow lobe of its film of oil, which the relief breaks into points
+_RIPPLE = 0.02  # slope of wet tissue
 
 
 Expected: TypeAlias = tuple[Region, Globe, "Future[RegionMesh]"]
@@ -282,19 +283,24 @@ def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, glo
         f = w D F / (4 (l . h)^2),  D = a^2 / (pi ((n . h)^2 (a^2 - 1) + 1)^2)
 
     with h half way between lamp and camera (GGX: Walter et al. 2007; the visibility term: Kelemen, Szirmay-Kalos 2001;
-    F: Schlick 1994).
+    F: Schlick 1994). Skin has two lobes: a wide one of its rough surface, and a narrow one of the film of oil on it.
     """
     wet = gloss > 0.5
     normal = dr.select(wet, film_normal(normal), normal)
     half = dr.normalize(to_lamp + to_camera)
     lh = dr.maximum(dr.dot(to_lamp, half), 0.05)
     nh = dr.maximum(dr.dot(normal, half), 0)
-    a = dr.select(wet, _ROUGH_WET, _ROUGH_SKIN)
     weight = dr.select(wet, 2 * gloss - 1, gloss * (1 / 0.45))
+    narrow = _ggx(nh, dr.select(wet, _ROUGH_WET, _ROUGH_OIL))
+    D = dr.select(wet, narrow, _OILY * narrow + (1 - _OILY) * _ggx(nh, mi.Float(_ROUGH_SKIN)))
+    return weight * D * _schlick(lh, dr.select(wet, _F0_TEARS, _F0_OIL)) * 0.25 / (lh * lh)
+
+
+def _ggx(nh: mi.Float, a: mi.Float) -> mi.Float:
+    """Distribution D (1/sr) of the normals of a surface of roughness a."""
     a2 = a * a
     base = nh * nh * (a2 - 1) + 1
-    D = a2 * dr.inv_pi / (base * base)
-    return weight * D * _schlick(lh) * 0.25 / (lh * lh)
+    return a2 * dr.inv_pi / (base * base)
 
 
 def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
@@ -306,10 +312,10 @@ def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
 
 def film_reflectance(cosine: mi.Float, gloss: mi.Float) -> mi.Float:
     """Share of the light from wide surroundings that the film of wet tissue mirrors."""
-    return (2 * gloss - 1) * _schlick(dr.clip(cosine, 0, 1))
+    return (2 * gloss - 1) * _schlick(dr.clip(cosine, 0, 1), mi.Float(_F0_TEARS))
 
 
-def _schlick(cosine: mi.Float) -> mi.Float:
+def _schlick(cosine: mi.Float, f0: mi.Float) -> mi.Float:
     s = 1 - cosine
     s2 = s * s
-    return _F0 + (1 - _F0) * s2 * s2 * s
+    return f0 + (1 - f0) * s2 * s2 * s

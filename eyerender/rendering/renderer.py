@@ -17,7 +17,7 @@ from .blur import Blur
 from .film import Exposed, mean_parts, mean_radiance
 from .frame import RenderJob
 from .integrator import integrator_class
-from .labels import PartLabels, depths_mm, part_labels
+from .labels import PartLabels, depths_mm, highlights, part_labels
 from .lighting import through_cornea
 from .occlusion import lid_margins_px
 from .region import RegionScene
@@ -100,8 +100,9 @@ class Renderer:
             mirrored = add_glints(job, place, np.zeros_like(glints), blur, front)
         margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
         labels = part_labels(shown, job.window) if job.labels else None
+        bright = highlights(shown, job.window) if job.highlights else None
         radiance = pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0)
-        return Traced(job, radiance, glints / len(shots), blur, mirrored, labels, failed, margins)
+        return Traced(job, radiance, glints / len(shots), blur, mirrored, labels, failed, margins, bright)
 
     def _pictures(self, job: RenderJob, shown: Exposed, blur: Blur, spp: int) -> tuple[Floats, int]:
         """Radiance of a window, or its parts, with the border that the lens needs, and failed light paths."""

@@ -33,7 +33,7 @@ EPSILON_MM = 2e-3  # points closer than this are the same in single precision
 _NEAR_MM = 20.0
 GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of maps of the globe
 _FAR = float(np.finfo(np.float32).max)
-_WET = 0.8  # gloss of the sclera
+_WET = 0.91  # gloss of the sclera
 _WIDE_MM = 2.5  # width of an iris whose relief has its full height
 _RING = (0.62, 0.95)  # share of the way from the pupil to the root over which a limbal ring grows dark
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayValue, Floats, Singles, frozen
+from ..arrays import ArrayValue, Bools, Floats, Singles, frozen
 from ..errors import InputError
 from ..rig import defocus, exposure, psf, stray
 from ..rig.camera import Window
@@ -33,6 +33,7 @@ class RenderedWindow(ArrayValue):
         failed_paths: number of light paths that did not converge; they are missing from the irradiance.
         glint_reasons: for each glint, whether it is visible or what hides it.
         lid_margins_px: landmarks along the lids, where there are any.
+        highlights: (height, width) pixels with highlights of wet and oily surfaces, if they were requested.
     """
 
     window: Window
@@ -45,6 +46,7 @@ class RenderedWindow(ArrayValue):
     failed_paths: int
     glint_reasons: tuple[str, ...] = ()
     lid_margins_px: dict[str, list[list[float]]] | None = None
+    highlights: Bools | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +62,7 @@ class Traced(ArrayValue):
         labels: raster labels, if they were requested.
         failed: number of light paths that did not converge.
         lid_margins_px: landmarks along the lids, where there are any.
+        highlights: (height, width) highlights of wet and oily surfaces, if they were requested.
     """
 
     job: RenderJob
@@ -70,6 +73,7 @@ class Traced(ArrayValue):
     labels: PartLabels | None
     failed: int
     lid_margins_px: dict[str, list[list[float]]] | None
+    highlights: Bools | None
 
     def developed(self) -> RenderedWindow:
         """The window through lens and sensor. It needs NumPy alone, so another thread may do it.
@@ -77,7 +81,7 @@ class Traced(ArrayValue):
         Raises:
             InputError: numbers so extreme that the image is not finite.
         """
-        job, labels, mirrored = self.job, self.labels, self.mirrored
+        job, labels, mirrored, highlights = self.job, self.labels, self.mirrored, self.highlights
         seen = (job.lens, job.camera, job.window)
         picture = psf.blur(self.blur.of_pictures(self.radiance), job.sensor.psf_sigma_px) + self.glints
         picture = stray.framed(picture * defocus.vignette(*seen), *seen)
@@ -93,6 +97,7 @@ class Traced(ArrayValue):
         if covered is not None:
             labels = labels.behind(covered) if labels is not None else None
             mirrored = mirrored.behind(covered, job.window)
+            highlights = None if highlights is None else frozen(highlights & ~covered, np.bool_)
         return RenderedWindow(
             job.window,
             irradiance,
@@ -104,4 +109,5 @@ class Traced(ArrayValue):
             self.failed,
             mirrored.reasons,
             self.lid_margins_px,
+            highlights,
         )

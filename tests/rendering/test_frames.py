@@ -112,7 +112,7 @@ def test_a_folder_says_its_classes_and_its_gamma(tmp_path):
     render_folder(given, tmp_path / "out", threads=1)
     folder = ImageFolder.load(tmp_path / "out")
     (entry,) = folder
-    assert (entry.line["schema"], entry.gamma) == ("eyerender/image/2", 2.2)
+    assert (entry.line["schema"], entry.gamma) == (IMAGE_SCHEMAS[0], 2.2)
     mask = entry.mask()
     assert (mask[:12] == FRAME).all()
     assert (mask[-12:] == FRAME).all()
@@ -126,9 +126,9 @@ def test_a_folder_says_its_classes_and_its_gamma(tmp_path):
     metadata = tmp_path / "out" / "metadata.jsonl"
     line = json.loads(metadata.read_text())
     del line["gamma"]
-    metadata.write_text(json.dumps({**line, "schema": IMAGE_SCHEMAS[1]}) + "\n")
+    metadata.write_text(json.dumps({**line, "schema": IMAGE_SCHEMAS[-1]}) + "\n")
     assert ImageFolder.load(tmp_path / "out").entries[0].gamma == 1.0
-    for wrong in ({"gamma": "2"}, {"gamma": 0.0}, {"schema": "eyerender/image/3"}):
+    for wrong in ({"gamma": "2"}, {"gamma": 0.0}, {"schema": "eyerender/image/4"}):
         metadata.write_text(json.dumps({**line, **wrong}) + "\n")
         with pytest.raises(InputError, match=next(iter(wrong))):
             ImageFolder.load(tmp_path / "out")

@@ -23,7 +23,7 @@ from torch.utils.data import DataLoader  # noqa: E402
 from eyerender.torch import PARTS, FolderDataset, StreamDataset, collate, place  # noqa: E402
 
 pytestmark = pytest.mark.render
-ALL = tuple(part for part in PARTS if part != "amodal_mask")
+ALL = tuple(part for part in PARTS if part not in ("amodal_mask", "highlight_mask"))
 
 
 def brighter(item):

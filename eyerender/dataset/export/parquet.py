@@ -1,9 +1,9 @@
 """Parquet: data/SPLIT-00000-of-00001.parquet with one row an image, as the Hugging Face Hub stores datasets.
 
-The columns `image` and `mask` (and `amodal_mask`, `noiseless` where the dataset has them) hold PNG files. The labels
-have the columns of the layout csv, in pixels of the image. `line_json` is the whole line of metadata as JSON text. Load
-the folder with `datasets.load_dataset("OUT")`, or upload it as it is: the head of this file tells the Hub's viewer the
-columns and the splits.
+The columns `image` and `mask` (and `amodal_mask`, `noiseless`, `highlight_mask` where the dataset has them) hold PNG
+files. The labels have the columns of the layout csv, in pixels of the image. `line_json` is the whole line of metadata
+as JSON text. Load the folder with `datasets.load_dataset("OUT")`, or upload it as it is: the head of this file tells
+the Hub's viewer the columns and the splits.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ _PICTURES = {
     "mask": "mask_file_name",
     "amodal_mask": "amodal_mask_file_name",
     "noiseless": "noiseless_file_name",
+    "highlight_mask": "highlight_mask_file_name",
 }
 _TEXTS = ("split", "encoding", "eye", "eye_model", "line_json")
 _WHOLE = ("sample", "subject", "sequence_index", "bit_depth", "source_bit_depth", "window_x0_px", "window_y0_px")

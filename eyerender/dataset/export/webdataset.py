@@ -1,6 +1,7 @@
 """WebDataset: tar files of at most 1000 images a split; NAME.png, NAME.mask.png and NAME.json make a sample.
 
-Where the dataset has amodal masks or noiseless images, NAME.amodal.png or NAME.noiseless.png too.
+Where the dataset has amodal masks, masks of highlights or noiseless images, NAME.amodal.png, NAME.highlights.png or
+NAME.noiseless.png too.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from ...files import read_bytes
 from .item import Items
 
 SAMPLES = 1000
+_MASKS = {"mask": "mask_file_name", "amodal": "amodal_mask_file_name", "highlights": "highlight_mask_file_name"}
 
 
 def write(items: Items, out: Path) -> None:
@@ -29,7 +31,7 @@ def write(items: Items, out: Path) -> None:
                 tars[split] = _open(out / f"{split}-{k // SAMPLES:06d}.tar")
             counts[split] = k + 1
             _add(tars[split], f"{item.name}.png", item.encode(item.entry.path))
-            for ending, key in (("mask", "mask_file_name"), ("amodal", "amodal_mask_file_name")):
+            for ending, key in _MASKS.items():
                 path = item.entry.file(key)
                 if path is not None:
                     _add(tars[split], f"{item.name}.{ending}.png", read_bytes(path, follow=False))

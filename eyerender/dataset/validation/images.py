@@ -61,13 +61,17 @@ def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> I
     if float(image.max()) > full:
         yield f"has values above {full:g}"
     tally.take(image, full)
-    quiet_path, mask_path, whole_path = (
-        entry.file(f"{kind}_file_name") for kind in ("noiseless", "mask", "amodal_mask")
+    quiet_path, mask_path, whole_path, bright_path = (
+        entry.file(f"{kind}_file_name") for kind in ("noiseless", "mask", "amodal_mask", "highlight_mask")
     )
     if quiet_path is not None:
         quiet, _ = read_image(quiet_path)
         if quiet.shape != image.shape or float(quiet.max()) > full:
             yield "its noiseless image has another shape or values above its range"
+    if bright_path is not None:
+        bright = read_image(bright_path)[0]
+        if bright.shape != image.shape or int(bright.max()) > 1:
+            yield "its mask of highlights has another shape or values above 1"
     if mask_path is not None:
         mask = read_image(mask_path)[0]
         whole = None if whole_path is None else read_image(whole_path)[0]

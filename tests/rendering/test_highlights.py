@@ -1,0 +1,41 @@
+"""Highlights of wet and oily surfaces, and their masks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eyerender.capture import render_job
+from eyerender.scene.shipped import load_scene
+
+pytestmark = pytest.mark.render
+
+
+def test_masks_mark_where_mirrored_light_exceeds_half_of_the_scattered(renderer, monkeypatch):
+    import mitsuba as mi
+
+    from eyerender.rendering import lighting
+    from eyerender.rendering.renderer import Renderer
+
+    given = load_scene("desktop_tracker").with_({"image.window_px": [260, 180], "image.interreflection": False})
+    job = replace(render_job(given.frames(), 8), highlights=True)
+    done = renderer.render(job, spp=4)
+    marked, part = done.highlights, done.labels.part
+    shiny = renderer.radiance(job, spp=64)
+    monkeypatch.setattr(lighting, "sheen", lambda *_: mi.Float(0))
+    matte = Renderer(renderer.backend).radiance(job, spp=64)
+    ratio = (shiny - matte) / matte
+    assert 20 < marked.sum() < 0.05 * marked.size
+    # Mask and picture take other samples of a pixel, which matters on relief and hairs that are finer than a pixel.
+    assert np.mean(ratio[marked] > 0.25) > 0.9
+    assert np.mean(ratio[~marked & (part < 2)] < 0.75) > 0.995
+    # The mirror of the cornea makes glints, not highlights.
+    assert not np.any(marked & (part >= 2) & (ratio < 0.1))
+    assert done.glints.visible.any()
+
+
+def test_a_bare_eye_has_no_highlights(renderer):
+    job = render_job(load_scene("blignaut2014").with_({"image.window_px": [64, 48]}).frames(), 0)
+    assert not renderer.render(replace(job, highlights=True), spp=1).highlights.any()
