@@ -6,6 +6,9 @@ angle f from the line of sight, negative in the temporal field, follows 0.99 cos
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+
 import numpy as np
 import pytest
 
@@ -18,8 +21,14 @@ PEOPLE, AWAY_MM, PUPIL_MM = 40, 800.0, -3.0
 
 
 def wide_pupils(count: int, luminance: float) -> list[EyeModel]:
-    people = er.Population("adults").draw(count, 3)
-    return [people.person(k).eye("right", luminance_cd_m2=luminance).build() for k in range(count)]
+    """Right eyes of the first people whom physics does not refuse."""
+    population, eyes = er.Population("adults"), []
+    for subject in itertools.count():
+        with contextlib.suppress(er.InputError):
+            eyes.append(population.person(subject, 3).eye("right", luminance_cd_m2=luminance).build())
+        if len(eyes) == count:
+            return eyes
+    raise AssertionError
 
 
 def seen_from(angle_deg: float, eyes: list[EyeModel]) -> Features:
@@ -54,8 +63,7 @@ def test_ratio_of_axes_follows_the_published_cosine():
         ratio = np.nanmean(np.ptp(points[..., 0], axis=1) / np.ptp(points[..., 1], axis=1))
         misses[angle] = ratio - 0.99 * np.cos((np.radians(angle) + np.radians(5.3)) / 1.121)
     assert max(abs(miss) for angle, miss in misses.items() if abs(angle) <= 50) < 0.01
-    assert abs(misses[-60]) < 0.02
-    assert abs(misses[60]) < 0.025
-    # Farther out the stop's edge matters, which has no thickness here: 0.1 mm would take 0.015 away.
-    assert abs(misses[-70]) < 0.035
-    assert abs(misses[70]) < 0.045
+    # Over 40 people the standard error is 0.004.
+    assert max(abs(misses[angle]) for angle in (-60, 60)) < 0.02
+    # Farther out the margin's roundness matters, which the stop lacks: a radius of 0.1 mm would take 0.015 away.
+    assert max(abs(misses[angle]) for angle in (-70, 70)) < 0.04
