@@ -60,10 +60,10 @@ def highlights(shown: Exposed, window: Window) -> Bools:
     """Pixels (height, width) whose skin, lids, lashes and tears mirror lamps: more than half of what they scatter.
 
     Both are light of the lamps alone, with its shadows. Lens and sensor do not matter, nor do glints of the cornea.
-    Without an eye region nothing but the cornea mirrors lamps.
+    Pixels that show mostly cornea are not marked. Without an eye region nothing but the cornea mirrors lamps.
     """
     values, lights, textures = shown.values, shown.lights, shown.textures
-    mirrored = scattered = 0.0
+    mirrored = scattered = beside = 0.0
     for i in range(_ACROSS * _ACROSS if values.structure.region else 0):
         place = ((i % _ACROSS + 0.5) / _ACROSS - 0.5, (i // _ACROSS + 0.5) / _ACROSS - 0.5)
         o, d = _rays(shown, window, *(dr.opaque(mi.Float, c) for c in place))
@@ -84,10 +84,12 @@ def highlights(shown: Exposed, window: Window) -> Bools:
         _, shine, even = dr.while_loop(state, lambda k, *_: k < lights.count, add, label="highlights")
         matte = outer_albedo(values, textures, view) * even * dr.inv_pi
         there = view.other | view.sclera
-        shine, matte = dr.select(there, shine, 0), dr.select(there, matte, 0)
-        dr.eval(shine, matte)
+        shine, matte, share = (dr.select(there, x, 0) for x in (shine, matte, mi.Float(1 / _ACROSS**2)))
+        dr.eval(shine, matte, share)
         mirrored, scattered = mirrored + shine.numpy(), scattered + matte.numpy()
-    marked = np.broadcast_to(np.asarray(mirrored) > _HIGHLIGHT * np.asarray(scattered), window[2] * window[3])
+        beside = beside + share.numpy()
+    marked = (np.asarray(mirrored) > _HIGHLIGHT * np.asarray(scattered)) & (np.asarray(beside) > 0.5)
+    marked = np.broadcast_to(marked, window[2] * window[3])
     return frozen(marked.reshape(window[3], window[2]), np.bool_)
 
 
