@@ -1,23 +1,30 @@
 #!/usr/bin/env python3
 """Bench of dataset runs: rate, time outside rendering, syncing, scaling over workers, memory, disk, killed runs.
 
-    bench_generate.py [--quick] [--json F] [--backend llvm|cuda]
+    bench_generate.py [--quick] [--json F] [--backend llvm|cuda] [--against CHECKOUT]
 
 Images are 640 x 480 px at 4 samples per pixel, with E2, two LEDs, labels and files. Rates are measured after every
-worker has made its first samples, so they exclude starting and compiling. The time outside rendering is CPU time of
-the worker's own thread, so other work on the machine has little influence. --quick makes fewer images and kills. The
+worker has made its first samples, so they exclude starting and compiling. The time outside rendering is CPU time, so
+other work on the machine has little influence. --quick makes fewer images and kills. The
 exit code is 1 if a `must` is missed.
+
+With --against, only images with a region are measured, here and in another checkout of this project in turns: the
+command `generate` with `dataset_region`, new subjects in every run. A long and a short run are compared, so what a run
+takes besides its images does not count.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 import random
+import resource
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +34,7 @@ from _bench import Report, Row, options_of, resident_mib, row, single_threaded
 
 single_threaded()
 
+import numpy as np  # noqa: E402
 import yaml  # noqa: E402
 
 from eyerender.dataset import shard  # noqa: E402
@@ -37,6 +45,8 @@ from eyerender.dataset.realise import frames_of  # noqa: E402
 from eyerender.dataset.shard import Staged, commit, write_shard  # noqa: E402
 from eyerender.dataset.spec import DatasetSpec, find_dataset  # noqa: E402
 from eyerender.dataset.worker import Job  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def plan(count: int, shard_size: int, window: tuple[int, int] = (640, 480), spp: int = 4) -> Plan:
@@ -98,6 +108,32 @@ class Bench:
         yield from self.memory()
         yield from self.kills()
 
+    def against(self, other: Path) -> Iterable[Row]:
+        """Images a second with a region, 640 x 480 px, 4 samples, 2 workers, here and in another checkout.
+
+        Both make `dataset_region` as it is in the other, which may be older.
+        """
+        text = (other / "scenes" / "dataset_region.yaml").read_text(encoding="utf-8")
+        data = yaml.safe_load(text)
+        turns, few, many = (1, 4, 12) if self.small else (4, 8, 40)
+        trees = {"here": ROOT, "there": other.resolve()}
+        found: dict[str, list[tuple[float, float]]] = {name: [] for name in trees}
+        for turn in range(turns):
+            for name, tree in trees.items():
+                short, long = (_generated(tree, data, self.backend, n, 1000 * turn + n) for n in (few, many))
+                found[name].append(tuple((b - a) / (many - few) for a, b in zip(short, long, strict=True)))  # type: ignore[arg-type]
+        here, there = (np.array(found[name]) for name in trees)
+        wall, cpu = (there / here).T
+        yield row("with a region, 640x480, 4 samples, 2 workers", 1 / np.median(here[:, 0]), "images/s")
+        yield row("the same, CPU", np.median(here[:, 1]), "s/image")
+        yield row("the same in the other checkout", 1 / np.median(there[:, 0]), "images/s")
+        yield row("the same, CPU", np.median(there[:, 1]), "s/image")
+        yield row(
+            f"images a second, here / there: median of {turns}", np.median(wall), "ratio", must=1.5, at_least=True
+        )
+        yield row("the same, least", np.min(wall), "ratio")
+        yield row("CPU of an image, there / here: median", np.median(cpu), "ratio")
+
     def rates(self) -> Iterable[Row]:
         """Images a second of one and of two workers of one thread each."""
         count = 24 if self.small else 96
@@ -121,28 +157,29 @@ class Bench:
         made = plan(count, count)
         maker = Maker(made, 1, backend=self.backend, threads=1)  # type: ignore[arg-type]
         maker.make(0)
-        inside = [0.0, 0.0]
-        render = maker.renderer.render
+        traced, inside, begin = deque[Any](), 0.0, maker.renderer.begin
 
-        def timed(*arguments: Any, **options: Any) -> Any:
-            start, cpu = time.perf_counter(), time.thread_time()
-            try:
-                return render(*arguments, **options)
-            finally:
-                inside[0] += time.perf_counter() - start
-                inside[1] += time.thread_time() - cpu
+        def kept(*arguments: Any, **options: Any) -> Any:
+            traced.append(begin(*arguments, **options))
+            return traced[-1]
 
-        maker.renderer.render = timed  # type: ignore[method-assign]
+        maker.renderer.begin = kept  # type: ignore[method-assign]
+        start = time.process_time()
+        for sample in made.spec.shard_samples(0):
+            maker.make(sample)
+        inside = time.process_time() - start
+        # The same samples again, with the windows that were rendered: what is left is everything else.
+        maker.renderer.begin = lambda *_, **__: traced.popleft()  # type: ignore[method-assign]
         with tempfile.TemporaryDirectory() as folder, syncing_timed() as syncing:
-            start, cpu = time.perf_counter(), time.thread_time()
+            start, clock = time.process_time(), time.perf_counter()
             staged = write_shard(maker, Path(folder), 0, lambda *_: None)
-            apart = time.thread_time() - cpu - inside[1]
+            apart = time.process_time() - start
             size = sum(p.stat().st_size for p in Path(staged.stage).rglob("*") if p.is_file())
             commit(Path(folder), staged)
-            whole = time.perf_counter() - start
+            whole = time.perf_counter() - clock + inside
         n = staged.images
-        yield row("rendering, one thread", 1e3 * inside[0] / n, "ms/image")
-        yield row("everything but rendering", 1e3 * apart / n, "ms/image", must=35.0)
+        yield row("making an image in memory, CPU", 1e3 * inside / n, "ms/image")
+        yield row("everything but rendering, CPU", 1e3 * apart / n, "ms/image", must=35.0)
         yield row(f"a shard of {n} images, synced", whole, "s")
         yield row("the same without syncing", whole - syncing[0], "s")
         yield row("what syncing adds", 100 * syncing[0] / (whole - syncing[0]), "%", must=3.0)
@@ -214,6 +251,29 @@ def syncing_timed() -> Iterator[list[float]]:
             setattr(shard, name, sync)
 
 
+def _generated(tree: Path, data: dict[str, Any], backend: str, count: int, seed: int) -> tuple[float, float]:
+    """Seconds of the clock and of the processors that `generate` takes in a checkout for images with a region."""
+    image = {**data["scene"].get("image", {}), "window_px": [640, 480], "spp": 4}
+    data = {
+        **data,
+        "count": count,
+        "subjects": min(8, count),
+        "shard_size": max(count // 4, 1),
+        "seed": seed,
+        "scene": {**data["scene"], "image": image},
+    }
+    with tempfile.TemporaryDirectory() as place:
+        spec = Path(place) / "spec.yaml"
+        spec.write_text(yaml.safe_dump(data), encoding="utf-8")
+        command = [sys.executable, "-m", "eyerender", "generate", str(spec), f"{place}/out", "--workers", "2"]
+        start, used = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+        environment = {**os.environ, "PYTHONPATH": str(tree)}
+        subprocess.run([*command, "--backend", backend], check=True, capture_output=True, env=environment, cwd=place)
+        now = resource.getrusage(resource.RUSAGE_CHILDREN)
+        cpu = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
+        return time.perf_counter() - start, cpu
+
+
 def _tree(folder: Path) -> dict[str, str]:
     return {
         str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest()
@@ -226,9 +286,10 @@ def main() -> int:
     """Measure, print, write."""
     parser = options_of(__doc__, "fewer images and kills")
     parser.add_argument("--backend", choices=["auto", "llvm", "cuda"], default="auto")
+    parser.add_argument("--against", metavar="CHECKOUT", type=Path, help="compare with another checkout")
     options = parser.parse_args()
-    report = Report()
-    report.extend(Bench(options.backend, options.quick).rows())
+    report, bench = Report(), Bench(options.backend, options.quick)
+    report.extend(bench.rows() if options.against is None else bench.against(options.against))
     return report.finish(options.json, ("eyerender", "mitsuba", "drjit", "numpy", "pillow"))
 
 

@@ -1,16 +1,19 @@
 #!/usr/bin/env python3
 """Bench of the renderer: physics against independent oracles, cost, first frames, new subjects, memory, determinism.
 
-    bench_render.py [--quick] [--json F] [--backend llvm|cuda] [--threads N]
+    bench_render.py [--quick] [--json F] [--backend llvm|cuda] [--threads N] [--cycles PYTHON]
 
 Limits apply to ratios and counts; seconds are only reported. Times are CPU times of the process, so other work on the
 machine has little influence. --quick takes fewer samples and poses with the same limits, but the standard error of the
-oracle then has no limit. The exit code is 1 if a `must` is missed.
+oracle then has no limit. The exit code is 1 if a `must` is missed. Blender's Cycles renders the same bare eye if the
+Python given by --cycles has the package `bpy`.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
+import os
 import resource
 import subprocess
 import sys
@@ -48,20 +51,20 @@ def cpu_of(work: Callable[[], Any], runs: int) -> tuple[float, float]:
 class Bench:
     """The measurements; `small` for --quick."""
 
-    def __init__(self, backend: Any, small: bool) -> None:
+    def __init__(self, backend: Any, small: bool, cycles: str = sys.executable) -> None:
         from eyerender.rendering.renderer import Renderer
         from tests.support import render_rigs
 
         self.rigs, self.small = render_rigs, small
         self.renderer = Renderer(backend, spp=16)
-        self.backend = backend
+        self.backend, self.cycles_python = backend, cycles
 
     def rows(self) -> Iterable[Row]:
         """All rows, as they are measured."""
         for part in (
             self.iris_against_path, self.iris_against_light_tracer, self.noise, self.glint_centroids, self.large_disc,
-            self.pupil_outline, self.cost, self.surfaces_cost, self.region_cost, self.region_noise, self.subjects,
-            self.first_frames, self.recompiles, self.fixed_cost, self.memory, self.determinism,
+            self.pupil_outline, self.cost, self.cycles, self.surfaces_cost, self.region_cost, self.region_noise,
+            self.subjects, self.first_frames, self.recompiles, self.fixed_cost, self.memory, self.determinism,
         ):  # fmt: skip
             yield from part()
 
@@ -355,6 +358,49 @@ class Bench:
         yield row("full-frame E4 / E2, CPU", cpu["E4"] / cpu["E2"], "ratio", 1.3)
         yield row("full-frame E5 / E2, CPU", cpu["E5"] / cpu["E2"], "ratio", 1.3)
 
+    def cycles(self) -> Iterable[Row]:
+        """CPU time and noise of Blender's Cycles and of this package on E2's meshes under one lamp, remote camera."""
+        from eyerender.rendering.export import bake_meshes
+
+        job, box = self._remote_eye()
+        camera, samples = job.camera, 16 if self.small else 64
+        view = {
+            "position_mm": camera.nodal_point_mm.tolist(), "axis": camera.axis.tolist(), "focal_px": camera.K[0, 0],
+            "resolution_px": list(camera.resolution_px), "iris_box": box,
+            "lamps": [{"position_mm": lamp.position_mm.tolist(), "axis": lamp.axis.tolist(),
+                       "radius_mm": float(lamp.radius_mm)} for lamp in job.lights],
+        }  # fmt: skip
+        with tempfile.TemporaryDirectory() as folder:
+            bake_meshes(job.eye, folder, rings=48, sectors=128)
+            (Path(folder) / "view.json").write_text(json.dumps(view), encoding="utf-8")
+            command = [self.cycles_python, str(ROOT / "scripts" / "_cycles.py"), folder, str(samples), "2"]
+            done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": ""})
+        if done.returncode:
+            print("Cycles: bpy is not installed" if "bpy" in done.stderr else f"Cycles: {done.stderr[-300:]}")
+            return
+        found = json.loads(next(line for line in done.stdout.splitlines() if line.startswith('{"cpu_s"')))
+        ours = self._in_turns({"ours": lambda k: self.renderer.render(self._turned(job, k), spp=1)})["ours"][0]
+        x0, y0, x1, y1 = box
+        part = self.renderer.radiance(job, spp=1)[y0:y1, x0:x1]
+        noise = np.std(np.diff(part, axis=1)) / np.sqrt(2) / part.mean()
+        yield row(f"Cycles, bare eye 640x480, {samples} spp: CPU", found["cpu_s"], "s")
+        yield row("the same: noise of the iris", 100 * found["noise"], "%")
+        yield row("this package, 1 spp: CPU", ours, "s")
+        yield row("the same: noise of the iris", 100 * noise, "%")
+        yield row("CPU of Cycles / ours", found["cpu_s"] / ours, "ratio")
+
+    def _remote_eye(self) -> tuple[Any, list[int]]:
+        """Job of a bare eye that fills a remote camera's picture, and the corners of a part that shows iris alone."""
+        rigs = self.rigs
+        camera = rigs.Camera(
+            resolution_px=(640, 480), position_mm=(520.0, 0.0, -300.0), look_at_mm=(0.0, 0.0, 0.0),
+            focal_length_px=9000.0,
+        ).build()  # fmt: skip
+        rig = rigs.LampRig(camera, (rigs.remote_rig().lights[0],))
+        look = rigs.PLAIN.model_copy(update={"limbus_width_mm": 0.0})
+        job = rigs.job_of(rigs.eye_of("E2"), rig, (0, 0, 640, 480), look=look, labels=False)
+        return job, [365, 225, 390, 255]
+
     def surfaces_cost(self) -> Iterable[Row]:
         """Meshed corneas and blur by depth, against exact surfaces and no blur."""
         from eyerender.capture import render_job
@@ -423,9 +469,37 @@ class Bench:
         yield row("headset 640x480, 8 LEDs, 4 spp, a new pose, labels, PNG: CPU", 1e3 * found["headset"][0], "ms")
         yield row("the same: wall", 1e3 * found["headset"][1], "ms")
         yield row("the same: host time outside tracing, CPU", 1e3 * (spent - tracing[0]) / count, "ms")
+        yield from self._critical_path()
         yield row("the same / one pose without PNG", found["headset"][0] / found["the same pose"][0], "ratio")
         yield row("the same / bare eye, a new pose each", found["headset"][0] / found["bare"][0], "ratio")
         yield row("desktop window 400x300, 2 LEDs, 4 spp, a new pose: CPU", 1e3 * found["desktop"][0], "ms")
+
+    def _critical_path(self) -> Iterable[Row]:
+        """Share of the clock in which no sample is traced while a run of headset frames is rendered and written."""
+        from eyerender.capture import render_windows
+        from eyerender.imagefile import Writer
+        from eyerender.rendering import film
+        from eyerender.scene.shipped import load_scene
+
+        scene, real = load_scene("headset").with_(spp=4), vars(film)["dr"]
+
+        def run(folder: Path) -> float:
+            start = time.perf_counter()
+            with Writer() as writer:
+                for image in render_windows(scene.frames(), renderer=self.renderer):
+                    writer.png(folder / f"{image.name}.png", image.counts)
+                    writer.png(folder / f"{image.name}.mask.png", image.parts)
+            return time.perf_counter() - start
+
+        timed = _TimedEval(real)
+        with tempfile.TemporaryDirectory() as folder:
+            run(Path(folder))
+            setattr(film, "dr", timed)  # noqa: B010
+            try:
+                whole = run(Path(folder))
+            finally:
+                setattr(film, "dr", real)  # noqa: B010
+        yield row("headset frames in a run: clock in which no sample is traced", 100 * (1 - timed.spent / whole), "%")
 
     def region_noise(self) -> Iterable[Row]:
         """Relative noise of the light on iris, sclera and skin at 4 samples with 8 lamps, before the sensor's."""
@@ -583,6 +657,23 @@ class Bench:
         yield row("one seed, 1 or 2 threads, fresh process: digests beyond one", len(set(digests)) - 1, "digests", 0)
 
 
+class _TimedEval:
+    """Stands for `drjit` in a module, and adds up the clock that evaluations take."""
+
+    def __init__(self, module: Any) -> None:
+        self._module, self.spent = module, 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._module, name)
+
+    def eval(self, *arguments: Any) -> None:
+        """Evaluate, and wait for the result."""
+        start = time.perf_counter()
+        self._module.eval(*arguments)
+        self._module.sync_thread()
+        self.spent += time.perf_counter() - start
+
+
 def _plain_region() -> Any:
     """Region of even skin, without hairs."""
     from eyerender.region.anatomy import Region
@@ -601,10 +692,11 @@ def main() -> int:
     parser = options_of(__doc__, "fewer samples and poses")
     parser.add_argument("--backend", choices=["auto", "llvm", "cuda"], default="llvm")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--cycles", metavar="PYTHON", default=sys.executable, help="a Python that has bpy")
     options = parser.parse_args()
     backend = choose_backend(options.backend, options.threads)
     report = Report()
-    report.extend(Bench(backend, options.quick).rows())
+    report.extend(Bench(backend, options.quick, options.cycles).rows())
     if backend.name != "cuda":
         print("physics on a GPU: not measured, no GPU here")
     machine = {"device": backend.device, "threads": backend.threads}
