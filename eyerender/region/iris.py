@@ -96,7 +96,7 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     heights are above the plane of the iris, 0 at margin and root.
     """
     # Every part has its own numbers, so that it stays when the strength of another changes.
-    rng, fibrous, furrowed, holed = (np.random.default_rng((0x1815, k, iris.seed)) for k in range(4))
+    rng, fibrous, furrowed, holed, grained = (np.random.default_rng((0x1815, k, iris.seed)) for k in range(5))
     shape = (RADIAL, ANGULAR)
     s = ((np.arange(RADIAL, dtype=np.float32) + 0.5) / RADIAL)[:, None]
     turn = ((np.arange(ANGULAR, dtype=np.float32) + 0.5) / ANGULAR)[None, :]
@@ -114,16 +114,19 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     # The stroma is thinner inside the collarette, which is a ridge of varying height.
     along = np.clip(1 + 0.8 * _noise(rng, (1, ANGULAR), (0, 1), (3, 30), True), 0, 2.4)
     crest = np.exp(-((off / rng.uniform(0.015, 0.04)) ** 2)) * along
-    height += iris.collarette * (0.045 * crest - 0.05 * (1 - ciliary) + 0.03 * np.exp(-((off / 0.12) ** 2)))
+    height += iris.collarette * (0.06 * crest - 0.06 * (1 - ciliary) + 0.03 * np.exp(-((off / 0.12) ** 2)))
     albedo += iris.collarette * (0.06 * crest + 0.05 * (1 - ciliary))
     slow = _noise(rng, shape, (0, 2.0), (0, 5))
-    albedo += 0.045 * slow + 0.02 * _noise(rng, shape, (0, 14), (0, 60)) - 0.04 * _step(s, 0.72, 1.0)
+    albedo += 0.045 * slow + 0.035 * _noise(rng, shape, (0, 14), (0, 60)) - 0.04 * _step(s, 0.72, 1.0)
     height += 0.02 * slow
+    # The stroma is a felt of collagen, whose grain shows in every iris.
+    albedo += grained.uniform(0.042, 0.070) * _noise(grained, shape, (8, 32), (50, 200))
+    albedo += 0.042 * _noise(grained, shape, (3, 12), (20, 70))
 
     grooves = iris.furrows * _furrows(furrowed, s, turn)
     depth, trabeculae = _crypts(holed, iris.crypts, s=s, off=off, turn=turn, warp=warp)
-    height += 0.02 * trabeculae - 0.055 * grooves - 0.22 * depth
-    albedo = albedo * (1 + 0.45 * trabeculae) * (1 - 0.10 * grooves) * (1 - 0.75 * depth)
+    height += 0.03 * trabeculae - 0.07 * grooves - 0.25 * depth
+    albedo = albedo * (1 + 0.45 * trabeculae) * (1 - 0.14 * grooves) * (1 - 0.85 * depth)
 
     # The ruff is the pigment epithelium turned over the margin, a dark beaded seam.
     beads = np.maximum(0.018 * (1 + 0.35 * _noise(rng, (1, ANGULAR), (0, 1), (30, 75), True)), 0.006)
@@ -156,9 +159,9 @@ def _fibres(rng: np.random.Generator, warp: Singles, ciliary: Singles, strength:
     sector = np.clip(1 + 0.7 * _noise(rng, (1, ANGULAR), (0, 1), (0, 4), True), 0, 2)
     strands = np.maximum(bent(_noise(rng, shape, (0, 2.6 * long_by), (30 * fine_by, 85 * fine_by)), 1.2) - 0.9, 0)
     strands = (strands - 0.08) * sector
-    outer = ciliary * (0.055 * coarse + 0.05 * ridges + 0.02 * fine + 0.16 * strands)
-    inner = (1 - ciliary) * (0.03 * coarse + 0.05 * fine + 0.03 * medium)
-    height = ciliary * (0.012 * coarse + 0.012 * ridges + 0.03 * strands)
+    outer = ciliary * (0.065 * coarse + 0.065 * ridges + 0.03 * fine + 0.2 * strands)
+    inner = (1 - ciliary) * (0.04 * coarse + 0.065 * fine + 0.04 * medium)
+    height = ciliary * (0.016 * coarse + 0.016 * ridges + 0.04 * strands)
     height += (1 - ciliary) * (0.006 * coarse + 0.006 * fine)
     return 1 + strength * (outer + inner), strength * height
 

@@ -96,12 +96,12 @@ class Look(Spec):
     )
     sclera_contrast: Contrast = Field(default=1.0, description="contrast of vessels and unevenness (chosen)")
     limbus_albedo: Albedo = Field(
-        default=0.40,
+        default=0.35,
         description="albedo of the tissue where the cornea merges into the sclera (chosen so that the limbus has no "
         "dark ring, as in most near-infrared photographs)",
     )
     limbus_width_mm: Annotated[float, Field(ge=0, le=3)] = Field(
-        default=0.8,
+        default=1.0,
         description="width of the transition from clear cornea to opaque sclera, inwards from the limbus (chosen)",
     )
     limbus_transmittance: Annotated[float, Field(ge=0, le=0.9)] = Field(
