@@ -21,7 +21,7 @@ from tests.support.render_rigs import FLAT_IRIS, PLAIN, LampRig, eye_of, job_of,
 
 pytestmark = pytest.mark.render
 
-DEEP = IrisPattern(relief=1.5, convexity_mm=0.3, crypts=1.2, fibres=0.8, collarette=1.0)
+DEEP = IrisPattern(relief=1.2, convexity_mm=0.3, crypts=1.2, fibres=0.8, collarette=1.0)
 SEED = 7
 BARE = PLAIN.model_copy(
     update={"limbus_width_mm": 0.0, "tear_film": False, "iris": DEEP, "iris_seed": SEED, "iris_albedo": 0.5}
