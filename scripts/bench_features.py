@@ -11,6 +11,8 @@ exit code is 1 if a `must` is missed.
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import sys
 import time
 import tracemalloc
@@ -21,6 +23,7 @@ import numpy as np
 
 from _bench import Report, Row, options_of, row
 from eyerender.analytic.features import Features, features
+from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.fixation import fixations
 from eyerender.scene import load_scene
@@ -90,8 +93,12 @@ def measure(quick: bool) -> Iterator[Row]:
 
 def different_eyes(count: int, runs: int) -> float:
     """Cost of fixation and features of `count` drawn eyes over that of one of them as often; best of runs in turns."""
-    population = Population("adults")
-    eyes = [population.person(k).eye("right").build() for k in range(count)]
+    population, eyes = Population("adults"), []
+    for k in itertools.count():
+        with contextlib.suppress(InputError):  # physics refuses a few people
+            eyes.append(population.person(k).eye("right").build())
+        if len(eyes) == count:
+            break
     scene = load_scene("blignaut2014")
     rng = np.random.default_rng(0)
     target = np.column_stack([np.full(count, 600.0), rng.uniform(-200, 200, (count, 2))])
