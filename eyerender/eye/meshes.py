@@ -121,7 +121,7 @@ def cornea_patches(eye: EyeModel, rings: int, sectors: int) -> tuple[Patch, ...]
     indices = [1.0, *(float(n) for n in eye.front_indices)]
     patches = [_cap("cornea_front", eye.front[0], limbus, rings, indices[0], indices[1])]
     if len(eye.front) > 1:
-        rho = _chamber_rim(eye, eye.front[-1], 2 * np.pi * np.arange(sectors) / sectors)
+        rho = chamber_rim(eye, eye.front[-1], 2 * np.pi * np.arange(sectors) / sectors)
         patches.append(_cap("cornea_back", eye.front[-1], rho, rings, indices[1], indices[2]))
     return tuple(patches)
 
@@ -173,7 +173,7 @@ def _band(
     return Patch(name, vertices, np.asarray(mesh.vertex_normals), faces, exterior, interior)
 
 
-def _chamber_rim(eye: EyeModel, surface: Surface, angle: Floats) -> Floats:
+def chamber_rim(eye: EyeModel, surface: Surface, angle: Floats) -> Floats:
     """Radius (sectors,) at which the posterior cornea meets the plane of the iris, at most that of the limbus."""
     low, high = np.zeros_like(angle), np.full_like(angle, float(eye.limbus_radius_mm) * 0.995)
     for _ in range(60):

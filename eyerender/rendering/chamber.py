@@ -26,6 +26,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
+from ..eye.meshes import chamber_rim
 from ..eye.model import EyeModel
 from ..geometry.surfaces import Surface, components
 from ..optics.interface import fresnel
@@ -35,7 +36,7 @@ IRIS = IRIS_RINGS * TURNS
 LEVELS = 2  # of points on the wall
 PLACES = IRIS + TURNS * LEVELS
 RAYS, LEAVING = 160, 32  # from each point; the first of them are followed out of the eye
-_MIRRORINGS = 6
+_STEPS = 20  # crossings and mirrorings of a ray
 _NEAR_MM = 1e-6
 _BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
 _WALL_MM = 1.0  # thickness of the sclera
@@ -67,7 +68,10 @@ def chamber_of(eye: EyeModel, film: float) -> Chamber:
     plane = (*np.asarray(eye.stop.centre_mm).tolist(), *np.asarray(eye.stop.normal).tolist())
     sclera = (*np.asarray(eye.sclera.centre_mm).tolist(), float(eye.sclera.radius_mm))
     indices = tuple(float(n) for n in eye.front_indices)
-    return _chamber(tuple(eye.front), indices, film, plane, float(eye.limbus_radius_mm), sclera)
+    foot = None
+    if len(eye.front) > 1:
+        foot = float(np.mean(chamber_rim(eye, eye.front[-1], 2 * np.pi * np.arange(TURNS) / TURNS)))
+    return _chamber(tuple(eye.front), indices, film, plane, float(eye.limbus_radius_mm), sclera, foot)
 
 
 def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
@@ -135,7 +139,8 @@ def shares(eye: EyeModel, chamber: Chamber, inside: float, iris: float, beyond: 
 class _Walls:
     """Surfaces about the chamber: refracting ones from outside inwards, their indices, film, plane and wall.
 
-    The wall is a cone about x with radius `rim` at x = `top`, which grows by `slope` per mm downwards.
+    The wall is a cone about x with radius `rim` at x = `top`, which grows by `slope` per mm downwards. Where the cornea
+    has a back surface, which meets the plane of the iris, the wall is the rim of the cornea in front of that.
     """
 
     front: tuple[Surface, ...]
@@ -147,6 +152,11 @@ class _Walls:
     rim: float
     top: float
     slope: float
+
+    @property
+    def layer(self) -> int:
+        """Medium that the wall bounds, as the number of surfaces in front of it."""
+        return max(len(self.front) - 1, 1)
 
     def height(self, p: Floats) -> Floats:
         """Height (n,) mm of points above the plane of the iris."""
@@ -176,9 +186,9 @@ class _Walls:
 @lru_cache(maxsize=64)
 def _chamber(
     front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...], limbus: float,
-    sclera: tuple[float, ...],
+    sclera: tuple[float, ...], foot: float | None,
 ) -> Chamber:  # fmt: skip
-    walls = _walls(front, indices, film, plane, limbus, sclera)
+    walls = _walls(front, indices, film, plane, limbus, sclera, foot)
     step, points, normals, valid = _places(walls)
     exchange = np.zeros((PLACES, PLACES))
     leaving = np.zeros((PLACES, RAYS, 7))
@@ -186,7 +196,7 @@ def _chamber(
     o, d = _pattern(points[rows], normals[rows])
     row = np.repeat(rows, RAYS)
     left = leaving.reshape(-1, 7)
-    arrived = _traced(walls, o, d)
+    arrived = _traced(walls, o, d, np.where(row < IRIS, len(front), walls.layer))
     slot = (row * RAYS + np.tile(np.arange(RAYS), len(rows)))[arrived.out]
     left[slot] = np.concatenate([arrived.origin, arrived.way, arrived.weight[:, None]], axis=1)
     for index, weight in _onto(arrived.back, arrived.on_wall, step, points, valid):
@@ -196,11 +206,13 @@ def _chamber(
 
 
 def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...],
-           limbus: float, sclera: tuple[float, ...]) -> _Walls:  # fmt: skip
+           limbus: float, sclera: tuple[float, ...], foot: float | None) -> _Walls:  # fmt: skip
     centre, normal = np.array(plane[:3]), np.array(plane[3:])
     top = float(np.asarray(front[0].origin_mm)[0] + front[0].sag(np.array(limbus), np.array(0.0)))
     bottom = centre[0] - _BELOW_MM
     wide = np.sqrt(max((sclera[3] - _WALL_MM) ** 2 - (bottom - sclera[0]) ** 2, limbus**2))
+    if foot is not None:
+        bottom, wide = min(centre[0], top - 0.1), foot
     return _Walls(front, indices, film, centre, normal, limbus, limbus, top, (wide - limbus) / (top - bottom))
 
 
@@ -224,7 +236,7 @@ def _places(walls: _Walls) -> tuple[float, Floats, Floats, Bools]:
     wall = np.stack([x, r * np.cos(angle), r * np.sin(angle)], axis=-1)
     steep = np.hypot(1.0, walls.slope)
     across = np.stack([np.full_like(x, -walls.slope), -np.cos(angle), -np.sin(angle)], axis=-1) / steep
-    there = (walls.height(wall) > 0.02) & (walls.top - foot > 0.1) & (len(walls.front) == 1)
+    there = (walls.height(wall) > 0.02) & (walls.top - foot > 0.1)
     points = np.concatenate([grid, wall + 1e-4 * across])
     return step, points, np.concatenate([np.tile(n, (IRIS, 1)), across]), np.append(inside, there)
 
@@ -265,82 +277,109 @@ class _Arrived:
     on_wall: Bools
 
 
-def _traced(walls: _Walls, o: Floats, d: Floats) -> _Arrived:
-    """Follow rays until they return to the plane or the wall; what leaves at the first refraction is kept."""
-    number, weight = np.arange(len(o)), np.ones(len(o))
-    ends = []
-    for mirroring in range(_MIRRORINGS):
-        plane, wall = walls.to_plane(o, d), walls.to_wall(o, d)
-        low = np.minimum(plane, wall)
-        p, w, ok = _to_front(walls, o, d, low)
-        arrives = np.isfinite(low) & ~ok.met
-        ends.append((number[arrives], weight[arrives], (o + low[:, None] * d)[arrives], (wall < plane)[arrives]))
-        number, weight, p, w = number[ok.there], weight[ok.there], p[ok.there], w[ok.there]
-        n = walls.front[0].normal(p)
-        cosine = np.sum(n * w, axis=1)
-        mirrored = fresnel(cosine, walls.indices[0], 1.0, walls.film).unpolarized
-        if mirroring == 0:
-            go = mirrored < 1
-            out, origin = number[go], p[go]
-            outward = _refracted(w[go], -n[go], walls.indices[0])
-            full = walls.indices[-1] ** 2 * (1 - mirrored[go])
-        d = w - 2 * cosine[:, None] * n
-        weight = weight * mirrored
-        keep = weight > 1e-3
-        number, weight, o, d = number[keep], weight[keep], p[keep], d[keep]
-        o, d, inside = _from_front(walls, o, d)
-        number, weight, o, d = number[inside], weight[inside], o[inside], d[inside]
-    rays, weights, places, walled = zip(*ends, strict=True)
-    arrived = np.concatenate(rays), np.concatenate(weights), np.concatenate(places), np.concatenate(walled)
-    return _Arrived(out, origin, outward, full, *arrived)
+@dataclass(slots=True)
+class _Rays:
+    """Rays on their way: numbers, weights, points, directions, and in which medium (surfaces in front of it)."""
+
+    number: Ints
+    weight: Floats
+    o: Floats
+    d: Floats
+    layer: Ints
+
+    def only(self, some: Bools) -> _Rays:
+        return _Rays(self.number[some], self.weight[some], self.o[some], self.d[some], self.layer[some])
+
+    def and_(self, other: _Rays) -> _Rays:
+        names = ("number", "weight", "o", "d", "layer")
+        return _Rays(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
 
-@dataclass(frozen=True, slots=True)
-class _Reached:
-    """Rays that meet the innermost surface before plane and wall (`met`), and those that reach the front's inside."""
+def _traced(walls: _Walls, o: Floats, d: Floats, layer: Ints) -> _Arrived:
+    """Follow rays until they arrive at the plane or the wall; what leaves at the first refraction by the front is kept.
 
-    met: Bools
-    there: Bools
+    The cornea's back refracts them; it mirrors only what it mirrors totally.
+    """
+    rays = _Rays(np.arange(len(o)), np.ones(len(o)), o, d, layer)
+    first = np.ones(len(o), dtype=bool)
+    ends, left = [], []
+    for _ in range(_STEPS):
+        if not len(rays.number):
+            break
+        outer, inner = _to_surfaces(walls, rays)
+        plane = np.where(rays.layer == len(walls.front), walls.to_plane(rays.o, rays.d), np.inf)
+        wall = np.where(rays.layer == walls.layer, walls.to_wall(rays.o, rays.d), np.inf)
+        nearest = np.minimum(np.minimum(plane, wall), np.minimum(outer, inner))
+        known = np.isfinite(nearest)
+        arrives = known & (nearest == np.minimum(plane, wall))
+        at = rays.o + np.where(known, nearest, 0)[:, None] * rays.d
+        ends.append((rays.number[arrives], rays.weight[arrives], at[arrives], (wall < plane)[arrives]))
+        rays.o = at
+        known &= ~arrives
+        outwards = nearest == outer
+        at_front = rays.only(known & outwards & (rays.layer == 1))
+        at_front, gone = _mirrored(walls, at_front, first)
+        left.append(gone)
+        further = [at_front]
+        for k in range(1, len(walls.front)):
+            further.append(_crossed(walls, rays.only(known & outwards & (rays.layer == k + 1)), k, outwards=True))
+            further.append(_crossed(walls, rays.only(known & ~outwards & (rays.layer == k)), k, outwards=False))
+        rays = further[0]
+        for more in further[1:]:
+            rays = rays.and_(more)
+    arrived = [np.concatenate(column) for column in zip(*ends, strict=True)]
+    out = [np.concatenate(column) for column in zip(*left, strict=True)]
+    return _Arrived(out[0], out[1], out[2], out[3], *arrived)
 
 
-def _to_front(walls: _Walls, o: Floats, d: Floats, limit: Floats) -> tuple[Floats, Floats, _Reached]:
-    """Trace outwards from the chamber to the inner side of the front surface; small mirrorings before are left out."""
-    p, w = o, d
-    met = there = np.ones(len(o), dtype=bool)
-    count = len(walls.front)
-    for k in range(count - 1, -1, -1):
-        surface = walls.front[k]
-        t = _outward(surface, p, w)
-        hit = p + np.where(np.isfinite(t), t, 0)[:, None] * w
-        good = np.isfinite(t)
+def _to_surfaces(walls: _Walls, rays: _Rays) -> tuple[Floats, Floats]:
+    """Distances (n,) to the surface in front of the rays' medium and to that behind it; infinite where it is missed."""
+    outer, inner = np.full(len(rays.number), np.inf), np.full(len(rays.number), np.inf)
+    for k, surface in enumerate(walls.front):
+        here = rays.layer == k + 1
+        t = _outward(surface, rays.o[here], rays.d[here])
         if k == 0:
+            hit = rays.o[here] + np.where(np.isfinite(t), t, 0)[:, None] * rays.d[here]
             local = surface.to_local(hit)
-            good &= (np.hypot(local[:, 1], local[:, 2]) < walls.limbus) & (hit[:, 0] > walls.top - 1e-6)
-        if k == count - 1:
-            met = good & (t < limit)
-        there = there & good & met
-        p = hit
-        if k > 0:
-            n = surface.normal(hit)
-            w = _refracted(w, -n, walls.indices[k] / walls.indices[k - 1])
-    return p, w, _Reached(met, there)
+            t[(np.hypot(local[:, 1], local[:, 2]) > walls.limbus) | (hit[:, 0] < walls.top - 1e-6)] = np.inf
+        outer[here] = t
+        here = rays.layer == k
+        hit = surface.hit(components(rays.o[here]), components(rays.d[here]), True)
+        inner[here] = np.where(hit.ok & (hit.distance > _NEAR_MM), hit.distance, np.inf)
+    return outer, inner
 
 
-def _from_front(walls: _Walls, o: Floats, d: Floats) -> tuple[Floats, Floats, Bools]:
-    """Trace from the front's inner side back into the chamber: origins, directions, and which rays arrive."""
-    ok = np.ones(len(o), dtype=bool)
-    for k in range(1, len(walls.front)):
-        surface = walls.front[k]
-        hit = surface.hit(components(o), components(d), True)
-        t = np.where(hit.ok & (hit.distance > 0), hit.distance, 0)
-        ok &= hit.ok & (hit.distance > 0)
-        o = o + t[:, None] * d
-        n = surface.normal(o)
-        eta = walls.indices[k - 1] / walls.indices[k]
-        cosine = -np.sum(n * d, axis=1)
-        ok &= 1 - eta * eta * (1 - cosine * cosine) > 0
-        d = _refracted(d, n, eta)
-    return o, d, ok
+def _mirrored(walls: _Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tuple[Ints, Floats, Floats, Floats]]:
+    """Mirror rays at the inner side of the front; also what leaves the eye there of those that are the first time.
+
+    `first` tells for every ray whether it has not been there yet.
+    """
+    n, w = walls.front[0].normal(rays.o), rays.d
+    cosine = np.sum(n * w, axis=1)
+    mirrored = fresnel(cosine, walls.indices[0], 1.0, walls.film).unpolarized
+    go = first[rays.number] & (mirrored < 1)
+    full = rays.weight * walls.indices[0] ** 2 * (1 - mirrored)
+    gone = rays.number[go], rays.o[go], _refracted(w[go], -n[go], walls.indices[0]), full[go]
+    first[rays.number] = False
+    rays.d = w - 2 * cosine[:, None] * n
+    rays.weight = rays.weight * mirrored
+    return rays.only(rays.weight > 1e-3), gone
+
+
+def _crossed(walls: _Walls, rays: _Rays, k: int, *, outwards: bool) -> _Rays:
+    """Refract rays at surface k behind the front, with the change of radiance between media; mirror the others."""
+    n = walls.front[k].normal(rays.o)
+    before, after = walls.indices[k - 1], walls.indices[k]
+    if outwards:
+        n, before, after = -n, after, before
+    eta = before / after
+    cosine = -np.sum(n * rays.d, axis=1)
+    passes = 1 - eta * eta * (1 - cosine * cosine) > 0
+    mirrored = rays.d + 2 * cosine[:, None] * n
+    rays.d = np.where(passes[:, None], _refracted(rays.d, n, eta), mirrored)
+    rays.weight = rays.weight * np.where(passes, eta * eta, 1.0)
+    rays.layer = rays.layer + np.where(passes, -1 if outwards else 1, 0)
+    return rays
 
 
 def _outward(surface: Surface, o: Floats, d: Floats) -> Floats:

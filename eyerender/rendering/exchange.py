@@ -48,6 +48,7 @@ from .view import Textures, appearance, iris_albedo, meet, outer_albedo
 
 if TYPE_CHECKING:
     from .region import RegionScene
+    from .surfaces import Surface
     from .surround import Surround
     from .values import Lights, Values
 
@@ -383,11 +384,23 @@ def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, chamber: Cha
     """Irradiance (PLACES,) of the chamber's places straight from lamps."""
     if len(lights) == 0:
         return np.zeros(PLACES)
-    index = dr.arange(mi.UInt32, PLACES)
-    n = _rows(np.column_stack([chamber.points, chamber.normals, chamber.valid]))(index)
+    rows = np.column_stack([chamber.points, chamber.normals, chamber.valid])
+    if len(values.surfaces) == 1:
+        return _through(values, lights, scene, rows, values.surfaces)
+    # The wall is the rim of the cornea, in front of its back.
+    wall = _through(values, lights, scene, rows[IRIS:], values.surfaces[:-1])
+    return np.concatenate([_through(values, lights, scene, rows[:IRIS], values.surfaces), wall])
+
+
+def _through(values: Values, lights: Lights, scene: mi.Scene, rows: Floats, surfaces: tuple[Surface, ...]) -> Floats:
+    """Irradiance of places behind some of the surfaces; rows hold points, normals, and whether they are in the eye."""
+    index = dr.arange(mi.UInt32, len(rows))
+    n = _rows(rows)(index)
     x, inside, normal = mi.Vector3f(*n[:3]), n[6] > 0, mi.Vector3f(*n[3:6])
     return _over_lamps(
-        lights, index, lambda u, v: through_cornea(values, lights, scene, x, inside, u, v, normal=normal)[0]
+        lights,
+        index,
+        lambda u, v: through_cornea(values, lights, scene, x, inside, u, v, normal=normal, surfaces=surfaces)[0],
     )
 
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from .manifold import connect
 from .region import sheen
+from .surfaces import Surface
 from .values import Lamp, Lights, Values
 from .view import EPSILON_MM, View, meet_sphere, opacity
 
@@ -197,10 +198,12 @@ def through_cornea(
     u: mi.Float,
     v: mi.Float,
     normal: mi.Vector3f | None = None,
+    surfaces: tuple[Surface, ...] | None = None,
 ) -> tuple[mi.Float, mi.UInt32]:
     """Irradiance (mW/mm^2) of all lamps at points `inner` in the plane of the iris, where `inside`; failed paths.
 
-    u, v: place on each lamp's disc, [0, 1). normal: unit normals at the points; None for those of the plane.
+    u, v: place on each lamp's disc, [0, 1). normal: unit normals at the points; None for those of the plane. surfaces:
+    those in front of the points; None for all.
     """
     bent, rest = mi.Float(0), inside
     if lights.on_iris is not None:
@@ -213,7 +216,7 @@ def through_cornea(
 
     def body(i: mi.UInt32, bent: mi.Float, failures: mi.UInt32) -> tuple[mi.UInt32, mi.Float, mi.UInt32]:
         lamp: Lamp = lights[i]
-        path = LampPath.to(values, scene, lamp, lamp.point(u, sine, cosine), inner, rest, normal)
+        path = LampPath.to(values, scene, lamp, lamp.point(u, sine, cosine), inner, rest, normal, surfaces)
         failed = dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
         return i + 1, bent + dr.select(path.blocked, 0, path.gain), failures + failed
 
@@ -260,13 +263,14 @@ class LampPath:
         inner: mi.Vector3f,
         active: mi.Bool,
         normal: mi.Vector3f | None = None,
+        surfaces: tuple[Surface, ...] | None = None,
     ) -> LampPath:
         """Find the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame)."""
         # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
         scale, shift = values.image.scale, values.image.shift
         aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
         normal = values.stop.normal if normal is None else normal
-        path = connect(values.surfaces, source, inner, normal, aim, values.limbus.radius, active)
+        path = connect(surfaces or values.surfaces, source, inner, normal, aim, values.limbus.radius, active)
         local = values.surfaces[0].point_in(path.entry)
         clear = 1 - opacity(values, dr.sqrt(local.y * local.y + local.z * local.z))
         enters = path.found & (clear > 0)
