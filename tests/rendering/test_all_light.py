@@ -10,11 +10,9 @@ from scipy import ndimage
 
 from eyerender.arrays import frozen
 from eyerender.region.anatomy import Region
-from eyerender.region.skin import SHEET_ROWS, skin_map
 from eyerender.rig.camera import Camera
 from eyerender.rig.imaging import Ambient
-from eyerender.rig.light import Lamp
-from tests.support.render_oracles import cos4, stock
+from tests.support.render_oracles import cos4, rings, stock
 from tests.support.render_rigs import PLAIN, LampRig, eye_of, head_rig, job_of, remote_rig
 
 pytestmark = pytest.mark.render
@@ -60,41 +58,7 @@ def test_mean_skin_has_the_albedo_of_the_spec(renderer, tmp_path):
     assert mine[skin].mean() == pytest.approx(truth[skin].mean(), rel=0.015)
 
 
-def rings(renderer, job) -> dict[str, np.ndarray]:
-    """Masks of pixels that lie wholly in one part: three rings of the iris, sclera, and surround or skin."""
-    import drjit as dr
-    import mitsuba as mi
-
-    from eyerender.rendering.sampling import camera_ray
-    from eyerender.rendering.view import meet
-
-    shown, _ = renderer.bind(job, lit=False)
-    x0, y0, w, h = job.window
-    v, u = (k.ravel() for k in np.mgrid[y0 : y0 + h, x0 : x0 + w])
-    kinds = []
-    for du, dv in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
-        o, d, _ = camera_ray(shown.values, mi.Float(u + du), mi.Float(v + dv))
-        view, hit = meet(shown.values, shown.scene, mi.Vector3f(o + dr.zeros(mi.Float, len(u))), d, mi.Bool(True))
-        region = shown.textures.region
-        sheet = view.other if region is None else view.other & region.on_sheet(region.face(hit))
-        cornea, pupil, sclera, other = (np.array(k, dtype=bool) for k in (view.cornea, view.pupil, view.sclera, sheet))
-        ring = 1 + np.digitize(np.hypot(*np.array(view.inner)[1:]), [3.2, 4.4, job.eye.iris_root_radius_mm - 0.05])
-        kinds.append(np.where(cornea & ~pupil, ring, np.where(sclera, 5, np.where(other, 6, 0))))
-    kind = np.where(np.all(kinds == kinds[0], axis=0), kinds[0], 0).reshape(h, w)
-    names = {"inner iris": 1, "middle iris": 2, "outer iris": 3, "sclera": 5, "other": 6}
-    return {name: kind == k for name, k in names.items() if np.sum(kind == k) > 8}
-
-
 FLAT = PLAIN.model_copy(update={"limbus_width_mm": 0.0})
-
-
-def large_lamps(places_mm) -> tuple[Lamp, ...]:
-    """Lamps of 100 mm, which the stock path integrator finds behind a cornea."""
-    places = [300 * np.array(p) / np.linalg.norm(p) for p in places_mm]
-    return tuple(
-        Lamp(position_mm=frozen(p), axis=frozen(-p / 300), radius_mm=100.0, intensity_mw_sr=1e3, lobe_exponent=1.0)
-        for p in places
-    )
 
 
 def remote(side_px: int, side_mm: float, lights) -> LampRig:
@@ -130,65 +94,6 @@ def test_an_even_sky_lights_sclera_surround_and_iris_as_in_the_stock_path_integr
     found = {name: mine[m].mean() / truth[m].mean() - 1 for name, m in rings(renderer, job).items()}
     assert len(found) == 5
     assert all(abs(away) < 0.02 for away in found.values()), found
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("albedo", [0.3, 0.6])
-def test_iris_and_chamber_against_path(renderer, tmp_path, albedo):
-    a = np.radians(65.0)
-    lights = large_lamps([[np.cos(a), np.sin(a), 0.0], [np.cos(a), -np.sin(a), 0.0]])
-    look = FLAT.model_copy(update={"iris_albedo": albedo})
-    job = job_of(eye_of("E2"), remote(48, 11.4, lights), (0, 0, 48, 48), look=look)
-    truth, error = many(job, tmp_path, 8192)
-    # The lamps' mirror images lie left and right.
-    v, u = np.mgrid[:48, :48] - 23.5
-    compare(renderer, job, truth, error, ("inner iris", "middle iris", "outer iris"), np.abs(u) < 0.45 * np.abs(v))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("place", ["bare", "region"])
-@pytest.mark.parametrize("model", ["E2", "E4"])
-def test_sclera_skin_and_surround_against_path(renderer, tmp_path, monkeypatch, place, model):
-    import mitsuba as mi
-
-    from eyerender.rendering import lighting
-    from eyerender.rendering.region import RegionScene
-
-    def even(spec):
-        look = skin_map(spec).copy()
-        look[:SHEET_ROWS, :, 0] = spec.skin.albedo
-        look[..., 1:] = 0
-        return look
-
-    # The exported skin has one albedo, no relief and no sheen.
-    monkeypatch.setattr(RegionScene, "_look", staticmethod(even))
-    monkeypatch.setattr(lighting, "sheen", lambda *_: mi.Float(0))
-    from eyerender.rendering.renderer import Renderer
-
-    plain = Renderer(renderer.backend)
-    lights = large_lamps([[0.42, 0.0, -0.91], [0.42, 0.72, 0.54]])
-    region, mm = (Region(), 40.0) if place == "region" else (None, 26.0)
-    job = job_of(eye_of(model), remote(96, mm, lights), (0, 0, 96, 96), look=FLAT, region=region)
-    truth, error = many(job, tmp_path, 2048)
-    compare(plain, job, truth, error, ("sclera", "other"), np.ones((96, 96), dtype=bool))
-
-
-def many(job, folder, spp) -> tuple[np.ndarray, np.ndarray]:
-    """Stock picture of all light (depth 24), and the standard error of each pixel."""
-    parts = np.stack([stock(job, folder, 24, spp // 8, seed=seed, rings=96, sectors=192) for seed in range(8)])
-    return parts.mean(axis=0), parts.std(axis=0, ddof=1) / np.sqrt(8)
-
-
-def compare(renderer, job, truth, error, parts, where) -> None:
-    """Assert that each part agrees with the oracle to 1 % and two standard errors."""
-    mine = renderer.radiance(job, spp=64) / cos4(job)
-    masks = rings(renderer, job)
-    found = {}
-    for name in parts:
-        m = masks[name] & where
-        noise = np.sqrt(np.sum(error[m] ** 2)) / np.sum(truth[m])
-        found[name] = (mine[m].mean() / truth[m].mean() - 1, noise)
-    assert all(abs(away) < 0.01 + 2 * noise for away, noise in found.values()), found
 
 
 def test_picture_does_not_depend_on_earlier_ones(renderer):

@@ -303,6 +303,10 @@ def test_the_own_region_as_a_head_hides_what_it_hides(renderer, tmp_path):
     assert np.mean(head.parts != own.parts) < 1e-4  # the file keeps five digits
     assert [g["reason"] for g in labels_of(head)["glints"]] == [g["reason"] for g in labels_of(own)["glints"]]
     assert labels_of(head)["iris_visible_fraction"] == pytest.approx(labels_of(own)["iris_visible_fraction"], abs=1e-3)
+    # The same skin sends the same light to the globe.
+    for part in (1, 2):
+        lit, same = (i.irradiance[i.parts == part].mean() for i in (head, own))
+        assert lit == pytest.approx(same, rel=0.01)
 
 
 def test_a_mesh_in_the_cornea_is_refused_with_its_depth(renderer, folder):

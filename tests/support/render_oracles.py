@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.path import Path as Outline
@@ -198,3 +198,28 @@ def cos4(job: RenderJob) -> Floats:
     x0, y0, w, h = job.window
     grid = np.stack(np.meshgrid(np.arange(w) + x0, np.arange(h) + y0), axis=-1).reshape(-1, 2)
     return np.asarray((job.camera.rays(grid) @ job.camera.axis) ** 4).reshape(h, w)
+
+
+def rings(renderer: Any, job: RenderJob) -> dict[str, Any]:
+    """Masks of pixels that lie wholly in one part: three rings of the iris, sclera, and surround or skin."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from eyerender.rendering.sampling import camera_ray
+    from eyerender.rendering.view import meet
+
+    shown, _ = renderer.bind(job, lit=False)
+    x0, y0, w, h = job.window
+    v, u = (k.ravel() for k in np.mgrid[y0 : y0 + h, x0 : x0 + w])
+    kinds = []
+    for du, dv in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
+        o, d, _ = camera_ray(shown.values, mi.Float(u + du), mi.Float(v + dv))
+        view, hit = meet(shown.values, shown.scene, mi.Vector3f(o + dr.zeros(mi.Float, len(u))), d, mi.Bool(True))
+        region = shown.textures.region
+        sheet = view.other if region is None else view.other & region.on_sheet(region.face(hit))
+        cornea, pupil, sclera, other = (np.array(k, dtype=bool) for k in (view.cornea, view.pupil, view.sclera, sheet))
+        ring = 1 + np.digitize(np.hypot(*np.array(view.inner)[1:]), [3.2, 4.4, job.eye.iris_root_radius_mm - 0.05])
+        kinds.append(np.where(cornea & ~pupil, ring, np.where(sclera, 5, np.where(other, 6, 0))))
+    kind = np.where(np.all(kinds == kinds[0], axis=0), kinds[0], 0).reshape(h, w)
+    names = {"inner iris": 1, "middle iris": 2, "outer iris": 3, "sclera": 5, "other": 6}
+    return {name: kind == k for name, k in names.items() if np.sum(kind == k) > 8}

@@ -1,0 +1,192 @@
+"""All light against Mitsuba's stock path integrator at depth 24, with lamps so large that it finds them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from eyerender.arrays import frozen
+from eyerender.region.anatomy import Region
+from eyerender.region.skin import SHEET_ROWS, skin_map
+from eyerender.rig.camera import Camera
+from eyerender.rig.imaging import Ambient, Panel, RadianceMap, Sun
+from eyerender.rig.light import Lamp
+from tests.support.render_oracles import cos4, rings
+from tests.support.render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of
+
+pytestmark = [pytest.mark.render, pytest.mark.slow]
+
+# The exported scene has no soft rims and no light through the limbus. The film of tears has an oracle of its own.
+BARE = {"limbus_width_mm": 0.0, "tear_film": False, "limbus_transmittance": 0.0}
+FLAT = PLAIN.model_copy(update={**BARE, "pupil_albedo": 0.0})
+# The exported lashes have one albedo.
+REGION = Region.from_mapping({"lashes": {"tip_albedo": 0.05, "lower_albedo": 0.05}})
+SIDE = [[0.42, 0.91, 0.0], [0.42, -0.91, 0.0]]
+LOW = [[0.42, 0.0, -0.91], [0.42, 0.72, 0.54]]
+
+
+def large_lamps(places_mm) -> tuple[Lamp, ...]:
+    """Lamps of 100 mm, which the stock path integrator finds behind a cornea."""
+    places = [300 * np.array(p) / np.linalg.norm(p) for p in places_mm]
+    return tuple(
+        Lamp(position_mm=frozen(p), axis=frozen(-p / 300), radius_mm=100.0, intensity_mw_sr=1e3, lobe_exponent=1.0)
+        for p in places
+    )
+
+
+def remote(side_px: int, side_mm: float) -> Camera:
+    return Camera(
+        resolution_px=(side_px, side_px),
+        position_mm=(600.0, 0.0, 0.0),
+        look_at_mm=(0.0, 0.0, 0.0),
+        focal_length_px=600 * side_px / side_mm,
+    )
+
+
+def head(side_px: int) -> Camera:
+    e, b = np.radians([25.0, 15.0])
+    place = 40.0 * np.array([np.cos(e) * np.cos(b), -np.cos(e) * np.sin(b), -np.sin(e)])
+    return Camera(
+        resolution_px=(side_px, side_px),
+        position_mm=tuple(place.tolist()),
+        look_at_mm=(0.0, 0.0, 0.0),
+        focal_length_px=1.2 * side_px,
+    )
+
+
+CASES = {
+    "iris E2": ("E2", remote(48, 11.4), SIDE, {}),
+    "iris E4": ("E4", remote(48, 11.4), SIDE, {}),
+    "bright iris E2": ("E2", remote(48, 11.4), SIDE, {"iris_albedo": 0.6}),
+    "eye E2 head-mounted": ("E2", head(64), SIDE, {}),
+    "eye E4 head-mounted": ("E4", head(64), LOW, {}),
+    "region E2 remote": ("E2", remote(96, 40.0), LOW, {"region": REGION}),
+    "region E2 head-mounted": ("E2", head(96), SIDE, {"region": REGION}),
+    "region E4 head-mounted": ("E4", head(96), LOW, {"region": REGION}),
+}
+
+
+@pytest.fixture
+def plain(renderer, monkeypatch):
+    """A renderer whose skin is as it is exported: of one albedo, without relief and sheen."""
+    import mitsuba as mi
+
+    from eyerender.rendering import lighting
+    from eyerender.rendering.region import RegionScene
+    from eyerender.rendering.renderer import Renderer
+
+    def even(spec):
+        look = skin_map(spec).copy()
+        look[:SHEET_ROWS, :, 0] = spec.skin.albedo
+        look[..., 1:] = 0
+        return look
+
+    monkeypatch.setattr(RegionScene, "_look", staticmethod(even))
+    monkeypatch.setattr(lighting, "sheen", lambda *_: mi.Float(0))
+    return Renderer(renderer.backend)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_all_light_of_lamps_against_path(plain, tmp_path, case):
+    # .5 % and two standard errors of the oracle, in every ring of the iris, on sclera, and on surround or skin.
+    model, camera, places, more = CASES[case]
+    look = FLAT.model_copy(update={k: v for k, v in more.items() if k != "region"})
+    job = job_in(camera, model, lights=large_lamps(places), look=look, region=more.get("region"))
+    found = against_path(plain, job, tmp_path, 8192)
+    assert len(found) == 5
+    assert all(abs(away) < 0.005 + 2 * noise for away, noise in found.values()), found
+
+
+@pytest.mark.parametrize("model", ["E2", "E4"])
+def test_a_wide_sun_against_path(plain, tmp_path, model):
+    # A disc of 40 degrees instead of half a one, so that the oracle finds it behind the cornea.
+    ambient = Ambient(sun=Sun(azimuth_deg=40.0, elevation_deg=30.0, irradiance_w_m2=1e3, diameter_deg=40.0))
+    found = against_path(plain, job_in(remote(48, 26.0), model, ambient=ambient), tmp_path, 4096)
+    assert len(found) == 5
+    assert all(abs(away) < 0.005 + 2 * noise for away, noise in found.values()), found
+
+
+def test_the_sun_before_a_face_against_path(plain, tmp_path):
+    # Sharp shadows of lids, lashes and nose: the sun as it is, which the oracle cannot find behind the cornea.
+    ambient = Ambient(sun=Sun(azimuth_deg=40.0, elevation_deg=30.0, irradiance_w_m2=1e3))
+    found = against_path(plain, job_in(remote(96, 40.0), "E2", ambient=ambient, region=REGION), tmp_path, 1024)
+    assert all(abs(found[name][0]) < 0.005 + 2 * found[name][1] for name in ("sclera", "other")), found
+
+
+def test_a_panel_against_path(plain, tmp_path):
+    # Its light on the iris is that of 16 parts; matte surfaces have Lambert's formula.
+    panel = Panel(centre_mm=(210.0, 150.0, 150.0), size_mm=(240.0, 180.0), radiance_w_m2_sr=1e3)
+    job = job_in(remote(48, 26.0), "E2", ambient=Ambient(panels=(panel,)))
+    found = against_path(plain, job, tmp_path, 4096, rectangle(panel))
+    assert len(found) == 5
+    assert all(abs(away) < 0.01 + 2 * noise for away, noise in found.values()), found
+
+
+def test_a_map_against_path(plain, tmp_path):
+    # A bright disc, 40 degrees wide. The irradiance of matte surfaces is an expansion to order 2, some per cent off.
+    # The rays that leave the eye see the map itself.
+    turn, polar = np.meshgrid(np.pi - 2 * np.pi * (np.arange(512) + 0.5) / 512, np.pi * (np.arange(256) + 0.5) / 256)
+    a, e = np.radians([30.0, 25.0])
+    way = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=-1)
+    near = way @ [np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)] > np.cos(np.radians(20.0))
+    np.save(tmp_path / "disc.npy", np.where(near, 1e3, 0.0).astype(np.float32))
+    sun = Sun(
+        azimuth_deg=30.0,
+        elevation_deg=25.0,
+        irradiance_w_m2=1e3 * np.pi * np.sin(np.radians(20.0)) ** 2,
+        diameter_deg=40.0,
+    )
+    job = job_in(remote(48, 26.0), "E2", ambient=Ambient(map=RadianceMap(file=str(tmp_path / "disc.npy"))))
+    found = against_path(plain, job, tmp_path, 4096, oracle=replace(job, ambient=Ambient(sun=sun)))
+    assert len(found) == 5
+    assert all(abs(away) < 0.08 + 2 * noise for away, noise in found.values()), found
+
+
+def job_in(camera: Camera, model: str, lights=(), look=FLAT, **more):
+    width, height = camera.resolution_px
+    return job_of(eye_of(model), LampRig(camera.build(), tuple(lights)), (0, 0, width, height), look=look, **more)
+
+
+def rectangle(panel: Panel) -> str:
+    """Write a panel as a shape of the stock integrator."""
+    x, y, z = panel.centre_mm
+    w, h = panel.size_mm
+    radiance = panel.radiance_w_m2_sr * 1e-3
+    return (
+        f'<shape type="rectangle"><transform name="to_world"><scale x="{w / 2}" y="{h / 2}"/>'
+        f'<lookat origin="{x}, {y}, {z}" target="0, 0, 0" up="0, 0, 1"/></transform>'
+        f'<emitter type="area"><rgb name="radiance" value="{radiance}"/></emitter></shape></scene>'
+    )
+
+
+def oracle_of(job, folder, spp: int, depth: int = 24, extra: str = "</scene>") -> tuple[np.ndarray, np.ndarray]:
+    """Stock picture of all light, and the standard error of each pixel."""
+    import mitsuba as mi
+
+    from eyerender.rendering.export import export_scene
+
+    path = export_scene(job, folder, max_depth=depth, rings=96, sectors=192)
+    path.write_text(path.read_text(encoding="utf-8").replace("</scene>", extra), encoding="utf-8")
+    scene = mi.load_file(str(path))
+    parts = np.stack([np.array(mi.render(scene, spp=spp // 8, seed=k))[..., 0].astype(float) for k in range(8)])
+    return parts.mean(axis=0), parts.std(axis=0, ddof=1) / np.sqrt(8)
+
+
+def against_path(renderer, job, folder, spp, extra: str = "</scene>", oracle=None) -> dict[str, tuple[float, float]]:
+    """Relative difference of each part from the oracle, and the oracle's standard error; mirror images are left out."""
+    truth, error = oracle_of(oracle or job, folder, spp, extra=extra)
+    black = BLACK.model_copy(update=BARE)
+    mirrors = oracle_of(replace(oracle or job, look=black, region=None), folder, 64, depth=4, extra=extra)[0] > 0
+    mirrors = ndimage.binary_dilation(mirrors, iterations=2)
+    mine = np.mean([renderer.radiance(replace(job, seed=k), spp=128) for k in range(2)], axis=0) / cos4(job)
+    found = {}
+    for name, m in rings(renderer, job).items():
+        m = m if name in ("sclera", "other") else m & ~mirrors
+        if np.sum(m) > 8:
+            noise = float(np.sqrt(np.sum(error[m] ** 2)) / np.sum(truth[m]))
+            found[name] = (float(mine[m].mean() / truth[m].mean() - 1), noise)
+    print(job.eye.name, {k: f"{100 * a:+.2f} +- {100 * n:.2f} %" for k, (a, n) in found.items()})
+    return found
