@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def head(side_px: int) -> Camera:
     )
 
 
-CASES = {
+CASES: dict[str, tuple[str, Camera, list[list[float]], dict[str, Any]]] = {
     "iris E2": ("E2", remote(48, 11.4), SIDE, {}),
     "iris E4": ("E4", remote(48, 11.4), SIDE, {}),
     "bright iris E2": ("E2", remote(48, 11.4), SIDE, {"iris_albedo": 0.6}),

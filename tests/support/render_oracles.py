@@ -218,7 +218,9 @@ def rings(renderer: Any, job: RenderJob) -> dict[str, Any]:
         region = shown.textures.region
         sheet = view.other if region is None else view.other & region.on_sheet(region.face(hit))
         cornea, pupil, sclera, other = (np.array(k, dtype=bool) for k in (view.cornea, view.pupil, view.sclera, sheet))
-        ring = 1 + np.digitize(np.hypot(*np.array(view.inner)[1:]), [3.2, 4.4, job.eye.iris_root_radius_mm - 0.05])
+        ring = 1 + np.digitize(
+            np.hypot(*np.array(view.inner)[1:]), [3.2, 4.4, float(job.eye.iris_root_radius_mm) - 0.05]
+        )
         kinds.append(np.where(cornea & ~pupil, ring, np.where(sclera, 5, np.where(other, 6, 0))))
     kind = np.where(np.all(kinds == kinds[0], axis=0), kinds[0], 0).reshape(h, w)
     names = {"inner iris": 1, "middle iris": 2, "outer iris": 3, "sclera": 5, "other": 6}
