@@ -51,9 +51,18 @@ class Recorder:
         with self._measured(f"{fixturedef.baseid}::{fixturedef.argname}"):
             return (yield)
 
-    def pytest_sessionfinish(self, exitstatus: int) -> None:
-        """Write the list."""
-        if exitstatus in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node: Any) -> None:
+        """Take the times of a process that has run a part of the tests (pytest-xdist)."""
+        for name, seconds in getattr(node, "workeroutput", {}).get("seconds", {}).items():
+            self.seconds[name] += seconds
+
+    def pytest_sessionfinish(self, session: pytest.Session, exitstatus: int) -> None:
+        """Write the list, or send the times to the process that does."""
+        output = getattr(session.config, "workeroutput", None)
+        if output is not None:
+            output["seconds"] = dict(self.seconds)
+        elif exitstatus in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
             before = set(listed(self.place))
             names = [name for name, s in self.seconds.items() if s > (self.leave_s if name in before else self.enter_s)]
             self.place.write_text("".join(f"{name}\n" for name in sorted(names)), encoding="utf-8")
