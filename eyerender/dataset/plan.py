@@ -281,7 +281,8 @@ class Plan:
         """Draw sample `sample` at an attempt.
 
         Raises:
-            InputError: there is no such sample, or its subject's eye cannot be made in any attempt.
+            InputError: there is no such sample, its subject's eye cannot be made in any attempt, or what the spec draws
+                is no scene.
         """
         spec = self.spec
         if not 0 <= sample < spec.count:
@@ -289,7 +290,7 @@ class Plan:
         subject, sequence = self.subject_of(sample)
         subject_attempt = self.identity(subject)[0]
         turn = Turn(sample=sample, subject=subject, sequence=sequence, attempt=attempt, subject_attempt=subject_attempt)
-        tree, drawn = self.scene_template.values(turn)
+        tree, drawn = self._scene_of(turn)
         tree.setdefault("format", 1)
         if spec.population is not None:
             tree["population"] = self.person_of(subject, subject_attempt).to_mapping()
@@ -298,6 +299,12 @@ class Plan:
             tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
         eye, eye_drawn, modified = self._eye_of(tree, turn)
         return Sample(turn, self.split_of(subject), tree, eye, modified, drawn | eye_drawn, self.base)
+
+    def _scene_of(self, turn: Turn) -> tuple[dict[str, Any], dict[str, Any]]:
+        tree, drawn = self.scene_template.values(turn)
+        if not isinstance(tree, dict):
+            raise InputError(f"must be a mapping in every sample, not {tree!r}", path="scene")
+        return tree, drawn
 
     @cached_property
     def _identities(self) -> dict[int, tuple[int, tuple[str, ...]]]:
@@ -324,7 +331,7 @@ class Plan:
                     continue
                 return attempt, tuple(reasons)
             turn = Turn(sample=0, subject=subject, sequence=0, attempt=0, subject_attempt=attempt)
-            tree, _ = self.scene_template.values(turn)
+            tree, _ = self._scene_of(turn)
             try:
                 eye, _, modified = self._eye_of(tree, turn)
                 if modified:

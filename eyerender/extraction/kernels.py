@@ -14,10 +14,11 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from numba import njit
-from numba.core import config
+from numba.core import config as numba_config
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Array = Any  # numba has types of its own
+config: Any = numba_config  # it makes its attributes at run time
 SECTORS, NEAR = 48, 2  # as in edge_model
 
 _ROOT_HALF = math.sqrt(0.5)

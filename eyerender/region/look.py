@@ -129,4 +129,4 @@ class Look(Spec):
     @field_validator("scattering", mode="before")
     @classmethod
     def _off(cls, value: object) -> object:
-        return None if value is False else value
+        return None if value is False or value == "off" else value  # YAML reads `off` as false

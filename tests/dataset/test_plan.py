@@ -259,3 +259,11 @@ def test_the_splits_of_existing_datasets_do_not_change():
     made = plan(count=5000, subjects=2000)
     found = hashlib.sha256(" ".join(map(made.split_of, range(2000))).encode()).hexdigest()
     assert found == "67f7fc7319740a4a7dd4998db5847cf02ae8a72a32133067ee597ae571ef9197"
+
+
+@pytest.mark.parametrize("name", ["dataset_quick", "people_eyelink"])
+def test_a_scene_that_is_drawn_as_a_number_is_an_error(name):
+    drawn = {"draw": "uniform", "low": 1.0, "high": 2.0}
+    spec = DatasetSpec.from_mapping({**Plan.load(name).spec.to_mapping(), "scene": drawn})
+    with pytest.raises(InputError, match="scene: must be a mapping"):
+        Plan.of(spec).draw(0)

@@ -298,8 +298,9 @@ def test_the_own_region_as_a_head_hides_what_it_hides(renderer, tmp_path):
 
     script = SCRIPTS / "describe_head.py"
     subprocess.run([sys.executable, str(script), "--example", str(tmp_path)], check=True, capture_output=True)
-    head = only(scene_of(tmp_path, {"file": "manifest.json"}), renderer)
-    own = only(Scene.of(SceneSpec.from_mapping({**scene_data({}), "region": {}})), renderer)
+    matte = {"look": {"scattering": "off"}}  # as heads are
+    head = only(scene_of(tmp_path, {"file": "manifest.json"}, **matte), renderer)
+    own = only(Scene.of(SceneSpec.from_mapping({**scene_data({}), "region": {}, **matte})), renderer)
     assert np.mean(head.parts != own.parts) < 1e-4  # the file keeps five digits
     assert [g["reason"] for g in labels_of(head)["glints"]] == [g["reason"] for g in labels_of(own)["glints"]]
     assert labels_of(head)["iris_visible_fraction"] == pytest.approx(labels_of(own)["iris_visible_fraction"], abs=1e-3)
