@@ -1,6 +1,6 @@
 """Reading and writing image files: 16- and 8-bit greyscale PNG; greyscale of the usual formats is read.
 
-Pixel values are linear sensor counts. Nothing here scales or gamma-encodes them, except `preview`, which is for people.
+Pixel values are linear sensor counts. Nothing here scales them, except `preview`, which is for people.
 """
 
 from __future__ import annotations
@@ -200,7 +200,6 @@ def _same_channels(file: Image.Image) -> Bytes | None:
     return np.ascontiguousarray(rgb[..., 0]) if equal else None
 
 
-def preview(image: NDArray[Any], full_scale: float, gamma: float = 2.2) -> Bytes:
-    """Make an 8-bit, gamma-encoded copy for viewing, not for measurements."""
-    linear = np.clip(np.asarray(image, dtype=float) / full_scale, 0, 1)
-    return np.asarray(np.round(255 * linear ** (1 / gamma)), dtype=np.uint8)
+def preview(image: NDArray[Any], full_scale: float) -> Bytes:
+    """Make an 8-bit copy for viewing: the codes as they are, as pictures of near-infrared cameras are usually shown."""
+    return np.asarray(np.round(255 * np.clip(np.asarray(image, dtype=float) / full_scale, 0, 1)), dtype=np.uint8)

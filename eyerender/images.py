@@ -43,11 +43,9 @@ class LabelledImage(EyeImage):
     labels: dict[str, Any]
 
     def _repr_png_(self) -> bytes:
-        """The picture as notebooks show it, brightened for people to look at."""
+        """The picture as notebooks show it."""
         buffer = io.BytesIO()
-        encode_png(
-            buffer, preview(self.counts, self.scene.spec.sensor.full_scale_dn, 2.2 / self.scene.spec.sensor.gamma)
-        )
+        encode_png(buffer, preview(self.counts, self.scene.spec.sensor.full_scale_dn))
         return buffer.getvalue()
 
 

@@ -32,7 +32,7 @@ SIZE = (6.4, 4.8)
 def draw(
     image: np.ndarray,
     origin: tuple[int, ...],
-    white: float,
+    full: float,
     truth: er.Observations,
     found: er.Observations,
     row: int,
@@ -46,7 +46,7 @@ def draw(
     ax = fig.add_axes((0, 0, 1, 1))
     h, w = image.shape
     extent = (origin[0] - 0.5, origin[0] + w - 0.5, origin[1] + h - 0.5, origin[1] - 0.5)
-    ax.imshow(preview(image, white, 1.6), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="bicubic")
+    ax.imshow(preview(image, full), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="bicubic")
     for seen, colour, dash, marker in (
         (truth, ANALYTIC_ON_DARK, "-", "+"),
         (found, IMAGE_ON_DARK, (0, (4, 4)), "x"),
@@ -68,7 +68,7 @@ def draw(
     fig.savefig(path, dpi=100, pil_kwargs={"quality": 85})
 
 
-def picture(scene: er.Scene, fixation: int, eye: int, crop: tuple[int, int], white: float, path: Path) -> None:
+def picture(scene: er.Scene, fixation: int, eye: int, crop: tuple[int, int], path: Path) -> None:
     """Render one eye at one fixation and draw both observers' features over it."""
     frames = scene.frames()
     one = frames.take((frames.index.fixation == fixation) & (frames.index.eye == eye))
@@ -76,7 +76,7 @@ def picture(scene: er.Scene, fixation: int, eye: int, crop: tuple[int, int], whi
     (image,) = render_windows(one)
     found = er.ImageObserver().observe_images([image])
     full = scene.spec.sensor.full_scale_dn
-    draw(image.counts, image.window[:2], white * full, truth, found, 0, crop, path)
+    draw(image.counts, image.window[:2], full, truth, found, 0, crop, path)
     print(path)
 
 
@@ -88,7 +88,7 @@ def labels(path: Path) -> None:
     fig = Figure(figsize=(8, 3.2), layout="constrained")
     FigureCanvasAgg(fig)
     left, right = fig.subplots(1, 2)
-    left.imshow(preview(image.counts, 0.54 * scene.spec.sensor.full_scale_dn, 1.6), cmap="gray")
+    left.imshow(preview(image.counts, scene.spec.sensor.full_scale_dn), cmap="gray")
     left.set_title("images/: counts of the sensor")
     right.imshow(image.parts, cmap="cividis", interpolation="nearest")
     right.set_title("masks/: skin or background, sclera, iris, pupil")
@@ -125,8 +125,8 @@ def screenshot(page: Path, path: Path) -> None:
 def main(out: Path) -> None:
     """Make all pictures."""
     out.mkdir(parents=True, exist_ok=True)
-    picture(er.load_scene("headset", spp=64), 4, 0, (624, 468), 0.54, out / "head_mounted.jpg")
-    picture(er.load_scene("desktop_tracker", spp=64), 4, 0, (312, 234), 0.75, out / "remote.jpg")
+    picture(er.load_scene("headset", spp=64), 4, 0, (624, 468), out / "head_mounted.jpg")
+    picture(er.load_scene("desktop_tracker", spp=64), 4, 0, (312, 234), out / "remote.jpg")
     labels(out / "labels.jpg")
     with TemporaryDirectory() as folder:
         scratch = Path(folder)

@@ -60,9 +60,9 @@ def test_truncated_png_is_refused(tmp_path):
         read_image(tmp_path / "b.png")
 
 
-def test_preview_is_gamma_encoded():
-    out = preview(np.array([[0.0, 0.5, 1.0, 2.0]]), 1.0)
-    assert out.tolist() == [[0, round(255 * 0.5 ** (1 / 2.2)), 255, 255]]
+def test_preview_shows_the_codes_as_they_are():
+    out = preview(np.array([[0.0, 0.4, 1.0, 2.0]]), 1.0)
+    assert out.tolist() == [[0, 102, 255, 255]]
 
 
 def line(name="a"):

@@ -131,9 +131,9 @@ def _of_scene(scene: Scene, backend: BackendChoice, threads: int | None) -> Iter
     renderer = make_renderer(backend, threads)
     for image in render_windows(frames.take(rows), renderer=renderer):
         sensor = scene.spec.sensor
-        tile = _tile(image.counts, {"bit_depth": sensor.bit_depth, "gamma": sensor.gamma}, image.name)
+        tile = _tile(image.counts, {"bit_depth": sensor.bit_depth}, image.name)
         yield count, tile, is_saturated(image.counts, scene.spec.sensor)
 
 
 def _tile(dn: Any, line: dict[str, Any], caption: str) -> Tile:
-    return eight_bit(dn, 2.0 ** line["bit_depth"] - 1, 2.2 / line["gamma"]), caption
+    return eight_bit(dn, 2.0 ** line["bit_depth"] - 1), caption

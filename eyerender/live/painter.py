@@ -386,7 +386,7 @@ def _shown(
         coarse=coarse,
         size_px=image.window[2:],
         window=image.window,
-        data=_encoded(_tones(sensor.full_scale_dn, sensor.gamma)[image.counts], kind),
+        data=_encoded(_tones(sensor.full_scale_dn)[image.counts], kind),
         kind=f"image/{kind.lower()}",
         hidden=canvas.hidden,
         saturated=is_saturated(image.counts, sensor),
@@ -395,9 +395,9 @@ def _shown(
 
 
 @lru_cache(maxsize=4)
-def _tones(full_scale: int, gamma: float) -> Bytes:
+def _tones(full_scale: int) -> Bytes:
     """The grey level of the screen for each code of a sensor."""
-    return preview(np.arange(full_scale + 1), full_scale, 2.2 / gamma)
+    return preview(np.arange(full_scale + 1), full_scale)
 
 
 def _encoded(pixels: Bytes, kind: str) -> bytes:
