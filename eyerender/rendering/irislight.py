@@ -21,7 +21,6 @@ from .values import Lights, Values
 
 _SIDE = 80
 _SPARE_MM = 0.3  # beyond the root of the iris
-SMALL, LARGE = 0.015, 0.25  # radius of a lamp over its distance
 
 
 class IrisLight:
@@ -37,9 +36,8 @@ class IrisLight:
             views: the lamps' views of an eye region; None for a bare eye.
         """
         self._values, self._lights, self._scene, self._views = values, lights, scene, views
-        self._points = dr.opaque(mi.UInt32, 1 if lights.widest < SMALL and not lights.rings else 4)
-        self._used = dr.opaque(mi.Bool, lights.widest < LARGE)
-        self._empty = not lights.widest < LARGE
+        self._points = dr.opaque(mi.UInt32, lights.points)
+        self._used = dr.opaque(mi.Bool, lights.gridded)
         self._half = values.iris.root_radius + _SPARE_MM
         self._grid: LightGrid | None = None
 
@@ -56,7 +54,7 @@ class IrisLight:
         """Fill the grid, once."""
         if self._grid is None:
             self._grid = LightGrid(_SIDE)
-            if not self._empty:
+            if self._lights.gridded:
                 self._grid.fill(self._on_grid(*self._grid.nodes()))
 
     def _on_grid(self, column: mi.UInt32, row: mi.UInt32) -> mi.Float:

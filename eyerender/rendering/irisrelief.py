@@ -19,7 +19,6 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .irislight import SMALL
 from .surfaces import Surface
 from .values import Lights, Values
 from .view import Textures, iris_height
@@ -129,7 +128,7 @@ class IrisRelief:
         from .lighting import LampPath
 
         values, lights = self._values, self._lights
-        points = 1 if lights.widest < SMALL and not lights.rings else 4
+        points = lights.points
         count = dr.opaque(mi.UInt32, _COARSE)
         index = dr.arange(mi.UInt32, _COARSE * _COARSE * points * max(len(lights), 1))
         spot = index // (_COARSE * _COARSE)

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from .irislight import LARGE, SMALL
 from .lightgrid import LightGrid
 from .lighting import irradiance, lamp_blocked
 from .values import Lights, Values
@@ -43,9 +42,8 @@ class MatteLight:
             reach_mm: distance from the axis of the unrotated eye within which the plane is seen.
         """
         self._values, self._lights, self._scene, self._received = values, lights, scene, received
-        self._points = dr.opaque(mi.UInt32, 1 if lights.widest < SMALL and not lights.rings else 4)
-        self._used = dr.opaque(mi.Bool, lights.widest < LARGE)
-        self._empty = not lights.widest < LARGE
+        self._points = dr.opaque(mi.UInt32, lights.points)
+        self._used = dr.opaque(mi.Bool, lights.gridded)
         self._reach = dr.opaque(mi.Float, reach_mm)
         self._grids: tuple[LightGrid, LightGrid] | None = None
 
@@ -72,7 +70,7 @@ class MatteLight:
         if self._grids is not None:
             return
         self._grids = LightGrid(_SIDE), LightGrid(_SIDE)
-        if self._empty:
+        if not self._lights.gridded:
             return
         values, (globe, plane) = self._values, self._grids
         column, row = globe.nodes()

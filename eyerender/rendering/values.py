@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .mattelight import MatteLight
 
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
+_POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
 _LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner radius, 2 unused
 
 
@@ -145,9 +146,10 @@ class PupilBoundary:
 class Lights:
     """The lamps in the eye frame, (n, 10) numbers in one buffer; kernels do not depend on their number.
 
-    `widest` is the largest radius over the distance from the eye, `rings` whether any lamp is a ring, `on_iris` and
-    `on_matte` their light in the plane of the iris and on matte surfaces where grids of it are used, and `relief` the
-    iris' relief in their light.
+    `widest` is the largest radius over the distance from the eye, `points` how many points stand for each lamp at the
+    nodes of a grid, and `gridded` whether lamps of that size may have grids. `on_iris` and `on_matte` are their light
+    in the plane of the iris and on matte surfaces where grids of it are used, and `relief` is the iris' relief in their
+    light.
     """
 
     def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
@@ -157,7 +159,8 @@ class Lights:
         self.relief: IrisRelief | None = None
         away = np.linalg.norm(table[:, :3], axis=1)
         self.widest = float(np.max(table[:, 6] / np.maximum(away, 1e-3), initial=0.0))
-        self.rings = bool(np.any(table[:, 9] > 0))
+        self.points = 1 if self.widest < _POINT_LIKE and not np.any(table[:, 9] > 0) else 4
+        self.gridded = self.widest < _LARGE
         self.count = dr.opaque(mi.UInt32, len(table))
         rows = np.zeros((max(len(table), 1), _LIGHT_ROW), np.float32)
         rows[: len(table), : table.shape[1]] = table
