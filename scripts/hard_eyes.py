@@ -3,11 +3,12 @@
 
     hard_eyes.py DIR [--row headset] [--count 40] [--seed 10000] [--processes 1]
 
-Every image is a pure function of (row, seed). Rows: `headset`, `desktop`, `subjects` (as in dataset_region), `stress`,
-`webcam`, `both_lids` (both lids lie over a wide pupil), and eyes without lids: `eight` (the headset's eight glints on a
-textured iris) and `texture` (the desktop tracker's small pupils in a textured iris). Seeds below 10,000 are for
-development, the others for reports. A file ROW-SEED.npz holds the image, its bit depth, the pupil, its visible share,
-and the glints with their visible shares. Files that are there already are kept.
+Every image is a pure function of (row, seed). Four seeds in a row share a face and an eye, whose maps are made once;
+pupil, gaze, blink, head and noise are their own. Rows: `headset`, `desktop`, `subjects` (as in dataset_region),
+`stress`, `webcam`, `both_lids` (both lids lie over a wide pupil), and eyes without lids: `eight` (the headset's eight
+glints on a textured iris) and `texture` (the desktop tracker's small pupils in a textured iris). Seeds below 10,000
+are for development, the others for reports. A file ROW-SEED.npz holds the image, its bit depth, the pupil, its
+visible share, and the glints with their visible shares. Files that are there already are kept.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ ROWS: dict[str, tuple[str, tuple[float, float], tuple[float, float], float]] = {
     "texture": ("desktop_tracker", (2.5, 6.0), (0.0, 0.0), 18.0),
 }
 MODELS = ("E1", "E2", "E3", "E4", "E5")
+FRAMES_OF_FACE = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,26 +62,35 @@ def mapping_of(row: str, seed: int) -> dict[str, Any]:
     scene, pupil_mm, blink, turn = ROWS[row]
     rng = np.random.default_rng([seed, zlib.crc32(row.encode())])
     mapping: dict[str, Any] = yaml.safe_load((SCENES / f"{scene}.yaml").read_text())
-    azimuth, elevation = rng.uniform(-turn, turn), rng.uniform(-0.8 * turn, 0.8 * turn)
     mapping.pop("targets", None)
+    azimuth, elevation = rng.uniform(-turn, turn), rng.uniform(-0.8 * turn, 0.8 * turn)
     mapping["poses"] = [{"azimuth_deg": float(azimuth), "elevation_deg": float(elevation)}]
-    mapping["eye"] = {
-        "model": str(rng.choice(MODELS)),
-        "pupil_diameter_mm": float(rng.uniform(*pupil_mm)),
-        "margin": {"seed": int(rng.integers(1, 10**6))},
-    }
     mapping["subject"] = {"eyes": ["right"], "head_positions_mm": [rng.uniform(-1.0, 1.0, 3).tolist()]}
     mapping["seed"] = seed
-    region = mapping["region"]
-    region["seed"] = int(rng.integers(1, 10**6))
-    region["blink"] = float(rng.uniform(*blink))
+    _give_face(mapping, row, seed // FRAMES_OF_FACE)
+    mapping["eye"]["pupil_diameter_mm"] = float(rng.uniform(*pupil_mm))
     if row in ("eight", "texture"):
         del mapping["region"]
+    else:
+        mapping["region"]["blink"] = float(rng.uniform(*blink))
+    if row in ("subjects", "both_lids"):
+        mapping["image"]["window_px"] = [320, 240]
+    if mapping["image"].get("window_px") is None and row == "headset":
+        mapping["image"]["spp"] = 8
+    return mapping
+
+
+def _give_face(mapping: dict[str, Any], row: str, face: int) -> None:
+    """Write the eye, its looks and its lids into a scene."""
+    rng = np.random.default_rng([face, zlib.crc32(row.encode()), 1])
+    mapping["eye"] = {"model": str(rng.choice(MODELS)), "margin": {"seed": int(rng.integers(1, 10**6))}}
     mapping["look"] = {
         "iris_seed": int(rng.integers(1, 10**6)),
         "iris_albedo": float(rng.uniform(0.2, 0.45)),
         "sclera_albedo": float(rng.uniform(0.36, 0.5)),
     }
+    region = mapping["region"]
+    region["seed"] = int(rng.integers(1, 10**6))
     if row in ("subjects", "both_lids"):
         low = row == "both_lids"
         region["fissure"] = {
@@ -91,10 +102,6 @@ def mapping_of(row: str, seed: int) -> dict[str, Any]:
             "upper_length_mm": float(rng.uniform(7.0, 10.5)),
             "upper_droop_deg": float(rng.uniform(25.0, 50.0)),
         }
-        mapping["image"]["window_px"] = [320, 240]
-    if mapping["image"].get("window_px") is None and row == "headset":
-        mapping["image"]["spp"] = 8
-    return mapping
 
 
 @cache

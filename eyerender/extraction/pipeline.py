@@ -22,7 +22,8 @@ from .glints.windows import window_radius
 from .preprocessing import DN, Image, Prepared, invert, prepare
 from .pupil.consensus import relative_to
 from .pupil.covariance import boundary_deviation
-from .pupil.edge_model import EdgeModel
+from .pupil.edge_model import SECTORS, EdgeModel
+from .pupil.glare import Cleared
 from .pupil.refinement import PixelFit, refine
 from .pupil.scoring import pupil_of
 from .pupil.search import SURE, Found, search
@@ -119,8 +120,15 @@ def explained(prepared: Prepared, found: Found, settings: ExtractionSettings) ->
         return Extraction(pupil, (), (), noise, size)
     step = abs(model.step_dn)
     large = bloomed_glints(prepared, model.ellipse, step)
-    accepted, rejected = classify_spots(spots, fit, prepared, step, model.sigma_px, settings, large)
+    iris = _iris_level(prepared, found, model)
+    accepted, rejected = classify_spots(spots, fit, prepared, step, model.sigma_px, iris, settings, large)
     return Extraction(pupil, accepted, rejected, noise, size)
+
+
+def _iris_level(prepared: Prepared, found: Found, model: EdgeModel) -> float:
+    """Level just outside the seen parts of the boundary, in the image as it is."""
+    levels = Cleared(prepared.linear).levels(model.ellipse, 1.5 * model.sigma_px + 1.0, SECTORS)
+    return median(levels[found.sectors])
 
 
 def pixel_fit(prepared: Prepared, found: Found, settings: ExtractionSettings) -> PixelFit | None:

@@ -103,3 +103,17 @@ def test_clipped_spots_are_not_judged():
     # Two spots run into each other, and all that is left of the tops is a plateau.
     image = np.minimum(np.maximum(image, np.roll(image, 3, axis=1)), np.float32(255.0))
     assert bell_shaped(image, places, np.full(7, 4.0), np.full(7, 215.0), 2.0, 250.0).all()
+
+
+def test_a_highlight_of_bright_skin_is_no_glint():
+    drawing = ideal.draw("noise2", 3)
+    x, y = _truth(drawing).centre_px
+    rows, columns = np.mgrid[: drawing.image.shape[0], : drawing.image.shape[1]]
+    below = y + 2.0 * _truth(drawing).semi_axes_px[0]
+    spot = 60.0 * np.exp(-0.5 * ((columns - x) ** 2 + (rows - below - 20.0) ** 2) / 1.2**2)
+    skin = np.where(rows > below, 180.0, drawing.image) + spot
+    found = extract(np.clip(skin, 0, 255).astype(np.uint8))
+    assert len(found.glints) == len(drawing.label["glints"])
+    near = [one for one in found.rejected if np.hypot(*(one.xy_px - [x, below + 20.0])) < 2.0]
+    assert near
+    assert "brighter than the iris" in near[0].reason
