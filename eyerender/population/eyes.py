@@ -14,7 +14,6 @@ from ..eye.kappa import fovea_of_kappa
 from ..eye.margin import drawn_contour
 from ..eye.parts import EyeParts
 from ..eye.spec import EyeSpec
-from ..geometry.surfaces import Surface
 from .pupil import ellipticity
 from .refraction import AQUEOUS, CORNEA, LENS, VITREOUS
 from .table import Table
@@ -64,8 +63,7 @@ def eye_file(
         seed: selects the outline of the pupil.
 
     Raises:
-        InputError: the eye cannot exist: surfaces cross, the stop lies outside the chamber, or the iris before the
-            limbus.
+        InputError: the eye cannot exist: surfaces cross, or the stop lies outside the chamber.
     """
     if not np.isfinite(eye["lens_c0"]):
         raise InputError("no lens of this shape gives the eye its refraction", path="lens.surfaces.0.medium")
@@ -76,8 +74,6 @@ def eye_file(
     data["stop"]["contour"] = contour.to_mapping()
     parts = EyeParts.from_mapping(data)
     front = tuple(surface_of(s) for s in parts.cornea)
-    if relaxed["stop"]["position_mm"][0] > _limbus_x(front[0], parts.limbus_radius_mm):
-        raise InputError("a flat iris cannot lie before the limbus", path="stop.position_mm")
     indices = tuple(index_at(s.medium, _DESIGN_NM, "cornea") for s in parts.cornea)
 
     def shaped(diameter: float) -> Any:
@@ -203,12 +199,6 @@ def _toric(flat_mm: float, steep_mm: float, axis_deg: float, asphericity: float)
         "shape": {"kind": "biconic", "radii_mm": [flat_mm, steep_mm], "conic_constants": [asphericity, asphericity]},
         "tilt_deg": [axis_deg, 0.0, 0.0],
     }
-
-
-def _limbus_x(cornea: Surface, radius_mm: float) -> float:
-    """Mean place of the limbus along the optic axis."""
-    angle = np.arange(8) * np.pi / 4.0
-    return float(np.mean(cornea.sag(radius_mm * np.cos(angle), radius_mm * np.sin(angle))))
 
 
 def _stop_gap(eye: Mapping[str, float]) -> float:

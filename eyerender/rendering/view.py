@@ -322,8 +322,7 @@ def _refracted(
     n = values.stop.normal
     down = dr.dot(w, n)
     s = dr.dot(values.stop.centre - inside, n) / down
-    inner = inside + s * w
-    reached &= s > 0
+    inner = dr.select(s > 0, inside + s * w, _beyond_root(values, inside))
     pu, pv = stop_coordinates(values, inner)
     margin = values.boundary.radius(pu, pv)
     pupil = reached & (pu * pu + pv * pv < margin * margin)
@@ -331,6 +330,18 @@ def _refracted(
     inner = dr.select(reached, inner, values.stop.centre)
     slant = dr.select(reached & (down < -0.05), w / down - n, 0)
     return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, slant, pupil
+
+
+def _beyond_root(values: Values, x: mi.Vector3f) -> mi.Vector3f:
+    """Places in the plane of the iris, just beyond its root, that stand for points behind the plane.
+
+    Where a shallow chamber's cornea ends behind the plane, a real iris bends back to its root. It is lit there about as
+    at the end of the flat one.
+    """
+    n, centre = values.stop.normal, values.stop.centre
+    scale = (values.iris.root_radius + EPSILON_MM) * dr.rsqrt(dr.maximum(x.y * x.y + x.z * x.z, 1e-12))
+    y, z = x.y * scale, x.z * scale
+    return mi.Vector3f(centre.x - (n.y * (y - centre.y) + n.z * (z - centre.z)) / n.x, y, z)
 
 
 def stop_coordinates(values: Values, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:

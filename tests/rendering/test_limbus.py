@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import ndimage
 
+from eyerender.eye.meshes import chamber_rim
+from eyerender.imagefolder import IRIS
 from eyerender.rendering.chamber import TURNS, chamber_of, through_limbus
 from tests.support.render_rigs import BLACK, PLAIN, eye_of, job_of, remote_rig
 
@@ -78,3 +83,18 @@ def test_a_translucent_limbus_lights_the_root_of_the_iris_and_hardly_its_middle(
     middle, root = (gain[across & (np.abs(np.abs(u) / 5.95 - r) < 0.15)].mean() for r in (3.0, 5.0))
     assert 0.0 < middle < 0.06
     assert root > 2 * middle
+
+
+def test_a_flat_iris_before_the_limbus_has_no_black_ring(renderer):
+    # A chamber 1.3 mm shallower: the cornea's back ends 0.6 mm behind the plane of the iris.
+    eye = eye_of("E4")
+    shallow = replace(eye, stop=replace(eye.stop, centre_mm=eye.stop.centre_mm + np.array([1.3, 0.0, 0.0])))
+    reach = chamber_rim(shallow, eye.front[-1], np.linspace(0, 2 * np.pi, 8))
+    shallow = replace(shallow, iris_root_radius_mm=float(np.min(reach)) - 0.1)
+    rig = remote_rig()
+    job = job_of(shallow, rig, rig.window(128, 128), look=PLAIN.model_copy(update={"limbus_albedo": 0.3}))
+    seen, parts = renderer.radiance(job, spp=16), renderer.labels(job).part
+    iris = ndimage.binary_erosion(parts == IRIS, iterations=2)
+    assert np.count_nonzero(iris) > 1500
+    # The end of the flat iris is lit half as well as its middle.
+    assert np.min(seen[iris]) > 0.4 * np.median(seen[iris])
