@@ -20,6 +20,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Array = Any  # numba has types of its own
 config: Any = numba_config  # it makes its attributes at run time
 SECTORS, NEAR = 48, 2  # as in edge_model
+MOST_BLOBS = 12  # as in candidates
 
 _ROOT_HALF = math.sqrt(0.5)
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
@@ -146,7 +147,7 @@ def _select(points, normals, ellipse, sigma_px, reach, clipped, moved, distance,
         count += chosen[i]
     if clipped and count >= 8:
         some = distance[chosen]
-        limit = max(3.5 * 1.4826 * np.median(np.abs(some - np.median(some))), 0.1)
+        limit = max(3.5 * 1.4826 * _median(np.abs(some - _median(some))), 0.1)
         count = 0
         for i in range(n):
             chosen[i] = chosen[i] and abs(distance[i]) < limit
@@ -203,15 +204,70 @@ def _scatter(points, chosen, mean_x, mean_y, scale):
 
 
 @_inlined
+def _factored(matrix):
+    """Cholesky's factor (lower) of a matrix, in place."""
+    n = matrix.shape[0]
+    for j in range(n):
+        for i in range(j, n):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = math.sqrt(max(total, 1e-300)) if i == j else total / matrix[j, j]
+
+
+@_inlined
+def _solve(lower, vector):
+    """Solve L L^T x = vector in place."""
+    n = vector.size
+    for i in range(n):
+        for k in range(i):
+            vector[i] -= lower[i, k] * vector[k]
+        vector[i] /= lower[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            vector[i] -= lower[k, i] * vector[k]
+        vector[i] /= lower[i, i]
+
+
+@_inlined
+def _least_direction(scatter, gradient):
+    """The v (5,) of the least v^T S v / v^T G v, by inverse iteration."""
+    trace = 0.0
+    for j in range(5):
+        trace += scatter[j, j]
+    for j in range(5):
+        scatter[j, j] += 1e-15 * trace
+    _factored(scatter)
+    found = np.ones(5)
+    found[1] = 0.5
+    new = np.empty(5)
+    for _ in range(50):
+        for j in range(5):
+            new[j] = 0.0
+            for m in range(5):
+                new[j] += gradient[j, m] * found[m]
+        _solve(scatter, new)
+        size = 0.0
+        for j in range(5):
+            size = max(size, abs(new[j]))
+        change = 0.0
+        for j in range(5):
+            new[j] /= size
+            change = max(change, abs(new[j] - found[j]))
+            found[j] = new[j]
+        if change < 1e-11:
+            break
+    return found
+
+
+@_inlined
 def _taubin(points, chosen, out):
     """Taubin's approximate mean square fit, as `cv2.fitEllipseAMS`, in double precision; False where it is none."""
     mean_x, mean_y, scale = _unit(points, chosen)
     if not scale > 0.0:
         return False
     mean, scatter, gradient = _scatter(points, chosen, mean_x, mean_y, scale)
-    inverse = np.linalg.inv(np.linalg.cholesky(gradient))
-    _, vectors = np.linalg.eigh(inverse @ scatter @ inverse.T)
-    conic = inverse.T @ np.ascontiguousarray(vectors[:, 0])
+    conic = _least_direction(scatter, gradient)
     a, b, c, d, e = conic[0], conic[1], conic[2], conic[3], conic[4]
     f = 0.0
     for j in range(5):
@@ -231,22 +287,44 @@ def _taubin(points, chosen, out):
 @_compiled
 def settled(points, normals, start, sigma_px, tolerance, free):
     n = points.shape[0]
-    ellipse, moved = start.copy(), np.empty((n, 2))
+    ellipse, moved, nothing = start.copy(), np.empty((n, 2)), np.zeros(3)
     distance, chosen, inliers = np.empty(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     for turn in range(5):
         reach = 2.0 * tolerance if turn == 0 and not free else tolerance
         count = _select(points, normals, ellipse, sigma_px, reach, turn >= 1, moved, distance, chosen)
         if count < 8:
-            return count, ellipse, chosen, moved
+            return count, ellipse, chosen, moved, nothing
         same = turn > 1
         for i in range(n):
             same = same and chosen[i] == inliers[i]
             inliers[i] = chosen[i]
         if not _taubin(moved, inliers, ellipse):
-            return -1, ellipse, inliers, moved
+            return -1, ellipse, inliers, moved, nothing
         if same:
             break
-    return count, ellipse, inliers, moved
+    return count, ellipse, inliers, moved, _seen(ellipse, moved, inliers)
+
+
+@_inlined
+def _seen(ellipse, points, chosen):
+    """Share of the outline that holds points, that of the longest gap, and the root mean square distance."""
+    cx, cy, a, b, angle = ellipse[0], ellipse[1], ellipse[2], ellipse[3], ellipse[4]
+    cos, sin = math.cos(angle), math.sin(angle)
+    held, square, count = np.zeros(SECTORS, dtype=np.bool_), 0.0, 0
+    for i in range(chosen.size):
+        if chosen[i]:
+            dx, dy = points[i, 0] - cx, points[i, 1] - cy
+            p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
+            held[_sector(p, q, SECTORS)] = True
+            radius2, u, v = p * p + q * q, p / a, q / b
+            square += (math.sqrt(radius2) - 1.0) ** 2 * radius2 / max(u * u + v * v, 1e-24)
+            count += 1
+    run = longest = full = 0
+    for k in range(2 * SECTORS):
+        run = 0 if held[k % SECTORS] else run + 1
+        longest = max(longest, run)
+        full += held[k % SECTORS]
+    return np.array([0.5 * full / SECTORS, min(longest, SECTORS) / SECTORS, math.sqrt(square / count)])
 
 
 @_compiled
@@ -317,22 +395,49 @@ def direct_fits(points):
     return out
 
 
+BUCKETS = 256
+
+
 @_inlined
 def _quantile(values, share):
-    """`statistics.quantile`; the values change their order."""
+    """`statistics.quantile` of values (n,), which stay as they are: counted in buckets, then sorted in two."""
     n = values.size
     if n == 0:
         return math.nan
     at = share * (n - 1)
     low = math.floor(at)
-    parted = np.partition(values, low)
-    first = float(parted[low])
+    least, most = values[0], values[0]
+    for i in range(n):
+        least, most = min(least, values[i]), max(most, values[i])
+    if not most > least:
+        return float(least)
+    scale = (BUCKETS - 1e-3) / (float(most) - float(least))
+    count = np.zeros(BUCKETS + 1, dtype=np.int64)
+    for i in range(n):
+        count[int((float(values[i]) - least) * scale)] += 1
+    first = before = 0
+    while before + count[first] <= low:
+        before += count[first]
+        first += 1
+    last, total = first, before + count[first]
+    while total < min(low + 2, n):
+        last += 1
+        total += count[last]
+    some, size = np.empty(total - before), 0
+    for i in range(n):
+        if first <= int((float(values[i]) - least) * scale) <= last:
+            some[size] = values[i]
+            size += 1
+    some = np.sort(some)
+    value = some[int(low) - before]
     if low == at:
-        return first
-    second = float(parted[low + 1])
-    for i in range(low + 2, n):
-        second = min(second, float(parted[i]))
-    return first + (at - low) * (second - first)
+        return value
+    return value + (at - low) * (some[int(low) - before + 1] - value)
+
+
+@_inlined
+def _median(values):
+    return _quantile(values, 0.5)
 
 
 @_compiled
@@ -411,37 +516,77 @@ def on_the_dark_side(smooth, points, normals, depth, dark, bright):
     return out
 
 
-@_inlined
-def _between(crop, squares, hidden, low, high):
-    """Levels of the pixels that are not hidden and whose squared radius lies between two limits."""
-    out, n = np.empty(crop.size, dtype=np.float32), 0
-    for y in range(crop.shape[0]):
-        for x in range(crop.shape[1]):
-            if low < squares[y, x] < high and not hidden[y, x]:
-                out[n] = crop[y, x]
-                n += 1
-    return out[:n]
-
-
 @_compiled
 def interior(crop, hidden, ellipse, end):
     cx, cy, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
-    squares = np.empty(crop.shape)
-    middle = covered = 0
-    for y in range(crop.shape[0]):
-        for x in range(crop.shape[1]):
-            p, q = ((x - cx) * cos + (y - cy) * sin) / a, ((y - cy) * cos - (x - cx) * sin) / b
-            squares[y, x] = p * p + q * q
-            if squares[y, x] < 0.35**2:
-                middle += 1
-                covered += hidden[y, x]
-    hidden = hidden if covered < 0.5 * middle else np.zeros_like(hidden)
-    core = _between(crop, squares, hidden, -1.0, 0.35**2)
-    ring = _between(crop, squares, hidden, (end - 0.25) ** 2, end**2)
-    inside = _between(crop, squares, hidden, -1.0, max(end, 0.5) ** 2)
-    spread = _quantile(inside, 0.75) - _quantile(inside, 0.25) if inside.size >= 8 else 0.0
-    return _quantile(ring, 0.5) - _quantile(core, 0.5), core.size, ring.size, spread
+    core, ring = np.empty(crop.size, dtype=np.float32), np.empty(crop.size, dtype=np.float32)
+    inside = np.empty(crop.size, dtype=np.float32)
+    whole = max(end, 0.5) ** 2
+    low, high = (end - 0.25) ** 2, end**2
+    n_core = n_ring = n_inside = 0
+    for shown in (True, False):
+        middle = covered = n_core = n_ring = n_inside = 0
+        for y in range(crop.shape[0]):
+            for x in range(crop.shape[1]):
+                p, q = ((x - cx) * cos + (y - cy) * sin) / a, ((y - cy) * cos - (x - cx) * sin) / b
+                square = p * p + q * q
+                if square < 0.35**2:
+                    middle += 1
+                    covered += hidden[y, x]
+                if shown and hidden[y, x]:
+                    continue
+                if square < 0.35**2:
+                    core[n_core] = crop[y, x]
+                    n_core += 1
+                if low < square < high:
+                    ring[n_ring] = crop[y, x]
+                    n_ring += 1
+                if square < whole:
+                    inside[n_inside] = crop[y, x]
+                    n_inside += 1
+        if covered < 0.5 * middle:
+            break
+    inside = inside[:n_inside]
+    spread = _quantile(inside, 0.75) - _quantile(inside, 0.25) if n_inside >= 8 else 0.0
+    return _median(ring[:n_ring]) - _median(core[:n_core]), n_core, n_ring, spread
+
+
+@_compiled
+def along(ellipse, points, others, linear, corner, patch, away, limits):
+    cx, cy, a, b, angle = ellipse
+    cos, sin = math.cos(angle), math.sin(angle)
+    held, dark, reach = np.zeros(SECTORS, dtype=np.bool_), limits[0], limits[1]
+    for i in range(points.shape[0]):
+        place = _place(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], NEAR)
+        held[_sector(place[6], place[7], SECTORS)] = True
+    hollow = beyond = within = 0
+    for k in range(SECTORS):
+        if held[k]:
+            continue
+        t = 2.0 * math.pi * ((k + 0.5) / SECTORS - 0.5) - angle
+        c, s = math.cos(t), math.sin(t)
+        nx, ny = b * c, a * s
+        height = math.sqrt(nx * nx + ny * ny)
+        nx, ny = nx / height, ny / height
+        is_dark = True
+        for side in (-away, away):
+            p, q = a * c + side * nx, b * s + side * ny
+            column = min(max(int(np.rint(cx + p * cos - q * sin)), 0), linear.shape[1] - 1)
+            row = min(max(int(np.rint(cy + p * sin + q * cos)), 0), linear.shape[0] - 1)
+            level, i, j = linear[row, column], row - corner[1], column - corner[0]
+            if 0 <= i < patch.shape[0] and 0 <= j < patch.shape[1]:
+                level = patch[i, j]
+            is_dark = is_dark and level < dark
+        hollow += is_dark
+    for i in range(others.shape[0]):
+        dx, dy = others[i, 0] - cx, others[i, 1] - cy
+        p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
+        radius, u, v = math.sqrt(p * p + q * q), p / a, q / b
+        distance = (radius - 1.0) * radius / max(math.sqrt(u * u + v * v), 1e-12)
+        beyond += distance > reach
+        within += distance < -reach
+    return hollow, beyond, within
 
 
 @_compiled
@@ -469,6 +614,73 @@ def ring_levels(small, blobs, noise, angles):
         out[k, 0], out[k, 1], out[k, 2] = np.median(within), typical, count / angles
         out[k, 3], out[k, 4] = np.median(near), np.std(within)
     return out
+
+
+@_inlined
+def _same_blob(first, second):
+    near = math.hypot(first[0] - second[0], first[1] - second[1]) < 0.35 * min(first[3], second[3])
+    return near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65
+
+
+@_compiled
+def best_blobs(blobs, levels, noise):
+    n = blobs.shape[0]
+    score, kept, count = np.empty(n), np.empty(MOST_BLOBS, dtype=np.int64), 0
+    for i in range(n):
+        typical, spread = levels[i, 1], levels[i, 4]
+        strength = max(typical, 0.0) / (max(typical, 0.0) + 8.0 * noise + 4.0)
+        uniform = 1.0 / (1.0 + (spread / max(typical, 1e-6)) ** 2)
+        score[i] = levels[i, 2] ** 2 * strength * uniform * min(blobs[i, 5], 1.0) ** 2
+    order = np.argsort(-score, kind="mergesort")
+    for i in order:
+        new = levels[i, 1] >= max(2.5 * noise, 0.5) and levels[i, 2] >= 0.3
+        for k in range(count):
+            new = new and not _same_blob(blobs[i], blobs[kept[k]])
+        if new:
+            kept[count] = i
+            count += 1
+        if count == MOST_BLOBS:
+            break
+    final = score[kept[:count]]
+    for k in range(count):
+        i = kept[k]
+        for m in range(count):
+            j = kept[m]
+            inner = blobs[j, 2] * blobs[j, 3] < 0.6 * blobs[i, 2] * blobs[i, 3]
+            inner = inner and math.hypot(blobs[i, 0] - blobs[j, 0], blobs[i, 1] - blobs[j, 1]) < 0.6 * blobs[i, 3]
+            darker = levels[i, 3] - levels[j, 3] > max(0.1 * levels[i, 1], 2.0 * noise)
+            if inner and darker and levels[j, 2] > 0.55 and levels[j, 1] > 0.12 * levels[i, 1]:
+                final[k] = min(final[k], 0.5 * final[m])
+    out = np.empty((count, 8))
+    for row, k in enumerate(np.argsort(-final, kind="mergesort")):
+        out[row, :5], out[row, 5:7], out[row, 7] = blobs[kept[k], :5], levels[kept[k], :2], final[k]
+    return out
+
+
+@_inlined
+def _box(image, x, y):
+    """Mean of the 3 x 3 pixels about a point."""
+    height, width, total = image.shape[0], image.shape[1], 0.0
+    column, row = int(np.rint(x)), int(np.rint(y))
+    for j in range(row - 1, row + 2):
+        for i in range(column - 1, column + 2):
+            total += image[min(max(j, 0), height - 1), min(max(i, 0), width - 1)]
+    return total / 9.0
+
+
+@_compiled
+def levels_about(linear, ellipse, angles):
+    x, y, a, b, angle = ellipse
+    cos, sin = math.cos(angle), math.sin(angle)
+    within, step = np.empty(2 * angles), np.empty(angles)
+    for i in range(angles):
+        turn = 2.0 * math.pi * i / angles
+        p, q = a * math.cos(turn), b * math.sin(turn)
+        u, v = p * cos - q * sin, p * sin + q * cos
+        within[i], within[angles + i] = _box(linear, x + 0.65 * u, y + 0.65 * v), _box(linear, x + 0.4 * u, y + 0.4 * v)
+        p, q = (1.15 * a + 3.0) * math.cos(turn), (1.15 * b + 3.0) * math.sin(turn)
+        step[i] = _box(linear, x + p * cos - q * sin, y + p * sin + q * cos) - within[i]
+    return float(np.median(within)), float(np.median(step))
 
 
 @_inlined

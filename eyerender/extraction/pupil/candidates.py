@@ -26,11 +26,12 @@ LEVELS = 20  # thresholds at even grey levels
 # hull is then a blob too.
 NOTCHED = 0.93
 ANGLES = 48  # samples around a blob
+MOST_BLOBS = 12  # that are ranked
 # Share of the thresholds, darkest first, that is tried first. The others are tried if these give no candidate.
 DARKER = 0.6
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
     """A dark blob.
 
@@ -38,15 +39,15 @@ class Candidate:
         ellipse: with the blob's second moments.
         inside_dn: level inside.
         step_dn: step from inside to a ring outside.
-        enclosed: share of the ring that shows the step.
         score: by which candidates are ranked.
+        rough: whether the ellipse is of a strongly reduced image.
     """
 
     ellipse: Ellipse
     inside_dn: float
     step_dn: float
-    enclosed: float
-    score: float
+    score: float = 1.0
+    rough: bool = False
 
 
 def find_candidates(
@@ -86,8 +87,11 @@ def _reduced(linear: Image, factor: int, removal: int, spot_px: float) -> Image:
     """Reduce, smooth, and remove glints by a morphological opening (by a closing in a negative)."""
     height, width = linear.shape
     size = (max(1, width // factor), max(1, height // factor))
-    small = cv2.resize(linear[: size[1] * factor, : size[0] * factor], size, interpolation=cv2.INTER_AREA)
-    small = cv2.GaussianBlur(small, (3, 3), 0.8)
+    small = linear[: size[1] * factor, : size[0] * factor]
+    if factor == 4:  # OpenCV has a fast function for halves only
+        small = as_image(cv2.resize(small, (2 * size[0], 2 * size[1]), interpolation=cv2.INTER_AREA))
+    small = as_image(cv2.resize(small, size, interpolation=cv2.INTER_AREA))
+    small = as_image(cv2.GaussianBlur(small, (3, 3), 0.8))
     spot = 2 * math.ceil(spot_px / factor) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (spot, spot))
     return as_image(cv2.morphologyEx(small, removal, kernel))
@@ -171,39 +175,42 @@ def _blob_ellipse(m: dict[str, float], least: float, most: float, shape: Shape) 
 
 
 def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -> list[Candidate]:
-    centre, axes, angle, filled = blobs[:, :2], blobs[:, 2:4], blobs[:, 4], blobs[:, 5]
-    inside, typical, enclosed, edge_level, spread = _ring_levels(small, blobs, noise, ANGLES).T
-    uniform = 1.0 / (1.0 + (spread / np.maximum(typical, 1e-6)) ** 2)
+    best = _best_blobs(blobs, _ring_levels(small, blobs, noise, ANGLES), noise)[:most]
+    return [
+        Candidate(Ellipse((row[:2] + 0.5) * factor - 0.5, row[2:4] * factor, angle), inside, step, score)
+        for row, (angle, inside, step, score) in zip(best, best[:, 4:].tolist(), strict=True)
+    ]
+
+
+@twin
+def _best_blobs(blobs: Floats, levels: Floats, noise: float) -> Floats:
+    """Find different blobs of `_sweep` that stand out: at most MOST_BLOBS, best first.
+
+    Returns:
+        Ellipse (x, y, a, b, angle), level inside, step and score of each, (k, 8).
+    """
+    typical, enclosed, edge_level, spread = levels[:, 1:].T
     strength = np.maximum(typical, 0.0) / (np.maximum(typical, 0.0) + 8.0 * noise + 4.0)
-    score = enclosed**2 * strength * uniform * np.minimum(filled, 1.0) ** 2
+    uniform = 1.0 / (1.0 + (spread / np.maximum(typical, 1e-6)) ** 2)
+    score = enclosed**2 * strength * uniform * np.minimum(blobs[:, 5], 1.0) ** 2
     eligible = (typical >= max(2.5 * noise, 0.5)) & (enclosed >= 0.3)
-    order = np.argsort(-score, kind="stable")
-    best = blobs[order[eligible[order]]]
-    index = order[eligible[order]].tolist()
     kept: list[int] = []
-    places: list[list[float]] = []
-    for i, place in zip(index, best.tolist(), strict=True):
-        if not any(_same(place, other) for other in places):
+    for i in np.argsort(-score, kind="stable").tolist():
+        if eligible[i] and not any(_same(blobs[i], blobs[j]) for j in kept):
             kept.append(i)
-            places.append(place)
-        if len(kept) >= 12:
+        if len(kept) >= MOST_BLOBS:
             break
-    final = {i: float(score[i]) for i in kept}
-    for i, (x, y, a, b, *_) in zip(kept, places, strict=True):
-        for j, (other_x, other_y, other_a, other_b, *_) in zip(kept, places, strict=True):
+    final = score[kept]
+    for k, i in enumerate(kept):
+        for m, j in enumerate(kept):
+            (x, y, a, b), (other_x, other_y, other_a, other_b) = blobs[i, :4].tolist(), blobs[j, :4].tolist()
             inner = other_a * other_b < 0.6 * a * b and math.hypot(x - other_x, y - other_y) < 0.6 * b
             darker = edge_level[i] - edge_level[j] > max(0.1 * typical[i], 2.0 * noise)
             # The iris contains the pupil, so a blob that contains a darker enclosed blob is not the pupil.
             if inner and darker and enclosed[j] > 0.55 and typical[j] > 0.12 * typical[i]:
-                final[i] = min(final[i], 0.5 * final[j])
-    kept.sort(key=lambda i: -final[i])
-    return [
-        Candidate(
-            ellipse=Ellipse((centre[i] + 0.5) * factor - 0.5, axes[i] * factor, float(angle[i])),
-            inside_dn=float(inside[i]), step_dn=float(typical[i]), enclosed=float(enclosed[i]), score=final[i],
-        )
-        for i in kept[:most]
-    ]  # fmt: skip
+                final[k] = min(final[k], 0.5 * final[m])
+    order = np.argsort(-final, kind="stable")
+    return np.column_stack([blobs[kept, :5], levels[kept, :2], final])[order]
 
 
 @twin
@@ -222,27 +229,42 @@ def _ring_levels(small: Image, blobs: Floats, noise: float, angles: int) -> Floa
 
 def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
     """Make a candidate of a known place, with the levels of the image there; None where it is no darker inside."""
-    centre, axes, angle = ellipse.centre_px[None], ellipse.semi_axes_px[None], np.array([ellipse.angle_rad])
-    inside = float(np.median(_sample(prepared.linear, centre, axes * 0.55, angle)))
-    outside = float(np.median(_sample(prepared.linear, centre, axes * 1.15 + 1.5, angle)))
-    step = outside - inside
-    if step <= 2.0 * prepared.noise_dn:
-        return None
-    return Candidate(ellipse=ellipse, inside_dn=inside, step_dn=step, enclosed=1.0, score=1.0)
+    about = (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
+    inside, step = _levels_about(prepared.linear, about, ANGLES)
+    return Candidate(ellipse, inside, step) if step > prepared.noise_dn else None
 
 
-def _sample(small: Image, centre: Floats, axes: Floats, angle: Floats, count: int = ANGLES) -> Image:
-    """Levels (n, count) along n ellipses at the nearest pixels; outside the frame its border is repeated."""
+@twin
+def _levels_about(linear: Image, ellipse: tuple[float, ...], angles: int) -> tuple[float, float]:
+    """Level inside an ellipse (cx, cy, a, b, angle), and the step from its outer part to a ring outside.
+
+    They are medians of the means of 3 x 3 pixels along ellipses.
+    """
+    centre, axes, angle = np.array([ellipse[:2]]), np.array([ellipse[2:4]]), np.array(ellipse[4:])
+    near, deep, outside = (
+        _sample(linear, centre, scaled, angle, angles, box=1) for scaled in (0.65 * axes, 0.4 * axes, 1.15 * axes + 3.0)
+    )
+    return float(np.median(np.concatenate([near, deep]))), float(np.median(outside - near))
+
+
+def _sample(small: Image, centre: Floats, axes: Floats, angle: Floats, count: int, box: int = 0) -> Floats:
+    """Levels (n, count) along n ellipses: means of the nearest pixels, up to `box` of them to each side.
+
+    Outside the frame its border is repeated.
+    """
     points = np.rint(points_on_ellipse(centre, axes, angle, count)).astype(np.intp)
-    column = np.minimum(np.maximum(points[..., 0], 0), small.shape[1] - 1)
-    row = np.minimum(np.maximum(points[..., 1], 0), small.shape[0] - 1)
-    return np.asarray(small[row, column])
+    out = np.zeros(points.shape[:-1])
+    for y in range(-box, box + 1):
+        for x in range(-box, box + 1):
+            column = np.minimum(np.maximum(points[..., 0] + x, 0), small.shape[1] - 1)
+            out += small[np.minimum(np.maximum(points[..., 1] + y, 0), small.shape[0] - 1), column]
+    return out / (2 * box + 1) ** 2
 
 
-def _same(first: list[float], second: list[float]) -> bool:
+def _same(first: Floats, second: Floats) -> bool:
     """Whether two blobs of `_sweep` are the same object at two thresholds."""
     near = math.hypot(first[0] - second[0], first[1] - second[1]) < 0.35 * min(first[3], second[3])
-    return near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65
+    return bool(near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65)
 
 
 @dataclass(frozen=True, slots=True)

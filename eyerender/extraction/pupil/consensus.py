@@ -172,28 +172,29 @@ def _polished(
 ) -> BoundaryFit | str:
     """Select points and refit with AMS until the selection settles."""
     begun = np.array([*start.centre_px, *start.semi_axes_px, start.angle_rad])
-    count, found, inliers, points = _settled(edges.points_px, edges.normals, begun, edges.sigma_px, tolerance, free)
+    count, found, inliers, points, seen = _settled(
+        edges.points_px, edges.normals, begun, edges.sigma_px, tolerance, free
+    )
     if 0 <= count < 8:
         return f"only {count} edge points agree on one ellipse"
     if count < 0:
         return "the edge points that agree span no ellipse"
     ellipse = _ellipse(found)
-    distance = signed_distance(ellipse, points[inliers])
-    support, gap = outline_support(ellipse, points[inliers])
-    a, b = ellipse.semi_axes_px
+    support, gap, residual = seen.tolist()
+    a, b = found[2:4].tolist()
     if support < shape.support:
         return f"only {100 * support:.0f} % of the outline is seen, less than {100 * shape.support:.0f} %"
     if b < shape.least_px or a > shape.most_px:
         return f"its semi-axes {a:.1f} x {b:.1f} px are outside the sizes looked for"
     if b < shape.aspect * a:
         return f"its axes' ratio {b / a:.2f} is below {shape.aspect:g}"
-    return BoundaryFit(ellipse, inliers, points[inliers], support, gap, float(np.sqrt(np.mean(distance**2))))
+    return BoundaryFit(ellipse, inliers, points[inliers], support, gap, residual)
 
 
 @twin
 def _settled(
     points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float, free: bool
-) -> tuple[int, Floats, Bools, Floats]:
+) -> tuple[int, Floats, Bools, Floats, Floats]:
     """Select points and refit with AMS until the selection settles.
 
     Edge points are moved outward by the curvature shift. The steepest place of a blurred convex edge is sigma^2 kappa /
@@ -209,7 +210,7 @@ def _settled(
 
     Returns:
         How many points were selected (fewer than 8: too few; -1: they span no ellipse), the ellipse (5,), which points
-        (n,), and the points (n, 2) as moved.
+        (n,), the points (n, 2) as moved, and (3,) support, gap and residual as in `BoundaryFit`.
     """
     ellipse, inliers, moved = _ellipse(start), np.zeros(points.shape[0], dtype=bool), points
     for turn in range(5):
@@ -223,17 +224,19 @@ def _settled(
             spread = 1.4826 * median(np.abs(distance[chosen] - median(distance[chosen])))
             chosen &= np.abs(distance) < max(3.5 * spread, 0.1)
         if chosen.sum() < 8:
-            return int(chosen.sum()), start, chosen, moved
+            return int(chosen.sum()), start, chosen, moved, np.zeros(3)
         same = bool((chosen == inliers).all()) and turn > 1
         inliers = chosen
         fitted = ams_fit(moved[inliers])
         if fitted is None:
-            return -1, start, inliers, moved
+            return -1, start, inliers, moved, np.zeros(3)
         ellipse = fitted
         if same:
             break
     found = np.array([*ellipse.centre_px, *ellipse.semi_axes_px, ellipse.angle_rad])
-    return int(inliers.sum()), found, inliers, moved
+    distance = signed_distance(ellipse, moved[inliers])
+    seen = np.array([*outline_support(ellipse, moved[inliers]), np.sqrt(np.mean(distance**2))])
+    return int(inliers.sum()), found, inliers, moved, seen
 
 
 def ams_fit(points: Floats) -> Ellipse | None:

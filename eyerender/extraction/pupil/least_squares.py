@@ -26,7 +26,7 @@ FIXED = SHAPE + 7
 # lean).
 HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
 KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond them the edge would not be monotonic
-STILL_PX = 1e-3  # a fit ends with a step smaller than this
+STILL_PX = 5e-3  # a fit ends with a step smaller than this
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -265,7 +265,7 @@ def gauss_newton(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Pri
         further = normal.displaced_by(step)
         trial, trial_displaced = moved(model, step), displaced + further
         if largest < STILL_PX and abs(float(step[SHAPE])) < 10.0 * STILL_PX and damping < 1e-3:
-            # Another step would be several times smaller, and so small a step changes no sum.
+            # Another step would be several times smaller, and so small a step hardly changes a sum.
             return Solution(trial, trial_displaced, sums)
         trial_sums = Sums.of(pixels, trial, trial_displaced)
         trial_normal = Normal.of(trial_sums, trial_displaced, prior)

@@ -12,9 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...arrays import Floats
 from ...geometry.ellipse import Ellipse
+from ..compiled import twin
+from ..preprocessing import Image
 from .consensus import relative_to
 from .edge_model import NEAR, SECTORS, sectors_at
+from .glare import Cleared
 
 if TYPE_CHECKING:
     from .search import Found
@@ -34,20 +38,48 @@ class Outline:
 
 def outline_of(found: Found, ellipse: Ellipse) -> Outline:
     """Look along an ellipse about a candidate."""
-    boundary, candidate, edges = found.boundary, found.candidate, found.edges
+    boundary, candidate, edges, cleared = found.boundary, found.candidate, found.edges, found.cleared
     b = float(ellipse.semi_axes_px[1])
-    held = np.zeros(SECTORS, dtype=bool)
     about = (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
-    x, y = np.ascontiguousarray(boundary.points_px.T)
-    held[sectors_at(about, x, y, NEAR)] = True
     away = min(1.5 * found.model.sigma_px + 1.0, 0.4 * b)
-    inside, outside = (found.cleared.levels(ellipse, side * away, SECTORS) for side in (-1.0, 1.0))
-    dark = candidate.inside_dn + DARK * candidate.step_dn
-    distance, _, _ = relative_to(ellipse, edges.points_px[~boundary.inliers])
-    own = max(int(np.count_nonzero(boundary.inliers)), 1)
-    limit = max(CLEAR * b, 1.0)
-    return Outline(
-        open=float(np.mean(~held & (inside < dark) & (outside < dark))),
-        beyond=np.count_nonzero(distance > limit) / own,
-        within=np.count_nonzero(distance < -limit) / own,
+    patch = np.zeros((0, 0), dtype=np.float32) if cleared.patch is None else cleared.patch
+    others = edges.points_px[~boundary.inliers]
+    limits = (candidate.inside_dn + DARK * candidate.step_dn, max(CLEAR * b, 1.0))
+    hollow, beyond, within = _along(
+        about, boundary.points_px, others, cleared.linear, cleared.corner, patch, away, limits
+    )
+    own = max(boundary.points_px.shape[0], 1)
+    return Outline(open=hollow / SECTORS, beyond=beyond / own, within=within / own)
+
+
+@twin
+def _along(
+    ellipse: tuple[float, ...], points: Floats, others: Floats, linear: Image, corner: tuple[int, int], patch: Image,
+    away: float, limits: tuple[float, float],
+) -> tuple[int, int, int]:  # fmt: skip
+    """Look along an ellipse (cx, cy, a, b, angle).
+
+    Args:
+        ellipse: the ellipse.
+        points: (n, 2) edge points that it fits.
+        others: (m, 2) the other edge points.
+        linear: the image, DN.
+        corner: column and row of the part of it that is replaced.
+        patch: that part, empty if there is none.
+        away: distance at which levels are looked at, px.
+        limits: a lower level is dark, DN; a farther point is not the ellipse's own, px.
+
+    Returns:
+        Sectors without points that are dark on both sides, and other points outside and inside the ellipse.
+    """
+    about = Ellipse(np.array(ellipse[:2]), np.array(ellipse[2:4]), ellipse[4])
+    held = np.zeros(SECTORS, dtype=bool)
+    held[sectors_at(ellipse, points[:, 0], points[:, 1], NEAR)] = True
+    cleared = Cleared(linear, corner, patch if patch.size else None)
+    inside, outside = (cleared.levels(about, side * away, SECTORS) for side in (-1.0, 1.0))
+    distance, _, _ = relative_to(about, others)
+    return (
+        int(np.count_nonzero(~held & (inside < limits[0]) & (outside < limits[0]))),
+        int(np.count_nonzero(distance > limits[1])),
+        int(np.count_nonzero(distance < -limits[1])),
     )

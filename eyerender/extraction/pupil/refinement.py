@@ -25,7 +25,10 @@ WIDE, NARROW = 3.0, 1.5
 UNEXPLAINED = 1.5
 # Largest distance outside the boundary, px, however wide the blur: the light changes across the iris, and not linearly.
 OUTWARD_PX = 8.0
-TURNS = 4  # fits at most; each leaves out what the previous one could not explain
+# Fits at most; each leaves out what the previous one could not explain. The second number is for the narrower band, the
+# third for a boundary that was fitted before in the same band. A wide band that leaves more than noise in the fit of
+# PATIENCE is given up.
+TURNS, PATIENCE = (4, 2, 1), 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +44,7 @@ class PixelFit:
         pixels: number of pixels used.
         sectors: (SECTORS,) which parts of the outline were used.
         uneven_px: standard deviation of the sectors' displacements.
+        outward: how far the band of pixels reached beyond the boundary, in widths of the blur.
     """
 
     model: EdgeModel
@@ -51,6 +55,7 @@ class PixelFit:
     pixels: int
     sectors: Bools
     uneven_px: float
+    outward: float
 
 
 def refine(
@@ -60,10 +65,12 @@ def refine(
 
     The arguments are those of `_fitted`.
     """
-    fit = _fitted(linear, start, sectors, masked, noise_dn, before, WIDE)
+    if before is not None:
+        return _fitted(linear, start, sectors, masked, noise_dn, before, before.outward, TURNS[2])
+    fit = _fitted(linear, start, sectors, masked, noise_dn, None, WIDE, TURNS[0])
     if isinstance(fit, str) or fit.reduced_chi2 < UNEXPLAINED:
         return fit
-    narrow = _fitted(linear, start, sectors, masked, noise_dn, fit, NARROW)
+    narrow = _fitted(linear, start, sectors, masked, noise_dn, fit, NARROW, TURNS[1])
     return fit if isinstance(narrow, str) else narrow
 
 
@@ -75,6 +82,7 @@ def _fitted(
     noise_dn: float,
     before: PixelFit | None,
     outward: float,
+    turns: int,
 ) -> PixelFit | str:
     """Fit the pixel model, or give the reason why the fit failed.
 
@@ -90,6 +98,7 @@ def _fitted(
         noise_dn: standard deviation of a pixel's noise.
         before: an earlier fit of the same boundary to start from.
         outward: how far the band of pixels reaches beyond the boundary, in widths of the blur.
+        turns: number of fits at most.
     """
     model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before.model
     prior = Prior.of(start, noise_dn, 0.0 if before is None else before.uneven_px)
@@ -100,7 +109,7 @@ def _fitted(
     # A lid must not decide the order of the outer level.
     seen = clear_of_lids(sectors, start) if before is None else before.sectors
     displaced = np.zeros(SECTORS) if model.displaced is None else model.displaced.copy()
-    for turn in range(TURNS):
+    for turn in range(turns):
         chosen = np.nonzero(use & seen[bins])[0]
         if chosen.size < 60:
             return "too few pixels on the boundary are free of glints and lids"
@@ -123,12 +132,13 @@ def _fitted(
             order = _best_order(pixels, found, prior)
             model = replace(model, outer=_padded(model.outer, order))
             same &= order == ORDERS[0]
-        if same or turn + 1 == TURNS:
+        texture = found.sums.cost > UNEXPLAINED * noise_dn**2 * chosen.size
+        if same or turn + 1 == turns or (outward == WIDE and before is None and turn + 1 >= PATIENCE and texture):
             break
         use, seen, displaced, bins = visible.use, new_seen, visible.displaced, visible.bins
         if seen.sum() < 0.15 * SECTORS:
             return "too little of the boundary fits the pixel model"
-    return _report(pixels, found, prior, noise_dn, new_seen)
+    return _report(pixels, found, prior, noise_dn, new_seen, outward)
 
 
 def _band(linear: Image, model: EdgeModel, masked: Bools, reach_out: float) -> tuple[Floats, Floats, Floats]:
@@ -191,7 +201,7 @@ def _sane(model: EdgeModel, start: EdgeModel) -> bool:
     return moved < 0.25 * float(b) + 1.0 and bool((ratio > 0.7).all() and (ratio < 1.4).all()) and model.step_dn > 0.0
 
 
-def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen: Bools) -> PixelFit:
+def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen: Bools, outward: float) -> PixelFit:
     model, of_pixels, count = found.model, found.sums, pixels.level.size
     variance = of_pixels.cost / max(count - of_pixels.matrix.shape[0], 1)
     normal = Normal.of(of_pixels, found.displaced, prior)
@@ -224,6 +234,7 @@ def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen
         count,
         seen,
         prior.uneven_px,
+        outward,
     )
 
 

@@ -15,6 +15,7 @@ steps of 12 to 75 DN, lids over up to half the pupil, iris texture) and 800 with
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -84,10 +85,15 @@ def design(rows: Floats, low: Floats, high: Floats) -> Floats:
 
 def confidence(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "refined"]) -> float:
     """Probability that IoU > 0.9."""
-    low, high, weights, bend, _ = (np.array(values) for values in TABLE[method])
+    low, high, weights, bend, _ = _arrays(method)
     row = design(features(ellipse, goodness)[None], low, high)
     logit = calibrated(row @ weights, bend)
     return float(1.0 / (1.0 + np.exp(-np.clip(logit[0], -30.0, 30.0))))
+
+
+@cache
+def _arrays(method: Literal["fast", "refined"]) -> tuple[Floats, ...]:
+    return tuple(np.array(values) for values in TABLE[method])
 
 
 def calibrated(logit: Floats, bend: Floats) -> Floats:
@@ -97,7 +103,7 @@ def calibrated(logit: Floats, bend: Floats) -> Floats:
 
 def covariance_scale(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "refined"]) -> float:
     """Factor of the covariance: how much farther ellipses like this one lie from the truth than it says."""
-    low, high, _, _, weights = (np.array(values) for values in TABLE[method])
+    low, high, _, _, weights = _arrays(method)
     row = scale_design(features(ellipse, goodness)[None], low, high)
     return float(np.exp(np.clip(row @ weights, *SCALES)[0]))
 
