@@ -71,8 +71,8 @@ of the folder (the loader itself calls all images `train`); without `filters` it
 {_LABELS.format(mask=CONVENTIONS["mask"], more="".join(_MORE.get(kind, "") for kind in spec.labels.pictures))}
 
 ## Reading the images
-The images are linear PNG files of `bit_depth` bits, 16 unless the spec says otherwise. A pupil has counts of about
-1 % of the full scale.
+The images are PNG files of `bit_depth` bits, 16 unless the spec says otherwise. They hold linear sensor counts where
+`gamma` is 1; otherwise count / full scale = linear^(1 / gamma).
 {WHOLE}
 {IMAGEFOLDER}
 ## Conventions

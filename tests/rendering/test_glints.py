@@ -9,7 +9,8 @@ import pytest
 
 from eyerender.rendering.surround import Obstacle
 from eyerender.rig.sensor import Sensor
-from tests.support.render_oracles import centroid, corneal_share, mirror_pixel
+from tests.support.light_tracing import trace_backward
+from tests.support.render_oracles import centroid, mirror_pixel
 from tests.support.render_rigs import BLACK, MODELS, RIGS, eye_of, head_rig, job_of, remote_rig
 
 
@@ -45,30 +46,8 @@ def test_flux_and_place_of_a_large_disc_against_backward_tracing(renderer, rig_n
     window = rig.window(64, 64, np.round(xy))
     job = replace(job, window=window)
     done = renderer.render(job, spp=1)
-
-    k = 24
-    sub = (np.arange(k) + 0.5) / k - 0.5
-    u = (window[0] + np.arange(64)[:, None] + sub).ravel()
-    v = (window[1] + np.arange(64)[:, None] + sub).ravel()
-    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    world = job.camera.rays(pixels)
-    d = world @ job.M
-    o = np.broadcast_to(job.M.T @ (job.camera.nodal_point_mm - job.t), d.shape)
-    surface = eye.front[0]
-    hit = surface.hit(tuple(o.T), tuple(d.T), True)
-    y = np.stack(hit.point, axis=-1)
-    N = surface.normal(y)
-    c = -np.sum(N * d, axis=1)
-    w = (d + 2 * c[:, None] * N) @ job.M.T
-    y = y @ job.M.T + job.t
-    s = ((lamp.position_mm - y) @ lamp.axis) / (w @ lamp.axis)
-    on = (np.linalg.norm(y + s[:, None] * w - lamp.position_mm, axis=1) < radius_mm) & (s > 0) & hit.ok
-    F = corneal_share(c, eye)
-    cos4 = (world @ job.camera.axis) ** 4
-    L = np.where(on, lamp.intensity_mw_sr / (np.pi * radius_mm**2) * F * cos4, 0.0)  # Lambertian: L = I / area
-    truth = (L[:, None] * pixels).sum(axis=0) / L.sum()
-    scale = 1e3 * np.pi * job.sensor.lens_transmission / (4 * job.sensor.f_number**2)
-    assert done.irradiance.sum(dtype=float) == pytest.approx(L.sum() / k**2 * scale, rel=3e-3)
+    flux, truth = trace_backward(job, lamp)
+    assert done.irradiance.sum(dtype=float) == pytest.approx(flux, rel=3e-3)
     assert np.linalg.norm(centroid(done.irradiance, window) - truth) < 3e-3
     assert np.linalg.norm(done.glints.xy_px[0] - truth) < 3e-3
 

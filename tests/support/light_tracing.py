@@ -1,9 +1,9 @@
-"""Light tracing of a glint in NumPy: forward from random points of a lamp over the cornea to a small aperture.
+"""Glints traced in NumPy: forward from random points of a lamp to a small aperture, and backward from the pixels.
 
-It shares neither a ray tube nor a quadrature with the package: light leaves a point of the lamp towards a random point
-of the cornea, is reflected there by the law of reflection, and counts where it passes the aperture. The points of the
-cornea fill a small box about a guess. Rays that count must stay away from the box's border, so the guess has no
-influence on the result.
+Forward tracing shares neither a ray tube nor a quadrature with the package: light leaves a point of the lamp towards a
+random point of the cornea, is reflected there by the law of reflection, and counts where it passes the aperture. The
+points of the cornea fill a small box about a guess. Rays that count must stay away from the box's border, so the guess
+has no influence on the result.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import qmc
 
+from eyerender.geometry.surfaces import components
 from eyerender.optics.solve import mirror_points
 from eyerender.rendering.frame import RenderJob
 from eyerender.rig.light import Lamp
@@ -108,6 +109,34 @@ def trace_light(
     assert nearest > 0.01, "the box is too small"
     scale = 4 * half.prod() / (samples // step * step * np.pi * aperture_mm**2)
     return float(flux * scale), moment / flux, counted
+
+
+def trace_backward(job: RenderJob, lamp: Lamp, *, rays: int = 24) -> tuple[float, np.ndarray]:
+    """Irradiance (summed over the job's window) and centroid (px) of a large Lambertian disc's glint.
+
+    Camera rays, `rays` x `rays` a pixel, are mirrored at the cornea and counted where they end on the disc.
+    """
+    eye, (left, top, width, height) = job.eye, job.window
+    sub = (np.arange(rays) + 0.5) / rays - 0.5
+    u, v = ((a + np.arange(n)[:, None] + sub).ravel() for a, n in ((left, width), (top, height)))
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    world = job.camera.rays(pixels)
+    d = world @ job.M
+    o = np.broadcast_to(job.M.T @ (job.camera.nodal_point_mm - job.t), d.shape)
+    surface = eye.front[0]
+    hit = surface.hit(components(o), components(d), True)
+    y = np.stack(hit.point, axis=-1)
+    N = surface.normal(y)
+    c = -np.sum(N * d, axis=1)
+    w = (d + 2 * c[:, None] * N) @ job.M.T
+    y = y @ job.M.T + job.t
+    s = ((lamp.position_mm - y) @ lamp.axis) / (w @ lamp.axis)
+    on = (np.linalg.norm(y + s[:, None] * w - lamp.position_mm, axis=1) < lamp.radius_mm) & (s > 0) & hit.ok
+    cos4 = (world @ job.camera.axis) ** 4
+    # Lambertian: the radiance is I / area.
+    L = np.where(on, lamp.intensity_mw_sr / (np.pi * lamp.radius_mm**2) * corneal_share(c, eye) * cos4, 0.0)
+    scale = 1e3 * np.pi * job.sensor.lens_transmission / (4 * job.sensor.f_number**2)
+    return float(L.sum() / rays**2 * scale), (L[:, None] * pixels).sum(axis=0) / L.sum()
 
 
 def _terms(ab: np.ndarray) -> np.ndarray:
