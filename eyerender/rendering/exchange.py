@@ -52,7 +52,12 @@ if TYPE_CHECKING:
     from .surround import Surround
     from .values import Lights, Values
 
-RAYS = 24  # from each place outside the eye
+RAYS = 24  # from each place on the globe or about it
+_NEAR_RAYS, _FAR_RAYS, _FAR_MM = (
+    16,
+    8,
+    17.0,
+)  # from each place on the skin; beyond this, and within lids, the fewer ones
 _ROUNDS = 6
 _START_MM = 0.02
 _SMALL, _SPOTS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
@@ -174,13 +179,28 @@ def _around(buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns:
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """What the rays of the places meet: numbers of places, weights, open rays, covered rays; all (places, rays)."""
+    """What the rays of the places meet: numbers of places, weights, open rays, covered rays; all (rays,).
 
+    Attributes:
+        first: (places,) number of the first ray of each place; rays of a place follow each other.
+        target: numbers of the places that are met.
+        weight: share of their irradiance that is sent back.
+        open_: whether nothing is met.
+        near: whether something is met very close.
+        sky: irradiance from what is far away.
+    """
+
+    first: Ints
     target: Ints
     weight: Floats
     open_: Floats
     near: Floats
     sky: Floats
+
+    def mean(self, values: Floats) -> Floats:
+        """Means (places,) over the rays of each place."""
+        count = np.diff(self.first, append=len(values))
+        return np.asarray(np.add.reduceat(values, self.first) / count)
 
 
 class Exchange:
@@ -253,6 +273,16 @@ class _Frame:
         return len(self.grid.points) + len(self.points) + IRIS_TURNS
 
     @property
+    def first_ray(self) -> Ints:
+        """Number of the first ray of each place outside the chamber, and the number of all these rays."""
+        count = np.full(self.outside, RAYS)
+        if self.skin is not None:
+            skin = count[self.on_globe : self.outside - IRIS_TURNS]
+            skin[:] = np.where(np.linalg.norm(self.points, axis=1) < _FAR_MM, _NEAR_RAYS, _FAR_RAYS)
+            skin[len(self.skin.vertices) :] = _FAR_RAYS
+        return np.append(0, np.cumsum(count))
+
+    @property
     def outer(self) -> Floats:
         """Points and normals of the places outside the chamber, (n, 6)."""
         job = self.job
@@ -296,13 +326,13 @@ class _Frame:
     ) -> Received:  # fmt: skip
         """Solve for the irradiance of all places."""
         job, outside, inside = self.job, *seen
-        open_ = outside.open_.mean(axis=1)
-        valid = outside.near.mean(axis=1)[: self.on_globe] < 0.5
+        open_ = outside.mean(outside.open_)
+        valid = outside.mean(outside.near)[: self.on_globe] < 0.5
         if region is None:
             valid &= self.grid.points[:, 0] > -job.look.backdrop_distance_mm
         stand_in = self._stand_in(valid)
         targets = stand_in[outside.target], stand_in[inside.target]
-        start = np.concatenate([direct + even * open_, lamps + panels + inside.sky.mean(axis=1)])
+        start = np.concatenate([direct + even * open_, lamps + panels + inside.mean(inside.sky)])
         total, entered, within = start, np.zeros(PLACES), np.zeros(PLACES)
         if job.interreflection:
             look = job.look
@@ -310,8 +340,8 @@ class _Frame:
             exchange = self.chamber.exchange * albedo
             limbus = through_limbus(job.eye, self.chamber, look.limbus_width_mm) * look.limbus_transmittance
             for _ in range(_ROUNDS):
-                arrived = (outside.weight * total[targets[0]]).mean(axis=1)
-                entered = (inside.weight * total[targets[1]]).mean(axis=1)
+                arrived = outside.mean(outside.weight * total[targets[0]])
+                entered = inside.mean(inside.weight * total[targets[1]])
                 within = exchange @ total[self.outside :] + limbus @ total[self.outside - IRIS_TURNS : self.outside]
                 total = start + np.append(arrived, entered + within)
         numbers = np.zeros((self.outside, 4))
@@ -327,7 +357,7 @@ class _Frame:
         if region is not None and self.skin is not None:
             other = self.skin.spread @ other[: len(self.skin.vertices)]
             region.skin.shine(other)
-        iris = self._on_iris(entered + inside.sky.mean(axis=1), 1.0) + self._on_iris(within + panels, 0.0)
+        iris = self._on_iris(entered + inside.mean(inside.sky), 1.0) + self._on_iris(within + panels, 0.0)
         return self.received((globe, other, iris))
 
 
@@ -413,9 +443,9 @@ def _over_lamps(lights: Lights, index: mi.UInt32, light: Callable[[mi.Float, mi.
     return total / count
 
 
-def _pattern(normal: mi.Vector3f, k: mi.UInt32, row: mi.UInt32) -> mi.Vector3f:
-    """Cosine-distributed directions about normals: ray k of place `row`."""
-    u, v = _spots(k + row * RAYS)
+def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
+    """Cosine-distributed directions about normals; rays of a place have consecutive numbers."""
+    u, v = _spots(ray)
     s, c = dr.sincos(v * (2 * dr.pi))
     e1, e2 = mi.coordinate_system(normal)
     r = dr.sqrt(u)
@@ -426,17 +456,18 @@ def _seen(
     values: Values, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame
 ) -> tuple[_Seen, _Seen]:
     """What the rays of the places outside and of those in the chamber meet."""
-    count = frame.outside
-    first = count * RAYS
+    start = frame.first_ray
+    first = int(start[-1])
     lanes = first + PLACES * LEAVING
     index = dr.arange(mi.UInt32, lanes)
     split = dr.opaque(mi.UInt32, first)
     outside = index < split
-    row = index // RAYS
+    of_place = np.repeat(np.arange(frame.outside, dtype=np.uint32), np.diff(start))
+    row = dr.gather(mi.UInt32, mi.UInt32(aligned(of_place)), index, outside)
     n = _rows(frame.outer)(row, outside)
     normal = mi.Vector3f(*n[3:])
     o = mi.Vector3f(*n[:3]) + _START_MM * normal
-    d = _pattern(normal, index - row * RAYS, row)
+    d = _pattern(normal, index)
     rays = _rows(frame.chamber.leaving.reshape(-1, 7))(index - split, ~outside)
     o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
     d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
@@ -451,8 +482,8 @@ def _seen(
     dr.eval(results)
     host = [r.numpy() for r in results]
     return (
-        _Seen(*(h[:first].reshape(count, RAYS) for h in host)),
-        _Seen(*(h[first:].reshape(PLACES, LEAVING) for h in host)),
+        _Seen(start[:-1], *(h[:first] for h in host)),
+        _Seen(np.arange(PLACES) * LEAVING, *(h[first:] for h in host)),
     )
 
 

@@ -13,15 +13,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, Ints, frozen
 from ..rig.camera import Window
 from .groups import Group, shade_group
-from .sampling import Sampler, Samples, camera_ray
+from .sampling import Sampler, Samples, camera_ray, lattice_generator
 from .values import Lamp, Lights, Values, aligned
 from .view import Textures, meet
 
@@ -31,6 +32,8 @@ _TILE = 4  # pixels across and down
 _LEAST_GROUPS = 4  # a pixel
 _FEW_LAMPS = 2  # with so few lamps shadows are dark, and they are sampled finely
 _TIMES, _ENOUGH = 3, 32  # times as many samples at hairs, unless a pixel has more than enough
+_MANY = 8  # samples, of which even pixels need the first four alone
+_EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and between it and its neighbours
 _SMALL = 0.02  # radius over distance of lamps whose shadows are so fine
 
 
@@ -60,8 +63,10 @@ def pixels_of(pixel: mi.UInt32, window: Window) -> tuple[mi.Int32, mi.Int32]:
     return u, v
 
 
-def group_size(spp: int) -> int:
-    """Number of samples of a pixel in a group."""
+def group_size(spp: int, soft: bool = False) -> int:
+    """Number of samples of a pixel in a group; `soft`: where light spreads in the skin, there are no fine shadows."""
+    if soft and spp == _LARGEST_GROUP:
+        return spp
     size = _LARGEST_GROUP
     while size > 1 and (spp % size or spp // size < min(_LEAST_GROUPS, spp // 2)):
         size //= 2
@@ -98,7 +103,10 @@ def _sums(
         if grid is not None:
             grid.make()
     grouped = shown.values.structure.region
-    size = group_size(spp) if grouped else 1
+    if not grouped and not layered and spp >= _MANY:
+        total, failed = _adaptive(integrator, shown, window, spp, seed)
+        return [total], failed
+    size = group_size(spp, shown.values.structure.scattering) if grouped else 1
     totals: list[Floats] = []
     failed = 0
     each = max(1, min(spp // size, _LANES // (width * height * size)))
@@ -123,6 +131,78 @@ def _samples(u: mi.Int32, v: mi.Int32, spp: int, seed: int, fine: mi.Bool | bool
     return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), spp, seed, fine=fine, times=times)
 
 
+def _adaptive(
+    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, spp: int, seed: int
+) -> tuple[Floats, int]:
+    """Sums of radiance over the samples of each pixel, (height, width); failed light paths.
+
+    Four samples of each pixel are taken first. Where they agree, and their mean is not far from those of the eight
+    neighbours, no edge crosses the pixel, and they stand for all samples. The pixels around the window are looked at,
+    too, so that no pixel depends on the window.
+    """
+    width, height = window[2:]
+    wide = (window[0] - 1, window[1] - 1, width + 2, height + 2)
+    first = _first_samples(spp)
+    every = np.arange((width + 2) * (height + 2), dtype=np.uint32)
+
+    def lanes(pixels: Ints, numbers: Ints) -> tuple[mi.Float, int]:
+        index = dr.arange(mi.UInt32, len(pixels) * len(numbers))
+        each = dr.opaque(mi.UInt32, len(numbers))
+        place = index // each
+        pixel = dr.gather(mi.UInt32, mi.UInt32(aligned(pixels.astype(np.uint32))), place)
+        k = dr.gather(mi.UInt32, mi.UInt32(aligned(numbers.astype(np.uint32))), index - place * each)
+        (radiance,), failures = _taken(integrator, shown, wide, spp=spp, seed=seed, pixel=pixel, k=k, layered=False)
+        return radiance, int(dr.sum(failures).numpy()[0])
+
+    # Few pixels at a time, because there may be more than can be held.
+    stretch = max(1, _LANES // len(first))
+    parts, failed = [], 0
+    for start in range(0, every.size, stretch):
+        radiance, more = lanes(every[start : start + stretch], first)
+        failed += more
+        parts.append(
+            [
+                dr.block_reduce(op, radiance, len(first)).numpy()
+                for op in (dr.ReduceOp.Add, dr.ReduceOp.Min, dr.ReduceOp.Max)
+            ]
+        )
+    total, least, most = (np.concatenate(p).reshape(height + 2, width + 2) for p in zip(*parts, strict=True))
+    uneven_px = (most - least)[1:-1, 1:-1] > _EVEN * most[1:-1, 1:-1]
+    highest = _of_neighbours(np.maximum, total)
+    uneven_px |= highest - _of_neighbours(np.minimum, total) > _STEP * highest
+    total = total[1:-1, 1:-1].astype(float)
+    row, column = np.nonzero(uneven_px)
+    uneven = (row + 1) * (width + 2) + column + 1
+    total[~uneven_px] *= spp / len(first)
+    rest = np.setdiff1d(np.arange(spp), first)
+    count = int(np.clip(_LANES // max(len(uneven), 1), 1, len(rest)))
+    for start in range(0, len(rest) if len(uneven) else 0, count):
+        numbers = rest[start : start + count]
+        radiance, more = lanes(uneven, numbers)
+        failed += more
+        total[row, column] += dr.block_sum(radiance, len(numbers)).numpy()
+    return total, failed
+
+
+def _of_neighbours(better: Callable[..., Floats], values: Floats) -> Floats:
+    """Least or greatest values of three by three pixels, (height - 2, width - 2)."""
+    across = better(better(values[:, :-2], values[:, 1:-1]), values[:, 2:])
+    return better(better(across[:-2], across[1:-1]), across[2:])
+
+
+@lru_cache(maxsize=16)
+def _first_samples(count: int) -> Ints:
+    """Numbers of the samples nearest to the middles of a pixel's quarters."""
+    k = np.arange(count)
+    x, y = (k + 0.5) / count, (k * lattice_generator(count) % count + 0.5) / count
+    chosen: list[int] = []
+    for u, v in ((0.25, 0.25), (0.75, 0.75), (0.75, 0.25), (0.25, 0.75)):
+        away = np.hypot(x - u, y - v)
+        away[chosen] = np.inf
+        chosen.append(int(np.argmin(away)))
+    return frozen(np.array(chosen), np.int64)
+
+
 def _singles(
     integrator: mi.SamplingIntegrator,
     shown: Exposed,
@@ -138,9 +218,25 @@ def _singles(
     index = dr.arange(mi.UInt32, window[2] * window[3] * count)
     n = dr.opaque(mi.UInt32, count)
     pixel = index // n
+    k = index - pixel * n + dr.opaque(mi.UInt32, first)
+    lanes, failures = _taken(integrator, shown, window, spp=spp, seed=seed, pixel=pixel, k=k, layered=layered)
+    return [dr.block_sum(x, count).numpy().astype(float) for x in lanes], int(dr.sum(failures).numpy()[0])
+
+
+def _taken(
+    integrator: mi.SamplingIntegrator,
+    shown: Exposed,
+    window: Window,
+    *,
+    spp: int,
+    seed: int,
+    pixel: mi.UInt32,
+    k: mi.UInt32,
+    layered: bool,
+) -> tuple[list[mi.Float], mi.UInt32]:
+    """What samples k of pixels show, and their failed light paths."""
     u, v = pixels_of(pixel, window)
     samples = _samples(u, v, spp, seed)
-    k = index - pixel * n + dr.opaque(mi.UInt32, first)
     spot = samples.in_pixel(k)
     o, d, cosine = camera_ray(shown.values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
     seen, _, _ = integrator.sample(shown.scene, Sampler(samples, k), mi.Ray3f(mi.Point3f(o), d))
@@ -152,7 +248,7 @@ def _singles(
         parts = (view.other, view.cornea | view.sclera)
         lanes = [dr.select(part, x, 0) for part in parts for x in (lanes[0], mi.Float(1), near)]
     dr.eval(lanes, failures)  # together, because a separate reduction would trace everything again
-    return [dr.block_sum(x, count).numpy().astype(float) for x in lanes], int(dr.sum(failures).numpy()[0])
+    return lanes, failures
 
 
 def _groups(

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .lighting import lamp_blocked, on_relief, straight, through_cornea
-from .shading import direct, indirect
+from .shading import direct, indirect, off_eye
 from .values import Lamp, Lights, Values
 from .view import Textures, View, look_at_skin, meet, outer_albedo
 
@@ -265,12 +265,13 @@ class _GroupShading:
         values, group = self.values, self.group
         _, d, _ = group.ray(kept.j)
         view = look_at_skin(values, self.skin, kept.face, kept.uv, d, kept.weight > 0)
-        rest = indirect(values, self.textures, self.scene, view, d, view.albedo, mi.Float(0), view.received)
-        inside, matte = mi.Float(0), view.albedo
+        rest = off_eye(values, self.textures, self.scene, view, d, view.albedo, view.received)
+        inside, matte, on_map = mi.Float(0), view.albedo, (mi.Float(0), mi.Float(0))
         soft = self.soft and on_sheet
         if soft:
             assert self.textures.tissues is not None
-            on_skin = self.textures.tissues.on_skin(*self.skin.map_place(kept.face, kept.uv, kept.weight > 0))
+            on_map = self.skin.map_place(kept.face, kept.uv, kept.weight > 0)
+            on_skin = self.textures.tissues.on_skin(*on_map)
             inside, matte = direct(view, view.albedo, on_skin, mi.Float(0)), mi.Float(0)
         total += (rest + inside) * kept.weight
         faint = _FAINT * inside
@@ -284,6 +285,9 @@ class _GroupShading:
             source = lamp.point(spot.x, *dr.sincos(spot.y * (2 * dr.pi)))
             outer, shine = straight(lamp, source, view, -values.vector_to_eye(d))
             lit = direct(view, matte, outer, shine) * share
+            if soft:
+                assert self.textures.tissues is not None
+                return k + 1, total + lit * kept.weight * self.textures.tissues.seen(lamp.number, *on_map)
             asked = (kept.shared > 0) & (lit > faint)
             blocked = self.skin_blocked(lamp, source, view.point, on_sheet, asked)
             return k + 1, total + lit * (kept.clear + dr.select(blocked, 0, kept.shared))

@@ -50,7 +50,7 @@ class LampViews:
         table = np.array([_frame(lamp, anchor_mm, reach) for lamp in lights], dtype=np.float32).reshape(-1)
         self._table = mi.Float(aligned(table))
         self._known = dr.opaque(mi.Bool, region is not None)
-        self._marks = dr.zeros(mi.UInt32, max(len(lights), 1) * _CELLS * _CELLS if region is not None else 1)
+        self._marks = dr.zeros(mi.UInt8, max(len(lights), 1) * _CELLS * _CELLS if region is not None else 1)
         if region is not None and len(lights):
             self._mark_triangles(region.skin, len(lights))
             self._mark_hairs(_pieces(region.posed), len(lights))
@@ -62,7 +62,7 @@ class LampViews:
         u, v = place.u, place.v
         inside = active & self._known & (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
         cell = (lamp * _CELLS + mi.UInt32(v)) * _CELLS + mi.UInt32(u)
-        return inside & (dr.gather(mi.UInt32, self._marks, cell, inside) == 0)
+        return inside & (dr.gather(mi.UInt8, self._marks, cell, inside) == 0)
 
     def _view(self, lamp: mi.UInt32) -> _View:
         four = [dr.gather(mi.Vector4f, self._table, lamp * (_WIDTH // 4) + k) for k in range(_WIDTH // 4)]
@@ -130,7 +130,7 @@ class LampViews:
             near = edge.distance2(mi.Float(u) + 0.5, mi.Float(v) + 0.5) < reach * reach
             inside = (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
             cell = (lamp * _CELLS + mi.UInt32(v)) * _CELLS + mi.UInt32(u)
-            dr.scatter(marks, mi.UInt32(1), cell, near & inside)
+            dr.scatter(marks, mi.UInt8(1), cell, near & inside)
             return k + 1
 
         dr.while_loop((mi.UInt32(0),), more, lambda k: (mark(k),), labels=("k",), label="marks")

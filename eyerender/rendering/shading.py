@@ -63,8 +63,7 @@ def shade(
 
 def direct(view: View, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
     """Radiance of matte surfaces lit by the lamps: from their irradiance, and from their sheen."""
-    cover = dr.select(view.cornea, view.opacity, 1)
-    return dr.select(view.met, cover * (albedo * outer * dr.inv_pi + shine), 0)
+    return dr.select(view.met, _cover(view) * (albedo * outer * dr.inv_pi + shine), 0)
 
 
 def of_surroundings(values: Values, textures: Textures, view: View, known: mi.Bool) -> mi.Vector4f:
@@ -109,16 +108,10 @@ def indirect(
         inner: irradiance of the lamps in the plane of the iris.
         received: what the first surface receives from other surfaces (see `exchange.Received`).
     """
-    assert textures.received is not None
     index = values.inner_index
-    cover = dr.select(view.cornea, view.opacity, 1)
-    even = received.x
-    if values.structure.ambient:
-        assert textures.ambience is not None
-        facing = view.normal if view.level is None else view.level
-        x, normal = values.point_to_scene(view.point), values.vector_to_scene(facing)
-        even += received.y * textures.ambience.irradiance(x, normal)
-    rest = cover * albedo * even * dr.inv_pi + _mirrored(values, textures, scene, view, d, 1 - cover)
+    rest = off_eye(values, textures, scene, view, d, albedo, received)
+    if not values.structure.ambient:
+        rest += _mirrored(values, textures, scene, view, d, 1 - _cover(view))
     leaving = (
         dr.if_stmt(
             (view.inner, inner),
@@ -134,6 +127,31 @@ def indirect(
         leaving += dr.select(seen, textures.pupil.at(*stop_coordinates(values, view.inner), seen), 0)
     rest += dr.select(view.cornea, (1 - view.opacity) * view.passed * leaving, 0)
     return dr.select(view.met, rest, 0)
+
+
+def off_eye(
+    values: Values,
+    textures: Textures,
+    scene: mi.Scene,
+    view: View,
+    d: mi.Vector3f,
+    albedo: mi.Float,
+    received: mi.Vector4f,
+) -> mi.Float:
+    """The same of what is not the clear cornea; see `indirect`."""
+    even, mirrored = received.x, mi.Float(0)
+    if values.structure.ambient:
+        assert textures.ambience is not None
+        facing = view.normal if view.level is None else view.level
+        x, normal = values.point_to_scene(view.point), values.vector_to_scene(facing)
+        even += received.y * textures.ambience.irradiance(x, normal)
+        mirrored = _mirrored(values, textures, scene, view, d, 1 - _cover(view))
+    return dr.select(view.met, _cover(view) * albedo * even * dr.inv_pi + mirrored, 0)
+
+
+def _cover(view: View) -> mi.Float:
+    """Share of the first surface that is matte."""
+    return dr.select(view.cornea, view.opacity, 1)
 
 
 def _leaving(values: Values, textures: Textures, pupil: mi.Bool, x: mi.Vector3f, lit: mi.Float) -> mi.Float:

@@ -45,8 +45,11 @@ if TYPE_CHECKING:
 _SIDE = 192  # of the grid over the front of the globe
 _LEVELS = 5  # each half as fine as the one before
 _RINGS, _TURNS = 6, 6
+_LEVEL_RINGS = (0, 1), (1, 4), (4, 6)  # whose light is found on the grid over the skin, and on its reductions
 _FOOTPRINT = 0.8  # size of the cells that a ring reads, in units of its radius
 _RAYS = 6  # to the lamps from each cell, and at least one to each
+_SMALL, _WIDE_RAYS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
+_COARSE_CELLS = ROWS * COLUMNS // 4  # of the grid on which shadows on the skin are found
 _SPARE, _SPARE_MM = 24.0, 10.0  # beyond the window, from where light still arrives: in units of d, and at least
 _FINEST_MM = 0.02  # of a cell; about the corners of the eye they are smaller
 _LID_MM = 4.5  # thicker than any lid
@@ -70,15 +73,11 @@ class Pyramid:
         levels, level = [], np.asarray(values, dtype=np.float32).reshape(self.rows, self.columns)
         for k in range(_LEVELS):
             if k:
-                level = level.reshape(len(level) // 2, 2, -1, 2).mean(axis=(1, 3))
-            right = np.roll(level, -1, axis=1)
-            if not self._around:
-                right[:, -1] = level[:, -1]
-            below = slice(1, None)
+                level = 0.25 * (level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2])
             four = np.empty((*level.shape, 4), np.float32)
-            four[..., 0], four[..., 1] = level, right
-            four[:-1, :, 2], four[:-1, :, 3] = level[below], right[below]
-            four[-1, :, 2:] = four[-1, :, :2]
+            four[..., 0], four[:, :-1, 1] = level, level[:, 1:]
+            four[:, -1, 1] = level[:, 0 if self._around else -1]
+            four[:-1, :, 2:], four[-1, :, 2:] = four[1:, :, :2], four[-1, :, :2]
             levels.append(four.reshape(-1, 4))
         self._cells = mi.Float(aligned(np.concatenate(levels).ravel()))
 
@@ -123,26 +122,35 @@ class _Places:
         steps = np.diff(place, axis=1, prepend=np.zeros((_TURNS, 1, 2)))
         return cls(mi.Float(aligned(np.concatenate([place, steps], axis=-1).astype(np.float32).ravel())))
 
-    def mean(
-        self, start: tuple[mi.Float, mi.Float], read: Callable[..., tuple[mi.Float, mi.Float, mi.Float]]
+    def share(
+        self,
+        start: tuple[mi.Float, mi.Float],
+        read: Callable[..., tuple[mi.Float, mi.Float, mi.Float]],
+        first: int = 0,
+        last: int = _RINGS,
     ) -> mi.Float:
-        """Mean over the places.
+        """Share of the mean over all places that some of the rings have.
 
         Args:
             start: row and column where walks begin.
-            read: called with a row of the table, the distance, and the row and column of the place before; returns the
-                number at the place, and its row and column.
+            read: called with the place (mm), the way to it from the place before, its distance, and row and column of
+                the place before; returns the number at the place, and its row and column.
+            first: the first of the rings.
+            last: the ring after the last one.
         """
+        inner, count = dr.opaque(mi.UInt32, first), dr.opaque(mi.UInt32, last - first)
 
         def more(k: mi.UInt32, *_: object) -> mi.Bool:
-            return k < _RINGS * _TURNS
+            return k < count * _TURNS
 
         def body(k: mi.UInt32, total: mi.Float, row: mi.Float, column: mi.Float) -> tuple[Any, ...]:
-            first = k % _RINGS == 0
-            row, column = dr.select(first, start[0], row), dr.select(first, start[1], column)
-            place = dr.gather(mi.Vector4f, self.table, k)
+            turn = k // count
+            begins = k == turn * count
+            row, column = dr.select(begins, start[0], row), dr.select(begins, start[1], column)
+            place = dr.gather(mi.Vector4f, self.table, turn * _RINGS + inner + k - turn * count)
             distance = dr.sqrt(place.x * place.x + place.y * place.y)
-            value, row, column = read(place, distance, row, column)
+            way = dr.select(begins, mi.Point2f(place.x, place.y), mi.Point2f(place.z, place.w))
+            value, row, column = read(mi.Point2f(place.x, place.y), way, distance, row, column)
             return k + 1, total + value, row, column
 
         state = (mi.UInt32(0), mi.Float(0) * start[0], *start)
@@ -153,12 +161,16 @@ class _Places:
 class TissueLight:
     """Light of the lamps on skin and globe, each after its way through the tissue."""
 
-    def __init__(self, skin: Pyramid, globe: Pyramid, values: Values) -> None:
-        self._skin, self._globe, self._values = skin, globe, values
+    def __init__(self, skin: mi.Float, seen: mi.Float, globe: Pyramid, values: Values) -> None:
+        self._skin, self._seen, self._globe, self._values = skin, seen, globe, values
 
     def on_skin(self, u: mi.Float, v: mi.Float) -> mi.Float:
         """Irradiance (mW/mm^2) at coordinates of the map of the skin."""
-        return self._skin.at(*_grid_place(u, v), 0)
+        return _between_cells(mi.Float, self._skin, *_grid_place(u, v), 0)
+
+    def seen(self, lamp: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.Float:
+        """Share of a lamp that the skin sees at coordinates of its map."""
+        return dr.clip(_between_cells(mi.Float, self._seen, *_grid_place(u, v), 1, lamp * _COARSE_CELLS), 0, 1)
 
     def on_globe(self, x: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
@@ -184,10 +196,10 @@ def tissue_light(
     make = _Maker(values, lights, place.scene, place.skin, views)
     thick = half_space_length_mm(job.region.skin.albedo, scattering.skin_per_mm)
     thin = slab_length_mm(job.look.sclera_albedo, scattering.sclera_per_mm)
-    sheet = make.sheet(SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px), thick)
+    sheet, seen = make.sheet(SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px), thick)
     loss = transmitted(job.region.skin.albedo, scattering.skin_per_mm)
     grid = GlobeGrid.of(place.posed, globe_of(job.eye, job.M, job.t - job.anchor_mm), _SPARE * thin)
-    return TissueLight(sheet, make.globe(grid, sheet, thin, loss), values)
+    return TissueLight(sheet, seen, make.globe(grid, sheet, thin, loss), values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,30 +212,84 @@ class _Maker:
     skin: SkinGeometry
     views: LampViews
 
-    def sheet(self, grid: SheetGrid, length_mm: float) -> Pyramid:
-        """Light on the skin after its way through the tissue."""
-        return grid.spread(grid.whole(self._on_sheet(grid)), length_mm)
-
-    def _on_sheet(self, grid: SheetGrid) -> mi.Float:
-        """Irradiance of the cells of the grid over the skin straight from the lamps."""
-        values, skin = self.values, self.skin
-        index, centre = grid.sent, values.point_to_scene(values.sclera.centre)
+    def sheet(self, grid: SheetGrid, length_mm: float) -> tuple[mi.Float, mi.Float]:
+        """Light on the skin after its way through the tissue, and how much of each lamp coarse cells see."""
+        straight, seen = self._from_lamps(grid)
+        index = grid.sent[0]
         row, column = index // COLUMNS, index % COLUMNS
-        relief = dr.gather(mi.Vector2f, skin.relief, index)
+        across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / COLUMNS)
+        _, n = self.skin.sheet_point(grid.vertex_row(row, mi.Float(0.5)), across)
+        relief = dr.gather(mi.Vector2f, self.skin.relief, index)
+        flux = _between_cells(mi.Vector4f, straight, mi.Float(row), mi.Float(column), 1)
+        facing = dr.dot(mi.Vector3f(flux.x, flux.y, flux.z), self.skin.tilted(n, relief.x, relief.y))
+        return grid.spread(grid.whole(dr.maximum(facing, 0)), length_mm), seen
 
-        def place(shift: tuple[mi.Float, mi.Float]) -> tuple[mi.Vector3f, mi.Vector3f]:
-            across = (mi.Float(column) + shift[0]) * ((SHEET_COLUMNS - 1) / COLUMNS)
-            x, n = skin.sheet_point(grid.vertex_row(row, shift[1]), across)
+    def _from_lamps(self, grid: SheetGrid) -> tuple[mi.Float, mi.Float]:
+        """Light straight from the lamps at coarse cells.
+
+        Light that passes a place varies slowly, but for shadows. So it is computed for two by two cells as a vector F
+        (three of four numbers for each cell, scene's frame): the irradiance of a surface with the normal n is F . n.
+
+        Returns:
+            The vectors, and for each lamp the share of it that each cell sees.
+        """
+        values, lights, skin = self.values, self.lights, self.skin
+        straight = dr.zeros(mi.Float, 4 * _COARSE_CELLS)
+        seen = dr.zeros(mi.Float, max(len(lights), 1) * _COARSE_CELLS)
+        index = grid.sent[1]
+        row, column = index // (COLUMNS // 2), index % (COLUMNS // 2)
+        centre = values.point_to_scene(values.sclera.centre)
+        wide = lights.widest >= _SMALL
+        points = dr.opaque(mi.UInt32, max(-(-_RAYS // max(len(lights), 1)), _WIDE_RAYS if wide else 1))
+        spread = dr.opaque(mi.Bool, wide)
+        shifts = [mi.sample_tea_32(index, mi.UInt32(key)) for key in _KEYS]
+
+        def place(s: mi.Float, t: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
+            half = mi.UInt32(2 * t)
+            across = (mi.Float(column) + s) * (2 * (SHEET_COLUMNS - 1) / COLUMNS)
+            x, n = skin.sheet_point(grid.vertex_row(2 * row + half, 2 * t - mi.Float(half)), across)
             # The conjunctiva dips into the globe where both join. Neither shades the other there.
             out = x - centre
-            x = centre + out * dr.maximum(1, (values.sclera.radius + _JOINT_MM) * dr.rcp(dr.norm(out)))
-            return x, skin.tilted(n, relief.x, relief.y)
+            return centre + out * dr.maximum(1, (values.sclera.radius + _JOINT_MM) * dr.rcp(dr.norm(out))), n
 
-        def blocked(lamp: Any, source: mi.Vector3f, x: mi.Vector3f, at: mi.Vector3f, lit: mi.Bool) -> mi.Bool:
-            clear = self.views.clear(lamp.number, at, lit)
-            return lamp_blocked(values, self.scene, x, source, True, True, lit & ~clear)
+        at, n = place(mi.Float(0.5), mi.Float(0.5))
+        x, facing = values.point_to_eye(at), values.vector_to_eye(n)
 
-        return self._lit(index, place, blocked)
+        def of_lamp(i: mi.UInt32, total: mi.Vector3f) -> tuple[mi.UInt32, mi.Vector3f]:
+            lamp = lights[i]
+            before = spread | (dr.dot(lamp.position - x, facing) > 0)
+            clear = self.views.clear(i, at, before)
+            count = dr.select(before, dr.select(clear & ~spread, 1, points), 0)
+
+            def at_point(k: mi.UInt32, flux: mi.Vector3f, free: mi.Float) -> tuple[mi.UInt32, mi.Vector3f, mi.Float]:
+                u, v = _spots(shifts[1], k)
+                sine, cosine = dr.sincos(v * (2 * dr.pi))
+                start = values.point_to_eye(place(*_spots(shifts[0], k))[0])
+                source = lamp.point(u, sine, cosine)
+                hidden = lamp_blocked(values, self.scene, start, source, True, True, ~clear)
+                to = dr.select(spread, source, lamp.position) - x
+                inv2 = dr.rcp(dr.squared_norm(to))
+                to *= dr.sqrt(inv2)
+                lit = dr.select(hidden | (dr.dot(to, facing) <= 0), 0, lamp.radiant_intensity(-to) * inv2)
+                return k + 1, flux + lit * to, free + dr.select(hidden, 0, 1)
+
+            state, labels = (mi.UInt32(0), mi.Vector3f(0), mi.Float(0)), ("k", "flux", "free")
+            _, flux, free = dr.while_loop(
+                state, lambda k, *_: k < count, at_point, labels=labels, label="points of a lamp"
+            )
+            share = dr.rcp(dr.maximum(mi.Float(count), 1))
+            dr.scatter(seen, free * share, i * _COARSE_CELLS + index)
+            return i + 1, total + flux * share
+
+        state = (mi.UInt32(0), mi.Vector3f(0) * x.x)
+        labels = ("i", "total")
+        _, total = dr.while_loop(state, lambda i, _: i < lights.count, of_lamp, labels=labels, label="lamps on skin")
+        total = values.vector_to_scene(total)
+        dr.eval(total)
+        for k, number in enumerate((total.x, total.y, total.z)):
+            dr.scatter(straight, number, 4 * index + k)
+        dr.eval(straight, seen)
+        return straight, seen
 
     def _lit(self, index: mi.UInt32, place: Callable[..., Any], blocked: Callable[..., mi.Bool]) -> mi.Float:
         """Mean irradiance of cells straight from all lamps, over points of the cell and of the lamps.
@@ -236,16 +302,10 @@ class _Maker:
         points = dr.opaque(mi.UInt32, -(-_RAYS // len(lights)))
         shifts = [mi.sample_tea_32(index, mi.UInt32(key)) for key in _KEYS]
 
-        def pair(which: int, k: mi.UInt32) -> tuple[mi.Float, ...]:
-            return tuple(
-                mi.Float((shift + k * mi.UInt32(round(a * 2**32))) >> 8) * (2.0**-24)
-                for shift, a in zip(shifts[which], _ALPHA, strict=True)
-            )
-
         def at_point(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            at, normal = place(pair(0, k))
+            at, normal = place(_spots(shifts[0], k))
             x, facing = values.point_to_eye(at), values.vector_to_eye(normal)
-            u, v = pair(1, k)
+            u, v = _spots(shifts[1], k)
             sine, cosine_v = dr.sincos(v * (2 * dr.pi))
 
             def of_lamp(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
@@ -268,7 +328,7 @@ class _Maker:
         dr.eval(total)
         return total
 
-    def globe(self, grid: GlobeGrid, sheet: Pyramid, length_mm: float, loss_per_mm: float) -> Pyramid:
+    def globe(self, grid: GlobeGrid, sheet: mi.Float, length_mm: float, loss_per_mm: float) -> Pyramid:
         """Light on the globe between the lids after its way through the sclera."""
         cells = np.zeros(_SIDE * _SIDE, np.float32)
         cells[grid.under] = self._through_lids(_numbers(grid.under), sheet, loss_per_mm).numpy()
@@ -304,7 +364,7 @@ class _Maker:
         met &= (y.y * y.y + y.z * y.z < dr.square(values.limbus.radius)) & (y.x > values.limbus.floor) & (t < away)
         return o - dr.select(met, t, away) * d, dr.normalize(dr.select(met, front.vector_out(facing), d))
 
-    def _through_lids(self, index: mi.UInt32, sheet: Pyramid, loss_per_mm: float) -> mi.Float:
+    def _through_lids(self, index: mi.UInt32, sheet: mi.Float, loss_per_mm: float) -> mi.Float:
         """Irradiance of cells of the globe by way of lids that lie on them: exp(-k t) of that on the lid's skin."""
         values, skin = self.values, self.skin
         n = _globe_direction(mi.Float(index // _SIDE), mi.Float(index % _SIDE))
@@ -316,7 +376,7 @@ class _Maker:
         face = dr.select(outer.is_valid(), skin.face(outer), face)
         uv = dr.select(outer.is_valid(), outer.prim_uv, inner.prim_uv)
         under = inner.is_valid() & skin.on_sheet(face)
-        lit = sheet.at(*_grid_place(*skin.map_place(face, uv, under)), 0, under)
+        lit = _between_cells(mi.Float, sheet, *_grid_place(*skin.map_place(face, uv, under)), 0)
         return dr.select(under, lit * dr.exp(-loss_per_mm * last), 0)
 
     def _next(self, o: mi.Vector3f, d: mi.Vector3f, first: mi.Float, active: mi.Bool) -> mi.PreliminaryIntersection3f:
@@ -334,14 +394,14 @@ class SheetGrid:
 
     Attributes:
         cells: numbers of its cells that matter.
-        sent: the same on the device.
+        sent: the same on the device, and the cells about them on the grid reduced by 2 and by 4.
         edges: row of the sheet's vertices at the edges of the grid's rows.
         metric: for each row and column of vertices: columns per mm along the row, a, rows per mm across it, size of a
             cell (mm). A place x mm along and y mm across is y per-mm rows and (x - a rows) per-mm columns away.
     """
 
     cells: Ints
-    sent: mi.UInt32
+    sent: tuple[mi.UInt32, ...]
     edges: mi.Float
     metric: mi.Float
 
@@ -365,23 +425,38 @@ class SheetGrid:
         width, height = np.maximum(width, _FINEST_MM), np.maximum(height, _FINEST_MM)
         metric = np.stack([1 / width, a, 1 / height, np.maximum(width, height)], axis=-1)
         columns = np.arange(COLUMNS) * near.shape[1] // COLUMNS
-        cells = np.flatnonzero(near[i + (share > 0.5)][:, columns])
-        if cells.size == 0:
-            cells = np.zeros(1, dtype=np.int64)
-        return cls(cells, _numbers(cells), *(mi.Float(aligned(t.astype(np.float32).ravel())) for t in (edges, metric)))
+        marks = [near[i + (share > 0.5)][:, columns]]
+        for _ in _LEVEL_RINGS[1:]:
+            marks.append(_grown(marks[-1].reshape(len(marks[-1]) // 2, 2, -1, 2).any(axis=(1, 3))))
+        cells = [np.flatnonzero(m) if m.any() else np.zeros(1, dtype=np.int64) for m in marks]
+        return cls(
+            cells[0],
+            tuple(_numbers(c) for c in cells),
+            *(mi.Float(aligned(t.astype(np.float32).ravel())) for t in (edges, metric)),
+        )
 
-    def spread(self, irradiance: Singles, length_mm: float) -> Pyramid:
-        """What leaves the skin of the light that falls on it (ROWS, COLUMNS)."""
-        straight, out = Pyramid(ROWS, COLUMNS, True), Pyramid(ROWS, COLUMNS, True)
+    def spread(self, irradiance: Singles, length_mm: float) -> mi.Float:
+        """What leaves the skin, cell by cell, of the light that falls on it (ROWS, COLUMNS)."""
+        straight = Pyramid(ROWS, COLUMNS, True)
         straight.fill(irradiance)
 
-        def read(place: mi.Vector4f, distance: mi.Float, row: mi.Float, column: mi.Float) -> tuple[mi.Float, ...]:
-            row, column, cell = self.step(row, column, place.z, place.w)
+        def read(
+            place: mi.Point2f, way: mi.Point2f, distance: mi.Float, row: mi.Float, column: mi.Float
+        ) -> tuple[mi.Float, ...]:
+            del place
+            row, column, cell = self.step(row, column, way.x, way.y)
             return straight.at(row, column, _level(_FOOTPRINT * distance, cell)), row, column
 
-        start = mi.Float(self.sent // COLUMNS), mi.Float(self.sent % COLUMNS)
-        out.fill(self.whole(_Places.of(length_mm).mean(start, read)))
-        return out
+        places, light = _Places.of(length_mm), mi.Float(0)
+        # The farther light has come, the more evenly it is spread, and the fewer cells tell it.
+        for level, rings_of in reversed(list(enumerate(_LEVEL_RINGS))):
+            row, column = _cells(self.sent[level], level)
+            wider, light = light, places.share((row, column), read, *rings_of)
+            if level + 1 < len(_LEVEL_RINGS):
+                light += _between_cells(mi.Float, wider, row, column, level + 1)
+            dr.eval(light)
+            light = _on_all_cells(light, self.sent[level], level)
+        return light
 
     def whole(self, values: mi.Float) -> Singles:
         """Numbers (ROWS, COLUMNS) of all cells, 0 for those that do not matter."""
@@ -438,16 +513,56 @@ class GlobeGrid:
         across = dr.normalize(mi.Vector3f(-n.y, n.x, 0))
         up = dr.cross(n, across)
 
-        def read(place: mi.Vector4f, distance: mi.Float, *_: mi.Float) -> tuple[mi.Float, ...]:
+        def read(place: mi.Point2f, way: mi.Point2f, distance: mi.Float, *_: mi.Float) -> tuple[mi.Float, ...]:
+            del way
             sine, cosine = dr.sincos(distance / radius_mm)
             out = (sine / distance) * (place.x * across + place.y * up)
             row, column = _globe_place(cosine * n + out)
             return straight.at(row, column, _level(_FOOTPRINT * distance, _WIDTH / _SIDE * radius_mm)), row, column
 
         cells = np.zeros(_SIDE * _SIDE, np.float32)
-        cells[self.between] = _Places.of(length_mm).mean(start, read).numpy()
+        cells[self.between] = _Places.of(length_mm).share(start, read).numpy()
         out.fill(cells)
         return out
+
+
+def _spots(shift: tuple[mi.UInt32, mi.UInt32], k: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    """The k-th of places in [0, 1)^2 that fill it evenly, for lanes with a shift."""
+    u, v = (
+        mi.Float((s + k * mi.UInt32(round(a * 2**32))) >> 8) * (2.0**-24) for s, a in zip(shift, _ALPHA, strict=True)
+    )
+    return u, v
+
+
+def _cells(index: mi.UInt32, level: int) -> tuple[mi.Float, mi.Float]:
+    """Middles (row, column) of cells of the grid over the skin reduced by 2^level, in units of its finest cells."""
+    columns, size = COLUMNS >> level, float(1 << level)
+    return (mi.Float(index // columns) + 0.5) * size - 0.5, (mi.Float(index % columns) + 0.5) * size - 0.5
+
+
+def _on_all_cells(values: mi.Float, index: mi.UInt32, level: int) -> mi.Float:
+    """Numbers of all cells of the grid over the skin reduced by 2^level, 0 but for some."""
+    out = dr.zeros(mi.Float, ROWS * COLUMNS >> 2 * level)
+    dr.scatter(out, values, index)
+    return out
+
+
+def _between_cells(
+    kind: Any, buffer: mi.Float, row: mi.Float, column: mi.Float, level: int, first: mi.UInt32 | int = 0
+) -> Any:
+    """Numbers between the cells of the grid over the skin reduced by 2^level, at places in units of its finest cells.
+
+    `first` is the number of the first cell in the buffer.
+    """
+    rows, columns, scale = ROWS >> level, COLUMNS >> level, 1 / (1 << level)
+    v, u = dr.clip((row + 0.5) * scale - 0.5, 0, rows - 1.001), (column + 0.5) * scale - 0.5
+    u = dr.select(u < 0, u + columns, u)
+    i, j = mi.UInt32(v), dr.minimum(mi.UInt32(u), columns - 1)
+    s, t = u - mi.Float(j), v - mi.Float(i)
+    after = dr.select(j + 1 < columns, j + 1, 0)
+    a, b, c, d = (dr.gather(kind, buffer, first + p * columns + q) for p in (i, i + 1) for q in (j, after))
+    high, low = a + s * (b - a), c + s * (d - c)
+    return high + t * (low - high)
 
 
 def _numbers(cells: Ints) -> mi.UInt32:
@@ -462,8 +577,13 @@ def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -
     spare = spare_px + spare_mm * float(max(camera.K[0, 0], camera.K[1, 1])) / depth
     with np.errstate(invalid="ignore"):
         inside = np.abs(xy - (x0 + 0.5 * width, y0 + 0.5 * height)) < 0.5 * np.array([width, height]) + spare[..., None]
-    shown = np.pad(front & inside.all(axis=-1), ((0, 0), (1, 1)), "wrap")
-    return np.asarray(ndimage.binary_dilation(shown, np.ones((3, 3)))[:, 1:-1])
+    return _grown(front & inside.all(axis=-1))
+
+
+def _grown(marked: Bools) -> Bools:
+    """Marks of a grid, whose columns close, and of all neighbours."""
+    around = np.pad(marked, ((0, 0), (1, 1)), "wrap")
+    return np.asarray(ndimage.binary_dilation(around, np.ones((3, 3)))[:, 1:-1])
 
 
 def _grid_place(u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:

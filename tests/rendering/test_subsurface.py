@@ -37,7 +37,7 @@ def grids(renderer, bound):
 
     shown, place = renderer.bind(bound)
     sheet = light.SheetGrid.of(place.posed, bound, 100.0, 0)
-    row, column = sheet.sent // GRID_COLUMNS, sheet.sent % GRID_COLUMNS
+    row, column = sheet.sent[0] // GRID_COLUMNS, sheet.sent[0] % GRID_COLUMNS
     across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / GRID_COLUMNS)
     x, _ = place.skin.sheet_point(sheet.vertex_row(row, mi.Float(0.5)), across)
     on_sheet = np.zeros((GRID_ROWS * GRID_COLUMNS, 3), np.float32)
@@ -57,7 +57,7 @@ def cells(pyramid, rows: int, columns: int) -> np.ndarray:
 
 def test_even_light_stays_even(renderer):
     sheet, at, globe, _, radius = grids(renderer, job(region=BARE))
-    out = cells(sheet.spread(np.ones(at.shape[:2], np.float32), 0.7), *at.shape[:2]).ravel()
+    out = sheet.spread(np.ones(at.shape[:2], np.float32), 0.7).numpy()
     assert len(sheet.cells) > 0.9 * out.size
     assert out[sheet.cells] == pytest.approx(1.0, abs=1e-5)
     side = 192
@@ -80,7 +80,7 @@ def test_shadow_edges_have_their_shape_on_skin_and_globe(renderer):
     near = level & known.reshape(away.shape) & (np.abs(away) < 2.5) & (at[..., 2] < -9.0) & (at[..., 2] > -14.0)
     assert near.sum() > 300
     lit = lit_share(away, np.abs(along[..., 1]))
-    out = cells(sheet.spread(lit, 0.65), *away.shape)[near]
+    out = sheet.spread(lit, 0.65).numpy().reshape(away.shape)[near]
     # Six rings of six places are good to 0.017 on a plane; the rows of cells are bent and of unequal width.
     worst = np.abs(out - edge(away[near], 0.65)).max()
     assert worst < 0.03
