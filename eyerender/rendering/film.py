@@ -143,7 +143,7 @@ def _adaptive(
     width, height = window[2:]
     wide = (window[0] - 1, window[1] - 1, width + 2, height + 2)
     first = _first_samples(spp)
-    every = np.arange((width + 2) * (height + 2), dtype=np.uint32)
+    every = np.arange((width + 2) * (height + 2))
 
     def lanes(pixels: Ints, numbers: Ints) -> tuple[mi.Float, int]:
         index = dr.arange(mi.UInt32, len(pixels) * len(numbers))

@@ -208,28 +208,36 @@ class _GroupShading:
         """
         values, lights, group = self.values, self.lights, self.group
 
-        # What went through the tissue is known, and what remains is the film's highlight.
-        matte = mi.Float(0) if self.soft else albedo
-        inside = mi.Float(0)
-        if self.soft:
-            assert self.textures.tissues is not None
-            inside = direct(seen, albedo, self.textures.tissues.on_globe(seen.point), mi.Float(0))
-        faint = _FAINT * inside
-
-        def lit_by(lamp: Lamp) -> tuple[mi.Vector3f, mi.Float]:
+        def lit_by(lamp: Lamp, matte: mi.Float) -> tuple[mi.Vector3f, mi.Float]:
             source = self.lamp_point(lamp, j)
             return source, direct(seen, matte, *straight(lamp, source, seen, back))
 
-        def add(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            return i + 1, total + lit_by(lights[i])[1]
+        if self.soft:
+            # What went through the tissue is known, and what remains is the film's highlight.
+            tissues = self.textures.tissues
+            assert tissues is not None
+            covered = ~seen.cornea | (seen.opacity > 0)
 
-        state = (mi.UInt32(0), inside)
+            def shine(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+                lamp = lights[i]
+                return i + 1, total + lit_by(lamp, mi.Float(0))[1] * tissues.globe_sees(lamp.number, seen.point)
+
+            state = (mi.UInt32(0), direct(seen, albedo, tissues.on_globe(seen.point), mi.Float(0)))
+            labels = ("i", "total")
+            return dr.while_loop(state, lambda i, _: covered & (i < lights.count), shine, labels=labels, label="film")[
+                1
+            ]
+
+        def add(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            return i + 1, total + lit_by(lights[i], albedo)[1]
+
+        state = (mi.UInt32(0), mi.Float(0))
         _, total = dr.while_loop(state, lambda i, _: i < lights.count, add, labels=("i", "total"), label="all lamps")
 
         def subtract(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             lamp, share = group.lamp(j, k)
-            source, lit = lit_by(lamp)
-            barred = lamp_blocked(values, self.scene, seen.point, source, False, ~seen.cornea, lit > faint)
+            source, lit = lit_by(lamp, albedo)
+            barred = lamp_blocked(values, self.scene, seen.point, source, False, ~seen.cornea, lit > 0)
             return k + 1, total - dr.select(barred, lit * share, 0)
 
         state, asked = (mi.UInt32(0), total), group.asked(j)
@@ -287,7 +295,7 @@ class _GroupShading:
             lit = direct(view, matte, outer, shine) * share
             if soft:
                 assert self.textures.tissues is not None
-                return k + 1, total + lit * kept.weight * self.textures.tissues.seen(lamp.number, *on_map)
+                return k + 1, total + lit * kept.weight * self.textures.tissues.skin_sees(lamp.number, *on_map)
             asked = (kept.shared > 0) & (lit > faint)
             blocked = self.skin_blocked(lamp, source, view.point, on_sheet, asked)
             return k + 1, total + lit * (kept.clear + dr.select(blocked, 0, kept.shared))

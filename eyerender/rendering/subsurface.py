@@ -29,7 +29,7 @@ from ..region.globe import Globe
 from ..region.mesh import RegionMesh
 from ..region.skin import BANDS, SHEET_ROWS, sheet_place
 from .frame import globe_of
-from .lighting import lamp_blocked
+from .lighting import irradiance, lamp_blocked
 from .region import GRID_COLUMNS as COLUMNS
 from .region import GRID_ROWS as ROWS
 from .region import SHEET_COLUMNS
@@ -161,20 +161,29 @@ class _Places:
 class TissueLight:
     """Light of the lamps on skin and globe, each after its way through the tissue."""
 
-    def __init__(self, skin: mi.Float, seen: mi.Float, globe: Pyramid, values: Values) -> None:
-        self._skin, self._seen, self._globe, self._values = skin, seen, globe, values
+    def __init__(self, skin: tuple[mi.Float, mi.Float], globe: tuple[Pyramid, mi.Float], values: Values) -> None:
+        """Take light of cells, and the shares of each lamp that they see, on skin and globe."""
+        self._skin, self._globe, self._values = skin, globe, values
 
     def on_skin(self, u: mi.Float, v: mi.Float) -> mi.Float:
         """Irradiance (mW/mm^2) at coordinates of the map of the skin."""
-        return _between_cells(mi.Float, self._skin, *_grid_place(u, v), 0)
+        return _between_cells(mi.Float, self._skin[0], *_grid_place(u, v), 0)
 
-    def seen(self, lamp: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.Float:
+    def skin_sees(self, lamp: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.Float:
         """Share of a lamp that the skin sees at coordinates of its map."""
-        return dr.clip(_between_cells(mi.Float, self._seen, *_grid_place(u, v), 1, lamp * _COARSE_CELLS), 0, 1)
+        return dr.clip(_between_cells(mi.Float, self._skin[1], *_grid_place(u, v), 1, lamp * _COARSE_CELLS), 0, 1)
 
     def on_globe(self, x: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
-        return self._globe.at(*_globe_place(self._values.vector_to_scene(x - self._values.sclera.centre)), 0)
+        return self._globe[0].at(*self._place(x), 0)
+
+    def globe_sees(self, lamp: mi.UInt32, x: mi.Vector3f) -> mi.Float:
+        """Share of a lamp that points of the globe (eye frame) see."""
+        row, column = (mi.UInt32(dr.clip(p + 0.5, 0, _SIDE - 1)) for p in self._place(x))
+        return dr.gather(mi.Float, self._globe[1], (lamp * _SIDE + row) * _SIDE + column)
+
+    def _place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        return _globe_place(self._values.vector_to_scene(x - self._values.sclera.centre))
 
 
 def tissue_light(
@@ -196,10 +205,10 @@ def tissue_light(
     make = _Maker(values, lights, place.scene, place.skin, views)
     thick = half_space_length_mm(job.region.skin.albedo, scattering.skin_per_mm)
     thin = slab_length_mm(job.look.sclera_albedo, scattering.sclera_per_mm)
-    sheet, seen = make.sheet(SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px), thick)
+    sheet = make.sheet(SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px), thick)
     loss = transmitted(job.region.skin.albedo, scattering.skin_per_mm)
     grid = GlobeGrid.of(place.posed, globe_of(job.eye, job.M, job.t - job.anchor_mm), _SPARE * thin)
-    return TissueLight(sheet, seen, make.globe(grid, sheet, thin, loss), values)
+    return TissueLight(sheet, make.globe(grid, sheet[0], thin, loss), values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,66 +300,48 @@ class _Maker:
         dr.eval(straight, seen)
         return straight, seen
 
-    def _lit(self, index: mi.UInt32, place: Callable[..., Any], blocked: Callable[..., mi.Bool]) -> mi.Float:
-        """Mean irradiance of cells straight from all lamps, over points of the cell and of the lamps.
-
-        `place` gives point and normal (scene's frame) for a place in the cell; `blocked` says whether a lamp is hidden.
-        """
-        values, lights = self.values, self.lights
-        if not len(lights):
-            return dr.zeros(mi.Float, dr.width(index))
-        points = dr.opaque(mi.UInt32, -(-_RAYS // len(lights)))
-        shifts = [mi.sample_tea_32(index, mi.UInt32(key)) for key in _KEYS]
-
-        def at_point(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            at, normal = place(_spots(shifts[0], k))
-            x, facing = values.point_to_eye(at), values.vector_to_eye(normal)
-            u, v = _spots(shifts[1], k)
-            sine, cosine_v = dr.sincos(v * (2 * dr.pi))
-
-            def of_lamp(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-                lamp = lights[i]
-                source = lamp.point(u, sine, cosine_v)
-                to = source - x
-                inv2 = dr.rcp(dr.squared_norm(to))
-                to *= dr.sqrt(inv2)
-                cosine = dr.dot(to, facing)
-                lit = dr.select(cosine > 0, lamp.radiant_intensity(-to) * cosine * inv2, 0)
-                return i + 1, total + dr.select(blocked(lamp, source, x, at, lit > 0), 0, lit)
-
-            state = (mi.UInt32(0), total)
-            labels = ("i", "total")
-            return k + 1, dr.while_loop(state, lambda i, _: i < lights.count, of_lamp, labels=labels, label="lamps")[1]
-
-        state = (mi.UInt32(0), mi.Float(0) * mi.Float(index))
-        _, total = dr.while_loop(state, lambda k, _: k < points, at_point, labels=("k", "total"), label="in cells")
-        total *= dr.rcp(mi.Float(points))
-        dr.eval(total)
-        return total
-
-    def globe(self, grid: GlobeGrid, sheet: mi.Float, length_mm: float, loss_per_mm: float) -> Pyramid:
-        """Light on the globe between the lids after its way through the sclera."""
+    def globe(self, grid: GlobeGrid, sheet: mi.Float, length_mm: float, loss_per_mm: float) -> tuple[Pyramid, mi.Float]:
+        """Light on the globe between the lids after its way through the sclera, and how much of each lamp cells see."""
         cells = np.zeros(_SIDE * _SIDE, np.float32)
         cells[grid.under] = self._through_lids(_numbers(grid.under), sheet, loss_per_mm).numpy()
-        cells[grid.between] += self._on_globe(_numbers(grid.between)).numpy()
-        return grid.spread(cells, self.values.sclera.radius, length_mm)
+        lit, seen = self._on_globe(_numbers(grid.between))
+        cells[grid.between] += lit.numpy()
+        return grid.spread(cells, self.values.sclera.radius, length_mm), seen
 
-    def _on_globe(self, index: mi.UInt32) -> mi.Float:
-        """Irradiance of cells of the grid over the globe straight from the lamps."""
-        values = self.values
+    def _on_globe(self, index: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+        """Irradiance of cells of the grid over the globe straight from the lamps; shares of each lamp that they see."""
+        values, lights = self.values, self.lights
+        seen = dr.zeros(mi.Float, max(len(lights), 1) * _SIDE * _SIDE)
+        points = dr.opaque(mi.UInt32, -(-_RAYS // max(len(lights), 1)))
+        shifts = [mi.sample_tea_32(index, mi.UInt32(key)) for key in _KEYS]
 
-        def place(shift: tuple[mi.Float, mi.Float]) -> tuple[mi.Vector3f, mi.Vector3f]:
-            n = _globe_direction(mi.Float(index // _SIDE) + shift[1] - 0.5, mi.Float(index % _SIDE) + shift[0] - 0.5)
-            x, normal = self._globe_surface(n)
-            return values.point_to_scene(x + _ABOVE_MM * normal), values.vector_to_scene(normal)
+        def of_lamp(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            lamp = lights[i]
 
-        def blocked(lamp: Any, source: mi.Vector3f, x: mi.Vector3f, at: mi.Vector3f, lit: mi.Bool) -> mi.Bool:
-            del lamp, at
-            local = values.surfaces[0].point_in(x)
-            outside = local.y * local.y + local.z * local.z > dr.square(values.limbus.radius)
-            return lamp_blocked(values, self.scene, x, source, False, outside, lit)
+            def at_point(k: mi.UInt32, total: mi.Float, free: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+                a, b = _spots(shifts[0], k)
+                row, column = mi.Float(index // _SIDE) + b - 0.5, mi.Float(index % _SIDE) + a - 0.5
+                x, normal = self._globe_surface(_globe_direction(row, column))
+                x += _ABOVE_MM * normal
+                u, v = _spots(shifts[1], k)
+                source = lamp.point(u, *dr.sincos(v * (2 * dr.pi)))
+                lit = irradiance(lamp, source, x, normal)
+                local = values.surfaces[0].point_in(x)
+                outside = local.y * local.y + local.z * local.z > dr.square(values.limbus.radius)
+                hidden = lamp_blocked(values, self.scene, x, source, False, outside, lit > 0)
+                return k + 1, total + dr.select(hidden, 0, lit), free + dr.select(hidden, 0, 1)
 
-        return self._lit(index, place, blocked)
+            state, labels = (mi.UInt32(0), mi.Float(0), mi.Float(0)), ("k", "total", "free")
+            _, lit, free = dr.while_loop(state, lambda k, *_: k < points, at_point, labels=labels, label="in cells")
+            share = dr.rcp(mi.Float(points))
+            dr.scatter(seen, free * share, i * (_SIDE * _SIDE) + index)
+            return i + 1, total + lit * share
+
+        state = (mi.UInt32(0), mi.Float(0) * mi.Float(index))
+        labels = ("i", "total")
+        _, total = dr.while_loop(state, lambda i, _: i < lights.count, of_lamp, labels=labels, label="lamps on globe")
+        dr.eval(total, seen)
+        return total, seen
 
     def _globe_surface(self, n: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
         """Point and normal (eye frame) of the globe along directions (scene's frame) from its centre."""
