@@ -19,7 +19,7 @@ from .lampviews import LampViews
 from .lightgrid import LightGrid
 from .values import Lights, Values
 
-_SIDE = 48
+_SIDE = 80
 _SPARE_MM = 0.3  # beyond the root of the iris
 
 
