@@ -4,10 +4,14 @@ Light enters the skin at one point and leaves it around there. What leaves is th
 with the weights of `optics.diffusion`, times the albedo. So even light is reflected as by a matte surface, shadows have
 soft edges, and the finest relief is seen in the sheen alone.
 
-The irradiance is computed with its shadows at points within each cell of a grid that is fixed to the tissue (skin) or
-to the head (globe). It is then averaged over rings of a few places in the tangent plane, each ring a sixth of the
-light. Places of wide rings read grids that were reduced by factors of two. On the skin the way out to the rings is
-walked in steps, because the size of a cell changes along it.
+The light straight from the lamps is found with its shadows at points within each cell of a coarse grid that is fixed
+to the tissue (skin) or of one fixed to the head (globe). On the skin it is a vector, whose product with the normal of
+the relief is the irradiance of finer cells. The irradiance is then averaged over rings of a few places in the tangent
+plane, each ring a sixth of the light. Places of wide rings read grids that were reduced by factors of two, and so are
+the cells whose light they give. On the skin the way out to the rings is walked in steps, because the size of a cell
+changes along it.
+
+The grids also tell which share of each lamp every cell sees, for the highlights.
 
 Where a lid lies on the globe, the globe receives what the lid transmits.
 """
