@@ -97,7 +97,7 @@ def observe(task: Task, folder: Path) -> Observed:
             continue
         out.fast.append(features(found.boundary.ellipse, found.goodness))
         out.right.append(truth is not None and iou(found.boundary.ellipse, truth) > 0.9)
-        out.away.append(_away(found.boundary.ellipse, found.covariance, truth))
+        out.away.append(_away(found.boundary.ellipse, found.boundary.covariance, truth))
         out.late.append(late or found.core_dn > 0.0)
         out.core.append(found.core_dn > 0.0)
         boundaries.append(found)

@@ -199,7 +199,7 @@ def _agrees(fit: PixelFit, found: Found) -> bool:
 
     Noise and texture may move it, but no more. Where glints leave too few pixels, it is not used.
     """
-    by_edges = boundary_deviation(found.boundary.ellipse, found.covariance)
+    by_edges = boundary_deviation(found.boundary.ellipse, found.boundary.covariance)
     # Both are estimates from a few dozen sectors, which scatter by a fifth or more.
     if boundary_deviation(fit.ellipse, fit.covariance) > 3.0 * by_edges:
         return False

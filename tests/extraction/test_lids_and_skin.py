@@ -9,6 +9,7 @@ import make_ideal_images as ideal
 from eyerender.extraction import FAST, REFINED, extract
 from eyerender.extraction.glints.prescreening import bell_shaped
 from eyerender.extraction.pupil.consensus import BoundaryFit, ams_fit, boundaries_without_stretch
+from eyerender.extraction.pupil.covariance import EdgeSums
 from eyerender.extraction.pupil.edges import EdgePoints
 from eyerender.extraction.settings import Shape
 from eyerender.geometry.ellipse import Ellipse, iou
@@ -65,7 +66,8 @@ def test_an_outline_without_the_lids_margin(covered, seed):
     through_all = ams_fit(points)
     assert through_all is not None
     assert iou(through_all, truth) < 0.9
-    boundary = BoundaryFit(through_all, np.ones(120, dtype=bool), points, 1.0, 0.0, 1.0)
+    sums = EdgeSums.of(through_all, points)
+    boundary = BoundaryFit(through_all, np.ones(120, dtype=bool), points, 1.0, 0.0, 1.0, sums, np.eye(5))
     boundaries = boundaries_without_stretch(edges, boundary, Shape(7.0, 100.0, 0.3, 0.2), 0.1)
     # The points are shifted outward by the curvature of a blurred edge, sigma^2 / (2 r) = 0.03 px: 0.5 % of the area.
     assert max(iou(one.ellipse, truth) for one in boundaries) > 0.95

@@ -9,6 +9,15 @@ import pytest
 
 import make_ideal_images as ideal
 from eyerender.extraction import FAST, REFINED, ExtractionSettings, extract
+from eyerender.extraction.pupil.covariance import (
+    GROUPS,
+    HIDDEN_UNEVEN,
+    distance_slopes,
+    hidden_part,
+    reshaped,
+    towards_round,
+)
+from eyerender.extraction.pupil.edge_model import SECTORS, Place
 from eyerender.geometry.ellipse import Ellipse, iou
 
 SEEDS = range(20_000, 20_006)
@@ -172,3 +181,31 @@ def test_same_image_same_answer():
     first, second = extract(image), extract(image)
     assert first.pupil.ellipse == second.pupil.ellipse
     assert [g.xy_px.tolist() for g in first.glints] == [g.xy_px.tolist() for g in second.glints]
+
+
+def test_an_arc_tells_little_across_it():
+    """An ellipse through a third of an uneven outline: its covariance holds the truth, and a rounder one is closer."""
+    rng = np.random.default_rng(5)
+    seen = np.zeros(SECTORS, dtype=bool)
+    seen[14:30] = True
+    truth = Ellipse(np.array([80.0, 60.0]), np.array([30.0, 28.5]), 0.7)
+    slopes = distance_slopes(truth, Place.middles(truth))
+    through_all = np.linalg.solve(slopes @ slopes.T, slopes)
+    through_seen = np.linalg.solve((slopes * seen) @ slopes.T, slopes * seen)
+    covariance = hidden_part(truth, seen)
+    distance, before, after = [], [], []
+    for _ in range(400):
+        displaced = np.repeat(rng.normal(0.0, HIDDEN_UNEVEN * np.sqrt(30.0 * 28.5), GROUPS), SECTORS // GROUPS)
+        off = (through_seen - through_all) @ displaced
+        distance.append(off @ np.linalg.lstsq(covariance, off, rcond=1e-9)[0])
+        found = reshaped(truth, off)
+        rounder, smaller = towards_round(found, covariance)
+        before.append(iou(found, truth))
+        after.append(iou(rounder, truth))
+        assert np.trace(smaller) < np.trace(covariance)
+    assert np.mean(distance) == pytest.approx(5.0, rel=0.1)  # chi^2 of five numbers
+    assert np.mean(after) > np.mean(before) + 0.01
+    nothing_hidden = hidden_part(truth, np.ones(SECTORS, dtype=bool))
+    assert np.abs(nothing_hidden).max() < 1e-12
+    same, _ = towards_round(truth, np.eye(5) * 0.02**2)
+    assert iou(same, truth) > 0.9999

@@ -15,6 +15,8 @@ from ..compiled import twin
 from ..settings import Shape
 from ..statistics import median
 from .candidates import Candidate
+from .covariance import EdgeSums, edge_covariance, hidden_part, to_axes, towards_round
+from .edge_model import NEAR, sectors_at
 from .edges import EdgePoints
 from .stretches import Cuts, direct_fits, turn_of
 
@@ -23,6 +25,7 @@ PIECES = 16  # arcs are cut at these sectors, to separate a lid margin from the 
 SAMPLES = 240
 POINTS_PER_PIECE = 3
 FINALISTS = 24  # random ellipses whose support is counted with all points
+CUT = 0.08  # share of the outline in a gap that is more than a glint's: a lid, lashes or a reflection cuts the outline
 ALL_AGREE = 0.85  # share of the highest support; the root mean square distance is then at most 0.39 of the tolerance
 
 
@@ -37,6 +40,8 @@ class BoundaryFit:
         support: share of the outline that they cover.
         gap: share of the outline in the longest stretch without them.
         residual_px: their root mean square distance.
+        sums: over those points, for the covariance and the leverage.
+        covariance: (5, 5) of (cx, cy, a, b, angle), from the scatter of the points and what is hidden of the outline.
     """
 
     ellipse: Ellipse
@@ -45,6 +50,8 @@ class BoundaryFit:
     support: float
     gap: float
     residual_px: float
+    sums: EdgeSums
+    covariance: Floats
 
 
 # Deviation of a pupil boundary from an ellipse, in its radius (rms; Wyatt 1995: 1.7 %, of which an ellipse takes about
@@ -188,7 +195,14 @@ def _polished(
         return f"its semi-axes {a:.1f} x {b:.1f} px are outside the sizes looked for"
     if b < shape.aspect * a:
         return f"its axes' ratio {b / a:.2f} is below {shape.aspect:g}"
-    return BoundaryFit(ellipse, inliers, points[inliers], support, gap, residual)
+    kept = points[inliers]
+    sums = EdgeSums.of(ellipse, kept)
+    covariance = edge_covariance(sums, residual)
+    if gap > CUT:
+        held = np.zeros(SECTORS, dtype=bool)
+        held[sectors_at((*found.tolist(),), kept[:, 0], kept[:, 1], NEAR)] = True
+        ellipse, covariance = towards_round(ellipse, covariance + hidden_part(ellipse, held))
+    return BoundaryFit(ellipse, inliers, kept, support, gap, residual, sums, to_axes(covariance, ellipse))
 
 
 @twin

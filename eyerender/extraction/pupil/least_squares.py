@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...arrays import Floats, Indices
-from ...geometry.ellipse import Ellipse
 from ..compiled import twin
-from .covariance import SHAPE, distance_slopes, gram
+from .covariance import SHAPE, distance_slopes, gram, reshaped
 from .edge_model import NEAR, EdgeModel, Place, Profile, harmonics
 
 # Parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, lean (two), mean outer level.
@@ -218,20 +217,13 @@ def _values(model: EdgeModel) -> Floats:
 
 
 def moved(model: EdgeModel, step: Floats) -> EdgeModel:
-    """Apply a step of the parameters to a model; the eigenvectors of the shape matrix give the new axes."""
-    x, y, aa, bb, ab, sigma, inner, slope, kurtosis, lean_x, lean_y = step[:11].tolist()
-    cx, cy = model.ellipse.centre_px.tolist()
-    a, b = model.ellipse.semi_axes_px.tolist()
-    a, b = a + aa, b + bb
-    mean, apart = 0.5 * (a + b), math.hypot(0.5 * (a - b), ab)
-    angle = model.ellipse.angle_rad + 0.5 * math.atan2(2.0 * ab, a - b)
-    axes = np.array([max(mean + apart, 0.5), max(mean - apart, 0.5)])
-    ellipse = Ellipse(np.array([cx + x, cy + y]), axes, angle)
+    """Apply a step of the parameters to a model."""
+    sigma, inner, slope, kurtosis, lean_x, lean_y = step[SHAPE:11].tolist()
     blur = min(max(model.sigma_px + sigma, 0.5 * model.sigma_px, 0.3), max(2.0 * model.sigma_px, 0.3))
     tails = min(max(model.kurtosis + kurtosis, KURTOSIS_LIMITS[0]), KURTOSIS_LIMITS[1])
     lean = (model.lean[0] + lean_x, model.lean[1] + lean_y)
     return EdgeModel(
-        ellipse=ellipse,
+        ellipse=reshaped(model.ellipse, step),
         inner_dn=model.inner_dn + inner,
         outer=model.outer + step[11:],
         sigma_px=blur,

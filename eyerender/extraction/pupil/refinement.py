@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse, fit_ellipse_direct
 from ..preprocessing import Image
-from .covariance import SHAPE, distance_slopes, sector_excess, to_axes
+from .covariance import SHAPE, distance_slopes, hidden_part, sector_excess, to_axes, towards_round
 from .edge_model import NEAR, SECTORS, EdgeModel, Place, sectors_at
 from .least_squares import FIXED, Normal, Pixels, Prior, Solution, Sums, gauss_newton
 from .occlusion import clear_of_lids, visible_part
@@ -225,6 +225,8 @@ def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen
     sums = of_pixels.pull - normal.across * (normal.inverse * of_pixels.along)
     excess = sector_excess(plain, influence, sums)
     covariance = plain * (excess if excess > 1.25 else 1.0) + own
+    if not seen.all():
+        ellipse, covariance = towards_round(ellipse, covariance + hidden_part(ellipse, seen))
     return PixelFit(
         model,
         ellipse,

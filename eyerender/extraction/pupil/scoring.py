@@ -118,7 +118,7 @@ def goodness_of(found: Found, fit: PixelFit | None) -> Goodness:
     boundary, image = found.boundary, found.image
     about = outline_of(found, boundary.ellipse if fit is None else fit.ellipse)
     if fit is None:
-        model, ellipse, covariance, inside = found.model, boundary.ellipse, found.covariance, found.interior
+        model, ellipse, covariance, inside = found.model, boundary.ellipse, found.boundary.covariance, found.interior
     else:
         model, ellipse, covariance = fit.model, fit.ellipse, fit.covariance
         inside = found.inside(ellipse, model.sigma_px)
@@ -135,7 +135,7 @@ def goodness_of(found: Found, fit: PixelFit | None) -> Goodness:
         spread=inside.spread_dn / model.step_dn,
         boundary_sd_px=boundary_deviation(ellipse, covariance),
         uneven_px=0.0 if fit is None else fit.uneven_px,
-        leverage=leverage(boundary.ellipse, found.sums) if fit is None else found.goodness.leverage,
+        leverage=leverage(boundary.ellipse, boundary.sums) if fit is None else found.goodness.leverage,
         refined=fit is not None,
         open=about.open,
         beyond=about.beyond,
@@ -150,7 +150,7 @@ def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -
     sure = found.confidence if fit is None else confidence(ellipse, goodness, "refined")
     if sure < settings.min_confidence:
         return PupilResult.missing("fit", f"the ellipse found is the pupil with a probability of only {sure:.2f}")
-    covariance, method = (found.covariance, FAST) if fit is None else (fit.covariance, REFINED)
+    covariance, method = (found.boundary.covariance, FAST) if fit is None else (fit.covariance, REFINED)
     return PupilResult(
         status=Status.OK,
         ellipse=ellipse,

@@ -14,14 +14,13 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from ...arrays import Bools, Floats
+from ...arrays import Bools
 from ...geometry.ellipse import Ellipse, iou
 from ..preprocessing import Prepared, as_image
 from ..result import Goodness, PupilResult
 from ..settings import Shape
 from .candidates import Candidate, Interior, candidate_at, find_candidates, find_inside, inspect_interior
 from .consensus import BoundaryFit, boundaries_without_stretch, fit_boundary
-from .covariance import EdgeSums, edge_covariance
 from .edge_model import SECTORS, EdgeModel, Place, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glare import Cleared, without_glare
@@ -39,6 +38,7 @@ SAME = 0.95  # candidates of at least this overlap have the same boundary
 LIKELY = 0.5  # share of the best candidate's score below which no later look starts from a candidate
 TOUCHING_PX = 10.0  # radius of glints that touch each other
 MOST_CUT = 2  # boundaries that are also tried without a stretch
+_TWICE = np.array([2.0, 2.0, 2.0, 2.0, 1.0])
 FLAT = 0.8  # ratio of axes below which a blob may be a pupil that lids cut
 
 
@@ -62,16 +62,6 @@ class Found:
         sigma = math.sqrt(max(self.edges.sigma_px**2 - self.edges.filter_px**2, 0.25))
         outer = np.array([candidate.inside_dn + candidate.step_dn])
         return EdgeModel(ellipse=self.boundary.ellipse, inner_dn=candidate.inside_dn, outer=outer, sigma_px=sigma)
-
-    @cached_property
-    def covariance(self) -> Floats:
-        """Covariance (5, 5) of centre, semi-axes and angle, from the scatter of the edge points."""
-        return edge_covariance(self.boundary.ellipse, self.sums, self.boundary.residual_px)
-
-    @cached_property
-    def sums(self) -> EdgeSums:
-        """Sums over the edge points, for covariance and leverage."""
-        return EdgeSums.of(self.boundary.ellipse, self.boundary.points_px)
 
     @cached_property
     def interior(self) -> Interior:
@@ -302,6 +292,7 @@ def _doubled(found: Found, work: Prepared) -> Found:
             ellipse=_double(boundary.ellipse),
             points_px=2.0 * boundary.points_px + 0.5,
             residual_px=2.0 * boundary.residual_px,
+            covariance=boundary.covariance * np.outer(_TWICE, _TWICE),
         ),
     )
 
