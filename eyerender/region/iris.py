@@ -120,7 +120,7 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     albedo += 0.045 * slow + 0.035 * _noise(rng, shape, (0, 14), (0, 60)) - 0.04 * _step(s, 0.72, 1.0)
     height += 0.02 * slow
     # The stroma is a felt of collagen, whose grain shows in every iris.
-    albedo += grained.uniform(0.042, 0.070) * _noise(grained, shape, (8, 32), (50, 200))
+    albedo += grained.uniform(0.052, 0.085) * _noise(grained, shape, (8, 32), (50, 200))
     albedo += 0.042 * _noise(grained, shape, (3, 12), (20, 70))
 
     grooves = iris.furrows * _furrows(furrowed, s, turn)
@@ -129,8 +129,8 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     albedo = albedo * (1 + 0.45 * trabeculae) * (1 - 0.14 * grooves) * (1 - 0.85 * depth)
 
     # The ruff is the pigment epithelium turned over the margin, a dark beaded seam.
-    beads = np.maximum(0.018 * (1 + 0.35 * _noise(rng, (1, ANGULAR), (0, 1), (30, 75), True)), 0.006)
-    albedo = np.clip(albedo * (1 - 0.45 * np.exp(-((s / beads) ** 2))), 0.30, 1.9)
+    beads = np.maximum(0.026 * (1 + 0.35 * _noise(rng, (1, ANGULAR), (0, 1), (30, 75), True)), 0.009)
+    albedo = np.clip(albedo * (1 - 0.55 * np.exp(-((s / beads) ** 2))), 0.30, 1.9)
     area = (MARGIN_MM + s * WIDTH_MM).astype(float)
     albedo /= np.sum(albedo * area) / np.sum(np.broadcast_to(area, shape))
     # Tissue has no edges as sharp as those between cells of the lattice.

@@ -88,9 +88,7 @@ def skin_map(spec: Region) -> Singles:
         out[k, :, 0], out[k, :, 3], height[k] = strip.look(spots[k])
     _slopes(height, y, z, out[:SHEET_ROWS, :, 1:3])
     _normalise(out[:SHEET_ROWS, :, 0], y, z, rows, spec.skin.albedo)
-    for which, (a, g) in enumerate(
-        ((spec.lashes.albedo, _HAIR_GLOSS), (spec.brow.albedo, _HAIR_GLOSS), (0.75 * spec.skin.wet_albedo, 1.0))
-    ):
+    for which, (a, g) in enumerate(((spec.lashes.albedo, _HAIR_GLOSS), (spec.brow.albedo, _HAIR_GLOSS), (0.0, 1.0))):
         middle = SHEET_ROWS + BANDS * (which + 1) / 4
         band_rows = slice(int(middle - BANDS / 8), int(middle + BANDS / 8))
         out[band_rows] = (a, 0, 0, g)
@@ -260,15 +258,15 @@ class _Strip:
         if np.any(self.flesh):
             bumps = 0.02 + 0.06 * spec.tears.unevenness
             height = height + bumps * self.flesh * self.field(6, (18, 60), (18, 60))
-        height = height + 0.05 * spec.tears.unevenness * self.margin_bumps()
+        height = height + 0.12 * spec.tears.unevenness * self.margin_bumps()
         # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
         open_ = 1 + 0.10 * (cells - 0.5) - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
-        wet = _WET * (1 - step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN - 1.0))
-        # Oil forms films of varying thickness. It shines in points where the skin is smooth and swollen, in short
-        # streaks along the lids.
-        oil = 0.55 + 0.2 * self.field(5, (0, 8), (0, 8))
-        points = np.maximum(self.tiles.at(8, _places(self.y, self.level), (30, 120), (70, 190)) - 0.4, 0.0)
-        sheen = 0.45 * spec.skin.sheen * np.clip(oil * (0.4 + 0.6 * cells) * (1 - pores) + 3.0 * points, 0.1, 2.2)
+        wet = _WET * (1 - step(rows, _LINE - 0.5, _LINE + 2.0))
+        # Oil forms films of varying thickness, most at the glands of the lash roots. It mirrors in points where the
+        # skin is smooth and swollen, in short streaks along the lids.
+        oil = 0.55 + 0.2 * self.field(5, (0, 8), (0, 8)) + 0.6 * _bell(self.out_mm, 0.6, 0.9)
+        points = np.maximum(self.tiles.at(8, _places(self.y, self.level), (15, 60), (35, 95)) - 0.4, 0.0)
+        sheen = 0.45 * spec.skin.sheen * np.clip(oil * (0.4 + 0.6 * cells) * (1 - pores) + 6.0 * points, 0.1, 2.2)
         gloss = np.clip(np.minimum(sheen, 0.45) * self.lid + wet, 0, 1)
         return self.albedo(open_, spots), gloss, height
 
@@ -277,7 +275,7 @@ class _Strip:
         at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0) * (1 - step(self.rows, _LINE - 2.0, _LINE))
         out: Singles = np.zeros_like(self.y)
         if np.any(at > 0):
-            out = at * self.tiles.at(9, _places(self.y, self.out_mm), (30, 75), (20, 60))
+            out = at * self.tiles.at(9, _places(self.y, self.out_mm), (10, 30), (8, 24))
         return out
 
     def cells(self) -> Singles:
@@ -302,11 +300,12 @@ class _Strip:
         """
         skin, y, z = self.spec.skin, self.y, self.z
         grain = self.field(3, (60, 200), (60, 200))
+        swell = self.field(13, (7, 20), (7, 20))
         sway = 0.5 * self.field(12, (0, 10), (0, 10))
         lines = self.tiles.at(11, _places(y, self.level + sway), (0, 6), (22, 60))
         under = _bell(z, -11.0, 6.0) + 0.7 * _bell(z, 8.0, 4.0) + _bell(y, -21.0, 5.0)
         amount = 0.025 * skin.wrinkles * _hill(y, z, 26.0, 20.0) * under
-        return np.asarray(skin.relief_mm * (cells + 0.15 * grain) - amount * np.abs(lines))
+        return np.asarray(skin.relief_mm * (cells + 0.03 * grain + 2.0 * swell) - amount * np.abs(lines))
 
     def creases(self) -> Singles:
         """Depth, 0 to about 1, of the creases of the lids' thin skin.
@@ -389,7 +388,7 @@ class _Strip:
         slow = self.field(21, (0, 4), (0, 4))
         blotch = self.field(22, (3, 22), (3, 22))
         fine = self.field(23, (40, 150), (40, 150))
-        tone = (1 + skin.mottling * (0.05 * slow + 0.022 * blotch + 0.024 * fine)) * open_
+        tone = (1 + skin.mottling * (0.05 * slow + 0.022 * blotch + 0.03 * fine)) * open_
         tone *= 1 - skin.veins * self.veins()
         # The hollow beside the nose and the rim below the lower lid are a little darker, the lash line more so.
         tone *= 1 - 0.20 * _bell(y, 15.5, 5.5) * _bell(z, 5.0, 8.0)

@@ -1,9 +1,8 @@
 """The tear meniscus: a concave strip of water between the globe and the inner edge of either margin.
 
 Its section is an arc that leaves the globe and the margin along their tangents, with the height `height_mm` on the
-globe. The upper one has two thirds of the lower one's height (Doughty et al. 2002 for the height). It is opaque here:
-it shows the line of light that it reflects, not what it would refract. Its height varies along the lids, and short
-waves bend its surface (`waves`), so lamps appear in it as broken rows of points.
+globe. The upper one has two thirds of the lower one's height (Doughty et al. 2002 for the height). Its height varies
+along the lids, and short waves bend its surface (`waves`), so lamps appear in it as broken rows of points.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from .lids import Sheet
 
 ROWS = 7
 _OUT = 1.8  # width on the margin over the height on the globe, so that the radius is about 1.6 heights
-_LONG, _SHORT = (6, 40), (12, 45)  # waves once around the fissure, which is about 60 mm long
+_LONG, _SHORT = (6, 40), (6, 20)  # waves once around the fissure, which is about 60 mm long
 _SLOPE = 0.35  # standard deviation of the slope of the short waves at an unevenness of 1
 
 

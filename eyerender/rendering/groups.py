@@ -13,6 +13,7 @@ from .lighting import lamp_blocked, on_relief, straight, through_cornea
 from .shading import direct, indirect, off_eye
 from .values import Lamp, Lights, Values
 from .view import Textures, View, look_at_skin, meet, outer_albedo
+from .water import through_water, wetted
 
 if TYPE_CHECKING:
     from .region import SkinGeometry
@@ -78,13 +79,20 @@ def shade_group(
     shading = _GroupShading(values, lights, textures, textures.region, scene, group)
     no = mi.Bool(False)
     depths = tuple(mi.Float(0) for _ in range(4)) if group.layered else ()
-    state = (mi.UInt32(0), no, mi.Float(0), Kept.none(), Kept.none(), no, no, mi.UInt32(0), depths)
-    names = ("i", "settled", "total", "sheet", "before", "known", "blocked", "failures", "depths")
-    i, settled, total, sheet, before, _, _, failures, depths = dr.while_loop(
+    state = (mi.UInt32(0), no, mi.Float(0), Kept.none(), Kept.none(), Kept.none(), no, no, mi.UInt32(0), depths)
+    names = ("i", "settled", "total", "sheet", "before", "water", "known", "blocked", "failures", "depths")
+    i, settled, total, sheet, before, water, _, _, failures, depths = dr.while_loop(
         state, shading.goes_on, shading.trace_sample, labels=names, label="group"
     )
     traced = sheet.weight
     sheet = shading.with_untraced(sheet, i, settled)
+
+    def with_region(total: mi.Float, kept: Kept, on_sheet: bool) -> mi.Float:
+        return dr.if_stmt(
+            (total,), kept.weight > 0, lambda total: shading.add_region(total, kept, on_sheet), lambda total: total
+        )
+
+    total = with_region(total, water, False)
     if group.layered:
         globe, *near = depths
         near[1] *= dr.select(traced > 0, sheet.weight / traced, 1)
@@ -92,14 +100,7 @@ def shade_group(
         weights = (before.weight, sheet.weight, globe)
         parts = tuple(Part(*part) for part in zip((*radiance, total), weights, near, strict=True))
         return parts, total, failures
-    for kept, on_sheet in ((sheet, True), (before, False)):
-        (total,) = dr.if_stmt(
-            (total,),
-            kept.weight > 0,
-            lambda total, kept=kept, on_sheet=on_sheet: (shading.add_region(total, kept, on_sheet),),
-            lambda total: (total,),
-        )
-    return (), total, failures
+    return (), with_region(with_region(total, sheet, True), before, False), failures
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,11 +140,12 @@ class _GroupShading:
         total: mi.Float,
         sheet: Kept,
         before: Kept,
+        water: Kept,
         known: mi.Bool,
         blocked: mi.Bool,
         failures: mi.UInt32,
         depths: tuple[mi.Float, ...],
-    ) -> tuple[mi.UInt32, mi.Bool, mi.Float, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32, tuple[mi.Float, ...]]:
+    ) -> tuple[mi.UInt32, mi.Bool, mi.Float, Kept, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32, tuple[mi.Float, ...]]:
         """Trace one sample: shade the globe if the sample hits it, else keep the hit on the region.
 
         `known` says whether the previous sample has sent its own ray to the lamp, `blocked` whether that ray met
@@ -152,9 +154,15 @@ class _GroupShading:
         values, group, skin = self.values, self.group, self.skin
         j = self.number(i)
         o, d, weight = group.ray(j)
+        no = mi.Bool(False)
         view, hit = meet(values, self.scene, o, d, mi.Bool(True))
+        at = o + hit.t * d
         face = skin.face(hit)
         on_sheet = skin.on_sheet(face)
+        if skin.water is not None:
+            film, wet = wetted(skin.water, o, d, view.distance)
+            water = water.with_(wet, j, skin.on_water(film), film.prim_uv, weight, no, no)
+            view, d = through_water(values, skin, film, wet, view, o, d)
         if group.layered:
             # Before the branches below: Dr.Jit would reuse their values outside of them.
             weight_globe, *near = depths
@@ -168,7 +176,6 @@ class _GroupShading:
             return total + radiance * weight, failures + missed
 
         total, failures = dr.if_stmt((total, failures), view.cornea | view.sclera, globe, lambda *unchanged: unchanged)
-        at = o + hit.t * d
         alone = view.other & group.fine
         if self.soft:
             alone &= ~on_sheet
@@ -188,7 +195,7 @@ class _GroupShading:
         sheet = sheet.with_(view.other & on_sheet, j, face, hit.prim_uv, weight, alone, blocked)
         before = before.with_(view.other & ~on_sheet, j, face, hit.prim_uv, weight, alone, blocked)
         settled = group.plain & view.other & on_sheet & ~alone
-        return i + 1, settled, total, sheet, before, known, blocked, failures, depths
+        return i + 1, settled, total, sheet, before, water, known, blocked, failures, depths
 
     def globe_radiance(self, view: View, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
         """Radiance of the globe along sample j's ray, and failed light paths."""

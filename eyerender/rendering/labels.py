@@ -15,6 +15,7 @@ from .film import Exposed, pixels_of
 from .lighting import lamp_blocked, straight
 from .sampling import camera_ray
 from .view import View, hidden, look, meet, meet_globe, outer_albedo
+from .water import on_water
 
 _HIGHLIGHT = 0.5  # of the scattered light
 _ACROSS = 3  # points of a pixel across and down that are looked at
@@ -68,6 +69,8 @@ def highlights(shown: Exposed, window: Window) -> Bools:
         place = ((i % _ACROSS + 0.5) / _ACROSS - 0.5, (i // _ACROSS + 0.5) / _ACROSS - 0.5)
         o, d = _rays(shown, window, *(dr.opaque(mi.Float, c) for c in place))
         view = look(values, textures, shown.scene, o, d, mi.Bool(True))
+        albedo = outer_albedo(values, textures, view)  # of what is below the water
+        view = on_water(values, textures, view, o, d)
         back = -values.vector_to_eye(d)
 
         def add(
@@ -82,7 +85,7 @@ def highlights(shown: Exposed, window: Window) -> Bools:
 
         state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
         _, shine, even = dr.while_loop(state, lambda k, *_: k < lights.count, add, label="highlights")
-        matte = outer_albedo(values, textures, view) * even * dr.inv_pi
+        matte = albedo * even * dr.inv_pi
         there = view.other | view.sclera
         shine, matte, share = (dr.select(there, x, 0) for x in (shine, matte, mi.Float(1 / _ACROSS**2)))
         dr.eval(shine, matte, share)

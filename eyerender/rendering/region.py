@@ -31,10 +31,11 @@ from .values import aligned
 
 GRID_ROWS, GRID_COLUMNS = 160, 768  # of the grid over the sheet on which its light is computed (see `subsurface`)
 SHEET_COLUMNS = COLUMNS + 1  # of vertices, because the first column is repeated
-_F0_OIL, _F0_TEARS = 0.028, 0.0202  # reflectance at normal incidence (n 1.40 and 1.331)
-_ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.05, 0.035
-_OILY = 0.75  # share of skin's sheen in the narrow lobe of its film of oil, which the relief breaks into points
+_F0_OIL, _F0_TEARS = 0.035, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
+_ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.025, 0.035
+_OILY = 0.85  # share of skin's sheen in the narrow lobe of its film of oil, which the relief breaks into points
 _RIPPLE = 0.02  # slope of wet tissue
+_NONE = slice(0)
 
 
 Expected: TypeAlias = tuple[Region, Globe, "Future[RegionMesh]"]
@@ -57,8 +58,12 @@ class RegionScene:
         # Without robust intersections rays slip between the triangles of a large face on some processors. An instance
         # cannot have them, but its triangles are small.
         parts: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True}
+        water = None
         if self.moving:
-            parts |= _instance("moving", _mesh(posed, slice(0, moved[0]), slice(0, moved[1])))
+            film = slice(int(layout.face_ends[0]), int(layout.face_ends[1]))
+            parts |= _instance("moving", _mesh(posed, slice(0, moved[0]), slice(0, moved[1]), without=film))
+            water = mi.load_dict({"type": "scene", "film": _mesh(posed, _water(layout), film)})
+            self._water: Any = mi.traverse(water)
         if moved[1] < len(layout.faces):
             still = _mesh(posed, slice(moved[0], None), slice(moved[1], None))
             parts |= _instance("still", still) if self.moving else {"still": still}
@@ -68,7 +73,9 @@ class RegionScene:
         pixels = aligned(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         moving = next((s for s in self.scene.shapes() if s.id() == "shown_moving"), None)
-        self.skin = SkinGeometry(look, pixels, layout, faces, moving, -1.0 if globe.mirrored else 1.0, self._inner())
+        self.skin = SkinGeometry(
+            look, pixels, layout, faces, moving, -1.0 if globe.mirrored else 1.0, self._inner(), water
+        )
         self.skin.pose(posed)
         self._shown: tuple[Region, Globe] | None = (spec, globe)
         self.posed = posed
@@ -99,6 +106,8 @@ class RegionScene:
         n, before, self.posed = self._vertices, self.posed, posed
         if self.moving:
             self._params["moving.mesh.vertex_positions"] = _floats(posed.vertices[:n])
+            self._water["film.vertex_positions"] = _floats(posed.vertices[_water(posed.layout)])
+            self._water.update()
         if not np.array_equal(before.vertices[n:], posed.vertices[n:]):
             mesh = "still.mesh" if self.moving else "still"
             self._params[f"{mesh}.vertex_positions"] = _floats(posed.vertices[n:])
@@ -133,9 +142,15 @@ def _floats(values: Floats) -> mi.Float:
     return mi.Float(values.astype(np.float32).ravel())
 
 
-def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
-    """Make a mesh of some of the triangles."""
+def _water(layout: RegionLayout) -> slice:
+    """Vertices of the menisci."""
+    return slice(int(layout.vertex_ends[0]), int(layout.vertex_ends[1]))
+
+
+def _mesh(posed: RegionMesh, vertices: slice, faces: slice, without: slice = _NONE) -> mi.Mesh:
+    """Make a mesh of some of the triangles. Those `without` keep their numbers, but nothing meets them."""
     corners, triangles = posed.vertices[vertices], posed.layout.faces[faces] - (vertices.start or 0)
+    triangles[without] = 0
     mesh = mi.Mesh("region", len(corners), len(triangles))
     params = mi.traverse(mesh)
     params["faces"] = mi.UInt32(triangles.astype(np.uint32).ravel())
@@ -163,7 +178,10 @@ class Surface:
 
 
 class SkinGeometry:
-    """A posed region for the kernels: the corners of its triangles, and the map."""
+    """A posed region for the kernels: the corners of its triangles, and the map.
+
+    `water` holds the menisci, which are not in the scene because light passes through them; None if they are opaque.
+    """
 
     def __init__(
         self,
@@ -174,8 +192,9 @@ class SkinGeometry:
         instance: mi.Shape | None,
         mirror: float,
         inner: Bools | None,
+        water: mi.Scene | None,
     ) -> None:
-        self._map = look
+        self._map, self.water = look, water
         self.relief = mi.Float(0 if inner is None else aligned(_mean_slopes(pixels).ravel()))
         corners = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
         corners[:, :3] = layout.faces
@@ -235,6 +254,10 @@ class SkinGeometry:
     def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
         """Index of the layout's triangle that was hit."""
         return hit.prim_index + dr.select(hit.instance == self._moving, 0, self._first_still)
+
+    def on_water(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
+        """Index of the layout's triangle of the menisci that was hit."""
+        return hit.prim_index + self._sheet
 
     def on_sheet(self, face: mi.UInt32) -> mi.Bool:
         """Whether a triangle belongs to the sheet of skin, not to what is in front of it."""

@@ -298,16 +298,21 @@ def test_the_own_region_as_a_head_hides_what_it_hides(renderer, tmp_path):
 
     script = SCRIPTS / "describe_head.py"
     subprocess.run([sys.executable, str(script), "--example", str(tmp_path)], check=True, capture_output=True)
-    matte = {"look": {"scattering": "off"}}  # as heads are
+    matte, dry = {"look": {"scattering": "off"}}, {"tears": {"height_mm": 0.0}}  # heads are matte
+    # The menisci of a head are opaque, those of a region are not.
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    del manifest["parts"]["tears"]
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     head = only(scene_of(tmp_path, {"file": "manifest.json"}, **matte), renderer)
-    own = only(Scene.of(SceneSpec.from_mapping({**scene_data({}), "region": {}, **matte})), renderer)
+    own = only(Scene.of(SceneSpec.from_mapping({**scene_data({}), "region": dry, **matte})), renderer)
     assert np.mean(head.parts != own.parts) < 1e-4  # the file keeps five digits
     assert [g["reason"] for g in labels_of(head)["glints"]] == [g["reason"] for g in labels_of(own)["glints"]]
     assert labels_of(head)["iris_visible_fraction"] == pytest.approx(labels_of(own)["iris_visible_fraction"], abs=1e-3)
-    # The same skin sends the same light to the globe.
+    # Much the same skin sends much the same light to the globe: a head's has neither relief nor patches of oil.
     for part in (1, 2):
-        lit, same = (i.irradiance[i.parts == part].mean() for i in (head, own))
-        assert lit == pytest.approx(same, rel=0.01)
+        inside = ndimage.binary_erosion(own.parts == part, iterations=2)  # lid margins look different
+        lit, same = (i.irradiance[inside].mean() for i in (head, own))
+        assert lit == pytest.approx(same, rel=0.02)
 
 
 def test_a_mesh_in_the_cornea_is_refused_with_its_depth(renderer, folder):

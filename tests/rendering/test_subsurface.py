@@ -107,7 +107,8 @@ def test_smooth_skin_and_sclera_reflect_as_much_as_before(renderer, name):
             assert soft[skin].sum() == pytest.approx(hard[skin].sum(), rel=0.01)
     # Near the lids the sclera loses light to what lies under them.
     assert 0.9 * hard[part == 1].sum() < soft[part == 1].sum() < hard[part == 1].sum()
-    assert soft[part == 2].sum() == pytest.approx(hard[part == 2].sum(), rel=2e-3)
+    # Pixels of the iris' edge show some of the sclera.
+    assert soft[part == 2].sum() == pytest.approx(hard[part == 2].sum(), rel=5e-3)
     # Shadows are softer: the sum of squared differences of neighbours is smaller.
     assert np.square(np.diff(soft, axis=0)).sum() < np.square(np.diff(hard, axis=0)).sum()
 
