@@ -6,7 +6,7 @@ import io
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from .progress import Progress
 from .rig.exposure import electrons
 from .rig.rig import RigLike
 from .scene import Frame, Frames, Scene
+
+if TYPE_CHECKING:
+    from .rendering.renderer import Renderer
 
 PICTURE_FIELDS = frozenset({"image", "sensor", "look", "region", "lens", "motion", "ambient", "seed"})
 """The fields of a scene that change its pictures alone."""
@@ -214,19 +217,25 @@ def auto_exposed(
         raise InputError("must be 0.01 to 2", source="--auto-exposure")
     if not 0 < share <= 1:
         raise InputError("must be above 0 and at most 1", path="share")
+    time_ms = settled_exposure_ms(scene, level, make_renderer(backend, threads), share=share)
+    if time_ms is None:
+        raise InputError("the images are too dark to be exposed automatically", source=scene.source)
+    return scene.with_(sensor={**scene.spec.sensor.to_mapping(), "exposure_ms": time_ms})
+
+
+def settled_exposure_ms(scene: Scene, level: float, renderer: Renderer, *, share: float = 0.98) -> float | None:
+    """The exposure time of `auto_exposed`, ms; None where the images are dark."""
     sensor = scene.spec.sensor
-    quiet = scene.with_(spp=4, sensor={**sensor.to_mapping(), "noise": False})
-    frames = quiet.frames()
+    frames = scene.with_(spp=4).frames()
     count = min(_LOOKED_AT, len(frames))
     rows = np.array([k * len(frames) // count for k in range(count)])
-    images = render_windows(frames.take(rows), backend=backend, threads=threads)
+    images = render_windows(frames.take(rows), renderer=renderer)
     seen = np.concatenate([image.irradiance[image.parts != FRAME].astype(float) for image in images])
     charge = float(np.quantile(electrons(sensor, seen, scene.spec.wavelength_nm), share)) if seen.size else 0.0
     room = level * sensor.full_scale_dn - sensor.black_dn
     if not charge * sensor.gain > 1e-3 or room <= 0:
-        raise InputError("the images are too dark to be exposed automatically", source=scene.source)
-    time_ms = min(sensor.exposure_ms * room / (charge * sensor.gain), _LONGEST_MS)
-    return scene.with_(sensor={**sensor.to_mapping(), "exposure_ms": float(f"{time_ms:.4g}")})
+        return None
+    return float(f"{min(sensor.exposure_ms * room / (charge * sensor.gain), _LONGEST_MS):.4g}")
 
 
 def export_scene(

@@ -24,6 +24,7 @@ def study(
     workers: int | None = None,
     spp: int | None = None,
     noise: Literal["on", "off", "both"] = "both",
+    auto_exposure: float | None = None,
     backend: Backend = "auto",
     threads: Threads = None,
     overwrite: Overwrite = False,
@@ -48,6 +49,8 @@ def study(
         workers: Number of worker processes (default: one per processor).
         spp: Samples per pixel of the images (default: the scene's value).
         noise: Images with sensor noise (on), without it (off), or both.
+        auto_exposure: Choose one exposure time for the images of each eye model, so that 98 % of the pixels are at most
+            at this share of full scale.
     """
     from ..study.literature import MODELS
     from ..study.run import REPORT, run_study
@@ -66,6 +69,7 @@ def study(
             workers=workers,
             spp=spp,
             noise=noise,
+            auto_exposure=auto_exposure,
             backend=backend,
             threads=threads,
             overwrite=overwrite,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..arrays import Bytes
 from ..backends.choose import BackendChoice
 from ..capture import BegunImage, EyeImage, begin_windows, make_renderer, noiseless
+from ..images import settled_exposure_ms
 from ..labels import image_labels
 from ..plausibility import is_saturated
 from ..progress import one_behind
@@ -58,6 +59,7 @@ class Maker:
         self.frames = frames
         self.renderer: Renderer = make_renderer(backend, threads)
         self._beside = ThreadPoolExecutor(1, "sample")
+        self._settled: tuple[int, float | None] | None = None
 
     @property
     def backend(self) -> dict[str, Any]:
@@ -76,12 +78,27 @@ class Maker:
 
     def _begun(self, index: int) -> Future[MadeSample]:
         """Trace a sample's frames; a second thread makes the rest."""
-        found = realise(self.plan, index, self.frames)
+        found = self._exposed(realise(self.plan, index, self.frames))
         highlights = self.plan.spec.labels.highlights
         begun: tuple[BegunImage, ...] = ()
         if found.frames is not None:
             begun = tuple(begin_windows(found.frames, self.renderer, highlights=highlights))
         return self._beside.submit(lambda: MadeSample(index, tuple(self._images(found, begun)), found.rejections))
+
+    def _exposed(self, found: Realised) -> Realised:
+        """The sample with the exposure of its subject; that of the scene where the subject's pictures are dark."""
+        level = self.plan.spec.auto_exposure
+        if level is None or found.sample is None:
+            return found
+        subject = found.sample.turn.subject
+        if self._settled is None or self._settled[0] != subject:
+            # Whatever sample of a subject is made, the first that can be made decides.
+            before = (realise(self.plan, k, self.frames) for k in range(self.plan.first_of(subject), found.index))
+            first = next((r.scene for r in before if r.scene is not None), found.scene)
+            assert first is not None
+            self._settled = subject, settled_exposure_ms(first, level, self.renderer)
+        time_ms = self._settled[1]
+        return found if time_ms is None else found.exposed(time_ms)
 
     def _images(self, found: Realised, begun: tuple[BegunImage, ...]) -> Iterator[MadeImage]:
         for image in (b.image() for b in begun):

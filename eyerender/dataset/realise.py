@@ -51,6 +51,13 @@ class Realised:
         """Scene of the sample."""
         return None if self.frames is None else self.frames.scene
 
+    def exposed(self, exposure_ms: float) -> Realised:
+        """The sample with another exposure time."""
+        assert self.sample is not None
+        tree = self.sample.scene
+        sample = replace(self.sample, scene={**tree, "sensor": {**tree.get("sensor", {}), "exposure_ms": exposure_ms}})
+        return replace(self, sample=sample, frames=sample.build().frames())
+
     def warnings(self) -> list[InputWarning]:
         """Probable mistakes in the scene (see `Scene.warnings`)."""
         return [] if self.scene is None else [warning.at(self.source) for warning in self.scene.warnings()]

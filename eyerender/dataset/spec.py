@@ -74,6 +74,12 @@ class DatasetSpec(FileSpec):
         "of `look`, `region` and `subject.ipd_mm` stays; default: the eye of the scene",
     )
     labels: LabelsSpec = Field(default=LabelsSpec(), description="labels in addition to those that every image has")
+    auto_exposure: Annotated[float, Field(ge=0.01, le=2)] | None = Field(
+        default=None,
+        description="expose each subject as a camera's automatic exposure settles: one exposure time for all of its "
+        "samples, at which 98 % of the pixels of the first are at most at this share of full scale (more than 1 "
+        "clips); default: the exposure of the scene",
+    )
     require: Literal["pupil", "nothing"] = Field(
         default="pupil", description="pupil: draw a sample again if its window does not contain the apparent pupil"
     )

@@ -35,7 +35,10 @@ _PATIENCE_S = 60.0  # per image, after which a silent worker counts as dead
 
 @dataclass(frozen=True, slots=True)
 class ImageSettings:
-    """Settings of the images: the dataset's folder, samples per pixel (None: the scene's), and where to render."""
+    """Settings of the images: the dataset's folder, samples per pixel (None: the scene's), and where to render.
+
+    With `auto_exposure` the images of each eye model have one exposure of their own (see `DatasetSpec`).
+    """
 
     folder: Path
     spp: int | None = None
@@ -44,6 +47,7 @@ class ImageSettings:
     threads: int | None = None
     progress: Progress | None = None
     say: Say | None = None
+    auto_exposure: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,10 +64,11 @@ class StudyImages:
 
     entries: Mapping[str, tuple[ImageEntry, ...]]
     spp: int | None = None
+    auto_exposure: float | None = None
 
     def of(self, scene: Scene) -> tuple[ImageEntry, ...]:
         """Images of a shot's scene, in frame order; empty where they were not made."""
-        return self.entries.get(_digest(scene), ())
+        return self.entries.get(_digest(scene, self.auto_exposure is not None), ())
 
     def holds(self, scene: Scene) -> bool:
         """Whether every image of a shot's scene exists."""
@@ -131,8 +136,9 @@ def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) ->
 
     scenes = list({_digest(scene): scene for scene in scenes}.values())
     found = read_images(settings.folder)
-    if found is None or not all(found.holds(scene) for scene in scenes):
-        plan = Plan.of(dataset_spec(study, scenes), source=str(settings.folder))
+    level = settings.auto_exposure
+    if found is None or found.auto_exposure != level or not all(found.holds(scene) for scene in scenes):
+        plan = Plan.of(dataset_spec(study, scenes, level), source=str(settings.folder))
         generate(
             plan,
             settings.folder,
@@ -150,7 +156,7 @@ def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) ->
     return replace(found, spp=settings.spp)
 
 
-def dataset_spec(study: str, scenes: Sequence[Scene]) -> Any:
+def dataset_spec(study: str, scenes: Sequence[Scene], auto_exposure: float | None = None) -> Any:
     """Spec of a dataset of scenes, the same ones for each eye model: a grid of models, a sequence of scenes.
 
     A scene without noise that is also needed with noise is no sample of its own; its images are stored with the others.
@@ -184,6 +190,7 @@ def dataset_spec(study: str, scenes: Sequence[Scene]) -> Any:
             "attempts": 1,
             "labels": {"noiseless": len(scenes) < wanted},
             "scene": template,
+            **({} if auto_exposure is None else {"auto_exposure": auto_exposure}),
         }
     )
 
@@ -205,8 +212,10 @@ def read_images(folder: Path) -> StudyImages | None:
     from ..dataset.shard import run_versions
 
     try:
-        if read_json(folder / DATASET)["versions"] != run_versions():
+        dataset = read_json(folder / DATASET)
+        if dataset["versions"] != run_versions():
             return None
+        level = dataset["spec"].get("auto_exposure")
         found: dict[str, list[tuple[int, ImageEntry]]] = {}
         lines = JsonLines.index(folder / METADATA)
         for line in lines.read(range(len(lines))):
@@ -215,12 +224,13 @@ def read_images(folder: Path) -> StudyImages | None:
             kept = {key: line[key] for key in ("window_px", "bit_depth")} | {"records": [{}]}
             for scene, name in _exposures(line):
                 entry = ImageEntry(folder, {"file_name": name, **kept})
-                found.setdefault(_digest_of(scene, eye), []).append((frame, entry))
+                found.setdefault(_digest_of(scene, eye, level is not None), []).append((frame, entry))
     except (InputError, ValueError, KeyError, TypeError, IndexError):
         return None
     # A dataset's lines need not be in the order of its samples.
     in_order = {key: sorted(those, key=lambda pair: pair[0]) for key, those in found.items()}
-    return StudyImages({key: tuple(entry for _, entry in those) for key, those in in_order.items()})
+    entries = {key: tuple(entry for _, entry in those) for key, those in in_order.items()}
+    return StudyImages(entries, auto_exposure=level)
 
 
 def _begun(folder: Path, plan: Any) -> bool:
@@ -253,11 +263,15 @@ def _exposures(line: Mapping[str, Any]) -> list[tuple[str, str]]:
     return out
 
 
-def _digest(scene: Scene) -> str:
-    """Digest of what a scene's images show, as in a dataset's lines of metadata."""
+def _digest(scene: Scene, auto: bool = False) -> str:
+    """Digest of what a scene's images show, as in a dataset's lines of metadata; with `auto`, whatever the exposure."""
     eye = {key: value for key, value in scene.eye_spec.to_mapping().items() if key != "sources"}
-    return _digest_of(json.dumps(scene.spec.to_mapping(), sort_keys=True), json.dumps(eye, sort_keys=True))
+    return _digest_of(json.dumps(scene.spec.to_mapping(), sort_keys=True), json.dumps(eye, sort_keys=True), auto)
 
 
-def _digest_of(scene_json: str, eye_json: str) -> str:
+def _digest_of(scene_json: str, eye_json: str, auto: bool) -> str:
+    if auto:
+        data = json.loads(scene_json)
+        del data["sensor"]["exposure_ms"]
+        scene_json = json.dumps(data, sort_keys=True)
     return hashlib.sha256(f"{scene_json}\n{eye_json}".encode()).hexdigest()

@@ -51,6 +51,7 @@ def run_study(
     workers: int | None = 1,
     spp: int | None = None,
     noise: Literal["on", "off", "both"] = "both",
+    auto_exposure: float | None = None,
     backend: BackendChoice = "auto",
     threads: int | None = None,
     overwrite: bool = False,
@@ -73,6 +74,8 @@ def run_study(
         workers: processes; None: one a processor.
         spp: samples per pixel of the images.
         noise: images with the sensor's noise, without it, or both.
+        auto_exposure: share of full scale that 98 % of the pixels stay below, by one exposure of the images of each eye
+            model; None: the exposure of the study's scene.
         backend: what renders the images.
         threads: of all workers together.
         overwrite: replace what the folder holds.
@@ -102,6 +105,7 @@ def run_study(
     settings: dict[str, Any] = {"study": name, "protocol": protocol, "observer": observer, "eyes": list(eyes)}
     if observer != "analytic":
         settings |= {"spp": spp, "sensor_noise": noise}
+    settings |= _exposure(auto_exposure, observer)
     folder = Path(folder)
     protocols = ("published", "corrected") if protocol == "both" else (protocol,)
     kinds = _kinds(observer, noise)
@@ -109,7 +113,7 @@ def run_study(
         start = time.monotonic()
         images = None
         if any(kind != "analytic" for kind in kinds):
-            made = ImageSettings(folder / IMAGES, spp, workers, backend, threads, _noted(progress), say)
+            made = ImageSettings(folder / IMAGES, spp, workers, backend, threads, _noted(progress), say, auto_exposure)
             images = _images(name, eyes, protocols, kinds, made)
         jobs = [
             (observings, eye, told)
@@ -125,6 +129,17 @@ def run_study(
             write_text(folder / "waterfall.csv", _waterfall_csv(more["waterfall"]))
         page.write(folder / REPORT)
         return summary
+
+
+def _exposure(level: float | None, observer: str) -> dict[str, float]:
+    """Setting of the automatic exposure, if there is one and it makes sense."""
+    if level is None:
+        return {}
+    if observer == "analytic":
+        raise InputError("the analytic observer takes no images", source="--auto-exposure")
+    if not 0.01 <= level <= 2:
+        raise InputError("must be 0.01 to 2", source="--auto-exposure")
+    return {"auto_exposure": level}
 
 
 def _kinds(observer: str, noise: str) -> list[ObserverKind]:

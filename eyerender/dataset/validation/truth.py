@@ -98,7 +98,7 @@ class DatasetTruth:
         """Compute a line again; raises one of `WRONG` for what is not a line of a dataset."""
         number, record = line["sample"], line["records"][0]
         if self._last is None or self._last.index != number:
-            self._last = realise(self.plan, number, self.frames)
+            self._last = self._exposed(realise(self.plan, number, self.frames), line)
         found = self._last
         frames, observations = found.frames, found.observations
         if frames is None or observations is None:
@@ -114,6 +114,12 @@ class DatasetTruth:
         problems = _differences(_open(expected, texts), _open(line, texts))
         problems += [*_spots(scene, view, line), *_lids(scene, observations, view, line)]
         return Again(tuple(problems), _limbus(scene, view))
+
+    def _exposed(self, found: Realised, line: dict[str, Any]) -> Realised:
+        """The sample with the exposure of its line, which only its pictures can tell where exposure is automatic."""
+        if self.plan.spec.auto_exposure is None or found.sample is None:
+            return found
+        return found.exposed(json.loads(line["parameters"]["scene_json"])["sensor"]["exposure_ms"])
 
 
 @dataclass
