@@ -1,8 +1,8 @@
 """Compiled twins of the extractor's inner functions, used where numba is installed (the extra `fast`).
 
-A function that is marked with `twin` takes and returns arrays and numbers only. `kernels` holds a compiled function of
-the same name, arguments and results. The marked function is what runs without numba, and what its twin is tested
-against.
+A function that is marked with `twin` takes and returns arrays and numbers only. `kernels` and `spot_kernels` hold
+compiled functions of the same name, arguments and results. The marked function is what runs without numba, and what
+its twin is tested against.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+MODULES = ("kernels", "spot_kernels")
 TWINS: dict[str, Callable[..., Any]] = {}  # the functions that have a compiled twin, by name
 
 
@@ -32,7 +33,8 @@ def kernel(name: str) -> Callable[..., Any] | None:
     """
     if not wanted():
         return None
-    function: Callable[..., Any] = getattr(importlib.import_module(".kernels", __package__), name)
+    modules = (importlib.import_module(f".{one}", __package__) for one in MODULES)
+    function: Callable[..., Any] = next(vars(one)[name] for one in modules if name in vars(one))
     return function
 
 

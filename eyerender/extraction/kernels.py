@@ -1,53 +1,25 @@
-"""The compiled functions (see `compiled`). Each has the name, arguments and results of its twin, documented there.
+"""The compiled functions of the search and the boundary (see `compiled`).
 
-They are written as loops over pixels or points, and use no memory but for their results. Numba keeps the machine code
-in $XDG_CACHE_HOME/eyerender/kernels.
+Each has the name, arguments and results of its twin, documented there. They are loops over pixels or points.
 """
 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, TypeVar, cast
 
 import numpy as np
-from numba import njit
-from numba.core import config as numba_config
 
-Function = TypeVar("Function", bound=Callable[..., Any])
-Array = Any  # numba has types of its own
-config: Any = numba_config  # it makes its attributes at run time
+from .jit import compiled, inlined, summing
+
 SECTORS, NEAR = 48, 2  # as in edge_model
 MOST_BLOBS = 12  # as in candidates
+SELECTION = 1.6  # as in covariance
 
 _ROOT_HALF = math.sqrt(0.5)
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 
-def _compiled(function: Function) -> Function:
-    """Compile at the first call; the machine code is kept on disk if a folder there can be written."""
-    before = config.CACHE_DIR
-    config.CACHE_DIR = str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eyerender" / "kernels")
-    try:
-        return cast(Function, njit(cache=True, nogil=True, error_model="numpy")(function))
-    except (RuntimeError, OSError):  # numba found no folder to write to
-        return cast(Function, njit(nogil=True, error_model="numpy")(function))
-    finally:
-        config.CACHE_DIR = before
-
-
-def _summing(function: Function) -> Function:
-    """Compile a helper whose sums may be taken in any order, so that they use vector instructions."""
-    return cast(Function, njit(error_model="numpy", fastmath={"reassoc", "contract"})(function))
-
-
-def _inlined(function: Function) -> Function:
-    return cast(Function, njit(inline="never", error_model="numpy")(function))
-
-
-@_inlined
+@inlined
 def _place(cx, cy, a, b, cos, sin, x, y, steps):
     """`Place.of` of one point: distance, cos t, sin t, normal (2), curvature, cos u, sin u."""
     dx, dy = x - cx, y - cy
@@ -72,13 +44,13 @@ def _place(cx, cy, a, b, cos, sin, x, y, steps):
     return distance, c, s, nx, ny, a * b * scale * scale * scale, c * cos - s * sin, s * cos + c * sin
 
 
-@_inlined
+@inlined
 def _sector(cos_u, sin_u, sectors):
     share = math.atan2(sin_u, cos_u) / (2.0 * math.pi) + 0.5
     return int(share * sectors) % sectors
 
 
-@_compiled
+@compiled
 def edge_sums(ellipse, points, sectors):
     cx, cy, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
@@ -101,7 +73,63 @@ def edge_sums(ellipse, points, sectors):
     return matrix, scores, slopes, count
 
 
-@_compiled
+@inlined
+def _inverse(matrix):
+    ridge = 0.0
+    for j in range(5):
+        ridge += 1e-9 * matrix[j, j]
+    return np.linalg.inv(matrix + ridge * np.eye(5))
+
+
+@compiled
+def of_edges(matrix, scores, count, residual_px):
+    inverse = _inverse(matrix)
+    variance = max(residual_px, 1e-4) ** 2
+    groups = 0
+    for k in range(count.size):
+        groups += count[k] > 0
+    groups = max(groups, 6)
+    # The trace of plain^-1 (inverse scores) (inverse scores)^T, with plain = variance inverse.
+    excess = 0.0
+    for k in range(scores.shape[1]):
+        for j in range(5):
+            for m in range(5):
+                excess += scores[j, k] * inverse[j, m] * scores[m, k]
+    excess *= groups / (groups - 5.0) / (5.0 * variance)
+    return inverse * (variance * max(excess, 1.0) * SELECTION)
+
+
+@compiled
+def along_outline(ellipse, covariance):
+    a, b, angle = ellipse[2], ellipse[3], ellipse[4]
+    cos, sin, total, row = math.cos(angle), math.sin(angle), 0.0, np.empty(5)
+    for k in range(32):
+        t = 2.0 * math.pi * ((k + 0.5) / 32 - 0.5) - angle
+        c, s = math.cos(t), math.sin(t)
+        nx, ny = b * c, a * s
+        height = math.sqrt(nx * nx + ny * ny)
+        nx, ny = nx / height, ny / height
+        row[0], row[1] = ny * sin - nx * cos, -nx * sin - ny * cos
+        row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
+        for j in range(5):
+            for m in range(5):
+                total += row[j] * covariance[j, m] * row[m]
+    return math.sqrt(max(total / 32, 0.0))
+
+
+@compiled
+def differences(linear, step):
+    rows, columns = (linear.shape[0] - 2) // step + 1, (linear.shape[1] - 2) // step + 1
+    out = np.empty(rows * columns, dtype=np.float32)
+    for k in range(rows):
+        above, below = linear[k * step], linear[k * step + 1]
+        for m in range(columns):
+            i = m * step
+            out[k * columns + m] = abs(above[i] - above[i + 1] - below[i] + below[i + 1])
+    return out
+
+
+@compiled
 def support(points, normals, fits, tolerance):
     out = np.zeros(fits.shape[0])
     for m in range(fits.shape[0]):
@@ -126,7 +154,7 @@ def support(points, normals, fits, tolerance):
     return out
 
 
-@_inlined
+@inlined
 def _select(points, normals, ellipse, sigma_px, reach, clipped, moved, distance, chosen):
     """Move points by the curvature shift and choose those near an ellipse; returns how many were chosen."""
     cx, cy, a, b, angle = ellipse[0], ellipse[1], ellipse[2], ellipse[3], ellipse[4]
@@ -155,7 +183,7 @@ def _select(points, normals, ellipse, sigma_px, reach, clipped, moved, distance,
     return count
 
 
-@_inlined
+@inlined
 def _axes(g11, g12, g22):
     """`_axes_from_shape_matrix` of the geometry, for one ellipse: a, b, angle."""
     mean, half = 0.5 * (g11 + g22), 0.5 * (g11 - g22)
@@ -166,7 +194,7 @@ def _axes(g11, g12, g22):
     return math.sqrt(major), math.sqrt(minor), 0.5 * math.atan2(g12, half)
 
 
-@_inlined
+@inlined
 def _unit(points, chosen):
     """Mean and largest offset of the chosen points: what makes them small numbers about 0."""
     n, x, y, scale = chosen.sum(), 0.0, 0.0, 0.0
@@ -179,7 +207,7 @@ def _unit(points, chosen):
     return x, y, scale
 
 
-@_inlined
+@inlined
 def _scatter(points, chosen, mean_x, mean_y, scale):
     """Mean (5,) of (x^2, x y, y^2, x, y), its covariance (5, 5), and that of its derivatives by x and y."""
     n = chosen.sum()
@@ -203,7 +231,7 @@ def _scatter(points, chosen, mean_x, mean_y, scale):
     return mean, scatter, gradient
 
 
-@_inlined
+@inlined
 def _factored(matrix):
     """Cholesky's factor (lower) of a matrix, in place."""
     n = matrix.shape[0]
@@ -215,7 +243,7 @@ def _factored(matrix):
             matrix[i, j] = math.sqrt(max(total, 1e-300)) if i == j else total / matrix[j, j]
 
 
-@_inlined
+@inlined
 def _solve(lower, vector):
     """Solve L L^T x = vector in place."""
     n = vector.size
@@ -229,7 +257,7 @@ def _solve(lower, vector):
         vector[i] /= lower[i, i]
 
 
-@_inlined
+@inlined
 def _least_direction(scatter, gradient):
     """The v (5,) of the least v^T S v / v^T G v, by inverse iteration."""
     trace = 0.0
@@ -260,7 +288,7 @@ def _least_direction(scatter, gradient):
     return found
 
 
-@_inlined
+@inlined
 def _taubin(points, chosen, out):
     """Taubin's approximate mean square fit, as `cv2.fitEllipseAMS`, in double precision; False where it is none."""
     mean_x, mean_y, scale = _unit(points, chosen)
@@ -280,11 +308,12 @@ def _taubin(points, chosen, out):
     major, minor, angle = _axes(factor * c, -0.5 * factor * b, factor * a)
     if not (minor > 0.0 and major < 25.0):
         return False
-    out[0], out[1], out[2], out[3], out[4] = x * scale + mean_x, y * scale + mean_y, major * scale, minor * scale, angle
+    out[0], out[1], out[2], out[3] = x * scale + mean_x, y * scale + mean_y, major * scale, minor * scale
+    out[4] = angle % math.pi
     return True
 
 
-@_compiled
+@compiled
 def settled(points, normals, start, sigma_px, tolerance, free):
     n = points.shape[0]
     ellipse, moved, nothing = start.copy(), np.empty((n, 2)), np.zeros(3)
@@ -305,7 +334,7 @@ def settled(points, normals, start, sigma_px, tolerance, free):
     return count, ellipse, inliers, moved, _seen(ellipse, moved, inliers)
 
 
-@_inlined
+@inlined
 def _seen(ellipse, points, chosen):
     """Share of the outline that holds points, that of the longest gap, and the root mean square distance."""
     cx, cy, a, b, angle = ellipse[0], ellipse[1], ellipse[2], ellipse[3], ellipse[4]
@@ -327,7 +356,7 @@ def _seen(ellipse, points, chosen):
     return np.array([0.5 * full / SECTORS, min(longest, SECTORS) / SECTORS, math.sqrt(square / count)])
 
 
-@_compiled
+@compiled
 def direct_fits(points):
     out = np.full((points.shape[0], 5), np.nan)
     k = points.shape[1]
@@ -398,7 +427,7 @@ def direct_fits(points):
 BUCKETS = 256
 
 
-@_inlined
+@inlined
 def _quantile(values, share):
     """`statistics.quantile` of values (n,), which stay as they are: counted in buckets, then sorted in two."""
     n = values.size
@@ -435,12 +464,12 @@ def _quantile(values, share):
     return value + (at - low) * (some[int(low) - before + 1] - value)
 
 
-@_inlined
+@inlined
 def _median(values):
     return _quantile(values, 0.5)
 
 
-@_compiled
+@compiled
 def ridges(gx, gy, magnitude, covered, ellipse, half_band, floor):
     cx, cy, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
@@ -483,7 +512,7 @@ def ridges(gx, gy, magnitude, covered, ellipse, half_band, floor):
     return points, normals, widths, row[:found].copy(), column[:found].copy()
 
 
-@_inlined
+@inlined
 def _vertex(gx, gy, magnitude, y, x, point, normal):
     """Write the sub-pixel place of a ridge and its normal; returns the squared width of the profile."""
     level = abs(gx[y, x]) >= abs(gy[y, x])
@@ -501,13 +530,13 @@ def _vertex(gx, gy, magnitude, y, x, point, normal):
     return lean * lean / -bend
 
 
-@_inlined
+@inlined
 def _nearest(image, x, y):
     column = min(max(int(np.rint(x)), 0), image.shape[1] - 1)
     return image[min(max(int(np.rint(y)), 0), image.shape[0] - 1), column]
 
 
-@_compiled
+@compiled
 def on_the_dark_side(smooth, points, normals, depth, dark, bright):
     out = np.empty(points.shape[0], dtype=np.bool_)
     for i in range(out.size):
@@ -516,7 +545,7 @@ def on_the_dark_side(smooth, points, normals, depth, dark, bright):
     return out
 
 
-@_compiled
+@compiled
 def interior(crop, hidden, ellipse, end):
     cx, cy, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
@@ -552,7 +581,7 @@ def interior(crop, hidden, ellipse, end):
     return _median(ring[:n_ring]) - _median(core[:n_core]), n_core, n_ring, spread
 
 
-@_compiled
+@compiled
 def along(ellipse, points, others, linear, corner, patch, away, limits):
     cx, cy, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
@@ -589,7 +618,7 @@ def along(ellipse, points, others, linear, corner, patch, away, limits):
     return hollow, beyond, within
 
 
-@_compiled
+@compiled
 def ring_levels(small, blobs, noise, angles):
     n = blobs.shape[0]
     out = np.empty((n, 5))
@@ -616,13 +645,13 @@ def ring_levels(small, blobs, noise, angles):
     return out
 
 
-@_inlined
+@inlined
 def _same_blob(first, second):
     near = math.hypot(first[0] - second[0], first[1] - second[1]) < 0.35 * min(first[3], second[3])
     return near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65
 
 
-@_compiled
+@compiled
 def best_blobs(blobs, levels, noise):
     n = blobs.shape[0]
     score, kept, count = np.empty(n), np.empty(MOST_BLOBS, dtype=np.int64), 0
@@ -657,7 +686,7 @@ def best_blobs(blobs, levels, noise):
     return out
 
 
-@_inlined
+@inlined
 def _box(image, x, y):
     """Mean of the 3 x 3 pixels about a point."""
     height, width, total = image.shape[0], image.shape[1], 0.0
@@ -668,7 +697,7 @@ def _box(image, x, y):
     return total / 9.0
 
 
-@_compiled
+@compiled
 def levels_about(linear, ellipse, angles):
     x, y, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
@@ -683,48 +712,7 @@ def levels_about(linear, ellipse, angles):
     return float(np.median(within)), float(np.median(step))
 
 
-@_inlined
-def _profile(low, sigma, out):
-    """`windows.profile` of one pixel from `low` to `low` + 1 (from the centre): by the centre, value, by ln sigma."""
-    first, last = low / sigma, (low + 1.0) / sigma
-    tail_first, tail_last = math.exp(-0.5 * first * first), math.exp(-0.5 * last * last)
-    value = sigma * math.sqrt(0.5 * math.pi) * (math.erf(last * _ROOT_HALF) - math.erf(first * _ROOT_HALF))
-    out[0], out[1] = tail_first - tail_last, value
-    out[2] = value + sigma * (first * tail_first - last * tail_last)
-
-
-@_compiled
-def spot_rows(first, plane, centre, radius, theta, rest, blur_px):
-    n, size = theta.shape
-    out = np.empty((size + 1, rest.size))
-    for k in range(n):
-        half = math.ceil(radius[k] + 0.5)
-        across, along = np.empty((2 * half + 1, 3)), np.empty((2 * half + 1, 3))
-        x, y, height = theta[k, 0] - centre[k, 0], theta[k, 1] - centre[k, 1], math.exp(theta[k, 2])
-        wide, high = math.exp(theta[k, 3]), math.exp(theta[k, 4])
-        for j in range(2 * half + 1):
-            _profile(j - half - 0.5 - x, wide, across[j])
-            _profile(j - half - 0.5 - y, high, along[j])
-        for i in range(first[k], first[k + 1]):
-            dx, dy = plane[1, i], plane[2, i]
-            p, q = across[int(dx) + half], along[int(dy) + half]
-            light = height * p[1] * q[1]
-            out[0, i], out[1, i], out[2, i] = height * p[0] * q[1], height * p[1] * q[0], light
-            out[3, i], out[4, i] = height * p[2] * q[1], height * p[1] * q[2]
-            out[5, i], out[6, i], out[7, i] = 1.0, dx, dy
-            left = rest[i] - light - theta[k, 5] - theta[k, 6] * dx - theta[k, 7] * dy
-            if size > 8:
-                cos, sin = math.cos(theta[k, 9]), math.sin(theta[k, 9])
-                t = (dx * cos + dy * sin - theta[k, 10]) / blur_px
-                bell = theta[k, 8] * (_DENSITY / blur_px) * math.exp(-0.5 * t * t)
-                out[8, i] = 0.5 * math.erfc(-t * _ROOT_HALF)
-                out[9, i], out[10, i] = bell * (dy * cos - dx * sin), -bell
-                left -= theta[k, 8] * out[8, i]
-            out[size, i] = left
-    return out
-
-
-@_summing
+@summing
 def _add_products(rows, begin, end, out):
     """Add the products of rows (k, n), over the columns from `begin` to `end`, to the lower half of out (k, k)."""
     for j in range(rows.shape[0]):
@@ -735,44 +723,7 @@ def _add_products(rows, begin, end, out):
             out[j, m] += total
 
 
-@_compiled
-def products(first, rows):
-    n, size = first.size - 1, rows.shape[0]
-    out = np.zeros((n, size, size))
-    for k in range(n):
-        _add_products(rows, first[k], first[k + 1], out[k])
-        for j in range(size):
-            for m in range(j):
-                out[k, m, j] = out[k, j, m]
-    return out
-
-
-@_compiled
-def solved(gram, damping):
-    n, size = gram.shape[0], gram.shape[1] - 1
-    out, lower = np.empty((n, size)), np.empty((size, size))
-    for k in range(n):
-        for j in range(size):
-            for m in range(j + 1):
-                total = gram[k, j, m]
-                if j == m:
-                    total = total * (1.0 + damping[k]) + 1e-9
-                for i in range(m):
-                    total -= lower[j, i] * lower[m, i]
-                lower[j, m] = math.sqrt(max(total, 1e-300)) if j == m else total / lower[m, m]
-            total = gram[k, j, size]
-            for i in range(j):
-                total -= lower[j, i] * out[k, i]
-            out[k, j] = total / lower[j, j]
-        for j in range(size - 1, -1, -1):
-            total = out[k, j]
-            for i in range(j + 1, size):
-                total -= lower[i, j] * out[k, i]
-            out[k, j] = total / lower[j, j]
-    return out
-
-
-@_compiled
+@compiled
 def sectors_at(ellipse, x, y, steps):
     cx, cy, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
@@ -783,7 +734,7 @@ def sectors_at(ellipse, x, y, steps):
     return out
 
 
-@_inlined
+@inlined
 def _edge(distance, curvature, sigma, kurtosis):
     """`Profile.of` of one pixel."""
     z = distance / sigma
@@ -799,7 +750,7 @@ def _edge(distance, curvature, sigma, kurtosis):
     return edge, by_distance, by_sigma, tails, distance * step + sigma * density, step, density
 
 
-@_inlined
+@inlined
 def _outer_level(outer, cos_u, sin_u, basis):
     """The outer level, with the harmonics written to `basis`."""
     basis[0] = 1.0
@@ -811,10 +762,29 @@ def _outer_level(outer, cos_u, sin_u, basis):
     return level
 
 
+@compiled
+def levels(numbers, displaced, x, y):
+    cx, cy, a, b, angle, sigma, inner_dn, slope, kurtosis, lean_x, lean_y = numbers[:11]
+    cos, sin = math.cos(angle), math.sin(angle)
+    outer, out = numbers[11:], np.empty(x.size)
+    basis, n = np.empty(outer.size), displaced.size
+    for i in range(x.size):
+        distance, _, _, _, _, curvature, cu, su = _place(cx, cy, a, b, cos, sin, x[i], y[i], 3)
+        if n:
+            at = (math.atan2(su, cu) / (2.0 * math.pi) + 0.5) * n - 0.5
+            low = math.floor(at)
+            first = displaced[int(low) % n]
+            distance += first + (at - low) * (displaced[int(low + 1.0) % n] - first)
+        edge, _, _, _, ramp, _, _ = _edge(distance, curvature, sigma, kurtosis)
+        inner = inner_dn + lean_x * cu + lean_y * su
+        out[i] = inner + (_outer_level(outer, cu, su, basis) - inner) * edge + slope * ramp
+    return out
+
+
 BLOCK = 128  # pixels whose rows stay in the first-level cache
 
 
-@_compiled
+@compiled
 def pixel_sums(x, y, level, index, numbers, displaced):
     cx, cy, a, b, angle, sigma, inner_dn, slope, kurtosis, lean_x, lean_y = numbers[:11]
     cos, sin = math.cos(angle), math.sin(angle)
@@ -863,7 +833,7 @@ def pixel_sums(x, y, level, index, numbers, displaced):
     return matrix, cost, pull, across, along, square
 
 
-@_summing
+@summing
 def _add_weighted(rows, begin, end, weight, k, out):
     """Add the weighted sums of rows (p, n), over the columns from `begin` to `end`, to column k of out (p, q)."""
     for j in range(rows.shape[0]):
@@ -873,7 +843,7 @@ def _add_weighted(rows, begin, end, weight, k, out):
         out[j, k] += total
 
 
-@_compiled
+@compiled
 def displacements(x, y, level, use, numbers, displaced):
     cx, cy, a, b, angle, sigma, inner_dn, slope, kurtosis, lean_x, lean_y = numbers[:11]
     cos, sin = math.cos(angle), math.sin(angle)

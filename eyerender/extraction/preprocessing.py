@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..arrays import Singles
 from ..errors import InputError
 from .buffers import image_buffer
+from .compiled import twin
 from .statistics import median, quantile
 
 Image = Singles
@@ -115,7 +116,11 @@ def _from_integers(array: NDArray[np.generic], bit_depth: int | None, gamma: flo
         raise InputError(f"holds levels {low} to {high}, outside the {bits} bits stated", path="bit_depth")
     if gamma == 1.0:
         out = image_buffer(array.shape)
-        return np.multiply(array, np.float32(DN / full), out=out, dtype=np.float32), DN, DN / full
+        if full == DN:
+            np.copyto(out, array)
+        else:
+            np.multiply(array, np.float32(DN / full), out=out, dtype=np.float32)
+        return out, DN, DN / full
     table = (DN * (np.arange(full + 1) / full) ** gamma).astype(np.float32)
     linear = table[array.astype(np.intp, copy=False)]
     # This is the decoded step at the image's own middle level.
@@ -151,16 +156,21 @@ def estimate_noise(linear: Image) -> float:
     The difference removes any plane, and the median ignores edges. Source: Immerkaer (1996), with a median for the
     mean.
     """
-    step = max(1, int(np.sqrt(linear.size / 20_000)))
-    a, b = linear[:-1:step, :-1:step], linear[:-1:step, 1::step]
-    c, d = linear[1::step, :-1:step], linear[1::step, 1::step]
-    difference = np.abs(a - b - c + d).ravel()
+    difference = _differences(linear, max(1, int(np.sqrt(linear.size / 20_000))))
     # Flat areas that clipping made constant contain no information on the noise.
     moving = difference[difference > 0.0]
     if moving.size < 0.05 * difference.size:
         return 0.0
     source = difference if moving.size > 0.6 * difference.size else moving
     return 0.7413 * median(source)
+
+
+@twin
+def _differences(linear: Image, step: int) -> Image:
+    """|I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1)| of every `step`-th pixel of every `step`-th row, in one row."""
+    a, b = linear[:-1:step, :-1:step], linear[:-1:step, 1::step]
+    c, d = linear[1::step, :-1:step], linear[1::step, 1::step]
+    return as_image(np.abs(a - b - c + d).ravel())
 
 
 def invert(prepared: Prepared) -> Prepared:

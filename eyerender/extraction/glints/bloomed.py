@@ -51,7 +51,10 @@ def bloomed_glints(prepared: Prepared, ellipse: Ellipse, step_dn: float) -> list
     if crop.size == 0:
         return []
     saturated = min(prepared.clip_dn, NEARLY * float(crop.max()))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((crop >= saturated).astype(np.uint8), connectivity=8)
+    bright = (crop >= saturated).view(np.uint8)
+    if np.count_nonzero(bright) < LEAST_PX:
+        return []
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
     out = []
     for k in range(1, count):
         left, top, w, h, area = stats[k].tolist()

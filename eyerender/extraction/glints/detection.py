@@ -10,6 +10,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices, Singles
 from ...geometry.ellipse import Ellipse
+from ..compiled import twin
 from ..preprocessing import Image, Prepared, as_image
 from ..settings import ExtractionSettings
 from .prescreening import bell_shaped
@@ -110,6 +111,7 @@ def _sampled(smooth: Image, xy: Floats, x: Floats, y: Floats) -> Singles:
     return np.asarray(np.take(smooth, row * width + column), dtype=np.float32)
 
 
+@twin
 def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
     """Height (n,) of each peak above the brightest tenth of a ring around it. Pixels of other spots are left out.
 
@@ -146,6 +148,7 @@ def optics_sigma(blur_px: float) -> float:
     return math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0))
 
 
+@twin
 def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
     """Whether the level falls by at least a third of the height in 9 of 12 directions, 2.5 sigma from the peak.
 
@@ -157,7 +160,8 @@ def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
     return np.asarray(fallen.sum(axis=1) >= 9)
 
 
-def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> list[int]:
+@twin
+def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> Indices:
     """Indices of the maxima xy (n, 2) that are spots of their own, in the given order.
 
     Two maxima count as one spot unless the level between them falls by `dip` below the lower one, or they are farther
@@ -177,7 +181,7 @@ def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> list[int]:
     for i in range(xy.shape[0]):
         if not any(k in kept for k in rival.get(i, ())):
             kept[i] = None
-    return list(kept)
+    return np.array(list(kept), dtype=np.intp)
 
 
 def _no_spots() -> Spots:
@@ -191,6 +195,7 @@ def _opening(half: Image, size: int) -> Image:
     return as_image(cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)))
 
 
+@twin
 def _maxima(smooth: Image, half: Image, opened: Image, threshold: float) -> tuple[Indices, Singles]:
     """Find local maxima that exceed the opened level by the threshold: flat indices (n,), and heights above it (n,)."""
     blocks = np.flatnonzero(half - opened > LEAST_OF_BLOCK * threshold)
@@ -207,6 +212,7 @@ def _maxima(smooth: Image, half: Image, opened: Image, threshold: float) -> tupl
     return flat[high], (height - level)[high]
 
 
+@twin
 def _widths(smooth: Image, opened: Image, xy: Floats, height: Floats, size: int) -> Floats:
     """Estimate sigma = sqrt(area above half height / (2 pi ln 2)) in a window of the opening's size."""
     step, (rows, columns) = np.arange(-(size // 2), size // 2 + 1), smooth.shape

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import ndtr
 
-from ...arrays import Bools, Floats
+from ...arrays import Bools, Floats, Indices
+from ..compiled import twin
 from ..preprocessing import Image
 from .fits import SpotFit, no_spots
 from .gaussian_model import PARAMETERS, SAME_LIGHT, Descent, Limits, descend, lost, prior, promising
@@ -209,15 +211,19 @@ def _moments(pixels: SpotPixels, rest: Floats, level: Floats, which: Bools, sigm
         return out
     if index.size < level.size:
         rest, level, pixels = rest[pixels.rows(index)], level[index], pixels.taken(index)
-    patch = rest - level[pixels.spot]
-    weight = np.maximum(patch - 0.35 * pixels.most(patch)[pixels.spot], 0.0)
-    dx, dy = pixels.dx, pixels.dy
-    total = np.maximum(pixels.total(weight), 1e-12)
-    wx, wy = weight * dx, weight * dy
-    x, y = pixels.total(wx) / total, pixels.total(wy) / total
-    xx, xy, yy = (pixels.total(value) / total for value in (wx * dx, wx * dy, wy * dy))
-    own = np.empty((total.size, 2, 2))
-    own[:, 0, 0], own[:, 1, 1] = xx - x * x, yy - y * y
-    own[:, 0, 1] = own[:, 1, 0] = xy - x * y
-    out[index] = own
+    out[index] = _bright_moments(pixels.first, pixels.plane, rest - level[pixels.spot])
+    return out
+
+
+@twin
+def _bright_moments(first: Indices, plane: Floats, patch: Floats) -> Floats:
+    """Second moments (n, 2, 2) of the part of each patch above a third of its highest level (at least 0)."""
+    out = np.empty((first.size - 1, 2, 2))
+    for k, (begin, end) in enumerate(pairwise(first.tolist())):
+        dx, dy = plane[1:, begin:end]
+        weight = np.maximum(patch[begin:end] - 0.35 * max(float(patch[begin:end].max(initial=0.0)), 0.0), 0.0)
+        weight /= max(float(weight.sum()), 1e-12)
+        x, y = weight @ dx, weight @ dy
+        out[k, 0, 0], out[k, 1, 1] = weight @ (dx * dx) - x * x, weight @ (dy * dy) - y * y
+        out[k, 0, 1] = out[k, 1, 0] = weight @ (dx * dy) - x * y
     return out

@@ -17,7 +17,7 @@ from scipy.special import ndtr
 
 from ...arrays import Bools, Floats, Indices
 from ..compiled import twin
-from .windows import Grid, Others, SpotPixels
+from .windows import Grid, Others, SpotPixels, Windows
 
 PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; with an edge also h, p, o
 LOST_PX = 12.0  # a spot that becomes wider or moves farther is not a glint
@@ -35,6 +35,8 @@ _FREE = np.inf
 _LEAST = np.array([-_FREE, -_FREE, -5.0, math.log(0.2), math.log(0.2), *[-_FREE] * 6])
 _MOST = np.array([_FREE, _FREE, 15.0, math.log(30.0), math.log(30.0), *[_FREE] * 6])
 _STRIDE = np.array([1.5, 1.5, 0.7, 0.7, 0.7, _FREE, _FREE, _FREE, _FREE, 0.5, 1.5])  # largest step of each parameter
+_BOUNDS = {edge: np.stack([_LEAST, _MOST, _STRIDE])[:, : WITH_EDGE if edge else PARAMETERS] for edge in (False, True)}
+_ALONE = np.zeros((0, 2), dtype=np.intp)
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 
@@ -53,7 +55,7 @@ class Limits:
     slope_dn: float
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Descent:
     """Result of a descent.
 
@@ -129,7 +131,6 @@ def _spot_rows(
     return out
 
 
-@twin
 def _products(first: Indices, rows: Floats) -> Floats:
     """Products (n, K + 1, K + 1) of rows (K + 1, P), summed over the pixels first[i] to first[i + 1] of each spot."""
     out = np.empty((first.size - 1, rows.shape[0], rows.shape[0]))
@@ -138,7 +139,6 @@ def _products(first: Indices, rows: Floats) -> Floats:
     return out
 
 
-@twin
 def _solved(gram: Floats, damping: Floats) -> Floats:
     """Damped steps (n, K) of the normal equations gram (n, K + 1, K + 1), whose last column is the right side."""
     k = gram.shape[1] - 1
@@ -163,20 +163,22 @@ def prior(limits: Limits, edge: bool) -> Floats:
     return out if edge else out[:PARAMETERS, :PARAMETERS]
 
 
-def _gram(pixels: SpotPixels, rows: Floats, theta: Floats, noise: float, penalty: Floats) -> tuple[Floats, Floats]:
+def _gram(
+    first: Indices, clip: Bools, rows: Floats, theta: Floats, noise: float, penalty: Floats
+) -> tuple[Floats, Floats]:
     """Products of the `slopes`, summed over each spot's pixels, with the priors, in units of the noise.
 
     Returns:
         (n, K + 1, K + 1) products, and (n,) number of pixels that count. A clipped pixel does not count where the model
         is brighter than the clip level.
     """
-    used = pixels.count
-    if pixels.clipped:
-        idle = pixels.clip & (rows[-1] <= 0.0)
+    used = np.diff(first).astype(np.float64)
+    if clip.size:
+        idle = clip & (rows[-1] <= 0.0)
         rows *= ~idle
-        used = used - pixels.total(idle)
+        used -= np.diff(np.concatenate([[0], np.cumsum(idle)])[first])
     k = theta.shape[1]
-    out = _products(pixels.first, rows)
+    out = _products(first, rows)
     out *= 1.0 / noise**2
     pull = theta @ penalty
     out[:, :k, :k] += penalty
@@ -186,11 +188,12 @@ def _gram(pixels: SpotPixels, rows: Floats, theta: Floats, noise: float, penalty
     return out, used
 
 
-def _dimmed(pixels: SpotPixels, rows: Floats, gram: Floats, light: Floats, noise: float) -> None:
+def _dimmed(first: Indices, rows: Floats, gram: Floats, light: Floats, noise: float) -> None:
     """Subtract more light (P,) of other spots from the residual; changes the products in place."""
     k = gram.shape[1] - 1
-    for product, row, part in zip(gram, pixels.parts(rows), pixels.parts(light), strict=True):
-        part = part * row[5]  # 0 in pixels that do not count
+    for product, (begin, end) in zip(gram, pairwise(first.tolist()), strict=True):
+        row = rows[:, begin:end]
+        part = light[begin:end] * row[5]  # 0 in pixels that do not count
         taken = row @ part
         product[:, k] -= taken * (1.0 / noise**2)
         product[k, k] += (part @ part - taken[k]) * (1.0 / noise**2)
@@ -218,15 +221,46 @@ def descend(
         blur_px: blur of the edges, if the spots have edges of their own.
         steps: how many at most.
     """
-    noise, penalty, k = limits.noise_dn, prior(limits, blur_px is not None), theta.shape[1]
+    edge = blur_px is not None
+    pairs = _ALONE if others is None else others.pairs
+    clip = pixels.clip if pixels.clipped else pixels.clip[:0]
+    windows = (pixels.first, pixels.plane, pixels.centre, pixels.radius)
+    about = (limits.noise_dn, prior(limits, edge), 1.0 if blur_px is None else blur_px, steps, _BOUNDS[edge])
+    return Descent(*_descended(windows, theta, rest, clip, pairs, *about))
+
+
+@twin
+def _descended(
+    windows: Windows, theta: Floats, rest: Floats, clip: Bools, pairs: Indices,
+    noise: float, penalty: Floats, blur_px: float, steps: int, bounds: Floats,
+) -> tuple[Floats, Floats, Floats, Bools, Floats, Bools]:  # fmt: skip
+    """Take the steps of `descend`.
+
+    Args:
+        windows: first, plane, centre and radius of `SpotPixels`.
+        theta: (n, K) start.
+        rest: (P,) image minus what is not fitted.
+        clip: (P,) clipped pixels; none if no pixel is.
+        pairs: (m, 2) the spots of a window, and those that shine into it.
+        noise: standard deviation of a pixel's noise, DN.
+        penalty: (K, K) normal matrix of the priors.
+        blur_px: blur of the edges.
+        steps: how many at most.
+        bounds: (3, K) least and most of the parameters, and their largest steps.
+
+    Returns:
+        The parts of `Descent`.
+    """
+    first, own = windows[0], np.arange(theta.shape[0]).repeat(np.diff(windows[0]))
+    others, k = Others.shining(windows, pairs) if pairs.size else None, theta.shape[1]
     theta, start, middle, cost = theta.copy(), theta[:, :2], theta[:, :2], np.full(theta.shape[0], np.inf)
-    rows = slopes(pixels, theta, rest, blur_px)
-    gram, used = _gram(pixels, rows, theta, noise, penalty)
+    rows = _spot_rows(*windows, theta, rest, blur_px)
+    gram, used = _gram(first, clip, rows, theta, noise, penalty)
     damping, over = np.full(theta.shape[0], 1e-2), np.zeros(theta.shape[0], dtype=bool)
     held = np.zeros(0) if others is None else others.light(theta, rest.size)
     stalled = over.copy()
     enough = SMALL_GAIN[0] if others is None else SMALL_GAIN[1]
-    least, most, stride = _LEAST[:k], _MOST[:k], _STRIDE[:k]
+    least, most, stride = bounds
     for turn in range(steps):
         step = _solved(gram, damping)
         gain = (step * gram[:, :k, k]).sum(axis=1)
@@ -239,8 +273,8 @@ def descend(
         if (over | stalled if turn >= STEPS // 2 else over).all():
             theta = np.where((np.abs(step) < 1.0).all(axis=1)[:, None], trial, theta)
             break
-        rows = slopes(pixels, trial, rest, blur_px)
-        new, new_used = _gram(pixels, rows, trial, noise, penalty)
+        rows = _spot_rows(*windows, trial, rest, blur_px)
+        new, new_used = _gram(first, clip, rows, trial, noise, penalty)
         better = new[:, k, k] <= gram[:, k, k] * (1.0 + 1e-12)
         stalled = better & (new[:, k, k] > STALLED * gram[:, k, k])
         if better.all():
@@ -254,10 +288,10 @@ def descend(
         if others is not None and turn % 2 == 1:
             change = others.light(theta, rest.size) - held
             if not better.all():
-                change *= better[pixels.spot]
+                change *= better[own]
             held, rest = held + change, rest - change
-            _dimmed(pixels, rows, gram, change, noise)
+            _dimmed(first, rows, gram, change, noise)
         if turn + 1 == steps // 2:
             middle, cost = theta[:, :2].copy(), gram[:, k, k].copy()
     moved = np.abs(theta[:, :2] - middle).max(axis=1)
-    return Descent(theta=theta, gram=gram, used=used, settled=over, moved=moved, falling=gram[:, k, k] < 0.5 * cost)
+    return theta, gram, used, over, moved, gram[:, k, k] < 0.5 * cost

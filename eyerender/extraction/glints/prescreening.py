@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from ...arrays import Bools, Floats, Indices, Singles
+from ..compiled import twin
 from ..preprocessing import DN, Image
 
 # Largest misfit as a share of the height and of the scatter; smallest fitted peak as a share of the detected height.
@@ -83,6 +84,14 @@ def bell_shaped(
         which: (n,) spots to judge; None for all. The others only occupy their pixels.
     """
     index = np.arange(width.size) if which is None else np.flatnonzero(which)
+    return _bells(linear, xy, width, height, noise_dn, clip_dn, index)
+
+
+@twin
+def _bells(
+    linear: Image, xy: Floats, width: Floats, height: Floats, noise_dn: float, clip_dn: float, index: Indices
+) -> Bools:
+    """Judge the spots with these indices (m,) (see `bell_shaped`)."""
     out = np.ones(index.size, dtype=bool)
     sigma, tall = np.maximum(width[index], NARROWEST_PX), height[index]  # a narrower one is mostly its pixel
     reach = 2.2 * sigma + 1.0

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from ...arrays import Bools, Floats, Indices
+from ..compiled import twin
 from ..preprocessing import Image
 
+Windows = tuple[Indices, Floats, Floats, Floats]  # first, plane, centre and radius of SpotPixels
 _T = TypeVar("_T", bound=np.generic)
 
 _ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)
@@ -137,24 +139,11 @@ def cut(
         width: (n,) their sigma.
         clip_dn: level at which the sensor clips.
     """
-    rows, columns = linear.shape
     centre, radius = np.rint(start), np.minimum(window_radius(width), LARGEST_PX)
-    half = math.ceil(float(radius.max()) + 0.5)
-    step = np.arange(-half, half + 1.0)
-    off = (centre - start)[:, :, None] + step
-    off *= off
-    inside = off[:, 1, :, None] + off[:, 0, None, :] <= (radius**2)[:, None, None]
-    low, high = centre.min(axis=0) - half, centre.max(axis=0) + half
-    if min(low) < 0.0 or high[0] >= columns or high[1] >= rows:
-        x, y = centre[:, :1] + step, centre[:, 1:] + step
-        inside &= ((x >= 0) & (x < columns))[:, None, :] & ((y >= 0) & (y < rows))[:, :, None]
-    spot, row, column = np.nonzero(inside)
-    dx, dy = step[column], step[row]
-    at_x, at_y = centre[spot, 0] + dx, centre[spot, 1] + dy
-    data = np.take(linear, (at_y * columns + at_x).astype(np.intp)).astype(np.float64)
-    level = known(np.concatenate([at_x, centre[:, 0]]), np.concatenate([at_y, centre[:, 1]]))
-    first, clip = _starts(np.bincount(spot, minlength=width.size)), data >= clip_dn
-    plane = np.stack([np.ones_like(dx), dx, dy])
+    first, spot, plane, data = _windows(linear, start, centre, radius)
+    at = np.concatenate([centre[spot] + plane[1:].T, centre])
+    level = known(at[:, 0], at[:, 1])
+    clip = data >= clip_dn
     return SpotPixels(
         centre=centre,
         radius=radius,
@@ -167,6 +156,29 @@ def cut(
         clip=clip,
         clipped=bool(clip.any()),
     )
+
+
+@twin
+def _windows(linear: Image, start: Floats, centre: Floats, radius: Floats) -> tuple[Indices, Indices, Floats, Floats]:
+    """Find the pixels (P,) within `radius` (n,) of `start` (n, 2).
+
+    Returns:
+        Where each spot's pixels begin (n + 1,), the spot of each pixel (P,), 1 and the offset from the spot's middle
+        pixel `centre` (3, P), and the levels (P,).
+    """
+    rows, columns = linear.shape
+    half = math.ceil(float(radius.max()) + 0.5)
+    step = np.arange(-half, half + 1.0)
+    off = (centre - start)[:, :, None] + step
+    off *= off
+    inside = off[:, 1, :, None] + off[:, 0, None, :] <= (radius**2)[:, None, None]
+    x, y = centre[:, :1] + step, centre[:, 1:] + step
+    inside &= ((x >= 0) & (x < columns))[:, None, :] & ((y >= 0) & (y < rows))[:, :, None]
+    spot, row, column = np.nonzero(inside)
+    dx, dy = step[column], step[row]
+    data = np.take(linear, ((centre[spot, 1] + dy) * columns + centre[spot, 0] + dx).astype(np.intp))
+    first = _starts(np.bincount(spot, minlength=radius.size))
+    return first, spot, np.stack([np.ones_like(dx), dx, dy]), data.astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,13 +256,15 @@ class Others:
     """Pairs of spots in which one spot's light reaches into the other's window.
 
     Attributes:
-        by: (m,) the spot that shines.
+        pairs: (m, 2) the spot of a window, and the one that shines into it.
+        by: (m,) the second of them.
         rows: (Q,) the pixels that it reaches, pair after pair.
         pair: (Q,) the pair of each of these pixels.
         grid: the windows of the pairs.
         centre: (m, 2) the middles of these windows.
     """
 
+    pairs: Indices
     by: Indices
     rows: Indices
     pair: Indices
@@ -274,10 +288,18 @@ class Others:
         to, by = to[shines], by[shines]
         if to.size == 0:
             return None
-        count = pixels.first[to + 1] - pixels.first[to]
-        rows, pair = _ranges(pixels.first[to], count), np.arange(to.size).repeat(count)
-        grid = Grid.of(pixels.radius[to], pair, pixels.dx[rows], pixels.dy[rows])
-        return Others(by, rows, pair, grid, pixels.centre[to])
+        windows = (pixels.first, pixels.plane, pixels.centre, pixels.radius)
+        return Others.shining(windows, np.stack([to, by], axis=1))
+
+    @staticmethod
+    def shining(windows: Windows, pairs: Indices) -> Others:
+        """Make the pairs (m, 2) of a window and the spot that shines into it."""
+        first, plane, centre, radius = windows
+        to, by = pairs.T
+        count = first[to + 1] - first[to]
+        rows, pair = _ranges(first[to], count), np.arange(to.size).repeat(count)
+        grid = Grid.of(radius[to], pair, plane[1, rows], plane[2, rows])
+        return Others(pairs, by, rows, pair, grid, centre[to])
 
     def light(self, theta: Floats, pixels: int, shining: Bools | None = None) -> Floats:
         """Light (pixels,) of other spots, all or those `shining` (n,), in every spot's pixels."""

@@ -118,7 +118,7 @@ def _random_fits(edges: EdgePoints, candidate: Candidate) -> Floats:
     offset = points - candidate.ellipse.centre_px
     bearing = np.arctan2(offset[:, 1], offset[:, 0])
     sector = ((bearing / (2.0 * np.pi) + 0.5) * PIECES).astype(np.intp) % PIECES
-    _, piece = np.unique(edges.arc * PIECES + sector, return_inverse=True)
+    _, piece = np.unique(edges.arcs() * PIECES + sector, return_inverse=True)
     sizes = np.bincount(piece)
     usable = np.nonzero(sizes >= 4)[0]
     if usable.size < 3:

@@ -92,14 +92,7 @@ class EdgeSums:
     @staticmethod
     def of(ellipse: Ellipse, points: Floats) -> EdgeSums:
         """Sum over points (n, 2)."""
-        about = (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
-        return EdgeSums(*_edge_sums(about, points, GROUPS))
-
-    @property
-    def inverse(self) -> Floats:
-        """Inverse (5, 5) of the matrix, which a ridge keeps regular."""
-        matrix = self.matrix
-        return np.asarray(np.linalg.inv(matrix + 1e-9 * np.trace(matrix) * np.eye(SHAPE)), dtype=np.float64)
+        return EdgeSums(*_edge_sums(_numbers(ellipse), points, GROUPS))
 
 
 @twin
@@ -121,11 +114,17 @@ def edge_covariance(sums: EdgeSums, residual_px: float) -> Floats:
 
     Neighbouring edge points share noise (through the filter) and texture. `sector_excess` accounts for that.
     """
-    inverse = sums.inverse
+    return _of_edges(sums.matrix, sums.scores, sums.count, residual_px)
+
+
+@twin
+def _of_edges(matrix: Floats, scores: Floats, count: Indices, residual_px: float) -> Floats:
+    """Covariance by the sums of `EdgeSums`."""
+    inverse = _inverse(matrix)
     plain = inverse * max(residual_px, 1e-4) ** 2
     # n / (n - 5) for the fitted parameters.
-    groups = max(int(np.count_nonzero(sums.count)), SHAPE + 1)
-    excess = sector_excess(plain, inverse, sums.scores) * groups / (groups - SHAPE)
+    groups = max(int(np.count_nonzero(count)), SHAPE + 1)
+    excess = sector_excess(plain, inverse, scores) * groups / (groups - SHAPE)
     return np.asarray(plain * max(excess, 1.0) * SELECTION)
 
 
@@ -188,18 +187,33 @@ def leverage(ellipse: Ellipse, sums: EdgeSums) -> float:
     that hold points were displaced independently by 1 px. A real boundary is uneven, so the hidden
     part of an outline is the more uncertain the larger this is.
     """
-    moved = sums.inverse @ sums.slopes
-    outline = distance_slopes(ellipse, Place.middles(ellipse, 32))
-    return math.sqrt(max(float(np.sum(outline * ((moved @ moved.T) @ outline))) / outline.shape[1], 1e-6))
+    moved = _inverse(sums.matrix) @ sums.slopes
+    return max(_along_outline(_numbers(ellipse), moved @ moved.T), 1e-3)
 
 
 def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
     """Root mean square, over the outline, of the boundary's standard deviation along its normal, px."""
-    slopes = distance_slopes(ellipse, Place.middles(ellipse, 32))
-    a, b = ellipse.semi_axes_px.tolist()
-    # Use the angle in place of the off-diagonal term of the shape matrix: d ab = (a - b) d angle.
-    slopes[4] *= a - b
-    return math.sqrt(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1])
+    # Use the off-diagonal term of the shape matrix in place of the angle: d ab = (a - b) d angle.
+    scale = np.ones(SHAPE)
+    scale[4] = ellipse.semi_axes_px[0] - ellipse.semi_axes_px[1]
+    return _along_outline(_numbers(ellipse), covariance * (scale[:, None] * scale))
+
+
+@twin
+def _along_outline(ellipse: tuple[float, ...], covariance: Floats) -> float:
+    """Root mean square of the boundary's standard deviation, by the covariance (5, 5) of centre and shape matrix."""
+    about = Ellipse(np.array(ellipse[:2]), np.array(ellipse[2:4]), ellipse[4])
+    slopes = distance_slopes(about, Place.middles(about, 32))
+    return math.sqrt(max(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1], 0.0))
+
+
+def _numbers(ellipse: Ellipse) -> tuple[float, ...]:
+    return (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
+
+
+def _inverse(matrix: Floats) -> Floats:
+    """Inverse (5, 5) of the points' matrix, which a ridge keeps regular."""
+    return np.asarray(np.linalg.inv(matrix + 1e-9 * np.trace(matrix) * np.eye(SHAPE)), dtype=np.float64)
 
 
 def to_axes(covariance: Floats, ellipse: Ellipse) -> Floats:

@@ -86,10 +86,8 @@ class EdgeModel:
 
     def level(self, x: Floats, y: Floats) -> Floats:
         """Expected grey level at pixels (x, y) of any shape."""
-        place = Place.of(self.ellipse, x.ravel(), y.ravel())
-        if self.displaced is not None:
-            place = replace(place, distance=place.distance + _between(self.displaced, place))
-        return self.level_and_slope(place)[0].reshape(x.shape)
+        displaced = _EXACT if self.displaced is None else self.displaced
+        return _levels(self.numbers(), displaced, x.ravel(), y.ravel()).reshape(x.shape)
 
     def level_and_slope(self, place: Place) -> tuple[Floats, Floats]:
         """Expected grey level (n,) near the boundary of an exact ellipse, and its derivative by distance, DN per px."""
@@ -102,6 +100,19 @@ class EdgeModel:
     def inner(self, place: Place) -> Floats:
         """Inner level (n,) at places about the boundary."""
         return self.inner_dn + self.lean[0] * place.cos_u + self.lean[1] * place.sin_u
+
+
+_EXACT = np.zeros(0)
+
+
+@twin
+def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
+    """Levels (n,) of the model of these numbers; `displaced` is empty for an exact ellipse."""
+    model = EdgeModel.of(numbers)
+    place = Place.of(model.ellipse, x, y)
+    if displaced.size:
+        place = replace(place, distance=place.distance + _between(displaced, place))
+    return model.level_and_slope(place)[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,7 +24,8 @@ class EdgePoints:
         points_px: (n, 2) ridge of the gradient, not corrected for curvature.
         normals: (n, 2) unit normals, from dark to bright.
         strength: (n,) gradient, DN per px.
-        arc: (n,) label of the connected piece that each point lies on.
+        ridge: (m, 2) row and column of all pixels of ridges, before the tests.
+        kept: (m,) which of them became edge points.
         sigma_px: width of the whole smoothing (optics, pixel and filter), measured across the edge.
         filter_px: sigma of the filter alone.
     """
@@ -32,9 +33,18 @@ class EdgePoints:
     points_px: Floats
     normals: Floats
     strength: Floats
-    arc: Indices
+    ridge: Indices
+    kept: Bools
     sigma_px: float
     filter_px: float
+
+    def arcs(self) -> Indices:
+        """Label (n,) of the connected piece that each point lies on."""
+        row, column = (self.ridge - self.ridge.min(axis=0)).T
+        mask = np.zeros((row.max() + 1, column.max() + 1), np.uint8)
+        mask[row, column] = 1
+        _, labels = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
+        return np.asarray(labels[row, column][self.kept], dtype=np.intp)
 
 
 def find_edges(
@@ -82,7 +92,6 @@ def find_edges(
     noise_smooth = noise_dn / (2.0 * math.sqrt(math.pi) * max(0.7, 0.7 * sigma))
     dark = candidate.inside_dn + max(0.5 * candidate.step_dn, 4.0 * noise_smooth)
     keep = _on_the_dark_side(smooth, points, normals, depth, dark, bright_dn)
-    arc = _arcs(crop.shape, row, column)
     spread = sigma * 1.1
     if keep.sum() >= 8:
         spread = math.sqrt(median(widths[keep]))
@@ -90,7 +99,8 @@ def find_edges(
         points[keep] + np.array([x0, y0]),
         normals[keep],
         magnitude[row, column][keep].astype(np.float64),
-        arc[keep],
+        np.stack([row, column], axis=-1),
+        keep,
         float(np.clip(spread, sigma, 8.0)),
         sigma,
     )
@@ -189,10 +199,3 @@ def _nearest(image: Image, points: Floats) -> Image:
     column = np.clip(np.rint(points[:, 0]).astype(np.intp), 0, image.shape[1] - 1)
     row = np.clip(np.rint(points[:, 1]).astype(np.intp), 0, image.shape[0] - 1)
     return image[row, column]
-
-
-def _arcs(shape: tuple[int, ...], row: Indices, column: Indices) -> Indices:
-    mask = np.zeros(shape[:2], np.uint8)
-    mask[row, column] = 1
-    _, labels = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
-    return labels[row, column].astype(np.intp)

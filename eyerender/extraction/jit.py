@@ -1,0 +1,40 @@
+"""How the compiled functions are compiled. Numba keeps the machine code in $XDG_CACHE_HOME/eyerender/kernels.
+
+Numba compiles a function again when its own file changed, but not when another file did from which it calls a
+function. So compiled functions call those of their own file only.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from numba import njit
+from numba.core import config as numba_config
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+config: Any = numba_config  # it makes its attributes at run time
+
+
+def compiled(function: Function) -> Function:
+    """Compile at the first call; the machine code is kept on disk if a folder there can be written."""
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eyerender" / "kernels")
+    try:
+        return cast(Function, njit(cache=True, nogil=True, error_model="numpy")(function))
+    except (RuntimeError, OSError):  # numba found no folder to write to
+        return cast(Function, njit(nogil=True, error_model="numpy")(function))
+    finally:
+        config.CACHE_DIR = before
+
+
+def summing(function: Function) -> Function:
+    """Compile a helper whose sums may be taken in any order, so that they use vector instructions."""
+    return cast(Function, njit(error_model="numpy", fastmath={"reassoc", "contract"})(function))
+
+
+def inlined(function: Function) -> Function:
+    """Compile a helper as part of what calls it."""
+    return cast(Function, njit(inline="never", error_model="numpy")(function))
