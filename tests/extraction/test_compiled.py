@@ -11,7 +11,7 @@ import make_ideal_images as ideal
 from eyerender.extraction import compiled, extract
 from eyerender.extraction.compiled import TWINS, kernel
 
-CONDITIONS = ("eight-glints", "lid", "head-mounted")
+CONDITIONS = ("eight-glints", "lid", "jpeg")
 
 
 @pytest.fixture
