@@ -165,7 +165,7 @@ class _Places:
 class TissueLight:
     """Light of the lamps on skin and globe, each after its way through the tissue."""
 
-    def __init__(self, skin: tuple[mi.Float, mi.Float], globe: tuple[Pyramid, mi.Float], values: Values) -> None:
+    def __init__(self, skin: tuple[mi.Float, mi.Float], globe: tuple[mi.Float, mi.Float], values: Values) -> None:
         """Take light of cells, and the shares of each lamp that they see, on skin and globe."""
         self._skin, self._globe, self._values = skin, globe, values
 
@@ -179,7 +179,10 @@ class TissueLight:
 
     def on_globe(self, x: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
-        return self._globe[0].at(*self._place(x), 0)
+        row, column = self._place(x)
+        u = dr.clip(column, 0, _SIDE - 1.001)
+        j = mi.UInt32(u)
+        return _between(mi.Float, self._globe[0], row, u - mi.Float(j), (j, j + 1), (_SIDE, _SIDE))
 
     def globe_sees(self, lamp: mi.UInt32, x: mi.Vector3f) -> mi.Float:
         """Share of a lamp that points of the globe (eye frame) see."""
@@ -306,8 +309,14 @@ class _Maker:
 
     def globe(self, grid: GlobeGrid, sheet: mi.Float, length_mm: float, loss_per_mm: float) -> tuple[Pyramid, mi.Float]:
         """Light on the globe between the lids after its way through the sclera, and how much of each lamp cells see."""
+        # What comes through a lid varies slowly, so it is found for two by two cells.
+        half, row, column = _SIDE // 2, *np.divmod(grid.under, _SIDE)
+        coarse = row // 2 * half + column // 2
+        wanted = np.flatnonzero(np.bincount(coarse, minlength=half * half))
+        under = np.zeros(half * half, np.float32)
+        under[wanted] = self._through_lids(_numbers(wanted), sheet, loss_per_mm).numpy()
         cells = np.zeros(_SIDE * _SIDE, np.float32)
-        cells[grid.under] = self._through_lids(_numbers(grid.under), sheet, loss_per_mm).numpy()
+        cells[grid.under] = under[coarse]
         lit, seen = self._on_globe(_numbers(grid.between))
         cells[grid.between] += lit.numpy()
         return grid.spread(cells, self.values.sclera.radius, length_mm), seen
@@ -360,9 +369,9 @@ class _Maker:
         return o - dr.select(met, t, away) * d, dr.normalize(dr.select(met, front.vector_out(facing), d))
 
     def _through_lids(self, index: mi.UInt32, sheet: mi.Float, loss_per_mm: float) -> mi.Float:
-        """Irradiance of cells of the globe by way of lids that lie on them: exp(-k t) of that on the lid's skin."""
-        values, skin = self.values, self.skin
-        n = _globe_direction(mi.Float(index // _SIDE), mi.Float(index % _SIDE))
+        """Irradiance of two by two cells of the globe by way of lids on them: exp(-k t) of that on the lid's skin."""
+        values, skin, half = self.values, self.skin, _SIDE // 2
+        n = _globe_direction(2 * mi.Float(index // half) + 0.5, 2 * mi.Float(index % half) + 0.5)
         start = values.point_to_scene(self._globe_surface(n)[0])
         inner = self._next(start, n, mi.Float(EPSILON_MM), mi.Bool(True))
         outer = self._next(start, n, inner.t + _BETWEEN_MM, inner.is_valid())
@@ -498,9 +507,9 @@ class GlobeGrid:
         between, under = np.flatnonzero(away < _EDGE_MM), np.flatnonzero((away > 0) & (away < reach_mm))
         return cls(*(cells if cells.size else np.zeros(1, dtype=np.int64) for cells in (between, under)))
 
-    def spread(self, irradiance: Singles, radius_mm: mi.Float, length_mm: float) -> Pyramid:
-        """What leaves the globe between the lids of the light that falls on it (side * side,)."""
-        straight, out = Pyramid(_SIDE, _SIDE, False), Pyramid(_SIDE, _SIDE, False)
+    def spread(self, irradiance: Singles, radius_mm: mi.Float, length_mm: float) -> mi.Float:
+        """What leaves the globe between the lids, cell by cell, of the light that falls on it (side * side,)."""
+        straight, light = Pyramid(_SIDE, _SIDE, False), dr.zeros(mi.Float, _SIDE * _SIDE)
         straight.fill(irradiance)
         index = _numbers(self.between)
         start = mi.Float(index // _SIDE), mi.Float(index % _SIDE)
@@ -515,10 +524,8 @@ class GlobeGrid:
             row, column = _globe_place(cosine * n + out)
             return straight.at(row, column, _level(_FOOTPRINT * distance, _WIDTH / _SIDE * radius_mm)), row, column
 
-        cells = np.zeros(_SIDE * _SIDE, np.float32)
-        cells[self.between] = _Places.of(length_mm).share(start, read).numpy()
-        out.fill(cells)
-        return out
+        dr.scatter(light, _Places.of(length_mm).share(start, read), index)
+        return light
 
 
 def _spots(shift: tuple[mi.UInt32, mi.UInt32], k: mi.UInt32) -> tuple[mi.Float, mi.Float]:
@@ -550,13 +557,28 @@ def _between_cells(
     `first` is the number of the first cell in the buffer.
     """
     rows, columns, scale = ROWS >> level, COLUMNS >> level, 1 / (1 << level)
-    v, u = dr.clip((row + 0.5) * scale - 0.5, 0, rows - 1.001), (column + 0.5) * scale - 0.5
+    u = (column + 0.5) * scale - 0.5
     u = dr.select(u < 0, u + columns, u)
-    i, j = mi.UInt32(v), dr.minimum(mi.UInt32(u), columns - 1)
-    s, t = u - mi.Float(j), v - mi.Float(i)
-    after = dr.select(j + 1 < columns, j + 1, 0)
-    a, b, c, d = (dr.gather(kind, buffer, first + p * columns + q) for p in (i, i + 1) for q in (j, after))
-    high, low = a + s * (b - a), c + s * (d - c)
+    j = dr.minimum(mi.UInt32(u), columns - 1)
+    right = dr.select(j + 1 < columns, j + 1, 0)
+    return _between(kind, buffer, (row + 0.5) * scale - 0.5, u - mi.Float(j), (j, right), (rows, columns), first)
+
+
+def _between(
+    kind: Any,
+    buffer: mi.Float,
+    row: mi.Float,
+    share: mi.Float,
+    beside: tuple[mi.UInt32, mi.UInt32],
+    size: tuple[int, int],
+    first: mi.UInt32 | int = 0,
+) -> Any:
+    """Numbers between rows, and at a share of the way from the first to the second of two columns, of a grid."""
+    v = dr.clip(row, 0, size[0] - 1.001)
+    i = mi.UInt32(v)
+    t = v - mi.Float(i)
+    a, b, c, d = (dr.gather(kind, buffer, first + p * size[1] + q) for p in (i, i + 1) for q in beside)
+    high, low = a + share * (b - a), c + share * (d - c)
     return high + t * (low - high)
 
 
