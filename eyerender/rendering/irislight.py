@@ -59,14 +59,14 @@ class IrisLight:
 
     def _on_grid(self, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
         """Irradiance at points of the grid; negative where anything may hide a lamp, or a path was not found."""
-        from .lighting import LampPath
+        from .lighting import LampPath, behind
 
         values, lights = self._values, self._lights
         stop = values.stop
         a, b = (self._half * (mi.Float(k) * (2 / (_SIDE - 1)) - 1) for k in (column, row))
         x = stop.centre + a * stop.u + b * stop.v
         points = self._points
-        within = a * a + b * b < dr.square(self._half)
+        within = (a * a + b * b < dr.square(self._half)) & behind(values.surfaces[-1], x)
 
         def more(k: mi.UInt32, *_: object) -> mi.Bool:
             return within & (k < lights.count * points)

@@ -205,10 +205,10 @@ def through_cornea(
     u, v: place on each lamp's disc, [0, 1). normal: unit normals at the points; None for those of the plane. surfaces:
     those in front of the points; None for all.
     """
-    bent, rest = mi.Float(0), inside
+    bent, rest = mi.Float(0), inside & behind((surfaces or values.surfaces)[-1], inner)
     if lights.on_iris is not None:
         bent, known = lights.on_iris.at(inner, inside)
-        rest = inside & ~known
+        rest &= ~known
     sine, cosine = dr.sincos(v * (2 * dr.pi))
 
     def more(i: mi.UInt32, *_: object) -> mi.Bool:
@@ -225,6 +225,17 @@ def through_cornea(
     if normal is None and lights.relief is not None:
         bent *= lights.relief.share(inner, inside)
     return bent, failures
+
+
+def behind(surface: Surface, x: mi.Vector3f) -> mi.Bool:
+    """Whether points (eye frame) are behind a surface. No light comes to others through it.
+
+    The end of an iris may not be: a cornea with a shallow chamber ends behind the plane of the iris.
+    """
+    away = 8.0
+    o = surface.point_in(x) + mi.Vector3f(away, 0, 0)
+    t, met = surface.hit(o, mi.Vector3f(-1, 0, 0))
+    return met & (t < away)
 
 
 def on_relief(lights: Lights, view: View) -> View:

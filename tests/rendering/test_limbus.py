@@ -11,7 +11,7 @@ from scipy import ndimage
 from eyerender.eye.meshes import chamber_rim
 from eyerender.imagefolder import IRIS
 from eyerender.rendering.chamber import TURNS, chamber_of, through_limbus
-from tests.support.render_rigs import BLACK, PLAIN, eye_of, job_of, remote_rig
+from tests.support.render_rigs import BLACK, PLAIN, eye_of, head_rig, job_of, remote_rig
 
 
 @pytest.mark.parametrize("model", ["E2", "E5"])
@@ -98,3 +98,6 @@ def test_a_flat_iris_before_the_limbus_has_no_black_ring(renderer):
     assert np.count_nonzero(iris) > 1500
     # The end of the flat iris is lit half as well as its middle.
     assert np.min(seen[iris]) > 0.4 * np.median(seen[iris])
+    # No light paths are sought to what the cornea is not in front of.
+    rig = head_rig(count=8)
+    assert renderer.render(job_of(eye_of("E5"), rig, rig.window(160, 120)), spp=4).failed_paths == 0
