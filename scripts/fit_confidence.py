@@ -32,14 +32,14 @@ from eyerender.extraction import ExtractionSettings
 from eyerender.extraction.pipeline import pixel_fit
 from eyerender.extraction.preprocessing import prepare
 from eyerender.extraction.pupil import scoring, search
-from eyerender.extraction.pupil.scoring import FEATURES, TABLE, design, features, goodness_of, scale_design
+from eyerender.extraction.pupil.scoring import FEATURES, TABLE, design, features, goodness_of
 from eyerender.extraction.settings import Shape
 from eyerender.geometry.ellipse import Ellipse, iou
 
 Array = NDArray[np.float64]
 METHODS: tuple[Literal["fast", "refined"], ...] = ("fast", "refined")
 PRIOR_VARIANCE = 20.0
-TAILS = 4.0  # degrees of freedom
+SCALE_VARIANCE, TAILS = 5.0, 8.0  # of the covariance's factor: prior of its weights, degrees of freedom
 FOLDS = 10
 REFINED_OF_IMAGE = 3  # hypotheses of an image to which the pixel model is fitted
 HARD = ("ring-light", "jpeg", "grey-pupil", "any-size", "eight-glints")
@@ -50,10 +50,11 @@ Task = tuple[str, int]
 class Observed:
     """All hypotheses of one image: features by each method (n, f), which are right, late, or with a dark core.
 
-    `refined` are the numbers of those to which the pixel model was fitted. `away` is the squared distance from the true
-    centre in standard deviations.
+    `row` is what kind of image it is. `refined` are the numbers of those to which the pixel model was fitted.
+    `away` is the squared distance from the true centre in standard deviations.
     """
 
+    row: str
     fast: list[Array] = field(default_factory=list)
     pixel: list[Array] = field(default_factory=list)
     refined: list[int] = field(default_factory=list)
@@ -86,7 +87,7 @@ def observe(task: Task, folder: Path) -> Observed:
     cv2.setNumThreads(1)
     ideal.CELLS = 2
     image, depth, truth = _image_of(task, folder)
-    out = Observed()
+    out = Observed(task[0])
     prepared = prepare(image, depth, 1.0)
     if isinstance(prepared, str):
         return out
@@ -159,24 +160,29 @@ def fit(rows: Array, right: Array, group: Array, observed: list[Observed] | None
     return low, high, _weights(columns, right, weight, PRIOR_VARIANCE), bend
 
 
-def scale_of(rows: Array, away: Array, low: Array, high: Array) -> Array:
-    """Weights of the covariance's factor f.
+def scale_of(columns: Array, away: Array, row: list[str]) -> Array:
+    """Weights of the covariance's factor f, from the first right ellipse of every image.
 
-    The squared distances of two coordinates in standard deviations are f times those of a Student distribution of 4
-    degrees of freedom, so that single large errors do not decide. Then f is multiplied so that it holds 68 %.
+    The squared distances of two coordinates in standard deviations are f times those of a Student distribution of
+    TAILS degrees of freedom, so that single large errors do not decide. Then f is multiplied so that it holds 68 %.
+    Every kind of image counts alike.
     """
-    columns = scale_design(rows, low, high)
+    kinds, kind, count = np.unique(row, return_inverse=True, return_counts=True)
+    share = len(row) / (kinds.size * count[kind].astype(np.float64))
 
     def cost(weights: Array) -> tuple[float, Array]:
         ratio = away * np.exp(-columns @ weights) / TAILS
-        prior = np.concatenate([[0.0], weights[1:]]) / PRIOR_VARIANCE
-        value = np.sum(columns @ weights + (0.5 * TAILS + 1.0) * np.log1p(ratio)) + 0.5 * float(prior @ weights)
-        slope = 1.0 - (0.5 * TAILS + 1.0) * ratio / (1.0 + ratio)
+        prior = np.concatenate([[0.0], weights[1:]]) / SCALE_VARIANCE
+        value = share @ (columns @ weights + (0.5 * TAILS + 1.0) * np.log1p(ratio)) + 0.5 * float(prior @ weights)
+        slope = share * (1.0 - (0.5 * TAILS + 1.0) * ratio / (1.0 + ratio))
         return float(value), columns.T @ slope + prior
 
     found = minimize(cost, np.zeros(columns.shape[1]), jac=True, method="L-BFGS-B", options={"maxiter": 5000})
     weights = np.asarray(found.x)
-    weights[0] += math.log(float(np.quantile(away * np.exp(-columns @ weights), 0.68)) / (-2.0 * math.log(1.0 - 0.68)))
+    scaled = away * np.exp(-columns @ weights)
+    order = np.argsort(scaled)
+    within = np.cumsum(share[order]) / share.sum()
+    weights[0] += math.log(float(scaled[order][np.searchsorted(within, 0.68)]) / (-2.0 * math.log(1.0 - 0.68)))
     return weights
 
 
@@ -214,8 +220,10 @@ def table_of(observed: list[Observed]) -> str:
         text.append(f'    "{method}": (')
         fitted = fit(rows, right, group, observed if fast else None)
         away = np.array([value for one in observed for value in (one.away if fast else one.away_refined)])
-        some = (right > 0.5) & (design(rows, *fitted[:2]) @ fitted[2] > 0.0)
-        text += [lines(values) for values in (*fitted, scale_of(rows[some], away[some], *fitted[:2]))]
+        told = np.flatnonzero(right > 0.5)
+        told = told[np.diff(group[told], prepend=-1) > 0]
+        scale = scale_of(design(rows[told], *fitted[:2]), away[told], [observed[k].row for k in group[told]])
+        text += [lines(values) for values in (*fitted, scale)]
         text.append(f"    ),  # {right.size} hypotheses, {100 * right.mean():.1f} % of them right")
     return "\n".join([*text, "}  # fmt: skip", ""])
 
@@ -236,7 +244,7 @@ def main() -> None:
     for method in METHODS:
         if len(TABLE[method][0]) != size:
             none = (0.0,) * size
-            TABLE[method] = (none, (1.0,) * size, (0.0,) * (1 + 3 * size), (0.0, 1.0, 0.0), (0.0, *none))
+            TABLE[method] = (none, (1.0,) * size, (0.0,) * (1 + 3 * size), (0.0, 1.0, 0.0), (0.0,) * (1 + 3 * size))
     tasks: list[Task] = [("mixed", seed) for seed in range(options.count)]
     tasks += [("no eye", seed) for seed in range(options.count // 6)]
     tasks += [(row, seed) for row in HARD for seed in range(options.count // 10)]
