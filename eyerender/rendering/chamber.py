@@ -32,10 +32,13 @@ from ..geometry.surfaces import Surface, components
 from ..optics.interface import fresnel
 
 IRIS_RINGS, TURNS = 16, 16  # points in the plane of the iris, over radius and angle
+ROOT_RINGS = 14  # of these on iris and pupil, the others beyond the root
 IRIS = IRIS_RINGS * TURNS
 LEVELS = 2  # of points on the wall
 PLACES = IRIS + TURNS * LEVELS
-RAYS, LEAVING = 160, 32  # from each point; the first of them are followed out of the eye
+RAYS, LEAVING = 256, 32  # from each point; the first of them are followed out of the eye
+_WEAK, _FEW = 0.25, 4  # of the rays of which the cornea mirrors less, one of four stands for all
+_ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find
 _STEPS = 20  # crossings and mirrorings of a ray
 _NEAR_MM = 1e-6
 _BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
@@ -47,7 +50,8 @@ class Chamber(ArrayValue):
     """The chamber of one eye, in the eye frame; arrays with PLACES rows list the rings from the middle, then the wall.
 
     Attributes:
-        step_mm: distance between the rings; the first has half this radius.
+        root_mm: radius of the iris' root, between two rings.
+        reach_mm: radius of the edge of the last ring.
         points: (PLACES, 3) places, mm.
         normals: (PLACES, 3) unit normals into the chamber.
         valid: (PLACES,) whether a place is in the chamber.
@@ -55,7 +59,8 @@ class Chamber(ArrayValue):
         leaving: (PLACES, LEAVING, 7) origin and direction of the rays that leave the eye, and n^2 (1 - F), 0 for none.
     """
 
-    step_mm: float
+    root_mm: float
+    reach_mm: float
     points: Floats
     normals: Floats
     valid: Bools
@@ -71,7 +76,8 @@ def chamber_of(eye: EyeModel, film: float) -> Chamber:
     foot = None
     if len(eye.front) > 1:
         foot = float(np.mean(chamber_rim(eye, eye.front[-1], 2 * np.pi * np.arange(TURNS) / TURNS)))
-    return _chamber(tuple(eye.front), indices, film, plane, float(eye.limbus_radius_mm), sclera, foot)
+    radii = float(eye.iris_root_radius_mm), float(eye.limbus_radius_mm)
+    return _chamber(tuple(eye.front), indices, film, plane, radii, sclera, foot)
 
 
 def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
@@ -128,11 +134,17 @@ def shares(eye: EyeModel, chamber: Chamber, inside: float, iris: float, beyond: 
     fine = (np.arange(4) + 0.5) / 4
     ring, turn = np.arange(IRIS)[:, None] // TURNS, np.arange(IRIS)[:, None] % TURNS
     part, side = (v.ravel() for v in np.meshgrid(fine, fine))
-    r, a = chamber.step_mm * (ring + part), 2 * np.pi * (turn + side) / TURNS
+    r, a = _radius(ring + part, chamber.root_mm, chamber.reach_mm), 2 * np.pi * (turn + side) / TURNS
     at = _in_plane(np.asarray(eye.stop.centre_mm), np.asarray(eye.stop.normal), r * np.cos(a), r * np.sin(a))
-    albedo = np.where(np.hypot(at[..., 1], at[..., 2]) < eye.iris_root_radius_mm, iris, beyond)
-    albedo = np.sum(np.where(eye.stop.contains(at), inside, albedo) * r, axis=1) / np.sum(r, axis=1)
+    albedo = np.where(ring < ROOT_RINGS, iris, beyond)
+    albedo = np.mean(np.where(eye.stop.contains(at), inside, albedo), axis=1)
     return np.append(albedo, np.full(TURNS * LEVELS, beyond))
+
+
+def _radius(ring: Floats, root: float, reach: float) -> Floats:
+    """Radius (mm) where so many rings end: those within the root have equal areas, and so have those beyond it."""
+    beyond = np.maximum(ring - ROOT_RINGS, 0) / (IRIS_RINGS - ROOT_RINGS)
+    return np.asarray(np.sqrt(root**2 * np.minimum(ring / ROOT_RINGS, 1) + (reach**2 - root**2) * beyond))
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,11 +197,13 @@ class _Walls:
 
 @lru_cache(maxsize=64)
 def _chamber(
-    front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...], limbus: float,
-    sclera: tuple[float, ...], foot: float | None,
+    front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...],
+    radii: tuple[float, float], sclera: tuple[float, ...], foot: float | None,
 ) -> Chamber:  # fmt: skip
-    walls = _walls(front, indices, film, plane, limbus, sclera, foot)
-    step, points, normals, valid = _places(walls)
+    walls = _walls(front, indices, film, plane, radii[1], sclera, foot)
+    reach = walls.rim + walls.slope * max(walls.top - walls.centre[0], 0)
+    root = min(radii[0], 0.99 * reach)
+    points, normals, valid = _places(walls, root, reach)
     exchange = np.zeros((PLACES, PLACES))
     leaving = np.zeros((PLACES, RAYS, 7))
     rows = np.flatnonzero(valid)
@@ -199,10 +213,11 @@ def _chamber(
     arrived = _traced(walls, o, d, np.where(row < IRIS, len(front), walls.layer))
     slot = (row * RAYS + np.tile(np.arange(RAYS), len(rows)))[arrived.out]
     left[slot] = np.concatenate([arrived.origin, arrived.way, arrived.weight[:, None]], axis=1)
-    for index, weight in _onto(arrived.back, arrived.on_wall, step, points, valid):
+    for index, weight in _onto(arrived.back, arrived.on_wall, (root, reach), points, valid):
         np.add.at(exchange, (row[arrived.ray], index), weight * arrived.share / RAYS)
+    exchange = _turned(exchange, valid)
     kept = frozen(leaving[:, :LEAVING])
-    return Chamber(step, frozen(points), frozen(normals), valid, frozen(exchange), kept)
+    return Chamber(root, reach, frozen(points), frozen(normals), valid, frozen(exchange), kept)
 
 
 def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...],
@@ -216,12 +231,10 @@ def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, 
     return _Walls(front, indices, film, centre, normal, limbus, limbus, top, (wide - limbus) / (top - bottom))
 
 
-def _places(walls: _Walls) -> tuple[float, Floats, Floats, Bools]:
+def _places(walls: _Walls, root: float, reach: float) -> tuple[Floats, Floats, Bools]:
     n, c = walls.normal, walls.centre
-    reach = walls.rim + walls.slope * max(walls.top - c[0], 0)
-    step = reach / IRIS_RINGS
     ring, turn = np.arange(IRIS) // TURNS, np.arange(IRIS) % TURNS
-    radius, angle = step * (ring + 0.5), 2 * np.pi * (turn + 0.5) / TURNS
+    radius, angle = _radius(ring + 0.5, root, reach), 2 * np.pi * (turn + 0.5) / TURNS
     y, z = radius * np.cos(angle), radius * np.sin(angle)
     grid = _in_plane(c, n, y, z)
     inside = np.ones(IRIS, dtype=bool)
@@ -238,7 +251,7 @@ def _places(walls: _Walls) -> tuple[float, Floats, Floats, Bools]:
     across = np.stack([np.full_like(x, -walls.slope), -np.cos(angle), -np.sin(angle)], axis=-1) / steep
     there = (walls.height(wall) > 0.02) & (walls.top - foot > 0.1)
     points = np.concatenate([grid, wall + 1e-4 * across])
-    return step, points, np.concatenate([np.tile(n, (IRIS, 1)), across]), np.append(inside, there)
+    return points, np.concatenate([np.tile(n, (IRIS, 1)), across]), np.append(inside, there)
 
 
 def _sign(surface: Surface) -> float:
@@ -362,8 +375,9 @@ def _mirrored(walls: _Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tuple[In
     gone = rays.number[go], rays.o[go], _refracted(w[go], -n[go], walls.indices[0]), full[go]
     first[rays.number] = False
     rays.d = w - 2 * cosine[:, None] * n
-    rays.weight = rays.weight * mirrored
-    return rays.only(rays.weight > 1e-3), gone
+    weak = mirrored < _WEAK
+    rays.weight = rays.weight * np.where(weak, _FEW * mirrored, mirrored)
+    return rays.only((rays.weight > 1e-3) & (~weak | (rays.number % _FEW == 0))), gone
 
 
 def _crossed(walls: _Walls, rays: _Rays, k: int, *, outwards: bool) -> _Rays:
@@ -396,12 +410,32 @@ def _refracted(d: Floats, n: Floats, eta: float) -> Floats:
     return np.asarray(w / np.linalg.norm(w, axis=1, keepdims=True))
 
 
-def _onto(back: Floats, on_wall: Bools, step: float, points: Floats, valid: Bools) -> list[tuple[Ints, Floats]]:
-    """Places that stand for points of arrival, each with its weight (n,)."""
+def _turned(exchange: Floats, valid: Bools) -> Floats:
+    """Exchange (PLACES, PLACES) averaged over neighbouring sectors: turned about the axis, an eye is nearly the same."""
+    place = np.arange(PLACES)
+    on_wall = place >= IRIS
+    turn = np.where(on_wall, (place - IRIS) // LEVELS, place % TURNS)
+    total, weight = np.zeros_like(exchange), np.zeros(PLACES)
+    for shift, share in enumerate(_ALIKE, -(len(_ALIKE) // 2)):
+        moved = place + ((turn + shift) % TURNS - turn) * np.where(on_wall, LEVELS, 1)
+        total += share * exchange[np.ix_(moved, moved)]
+        weight += share * valid[moved]
+    return np.asarray(total * np.where(valid & (weight > 0), 1 / np.maximum(weight, 1), 0)[:, None])
+
+
+def _onto(
+    back: Floats, on_wall: Bools, radii: tuple[float, float], points: Floats, valid: Bools
+) -> list[tuple[Ints, Floats]]:
+    """Places that stand for points of arrival, each with its weight (n,): on the same side of the iris' root."""
     turn = np.arctan2(back[:, 2], back[:, 1]) / (2 * np.pi) * TURNS % TURNS
-    ring = np.clip(np.hypot(back[:, 1], back[:, 2]) / step - 0.5, 0, IRIS_RINGS - 1.000001)
+    root2, reach2 = np.square(radii)
+    r2 = back[:, 1] ** 2 + back[:, 2] ** 2
+    within = np.clip(ROOT_RINGS * r2 / root2 - 0.5, 0, ROOT_RINGS - 1)
+    beyond = ROOT_RINGS - 0.5 + (IRIS_RINGS - ROOT_RINGS) * (r2 - root2) / (reach2 - root2)
+    ring = np.where(r2 < root2, within, np.clip(beyond, ROOT_RINGS, IRIS_RINGS - 1))
     before = np.floor(turn - 0.5).astype(int)
-    i, f, g = ring.astype(int), ring % 1, turn - 0.5 - before
+    i = np.minimum(ring.astype(int), IRIS_RINGS - 2)
+    f, g = ring - i, turn - 0.5 - before
     index, weight = [], []
     for a in (0, 1):
         for b in (0, 1):

@@ -24,7 +24,18 @@ from scipy.spatial import cKDTree
 
 from ..arrays import Bools, Floats, Ints
 from ..region.globe import Globe
-from .chamber import IRIS, IRIS_RINGS, LEAVING, PLACES, Chamber, chamber_of, limbus_points, shares, through_limbus
+from .chamber import (
+    IRIS,
+    IRIS_RINGS,
+    LEAVING,
+    PLACES,
+    ROOT_RINGS,
+    Chamber,
+    chamber_of,
+    limbus_points,
+    shares,
+    through_limbus,
+)
 from .chamber import TURNS as IRIS_TURNS
 from .frame import RenderJob, globe_of
 from .lighting import onto_points, through_cornea
@@ -93,13 +104,13 @@ class Received:
         self.on = dr.opaque(mi.Bool, on)
         self._between = globe.columns == GLOBE_COLUMNS
         self._columns, self._rows = globe.columns, globe.rows
-        numbers = np.concatenate([globe.table, [chamber.step_mm], plane])
+        numbers = np.concatenate([globe.table, [chamber.root_mm**2, chamber.reach_mm**2], plane])
         buffer = _sent(numbers)
-        tail = range(numbers.size - 4, numbers.size)
+        tail = range(numbers.size - 5, numbers.size)
         n = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in (*range(5), *tail)]
         dr.eval(n)
         self._centre, self._first, self._per_mm = mi.Vector3f(*n[:3]), n[3], n[4]
-        self._step, self._plane = n[5], n[6:]
+        self._root2, self._reach2, self._plane = n[5], n[6], n[7:]
         self._ends = _sent(globe.table[5:])
         self._globe, self._other, self._iris = (_sent(t.ravel()) for t in tables)
 
@@ -134,7 +145,9 @@ class Received:
     def iris_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Ring and turn of points in the plane of the iris among the places of the chamber."""
         turn = dr.atan2(x.z, x.y) * (IRIS_TURNS * 0.5 * dr.inv_pi) - 0.5
-        ring = dr.sqrt(x.y * x.y + x.z * x.z) / self._step - 0.5
+        r2 = x.y * x.y + x.z * x.z
+        beyond = dr.maximum(r2 - self._root2, 0) * ((IRIS_RINGS - ROOT_RINGS) / (self._reach2 - self._root2))
+        ring = dr.minimum(r2 / self._root2, 1) * ROOT_RINGS + beyond - 0.5
         return ring, dr.select(turn < 0, turn + IRIS_TURNS, turn)
 
     def surround(self, x: mi.Vector3f) -> mi.Vector4f:
