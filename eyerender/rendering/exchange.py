@@ -514,9 +514,10 @@ def _met(
     at = values.point_to_scene(view.point)
     if textures.region is not None and frame.skin is not None:
         face, count = textures.region.face(hit), len(frame.skin.vertices)
-        table = np.stack([frame.skin.faces, frame.skin.behind + count], axis=1).astype(np.int32)
+        table = np.stack([frame.skin.nearest, frame.skin.behind + count], axis=1).astype(np.int32)
         inner = textures.region.from_behind(face, hit.prim_uv, d, view.other)
-        which = dr.gather(mi.Int32, mi.Int32(aligned(table.ravel())), 2 * face + dr.select(inner, 1, 0), view.other)
+        corner = textures.region.corner(face, hit.prim_uv, s, view.other)
+        which = dr.gather(mi.Int32, mi.Int32(aligned(table.ravel())), 2 * corner + dr.select(inner, 1, 0), view.other)
         other = first + mi.UInt32(which)
         matte = view.other & (~inner | (which >= dr.opaque(mi.Int32, count)))
     else:

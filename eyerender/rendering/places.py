@@ -29,14 +29,14 @@ class SkinPlaces(ArrayValue):
 
     Attributes:
         vertices: (n,) indices of the vertices.
-        faces: (m,) place that stands for each triangle.
+        nearest: (all vertices,) place that stands for each vertex.
         lids: (l,) places on the skin right in front of the globe, whose inner sides close a space about the cornea.
-        behind: (m,) index in `lids` of what stands for the inner side of each triangle; -1 for none.
+        behind: (all vertices,) index in `lids` of what stands for the inner side of each; -1 for none.
         spread: (all vertices, n) weights of the places at every vertex.
     """
 
     vertices: Ints
-    faces: Ints
+    nearest: Ints
     lids: Ints
     behind: Ints
     spread: Any
@@ -69,15 +69,14 @@ def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
     order = np.lexsort((away, group))
     chosen = solid[order[np.searchsorted(group[order], np.arange(len(first)))]]
     spread = _spread(mesh, chosen, size[first])
-    strongest = np.asarray(spread.tocsr().argmax(axis=1)).reshape(-1)
-    faces = strongest[mesh.layout.faces[:, 0]]
+    nearest = np.asarray(spread.tocsr().argmax(axis=1)).reshape(-1)
     out = _from_globe(globe, mesh.vertices[chosen])
     away = np.linalg.norm(out, axis=1)
     over = (away < globe.radius_mm + _LID_MM) & (np.sum(out * mesh.normals[chosen], axis=1) > 0.2 * away)
     lids = np.flatnonzero(over & (out[:, 0] > 0))
     index = np.full(len(chosen), -1)
     index[lids] = np.arange(len(lids))
-    return SkinPlaces(chosen, faces, lids, index[faces], spread)
+    return SkinPlaces(chosen, nearest, lids, index[nearest], spread)
 
 
 def _from_globe(globe: Globe, points: Floats) -> Floats:

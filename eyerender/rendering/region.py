@@ -263,6 +263,11 @@ class SkinGeometry:
         """Whether a triangle belongs to the sheet of skin, not to what is in front of it."""
         return face < self._sheet
 
+    def corner(self, face: mi.UInt32, uv: mi.Point2f, u: mi.Float, active: mi.Bool) -> mi.UInt32:
+        """Vertices of triangles, each as often as its barycentric weight for even u in [0, 1)."""
+        corner = dr.gather(mi.Vector4u, self._corners, face, active)
+        return dr.select(u < uv.x, corner.y, dr.select(u < uv.x + uv.y, corner.z, corner.x))
+
     def from_behind(self, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Bool:
         """Whether rays along d (scene's frame) meet triangles on their inner side, such as a lid's from within it."""
         corner = dr.gather(mi.Vector4u, self._corners, face, active)
