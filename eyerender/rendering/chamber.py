@@ -411,7 +411,7 @@ def _refracted(d: Floats, n: Floats, eta: float) -> Floats:
 
 
 def _turned(exchange: Floats, valid: Bools) -> Floats:
-    """Exchange (PLACES, PLACES) averaged over neighbouring sectors: turned about the axis, an eye is nearly the same."""
+    """Exchange (PLACES, PLACES) averaged over neighbouring sectors, because an eye is nearly round."""
     place = np.arange(PLACES)
     on_wall = place >= IRIS
     turn = np.where(on_wall, (place - IRIS) // LEVELS, place % TURNS)

@@ -74,6 +74,7 @@ _START_MM = 0.02
 _SMALL, _SPOTS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
 _TOUCHING_MM = 0.3  # a place most of whose rays are stopped this near is covered
 _ALPHA = (0.7548776662466927, 0.5698402909980532)
+_SHUFFLED = 0x9E3779B1
 
 
 class Received:
@@ -201,6 +202,7 @@ class _Seen:
         open_: whether nothing is met.
         near: whether something is met very close.
         sky: irradiance from what is far away.
+        lit: irradiance straight from the lamps at the very point of the skin that is met, -1 where it is not known.
     """
 
     first: Ints
@@ -209,11 +211,17 @@ class _Seen:
     open_: Floats
     near: Floats
     sky: Floats
+    lit: Floats
 
     def mean(self, values: Floats) -> Floats:
         """Means (places,) over the rays of each place."""
         count = np.diff(self.first, append=len(values))
         return np.asarray(np.add.reduceat(values, self.first) / count)
+
+    def correction(self, direct: Floats) -> Floats:
+        """What the lamps' light at the points that are met adds to that of the places there, `direct`."""
+        more = self.lit - direct[np.minimum(self.target, len(direct) - 1)]
+        return self.mean(self.weight * np.where(self.lit >= 0, more, 0))
 
 
 class Exchange:
@@ -249,7 +257,7 @@ class Exchange:
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
         direct, even = _direct(values, lights, place.scene, textures, frame)
         lamps, more = (_direct_inside(values, some, place.scene, frame.chamber) for some in (lights, panels))
-        seen = _seen(values, textures, place, numbers, frame)
+        seen = _seen(values, lights, textures, place, numbers, frame)
         return frame.solved(region, direct, even, lamps, more, seen)
 
     def _skin(self, region: RegionScene, globe: Globe) -> SkinPlaces:
@@ -352,9 +360,10 @@ class _Frame:
             albedo = shares(job.eye, self.chamber, look.pupil_albedo, look.iris_albedo, look.limbus_albedo)
             exchange = self.chamber.exchange * albedo
             limbus = through_limbus(job.eye, self.chamber, look.limbus_width_mm) * look.limbus_transmittance
+            here, there = (part.correction(direct) for part in seen)
             for _ in range(_ROUNDS):
-                arrived = outside.mean(outside.weight * total[targets[0]])
-                entered = inside.mean(inside.weight * total[targets[1]])
+                arrived = outside.mean(outside.weight * total[targets[0]]) + here
+                entered = inside.mean(inside.weight * total[targets[1]]) + there
                 within = exchange @ total[self.outside :] + limbus @ total[self.outside - IRIS_TURNS : self.outside]
                 total = start + np.append(arrived, entered + within)
         numbers = np.zeros((self.outside, 4))
@@ -466,7 +475,7 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
 
 
 def _seen(
-    values: Values, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame
+    values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame
 ) -> tuple[_Seen, _Seen]:
     """What the rays of the places outside and of those in the chamber meet."""
     start = frame.first_ray
@@ -485,31 +494,56 @@ def _seen(
     o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
     d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
     gain = dr.select(outside, 1, rays[6])
-    target, weight, open_, distance = _met(values, textures, place, numbers, o, d, gain > 0, frame)
+    target, weight, open_, distance, spot = _met(values, textures, place, numbers, o, d, gain > 0, frame)
     sky = mi.Float(0) * o.x
     if values.structure.ambient:
         assert textures.ambience is not None
         far = textures.ambience.far(d, open_ & ~outside)
         sky = dr.select(open_ & ~outside, dr.pi * far * gain, 0)
     results = (target, weight * gain, mi.Float(open_) * gain, mi.Float(distance < _TOUCHING_MM), sky)
-    dr.eval(results)
+    dr.eval(results, spot)
     host = [r.numpy() for r in results]
+    host.append(np.full(lanes, -1.0))
+    if frame.skin is not None and len(lights):
+        lane = np.append(np.arange(start[frame.on_globe]), np.arange(first, lanes))
+        host[-1][lane] = _at_spots(values, lights, place.scene, spot, lane)
     return (
         _Seen(start[:-1], *(h[:first] for h in host)),
         _Seen(np.arange(PLACES) * LEAVING, *(h[first:] for h in host)),
     )
 
 
+def _at_spots(values: Values, lights: Lights, scene: mi.Scene, spot: tuple[Any, ...], lane: Ints) -> Floats:
+    """Irradiance straight from the lamps at points of the skin that lanes of rays have met, -1 for those of others.
+
+    What eye and lids send to each other in the narrow space between them comes from places close by, where the light
+    changes within a fraction of the distance of the places.
+    """
+    number = mi.UInt32(aligned(lane.astype(np.uint32)))
+    on_skin, x, normal = (dr.gather(type(part), part, number) for part in spot)
+    state = (on_skin, x, normal, number)
+
+    def light(_: mi.Bool, x: mi.Vector3f, normal: mi.Vector3f, number: mi.UInt32) -> mi.Float:
+        start = x + _START_MM * normal
+        return onto_points(values, lights, scene, start, normal, mi.Bool(True), *_spots(number * mi.UInt32(_SHUFFLED)))
+
+    return np.asarray(dr.if_stmt(state, on_skin, light, lambda *_: mi.Float(-1)).numpy(), dtype=float)
+
+
 def _met(
     values: Values, textures: Textures, place: Surround | RegionScene, numbers: Received, o: mi.Vector3f,
     d: mi.Vector3f, active: mi.Bool, frame: _Frame,
-) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float]:  # fmt: skip
-    """Along rays: the place met, the share of its irradiance that is sent back, whether nothing is met, distance."""
+) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float, tuple[mi.Bool, mi.Vector3f, mi.Vector3f]]:  # fmt: skip
+    """What is met along rays.
+
+    The place, the share of its irradiance that is sent back, whether nothing is met, the distance, and for the outer
+    side of the sheet of skin (a mark) point and normal in the eye frame.
+    """
     view, hit = meet(values, place.scene, o, d, active, coherent=False)
     view = appearance(values, textures, view, hit, d)
     albedo = outer_albedo(values, textures, view)
     # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.
-    s, t = _spots(dr.arange(mi.UInt32, dr.width(o)) * mi.UInt32(0x9E3779B1))
+    s, t = _spots(dr.arange(mi.UInt32, dr.width(o)) * mi.UInt32(_SHUFFLED))
     first = dr.opaque(mi.UInt32, frame.on_globe)
     at = values.point_to_scene(view.point)
     if textures.region is not None and frame.skin is not None:
@@ -520,7 +554,9 @@ def _met(
         which = dr.gather(mi.Int32, mi.Int32(aligned(table.ravel())), 2 * corner + dr.select(inner, 1, 0), view.other)
         other = first + mi.UInt32(which)
         matte = view.other & (~inner | (which >= dr.opaque(mi.Int32, count)))
+        on_skin = view.other & ~inner & textures.region.on_sheet(face)
     else:
+        on_skin = mi.Bool(False)
         ring, turn = numbers.surround_place(at)
         ring = mi.UInt32(dr.clip(ring + s, 0, RINGS - 1))
         turn = mi.UInt32(dr.clip(turn + t, 0, TURNS))
@@ -538,4 +574,5 @@ def _met(
     target = dr.select(through, dr.opaque(mi.UInt32, frame.outside) + cell, dr.select(view.other, other, on_globe))
     back = dr.select(through, inside, dr.select(view.other & ~matte, 0, albedo))
     back = dr.select(view.met, back, 0)
-    return dr.select(back > 0, target, 0), back, active & ~view.met, dr.select(view.met, view.distance, 1e9)
+    distance = dr.select(view.met, view.distance, 1e9)
+    return dr.select(back > 0, target, 0), back, active & ~view.met, distance, (on_skin, view.point, view.normal)
