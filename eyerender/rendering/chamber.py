@@ -234,7 +234,7 @@ def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, 
 def _places(walls: _Walls, root: float, reach: float) -> tuple[Floats, Floats, Bools]:
     n, c = walls.normal, walls.centre
     ring, turn = np.arange(IRIS) // TURNS, np.arange(IRIS) % TURNS
-    radius, angle = _radius(ring + 0.5, root, reach), 2 * np.pi * (turn + 0.5) / TURNS
+    radius, angle = _radius(np.asarray(ring + 0.5, dtype=float), root, reach), 2 * np.pi * (turn + 0.5) / TURNS
     y, z = radius * np.cos(angle), radius * np.sin(angle)
     grid = _in_plane(c, n, y, z)
     inside = np.ones(IRIS, dtype=bool)

@@ -122,7 +122,8 @@ class Received:
 
     def globe(self, x: mi.Vector3f) -> mi.Vector4f:
         """Numbers of points of the globe, given in the scene's frame."""
-        return _bilinear(self._globe, *self.globe_place(x), self._columns, self._rows)
+        beyond = 0.5 if self._between else 0.0  # the last rows are half a row from the lids, where light changes fast
+        return _bilinear(self._globe, *self.globe_place(x), self._columns, self._rows, beyond)
 
     def globe_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Column and row of points of the globe in the grid of its places."""
@@ -171,13 +172,14 @@ def _sent(values: Floats) -> mi.Float:
     return mi.Float(aligned(np.ascontiguousarray(values, dtype=np.float32)))
 
 
-def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int) -> mi.Vector4f:
-    column, row = dr.clip(column, 0, columns - 1.001), dr.clip(row, 0, rows - 1.001)
-    i, j = mi.UInt32(column), mi.UInt32(row)
+def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int, beyond: float) -> mi.Vector4f:
+    """Values between columns and rows, continued by so many rows beyond the last ones."""
+    column, row = dr.clip(column, 0, columns - 1.001), dr.clip(row, -beyond, rows - 1.001 + beyond)
+    i, j = mi.UInt32(column), mi.UInt32(dr.clip(row, 0, rows - 1.001))
     s, t = column - mi.Float(i), row - mi.Float(j)
     a, b, c, d = (dr.gather(mi.Vector4f, buffer, j * columns + i + k) for k in (0, 1, columns, columns + 1))
     low, high = a + s * (b - a), c + s * (d - c)
-    return low + t * (high - low)
+    return dr.maximum(low + t * (high - low), 0)
 
 
 def _around(buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns: int, kind: Any) -> Any:
