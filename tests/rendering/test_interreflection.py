@@ -24,8 +24,8 @@ pytestmark = [pytest.mark.render, pytest.mark.slow]
 # of its own.
 BARE = {"limbus_width_mm": 0.0, "tear_film": False, "limbus_transmittance": 0.0, "scattering": None}
 FLAT = PLAIN.model_copy(update={**BARE, "pupil_albedo": 0.0})
-# The exported lashes have one albedo.
-REGION = Region.from_mapping({"lashes": {"tip_albedo": 0.05, "lower_albedo": 0.05}})
+# The exported lashes have one albedo, and the exported menisci are matte.
+REGION = Region.from_mapping({"lashes": {"tip_albedo": 0.05, "lower_albedo": 0.05}, "tears": {"height_mm": 0.0}})
 SIDE = [[0.42, 0.91, 0.0], [0.42, -0.91, 0.0]]
 LOW = [[0.42, 0.0, -0.91], [0.42, 0.72, 0.54]]
 
