@@ -3,8 +3,8 @@
     mitsuba -m scalar_rgb scene.xml        (or llvm_ad_rgb, cuda_ad_rgb)
 
 Lengths are mm, radiance is mW/mm^2/sr. What stock Mitsuba lacks is left out, and the file says so: textures, the
-limbus' soft rim, lens distortion, the point-spread function, ambient light but the sun, and lamps that are neither
-Lambertian discs nor isotropic points.
+relief of the iris, the limbus' soft rim, menisci, light inside tissue, lens distortion, the point-spread function,
+ambient light but the sun, and lamps that are neither Lambertian discs nor isotropic points.
 """
 
 from __future__ import annotations
@@ -146,7 +146,9 @@ def _notes(job: RenderJob) -> list[str]:
         notes.append(f"The film of tears on the cornea is a dielectric layer of its own, {_FILM_MM} mm thick.")
     if job.ambient.model_copy(update={"sun": None}) != Ambient():
         notes.append("Even light, panels and the surrounding's map are left out.")
-    notes.append("Textures, the limbus' soft rim and the point-spread function are left out.")
+    notes.append("Textures, the relief of the iris, the limbus' soft rim and the point-spread function are left out.")
+    if job.region is not None:
+        notes.append("Sheen, menisci and light inside skin and sclera are left out.")
     return notes
 
 
@@ -212,7 +214,7 @@ def _lamp(root: ET.Element, k: int, position: Floats, axis: Floats, radius: floa
 
 
 def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
-    """Parts of the eye region or of the head mesh, each with its mean albedo; the sheen is left out."""
+    """Parts of the eye region, without its menisci, or of the head mesh, each with its mean albedo."""
     globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
     mesh = region_mesh(spec, globe) if spec.head is None else placed(load_head(spec.head), globe)
     skin = spec.skin
@@ -229,7 +231,7 @@ def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
             albedo.get(name, skin.albedo),
         )
         for k, name in enumerate(HEAD_PARTS[: len(f) - 1])
-        if f[k + 1] > f[k]
+        if f[k + 1] > f[k] and (spec.head is not None or name != "tears")
     ]
 
 
