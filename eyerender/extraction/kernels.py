@@ -712,17 +712,6 @@ def levels_about(linear, ellipse, angles):
     return float(np.median(within)), float(np.median(step))
 
 
-@summing
-def _add_products(rows, begin, end, out):
-    """Add the products of rows (k, n), over the columns from `begin` to `end`, to the lower half of out (k, k)."""
-    for j in range(rows.shape[0]):
-        for m in range(j + 1):
-            total = 0.0
-            for i in range(begin, end):
-                total += rows[j, i] * rows[m, i]
-            out[j, m] += total
-
-
 @compiled
 def sectors_at(ellipse, x, y, steps):
     cx, cy, a, b, angle = ellipse

@@ -342,6 +342,40 @@ def _add_products(rows, begin, end, out):
             out[j, m] += total
 
 
+@compiled
+def covered(linear, clip_dn, xy, radius):
+    height, width = linear.shape
+    mask = np.empty(linear.shape, dtype=np.bool_)
+    for y in range(height):
+        for x in range(width):
+            mask[y, x] = linear[y, x] >= clip_dn
+    for k in range(radius.size):
+        for y in range(max(0, math.floor(xy[k, 1] - radius[k])), min(height, math.ceil(xy[k, 1] + radius[k]) + 1)):
+            for x in range(max(0, math.floor(xy[k, 0] - radius[k])), min(width, math.ceil(xy[k, 0] + radius[k]) + 1)):
+                mask[y, x] |= (x - xy[k, 0]) ** 2 + (y - xy[k, 1]) ** 2 < radius[k] ** 2
+    return mask
+
+
+@compiled
+def subtracted(linear, spots, radius, limit):
+    height, width = linear.shape
+    out, bright, whole = linear.copy(), np.zeros(linear.shape, dtype=np.bool_), np.empty(3)
+    for k in range(radius.size):
+        x0, x1 = max(0, math.floor(spots[k, 0] - radius[k])), min(width, math.ceil(spots[k, 0] + radius[k]) + 1)
+        y0, y1 = max(0, math.floor(spots[k, 1] - radius[k])), min(height, math.ceil(spots[k, 1] + radius[k]) + 1)
+        across = np.empty(max(x1 - x0, 0))
+        for x in range(x0, x1):
+            _profile(x - 0.5 - spots[k, 0], spots[k, 2], whole)
+            across[x - x0] = whole[1] * spots[k, 4]
+        for y in range(y0, y1):
+            _profile(y - 0.5 - spots[k, 1], spots[k, 3], whole)
+            for x in range(x0, x1):
+                light = across[x - x0] * whole[1]
+                out[y, x] -= np.float32(light)
+                bright[y, x] |= light > limit
+    return out, bright
+
+
 @inlined
 def _weighed(first, rows, clip, theta, noise, penalty, gram, used):
     """`gaussian_model._gram`: write the products with the priors, and how many pixels count."""

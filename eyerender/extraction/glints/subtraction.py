@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
-from ...arrays import Bools
+from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse
+from ..compiled import twin
 from ..preprocessing import Image, Prepared
 from .detection import Spots
 from .fits import SpotFit, profile
@@ -30,13 +31,19 @@ def affected_pixels(prepared: Prepared, spots: Spots, which: Bools | None = None
     own = slice(None) if which is None else which
     parts = zip((spots.xy_px[own], spots.width_px[own], spots.height_dn[own]), spots.clutter, strict=True)
     xy, width, height = (np.concatenate(part) for part in parts)
-    mask = prepared.linear >= prepared.clip_dn
-    for (x, y), sigma, peak in zip(xy.tolist(), width.tolist(), height.tolist(), strict=True):
-        radius = 1.2 * _reach(sigma, peak, prepared.noise_dn) + 1.0
-        rows, columns = _window(x, y, radius, mask.shape)
+    radius = 1.2 * _reach(width, height, prepared.noise_dn) + 1.0
+    return _covered(prepared.linear, prepared.clip_dn, xy, radius)
+
+
+@twin
+def _covered(linear: Image, clip_dn: float, xy: Floats, radius: Floats) -> Bools:
+    """Mask (h, w) of the clipped pixels and those nearer to a place (n, 2) than its radius (n,)."""
+    mask = linear >= clip_dn
+    for (x, y), far in zip(xy.tolist(), radius.tolist(), strict=True):
+        rows, columns = _window(x, y, far, mask.shape)
         dx, dy = np.arange(columns.start, columns.stop) - x, np.arange(rows.start, rows.stop) - y
-        mask[rows, columns] |= dx[None, :] ** 2 + dy[:, None] ** 2 < radius**2
-    return mask
+        mask[rows, columns] |= dx[None, :] ** 2 + dy[:, None] ** 2 < far**2
+    return np.asarray(mask)
 
 
 def subtract_spots(prepared: Prepared, fit: SpotFit, which: Bools, about: Ellipse) -> tuple[Image, Bools]:
@@ -54,24 +61,34 @@ def subtract_spots(prepared: Prepared, fit: SpotFit, which: Bools, about: Ellips
     Returns:
         The image (h, w) without that light, and the mask (h, w) of pixels where the light is too bright.
     """
-    linear, bright = prepared.linear.copy(), np.zeros(prepared.linear.shape, dtype=bool)
     reach = float(about.semi_axes_px[0]) + 10.0 + 8.0 * fit.sigma_px.max(axis=1, initial=0.0)
     near = which & (np.hypot(*(fit.xy_px - about.centre_px).T) < reach)
-    for i in np.nonzero(near)[0]:
-        (x, y), sigma = fit.xy_px[i].tolist(), float(fit.sigma_px[i].max())
-        radius = _reach(sigma, float(fit.amplitude_dn[i]), prepared.noise_dn) + 1.0
-        rows, columns = _window(x, y, radius, linear.shape)
-        gx = profile(np.arange(columns.start, columns.stop), x, float(fit.sigma_px[i, 0]))
-        gy = profile(np.arange(rows.start, rows.stop), y, float(fit.sigma_px[i, 1]))
-        light = fit.amplitude_dn[i] * gx * gy[:, None]
+    sigma, height = fit.sigma_px[near], fit.amplitude_dn[near]
+    spots = np.column_stack([fit.xy_px[near], sigma, height])
+    radius = _reach(sigma.max(axis=1, initial=0.0), height, prepared.noise_dn) + 1.0
+    return _subtracted(prepared.linear, spots, radius, BRIGHT * prepared.noise_dn)
+
+
+@twin
+def _subtracted(linear: Image, spots: Floats, radius: Floats, limit: float) -> tuple[Image, Bools]:
+    """Subtract the light of spots (n, 5: centre, two sigma, amplitude) within radius (n,).
+
+    Returns:
+        The image (h, w), and the mask (h, w) of pixels where the light of one exceeds the limit.
+    """
+    linear, bright = linear.copy(), np.zeros(linear.shape, dtype=bool)
+    for (x, y, wide, high, amplitude), far in zip(spots.tolist(), radius.tolist(), strict=True):
+        rows, columns = _window(x, y, far, linear.shape)
+        gx = profile(np.arange(columns.start, columns.stop), x, wide)
+        light = amplitude * gx * profile(np.arange(rows.start, rows.stop), y, high)[:, None]
         linear[rows, columns] -= light.astype(np.float32)
-        bright[rows, columns] |= light > BRIGHT * prepared.noise_dn
+        bright[rows, columns] |= light > limit
     return linear, bright
 
 
-def _reach(sigma: float, peak: float, noise_dn: float) -> float:
-    """Distance from the peak at which a Gaussian spot falls to FAINT standard deviations of the noise."""
-    return sigma * math.sqrt(2.0 * math.log(max(peak / (FAINT * noise_dn), math.e)))
+def _reach(sigma: Floats, peak: Floats, noise_dn: float) -> Floats:
+    """Distance (n,) from the peak at which a Gaussian spot falls to FAINT standard deviations of the noise."""
+    return np.asarray(sigma * np.sqrt(2.0 * np.log(np.maximum(peak / (FAINT * noise_dn), math.e))))
 
 
 def _window(x: float, y: float, radius: float, shape: tuple[int, ...]) -> tuple[slice, slice]:

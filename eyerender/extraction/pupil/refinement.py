@@ -32,6 +32,32 @@ TURNS, PATIENCE = (4, 2, 1), 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Ended:
+    """The end of a fit: its pixels, solution and prior, the sectors that it explains, and how far its band reaches."""
+
+    pixels: Pixels
+    found: Solution
+    prior: Prior
+    seen: Bools
+    outward: float
+
+    @property
+    def model(self) -> EdgeModel:
+        """The model, with the displacements of its sectors where it is uneven."""
+        if self.prior.uneven_px == 0.0:
+            return self.found.model
+        displaced = np.zeros(SECTORS)
+        displaced[self.pixels.sector] = self.found.displaced
+        return replace(self.found.model, displaced=displaced)
+
+    @property
+    def variance(self) -> float:
+        """Mean squared residual."""
+        sums = self.found.sums
+        return float(sums.cost) / max(self.pixels.level.size - sums.matrix.shape[0], 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PixelFit:
     """The result of a refinement.
 
@@ -66,12 +92,17 @@ def refine(
     The arguments are those of `_fitted`.
     """
     if before is not None:
-        return _fitted(linear, start, sectors, masked, noise_dn, before, before.outward, TURNS[2])
-    fit = _fitted(linear, start, sectors, masked, noise_dn, None, WIDE, TURNS[0])
-    if isinstance(fit, str) or fit.reduced_chi2 < UNEXPLAINED:
-        return fit
-    narrow = _fitted(linear, start, sectors, masked, noise_dn, fit, NARROW, TURNS[1])
-    return fit if isinstance(narrow, str) else narrow
+        start_at = (before.model, before.uneven_px, before.sectors)
+        ended = _fitted(linear, start, sectors, masked, noise_dn, start_at, before.outward, TURNS[2])
+        return ended if isinstance(ended, str) else _report(ended, noise_dn)
+    wide = _fitted(linear, start, sectors, masked, noise_dn, None, WIDE, TURNS[0])
+    if isinstance(wide, str):
+        return wide
+    if wide.variance < UNEXPLAINED * noise_dn**2:
+        return _report(wide, noise_dn)
+    start_at = (wide.model, wide.prior.uneven_px, wide.seen)
+    narrow = _fitted(linear, start, sectors, masked, noise_dn, start_at, NARROW, TURNS[1])
+    return _report(wide if isinstance(narrow, str) else narrow, noise_dn)
 
 
 def _fitted(
@@ -80,10 +111,10 @@ def _fitted(
     sectors: Bools,
     masked: Bools,
     noise_dn: float,
-    before: PixelFit | None,
+    before: tuple[EdgeModel, float, Bools] | None,
     outward: float,
     turns: int,
-) -> PixelFit | str:
+) -> _Ended | str:
     """Fit the pixel model, or give the reason why the fit failed.
 
     The Fourier order of the outer level is the one with the least BIC, predicted by one linear step. Pixels and sectors
@@ -96,18 +127,18 @@ def _fitted(
         sectors: (SECTORS,) parts of the outline with edge points.
         masked: (h, w) pixels that glints affect or the sensor clipped.
         noise_dn: standard deviation of a pixel's noise.
-        before: an earlier fit of the same boundary to start from.
+        before: model, unevenness and sectors of an earlier fit of the same boundary to start from.
         outward: how far the band of pixels reaches beyond the boundary, in widths of the blur.
         turns: number of fits at most.
     """
-    model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before.model
-    prior = Prior.of(start, noise_dn, 0.0 if before is None else before.uneven_px)
+    model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before[0]
+    prior = Prior.of(start, noise_dn, 0.0 if before is None else before[1])
     x, y, level = _band(linear, model, masked, outward)
     about = (*model.ellipse.centre_px.tolist(), *model.ellipse.semi_axes_px.tolist(), model.ellipse.angle_rad)
     bins = sectors_at(about, x, y, NEAR)
     use = np.ones(x.size, dtype=bool)
     # A lid must not decide the order of the outer level.
-    seen = clear_of_lids(sectors, start) if before is None else before.sectors
+    seen = clear_of_lids(sectors, start) if before is None else before[2]
     displaced = np.zeros(SECTORS) if model.displaced is None else model.displaced.copy()
     for turn in range(turns):
         chosen = np.nonzero(use & seen[bins])[0]
@@ -138,7 +169,7 @@ def _fitted(
         use, seen, displaced, bins = visible.use, new_seen, visible.displaced, visible.bins
         if seen.sum() < 0.15 * SECTORS:
             return "too little of the boundary fits the pixel model"
-    return _report(pixels, found, prior, noise_dn, new_seen, outward)
+    return _Ended(pixels, found, prior, new_seen, outward)
 
 
 def _band(linear: Image, model: EdgeModel, masked: Bools, reach_out: float) -> tuple[Floats, Floats, Floats]:
@@ -201,19 +232,16 @@ def _sane(model: EdgeModel, start: EdgeModel) -> bool:
     return moved < 0.25 * float(b) + 1.0 and bool((ratio > 0.7).all() and (ratio < 1.4).all()) and model.step_dn > 0.0
 
 
-def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen: Bools, outward: float) -> PixelFit:
-    model, of_pixels, count = found.model, found.sums, pixels.level.size
-    variance = of_pixels.cost / max(count - of_pixels.matrix.shape[0], 1)
+def _report(ended: _Ended, noise_dn: float) -> PixelFit:
+    pixels, found, prior, seen, model = ended.pixels, ended.found, ended.prior, ended.seen, ended.model
+    of_pixels, count, variance = found.sums, pixels.level.size, ended.variance
     normal = Normal.of(of_pixels, found.displaced, prior)
     matrix = normal.matrix + np.diag(prior.of_all(of_pixels.matrix.shape[0]))
     inverse = np.asarray(np.linalg.inv(matrix + 1e-12 * np.diag(np.diag(matrix))), dtype=np.float64)
     influence, own = inverse[:SHAPE], np.zeros((SHAPE, SHAPE))
     ellipse = model.ellipse
-    if prior.uneven_px > 0.0:
-        displaced = np.zeros(SECTORS)
-        displaced[pixels.sector] = found.displaced
-        model = replace(model, displaced=displaced)
-        ellipse, by_displaced = _through(model.ellipse, displaced)
+    if model.displaced is not None:
+        ellipse, by_displaced = _through(model.ellipse, model.displaced)
         # The displacements follow the parameters, and have errors of their own; where nothing is seen, the prior's.
         follow = by_displaced[:, pixels.sector]
         influence = influence - (follow * normal.inverse) @ (normal.across.T @ inverse)
@@ -236,7 +264,7 @@ def _report(pixels: Pixels, found: Solution, prior: Prior, noise_dn: float, seen
         count,
         seen,
         prior.uneven_px,
-        outward,
+        ended.outward,
     )
 
 
