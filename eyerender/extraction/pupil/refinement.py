@@ -54,7 +54,8 @@ class _Ended:
     def variance(self) -> float:
         """Mean squared residual."""
         sums = self.found.sums
-        return float(sums.cost) / max(self.pixels.level.size - sums.matrix.shape[0], 1)
+        freedom = max(self.pixels.level.size - sums.matrix.shape[0], 1)
+        return float(sums.cost / freedom)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
