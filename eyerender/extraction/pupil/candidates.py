@@ -29,6 +29,7 @@ ANGLES = 48  # samples around a blob
 MOST_BLOBS = 12  # that are ranked
 # Share of the thresholds, darkest first, that is tried first. The others are tried if these give no candidate.
 DARKER = 0.6
+SPOT_PX = 5.0  # radius of the glints that are removed first
 # Contours after which a sweep ends. Eyes have 20 to 2,000 in all its levels; noise and fine texture have tens of
 # thousands, which take half a second.
 MOST_CONTOURS = 5000
@@ -53,9 +54,7 @@ class Candidate:
     rough: bool = False
 
 
-def find_candidates(
-    prepared: Prepared, shape: Shape, most: int = 4, *, without_lines: bool = False, spot_px: float = 5.0
-) -> list[Candidate]:
+def find_candidates(prepared: Prepared, shape: Shape, most: int = 4, *, without_lines: bool = False) -> list[Candidate]:
     """Find up to `most` candidates, best first; the list is empty if nothing dark and round stands out.
 
     Args:
@@ -64,13 +63,12 @@ def find_candidates(
         most: number of candidates.
         without_lines: fill dark lines thinner than the smallest pupil first. Lid shadows and lashes that touch the
             pupil are as dark as the pupil and form one blob with it at every threshold.
-        spot_px: radius of the glints that are removed first.
     """
     linear, noise_dn = prepared.linear, prepared.noise_dn
     factor = int(np.clip(shape.least_px // 3.5, 1, 4))
     while factor < 8 and linear.size / factor**2 > 160_000:
         factor += 1
-    small = _reduced(linear, factor, cv2.MORPH_CLOSE if prepared.inverted else cv2.MORPH_OPEN, spot_px)
+    small = _reduced(linear, factor, cv2.MORPH_CLOSE if prepared.inverted else cv2.MORPH_OPEN)
     if without_lines:
         width = 2 * max(1, round(0.7 * shape.least_px / factor)) + 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
@@ -86,7 +84,7 @@ def find_candidates(
     return _ranked(small, noise, factor, blobs, most) if blobs.size else []
 
 
-def _reduced(linear: Image, factor: int, removal: int, spot_px: float) -> Image:
+def _reduced(linear: Image, factor: int, removal: int) -> Image:
     """Reduce, smooth, and remove glints by a morphological opening (by a closing in a negative)."""
     height, width = linear.shape
     size = (max(1, width // factor), max(1, height // factor))
@@ -95,7 +93,7 @@ def _reduced(linear: Image, factor: int, removal: int, spot_px: float) -> Image:
         small = as_image(cv2.resize(small, (2 * size[0], 2 * size[1]), interpolation=cv2.INTER_AREA))
     small = as_image(cv2.resize(small, size, interpolation=cv2.INTER_AREA))
     small = as_image(cv2.GaussianBlur(small, (3, 3), 0.8))
-    spot = 2 * math.ceil(spot_px / factor) + 1
+    spot = 2 * math.ceil(SPOT_PX / factor) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (spot, spot))
     return as_image(cv2.morphologyEx(small, removal, kernel))
 

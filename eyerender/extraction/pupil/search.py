@@ -36,7 +36,6 @@ MOVED, GROWN = 4.0, 0.7
 ROUGH = 0.8  # overlap with its boundary below which a rough candidate's edges are found again, about the boundary
 SAME = 0.95  # candidates of at least this overlap have the same boundary
 LIKELY = 0.5  # share of the best candidate's score below which no later look starts from a candidate
-TOUCHING_PX = 10.0  # radius of glints that touch each other
 MOST_CUT = 2  # boundaries that are also tried without a stretch
 # Work after which a search ends: boundaries, and the pixels about each in units of this many. That is about 0.1 s on a
 # quiet core. In 1,697 development images, 2 of the right boundaries came after more than 50, none after 60.
@@ -160,7 +159,7 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, Found | str
     1. the best candidate at a quarter of the scale, then those of a less reduced image, and those inside each that has
        a dark core
     2. pupils that lids cut: each boundary without the stretch that may be a lid, and rounder starts
-    3. the image without larger bright spots, and without dark lines, which lashes and the shadows of lids are
+    3. the image without dark lines, which lashes and the shadows of lids are
     4. the image at half scale, where block compression and texture are finer than the edges
     5. pupils smaller than USUAL_PX
     """
@@ -186,7 +185,6 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, Found | str
             yield from ((True, found) for found in bounded([replace(one.candidate, ellipse=cut.ellipse)]))
     yield from ((True, one) for one in bounded(list(_rounder(_best(tried), shape))))
     if not work.inverted:
-        yield from ((True, one) for one in bounded(_best(find_candidates(work, usual, spot_px=TOUCHING_PX))))
         lineless = _best(find_candidates(work, usual, without_lines=True))
         yield from ((True, one) for one in bounded([*lineless, *_rounder(lineless, shape)]))
     yield from ((True, one) for one in _at_half_scale(work, shape))
