@@ -284,7 +284,11 @@ class Ambience:
         far = h[0] + h[1] * w.y + h[2] * w.z + h[3] * w.x
         far += h[4] * w.x * w.y + h[5] * w.y * w.z + h[6] * (3 * w.z * w.z - 1) + h[7] * w.x * w.z
         far += h[8] * (w.x * w.x - w.y * w.y)
-        return self._even + dr.maximum(far, 0) + self._panels.irradiance(x, n)
+        return self._even + dr.maximum(far, 0) + self.of_panels(x, n)
+
+    def of_panels(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
+        """The panels' part of the irradiance."""
+        return self._panels.irradiance(x, n)
 
 
 def _reduced(values: Floats) -> Floats:

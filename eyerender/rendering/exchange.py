@@ -257,10 +257,10 @@ class Exchange:
         if not job.interreflection and not values.structure.ambient:
             return frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
-        direct, even = _direct(values, lights, place.scene, textures, frame)
+        direct, even, of_panels = _direct(values, lights, panels, place.scene, textures, frame)
         lamps, more = (_direct_inside(values, some, place.scene, frame.chamber) for some in (lights, panels))
         seen = _seen(values, lights, textures, place, numbers, frame)
-        return frame.solved(region, direct, even, lamps, more, seen)
+        return frame.solved(region, direct, (even, *of_panels), lamps, more, seen)
 
     def _skin(self, region: RegionScene, globe: Globe) -> SkinPlaces:
         """Places on the skin of a region, chosen with the eye straight ahead: no earlier pose may change a picture."""
@@ -344,18 +344,22 @@ class _Frame:
         return out
 
     def solved(
-        self, region: RegionScene | None, direct: Floats, even: Floats, lamps: Floats, panels: Floats,
-        seen: tuple[_Seen, _Seen],
+        self, region: RegionScene | None, direct: Floats, ambient: tuple[Floats, Floats, Floats], lamps: Floats,
+        panels: Floats, seen: tuple[_Seen, _Seen],
     ) -> Received:  # fmt: skip
         """Solve for the irradiance of all places."""
         job, outside, inside = self.job, *seen
+        # Light from all sides is shaded by the share of open sky, and that of panels by what stands before them.
+        even, free, shaded = ambient
         open_ = outside.mean(outside.open_)
+        arriving = (even - free) * open_ + shaded
+        open_ = np.where(even > 0, arriving / np.where(even > 0, even, 1), open_)
         valid = outside.mean(outside.near)[: self.on_globe] < 0.5
         if region is None:
             valid &= self.grid.points[:, 0] > -job.look.backdrop_distance_mm
         stand_in = self._stand_in(valid)
         targets = stand_in[outside.target], stand_in[inside.target]
-        start = np.concatenate([direct + even * open_, lamps + panels + inside.mean(inside.sky)])
+        start = np.concatenate([direct + arriving, lamps + panels + inside.mean(inside.sky)])
         total, entered, within = start, np.zeros(PLACES), np.zeros(PLACES)
         if job.interreflection:
             look = job.look
@@ -414,9 +418,13 @@ def _spots(i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
 
 
 def _direct(
-    values: Values, lights: Lights, scene: mi.Scene, textures: Textures, frame: _Frame
-) -> tuple[Floats, Floats]:
-    """Irradiance of places outside the eye straight from the lamps, and from unshadowed ambient light."""
+    values: Values, lights: Lights, panels: Lights, scene: mi.Scene, textures: Textures, frame: _Frame
+) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
+    """Irradiance of places outside the eye.
+
+    Straight from the lamps; from unshadowed ambient light; from panels, which are a part of it, without and with
+    shadows.
+    """
     outer = frame.outer
     index = dr.arange(mi.UInt32, len(outer))
     n = _rows(outer)(index)
@@ -426,12 +434,19 @@ def _direct(
     start = values.point_to_eye(x + _START_MM * normal)
     facing = values.vector_to_eye(normal)
     lit = _over_lamps(lights, index, lambda u, v: onto_points(values, lights, scene, start, facing, ~on_globe, u, v))
-    even = mi.Float(0) * x.x
+    even, free, shaded = (mi.Float(0) * x.x for _ in range(3))
     if values.structure.ambient:
         assert textures.ambience is not None
         even = textures.ambience.irradiance(x, normal)
-    dr.eval(even)
-    return lit, np.asarray(even.numpy(), dtype=float)
+    if len(panels):
+        assert textures.ambience is not None
+        free = textures.ambience.of_panels(x, normal)
+        middle = mi.Float(0)
+        shaded = onto_points(values, panels, scene, start, facing, ~on_globe, middle, middle)
+        shaded = dr.minimum(shaded, free)
+    dr.eval(even, free, shaded)
+    even, free, shaded = (np.asarray(part.numpy(), dtype=float) for part in (even, free, shaded))
+    return lit, even, (free, shaded)
 
 
 def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, chamber: Chamber) -> Floats:
