@@ -100,6 +100,12 @@ def of_edges(matrix, scores, count, residual_px):
 
 
 @compiled
+def followed(matrix, slopes):
+    moved = _inverse(matrix) @ slopes
+    return moved @ moved.T
+
+
+@compiled
 def along_outline(ellipse, covariance):
     a, b, angle = ellipse[2], ellipse[3], ellipse[4]
     cos, sin, total, row = math.cos(angle), math.sin(angle), 0.0, np.empty(5)

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import Floats, frozen
+from ...arrays import Bools, Floats, frozen
 from ...status import Status
+from ..compiled import twin
 from ..preprocessing import DN, Image, Prepared
 from ..result import GlintResult
 from ..settings import ExtractionSettings
@@ -147,18 +148,22 @@ def _objection(
 
 def _beside(fit: SpotFit, i: int, linear: Image) -> Image:
     """Levels (n,) of the pixels in a ring around spot i, without other spots."""
-    x, y = fit.xy_px[i]
-    wide = float(fit.sigma_px[i].max())
-    reach = 3.5 * wide + 1.0
+    return _ring(linear, fit.xy_px, fit.sigma_px.max(axis=1), fit.converged, i)
+
+
+@twin
+def _ring(linear: Image, xy: Floats, wide: Floats, converged: Bools, i: int) -> Image:
+    """Do what `_beside` does, for spots at xy (n, 2) of sigma `wide` (n,)."""
+    x, y = xy[i]
+    reach = 3.5 * wide[i] + 1.0
     x0, x1 = max(0, math.floor(x - reach)), min(linear.shape[1], math.ceil(x + reach) + 1)
     y0, y1 = max(0, math.floor(y - reach)), min(linear.shape[0], math.ceil(y + reach) + 1)
     columns, rows = np.arange(x0, x1), np.arange(y0, y1)[:, None]
-    ring = (columns - x) ** 2 + (rows - y) ** 2 > (2.2 * wide) ** 2
-    disc = 3.0 * fit.sigma_px.max(axis=1)
-    apart2 = ((fit.xy_px - fit.xy_px[i]) ** 2).sum(axis=1)
-    near = fit.converged & (apart2 < (1.5 * reach + disc + 1.0) ** 2) & (np.arange(disc.size) != i)
+    ring = (columns - x) ** 2 + (rows - y) ** 2 > (2.2 * wide[i]) ** 2
+    apart2 = ((xy - xy[i]) ** 2).sum(axis=1)
+    near = converged & (apart2 < (1.5 * reach + 3.0 * wide + 1.0) ** 2) & (np.arange(wide.size) != i)
     for k in np.flatnonzero(near):
-        ring &= (columns - fit.xy_px[k, 0]) ** 2 + (rows - fit.xy_px[k, 1]) ** 2 > disc[k] ** 2
+        ring &= (columns - xy[k, 0]) ** 2 + (rows - xy[k, 1]) ** 2 > (3.0 * wide[k]) ** 2
     return np.asarray(linear[y0:y1, x0:x1][ring])
 
 

@@ -187,8 +187,14 @@ def leverage(ellipse: Ellipse, sums: EdgeSums) -> float:
     that hold points were displaced independently by 1 px. A real boundary is uneven, so the hidden
     part of an outline is the more uncertain the larger this is.
     """
-    moved = _inverse(sums.matrix) @ sums.slopes
-    return max(_along_outline(_numbers(ellipse), moved @ moved.T), 1e-3)
+    return max(_along_outline(_numbers(ellipse), _followed(sums.matrix, sums.slopes)), 1e-3)
+
+
+@twin
+def _followed(matrix: Floats, slopes: Floats) -> Floats:
+    """Covariance (5, 5) that independent displacements of the groups of 1 px cause, by the sums of `EdgeSums`."""
+    moved = _inverse(matrix) @ slopes
+    return np.asarray(moved @ moved.T)
 
 
 def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:

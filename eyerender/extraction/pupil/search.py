@@ -329,7 +329,7 @@ def boundary_about(work: Prepared, candidate: Candidate, shape: Shape) -> Found 
     boundary = fit_boundary(edges, candidate, shape, expected)
     if isinstance(boundary, str):
         return boundary
-    if candidate.rough and iou(candidate.ellipse, boundary.ellipse) < ROUGH:
+    if candidate.rough and iou(candidate.ellipse, boundary.ellipse, nodes=128) < ROUGH:
         near = candidate_at(work, boundary.ellipse)
         again = None if near is None else boundary_about(work, near, shape)
         if isinstance(again, Found):
