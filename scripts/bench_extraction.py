@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Bench of the image feature extractor on ideal and rendered images: errors, bounds, coverage, confidence, time.
 
-    bench_extraction.py [--quick] [--json F] [--seed 10000] [--count N] [--only ideal|confidence|rendered]
+    bench_extraction.py [--quick] [--json F] [--seed 10000] [--count N] [--only ideal|confidence|rendered|speed]
 
 Images come from make_ideal_images.py, 40 per row (`--quick`: 10), with seeds from 10,000 on; development used the
 seeds below. The bound is the Cramer-Rao bound of a blurred step: per axis (s / step) sqrt(2 sigma_b / (sqrt(pi) R))
@@ -13,9 +13,13 @@ is missed.
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing import Pool
 
 import cv2
@@ -185,12 +189,39 @@ def reliability(table: Table, count: int, first: int, processes: int) -> None:
         table.add(f"{name}: confidence > 0.9, of those wrong", float(1.0 - np.mean(right[certain])), "1")
 
 
+def speed(table: Table, count: int, first: int) -> None:
+    """CPU time relative to pupil-detectors where it can be imported: best of five in turns, median of the images."""
+    if importlib.util.find_spec("pupil_detectors") is None:
+        print("pupil-detectors is not installed; run with it on PYTHONPATH to measure relative times")
+        return
+    detector = importlib.import_module("pupil_detectors").Detector2D()
+    for condition in ("noise2", "head-mounted"):
+        images = [_drawing(condition, seed).image for seed in range(first, first + count)]
+        priors = [extract(image, settings=FAST).pupil for image in images]
+        least = np.full((4, count), np.inf)
+        for _ in range(5):
+            for i, (image, prior) in enumerate(zip(images, priors, strict=True)):
+                jobs: tuple[Callable[[], object], ...] = (
+                    partial(detector.detect, image),
+                    partial(extract, image, settings=FAST),
+                    partial(extract, image, settings=REFINED),
+                    partial(extract, image, settings=FAST, prior=prior),
+                )
+                for k, job in enumerate(jobs):
+                    start = time.process_time()
+                    job()
+                    least[k, i] = min(least[k, i], time.process_time() - start)
+        theirs, *ours = np.median(least, axis=1)
+        for name, own, bar in zip(("fast", "refined", "fast with a prior"), ours, (1.8, 4.0, 1.8), strict=True):
+            table.add(f"{condition}, {name}: CPU time, of that of pupil-detectors", float(own / theirs), "1", aim=bar)
+
+
 def main() -> int:
     parser = options_of(__doc__, "10 images a row, 200 for the confidence")
     parser.add_argument("--seed", type=int, default=10_000, help="first seed")
     parser.add_argument("--count", type=int, help="images a row (default 40; --quick: 10)")
     parser.add_argument("--processes", type=int, default=2, help="for the confidence and the rendered images")
-    parser.add_argument("--only", choices=("ideal", "confidence", "rendered"), help="one part of the table")
+    parser.add_argument("--only", choices=("ideal", "confidence", "rendered", "speed"), help="one part of the table")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     count, many = (10, 200) if options.quick else (40, 4000)
@@ -204,6 +235,8 @@ def main() -> int:
         coverage(table, tallies, "fast")
     if "rendered" in parts:
         bench_rendered_rows.add(table, count, options.seed, options.processes)
+    if "speed" in parts:
+        speed(table, min(count, 12), options.seed)
     if "confidence" in parts:
         reliability(table, many, options.seed, options.processes)
     return table.report.finish(options.json, ("eyerender", "numpy", "opencv-python-headless"))
