@@ -168,7 +168,8 @@ def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tu
 
 def _boundary_fit(found: Found, cleared: tuple[Image, Bools], before: PixelFit | None = None) -> PixelFit | None:
     try:
-        fit = refine(cleared[0], found.model, found.sectors, cleared[1], found.image.noise_dn, before)
+        scatter = found.boundary.residual_px
+        fit = refine(cleared[0], found.model, found.sectors, cleared[1], found.image.noise_dn, scatter, before)
     except np.linalg.LinAlgError:  # the pixels do not determine the parameters
         return None
     return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None

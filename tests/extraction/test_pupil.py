@@ -192,7 +192,7 @@ def test_an_arc_tells_little_across_it():
     slopes = distance_slopes(truth, Place.middles(truth))
     through_all = np.linalg.solve(slopes @ slopes.T, slopes)
     through_seen = np.linalg.solve((slopes * seen) @ slopes.T, slopes * seen)
-    covariance = hidden_part(truth, seen)
+    covariance = hidden_part(truth, seen, 1.0)
     distance, before, after = [], [], []
     for _ in range(400):
         displaced = np.repeat(rng.normal(0.0, HIDDEN_UNEVEN * np.sqrt(30.0 * 28.5), GROUPS), SECTORS // GROUPS)
@@ -205,7 +205,9 @@ def test_an_arc_tells_little_across_it():
         assert np.trace(smaller) < np.trace(covariance)
     assert np.mean(distance) == pytest.approx(5.0, rel=0.1)  # chi^2 of five numbers
     assert np.mean(after) > np.mean(before) + 0.01
-    nothing_hidden = hidden_part(truth, np.ones(SECTORS, dtype=bool))
+    nothing_hidden = hidden_part(truth, np.ones(SECTORS, dtype=bool), 1.0)
     assert np.abs(nothing_hidden).max() < 1e-12
+    even = hidden_part(truth, seen, 0.01)  # a boundary that is smooth where it is seen
+    assert np.trace(even) < 0.01 * np.trace(covariance)
     same, _ = towards_round(truth, np.eye(5) * 0.02**2)
     assert iou(same, truth) > 0.9999

@@ -201,7 +201,7 @@ def _polished(
     if gap > CUT:
         held = np.zeros(SECTORS, dtype=bool)
         held[sectors_at((*found.tolist(),), kept[:, 0], kept[:, 1], NEAR)] = True
-        ellipse, covariance = towards_round(ellipse, covariance + hidden_part(ellipse, held))
+        ellipse, covariance = towards_round(ellipse, covariance + hidden_part(ellipse, held, residual))
     return BoundaryFit(ellipse, inliers, kept, support, gap, residual, sums, to_axes(covariance, ellipse))
 
 

@@ -24,6 +24,9 @@ SELECTION = 1.6
 # 1.7 % from a circle). Of 0.01, 0.015 and 0.02, this one makes the covariance of cut pupils right (rendered development
 # images, both lids over the pupil: 68 and 95 % ellipses hold .61 and .90 of the centres).
 HIDDEN_UNEVEN = 0.015
+# The hidden part is no more uneven than this many times the scatter of the visible edge points. Drawn ellipses have a
+# scatter of 0.0017 of the radius, rendered pupils 0.004 and more.
+ROUGHER = 3.0
 # Standard deviation of the difference of a pupil's semi-axes, and of what turns them, in its radius: the aspect of
 # pupils seen from up to 35 degrees aside is 0.82 to 1.
 ELONGATION = 0.1
@@ -128,7 +131,7 @@ def _of_edges(matrix: Floats, scores: Floats, count: Indices, residual_px: float
     return np.asarray(plain * max(excess, 1.0) * SELECTION)
 
 
-def hidden_part(ellipse: Ellipse, seen: Bools) -> Floats:
+def hidden_part(ellipse: Ellipse, seen: Bools, residual_px: float) -> Floats:
     """Covariance (5, 5) of the centre and shape matrix that unevenness causes where only a part of the outline is seen.
 
     The ellipse through the visible sectors differs from the one through all of them by a linear function of their
@@ -137,6 +140,7 @@ def hidden_part(ellipse: Ellipse, seen: Bools) -> Floats:
     Args:
         ellipse: the ellipse through the visible sectors.
         seen: (SECTORS,) which are visible.
+        residual_px: root mean square distance of the edge points in them.
     """
     slopes = distance_slopes(ellipse, Place.middles(ellipse))
     visible = slopes * seen
@@ -144,7 +148,7 @@ def hidden_part(ellipse: Ellipse, seen: Bools) -> Floats:
     ridge = 1e-9 * np.trace(matrix) * np.eye(SHAPE)
     by_sector = np.linalg.solve(matrix + ridge, visible) - np.linalg.solve(slopes @ slopes.T, slopes)
     by_group = by_sector.reshape(SHAPE, GROUPS, -1).sum(axis=2)
-    uneven = HIDDEN_UNEVEN * math.sqrt(float(ellipse.semi_axes_px.prod()))
+    uneven = min(HIDDEN_UNEVEN * math.sqrt(float(ellipse.semi_axes_px.prod())), ROUGHER * residual_px)
     return np.asarray(uneven**2 * (by_group @ by_group.T))
 
 

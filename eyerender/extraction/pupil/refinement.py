@@ -86,24 +86,30 @@ class PixelFit:
 
 
 def refine(
-    linear: Image, start: EdgeModel, sectors: Bools, masked: Bools, noise_dn: float, before: PixelFit | None = None
+    linear: Image,
+    start: EdgeModel,
+    sectors: Bools,
+    masked: Bools,
+    noise_dn: float,
+    scatter_px: float,
+    before: PixelFit | None = None,
 ) -> PixelFit | str:
     """Fit the pixel model, in a narrower band if that leaves more than noise; or give the reason why the fit failed.
 
-    The arguments are those of `_fitted`.
+    The arguments are those of `_fitted`, and the root mean square distance of the edge points from their ellipse.
     """
     if before is not None:
         start_at = (before.model, before.uneven_px, before.sectors)
         ended = _fitted(linear, start, sectors, masked, noise_dn, start_at, before.outward, TURNS[2])
-        return ended if isinstance(ended, str) else _report(ended, noise_dn)
+        return ended if isinstance(ended, str) else _report(ended, noise_dn, scatter_px)
     wide = _fitted(linear, start, sectors, masked, noise_dn, None, WIDE, TURNS[0])
     if isinstance(wide, str):
         return wide
     if wide.variance < UNEXPLAINED * noise_dn**2:
-        return _report(wide, noise_dn)
+        return _report(wide, noise_dn, scatter_px)
     start_at = (wide.model, wide.prior.uneven_px, wide.seen)
     narrow = _fitted(linear, start, sectors, masked, noise_dn, start_at, NARROW, TURNS[1])
-    return _report(wide if isinstance(narrow, str) else narrow, noise_dn)
+    return _report(wide if isinstance(narrow, str) else narrow, noise_dn, scatter_px)
 
 
 def _fitted(
@@ -233,7 +239,7 @@ def _sane(model: EdgeModel, start: EdgeModel) -> bool:
     return moved < 0.25 * float(b) + 1.0 and bool((ratio > 0.7).all() and (ratio < 1.4).all()) and model.step_dn > 0.0
 
 
-def _report(ended: _Ended, noise_dn: float) -> PixelFit:
+def _report(ended: _Ended, noise_dn: float, scatter_px: float) -> PixelFit:
     pixels, found, prior, seen, model = ended.pixels, ended.found, ended.prior, ended.seen, ended.model
     of_pixels, count, variance = found.sums, pixels.level.size, ended.variance
     normal = Normal.of(of_pixels, found.displaced, prior)
@@ -255,7 +261,7 @@ def _report(ended: _Ended, noise_dn: float) -> PixelFit:
     excess = sector_excess(plain, influence, sums)
     covariance = plain * (excess if excess > 1.25 else 1.0) + own
     if not seen.all():
-        ellipse, covariance = towards_round(ellipse, covariance + hidden_part(ellipse, seen))
+        ellipse, covariance = towards_round(ellipse, covariance + hidden_part(ellipse, seen, scatter_px))
     return PixelFit(
         model,
         ellipse,
