@@ -305,7 +305,7 @@ class _Strip:
         lines = self.tiles.at(11, _places(y, self.level + sway), (0, 6), (22, 60))
         under = _bell(z, -11.0, 6.0) + 0.7 * _bell(z, 8.0, 4.0) + _bell(y, -21.0, 5.0)
         amount = 0.025 * skin.wrinkles * _hill(y, z, 26.0, 20.0) * under
-        return np.asarray(skin.relief_mm * (cells + 0.03 * grain + 2.0 * swell) - amount * np.abs(lines))
+        return np.asarray(skin.relief_mm * (cells + 0.03 * grain + 1.8 * swell) - amount * np.abs(lines))
 
     def creases(self) -> Singles:
         """Depth, 0 to about 1, of the creases of the lids' thin skin.
@@ -388,7 +388,7 @@ class _Strip:
         slow = self.field(21, (0, 4), (0, 4))
         blotch = self.field(22, (3, 22), (3, 22))
         fine = self.field(23, (40, 150), (40, 150))
-        tone = (1 + skin.mottling * (0.05 * slow + 0.022 * blotch + 0.03 * fine)) * open_
+        tone = (1 + skin.mottling * (0.06 * slow + 0.026 * blotch + 0.03 * fine)) * open_
         tone *= 1 - skin.veins * self.veins()
         # The hollow beside the nose and the rim below the lower lid are a little darker, the lash line more so.
         tone *= 1 - 0.20 * _bell(y, 15.5, 5.5) * _bell(z, 5.0, 8.0)

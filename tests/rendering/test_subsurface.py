@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from eyerender.optics import diffusion
 from eyerender.region.anatomy import Brow, Lashes, Region, Skin
@@ -100,8 +101,8 @@ def test_smooth_skin_and_sclera_reflect_as_much_as_before(renderer, name):
             assert soft[skin].sum() == pytest.approx(hard[skin].sum(), rel=0.01)
     # Near the lids the sclera loses light to what lies under them.
     assert 0.9 * hard[part == 1].sum() < soft[part == 1].sum() < hard[part == 1].sum()
-    # Pixels of the iris' edge show some of the sclera.
-    assert soft[part == 2].sum() == pytest.approx(hard[part == 2].sum(), rel=5e-3)
+    iris = ndimage.binary_erosion(part == 2, iterations=3)  # pixels of its edge show some of the sclera and the lids
+    assert soft[iris].sum() == pytest.approx(hard[iris].sum(), rel=5e-4)
     # Shadows are softer: the sum of squared differences of neighbours is smaller.
     assert np.square(np.diff(soft, axis=0)).sum() < np.square(np.diff(hard, axis=0)).sum()
 
