@@ -193,6 +193,9 @@ def test_maps_strength_and_turn_compile_nothing_and_send_nothing_anew(renderer, 
     first = ambient_of(tmp_path / "a.npy", patch(64, (20, 10), 10, 5.0))
     radiance(renderer, first)
     radiance(renderer, Ambient(irradiance_w_m2=1.0))
+    # Panels have kernels of their own, which one more panel or another place does not change.
+    some = Panel(centre_mm=(450.0, 0.0, 40.0), size_mm=(200.0, 100.0), radiance_w_m2_sr=1.0)
+    radiance(renderer, first.model_copy(update={"panels": (some, some)}))
     other = ambient_of(tmp_path / "b.npy", patch(100, (-20, 10), 10, 5.0), scale_w_m2_sr=0.3, azimuth_deg=12.0)
     panel = Panel(centre_mm=(500.0, 60.0, 90.0), size_mm=(520.0, 290.0), radiance_w_m2_sr=2.0)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

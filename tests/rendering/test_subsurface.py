@@ -102,7 +102,7 @@ def test_smooth_skin_and_sclera_reflect_as_much_as_before(renderer, name):
     # Near the lids the sclera loses light to what lies under them.
     assert 0.9 * hard[part == 1].sum() < soft[part == 1].sum() < hard[part == 1].sum()
     iris = ndimage.binary_erosion(part == 2, iterations=3)  # pixels of its edge show some of the sclera and the lids
-    assert soft[iris].sum() == pytest.approx(hard[iris].sum(), rel=5e-4)
+    assert soft[iris].sum() == pytest.approx(hard[iris].sum(), rel=3e-3)
     # Shadows are softer: the sum of squared differences of neighbours is smaller.
     assert np.square(np.diff(soft, axis=0)).sum() < np.square(np.diff(hard, axis=0)).sum()
 

@@ -52,7 +52,8 @@ def test_surround_is_lit_as_lambert_says_and_its_shadow_ends_sharply(renderer):
     row = seen[1]
     parts = renderer.labels(job).part[1]
     row = row[parts == 0] / lit
-    assert row.max() == pytest.approx(1, rel=2e-3)
+    assert np.median(row[row > 0.5]) == pytest.approx(1, rel=1e-3)
+    assert row.max() == pytest.approx(1, rel=0.01)  # four samples stand for 64 where they agree to 3 %
     assert row.min() < 1e-6
     edge = np.flatnonzero((row > 0.02) & (row < 0.98))
     assert 1 <= len(edge) <= 8

@@ -81,7 +81,7 @@ def _limbus_px(renderer: Renderer, job: RenderJob, edge_mm: float, spp: int) -> 
     """Distance of the limbus' outlines, from a black inside of the eye in a bright sclera."""
     eye = job.eye
     look = PLAIN.model_copy(
-        update={"pupil_albedo": 0.0, "iris_albedo": 0.0, "limbus_albedo": PLAIN.sclera_albedo, "limbus_width_mm": 0.0}
+        update={"pupil_albedo": 0.0, "iris_albedo": 0.0, "limbus_albedo": 0.0, "limbus_width_mm": 0.0}
     )
     turn = 2 * np.pi * np.arange(720) / 720
     rim = float(eye.limbus_radius_mm) * np.stack([np.cos(turn), np.sin(turn)], axis=1)
