@@ -266,7 +266,7 @@ class _Strip:
         # skin is smooth and swollen, in short streaks along the lids.
         oil = 0.55 + 0.2 * self.field(5, (0, 8), (0, 8)) + 0.6 * _bell(self.out_mm, 0.6, 0.9)
         points = np.maximum(self.tiles.at(8, _places(self.y, self.level), (15, 60), (35, 95)) - 0.4, 0.0)
-        sheen = 0.45 * spec.skin.sheen * np.clip(oil * (0.4 + 0.6 * cells) * (1 - pores) + 6.0 * points, 0.1, 2.2)
+        sheen = 0.42 * spec.skin.sheen * np.clip(oil * (0.4 + 0.6 * cells) * (1 - pores) + 5.0 * points, 0.1, 2.2)
         gloss = np.clip(np.minimum(sheen, 0.45) * self.lid + wet, 0, 1)
         return self.albedo(open_, spots), gloss, height
 
@@ -305,7 +305,7 @@ class _Strip:
         lines = self.tiles.at(11, _places(y, self.level + sway), (0, 6), (22, 60))
         under = _bell(z, -11.0, 6.0) + 0.7 * _bell(z, 8.0, 4.0) + _bell(y, -21.0, 5.0)
         amount = 0.025 * skin.wrinkles * _hill(y, z, 26.0, 20.0) * under
-        return np.asarray(skin.relief_mm * (cells + 0.03 * grain + 1.8 * swell) - amount * np.abs(lines))
+        return np.asarray(skin.relief_mm * (cells + 0.03 * grain + 1.3 * swell) - amount * np.abs(lines))
 
     def creases(self) -> Singles:
         """Depth, 0 to about 1, of the creases of the lids' thin skin.

@@ -31,8 +31,8 @@ from .values import aligned
 
 GRID_ROWS, GRID_COLUMNS = 160, 768  # of the grid over the sheet on which its light is computed (see `subsurface`)
 SHEET_COLUMNS = COLUMNS + 1  # of vertices, because the first column is repeated
-_F0_OIL, _F0_TEARS = 0.034, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
-_ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.03, 0.035
+_F0_OIL, _F0_TEARS = 0.03, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
+_ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.042, 0.035
 _OILY = 0.85  # share of skin's sheen in the narrow lobe of its film of oil, which the relief breaks into points
 _RIPPLE = 0.02  # slope of wet tissue
 _NONE = slice(0)
