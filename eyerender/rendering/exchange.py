@@ -64,11 +64,8 @@ if TYPE_CHECKING:
     from .values import Lights, Values
 
 RAYS = 24  # from each place on the globe or about it
-_NEAR_RAYS, _FAR_RAYS, _FAR_MM = (
-    16,
-    8,
-    17.0,
-)  # from each place on the skin; beyond this, and within lids, the fewer ones
+_NEAR_RAYS, _FAR_RAYS = 16, 8  # from each place on the skin: the fewer ones within lids and far away
+_FAR_MM = 17.0  # distance from the eye beyond which skin is far
 _ROUNDS = 6
 _START_MM = 0.02
 _SMALL, _SPOTS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
