@@ -435,39 +435,42 @@ BUCKETS = 256
 
 @inlined
 def _quantile(values, share):
-    """`statistics.quantile` of values (n,), which stay as they are: counted in buckets, then sorted in two."""
-    n = values.size
-    if n == 0:
+    """`statistics.quantile` of values (n,), which stay as they are.
+
+    They are counted in buckets, then those of the right bucket in smaller ones, until all in a bucket are equal.
+    """
+    if values.size == 0:
         return math.nan
-    at = share * (n - 1)
+    at = share * (values.size - 1)
     low = math.floor(at)
-    least, most = values[0], values[0]
-    for i in range(n):
-        least, most = min(least, values[i]), max(most, values[i])
-    if not most > least:
-        return float(least)
-    scale = (BUCKETS - 1e-3) / (float(most) - float(least))
-    count = np.zeros(BUCKETS + 1, dtype=np.int64)
-    for i in range(n):
-        count[int((float(values[i]) - least) * scale)] += 1
-    first = before = 0
-    while before + count[first] <= low:
-        before += count[first]
-        first += 1
-    last, total = first, before + count[first]
-    while total < min(low + 2, n):
-        last += 1
-        total += count[last]
-    some, size = np.empty(total - before), 0
-    for i in range(n):
-        if first <= int((float(values[i]) - least) * scale) <= last:
-            some[size] = values[i]
-            size += 1
-    some = np.sort(some)
-    value = some[int(low) - before]
+    rank, some, count = int(low), values, np.empty(BUCKETS, dtype=np.int64)
+    while True:
+        least, most = some[0], some[0]
+        for i in range(some.size):
+            least, most = min(least, some[i]), max(most, some[i])
+        if least == most:
+            break
+        count[:], scale, bucket = 0, (BUCKETS - 1e-3) / (float(most) - float(least)), 0
+        for i in range(some.size):
+            count[int((float(some[i]) - least) * scale)] += 1
+        while rank >= count[bucket]:
+            rank -= count[bucket]
+            bucket += 1
+        inside, size = np.empty(count[bucket], dtype=values.dtype), 0
+        for i in range(some.size):
+            if int((float(some[i]) - least) * scale) == bucket:
+                inside[size] = some[i]
+                size += 1
+        some = inside
+    first, second, upto = float(some[0]), math.inf, 0
     if low == at:
-        return value
-    return value + (at - low) * (some[int(low) - before + 1] - value)
+        return first
+    for i in range(values.size):
+        if values[i] > first:
+            second = min(second, float(values[i]))
+        else:
+            upto += 1
+    return first if upto > low + 1 else first + (at - low) * (second - first)
 
 
 @inlined
@@ -587,6 +590,74 @@ def interior(crop, hidden, ellipse, end):
     return _median(ring[:n_ring]) - _median(core[:n_core]), n_core, n_ring, spread
 
 
+@inlined
+def _beside(ellipse, k, sectors, away, linear, corner, patch):
+    """Level at the pixel `away` outside an ellipse, in the middle of sector k."""
+    cx, cy, a, b, angle = ellipse
+    cos, sin, t = math.cos(angle), math.sin(angle), 2.0 * math.pi * ((k + 0.5) / sectors - 0.5) - angle
+    c, s = math.cos(t), math.sin(t)
+    nx, ny = b * c, a * s
+    height = math.sqrt(nx * nx + ny * ny)
+    p, q = a * c + away * nx / height, b * s + away * ny / height
+    column = min(max(int(np.rint(cx + p * cos - q * sin)), 0), linear.shape[1] - 1)
+    row = min(max(int(np.rint(cy + p * sin + q * cos)), 0), linear.shape[0] - 1)
+    i, j = row - corner[1], column - corner[0]
+    if 0 <= i < patch.shape[0] and 0 <= j < patch.shape[1]:
+        return patch[i, j]
+    return linear[row, column]
+
+
+@compiled
+def levels_beside(ellipse, away_px, sectors, linear, corner, patch):
+    out = np.empty(sectors, dtype=np.float32)
+    for k in range(sectors):
+        out[k] = _beside(ellipse, k, sectors, away_px, linear, corner, patch)
+    return out
+
+
+@compiled
+def held(ellipse, points):
+    cx, cy, a, b, angle = ellipse
+    cos, sin = math.cos(angle), math.sin(angle)
+    hit, grown = np.zeros(SECTORS, dtype=np.bool_), np.empty(SECTORS, dtype=np.bool_)
+    for i in range(points.shape[0]):
+        place = _place(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], 3)
+        hit[_sector(place[6], place[7], SECTORS)] = True
+    for k in range(SECTORS):
+        grown[k] = hit[k] or hit[k - 1] or hit[(k + 1) % SECTORS]
+    for k in range(SECTORS):
+        hit[k] = hit[k] or (grown[k] and grown[k - 1] and grown[(k + 1) % SECTORS])
+    return hit
+
+
+@inlined
+def _chord(ellipse, y):
+    """Ends of the horizontal chord of an ellipse at a height."""
+    cx, cy, a, b, angle = ellipse
+    cos, sin, dy = math.cos(angle), math.sin(angle), y - cy
+    square, mixed = (cos / a) ** 2 + (sin / b) ** 2, cos * sin * (1.0 / (a * a) - 1.0 / (b * b)) * dy
+    root = math.sqrt(max(mixed * mixed - square * (((sin / a) ** 2 + (cos / b) ** 2) * dy * dy - 1.0), 0.0))
+    return cx - (mixed + root) / square, cx - (mixed - root) / square
+
+
+@compiled
+def overlap(first, second):
+    nodes = 128
+    high_1 = math.sqrt((first[2] * math.sin(first[4])) ** 2 + (first[3] * math.cos(first[4])) ** 2)
+    high_2 = math.sqrt((second[2] * math.sin(second[4])) ** 2 + (second[3] * math.cos(second[4])) ** 2)
+    low, high = max(first[1] - high_1, second[1] - high_2), min(first[1] + high_1, second[1] + high_2)
+    if low >= high:
+        return 0.0
+    common = 0.0
+    for k in range(nodes):
+        t = (k + 0.5) * (math.pi / nodes) - 0.5 * math.pi
+        y = 0.5 * (low + high) + 0.5 * (high - low) * math.sin(t)
+        (left_1, right_1), (left_2, right_2) = _chord(first, y), _chord(second, y)
+        common += max(min(right_1, right_2) - max(left_1, left_2), 0.0) * math.cos(t)
+    common *= 0.5 * (high - low) * math.pi / nodes
+    return common / (math.pi * (first[2] * first[3] + second[2] * second[3]) - common)
+
+
 @compiled
 def along(ellipse, points, others, linear, corner, patch, away, limits):
     cx, cy, a, b, angle = ellipse
@@ -599,21 +670,8 @@ def along(ellipse, points, others, linear, corner, patch, away, limits):
     for k in range(SECTORS):
         if held[k]:
             continue
-        t = 2.0 * math.pi * ((k + 0.5) / SECTORS - 0.5) - angle
-        c, s = math.cos(t), math.sin(t)
-        nx, ny = b * c, a * s
-        height = math.sqrt(nx * nx + ny * ny)
-        nx, ny = nx / height, ny / height
-        is_dark = True
-        for side in (-away, away):
-            p, q = a * c + side * nx, b * s + side * ny
-            column = min(max(int(np.rint(cx + p * cos - q * sin)), 0), linear.shape[1] - 1)
-            row = min(max(int(np.rint(cy + p * sin + q * cos)), 0), linear.shape[0] - 1)
-            level, i, j = linear[row, column], row - corner[1], column - corner[0]
-            if 0 <= i < patch.shape[0] and 0 <= j < patch.shape[1]:
-                level = patch[i, j]
-            is_dark = is_dark and level < dark
-        hollow += is_dark
+        inside = _beside(ellipse, k, SECTORS, -away, linear, corner, patch)
+        hollow += inside < dark and _beside(ellipse, k, SECTORS, away, linear, corner, patch) < dark
     for i in range(others.shape[0]):
         dx, dy = others[i, 0] - cx, others[i, 1] - cy
         p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b

@@ -23,7 +23,7 @@ from .preprocessing import DN, Image, Prepared, invert, prepare
 from .pupil.consensus import relative_to
 from .pupil.covariance import boundary_deviation
 from .pupil.edge_model import SECTORS, EdgeModel
-from .pupil.glare import Cleared
+from .pupil.glare import NO_PATCH, levels_beside
 from .pupil.refinement import PixelFit, refine
 from .pupil.scoring import pupil_of
 from .pupil.search import SURE, Found, search
@@ -127,7 +127,8 @@ def explained(prepared: Prepared, found: Found, settings: ExtractionSettings) ->
 
 def _iris_level(prepared: Prepared, found: Found, model: EdgeModel) -> float:
     """Level just outside the seen parts of the boundary, in the image as it is."""
-    levels = Cleared(prepared.linear).levels(model.ellipse, 1.5 * model.sigma_px + 1.0, SECTORS)
+    away = 1.5 * model.sigma_px + 1.0
+    levels = levels_beside(model.ellipse.numbers(), away, SECTORS, prepared.linear, (0, 0), NO_PATCH)
     return median(levels[found.sectors])
 
 

@@ -71,9 +71,10 @@ def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | st
         linear, clip, quantum = scaled, float("inf"), 0.0
     else:
         linear, clip, quantum = _from_integers(array, bit_depth, gamma)
-    low, high = float(linear.min()), float(linear.max())
-    if low == high:
-        name = "all black" if high == 0.0 else "all white" if high >= clip else "of one grey level"
+    levels = linear if array.dtype.kind == "f" else array  # the smallest type takes the least time
+    if levels.min() == levels.max():
+        level = float(linear[0, 0])
+        name = "all black" if level == 0.0 else "all white" if level >= clip else "of one grey level"
         return f"the image is {name}"
     # Rounding to integers adds noise of 1/sqrt(12) of a step.
     noise = max(estimate_noise(linear), quantum / np.sqrt(12.0), 1e-3)
@@ -158,11 +159,10 @@ def estimate_noise(linear: Image) -> float:
     """
     difference = _differences(linear, max(1, int(np.sqrt(linear.size / 20_000))))
     # Flat areas that clipping made constant contain no information on the noise.
-    moving = difference[difference > 0.0]
-    if moving.size < 0.05 * difference.size:
+    moving = np.count_nonzero(difference)
+    if moving < 0.05 * difference.size:
         return 0.0
-    source = difference if moving.size > 0.6 * difference.size else moving
-    return 0.7413 * median(source)
+    return 0.7413 * median(difference if moving > 0.6 * difference.size else difference[difference > 0.0])
 
 
 @twin

@@ -11,6 +11,7 @@ As a conic it is A x^2 + B x y + C y^2 + D x + E y + F = 0 with 4 A C - B^2 > 0,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -66,17 +67,18 @@ class Ellipse:
         # As in `wrap_angle`: the remainder of a tiny negative angle is rounded up to pi itself.
         object.__setattr__(self, "angle_rad", 0.0 if angle >= math.pi else angle)
 
-    def _key(self) -> tuple[float, ...]:
+    def numbers(self) -> tuple[float, ...]:
+        """Centre (x, y), semi-axes (a, b) and angle as plain numbers."""
         return (*self.centre_px.tolist(), *self.semi_axes_px.tolist(), self.angle_rad)
 
     def __eq__(self, other: object) -> bool:
-        return self._key() == other._key() if isinstance(other, Ellipse) else NotImplemented
+        return self.numbers() == other.numbers() if isinstance(other, Ellipse) else NotImplemented
 
     def __hash__(self) -> int:
-        return hash(self._key())
+        return hash(self.numbers())
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Ellipse, (self.centre_px.tolist(), self.semi_axes_px.tolist(), self.angle_rad)
+        return Ellipse.of, (self.numbers(),)
 
     @property
     def area_px2(self) -> float:
@@ -87,6 +89,11 @@ class Ellipse:
     def aspect(self) -> float:
         """Aspect ratio b / a, in (0, 1]."""
         return float(self.semi_axes_px[1] / self.semi_axes_px[0])
+
+    @staticmethod
+    def of(numbers: Sequence[float] | Floats) -> Ellipse:
+        """Make the ellipse of what `numbers` gives."""
+        return Ellipse(np.array(numbers[:2]), np.array(numbers[2:4]), float(numbers[4]))
 
     def conic(self) -> Floats:
         """Conic coefficients (6,); see `conic_from_parameters`."""

@@ -74,8 +74,8 @@ def find_candidates(prepared: Prepared, shape: Shape, most: int = 4, *, without_
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
         small = as_image(cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel))
     noise = noise_dn / (1.5 * factor) + 0.1  # after averaging factor^2 pixels and a 3 x 3 Gaussian
-    levels = _levels(small)
-    dark = round(DARKER * levels.size)
+    levels = _levels(small, LEVELS)
+    dark = round(DARKER * len(levels))
     blobs = _sweep(small, levels[:dark], factor, shape)
     found = _ranked(small, noise, factor, blobs, most) if blobs.size else []
     if found:
@@ -98,26 +98,24 @@ def _reduced(linear: Image, factor: int, removal: int) -> Image:
     return as_image(cv2.morphologyEx(small, removal, kernel))
 
 
-def _levels(small: Image) -> Floats:
-    """Thresholds at even levels and at even areas.
+def _levels(small: Image, count: int) -> list[float]:
+    """Thresholds: `count` at even levels, and a third as many at even areas.
 
     Some of them separate the pupil even if its step is faint or the image has a small dark backdrop.
     """
     values = np.sort(small.ravel()[:: max(1, small.size // 8000)])
-    n = values.size
-    low, high = float(values[0]), float(values[int(0.98 * n)])
-    even = np.linspace(low, high, LEVELS + 2)[1:-1]
-    by_area = values[(n * np.linspace(0.004, 0.5, LEVELS // 3)).astype(int)]
-    levels = np.sort(np.concatenate([even, by_area]))
-    gap = max((high - low) / (3 * LEVELS), 1e-6)
-    keep = [0]
-    for i in range(1, levels.size):
-        if levels[i] - levels[keep[-1]] > gap:
-            keep.append(i)
-    return np.asarray(levels[keep], dtype=np.float64)
+    low, high = float(values[0]), float(values[int(0.98 * values.size)])
+    even = [low + (high - low) * (k + 1) / (count + 1) for k in range(count)]
+    areas = (0.004 + 0.496 * k / (count // 3 - 1) for k in range(count // 3))
+    gap = max((high - low) / (3 * count), 1e-6)
+    levels: list[float] = []
+    for level in sorted([*even, *(float(values[int(share * values.size)]) for share in areas)]):
+        if not levels or level - levels[-1] > gap:
+            levels.append(level)
+    return levels
 
 
-def _sweep(small: Image, levels: Floats, factor: int, shape: Shape) -> Floats:
+def _sweep(small: Image, levels: list[float], factor: int, shape: Shape) -> Floats:
     """Find blobs (n, 6) that could be a pupil: ellipse (x, y, a, b, angle) in reduced pixels, and filled share."""
     height, width = small.shape
     least = max(0.5 * shape.least_px, shape.least_px - 2.0 * factor) / factor
@@ -126,7 +124,7 @@ def _sweep(small: Image, levels: Floats, factor: int, shape: Shape) -> Floats:
     shortest, longest = 3.0 * least, 15.0 * most
     blobs: list[tuple[float, ...]] = []
     seen = 0
-    for level in levels.tolist():
+    for level in levels:
         if seen > MOST_CONTOURS:
             break
         mask = cv2.compare(small, level, cv2.CMP_LE)
@@ -234,7 +232,7 @@ def _ring_levels(small: Image, blobs: Floats, noise: float, angles: int) -> Floa
 
 def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
     """Make a candidate of a known place, with the levels of the image there; None where it is no darker inside."""
-    about = (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
+    about = ellipse.numbers()
     inside, step = _levels_about(prepared.linear, about, ANGLES)
     return Candidate(ellipse, inside, step) if step > prepared.noise_dn else None
 

@@ -101,7 +101,7 @@ def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance:
     points = edges.points_px
     whole = _sane(direct_fits(points[None]), candidate, shape)
     if whole.shape[0] and _support(points, edges.normals, whole, tolerance)[0] > ALL_AGREE * _most(points, whole)[0]:
-        return _ellipse(whole[0])
+        return Ellipse.of(whole[0])
     fits = np.concatenate([whole, _sane(_random_fits(edges, candidate), candidate, shape)])
     if fits.shape[0] == 0:
         return None
@@ -109,7 +109,7 @@ def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance:
     some, facing = np.ascontiguousarray(points[::3]), np.ascontiguousarray(edges.normals[::3])
     rough = _support(some, facing, fits, tolerance)
     fits = fits[np.argsort(-rough, kind="stable")[:FINALISTS]]
-    return _ellipse(fits[int(np.argmax(_support(points, edges.normals, fits, tolerance)))])
+    return Ellipse.of(fits[int(np.argmax(_support(points, edges.normals, fits, tolerance)))])
 
 
 def _random_fits(edges: EdgePoints, candidate: Candidate) -> Floats:
@@ -144,10 +144,6 @@ def _sane(fits: Floats, candidate: Candidate, shape: Shape) -> Floats:
     return np.asarray(fits[sane])
 
 
-def _ellipse(row: Floats) -> Ellipse:
-    return Ellipse(row[:2], row[2:4], float(row[4]))
-
-
 @twin
 def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) -> Floats:
     """Score (m,) of every ellipse (m, 5).
@@ -178,7 +174,7 @@ def _polished(
     edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float, *, free: bool = False
 ) -> BoundaryFit | str:
     """Select points and refit with AMS until the selection settles."""
-    begun = np.array([*start.centre_px, *start.semi_axes_px, start.angle_rad])
+    begun = np.array(start.numbers())
     count, found, inliers, points, seen = _settled(
         edges.points_px, edges.normals, begun, edges.sigma_px, tolerance, free
     )
@@ -186,7 +182,7 @@ def _polished(
         return f"only {count} edge points agree on one ellipse"
     if count < 0:
         return "the edge points that agree span no ellipse"
-    ellipse = _ellipse(found)
+    ellipse = Ellipse.of(found)
     support, gap, residual = seen.tolist()
     a, b = found[2:4].tolist()
     if support < shape.support:
@@ -200,7 +196,7 @@ def _polished(
     covariance = edge_covariance(sums, residual)
     if gap > CUT:
         held = np.zeros(SECTORS, dtype=bool)
-        held[sectors_at((*found.tolist(),), kept[:, 0], kept[:, 1], NEAR)] = True
+        held[sectors_at(tuple(found.tolist()), kept[:, 0], kept[:, 1], NEAR)] = True
         ellipse, covariance = towards_round(ellipse, covariance + hidden_part(ellipse, held, residual))
     return BoundaryFit(ellipse, inliers, kept, support, gap, residual, sums, to_axes(covariance, ellipse))
 
@@ -226,7 +222,7 @@ def _settled(
         How many points were selected (fewer than 8: too few; -1: they span no ellipse), the ellipse (5,), which points
         (n,), the points (n, 2) as moved, and (3,) support, gap and residual as in `BoundaryFit`.
     """
-    ellipse, inliers, moved = _ellipse(start), np.zeros(points.shape[0], dtype=bool), points
+    ellipse, inliers, moved = Ellipse.of(start), np.zeros(points.shape[0], dtype=bool), points
     for turn in range(5):
         distance, outward, curvature = relative_to(ellipse, points)
         shift = np.minimum(0.5 * sigma_px**2 * curvature, 0.15 * float(ellipse.semi_axes_px[1]))
@@ -247,7 +243,7 @@ def _settled(
         ellipse = fitted
         if same:
             break
-    found = np.array([*ellipse.centre_px, *ellipse.semi_axes_px, ellipse.angle_rad])
+    found = np.array(ellipse.numbers())
     distance = signed_distance(ellipse, moved[inliers])
     seen = np.array([*outline_support(ellipse, moved[inliers]), np.sqrt(np.mean(distance**2))])
     return int(inliers.sum()), found, inliers, moved, seen

@@ -95,13 +95,13 @@ class EdgeSums:
     @staticmethod
     def of(ellipse: Ellipse, points: Floats) -> EdgeSums:
         """Sum over points (n, 2)."""
-        return EdgeSums(*_edge_sums(_numbers(ellipse), points, GROUPS))
+        return EdgeSums(*_edge_sums(ellipse.numbers(), points, GROUPS))
 
 
 @twin
 def _edge_sums(ellipse: tuple[float, ...], points: Floats, groups: int) -> tuple[Floats, Floats, Floats, Indices]:
     """The sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle)."""
-    about = Ellipse(np.array(ellipse[:2]), np.array(ellipse[2:4]), ellipse[4])
+    about = Ellipse.of(ellipse)
     place = Place.of(about, points[:, 0], points[:, 1])
     slopes = distance_slopes(about, place)
     group = sector_of(place) // (SECTORS // groups)
@@ -191,7 +191,7 @@ def leverage(ellipse: Ellipse, sums: EdgeSums) -> float:
     that hold points were displaced independently by 1 px. A real boundary is uneven, so the hidden
     part of an outline is the more uncertain the larger this is.
     """
-    return max(_along_outline(_numbers(ellipse), _followed(sums.matrix, sums.slopes)), 1e-3)
+    return max(_along_outline(ellipse.numbers(), _followed(sums.matrix, sums.slopes)), 1e-3)
 
 
 @twin
@@ -206,19 +206,15 @@ def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
     # Use the off-diagonal term of the shape matrix in place of the angle: d ab = (a - b) d angle.
     scale = np.ones(SHAPE)
     scale[4] = ellipse.semi_axes_px[0] - ellipse.semi_axes_px[1]
-    return _along_outline(_numbers(ellipse), covariance * (scale[:, None] * scale))
+    return _along_outline(ellipse.numbers(), covariance * (scale[:, None] * scale))
 
 
 @twin
 def _along_outline(ellipse: tuple[float, ...], covariance: Floats) -> float:
     """Root mean square of the boundary's standard deviation, by the covariance (5, 5) of centre and shape matrix."""
-    about = Ellipse(np.array(ellipse[:2]), np.array(ellipse[2:4]), ellipse[4])
+    about = Ellipse.of(ellipse)
     slopes = distance_slopes(about, Place.middles(about, 32))
     return math.sqrt(max(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1], 0.0))
-
-
-def _numbers(ellipse: Ellipse) -> tuple[float, ...]:
-    return (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
 
 
 def _inverse(matrix: Floats) -> Floats:

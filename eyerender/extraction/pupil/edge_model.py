@@ -61,7 +61,7 @@ class EdgeModel:
         They are the centre, the semi-axes and the angle, sigma, inner level, slope, kurtosis, lean (two) and `outer`.
         """
         ellipse = self.ellipse
-        head = (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
+        head = ellipse.numbers()
         rest = (self.sigma_px, self.inner_dn, self.slope, self.kurtosis, *self.lean)
         return np.array([*head, *rest, *self.outer.tolist()])
 
@@ -70,7 +70,7 @@ class EdgeModel:
         """Make the model of the parameters that `numbers` gives."""
         sigma, inner, slope, kurtosis, lean_x, lean_y = numbers[5:11].tolist()
         return EdgeModel(
-            ellipse=Ellipse(numbers[:2], numbers[2:4], float(numbers[4])),
+            ellipse=Ellipse.of(numbers),
             inner_dn=inner,
             outer=numbers[11:],
             sigma_px=sigma,
@@ -233,7 +233,7 @@ class Profile:
 @twin
 def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats, steps: int) -> Indices:
     """Sector (n,) of each pixel (x, y) near an ellipse (cx, cy, a, b, angle)."""
-    about = Ellipse(np.array(ellipse[:2]), np.array(ellipse[2:4]), ellipse[4])
+    about = Ellipse.of(ellipse)
     return sector_of(Place.of(about, x, y, steps))
 
 

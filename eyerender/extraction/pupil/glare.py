@@ -14,12 +14,14 @@ import numpy as np
 
 from ...arrays import Bools
 from ...geometry.ellipse import Ellipse
+from ..compiled import twin
 from ..preprocessing import Image, as_image
 from .edge_model import Place
 
 # A glint is brighter than the iris by this share of the step and stands out of its surroundings by that share of it.
 # The texture of an iris reaches a third of the step.
 ABOVE_IRIS, STANDS_OUT = 0.25, 0.75
+NO_PATCH = np.zeros((0, 0), dtype=np.float32)
 NOISE = 6.0  # in standard deviations: what noise alone does not reach in any pixel
 # Flank of a glint below these limits, px. A glint of sigma 2 and four steps falls from one step to a tenth of one in
 # 1.1 sigma.
@@ -57,22 +59,6 @@ class Cleared:
             crop[to], hidden[to] = self.patch[part], self.mask[part]
         return crop, hidden
 
-    def levels(self, ellipse: Ellipse, away_px: float, count: int) -> Image:
-        """Levels (count,) at the pixels `away_px` outside an ellipse, in the middle of each of `count` sectors."""
-        place = Place.middles(ellipse, count)
-        cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-        normal = np.stack([place.nx * cos - place.ny * sin, place.nx * sin + place.ny * cos], axis=-1)
-        x, y = np.rint(ellipse.points_at(place.cos_t, place.sin_t) + away_px * normal).astype(np.intp).T
-        height, width = self.linear.shape
-        x, y = np.minimum(np.maximum(x, 0), width - 1), np.minimum(np.maximum(y, 0), height - 1)
-        out: Image = np.asarray(self.linear[y, x], dtype=np.float32)
-        if self.patch is None:
-            return out
-        column, row = x - self.corner[0], y - self.corner[1]
-        here = (column >= 0) & (row >= 0) & (column < self.patch.shape[1]) & (row < self.patch.shape[0])
-        out[here] = self.patch[row[here], column[here]]
-        return out
-
     def doubled(self, linear: Image) -> Cleared:
         """The same at twice the scale, of the image `linear` at that scale."""
         if self.patch is None or self.mask is None:
@@ -83,6 +69,28 @@ class Cleared:
         x, y = 2 * self.corner[0], 2 * self.corner[1]
         patch[~mask] = linear[y : y + size[1], x : x + size[0]][~mask]
         return Cleared(linear, (x, y), patch, mask)
+
+
+@twin
+def levels_beside(
+    ellipse: tuple[float, ...], away_px: float, sectors: int, linear: Image, corner: tuple[int, int], patch: Image
+) -> Image:
+    """Levels (sectors,) at the pixels `away_px` outside an ellipse (cx, cy, a, b, angle), in the middle of each sector.
+
+    Outside the frame its border is repeated. The part of the image from `corner` on is replaced by `patch`, unless that
+    is empty.
+    """
+    about = Ellipse.of(ellipse)
+    place = Place.middles(about, sectors)
+    cos, sin = math.cos(about.angle_rad), math.sin(about.angle_rad)
+    normal = np.stack([place.nx * cos - place.ny * sin, place.nx * sin + place.ny * cos], axis=-1)
+    x, y = np.rint(about.points_at(place.cos_t, place.sin_t) + away_px * normal).astype(np.intp).T
+    x, y = np.clip(x, 0, linear.shape[1] - 1), np.clip(y, 0, linear.shape[0] - 1)
+    out: Image = np.asarray(linear[y, x], dtype=np.float32)
+    column, row = x - corner[0], y - corner[1]
+    here = (column >= 0) & (row >= 0) & (column < patch.shape[1]) & (row < patch.shape[0])
+    out[here] = patch[row[here], column[here]]
+    return out
 
 
 def around(ellipse: Ellipse, reach: float, shape: tuple[int, ...]) -> tuple[slice, slice]:

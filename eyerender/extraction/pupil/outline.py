@@ -18,7 +18,7 @@ from ..compiled import twin
 from ..preprocessing import Image
 from .consensus import relative_to
 from .edge_model import NEAR, SECTORS, sectors_at
-from .glare import Cleared
+from .glare import NO_PATCH, levels_beside
 
 if TYPE_CHECKING:
     from .search import Found
@@ -40,9 +40,9 @@ def outline_of(found: Found, ellipse: Ellipse) -> Outline:
     """Look along an ellipse about a candidate."""
     boundary, candidate, edges, cleared = found.boundary, found.candidate, found.edges, found.cleared
     b = float(ellipse.semi_axes_px[1])
-    about = (*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
+    about = ellipse.numbers()
     away = min(1.5 * found.model.sigma_px + 1.0, 0.4 * b)
-    patch = np.zeros((0, 0), dtype=np.float32) if cleared.patch is None else cleared.patch
+    patch = NO_PATCH if cleared.patch is None else cleared.patch
     others = edges.points_px[~boundary.inliers]
     limits = (candidate.inside_dn + DARK * candidate.step_dn, max(CLEAR * b, 1.0))
     hollow, beyond, within = _along(
@@ -72,12 +72,10 @@ def _along(
     Returns:
         Sectors without points that are dark on both sides, and other points outside and inside the ellipse.
     """
-    about = Ellipse(np.array(ellipse[:2]), np.array(ellipse[2:4]), ellipse[4])
     held = np.zeros(SECTORS, dtype=bool)
     held[sectors_at(ellipse, points[:, 0], points[:, 1], NEAR)] = True
-    cleared = Cleared(linear, corner, patch if patch.size else None)
-    inside, outside = (cleared.levels(about, side * away, SECTORS) for side in (-1.0, 1.0))
-    distance, _, _ = relative_to(about, others)
+    inside, outside = (levels_beside(ellipse, side * away, SECTORS, linear, corner, patch) for side in (-1.0, 1.0))
+    distance, _, _ = relative_to(Ellipse.of(ellipse), others)
     return (
         int(np.count_nonzero(~held & (inside < limits[0]) & (outside < limits[0]))),
         int(np.count_nonzero(distance > limits[1])),

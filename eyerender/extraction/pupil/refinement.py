@@ -141,7 +141,7 @@ def _fitted(
     model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before[0]
     prior = Prior.of(start, noise_dn, 0.0 if before is None else before[1])
     x, y, level = _band(linear, model, masked, outward)
-    about = (*model.ellipse.centre_px.tolist(), *model.ellipse.semi_axes_px.tolist(), model.ellipse.angle_rad)
+    about = model.ellipse.numbers()
     bins = sectors_at(about, x, y, NEAR)
     use = np.ones(x.size, dtype=bool)
     # A lid must not decide the order of the outer level.

@@ -79,7 +79,9 @@ def design(rows: Floats, low: Floats, high: Floats) -> Floats:
 
     The excesses are those over 1/3 and over 2/3.
     """
-    scaled = (np.clip(rows, low, high) - low) / np.where(high > low, high - low, 1.0)
+    width = high - low
+    width[width == 0.0] = 1.0
+    scaled = (np.minimum(np.maximum(rows, low), high) - low) / width
     bends = [np.maximum(scaled - knot, 0.0) for knot in (1.0 / 3.0, 2.0 / 3.0)]
     return np.concatenate([np.ones((rows.shape[0], 1)), scaled, *bends], axis=1)
 
@@ -88,8 +90,8 @@ def confidence(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "re
     """Probability that IoU > 0.9."""
     low, high, weights, bend, _ = _arrays(method)
     row = design(features(ellipse, goodness)[None], low, high)
-    logit = calibrated(row @ weights, bend)
-    return float(1.0 / (1.0 + np.exp(-np.clip(logit[0], -30.0, 30.0))))
+    logit = float(calibrated(row @ weights, bend)[0])
+    return 1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
 
 
 @cache
@@ -106,7 +108,7 @@ def covariance_scale(ellipse: Ellipse, goodness: Goodness, method: Literal["fast
     """Factor of the covariance: how much farther ellipses like this one lie from the truth than it says."""
     low, high, _, _, weights = _arrays(method)
     row = design(features(ellipse, goodness)[None], low, high)
-    return float(np.exp(np.clip(row @ weights, *SCALES)[0]))
+    return math.exp(min(max(float((row @ weights)[0]), SCALES[0]), SCALES[1]))
 
 
 def goodness_of(found: Found, fit: PixelFit | None) -> Goodness:

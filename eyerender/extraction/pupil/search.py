@@ -14,8 +14,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from ...arrays import Bools
+from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse, iou
+from ..compiled import twin
 from ..preprocessing import Prepared, as_image
 from ..result import Goodness, PupilResult
 from ..settings import Shape
@@ -77,10 +78,7 @@ class Found:
     @cached_property
     def sectors(self) -> Bools:
         """Sectors (SECTORS,) with an edge point, and gaps of up to two sectors between them."""
-        hit = np.bincount(sector_of(Place.of(self.boundary.ellipse, *self.edges.points_px[self.boundary.inliers].T)),
-                          minlength=SECTORS) > 0  # fmt: skip
-        grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
-        return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
+        return _held(self.boundary.ellipse.numbers(), self.edges.points_px[self.boundary.inliers])
 
     @cached_property
     def goodness(self) -> Goodness:
@@ -106,6 +104,21 @@ class Found:
         inside = self.interior
         limit = max(4.0 * inside.error_dn, 0.15 * self.candidate.step_dn)
         return inside.darker_dn if abs(inside.darker_dn) > limit else 0.0
+
+
+@twin
+def _held(ellipse: tuple[float, ...], points: Floats) -> Bools:
+    """Sectors (SECTORS,) of an ellipse that hold points (n, 2), and gaps of up to two sectors between them."""
+    hit = np.zeros(SECTORS, dtype=bool)
+    hit[sector_of(Place.of(Ellipse.of(ellipse), points[:, 0], points[:, 1]))] = True
+    grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
+    return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
+
+
+@twin
+def _overlap(first: tuple[float, ...], second: tuple[float, ...]) -> float:
+    """Intersection over union of two ellipses (cx, cy, a, b, angle), to about 0.001."""
+    return iou(Ellipse.of(first), Ellipse.of(second), nodes=128)
 
 
 def search(work: Prepared, shape: Shape, prior: Ellipse | None = None) -> Found | PupilResult:
@@ -329,7 +342,7 @@ def boundary_about(work: Prepared, candidate: Candidate, shape: Shape) -> Found 
     boundary = fit_boundary(edges, candidate, shape, expected)
     if isinstance(boundary, str):
         return boundary
-    if candidate.rough and iou(candidate.ellipse, boundary.ellipse, nodes=128) < ROUGH:
+    if candidate.rough and _overlap(candidate.ellipse.numbers(), boundary.ellipse.numbers()) < ROUGH:
         near = candidate_at(work, boundary.ellipse)
         again = None if near is None else boundary_about(work, near, shape)
         if isinstance(again, Found):

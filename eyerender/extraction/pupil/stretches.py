@@ -91,7 +91,7 @@ class Cuts:
         given: list[Ellipse] = []
         for i in np.nonzero(which)[0][np.argsort(self.residual_px[which], kind="stable")]:
             hidden = (self.first[i] + np.arange(self.count[i])) % self.points.shape[0]
-            ellipse = Ellipse(self.fits[i, :2], self.fits[i, 2:4], float(self.fits[i, 4]))
+            ellipse = Ellipse.of(self.fits[i])
             if median(signed_distance(ellipse, self.points[hidden])) < -depth_px(float(self.residual_px[i])) and all(
                 iou(ellipse, other) < 0.9 for other in given
             ):
