@@ -434,22 +434,16 @@ BUCKETS = 256
 
 
 @inlined
-def _quantile(values, share):
-    """`statistics.quantile` of values (n,), which stay as they are.
+def _ranked(values, rank):
+    """The value before which `rank` of values (n,) come in ascending order.
 
     They are counted in buckets, then those of the right bucket in smaller ones, until all in a bucket are equal.
     """
-    if values.size == 0:
-        return math.nan
-    at = share * (values.size - 1)
-    low = math.floor(at)
-    rank, some, count = int(low), values, np.empty(BUCKETS, dtype=np.int64)
+    some, count = values, np.empty(BUCKETS, dtype=np.int64)
     while True:
-        least, most = some[0], some[0]
-        for i in range(some.size):
-            least, most = min(least, some[i]), max(most, some[i])
+        least, most = some.min(), some.max()
         if least == most:
-            break
+            return float(least)
         count[:], scale, bucket = 0, (BUCKETS - 1e-3) / (float(most) - float(least)), 0
         for i in range(some.size):
             count[int((float(some[i]) - least) * scale)] += 1
@@ -462,7 +456,16 @@ def _quantile(values, share):
                 inside[size] = some[i]
                 size += 1
         some = inside
-    first, second, upto = float(some[0]), math.inf, 0
+
+
+@inlined
+def _quantile(values, share):
+    """`statistics.quantile` of values (n,), which stay as they are."""
+    if values.size == 0:
+        return math.nan
+    at = share * (values.size - 1)
+    low = math.floor(at)
+    first, second, upto = _ranked(values, int(low)), math.inf, 0
     if low == at:
         return first
     for i in range(values.size):

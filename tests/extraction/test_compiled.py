@@ -42,7 +42,9 @@ def same(ours, theirs, name):
         assert (ours == theirs).mean() > 0.999, name
         return
     scale = float(np.nanmax(np.abs(theirs), initial=1e-3))
-    limit = 1e-4 if name in ("settled", "ring_levels", "ridges") else 1e-8  # single precision in one of the two
+    single = ("settled", "ring_levels", "ridges")  # single precision in one of the two
+    # Of an ellipse through nearly straight points only some six digits are determined.
+    limit = 1e-4 if name in single else 1e-5 if name == "direct_fits" else 1e-8
     np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=limit * scale, err_msg=name)
 
 

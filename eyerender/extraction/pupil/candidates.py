@@ -54,13 +54,16 @@ class Candidate:
     rough: bool = False
 
 
-def find_candidates(prepared: Prepared, shape: Shape, most: int = 4, *, without_lines: bool = False) -> list[Candidate]:
+def find_candidates(
+    prepared: Prepared, shape: Shape, most: int = 4, *, levels: int = LEVELS, without_lines: bool = False
+) -> list[Candidate]:
     """Find up to `most` candidates, best first; the list is empty if nothing dark and round stands out.
 
     Args:
         prepared: the image.
         shape: sizes and shapes to look for.
         most: number of candidates.
+        levels: thresholds at even grey levels.
         without_lines: fill dark lines thinner than the smallest pupil first. Lid shadows and lashes that touch the
             pupil are as dark as the pupil and form one blob with it at every threshold.
     """
@@ -74,13 +77,13 @@ def find_candidates(prepared: Prepared, shape: Shape, most: int = 4, *, without_
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
         small = as_image(cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel))
     noise = noise_dn / (1.5 * factor) + 0.1  # after averaging factor^2 pixels and a 3 x 3 Gaussian
-    levels = _levels(small, LEVELS)
-    dark = round(DARKER * len(levels))
-    blobs = _sweep(small, levels[:dark], factor, shape)
+    limits = _levels(small, levels)
+    dark = round(DARKER * limits.size)
+    blobs = _sweep(small, limits[:dark], factor, shape)
     found = _ranked(small, noise, factor, blobs, most) if blobs.size else []
     if found:
         return found
-    blobs = np.concatenate([blobs, _sweep(small, levels[dark:], factor, shape)])
+    blobs = np.concatenate([blobs, _sweep(small, limits[dark:], factor, shape)])
     return _ranked(small, noise, factor, blobs, most) if blobs.size else []
 
 
@@ -98,7 +101,7 @@ def _reduced(linear: Image, factor: int, removal: int) -> Image:
     return as_image(cv2.morphologyEx(small, removal, kernel))
 
 
-def _levels(small: Image, count: int) -> list[float]:
+def _levels(small: Image, count: int) -> Floats:
     """Thresholds: `count` at even levels, and a third as many at even areas.
 
     Some of them separate the pupil even if its step is faint or the image has a small dark backdrop.
@@ -112,10 +115,10 @@ def _levels(small: Image, count: int) -> list[float]:
     for level in sorted([*even, *(float(values[int(share * values.size)]) for share in areas)]):
         if not levels or level - levels[-1] > gap:
             levels.append(level)
-    return levels
+    return np.array(levels)
 
 
-def _sweep(small: Image, levels: list[float], factor: int, shape: Shape) -> Floats:
+def _sweep(small: Image, levels: Floats, factor: int, shape: Shape) -> Floats:
     """Find blobs (n, 6) that could be a pupil: ellipse (x, y, a, b, angle) in reduced pixels, and filled share."""
     height, width = small.shape
     least = max(0.5 * shape.least_px, shape.least_px - 2.0 * factor) / factor
@@ -124,7 +127,7 @@ def _sweep(small: Image, levels: list[float], factor: int, shape: Shape) -> Floa
     shortest, longest = 3.0 * least, 15.0 * most
     blobs: list[tuple[float, ...]] = []
     seen = 0
-    for level in levels:
+    for level in levels.tolist():
         if seen > MOST_CONTOURS:
             break
         mask = cv2.compare(small, level, cv2.CMP_LE)

@@ -30,6 +30,7 @@ from .scoring import confidence, goodness_of
 SURE = 0.9  # a hypothesis of this confidence ends the search
 LATE_CONFIDENCE = 0.5  # least confidence of a hypothesis of a later look
 LARGE_PX = 14.0  # pupils from this semi-axis on are found at a quarter of the scale, in a quarter of the time
+FEW = 9  # thresholds of the first look; the edges decide, and the later looks use all
 USUAL_PX = 7.0  # smaller pupils are looked for at full resolution and last; lashes and shadows are as small
 # Between two frames a pupil moves by up to a few of its own sizes (a saccade of 500 deg/s covers 4 mm in 1/30 s). Its
 # size changes by less than a third.
@@ -210,7 +211,7 @@ def _large(work: Prepared, shape: Shape) -> list[Candidate]:
     """The best candidate of at least LARGE_PX, with the levels of the image at full scale."""
     if not shape.least_px < LARGE_PX < 0.5 * shape.most_px:
         return []
-    found = find_candidates(work, replace(shape, least_px=LARGE_PX), 1)
+    found = find_candidates(work, replace(shape, least_px=LARGE_PX), 1, levels=FEW)
     places = (candidate_at(work, one.ellipse) for one in found)
     return [replace(one, rough=True) for one in places if one is not None]
 
