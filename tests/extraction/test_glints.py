@@ -47,6 +47,29 @@ def test_clipped_glints_say_so_and_keep_their_amplitude():
     assert not any(g.saturated for g in extract(ideal.draw("noise2", SEEDS[0]).image).glints)
 
 
+def test_a_strongly_clipped_glint_hides_no_other():
+    drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[0])
+    places = np.array(drawing.label["pupil"]["centre_px"]) + np.array([[-8.0, 6.0], [9.0, 5.0]])
+    image = drawing.image.astype(np.float64)
+    for xy, height in zip(places, (160.0, 20_000.0), strict=True):
+        ideal._add_glint(image, {"xy": xy, "sigma": 1.0}, height)
+    found = extract(np.clip(np.rint(image), 0, 255).astype(np.uint8)).glints
+    assert len(found) == 2
+    assert all(min(np.hypot(*(g.xy_px - xy)) for g in found) < 0.1 for xy in places)
+
+
+def test_a_glint_before_bright_sclera_is_found():
+    drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[1])
+    x, y = drawing.label["pupil"]["centre_px"]
+    y += 2.0 * drawing.label["pupil"]["semi_axes_px"][0]
+    image = drawing.image.astype(np.float64)
+    image[round(y) - 3 :] = 190.0
+    ideal._add_glint(image, {"xy": np.array([x, y + 4.0]), "sigma": 1.0}, 3000.0)
+    found = extract(np.clip(np.rint(image), 0, 255).astype(np.uint8)).glints
+    assert len(found) == 1
+    assert np.hypot(*(found[0].xy_px - [x, y + 4.0])) < 0.1
+
+
 def test_merged_pair_is_parted():
     """Two spots 3.5 px apart, sigma 1.2 px: one bright patch with a dent."""
     drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none", aspect=(0.95, 1.0)), SEEDS[0])

@@ -25,9 +25,10 @@ LONG, LONG_TWICE = 2.0, 2.4
 # The cornea mirrors 2 % of a lamp, a point; wet lid margins and skin spread it. Lamps of one rig differ less than this:
 # of rendered eyes in lids, all 1,436 glints but one are above 0.3 of the brightest.
 FAINTEST = 0.2
-# Steps from pupil to iris by which what lies around a glint may be brighter than the iris. With both limits, 1 of 719
-# highlights of newly rendered skin passes, and 1 of 298 glints does not.
-LIT = 0.9
+# What lies around a glint is not brighter than the iris by more than LIT steps from pupil to iris, except where the
+# glint is near the sclera. There it is still SHINING times as high: 19 such glints of rendered eyes are above 3.4, and
+# 110 highlights of skin and lid margins below 1.8.
+LIT, SHINING = 0.9, 2.5
 
 _PIXEL = 1.0 / 12.0  # variance of a pixel; without it a spot of one row of pixels would be a line
 
@@ -63,11 +64,11 @@ def classify_spots(
         )
         (accepted if reason is None else rejected).append(result)
     faint = "much fainter than the brightest glint, as highlights of skin and lid margins are"
-    least = FAINTEST * max((glint.amplitude for glint in accepted), default=0.0)
+    least = FAINTEST * max((_shown(glint) for glint in accepted), default=0.0)
     kept = len(large)  # the height of a large patch is not known, only where it is cut
-    bright = accepted[:kept] + [glint for glint in accepted[kept:] if glint.amplitude >= least]
+    bright = accepted[:kept] + [glint for glint in accepted[kept:] if _shown(glint) >= least]
     rejected += [
-        replace(glint, status=Status.REJECTED, reason=faint) for glint in accepted[kept:] if glint.amplitude < least
+        replace(glint, status=Status.REJECTED, reason=faint) for glint in accepted[kept:] if _shown(glint) < least
     ]
     accepted = bright
     reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
@@ -81,6 +82,11 @@ def classify_spots(
         if not any(_in_patch(patch, xy) for patch in large)
     ]
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
+
+
+def _shown(glint: GlintResult) -> float:
+    """Height of a glint as the image shows it: what a fit adds above the clipped level is not known well enough."""
+    return min(glint.amplitude, 1.0)
 
 
 def _in_patch(patch: Patch, xy: Floats) -> bool:
@@ -136,7 +142,7 @@ def _objection(
     if look.height < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
         return "too faint for a glint"
     beside = _beside(fit, i, prepared.linear)
-    if beside.size and median(beside) > lit_dn:
+    if beside.size and median(beside) > max(lit_dn, look.height / SHINING):
         return "before something much brighter than the iris, as highlights of skin are"
     if wide > 2.5 and not _outshines(fit, i, beside):
         return "no brighter than what lies beside it, as a corner of sclera between lid and iris is"
