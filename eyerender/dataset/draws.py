@@ -58,6 +58,14 @@ class UniformDraw(_RangeDraw):
     draw: Literal["uniform"]
 
 
+class LogUniformDraw(_RangeDraw):
+    """Uniform distribution of the logarithm: low (high / low)^u, for numbers that span orders of magnitude."""
+
+    draw: Literal["log_uniform"]
+    low: Annotated[Positive, Field(le=1e20)]
+    high: Annotated[Positive, Field(le=1e20)]
+
+
 class IntegerDraw(_RangeDraw):
     """Whole number from low to high, both included."""
 
@@ -136,10 +144,21 @@ class SequenceDraw(_Draw):
     values: Annotated[tuple[Any, ...], Field(min_length=1)]
 
 
-Draw = FixedDraw | UniformDraw | IntegerDraw | NormalDraw | ChoiceDraw | GridDraw | SobolDraw | SequenceDraw
+Draw = (
+    FixedDraw
+    | UniformDraw
+    | LogUniformDraw
+    | IntegerDraw
+    | NormalDraw
+    | ChoiceDraw
+    | GridDraw
+    | SobolDraw
+    | SequenceDraw
+)
 _KINDS: dict[str, type[Draw]] = {
     "fixed": FixedDraw,
     "uniform": UniformDraw,
+    "log_uniform": LogUniformDraw,
     "integer": IntegerDraw,
     "truncated_normal": NormalDraw,
     "choice": ChoiceDraw,
@@ -180,6 +199,8 @@ def random_value(draw: Draw, u: float) -> Any:
     """Value of a random draw at u; for a choice the index of the value."""
     if isinstance(draw, UniformDraw | SobolDraw):
         return draw.low + (draw.high - draw.low) * u
+    if isinstance(draw, LogUniformDraw):
+        return draw.low * (draw.high / draw.low) ** u
     if isinstance(draw, IntegerDraw):
         return min(draw.low + int(u * (draw.high - draw.low + 1)), draw.high)
     if isinstance(draw, NormalDraw):

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import kstest, qmc, truncnorm, uniform
+from scipy.stats import kstest, loguniform, qmc, truncnorm, uniform
 
 from eyerender.dataset.draws import parse_draw, random_value, truncated_normal, unit_number
 from eyerender.dataset.plan import Plan
@@ -50,6 +50,7 @@ def test_truncated_normal_is_scipys(bounds):
     ("node", "law"),
     [
         ({"draw": "uniform", "low": -2, "high": 3}, uniform(-2, 5)),
+        ({"draw": "log_uniform", "low": 0.03, "high": 100}, loguniform(0.03, 100)),
         ({"draw": "truncated_normal", "mean": 1, "sd": 2, "low": 0, "high": 3}, truncnorm(-0.5, 1, loc=1, scale=2)),
         ({"draw": "sobol", "low": 5, "high": 6}, uniform(5, 1)),
     ],
@@ -138,6 +139,7 @@ def test_the_order_of_keys_means_nothing():
     [
         ("scene.wavelength_nm", {"draw": "gamma"}, "scene.wavelength_nm.draw: must be one of fixed, uniform"),
         ("scene.wavelength_nm", {"draw": "uniform", "low": 2, "high": 1}, "low must be < high"),
+        ("scene.wavelength_nm", {"draw": "log_uniform", "low": 0, "high": 1}, "scene.wavelength_nm.low: must be > 0"),
         ("scene.wavelength_nm", {"draw": "uniform", "low": 2}, "scene.wavelength_nm.high: missing"),
         ("scene.wavelength_nm", {"draw": "uniform", "low": 2, "high": 3, "x": 1}, "scene.wavelength_nm.x: unknown key"),
         ("scene.wavelength_nm", {"draw": "choice", "values": []}, "needs at least 1 entries"),
