@@ -288,6 +288,11 @@ class _Frame:
         return len(self.grid.points)
 
     @property
+    def on_skin(self) -> int:
+        """Number of places on the outer side of a region's skin."""
+        return 0 if self.skin is None else len(self.skin.vertices)
+
+    @property
     def outside(self) -> int:
         """Number of places outside the chamber; the last ones are on the limbus."""
         return len(self.grid.points) + len(self.points) + IRIS_TURNS
@@ -430,7 +435,14 @@ def _direct(
     on_globe |= index >= dr.opaque(mi.UInt32, frame.outside - IRIS_TURNS)
     start = values.point_to_eye(x + _START_MM * normal)
     facing = values.vector_to_eye(normal)
-    lit = _over_lamps(lights, index, lambda u, v: onto_points(values, lights, scene, start, facing, ~on_globe, u, v))
+    views, sheet = textures.lamp_views, dr.opaque(mi.UInt32, frame.on_globe + frame.on_skin)
+    lit = _over_lamps(
+        lights,
+        index,
+        lambda u, v: onto_points(
+            values, lights, scene, start, facing, ~on_globe, u, v, views, ~on_globe & (index < sheet)
+        ),
+    )
     even, free, shaded = (mi.Float(0) * x.x for _ in range(3))
     if values.structure.ambient:
         assert textures.ambience is not None
@@ -520,14 +532,16 @@ def _seen(
     host.append(np.full(lanes, -1.0))
     if frame.skin is not None and len(lights):
         lane = np.append(np.arange(start[frame.on_globe]), np.arange(first, lanes))
-        host[-1][lane] = _at_spots(values, lights, place.scene, spot, lane)
+        host[-1][lane] = _at_spots(values, lights, place.scene, textures, spot, lane)
     return (
         _Seen(start[:-1], *(h[:first] for h in host)),
         _Seen(np.arange(PLACES) * LEAVING, *(h[first:] for h in host)),
     )
 
 
-def _at_spots(values: Values, lights: Lights, scene: mi.Scene, spot: tuple[Any, ...], lane: Ints) -> Floats:
+def _at_spots(
+    values: Values, lights: Lights, scene: mi.Scene, textures: Textures, spot: tuple[Any, ...], lane: Ints
+) -> Floats:
     """Irradiance straight from the lamps at points of the skin that lanes of rays have met, -1 for those of others.
 
     What eye and lids send to each other in the narrow space between them comes from places close by, where the light
@@ -539,7 +553,10 @@ def _at_spots(values: Values, lights: Lights, scene: mi.Scene, spot: tuple[Any, 
 
     def light(_: mi.Bool, x: mi.Vector3f, normal: mi.Vector3f, number: mi.UInt32) -> mi.Float:
         start = x + _START_MM * normal
-        return onto_points(values, lights, scene, start, normal, mi.Bool(True), *_spots(number * mi.UInt32(_SHUFFLED)))
+        u, v = _spots(number * mi.UInt32(_SHUFFLED))
+        return onto_points(
+            values, lights, scene, start, normal, mi.Bool(True), u, v, textures.lamp_views, mi.Bool(True)
+        )
 
     return np.asarray(dr.if_stmt(state, on_skin, light, lambda *_: mi.Float(-1)).numpy(), dtype=float)
 

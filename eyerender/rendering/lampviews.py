@@ -28,7 +28,7 @@ from .values import aligned
 if TYPE_CHECKING:
     from .region import RegionScene, SkinGeometry
 
-_CELLS = 512  # along each side of a map
+_CELLS = 256  # along each side of a map
 _WIDTH = 16  # numbers of a lamp
 _REACH_MM = 72.0  # of the sheet about the apex of the eye
 _HAIR_MM = 0.06  # half the thickness of hairs at most, with some to spare

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +13,9 @@ from .region import sheen
 from .surfaces import Surface
 from .values import Lamp, Lights, Values
 from .view import EPSILON_MM, View, meet_sphere, opacity
+
+if TYPE_CHECKING:
+    from .lampviews import LampViews
 
 
 def lamp_blocked(
@@ -109,10 +113,13 @@ def onto_points(
     other: mi.Bool,
     u: mi.Float,
     v: mi.Float,
+    views: LampViews | None = None,
+    on_sheet: mi.Bool | bool = False,
 ) -> mi.Float:
     """Irradiance (mW/mm^2) of points in air (eye frame) straight from all lamps; `other` marks those off the globe.
 
-    u, v: place on each lamp's disc, [0, 1).
+    u, v: place on each lamp's disc, [0, 1). views: the lamps' views of a region, which spare rays from the points
+    `on_sheet`, those on the outer side of its sheet of skin.
     """
     sine, cosine_v = dr.sincos(v * (2 * dr.pi))
 
@@ -123,7 +130,10 @@ def onto_points(
         lamp: Lamp = lights[i]
         source = lamp.point(u, sine, cosine_v)
         lit = irradiance(lamp, source, x, normal)
-        blocked = lamp_blocked(values, scene, x, source, other, True, lit > 0)
+        asked = lit > 0
+        if views is not None:
+            asked &= ~views.clear(i, values.point_to_scene(x), asked & on_sheet)
+        blocked = lamp_blocked(values, scene, x, source, other, True, asked)
         return i + 1, total + dr.select(blocked, 0, lit)
 
     state = (mi.UInt32(0), mi.Float(0) * x.x)

@@ -29,7 +29,7 @@ from ..region.skin import SHEET_ROWS, skin_texels
 from .surround import clear_between, rays_between
 from .values import aligned
 
-GRID_ROWS, GRID_COLUMNS = 160, 768  # of the grid over the sheet on which its light is computed (see `subsurface`)
+GRID_ROWS, GRID_COLUMNS = 160, 768  # of the finer grid over the sheet on which its light is computed (`subsurface`)
 SHEET_COLUMNS = COLUMNS + 1  # of vertices, because the first column is repeated
 _F0_OIL, _F0_TEARS = 0.03, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
 _ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.042, 0.035
@@ -130,12 +130,14 @@ class RegionScene:
         return clear_between(self.scene, a, b)
 
 
-def _mean_slopes(pixels: NDArray[np.float16]) -> Singles:
-    """Means (rows, columns, 2) of the slopes of a map over the cells of the grid on which light spreads."""
+def _mean_slopes(pixels: NDArray[np.float16]) -> dict[int, mi.Float]:
+    """Means of the slopes of a map over the cells of the two grids on which light spreads, by their rows."""
     slopes = pixels[:SHEET_ROWS, :, 1:3]
     down, across = len(slopes) // GRID_ROWS, slopes.shape[1] // GRID_COLUMNS
     parts = [slopes[i::down, j::across].astype(np.float32) for i in range(down) for j in range(across)]
-    return np.asarray(sum(parts) / len(parts), dtype=np.float32)
+    fine: Singles = np.asarray(sum(parts) / len(parts), dtype=np.float32)
+    coarse = 0.25 * (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2])
+    return {len(means): mi.Float(aligned(means.ravel())) for means in (fine, coarse)}
 
 
 def _floats(values: Floats) -> mi.Float:
@@ -195,7 +197,7 @@ class SkinGeometry:
         water: mi.Scene | None,
     ) -> None:
         self._map, self.water = look, water
-        self.relief = mi.Float(0 if inner is None else aligned(_mean_slopes(pixels).ravel()))
+        self.relief = {} if inner is None else _mean_slopes(pixels)
         corners = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
         corners[:, :3] = layout.faces
         corners[: layout.face_ends[0], 3] = False if inner is None else ~inner

@@ -34,9 +34,7 @@ from ..region.mesh import RegionMesh
 from ..region.skin import BANDS, SHEET_ROWS, sheet_place
 from .frame import globe_of
 from .lighting import irradiance, lamp_blocked
-from .region import GRID_COLUMNS as COLUMNS
-from .region import GRID_ROWS as ROWS
-from .region import SHEET_COLUMNS
+from .region import GRID_COLUMNS, GRID_ROWS, SHEET_COLUMNS
 from .values import Lights, Values, aligned
 from .view import EPSILON_MM
 
@@ -53,7 +51,7 @@ _LEVEL_RINGS = (0, 1), (1, 4), (4, 6)  # whose light is found on the grid over t
 _FOOTPRINT = 0.8  # size of the cells that a ring reads, in units of its radius
 _RAYS = 6  # to the lamps from each cell, and at least one to each
 _SMALL, _WIDE_RAYS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
-_COARSE_CELLS = ROWS * COLUMNS // 4  # of the grid on which shadows on the skin are found
+_FINE_PX_PER_MM = 11.0  # in pictures of fewer pixels per mm every second row and column of the skin's grid will do
 _SPARE, _SPARE_MM = 24.0, 10.0  # beyond the window, from where light still arrives: in units of d, and at least
 _FINEST_MM = 0.02  # of a cell; about the corners of the eye they are smaller
 _LID_MM = 4.5  # thicker than any lid
@@ -70,6 +68,7 @@ class Pyramid:
 
     def __init__(self, rows: int, columns: int, around: bool) -> None:
         self.rows, self.columns, self._around = rows, columns, around
+        self._size = dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns)
         self._cells: mi.Float | None = None
 
     def fill(self, values: Singles) -> None:
@@ -89,8 +88,8 @@ class Pyramid:
         """Numbers at places in units of the finest cells, whose middles are at integers."""
         level = mi.UInt32(level)
         scale = dr.rcp(mi.Float(mi.UInt32(1) << level))
-        rows, columns = mi.UInt32(self.rows) >> level, mi.UInt32(self.columns) >> level
-        first = (self.rows * self.columns - rows * columns) // 3 * 4
+        rows, columns = (n >> level for n in self._size)
+        first = (self._size[0] * self._size[1] - rows * columns) // 3 * 4
         v = dr.clip((row + 0.5) * scale - 0.5, 0, mi.Float(rows) - 1)
         u = (column + 0.5) * scale - 0.5
         if self._around:
@@ -165,17 +164,21 @@ class _Places:
 class TissueLight:
     """Light of the lamps on skin and globe, each after its way through the tissue."""
 
-    def __init__(self, skin: tuple[mi.Float, mi.Float], globe: tuple[mi.Float, mi.Float], values: Values) -> None:
+    def __init__(
+        self, grid: SheetGrid, skin: tuple[mi.Float, mi.Float], globe: tuple[mi.Float, mi.Float], values: Values
+    ) -> None:
         """Take light of cells, and the shares of each lamp that they see, on skin and globe."""
-        self._skin, self._globe, self._values = skin, globe, values
+        self._grid, self._skin, self._globe, self._values = grid, skin, globe, values
 
     def on_skin(self, u: mi.Float, v: mi.Float) -> mi.Float:
         """Irradiance (mW/mm^2) at coordinates of the map of the skin."""
-        return _between_cells(mi.Float, self._skin[0], *_grid_place(u, v), 0)
+        return self._grid.between(mi.Float, self._skin[0], *self._grid.place(u, v), 0)
 
     def skin_sees(self, lamp: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.Float:
         """Share of a lamp that the skin sees at coordinates of its map."""
-        return dr.clip(_between_cells(mi.Float, self._skin[1], *_grid_place(u, v), 1, lamp * _COARSE_CELLS), 0, 1)
+        grid = self._grid
+        first = lamp * grid.count(1)
+        return dr.clip(grid.between(mi.Float, self._skin[1], *grid.place(u, v), 1, first), 0, 1)
 
     def on_globe(self, x: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
@@ -212,10 +215,11 @@ def tissue_light(
     make = _Maker(values, lights, place.scene, place.skin, views)
     thick = half_space_length_mm(job.region.skin.albedo, scattering.skin_per_mm)
     thin = slab_length_mm(job.look.sclera_albedo, scattering.sclera_per_mm)
-    sheet = make.sheet(SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px), thick)
+    skin = SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px)
+    sheet = make.sheet(skin, thick)
     loss = transmitted(job.region.skin.albedo, scattering.skin_per_mm)
-    grid = GlobeGrid.of(place.posed, globe_of(job.eye, job.M, job.t - job.anchor_mm), _SPARE * thin)
-    return TissueLight(sheet, make.globe(grid, sheet[0], thin, loss), values)
+    globe = GlobeGrid.of(place.posed, globe_of(job.eye, job.M, job.t - job.anchor_mm), _SPARE * thin)
+    return TissueLight(skin, sheet, make.globe(globe, skin, sheet[0], thin, loss), values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,11 +236,12 @@ class _Maker:
         """Light on the skin after its way through the tissue, and how much of each lamp coarse cells see."""
         straight, seen = self._from_lamps(grid)
         index = grid.sent[0]
-        row, column = index // COLUMNS, index % COLUMNS
-        across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / COLUMNS)
+        columns = grid.size[1]
+        row, column = index // columns, index % columns
+        across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / mi.Float(columns))
         _, n = self.skin.sheet_point(grid.vertex_row(row, mi.Float(0.5)), across)
-        relief = dr.gather(mi.Vector2f, self.skin.relief, index)
-        flux = _between_cells(mi.Vector4f, straight, mi.Float(row), mi.Float(column), 1)
+        relief = dr.gather(mi.Vector2f, self.skin.relief[grid.rows], index)
+        flux = grid.between(mi.Vector4f, straight, mi.Float(row), mi.Float(column), 1)
         facing = dr.dot(mi.Vector3f(flux.x, flux.y, flux.z), self.skin.tilted(n, relief.x, relief.y))
         return grid.spread(grid.whole(dr.maximum(facing, 0)), length_mm), seen
 
@@ -250,10 +255,11 @@ class _Maker:
             The vectors, and for each lamp the share of it that each cell sees.
         """
         values, lights, skin = self.values, self.lights, self.skin
-        straight = dr.zeros(mi.Float, 4 * _COARSE_CELLS)
-        seen = dr.zeros(mi.Float, max(len(lights), 1) * _COARSE_CELLS)
+        cells, columns = grid.rows * grid.columns // 4, grid.size[1] // 2
+        straight = dr.zeros(mi.Float, 4 * cells)
+        seen = dr.zeros(mi.Float, max(len(lights), 1) * cells)
         index = grid.sent[1]
-        row, column = index // (COLUMNS // 2), index % (COLUMNS // 2)
+        row, column = index // columns, index % columns
         centre = values.point_to_scene(values.sclera.centre)
         wide = lights.widest >= _SMALL
         points = dr.opaque(mi.UInt32, max(-(-_RAYS // max(len(lights), 1)), _WIDE_RAYS if wide else 1))
@@ -262,7 +268,7 @@ class _Maker:
 
         def place(s: mi.Float, t: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
             half = mi.UInt32(2 * t)
-            across = (mi.Float(column) + s) * (2 * (SHEET_COLUMNS - 1) / COLUMNS)
+            across = (mi.Float(column) + s) * ((SHEET_COLUMNS - 1) / mi.Float(columns))
             x, n = skin.sheet_point(grid.vertex_row(2 * row + half, 2 * t - mi.Float(half)), across)
             # The conjunctiva dips into the globe where both join. Neither shades the other there.
             out = x - centre
@@ -294,7 +300,7 @@ class _Maker:
                 state, lambda k, *_: k < count, at_point, labels=labels, label="points of a lamp"
             )
             share = dr.rcp(dr.maximum(mi.Float(count), 1))
-            dr.scatter(seen, free * share, i * _COARSE_CELLS + index)
+            dr.scatter(seen, free * share, i * grid.count(1) + index)
             return i + 1, total + flux * share
 
         state = (mi.UInt32(0), mi.Vector3f(0) * x.x)
@@ -307,14 +313,16 @@ class _Maker:
         dr.eval(straight, seen)
         return straight, seen
 
-    def globe(self, grid: GlobeGrid, sheet: mi.Float, length_mm: float, loss_per_mm: float) -> tuple[Pyramid, mi.Float]:
+    def globe(
+        self, grid: GlobeGrid, skin: SheetGrid, sheet: mi.Float, length_mm: float, loss_per_mm: float
+    ) -> tuple[mi.Float, mi.Float]:
         """Light on the globe between the lids after its way through the sclera, and how much of each lamp cells see."""
         # What comes through a lid varies slowly, so it is found for two by two cells.
         half, row, column = _SIDE // 2, *np.divmod(grid.under, _SIDE)
         coarse = row // 2 * half + column // 2
         wanted = np.flatnonzero(np.bincount(coarse, minlength=half * half))
         under = np.zeros(half * half, np.float32)
-        under[wanted] = self._through_lids(_numbers(wanted), sheet, loss_per_mm).numpy()
+        under[wanted] = self._through_lids(_numbers(wanted), skin, sheet, loss_per_mm).numpy()
         cells = np.zeros(_SIDE * _SIDE, np.float32)
         cells[grid.under] = under[coarse]
         lit, seen = self._on_globe(_numbers(grid.between))
@@ -368,7 +376,7 @@ class _Maker:
         met &= (y.y * y.y + y.z * y.z < dr.square(values.limbus.radius)) & (y.x > values.limbus.floor) & (t < away)
         return o - dr.select(met, t, away) * d, dr.normalize(dr.select(met, front.vector_out(facing), d))
 
-    def _through_lids(self, index: mi.UInt32, sheet: mi.Float, loss_per_mm: float) -> mi.Float:
+    def _through_lids(self, index: mi.UInt32, grid: SheetGrid, sheet: mi.Float, loss_per_mm: float) -> mi.Float:
         """Irradiance of two by two cells of the globe by way of lids on them: exp(-k t) of that on the lid's skin."""
         values, skin, half = self.values, self.skin, _SIDE // 2
         n = _globe_direction(2 * mi.Float(index // half) + 0.5, 2 * mi.Float(index % half) + 0.5)
@@ -380,7 +388,7 @@ class _Maker:
         face = dr.select(outer.is_valid(), skin.face(outer), face)
         uv = dr.select(outer.is_valid(), outer.prim_uv, inner.prim_uv)
         under = inner.is_valid() & skin.on_sheet(face)
-        lit = _between_cells(mi.Float, sheet, *_grid_place(*skin.map_place(face, uv, under)), 0)
+        lit = grid.between(mi.Float, sheet, *grid.place(*skin.map_place(face, uv, under)), 0)
         return dr.select(under, lit * dr.exp(-loss_per_mm * last), 0)
 
     def _next(self, o: mi.Vector3f, d: mi.Vector3f, first: mi.Float, active: mi.Bool) -> mi.PreliminaryIntersection3f:
@@ -397,6 +405,9 @@ class SheetGrid:
     """The grid over a posed sheet of skin.
 
     Attributes:
+        rows: number of its rows.
+        columns: number of its columns, which close.
+        size: the same on the device.
         cells: numbers of its cells that matter.
         sent: the same on the device, and the cells about them on the grid reduced by 2 and by 4.
         edges: row of the sheet's vertices at the edges of the grid's rows.
@@ -404,6 +415,9 @@ class SheetGrid:
             cell (mm). A place x mm along and y mm across is y per-mm rows and (x - a rows) per-mm columns away.
     """
 
+    rows: int
+    columns: int
+    size: tuple[mi.UInt32, mi.UInt32]
     cells: Ints
     sent: tuple[mi.UInt32, ...]
     edges: mi.Float
@@ -412,36 +426,40 @@ class SheetGrid:
     @classmethod
     def of(cls, posed: RegionMesh, job: RenderJob, spare_mm: float, spare_px: int) -> SheetGrid:
         """Make the grid of a pose; what matters is shown in the window or is so close that its light gets there."""
-        texels = SHEET_ROWS // ROWS
-        edges = sheet_place(np.arange(ROWS + 1.0) * texels - 0.5)
+        each = 1 if float(job.camera.scale_at(job.t)) > _FINE_PX_PER_MM else 2
+        rows, columns = GRID_ROWS // each, GRID_COLUMNS // each
+        texels = SHEET_ROWS // rows
+        edges = sheet_place(np.arange(rows + 1.0) * texels - 0.5)
         sheet = posed.vertices[: posed.layout.vertex_ends[0]].reshape(-1, SHEET_COLUMNS, 3)[:, :-1]
         near = _in_window(sheet + job.anchor_mm, job, spare_mm, spare_px)
         sheet = sheet.astype(np.float32)
-        middle = sheet_place((np.arange(ROWS, dtype=float) + 0.5) * texels - 0.5)
+        middle = sheet_place((np.arange(rows, dtype=float) + 0.5) * texels - 0.5)
         i = np.minimum(middle.astype(int), len(sheet) - 2)
         share = (middle - i).astype(np.float32)
         x = sheet[i] + share[:, None, None] * (sheet[i + 1] - sheet[i])
-        along = (np.roll(x, -1, axis=1) - np.roll(x, 1, axis=1)) * (0.5 * x.shape[1] / COLUMNS)
+        along = (np.roll(x, -1, axis=1) - np.roll(x, 1, axis=1)) * (0.5 * x.shape[1] / columns)
         down = np.gradient(x, axis=0)
         width = np.maximum(np.linalg.norm(along, axis=-1), 1e-6)
         a = np.sum(along * down, axis=-1) / width
         height = np.sqrt(np.maximum(np.sum(down * down, axis=-1) - a * a, 0))
         width, height = np.maximum(width, _FINEST_MM), np.maximum(height, _FINEST_MM)
         metric = np.stack([1 / width, a, 1 / height, np.maximum(width, height)], axis=-1)
-        columns = np.arange(COLUMNS) * near.shape[1] // COLUMNS
-        marks = [near[i + (share > 0.5)][:, columns]]
+        marks = [near[i + (share > 0.5)][:, np.arange(columns) * near.shape[1] // columns]]
         for _ in _LEVEL_RINGS[1:]:
             marks.append(_grown(marks[-1].reshape(len(marks[-1]) // 2, 2, -1, 2).any(axis=(1, 3))))
         cells = [np.flatnonzero(m) if m.any() else np.zeros(1, dtype=np.int64) for m in marks]
         return cls(
+            rows,
+            columns,
+            (dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns)),
             cells[0],
             tuple(_numbers(c) for c in cells),
             *(mi.Float(aligned(t.astype(np.float32).ravel())) for t in (edges, metric)),
         )
 
     def spread(self, irradiance: Singles, length_mm: float) -> mi.Float:
-        """What leaves the skin, cell by cell, of the light that falls on it (ROWS, COLUMNS)."""
-        straight = Pyramid(ROWS, COLUMNS, True)
+        """What leaves the skin, cell by cell, of the light that falls on it (rows, columns)."""
+        straight = Pyramid(self.rows, self.columns, True)
         straight.fill(irradiance)
 
         def read(
@@ -454,19 +472,51 @@ class SheetGrid:
         places, light = _Places.of(length_mm), mi.Float(0)
         # The farther light has come, the more evenly it is spread, and the fewer cells tell it.
         for level, rings_of in reversed(list(enumerate(_LEVEL_RINGS))):
-            row, column = _cells(self.sent[level], level)
+            index, columns, size = self.sent[level], self.size[1] >> level, float(1 << level)
+            row, column = ((mi.Float(n) + 0.5) * size - 0.5 for n in (index // columns, index % columns))
             wider, light = light, places.share((row, column), read, *rings_of)
             if level + 1 < len(_LEVEL_RINGS):
-                light += _between_cells(mi.Float, wider, row, column, level + 1)
+                light += self.between(mi.Float, wider, row, column, level + 1)
             dr.eval(light)
-            light = _on_all_cells(light, self.sent[level], level)
+            everywhere = dr.zeros(mi.Float, self.rows * self.columns >> 2 * level)
+            dr.scatter(everywhere, light, index)
+            light = everywhere
         return light
 
+    def count(self, level: int) -> mi.UInt32:
+        """Number of cells of the grid reduced by 2^level."""
+        return (self.size[0] * self.size[1]) >> (2 * level)
+
+    def place(self, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Row and column at coordinates of the map."""
+        rows, columns = (mi.Float(n) for n in self.size)
+        return v * ((SHEET_ROWS + BANDS) / SHEET_ROWS) * rows - 0.5, u * columns - 0.5
+
+    def between(
+        self,
+        kind: Any,
+        buffer: mi.Float,
+        row: mi.Float,
+        column: mi.Float,
+        level: int,
+        first: mi.UInt32 | int = 0,
+    ) -> Any:
+        """Numbers between the cells of the grid reduced by 2^level, at places in units of its finest cells.
+
+        `first` is the number of the first cell in the buffer.
+        """
+        rows, columns, scale = self.size[0] >> level, self.size[1] >> level, 1 / (1 << level)
+        u = (column + 0.5) * scale - 0.5
+        u = dr.select(u < 0, u + mi.Float(columns), u)
+        j = dr.minimum(mi.UInt32(u), columns - 1)
+        right = dr.select(j + 1 < columns, j + 1, 0)
+        return _between(kind, buffer, (row + 0.5) * scale - 0.5, u - mi.Float(j), (j, right), (rows, columns), first)
+
     def whole(self, values: mi.Float) -> Singles:
-        """Numbers (ROWS, COLUMNS) of all cells, 0 for those that do not matter."""
-        out = np.zeros(ROWS * COLUMNS, np.float32)
+        """Numbers (rows, columns) of all cells, 0 for those that do not matter."""
+        out = np.zeros(self.rows * self.columns, np.float32)
         out[self.cells] = values.numpy()
-        return out.reshape(ROWS, COLUMNS)
+        return out.reshape(self.rows, self.columns)
 
     def vertex_row(self, row: mi.UInt32, share: mi.Float) -> mi.Float:
         """Row of the sheet's vertices at a share of the grid's rows."""
@@ -475,14 +525,14 @@ class SheetGrid:
 
     def step(self, row: mi.Float, column: mi.Float, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Go x mm along a row and y mm across: the new row and column, and the size of a cell (mm)."""
-        columns = SHEET_COLUMNS - 1
+        columns, around = SHEET_COLUMNS - 1, mi.Float(self.size[1])
         i = mi.UInt32(row + 0.5)
-        j = mi.UInt32((column + 0.5) * (columns / COLUMNS) + 0.5)
+        j = mi.UInt32((column + 0.5) * (columns / around) + 0.5)
         m = dr.gather(mi.Vector4f, self.metric, i * columns + dr.select(j < columns, j, 0))
         down = y * m.z
         column += (x - m.y * down) * m.x
-        column -= dr.floor(column / COLUMNS) * COLUMNS
-        return dr.clip(row + down, 0, ROWS - 1.0), dr.minimum(column, COLUMNS - 0.51), m.w
+        column -= dr.floor(column / around) * around
+        return dr.clip(row + down, 0, mi.Float(self.size[0]) - 1), dr.minimum(column, around - 0.51), m.w
 
 
 @dataclass(frozen=True, slots=True)
@@ -536,45 +586,17 @@ def _spots(shift: tuple[mi.UInt32, mi.UInt32], k: mi.UInt32) -> tuple[mi.Float, 
     return u, v
 
 
-def _cells(index: mi.UInt32, level: int) -> tuple[mi.Float, mi.Float]:
-    """Middles (row, column) of cells of the grid over the skin reduced by 2^level, in units of its finest cells."""
-    columns, size = COLUMNS >> level, float(1 << level)
-    return (mi.Float(index // columns) + 0.5) * size - 0.5, (mi.Float(index % columns) + 0.5) * size - 0.5
-
-
-def _on_all_cells(values: mi.Float, index: mi.UInt32, level: int) -> mi.Float:
-    """Numbers of all cells of the grid over the skin reduced by 2^level, 0 but for some."""
-    out = dr.zeros(mi.Float, ROWS * COLUMNS >> 2 * level)
-    dr.scatter(out, values, index)
-    return out
-
-
-def _between_cells(
-    kind: Any, buffer: mi.Float, row: mi.Float, column: mi.Float, level: int, first: mi.UInt32 | int = 0
-) -> Any:
-    """Numbers between the cells of the grid over the skin reduced by 2^level, at places in units of its finest cells.
-
-    `first` is the number of the first cell in the buffer.
-    """
-    rows, columns, scale = ROWS >> level, COLUMNS >> level, 1 / (1 << level)
-    u = (column + 0.5) * scale - 0.5
-    u = dr.select(u < 0, u + columns, u)
-    j = dr.minimum(mi.UInt32(u), columns - 1)
-    right = dr.select(j + 1 < columns, j + 1, 0)
-    return _between(kind, buffer, (row + 0.5) * scale - 0.5, u - mi.Float(j), (j, right), (rows, columns), first)
-
-
 def _between(
     kind: Any,
     buffer: mi.Float,
     row: mi.Float,
     share: mi.Float,
     beside: tuple[mi.UInt32, mi.UInt32],
-    size: tuple[int, int],
+    size: tuple[mi.UInt32 | int, mi.UInt32 | int],
     first: mi.UInt32 | int = 0,
 ) -> Any:
     """Numbers between rows, and at a share of the way from the first to the second of two columns, of a grid."""
-    v = dr.clip(row, 0, size[0] - 1.001)
+    v = dr.clip(row, 0, mi.Float(size[0]) - 1.001)
     i = mi.UInt32(v)
     t = v - mi.Float(i)
     a, b, c, d = (dr.gather(kind, buffer, first + p * size[1] + q) for p in (i, i + 1) for q in beside)
@@ -601,11 +623,6 @@ def _grown(marked: Bools) -> Bools:
     """Marks of a grid, whose columns close, and of all neighbours."""
     around = np.pad(marked, ((0, 0), (1, 1)), "wrap")
     return np.asarray(ndimage.binary_dilation(around, np.ones((3, 3)))[:, 1:-1])
-
-
-def _grid_place(u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Row and column of the grid over the skin at coordinates of the map."""
-    return v * ((SHEET_ROWS + BANDS) * ROWS / SHEET_ROWS) - 0.5, u * COLUMNS - 0.5
 
 
 def _globe_place(n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:

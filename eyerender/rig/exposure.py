@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from ..arrays import Floats, frozen
+from ..arrays import Floats, Singles, frozen
 from .camera import PinholeCamera, Window
 from .sensor import Sensor
 from .stray import border
+
+Reals: TypeAlias = NDArray[np.floating[Any]]
+"""Numbers of single or double precision."""
 
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0
@@ -54,14 +58,16 @@ def expose(
     Returns:
         (h, w) codes.
     """
-    mean = electrons(sensor, irradiance, wavelength_nm)
-    read: Floats | float = 0.0
+    # Single precision is finer than any sensor, and takes half the time.
+    mean: Reals = electrons(sensor, irradiance, wavelength_nm).astype(np.float32)
+    read: Reals | float = 0.0
     if sensor.noise:
         if sensor.prnu > 0:
             mean = mean * np.maximum(1 + sensor.prnu * pattern(sensor.pattern_seed, 0, corner_px, mean.shape), 0)
         rng = np.random.default_rng((0x5E75, seed))
-        shot, read = rng.standard_normal(mean.shape), sensor.read_noise_e * rng.standard_normal(mean.shape)
-        read = read + _offsets(sensor, corner_px, mean.shape)
+        shot, read = (rng.standard_normal(mean.shape, dtype=np.float32) for _ in range(2))
+        read *= sensor.read_noise_e
+        read += _offsets(sensor, corner_px, mean.shape)
         # Above a few wells a pixel is clipped whatever its noise, but its charge may spill.
         most = np.inf if sensor.blooming > 0 else 4 * sensor.full_well_e + 1e4
         mean = photon_counts(np.minimum(mean, most), shot)
@@ -83,9 +89,9 @@ def recorded(
     return codes
 
 
-def _offsets(sensor: Sensor, corner_px: tuple[int, int], shape: tuple[int, ...]) -> Floats | float:
+def _offsets(sensor: Sensor, corner_px: tuple[int, int], shape: tuple[int, ...]) -> Singles | float:
     """Fixed offsets of the pixels and the columns, electrons."""
-    out: Floats | float = 0.0
+    out: Singles | float = 0.0
     if sensor.dsnu_e > 0:
         out = out + sensor.dsnu_e * pattern(sensor.pattern_seed, 1, corner_px, shape)
     if sensor.column_e > 0:
@@ -94,7 +100,7 @@ def _offsets(sensor: Sensor, corner_px: tuple[int, int], shape: tuple[int, ...])
 
 
 @lru_cache(maxsize=8)
-def pattern(seed: int, which: int, corner_px: tuple[int, int], shape: tuple[int, ...]) -> Floats:
+def pattern(seed: int, which: int, corner_px: tuple[int, int], shape: tuple[int, ...]) -> Singles:
     """Standard normal numbers of a sensor's pixels (h, w), each a pure function of seed, `which` and its place.
 
     The uniform numbers below are those of SplitMix64 (Steele, Lea, Flood 2014), which maps counters to numbers.
@@ -108,10 +114,10 @@ def pattern(seed: int, which: int, corner_px: tuple[int, int], shape: tuple[int,
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     z ^= z >> np.uint64(31)
     uniform = ((z >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
-    return frozen(special.ndtri(uniform))
+    return frozen(special.ndtri(uniform), np.float32)
 
 
-def bloomed(charge: Floats, full_well: float, share: float, along: str = "columns") -> Floats:
+def bloomed(charge: Reals, full_well: float, share: float, along: str = "columns") -> Reals:
     """Charge (h, w) of the pixels, at most the full well; what exceeds it spills.
 
     Of the excess, `share` spills, half of it to either side along the columns (or rows), into the nearest pixels that
@@ -126,7 +132,7 @@ def bloomed(charge: Floats, full_well: float, share: float, along: str = "column
     # One row of the loop is one pixel of every column.
     held, excess = (v if along == "columns" else v.T for v in (held.copy(), excess))
     for rows in (range(len(held)), range(len(held) - 1, -1, -1)):
-        carried = np.zeros(held.shape[1])
+        carried = np.zeros(held.shape[1], held.dtype)
         for row in rows:
             taken = np.minimum(carried, full_well - held[row])
             held[row] += taken
@@ -134,7 +140,7 @@ def bloomed(charge: Floats, full_well: float, share: float, along: str = "column
     return held if along == "columns" else held.T
 
 
-def photon_counts(mean: Floats, normal: Floats) -> Floats:
+def photon_counts(mean: Reals, normal: Reals) -> Reals:
     """Convert standard normal variates to Poisson variates of the given means: the quantile at Phi(normal).
 
     The quantile is the normal asymptotic expansion of the Poisson distribution's inverse (Giles 2016, Algorithm 955,
@@ -148,7 +154,7 @@ def photon_counts(mean: Floats, normal: Floats) -> Floats:
     return out
 
 
-def _counts(mean: Floats, normal: Floats) -> Floats:
+def _counts(mean: Reals, normal: Reals) -> Reals:
     root = np.sqrt(np.maximum(mean, _FEW))
     w = normal
     w2 = w * w
@@ -163,7 +169,7 @@ def _counts(mean: Floats, normal: Floats) -> Floats:
     return np.asarray(np.maximum(count, 0, out=count))
 
 
-def _few_counts(mean: Floats, probability: Floats) -> Floats:
+def _few_counts(mean: Reals, probability: Reals) -> Reals:
     """Smallest k whose cumulative probability reaches the given one."""
     count = np.zeros_like(mean)
     term = np.exp(-mean)

@@ -34,19 +34,19 @@ def grids(renderer, bound):
 
     from eyerender.rendering import subsurface as light
     from eyerender.rendering.frame import globe_of
-    from eyerender.rendering.region import GRID_COLUMNS, GRID_ROWS, SHEET_COLUMNS
+    from eyerender.rendering.region import SHEET_COLUMNS
 
     shown, place = renderer.bind(bound)
     sheet = light.SheetGrid.of(place.posed, bound, 100.0, 0)
-    row, column = sheet.sent[0] // GRID_COLUMNS, sheet.sent[0] % GRID_COLUMNS
-    across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / GRID_COLUMNS)
+    row, column = sheet.sent[0] // sheet.columns, sheet.sent[0] % sheet.columns
+    across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / sheet.columns)
     x, _ = place.skin.sheet_point(sheet.vertex_row(row, mi.Float(0.5)), across)
-    on_sheet = np.zeros((GRID_ROWS * GRID_COLUMNS, 3), np.float32)
+    on_sheet = np.zeros((sheet.rows * sheet.columns, 3), np.float32)
     on_sheet[sheet.cells] = x.numpy().T
     globe = light.GlobeGrid.of(place.posed, globe_of(bound.eye, bound.M, bound.t - bound.anchor_mm), 8.0)
     n = light._globe_direction(*(mi.Float(k) for k in np.divmod(np.arange(light._SIDE**2), light._SIDE)))
     on_globe = float(bound.eye.sclera.radius_mm) * n.numpy().T
-    return sheet, on_sheet.reshape(GRID_ROWS, GRID_COLUMNS, 3), globe, on_globe, shown.values.sclera.radius
+    return sheet, on_sheet.reshape(sheet.rows, sheet.columns, 3), globe, on_globe, shown.values.sclera.radius
 
 
 def test_even_light_stays_even(renderer):
@@ -64,20 +64,22 @@ def lit_share(away: np.ndarray, width: np.ndarray | float) -> np.ndarray:
     return np.clip(away / np.maximum(width, 1e-6) + 0.5, 0, 1).astype(np.float32)
 
 
-def test_shadow_edges_have_their_shape_on_skin_and_globe(renderer):
-    sheet, at, globe, on_globe, radius = grids(renderer, job(region=BARE))
+@pytest.mark.parametrize(("name", "rows", "tolerance"), [("head", 160, 0.03), ("remote", 80, 0.05)])
+def test_shadow_edges_have_their_shape_on_skin_and_globe(renderer, name, rows, tolerance):
+    sheet, at, globe, on_globe, radius = grids(renderer, job(name, region=BARE))
+    assert sheet.rows == rows  # in pictures of few pixels per mm the cells are twice as large
     # The edge of a shadow runs up and down the cheek and the lower lid, and up and down the sclera.
     away, along = at[..., 1] - 2.0, np.gradient(at, axis=1)
     level = np.abs(along[..., 1]) / np.maximum(np.linalg.norm(along, axis=-1), 1e-6) > 0.95
     known = np.zeros(away.size, bool)
     known[sheet.cells] = True
     near = level & known.reshape(away.shape) & (np.abs(away) < 2.5) & (at[..., 2] < -9.0) & (at[..., 2] > -14.0)
-    assert near.sum() > 300
+    assert near.sum() > 100
     lit = lit_share(away, np.abs(along[..., 1]))
     out = sheet.spread(lit, 0.65).numpy().reshape(away.shape)[near]
     # Six rings of six places are good to 0.017 on a plane; the rows of cells are bent and of unequal width.
     worst = np.abs(out - edge(away[near], 0.65)).max()
-    assert worst < 0.03
+    assert worst < tolerance
     side = 192
     away = on_globe[:, 1] - 1.0
     inside = np.zeros(side * side, bool)
