@@ -1,10 +1,13 @@
 """Light other than that of the lamps: even light, emitting panels, and surroundings given as an HDR map.
 
 The front cornea mirrors all of it along exact rays (those of the integrator). Matte surfaces are lit by its irradiance,
-without shadows. A map is infinitely far away. Its irradiance is its cosine convolution in spherical harmonics up to
-order 2 (Ramamoorthi and Hanrahan 2001, equations 4 to 12; on average within a few per cent of the integral),
+from which `exchange` takes what is hidden. A map is infinitely far away. It is the sum of two maps: the soft one ends
+at a ceiling, and the rest, which may be as bright and small as the sun, is represented by directions that stand for
+equal shares of its light (median cut: Debevec 2005). The irradiance of both is a table over the normals,
 
-    E(n) = sum_lm A_l L_lm Y_lm(n),    A = (pi, 2 pi / 3, pi / 4),    L_lm = integral of L Y_lm over all directions.
+    E(n) = sum_k max(0, n . V_k),    V_k = integral of L w dw over a block of texels,
+
+exact for every block that the horizon does not cut.
 """
 
 from __future__ import annotations
@@ -25,13 +28,17 @@ from ..arrays import ArrayValue, Floats, frozen
 from ..errors import InputError
 from ..files import opened
 from ..rig.imaging import RadianceMap
+from ..rig.light import Lamp
 from ..rig.surroundings import paint
 from ..spec import file_digest
 from .exr import second_thread
 from .panels import Panels
 
 _WIDTH, _HEIGHT = 1024, 512
-_FINE = 256
+_FINE, _BLOCKS, _NORMALS = 256, 32, 48  # rows from which blocks are summed, and of blocks and normals
+_CEILING = 2.0  # of the soft part of a map, over its mean
+_CUTS = 6  # 2^6 directions
+_FAR_MM = 1e6
 _FORMATS = (".hdr", ".exr", ".pfm", ".npy")
 # Rec. 709.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -43,15 +50,25 @@ _SIDES = {
     ".hdr": rb"[-+][XY] *([0-9]{1,20}) *[-+][XY] *([0-9]{1,20})",
     ".pfm": rb"^P[fF]\s+([0-9]{1,20})\s+([0-9]{1,20})",
 }
-_ENTRIES = 21  # even irradiance, 9 of the rotation, scale, rows, 9 of the irradiance
+_ENTRIES = 13  # even irradiance, 9 of the rotation, scale, rows, ceiling
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surrounding(ArrayValue):
-    """A map made ready: `values` (h, w) float32, and `harmonics` (9,) of the irradiance per unit of its values."""
+    """A map made ready, in its own frame.
+
+    Attributes:
+        values: (h, 2 h) radiance, float32.
+        ceiling: largest radiance of the soft part.
+        irradiance: (rows, 2 rows, 2) irradiance of surfaces whose normal is the direction of a texel, from the soft
+            part and from the rest, float32.
+        bright: (n, 3) directions that stand for the rest, times their irradiance of surfaces that face them.
+    """
 
     values: Any
-    harmonics: Floats
+    ceiling: float
+    irradiance: Any
+    bright: Floats
 
 
 def read_map(path: str | Path, channel: str = "red") -> Floats:
@@ -129,48 +146,58 @@ def _size(kind: str, head: bytes) -> int | None:
 def surrounding(values: Floats) -> Surrounding:
     """Prepare a map (h, 2 h): average it down to at most 1024 x 512, and compute its irradiance."""
     reduced = _reduced(values)
-    return Surrounding(frozen(reduced, np.float32), frozen(irradiance_harmonics(reduced)))
+    fold = max(1, -(-_FINE // len(reduced)))
+    fine = np.repeat(np.repeat(reduced, fold, axis=0), fold, axis=1)
+    way, angle = _directions(len(fine))
+    ceiling = _CEILING * float(np.sum(fine * angle)) / (4 * np.pi)
+    # Blocks have whole rows and columns of texels, but for the last ones.
+    size = len(fine) // _BLOCKS
+    starts = np.arange(0, len(fine), size), np.arange(0, 2 * len(fine), size)
 
+    def blocks(radiance: Floats) -> Floats:
+        flux = (radiance * angle)[..., None] * way
+        out = np.add.reduceat(np.add.reduceat(flux, starts[0], axis=0), starts[1], axis=1)
+        return np.asarray(out.reshape(-1, 3))
 
-def irradiance_harmonics(values: Floats) -> Floats:
-    """Coefficients A_l L_lm c_lm of a map's irradiance, (9,).
-
-    E(n) is their sum with the factors 1, y, z, x, xy, yz, 3 z^2 - 1, xz and x^2 - y^2 of n.
-    """
-    fold = max(1, -(-_FINE // len(values)))
-    h, w = len(values) * fold, values.shape[1] * fold
-    edges = np.cos(np.pi * np.arange(h + 1) / h)
-    # This is the solid angle of a texel in each row; values are constant within texels.
-    weight = (edges[:-1] - edges[1:]) * (2 * np.pi / w)
-    polar = np.pi * (np.arange(h) + 0.5) / h
-    turn = 2 * np.pi * (0.5 - (np.arange(w) + 0.5) / w)
-    # Columns are summed first, because each basis function is a product of one of the row and one of the column.
-    rows = np.repeat(values, fold, axis=0)
-
-    def along(f: Floats) -> Floats:
-        out: Floats = rows @ f.reshape(-1, fold).sum(axis=1) * weight
-        return out
-
-    c, s, c2, s2 = (along(f) for f in (np.cos(turn), np.sin(turn), np.cos(2 * turn), np.sin(2 * turn)))
-    one = along(np.ones(w))
-    st, ct = np.sin(polar), np.cos(polar)
-    moments = np.array(
-        [
-            np.sum(one),
-            np.sum(s * st),
-            np.sum(one * ct),
-            np.sum(c * st),
-            np.sum(0.5 * s2 * st * st),
-            np.sum(s * st * ct),
-            np.sum(one * (3 * ct * ct - 1)),
-            np.sum(c * st * ct),
-            np.sum(c2 * st * st),
-        ]
+    soft, rest = blocks(np.minimum(fine, ceiling)), blocks(np.maximum(fine - ceiling, 0))
+    whole = blocks(np.ones_like(fine))
+    normals = _directions(_NORMALS)[0]
+    table = [[np.maximum(row @ flux.T, 0).sum(axis=1) for flux in (soft, rest, whole)] for row in normals]
+    irradiance = np.moveaxis(np.asarray(table), 1, -1)
+    # Cut blocks are a little off, and by the known light of all directions most of that is taken away.
+    irradiance = np.pi * irradiance[..., :2] / irradiance[..., 2:]
+    return Surrounding(
+        frozen(reduced, np.float32), ceiling, frozen(irradiance, np.float32), frozen(_median_cut(rest, _CUTS))
     )
-    y0, y1, y2, y20, y22 = 1 / (4 * np.pi), 3 / (4 * np.pi), 15 / (4 * np.pi), 5 / (16 * np.pi), 15 / (16 * np.pi)
-    squares = np.array([y0, y1, y1, y1, y2, y2, y20, y2, y22])
-    band = np.pi * np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])
-    return np.asarray(moments * squares * band, dtype=np.float64)
+
+
+def _directions(rows: int) -> tuple[Floats, Floats]:
+    """Directions (rows, 2 rows, 3) of a map's texels in its own frame, and their solid angles (rows, 1)."""
+    edge = np.pi * np.arange(rows + 1) / rows
+    polar, turn = 0.5 * (edge[1:] + edge[:-1])[:, None], (np.pi - np.pi * (np.arange(2 * rows) + 0.5) / rows)[None]
+    s = np.sin(polar)
+    way = np.stack(np.broadcast_arrays(s * np.cos(turn), s * np.sin(turn), np.cos(polar)), axis=-1)
+    return way, -np.diff(np.cos(edge))[:, None] * (np.pi / rows)
+
+
+def _median_cut(flux: Floats, cuts: int) -> Floats:
+    """Sums (m, 3) of vectors (n, 3) in at most 2^cuts groups of neighbouring directions and like sums of lengths."""
+    length = np.linalg.norm(flux, axis=1)
+    flux, length = flux[length > 0], length[length > 0]
+    groups = [np.arange(len(flux))] if len(flux) else []
+    for _ in range(cuts):
+        halves = []
+        for group in groups:
+            at = flux[group] / length[group, None]
+            spread = np.average(
+                (at - np.average(at, axis=0, weights=length[group])) ** 2, axis=0, weights=length[group]
+            )
+            order = group[np.argsort(at[:, np.argmax(spread)], kind="stable")]
+            before = np.cumsum(length[order]) - 0.5 * length[order]
+            split = int(np.searchsorted(before, 0.5 * length[order].sum()))
+            halves += [half for half in (order[:split], order[split:]) if len(half)]
+        groups = halves
+    return np.array([flux[group].sum(axis=0) for group in groups]).reshape(-1, 3)
 
 
 def map_rotation(spec: RadianceMap) -> Floats:
@@ -199,11 +226,11 @@ class Maps:
     """The maps in use, on the device; each is read and sent there once."""
 
     def __init__(self) -> None:
-        self._kept: dict[Any, tuple[Any, Surrounding]] = {}
-        self._none = self._sent(Surrounding(frozen(np.zeros((2, 4)), np.float32), frozen(np.zeros(9))))
+        self._kept: dict[Any, tuple[Any, Any, Surrounding]] = {}
+        self._none = self._sent(surrounding(np.zeros((2, 4))))
 
-    def of(self, spec: RadianceMap | None) -> tuple[Any, Surrounding]:
-        """Texture and map of a spec (its file's path is absolute or relative to the current folder)."""
+    def of(self, spec: RadianceMap | None) -> tuple[Any, Any, Surrounding]:
+        """Textures of radiance and irradiance, and map, of a spec (its path is absolute or from the current folder)."""
         if spec is None:
             return self._none
         key: tuple[Any, ...] = (spec.place, spec.place_seed)
@@ -220,11 +247,15 @@ class Maps:
         return self._kept[key]
 
     @staticmethod
-    def _sent(made: Surrounding) -> tuple[Any, Surrounding]:
-        # The texture repeats so that the columns wrap. Additional rows separate the poles.
-        rows = np.concatenate([made.values[:1], made.values, made.values[-1:]])
-        texture: Any = mi.Texture2f
-        return texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat), made
+    def _sent(made: Surrounding) -> tuple[Any, Any, Surrounding]:
+        return _texture(made.values[..., None]), _texture(made.irradiance), made
+
+
+def _texture(values: NDArray[np.float32]) -> Any:
+    # The texture repeats so that the columns wrap. Additional rows separate the poles.
+    rows = np.concatenate([values[:1], values, values[-1:]])
+    texture: Any = mi.Texture2f
+    return texture(mi.TensorXf(rows), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
 
 
 class Ambience:
@@ -246,18 +277,16 @@ class Ambience:
             maps: the maps that are kept.
         """
         self._panels = Panels(panels)
-        self._texture, made = maps.of(spec)
+        self._texture, self._table, made = maps.of(spec)
         scale = 0.0 if spec is None else spec.scale_w_m2_sr * 1e-3
         M = np.eye(3) if spec is None else map_rotation(spec)
-        numbers = [even_mw_mm2, *M.T.ravel(), scale, len(made.values), *(made.harmonics * scale)]
+        self._bright = made.bright @ M.T * scale
+        numbers = [even_mw_mm2, *M.T.ravel(), scale, len(made.values), made.ceiling]
         buffer = mi.Float(np.array(numbers, dtype=np.float32))
         n = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in range(_ENTRIES)]
         dr.eval(n)
-        self._even, self._scale, self._rows, self._harmonics = n[0], n[10], n[11], n[12:]
+        self._even, self._scale, self._rows, self._ceiling = n[0], n[10], n[11], n[12]
         self._axes = tuple(mi.Vector3f(*n[k : k + 3]) for k in (1, 4, 7))
-
-    def _in_map(self, v: mi.Vector3f) -> mi.Vector3f:
-        return mi.Vector3f(*(dr.dot(axis, v) for axis in self._axes))
 
     def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Radiance (mW/mm^2/sr) along rays of the scene's frame, without the even light.
@@ -266,29 +295,44 @@ class Ambience:
         """
         return self._panels.radiance(o, d, active) + self._mapped(d, active)
 
-    def far(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Radiance (mW/mm^2/sr) of even light and map along directions of the scene's frame."""
-        return self._even * dr.inv_pi + self._mapped(d, active)
+    def soft(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """Radiance (mW/mm^2/sr) of even light and of the soft part of the map along directions of the scene's frame."""
+        value = self._texture.eval(self._place(d, self._rows), active)[0]
+        return self._even * dr.inv_pi + self._scale * dr.minimum(value, self._ceiling)
+
+    def bright(self, anchor_mm: Floats) -> tuple[Lamp, ...]:
+        """The rest of the map as far lamps; `anchor_mm` is the origin of the scene's frame in the world."""
+        size = np.linalg.norm(self._bright, axis=1)
+        return tuple(
+            Lamp(
+                position_mm=frozen(anchor_mm + _FAR_MM * flux / one),
+                axis=frozen(-flux / one),
+                radius_mm=0.0,
+                intensity_mw_sr=float(one * _FAR_MM**2),
+                lobe_exponent=0.0,
+            )
+            for flux, one in zip(self._bright, size, strict=True)
+            if one > 0
+        )
 
     def _mapped(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        w = self._in_map(d)
-        u = 0.5 - dr.atan2(w.y, w.x) * (0.5 * dr.inv_pi)
-        v = dr.acos(dr.clip(w.z, -1, 1)) * dr.inv_pi
-        place = mi.Point2f(u, (1 + v * self._rows) / (self._rows + 2))
-        return self._scale * self._texture.eval(place, active)[0]
+        return self._scale * self._texture.eval(self._place(d, self._rows), active)[0]
+
+    def _place(self, v: mi.Vector3f, rows: mi.Float | float) -> mi.Point2f:
+        """Place of directions (scene's frame) in a texture with so many rows, and one more at both ends."""
+        w = mi.Vector3f(*(dr.dot(axis, v) for axis in self._axes))
+        polar = dr.acos(dr.clip(w.z, -1, 1)) * dr.inv_pi
+        return mi.Point2f(0.5 - dr.atan2(w.y, w.x) * (0.5 * dr.inv_pi), (1 + polar * rows) / (rows + 2))
 
     def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) of a matte surface at points x with unit normals n of the scene's frame, unshadowed."""
-        w = self._in_map(n)
-        h = self._harmonics
-        far = h[0] + h[1] * w.y + h[2] * w.z + h[3] * w.x
-        far += h[4] * w.x * w.y + h[5] * w.y * w.z + h[6] * (3 * w.z * w.z - 1) + h[7] * w.x * w.z
-        far += h[8] * (w.x * w.x - w.y * w.y)
-        return self._even + dr.maximum(far, 0) + self.of_panels(x, n)
+        soft, hard = self.irradiances(x, n)
+        return soft + hard
 
-    def of_panels(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
-        """The panels' part of the irradiance."""
-        return self._panels.irradiance(x, n)
+    def irradiances(self, x: mi.Vector3f, n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """The same: of even light and of the soft part of the map; of the rest of the map and of panels."""
+        soft, rest = self._table.eval(self._place(n, float(_NORMALS)))
+        return self._even + self._scale * soft, self._scale * rest + self._panels.irradiance(x, n)
 
 
 def _reduced(values: Floats) -> Floats:

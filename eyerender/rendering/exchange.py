@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from .values import Lights, Values
 
 RAYS = 24  # from each place on the globe or about it
+_LEAVING = 32  # rays out of the eye from each place in it, without light from afar
 _NEAR_RAYS, _FAR_RAYS = 16, 8  # from each place on the skin: the fewer ones within lids and far away
 _FAR_MM = 17.0  # distance from the eye beyond which skin is far
 _ROUNDS = 6
@@ -198,18 +199,18 @@ class _Seen:
         first: (places,) number of the first ray of each place; rays of a place follow each other.
         target: numbers of the places that are met.
         weight: share of their irradiance that is sent back.
-        open_: whether nothing is met.
         near: whether something is met very close.
-        sky: irradiance from what is far away.
+        sky: irradiance from even light and the soft part of a map, where nothing is met.
+        free: the same as if nothing were met.
         lit: irradiance straight from the lamps at the very point of the skin that is met, -1 where it is not known.
     """
 
     first: Ints
     target: Ints
     weight: Floats
-    open_: Floats
     near: Floats
     sky: Floats
+    free: Floats
     lit: Floats
 
     def mean(self, values: Floats) -> Floats:
@@ -239,7 +240,7 @@ class Exchange:
             job: the job.
             values: its numbers.
             lights: its lamps.
-            panels: parts of its panels as lamps, which light the chamber's places.
+            panels: parts of its panels, and the bright parts of its map, as lamps.
             textures: its textures, with the region and the ambient light.
             place: its surroundings.
         """
@@ -254,10 +255,10 @@ class Exchange:
         if not job.interreflection and not values.structure.ambient:
             return frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
-        direct, even, of_panels = _direct(values, lights, panels, place.scene, textures, frame)
+        direct, ambient = _direct(values, lights, panels, place.scene, textures, frame)
         lamps, more = (_direct_inside(values, some, place.scene, frame.chamber) for some in (lights, panels))
         seen = _seen(values, lights, textures, place, numbers, frame)
-        return frame.solved(region, direct, (even, *of_panels), lamps, more, seen)
+        return frame.solved(region, direct, ambient, lamps, more, seen)
 
     def _skin(self, region: RegionScene, globe: Globe) -> SkinPlaces:
         """Places on the skin of a region, chosen with the eye straight ahead: no earlier pose may change a picture."""
@@ -308,6 +309,12 @@ class _Frame:
         return np.append(0, np.cumsum(count))
 
     @property
+    def leaving(self) -> int:
+        """Number of rays that leave the eye from each place of the chamber, more where they look for light."""
+        ambient = self.job.ambient
+        return LEAVING if ambient.map is not None or ambient.irradiance_w_m2 > 0 else _LEAVING
+
+    @property
     def outer(self) -> Floats:
         """Points and normals of the places outside the chamber, (n, 6)."""
         job = self.job
@@ -346,16 +353,15 @@ class _Frame:
         return out
 
     def solved(
-        self, region: RegionScene | None, direct: Floats, ambient: tuple[Floats, Floats, Floats], lamps: Floats,
+        self, region: RegionScene | None, direct: Floats, ambient: tuple[Floats, Floats, Floats, Floats], lamps: Floats,
         panels: Floats, seen: tuple[_Seen, _Seen],
     ) -> Received:  # fmt: skip
         """Solve for the irradiance of all places."""
         job, outside, inside = self.job, *seen
-        # Light from all sides is shaded by the share of open sky, and that of panels by what stands before them.
-        even, free, shaded = ambient
-        open_ = outside.mean(outside.open_)
-        arriving = (even - free) * open_ + shaded
-        open_ = np.where(even > 0, arriving / np.where(even > 0, even, 1), open_)
+        # What is hidden of soft light is told by the rays, and of the rest by what stands before its parts.
+        soft, hard, free, shaded = ambient
+        sky = soft * _over(outside.mean(outside.sky), outside.mean(outside.free))
+        arriving = sky + hard * _over(shaded, free)
         valid = outside.mean(outside.near)[: self.on_globe] < 0.5
         if region is None:
             valid &= self.grid.points[:, 0] > -job.look.backdrop_distance_mm
@@ -376,7 +382,7 @@ class _Frame:
                 total = start + np.append(arrived, entered + within)
         numbers = np.zeros((self.outside, 4))
         numbers[:, 0] = (total - start)[: self.outside]
-        numbers[:, 1] = open_
+        numbers[:, 1], numbers[:, 3] = arriving, soft + hard
         numbers[:, 2] = total[: self.outside] if job.interreflection else 0
         if region is None:
             numbers[self.on_globe :, 2] *= job.look.backdrop_albedo
@@ -386,9 +392,17 @@ class _Frame:
         other = numbers[self.on_globe : self.outside - IRIS_TURNS]
         if region is not None and self.skin is not None:
             other = self.skin.spread @ other[: len(self.skin.vertices)]
+        for table in (globe, other):
+            table[:, 1], table[:, 3] = _over(table[:, 1], table[:, 3]), 0
+        if region is not None:
             region.skin.shine(other)
         iris = self._on_iris(entered + inside.mean(inside.sky), 1.0) + self._on_iris(within + panels, 0.0)
         return self.received((globe, other, iris))
+
+
+def _over(part: Floats, whole: Floats) -> Floats:
+    """Share that a part has of the whole, 1 where there is nothing."""
+    return np.where(whole > 0, part / np.where(whole > 0, whole, 1), 1.0)
 
 
 def _others(
@@ -421,11 +435,11 @@ def _spots(i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
 
 def _direct(
     values: Values, lights: Lights, panels: Lights, scene: mi.Scene, textures: Textures, frame: _Frame
-) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
+) -> tuple[Floats, tuple[Floats, Floats, Floats, Floats]]:
     """Irradiance of places outside the eye.
 
-    Straight from the lamps; from unshadowed ambient light; from panels, which are a part of it, without and with
-    shadows.
+    Straight from the lamps; from ambient light without shadows: what is soft, and the rest; this rest from its parts,
+    without and with shadows.
     """
     outer = frame.outer
     index = dr.arange(mi.UInt32, len(outer))
@@ -441,21 +455,19 @@ def _direct(
         index,
         lambda u, v: onto_points(
             values, lights, scene, start, facing, ~on_globe, u, v, views, ~on_globe & (index < sheet)
-        ),
+        )[0],
     )
-    even, free, shaded = (mi.Float(0) * x.x for _ in range(3))
+    ambient = [mi.Float(0) * x.x] * 4
     if values.structure.ambient:
         assert textures.ambience is not None
-        even = textures.ambience.irradiance(x, normal)
+        ambient[:2] = textures.ambience.irradiances(x, normal)
     if len(panels):
-        assert textures.ambience is not None
-        free = textures.ambience.of_panels(x, normal)
         middle = mi.Float(0)
-        shaded = onto_points(values, panels, scene, start, facing, ~on_globe, middle, middle)
-        shaded = dr.minimum(shaded, free)
-    dr.eval(even, free, shaded)
-    even, free, shaded = (np.asarray(part.numpy(), dtype=float) for part in (even, free, shaded))
-    return lit, even, (free, shaded)
+        shaded, free = onto_points(values, panels, scene, start, facing, ~on_globe, middle, middle)
+        ambient[2:] = free, shaded
+    dr.eval(ambient)
+    soft, hard, free, shaded = (np.asarray(part.numpy(), dtype=float) for part in ambient)
+    return lit, (soft, hard, free, shaded)
 
 
 def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, chamber: Chamber) -> Floats:
@@ -506,7 +518,7 @@ def _seen(
     """What the rays of the places outside and of those in the chamber meet."""
     start = frame.first_ray
     first = int(start[-1])
-    lanes = first + PLACES * LEAVING
+    lanes = first + PLACES * frame.leaving
     index = dr.arange(mi.UInt32, lanes)
     split = dr.opaque(mi.UInt32, first)
     outside = index < split
@@ -516,7 +528,7 @@ def _seen(
     normal = mi.Vector3f(*n[3:])
     o = mi.Vector3f(*n[:3]) + _START_MM * normal
     d = _pattern(normal, index)
-    rays = _rows(frame.chamber.leaving.reshape(-1, 7))(index - split, ~outside)
+    rays = _rows(frame.chamber.leaving[:, : frame.leaving].reshape(-1, 7))(index - split, ~outside)
     o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
     d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
     gain = dr.select(outside, 1, rays[6])
@@ -524,9 +536,8 @@ def _seen(
     sky = mi.Float(0) * o.x
     if values.structure.ambient:
         assert textures.ambience is not None
-        far = textures.ambience.far(d, open_ & ~outside)
-        sky = dr.select(open_ & ~outside, dr.pi * far * gain, 0)
-    results = (target, weight * gain, mi.Float(open_) * gain, mi.Float(distance < _TOUCHING_MM), sky)
+        sky = dr.pi * textures.ambience.soft(d, outside | open_) * gain
+    results = (target, weight * gain, mi.Float(distance < _TOUCHING_MM), dr.select(open_, sky, 0), sky)
     dr.eval(results, spot)
     host = [r.numpy() for r in results]
     host.append(np.full(lanes, -1.0))
@@ -535,7 +546,7 @@ def _seen(
         host[-1][lane] = _at_spots(values, lights, place.scene, textures, spot, lane)
     return (
         _Seen(start[:-1], *(h[:first] for h in host)),
-        _Seen(np.arange(PLACES) * LEAVING, *(h[first:] for h in host)),
+        _Seen(np.arange(PLACES) * frame.leaving, *(h[first:] for h in host)),
     )
 
 
@@ -556,7 +567,7 @@ def _at_spots(
         u, v = _spots(number * mi.UInt32(_SHUFFLED))
         return onto_points(
             values, lights, scene, start, normal, mi.Bool(True), u, v, textures.lamp_views, mi.Bool(True)
-        )
+        )[0]
 
     return np.asarray(dr.if_stmt(state, on_skin, light, lambda *_: mi.Float(-1)).numpy(), dtype=float)
 

@@ -296,7 +296,8 @@ def _groups(
         return o, d, cosine * cosine
 
     lights = shown.lights
-    lamps, groups, all_samples = lights.count, dr.opaque(mi.UInt32, spp // size), samples.count
+    # A frame without lamps has a dark one.
+    lamps, groups, all_samples = dr.maximum(lights.count, 1), dr.opaque(mi.UInt32, spp // size), samples.count
 
     def asked(j: mi.UInt32) -> mi.UInt32:
         return dr.select(all_samples < lamps, (all_samples + lamps - 1 - number(j)) // all_samples, 1)

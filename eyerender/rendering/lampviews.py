@@ -47,8 +47,9 @@ class LampViews:
 
     def __init__(self, lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float, region: RegionScene | None) -> None:
         reach = min(reach_mm, _REACH_MM)
-        table = np.array([_frame(lamp, anchor_mm, reach) for lamp in lights], dtype=np.float32).reshape(-1)
-        self._table = mi.Float(aligned(table))
+        # Without lamps nothing reads the table, but kernels cannot be compiled for an empty one.
+        table = [_frame(lamp, anchor_mm, reach) for lamp in lights] or [[0.0] * _WIDTH]
+        self._table = mi.Float(aligned(np.array(table, dtype=np.float32).reshape(-1)))
         self._known = dr.opaque(mi.Bool, region is not None)
         self._marks = dr.zeros(mi.UInt8, max(len(lights), 1) * _CELLS * _CELLS if region is not None else 1)
         if region is not None and len(lights):

@@ -115,18 +115,17 @@ def onto_points(
     v: mi.Float,
     views: LampViews | None = None,
     on_sheet: mi.Bool | bool = False,
-) -> mi.Float:
-    """Irradiance (mW/mm^2) of points in air (eye frame) straight from all lamps; `other` marks those off the globe.
+) -> tuple[mi.Float, mi.Float]:
+    """Irradiance (mW/mm^2) of points in air (eye frame) straight from all lamps, and the same without shadows.
+
+    `other` marks points off the globe.
 
     u, v: place on each lamp's disc, [0, 1). views: the lamps' views of a region, which spare rays from the points
     `on_sheet`, those on the outer side of its sheet of skin.
     """
     sine, cosine_v = dr.sincos(v * (2 * dr.pi))
 
-    def more(i: mi.UInt32, _: mi.Float) -> mi.Bool:
-        return i < lights.count
-
-    def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    def body(i: mi.UInt32, total: mi.Float, free: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         lamp: Lamp = lights[i]
         source = lamp.point(u, sine, cosine_v)
         lit = irradiance(lamp, source, x, normal)
@@ -134,10 +133,11 @@ def onto_points(
         if views is not None:
             asked &= ~views.clear(i, values.point_to_scene(x), asked & on_sheet)
         blocked = lamp_blocked(values, scene, x, source, other, True, asked)
-        return i + 1, total + dr.select(blocked, 0, lit)
+        return i + 1, total + dr.select(blocked, 0, lit), free + lit
 
-    state = (mi.UInt32(0), mi.Float(0) * x.x)
-    return dr.while_loop(state, more, body, labels=("i", "total"), label="lamps on places")[1]
+    state, labels = (mi.UInt32(0), mi.Float(0) * x.x, mi.Float(0) * x.x), ("i", "total", "free")
+    _, total, free = dr.while_loop(state, lambda i, *_: i < lights.count, body, labels=labels, label="lamps on places")
+    return total, free
 
 
 def light(

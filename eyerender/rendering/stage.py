@@ -112,7 +112,10 @@ class Stage:
             tissues = _tissues(job, values, lights, region, views) if structure.scattering and lit else None
             textures = replace(textures, region=region.skin, lamp_views=views, tissues=tissues)
         if lit:
-            panels = Lights(light_table(panel_lamps(job.ambient, anchor), job.M, job.t))
+            parts = panel_lamps(job.ambient, anchor)
+            if textures.ambience is not None:
+                parts += textures.ambience.bright(anchor)
+            panels = Lights(light_table(parts, job.M, job.t))
             received = self._exchange.received(job, values, lights, panels, textures, place)
             textures = replace(textures, received=received)
             px_per_mm = float(job.camera.scale_at(job.t))
