@@ -549,11 +549,16 @@ def _nearest(image, x, y):
 
 
 @compiled
-def on_the_dark_side(smooth, points, normals, depth, dark, bright):
+def at_the_iris(smooth, points, normals, depth, limits):
+    dark, faint, bright = limits
     out = np.empty(points.shape[0], dtype=np.bool_)
     for i in range(out.size):
         x, y, u, v = points[i, 0], points[i, 1], depth * normals[i, 0], depth * normals[i, 1]
-        out[i] = _nearest(smooth, x - u, y - v) < dark and _nearest(smooth, x + 0.5 * u, y + 0.5 * v) < bright
+        out[i] = (
+            _nearest(smooth, x - u, y - v) < dark
+            and _nearest(smooth, x + u, y + v) > faint
+            and _nearest(smooth, x + 0.5 * u, y + 0.5 * v) < bright
+        )
     return out
 
 

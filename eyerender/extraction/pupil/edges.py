@@ -15,6 +15,11 @@ from ..statistics import median, quantile
 from .candidates import Candidate
 from .glare import Cleared, around
 
+# Levels at an edge of the pupil, in steps above the pupil's: the highest one behind it; the lowest one ahead, which
+# shadows below a lid do not reach; and the highest one close ahead. Texture and shading of an iris stay between them.
+# Skin and sclera are brighter by two steps and more.
+DARK, FAINT, BRIGHT = 0.5, 0.35, 1.5
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgePoints:
@@ -51,15 +56,14 @@ def find_edges(
     cleared: Cleared,
     candidate: Candidate,
     noise_dn: float,
-    bright_dn: float,
     filter_px: float,
     *,
     band: float,
 ) -> EdgePoints:
     """Find edge points within `band` times the semi-axes of the candidate's outline (and at least 4 px).
 
-    A gradient ridge is kept if it points outward (within 45 deg of the candidate's normal), exceeds the noise, has dark
-    pupil behind it, and is not the flank of a spot brighter than `bright_dn`.
+    A gradient ridge is kept if it points outward (within 45 deg of the candidate's normal), exceeds the noise, and has
+    dark pupil behind it and an iris ahead: neither something as bright as skin or the sclera nor a shadow.
 
     The sub-pixel position, along the gradient's larger component, is the vertex of the parabola through the logarithms
     of three magnitudes. It is exact for a Gaussian-blurred straight edge. Source: Devernay (1995), with the logarithm.
@@ -68,7 +72,6 @@ def find_edges(
         cleared: the image; no edge point is taken beside the glints in it.
         candidate: the dark blob.
         noise_dn: standard deviation of a pixel's noise.
-        bright_dn: level of a bright spot.
         filter_px: sigma of the derivative filter.
         band: width of the search, in semi-axes.
     """
@@ -90,8 +93,10 @@ def find_edges(
     smooth = as_image(cv2.GaussianBlur(crop, (0, 0), max(0.7, 0.7 * sigma)))
     depth = min(max(4.0, 2.5 * sigma), 0.6 * b)
     noise_smooth = noise_dn / (2.0 * math.sqrt(math.pi) * max(0.7, 0.7 * sigma))
-    dark = candidate.inside_dn + max(0.5 * candidate.step_dn, 4.0 * noise_smooth)
-    keep = _on_the_dark_side(smooth, points, normals, depth, dark, bright_dn)
+    step, error = candidate.step_dn, 4.0 * noise_smooth
+    dark, faint, bright = max(DARK * step, error), min(FAINT * step, step - error), max(BRIGHT * step, step + error)
+    limits = (candidate.inside_dn + dark, candidate.inside_dn + faint, candidate.inside_dn + bright)
+    keep = _at_the_iris(smooth, points, normals, depth, limits)
     spread = sigma * 1.1
     if keep.sum() >= 8:
         spread = math.sqrt(median(widths[keep]))
@@ -142,12 +147,16 @@ def _ridges(
 
 
 @twin
-def _on_the_dark_side(
-    smooth: Image, points: Floats, normals: Floats, depth: float, dark: float, bright: float
+def _at_the_iris(
+    smooth: Image, points: Floats, normals: Floats, depth: float, limits: tuple[float, float, float]
 ) -> Bools:
-    """Whether the level `depth` px behind points is below `dark`, and half as far ahead of them below `bright`."""
-    behind, ahead = _nearest(smooth, points - depth * normals), _nearest(smooth, points + 0.5 * depth * normals)
-    return np.asarray((behind < dark) & (ahead < bright))
+    """Whether there is pupil behind points and iris ahead of them.
+
+    The level `depth` px behind is below the first of the limits. That as far ahead is above the second one, and that
+    half as far ahead below the third one.
+    """
+    behind, ahead, near = (_nearest(smooth, points + away * depth * normals) for away in (-1.0, 1.0, 0.5))
+    return np.asarray((behind < limits[0]) & (ahead > limits[1]) & (near < limits[2]))
 
 
 def filter_sigma(step_dn: float, noise_dn: float, b: float) -> float:

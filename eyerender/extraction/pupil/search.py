@@ -331,14 +331,13 @@ def boundary_about(work: Prepared, candidate: Candidate, shape: Shape) -> Found 
     cleared = Cleared(work.linear)
     if not work.inverted:
         cleared = without_glare(work.linear, candidate.ellipse, candidate.inside_dn, candidate.step_dn, work.noise_dn)
-    bright = candidate.inside_dn + 4.0 * candidate.step_dn
     b = float(candidate.ellipse.semi_axes_px[1])
     sigma = filter_sigma(candidate.step_dn, work.noise_dn, b)
-    edges = find_edges(cleared, candidate, work.noise_dn, bright, sigma, band=0.4)
+    edges = find_edges(cleared, candidate, work.noise_dn, sigma, band=0.4)
     blur = math.sqrt(max(edges.sigma_px**2 - sigma**2, 0.0))
     if blur > 1.7 * sigma:  # a filter much sharper than the image only adds noise
         sigma = min(blur, max(1.0, 0.2 * b))
-        edges = find_edges(cleared, candidate, work.noise_dn, bright, sigma, band=0.4)
+        edges = find_edges(cleared, candidate, work.noise_dn, sigma, band=0.4)
     expected = edge_noise_px(candidate.step_dn, noise_dn=work.noise_dn, sigma_filter=sigma, sigma_total=edges.sigma_px)
     boundary = fit_boundary(edges, candidate, shape, expected)
     if isinstance(boundary, str):
