@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-MODULES = ("kernels", "spot_kernels")
+MODULES = ("kernels", "model_kernels", "spot_kernels")
 TWINS: dict[str, Callable[..., Any]] = {}  # the functions that have a compiled twin, by name
 
 

@@ -1,11 +1,12 @@
 """How the compiled functions are compiled. Numba keeps the machine code in $XDG_CACHE_HOME/eyerender/kernels.
 
 Numba compiles a function again when its own file changed, but not when another file did from which it calls a
-function. So compiled functions call those of their own file only.
+function. So the machine code is kept in a folder of a name that depends on all files of compiled functions.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -18,10 +19,20 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 config: Any = numba_config  # it makes its attributes at run time
 
 
+def _folder() -> Path:
+    """Folder of the machine code of these files as they are."""
+    sources = sorted(Path(__file__).parent.glob("*kernels.py"))
+    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eyerender" / "kernels" / digest
+
+
+FOLDER = str(_folder())
+
+
 def compiled(function: Function) -> Function:
     """Compile at the first call; the machine code is kept on disk if a folder there can be written."""
     before = config.CACHE_DIR
-    config.CACHE_DIR = str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eyerender" / "kernels")
+    config.CACHE_DIR = FOLDER
     try:
         return cast(Function, njit(cache=True, nogil=True, error_model="numpy")(function))
     except (RuntimeError, OSError):  # numba found no folder to write to

@@ -9,18 +9,16 @@ import math
 
 import numpy as np
 
-from .jit import compiled, inlined, summing
+from .jit import compiled, inlined
 
 SECTORS, NEAR = 48, 2  # as in edge_model
 MOST_BLOBS = 12  # as in candidates
 SELECTION = 1.6  # as in covariance
 
-_ROOT_HALF = math.sqrt(0.5)
-_DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @inlined
-def _place(cx, cy, a, b, cos, sin, x, y, steps):
+def nearest_on(cx, cy, a, b, cos, sin, x, y, steps):
     """`Place.of` of one point: distance, cos t, sin t, normal (2), curvature, cos u, sin u."""
     dx, dy = x - cx, y - cy
     p, q = dx * cos + dy * sin, dy * cos - dx * sin
@@ -45,7 +43,7 @@ def _place(cx, cy, a, b, cos, sin, x, y, steps):
 
 
 @inlined
-def _sector(cos_u, sin_u, sectors):
+def sector_at(cos_u, sin_u, sectors):
     share = math.atan2(sin_u, cos_u) / (2.0 * math.pi) + 0.5
     return int(share * sectors) % sectors
 
@@ -57,10 +55,10 @@ def edge_sums(ellipse, points, sectors):
     matrix, scores, slopes = np.zeros((5, 5)), np.zeros((5, sectors)), np.zeros((5, sectors))
     count, row = np.zeros(sectors, dtype=np.int64), np.empty(5)
     for i in range(points.shape[0]):
-        distance, c, s, nx, ny, _, cos_u, sin_u = _place(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], 3)
+        distance, c, s, nx, ny, _, cos_u, sin_u = nearest_on(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], 3)
         row[0], row[1] = ny * sin - nx * cos, -nx * sin - ny * cos
         row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
-        k = _sector(cos_u, sin_u, 3 * sectors) // 3
+        k = sector_at(cos_u, sin_u, 3 * sectors) // 3
         count[k] += 1
         for j in range(5):
             scores[j, k] += row[j] * distance
@@ -181,7 +179,7 @@ def _select(points, normals, ellipse, sigma_px, reach, clipped, moved, distance,
         count += chosen[i]
     if clipped and count >= 8:
         some = distance[chosen]
-        limit = max(3.5 * 1.4826 * _median(np.abs(some - _median(some))), 0.1)
+        limit = max(3.5 * 1.4826 * median_of(np.abs(some - median_of(some))), 0.1)
         count = 0
         for i in range(n):
             chosen[i] = chosen[i] and abs(distance[i]) < limit
@@ -238,7 +236,7 @@ def _scatter(points, chosen, mean_x, mean_y, scale):
 
 
 @inlined
-def _factored(matrix):
+def factored(matrix):
     """Cholesky's factor (lower) of a matrix, in place."""
     n = matrix.shape[0]
     for j in range(n):
@@ -250,7 +248,7 @@ def _factored(matrix):
 
 
 @inlined
-def _solve(lower, vector):
+def solved(lower, vector):
     """Solve L L^T x = vector in place."""
     n = vector.size
     for i in range(n):
@@ -271,7 +269,7 @@ def _least_direction(scatter, gradient):
         trace += scatter[j, j]
     for j in range(5):
         scatter[j, j] += 1e-15 * trace
-    _factored(scatter)
+    factored(scatter)
     found = np.ones(5)
     found[1] = 0.5
     new = np.empty(5)
@@ -280,7 +278,7 @@ def _least_direction(scatter, gradient):
             new[j] = 0.0
             for m in range(5):
                 new[j] += gradient[j, m] * found[m]
-        _solve(scatter, new)
+        solved(scatter, new)
         size = 0.0
         for j in range(5):
             size = max(size, abs(new[j]))
@@ -350,7 +348,7 @@ def _seen(ellipse, points, chosen):
         if chosen[i]:
             dx, dy = points[i, 0] - cx, points[i, 1] - cy
             p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
-            held[_sector(p, q, SECTORS)] = True
+            held[sector_at(p, q, SECTORS)] = True
             radius2, u, v = p * p + q * q, p / a, q / b
             square += (math.sqrt(radius2) - 1.0) ** 2 * radius2 / max(u * u + v * v, 1e-24)
             count += 1
@@ -477,8 +475,22 @@ def _quantile(values, share):
 
 
 @inlined
-def _median(values):
+def median_of(values):
     return _quantile(values, 0.5)
+
+
+@compiled
+def median_off(ellipse, points, sigma_px):
+    cx, cy, a, b, angle = ellipse
+    cos, sin, off = math.cos(angle), math.sin(angle), np.empty(points.shape[0])
+    for i in range(off.size):
+        dx, dy = points[i, 0] - cx, points[i, 1] - cy
+        p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
+        radius = max(math.sqrt(p * p + q * q), 1e-12)
+        slope = max(math.sqrt((p / a) ** 2 + (q / b) ** 2), 1e-12)
+        curvature = (radius / slope) ** 3 / (a * b) ** 2
+        off[i] = abs((radius - 1.0) * radius / slope + 0.5 * sigma_px * sigma_px * curvature)
+    return median_of(off)
 
 
 @compiled
@@ -595,7 +607,7 @@ def interior(crop, hidden, ellipse, end):
             break
     inside = inside[:n_inside]
     spread = _quantile(inside, 0.75) - _quantile(inside, 0.25) if n_inside >= 8 else 0.0
-    return _median(ring[:n_ring]) - _median(core[:n_core]), n_core, n_ring, spread
+    return median_of(ring[:n_ring]) - median_of(core[:n_core]), n_core, n_ring, spread
 
 
 @inlined
@@ -629,8 +641,8 @@ def held(ellipse, points):
     cos, sin = math.cos(angle), math.sin(angle)
     hit, grown = np.zeros(SECTORS, dtype=np.bool_), np.empty(SECTORS, dtype=np.bool_)
     for i in range(points.shape[0]):
-        place = _place(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], 3)
-        hit[_sector(place[6], place[7], SECTORS)] = True
+        place = nearest_on(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], 3)
+        hit[sector_at(place[6], place[7], SECTORS)] = True
     for k in range(SECTORS):
         grown[k] = hit[k] or hit[k - 1] or hit[(k + 1) % SECTORS]
     for k in range(SECTORS):
@@ -672,8 +684,8 @@ def along(ellipse, points, others, linear, corner, patch, away, limits):
     cos, sin = math.cos(angle), math.sin(angle)
     held, dark, reach = np.zeros(SECTORS, dtype=np.bool_), limits[0], limits[1]
     for i in range(points.shape[0]):
-        place = _place(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], NEAR)
-        held[_sector(place[6], place[7], SECTORS)] = True
+        place = nearest_on(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], NEAR)
+        held[sector_at(place[6], place[7], SECTORS)] = True
     hollow = beyond = within = 0
     for k in range(SECTORS):
         if held[k]:
@@ -790,220 +802,6 @@ def sectors_at(ellipse, x, y, steps):
     cos, sin = math.cos(angle), math.sin(angle)
     out = np.empty(x.size, dtype=np.int64)
     for i in range(x.size):
-        place = _place(cx, cy, a, b, cos, sin, x[i], y[i], steps)
-        out[i] = _sector(place[6], place[7], SECTORS)
+        place = nearest_on(cx, cy, a, b, cos, sin, x[i], y[i], steps)
+        out[i] = sector_at(place[6], place[7], SECTORS)
     return out
-
-
-# Phi and phi at z = -LAST to LAST in steps of 1 / FINE; a Taylor series of fourth order leads to 1e-11 between them.
-FINE, LAST = 32, 8
-_STEPS = np.arange(-LAST * FINE, LAST * FINE + 1) / FINE
-_PHI = np.array([0.5 * math.erfc(-z * _ROOT_HALF) for z in _STEPS.tolist()])
-_BELL = _DENSITY * np.exp(-0.5 * _STEPS**2)
-
-
-@inlined
-def _edge(distance, curvature, sigma, kurtosis):
-    """`Profile.of` of one pixel."""
-    z = min(max(distance / sigma, -float(LAST)), float(LAST))
-    at = int(z * FINE + (LAST * FINE + 0.5))
-    near = at * (1.0 / FINE) - LAST
-    d, n2, bell = z - near, near * near, _BELL[at]
-    second, third, fourth = 0.5 * (n2 - 1.0), near * (3.0 - n2) / 6.0, (n2 * (n2 - 6.0) + 3.0) / 24.0
-    density = bell * (1.0 + d * (-near + d * (second + d * (third + d * fourth))))
-    series = 1.0 + d * (-0.5 * near + d * (second / 3.0 + d * (0.25 * third + d * 0.2 * fourth)))
-    step, z2, half = _PHI[at] + bell * d * series, z * z, 0.5 * curvature
-    tails = z * (3.0 - z2) * density / 24.0
-    bend = density * (1.0 + (kurtosis / 24.0) * (z2 * (z2 - 6.0) + 3.0))
-    edge = step + half * sigma * density + kurtosis * tails
-    by_distance = bend / sigma - half * z * density
-    by_sigma = half * (1.0 + z2) * density - z * bend / sigma
-    return edge, by_distance, by_sigma, tails, distance * step + sigma * density, step, density
-
-
-@inlined
-def _outer_level(outer, cos_u, sin_u, basis):
-    """The outer level, with the harmonics written to `basis`."""
-    basis[0] = 1.0
-    level, c, s = outer[0], 1.0, 0.0
-    for k in range(1, outer.size, 2):
-        c, s = c * cos_u - s * sin_u, s * cos_u + c * sin_u
-        basis[k], basis[k + 1] = c, s
-        level += outer[k] * c + outer[k + 1] * s
-    return level
-
-
-@compiled
-def levels(numbers, displaced, x, y):
-    cx, cy, a, b, angle, sigma, inner_dn, slope, kurtosis, lean_x, lean_y = numbers[:11]
-    cos, sin = math.cos(angle), math.sin(angle)
-    outer, out = numbers[11:], np.empty(x.size)
-    basis, n = np.empty(outer.size), displaced.size
-    for i in range(x.size):
-        distance, _, _, _, _, curvature, cu, su = _place(cx, cy, a, b, cos, sin, x[i], y[i], 3)
-        if n:
-            at = (math.atan2(su, cu) / (2.0 * math.pi) + 0.5) * n - 0.5
-            low = math.floor(at)
-            first = displaced[int(low) % n]
-            distance += first + (at - low) * (displaced[int(low + 1.0) % n] - first)
-        edge, _, _, _, ramp, _, _ = _edge(distance, curvature, sigma, kurtosis)
-        inner = inner_dn + lean_x * cu + lean_y * su
-        out[i] = inner + (_outer_level(outer, cu, su, basis) - inner) * edge + slope * ramp
-    return out
-
-
-BLOCK = 128  # pixels whose rows stay in the first-level cache
-
-
-@inlined
-def _edges(distance, bend, count, sigma, kurtosis, out):
-    """`Profile.of` of `count` pixels: `_edge` of each, as columns of out (7, n)."""
-    for i in range(count):
-        profile = _edge(distance[i], bend[i], sigma, kurtosis)
-        for j in range(7):
-            out[j, i] = profile[j]
-
-
-@inlined
-def _places(ellipse, x, y, count, out):
-    """`_place` of `count` pixels, as columns of out (8, n)."""
-    cx, cy, a, b, angle = ellipse
-    cos, sin = math.cos(angle), math.sin(angle)
-    for i in range(count):
-        place = _place(cx, cy, a, b, cos, sin, x[i], y[i], NEAR)
-        for j in range(8):
-            out[j, i] = place[j]
-
-
-@inlined
-def _rows(place, edge, level, count, numbers, basis, rows, residual, steep):
-    """Write the slopes of the level by the parameters, the residuals, and the slopes by the distance."""
-    cos, sin = math.cos(numbers[4]), math.sin(numbers[4])
-    inner_dn, slope, _, lean_x, lean_y = numbers[6:11]
-    outer = numbers[11:]
-    for i in range(count):
-        residual[i], rows[11, i] = outer[0], edge[0, i]
-        basis[0, i], basis[1, i] = 1.0, 0.0
-    for j in range(1, outer.size, 2):
-        for i in range(count):
-            c = basis[0, i] * place[6, i] - basis[1, i] * place[7, i]
-            s = basis[1, i] * place[6, i] + basis[0, i] * place[7, i]
-            basis[0, i], basis[1, i] = c, s
-            rows[11 + j, i], rows[12 + j, i] = c * edge[0, i], s * edge[0, i]
-            residual[i] += outer[j] * c + outer[j + 1] * s
-    for i in range(count):
-        c, s, nx, ny, cu, su = place[1, i], place[2, i], place[3, i], place[4, i], place[6, i], place[7, i]
-        inner = inner_dn + lean_x * cu + lean_y * su
-        step, within = residual[i] - inner, 1.0 - edge[0, i]
-        steepness = step * edge[1, i] + slope * edge[5, i]
-        residual[i] = level[i] - (inner + step * edge[0, i] + slope * edge[4, i])
-        steep[i] = steepness
-        rows[0, i], rows[1, i] = (ny * sin - nx * cos) * steepness, (-nx * sin - ny * cos) * steepness
-        rows[2, i], rows[3, i], rows[4, i] = -nx * c * steepness, -ny * s * steepness, (-nx * s - ny * c) * steepness
-        rows[5, i], rows[6, i], rows[7, i] = step * edge[2, i] + slope * edge[6, i], within, edge[4, i]
-        rows[8, i], rows[9, i], rows[10, i] = step * edge[3, i], within * cu, within * su
-
-
-@summing
-def _add_products(rows, count, out):
-    """Add the products of rows (k, n), over the first columns, to the lower half of out (k, k), two by two."""
-    even = rows.shape[0] // 2 * 2
-    for j in range(0, even, 2):
-        for m in range(0, j + 2, 2):
-            first = second = third = fourth = 0.0
-            for i in range(count):
-                first += rows[j, i] * rows[m, i]
-                second += rows[j, i] * rows[m + 1, i]
-                third += rows[j + 1, i] * rows[m, i]
-                fourth += rows[j + 1, i] * rows[m + 1, i]
-            out[j, m] += first
-            out[j, m + 1] += second
-            out[j + 1, m] += third
-            out[j + 1, m + 1] += fourth
-    for j in range(even, rows.shape[0]):
-        for m in range(j + 1):
-            total = 0.0
-            for i in range(count):
-                total += rows[j, i] * rows[m, i]
-            out[j, m] += total
-
-
-@summing
-def _add_weighted(rows, begin, end, residual, steep, k, pull, across):
-    """Add the sums of rows (p, n), weighted by two values, from `begin` to `end`, to columns k of (p, q)."""
-    for j in range(rows.shape[0]):
-        first = second = 0.0
-        for i in range(begin, end):
-            first += rows[j, i] * residual[i]
-            second += rows[j, i] * steep[i]
-        pull[j, k] += first
-        across[j, k] += second
-
-
-@compiled
-def pixel_sums(x, y, level, index, numbers, displaced):
-    ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
-    sectors, size = displaced.size, numbers.size
-    matrix, basis = np.zeros((size, size)), np.empty((2, BLOCK))
-    place, edge = np.empty((8, BLOCK)), np.empty((7, BLOCK))
-    rows, residual, steep = np.empty((size, BLOCK)), np.empty(BLOCK), np.empty(BLOCK)
-    pull, across = np.zeros((size, sectors)), np.zeros((size, sectors))
-    along, square, cost = np.zeros(sectors), np.zeros(sectors), 0.0
-    for start in range(0, x.size, BLOCK):
-        count = min(BLOCK, x.size - start)
-        _places(ellipse, x[start:], y[start:], count, place)
-        for i in range(count):
-            place[0, i] += displaced[index[start + i]]
-        _edges(place[0], place[5], count, numbers[5], numbers[8], edge)
-        _rows(place, edge, level[start:], count, numbers, basis, rows, residual, steep)
-        _add_products(rows, count, matrix)
-        begin = 0
-        while begin < count:  # the pixels of a sector follow each other
-            k, end = index[start + begin], begin
-            while end < count and index[start + end] == k:
-                cost += residual[end] * residual[end]
-                along[k] += steep[end] * residual[end]
-                square[k] += steep[end] * steep[end]
-                end += 1
-            _add_weighted(rows, begin, end, residual, steep, k, pull, across)
-            begin = end
-    for j in range(size):
-        for m in range(j):
-            matrix[m, j] = matrix[j, m]
-    return matrix, cost, pull, across, along, square
-
-
-@compiled
-def displacements(x, y, level, use, numbers, displaced):
-    cx, cy, a, b, angle, sigma, inner_dn, slope, kurtosis, lean_x, lean_y = numbers[:11]
-    cos, sin = math.cos(angle), math.sin(angle)
-    outer, n = numbers[11:], x.size
-    bins, residual, basis = np.empty(n, dtype=np.int64), np.empty(n), np.empty(outer.size)
-    place, steepness = np.empty((n, 4)), np.empty(n)
-    whole, weight, further = displaced.copy(), np.empty(SECTORS), np.empty(SECTORS)
-    for i in range(n):
-        distance, _, _, _, _, curvature, cu, su = _place(cx, cy, a, b, cos, sin, x[i], y[i], NEAR)
-        inner = inner_dn + lean_x * cu + lean_y * su
-        place[i, 0], place[i, 1], place[i, 2] = distance, curvature, inner
-        place[i, 3] = _outer_level(outer, cu, su, basis) - inner
-        bins[i] = _sector(cu, su, SECTORS)
-    for _ in range(2):
-        weight[:], further[:] = 0.0, 0.0
-        for i in range(n):
-            k = bins[i]
-            edge, by_d, _, _, ramp, ramp_d, _ = _edge(place[i, 0] + whole[k], place[i, 1], sigma, kurtosis)
-            residual[i] = level[i] - (place[i, 2] + place[i, 3] * edge + slope * ramp)
-            steepness[i] = place[i, 3] * by_d + slope * ramp_d
-            if use[i]:
-                weight[k] += steepness[i] ** 2
-                further[k] += steepness[i] * residual[i]
-        largest = 0.0
-        for k in range(SECTORS):
-            further[k] = min(max(further[k] / weight[k], -sigma), sigma) if weight[k] > 1e-9 else 0.0
-            whole[k] += further[k]
-            largest = max(largest, abs(further[k]))
-        if largest < 0.1 * sigma:
-            break
-    for i in range(n):
-        residual[i] -= steepness[i] * further[bins[i]]
-    return bins, residual, whole, weight

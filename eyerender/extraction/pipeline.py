@@ -20,7 +20,7 @@ from .glints.gaussian_model import Limits
 from .glints.subtraction import affected_pixels, subtract_spots, well_fitted
 from .glints.windows import window_radius
 from .preprocessing import DN, Image, Prepared, invert, prepare
-from .pupil.consensus import relative_to
+from .pupil.consensus import median_off
 from .pupil.covariance import boundary_deviation
 from .pupil.edge_model import SECTORS, EdgeModel
 from .pupil.glare import NO_PATCH, levels_beside
@@ -207,9 +207,7 @@ def _agrees(fit: PixelFit, found: Found) -> bool:
         return False
     boundary = found.boundary
     points = found.edges.points_px[boundary.inliers]
-    ellipse = fit.ellipse
-    distance, _, curvature = relative_to(ellipse, points)
-    off = median(np.abs(distance + 0.5 * found.edges.sigma_px**2 * curvature))
+    off = median_off(fit.ellipse.numbers(), points, found.edges.sigma_px)
     return off < max(2.5 * boundary.residual_px, 0.3)
 
 

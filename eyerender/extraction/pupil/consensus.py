@@ -280,6 +280,13 @@ def outline_support(ellipse: Ellipse, points: Floats) -> tuple[float, float]:
     return held.size / SECTORS, float(rows.max()) / SECTORS
 
 
+@twin
+def median_off(ellipse: tuple[float, ...], points: Floats, sigma_px: float) -> float:
+    """Median distance of edge points (n, 2), moved outward by the curvature shift, from (cx, cy, a, b, angle)."""
+    distance, _, curvature = relative_to(Ellipse.of(ellipse), points)
+    return median(np.abs(distance + 0.5 * sigma_px**2 * curvature))
+
+
 def relative_to(ellipse: Ellipse, points: Floats) -> tuple[Floats, Floats, Floats]:
     """Signed distance (n,), outward normal (n, 2) and curvature of the outline (n,) at points near an ellipse."""
     a, b = ellipse.semi_axes_px.tolist()

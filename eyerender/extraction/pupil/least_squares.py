@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import Floats, Indices
+from ...arrays import Bools, Floats, Indices
 from ..compiled import twin
 from .covariance import SHAPE, distance_slopes, gram, reshaped
 from .edge_model import NEAR, EdgeModel, Place, Profile, harmonics
@@ -47,10 +47,21 @@ class Pixels:
     sector: Indices
 
     @staticmethod
-    def of(x: Floats, y: Floats, level: Floats, sector: Indices) -> Pixels:
-        """Sort pixels by their sector; sector (n,) ascends."""
-        new = np.diff(sector, prepend=-1) > 0
-        return Pixels(x, y, level, np.cumsum(new) - 1, sector[new])
+    def of(x: Floats, y: Floats, level: Floats, sector: Indices, use: Bools, seen: Bools) -> Pixels:
+        """Choose the pixels (n,) in `use` whose sector is one of those `seen` (SECTORS,)."""
+        return Pixels(*_grouped(x, y, level, sector, use, seen))
+
+
+@twin
+def _grouped(
+    x: Floats, y: Floats, level: Floats, sector: Indices, use: Bools, seen: Bools
+) -> tuple[Floats, Floats, Floats, Indices, Indices]:
+    """Compute the parts of `Pixels`."""
+    chosen = np.nonzero(use & seen[sector])[0]
+    chosen = chosen[np.argsort(sector[chosen].astype(np.uint8), kind="stable")]  # a radix sort
+    sector = sector[chosen]
+    new = np.diff(sector, prepend=-1) > 0
+    return x[chosen], y[chosen], level[chosen], np.cumsum(new) - 1, sector[new]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,11 +244,45 @@ def moved(model: EdgeModel, step: Floats) -> EdgeModel:
     )
 
 
-def gauss_newton(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
-    """Fit the model with at most `steps` Gauss-Newton steps with Levenberg's damping.
+def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
+    """Fit the model with at most `steps` Gauss-Newton steps; displaced (k,) is the start of the displacements."""
+    about = (pixels.x, pixels.y, pixels.level, pixels.index)
+    numbers, displaced, sums = _gauss_newton(
+        *about, model.numbers(), displaced, prior.weights, prior.displacement, steps
+    )
+    return Solution(EdgeModel.of(numbers), displaced, Sums(*sums))
 
-    The cost is sum r^2 plus the priors' part. displaced (k,) is the start of the sectors' displacements.
+
+@twin
+def _gauss_newton(
+    x: Floats, y: Floats, level: Floats, index: Indices, numbers: Floats, displaced: Floats,
+    weights: Floats, displacement: float, steps: int,
+) -> tuple[Floats, Floats, tuple[Floats, float, Floats, Floats, Floats, Floats]]:  # fmt: skip
+    """Take Gauss-Newton steps with Levenberg's damping; the cost is sum r^2 plus the priors' part.
+
+    Args:
+        x: (n,) px, like the next three one of `Pixels`.
+        y: (n,) px.
+        level: (n,) DN.
+        index: (n,) sectors.
+        numbers: the start of the model (see `EdgeModel.numbers`).
+        displaced: (k,) the start of the sectors' displacements.
+        weights: (4,) of `Prior`.
+        displacement: of `Prior`.
+        steps: how many at most.
+
+    Returns:
+        The numbers, the displacements, and the parts of `Sums`.
     """
+    pixels, model = Pixels(x, y, level, index, index[:0]), EdgeModel.of(numbers)
+    prior = Prior(weights, 0.0, displacement)
+    found = _descended(pixels, model, displaced, prior, steps)
+    sums = found.sums
+    parts = (sums.matrix, sums.cost, sums.pull, sums.across, sums.along, sums.square)
+    return found.model.numbers(), found.displaced, parts
+
+
+def _descended(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
     sums = Sums.of(pixels, model, displaced)
     held = prior.of_all(sums.matrix.shape[0])
     diagonal = np.arange(held.size)

@@ -66,7 +66,16 @@ def visible_part(
         sectors: (SECTORS,) sectors with edge points.
         noise_dn: standard deviation of a pixel's noise.
     """
-    bins, residual, whole, weight = _displacements(x, y, level, use, model.numbers(), displaced)
+    return Visible(*_visible(x, y, level, use, seen, sectors, model.numbers(), displaced, noise_dn))
+
+
+@twin
+def _visible(
+    x: Floats, y: Floats, level: Floats, use: Bools, seen: Bools, sectors: Bools, numbers: Floats, displaced: Floats,
+    noise_dn: float,
+) -> tuple[Bools, Bools, float, Floats, Indices]:  # fmt: skip
+    """Compute the parts of `Visible`."""
+    bins, residual, whole, weight = _displacements(x, y, level, use, numbers, displaced)
     told = seen & (weight > 0.1 * float(weight.max(initial=0.0)))
     by_noise = noise_dn**2 / np.maximum(weight, 1e-9)
     uneven2 = 0.0
@@ -80,14 +89,13 @@ def visible_part(
     outliers = np.bincount(bins, weights=~new_use, minlength=SECTORS) / total
     usual = max(median(mean_square[seen]), 1.0)
     explained = (mean_square < np.where(sectors, 5.0, 2.5) * usual) & (outliers < np.where(sectors, 0.25, 0.1))
-    radius = math.sqrt(float(model.ellipse.semi_axes_px.prod()))
+    radius = math.sqrt(numbers[2] * numbers[3])
     likely2 = np.where(sectors, max(uneven2, (UNEVEN * radius) ** 2), uneven2) + by_noise
     explained &= np.abs(whole) < FARTHEST * np.sqrt(likely2)
     likely = np.where(explained, whole * uneven2 / (uneven2 + by_noise), 0.0)
-    return Visible(new_use, explained, math.sqrt(uneven2), likely, bins)
+    return new_use, explained, math.sqrt(uneven2), likely, bins
 
 
-@twin
 def _displacements(
     x: Floats, y: Floats, level: Floats, use: Bools, numbers: Floats, displaced: Floats
 ) -> tuple[Indices, Floats, Floats, Floats]:

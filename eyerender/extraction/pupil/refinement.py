@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import Bools, Floats
+from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse, fit_ellipse_direct
+from ..compiled import twin
 from ..preprocessing import Image
 from .covariance import SHAPE, distance_slopes, hidden_part, sector_excess, to_axes, towards_round
 from .edge_model import NEAR, SECTORS, EdgeModel, Place, sectors_at
-from .least_squares import FIXED, Normal, Pixels, Prior, Solution, Sums, gauss_newton
+from .least_squares import FIXED, Normal, Pixels, Prior, Solution, Sums, fitted
 from .occlusion import clear_of_lids, visible_part
 
 # Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
@@ -142,21 +143,17 @@ def _fitted(
     """
     model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before[0]
     prior = Prior.of(start, noise_dn, 0.0 if before is None else before[1])
-    x, y, level = _band(linear, model, masked, outward)
-    about = model.ellipse.numbers()
-    bins = sectors_at(about, x, y, NEAR)
+    x, y, level, bins = _near_boundary(linear, model, masked, outward)
     use = np.ones(x.size, dtype=bool)
     # A lid must not decide the order of the outer level.
     seen = clear_of_lids(sectors, start) if before is None else before[2]
     displaced = np.zeros(SECTORS) if model.displaced is None else model.displaced.copy()
     for turn in range(turns):
-        chosen = np.nonzero(use & seen[bins])[0]
-        if chosen.size < 60:
+        pixels = Pixels.of(x, y, level, bins, use, seen)
+        if pixels.x.size < 60:
             return "too few pixels on the boundary are free of glints and lids"
-        chosen = chosen[np.argsort(bins[chosen].astype(np.uint8), kind="stable")]  # a radix sort
-        pixels = Pixels.of(x[chosen], y[chosen], level[chosen], bins[chosen])
         begun = displaced[pixels.sector]
-        found = gauss_newton(pixels, model, begun, prior, steps=6 if turn == 0 else 4)
+        found = fitted(pixels, model, begun, prior, steps=6 if turn == 0 else 4)
         model = found.model
         if not _sane(model, start):
             return "the pixel model's fit ran away from the edges"
@@ -172,7 +169,7 @@ def _fitted(
             order = _best_order(pixels, found, prior)
             model = replace(model, outer=_padded(model.outer, order))
             same &= order == ORDERS[0]
-        texture = found.sums.cost > UNEXPLAINED * noise_dn**2 * chosen.size or _rough(model, visible.uneven_px)
+        texture = found.sums.cost > UNEXPLAINED * noise_dn**2 * pixels.x.size or _rough(model, visible.uneven_px)
         if same or turn + 1 == turns or (outward == WIDE and before is None and turn + 1 >= PATIENCE and texture):
             break
         use, seen, displaced, bins = visible.use, new_seen, visible.displaced, visible.bins
@@ -186,30 +183,38 @@ def _rough(model: EdgeModel, uneven_px: float) -> bool:
     return uneven_px > ROUGH * math.sqrt(float(model.ellipse.semi_axes_px.prod()))
 
 
-def _band(linear: Image, model: EdgeModel, masked: Bools, reach_out: float) -> tuple[Floats, Floats, Floats]:
-    """Pixels near the boundary, as (x, y, level).
+def _near_boundary(
+    linear: Image, model: EdgeModel, masked: Bools, reach_out: float
+) -> tuple[Floats, Floats, Floats, Indices]:
+    """Pixels near the boundary, as (x, y, level, sector).
 
     The band reaches 4 sigma + 1 px inside the boundary and `reach_out` sigma + 1 px outside it, but not beyond
     OUTWARD_PX.
     """
     ellipse, sigma = model.ellipse, model.sigma_px
-    a, b = ellipse.semi_axes_px
+    a, b = ellipse.semi_axes_px.tolist()
     inward, outward = min(4.0 * sigma + 1.0, 0.8 * b), min(reach_out * sigma + 1.0, OUTWARD_PX)
-    reach = float(a) + outward + 2.0
-    cx, cy = ellipse.centre_px
+    # Inside the larger concentric ellipse and outside the smaller one: a cheap cover of the band.
+    outer, inner = (a + outward, b + outward), (max(a - inward, 0.5), max(b - inward, 0.5))
+    return _band(linear, masked, ellipse.numbers(), outer, inner)
+
+
+@twin
+def _band(
+    linear: Image, masked: Bools, ellipse: tuple[float, ...], outer: tuple[float, float], inner: tuple[float, float]
+) -> tuple[Floats, Floats, Floats, Indices]:
+    """Pixels (x, y, level, sector) between two ellipses of these semi-axes, concentric with an ellipse."""
+    cx, cy, _, _, angle = ellipse
+    reach = outer[0] + 2.0
     x0, x1 = max(0, math.floor(cx - reach)), min(linear.shape[1], math.ceil(cx + reach) + 1)
     y0, y1 = max(0, math.floor(cy - reach)), min(linear.shape[0], math.ceil(cy + reach) + 1)
-    conic_x = np.arange(x0, x1)[None, :] - cx
-    conic_y = np.arange(y0, y1)[:, None] - cy
-    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-    p, q = conic_x * cos + conic_y * sin, conic_y * cos - conic_x * sin
-    # Inside the larger concentric ellipse and outside the smaller one: a cheap cover of the band.
-    outer = (p / (a + outward)) ** 2 + (q / (b + outward)) ** 2 < 1.0
-    inner = (p / max(a - inward, 0.5)) ** 2 + (q / max(b - inward, 0.5)) ** 2 > 1.0
-    at = np.flatnonzero(outer & inner & ~masked[y0:y1, x0:x1])  # several times as fast as the mask's own indices
-    row, column = at // (x1 - x0), at % (x1 - x0)
-    level = linear[row + y0, column + x0].astype(np.float64)
-    return (column + x0).astype(np.float64), (row + y0).astype(np.float64), level
+    dx, dy = np.arange(x0, x1)[None, :] - cx, np.arange(y0, y1)[:, None] - cy
+    cos, sin = math.cos(angle), math.sin(angle)
+    p, q = dx * cos + dy * sin, dy * cos - dx * sin
+    out2, in2 = ((p / axes[0]) ** 2 + (q / axes[1]) ** 2 for axes in (outer, inner))
+    row, column = np.nonzero((out2 < 1.0) & (in2 > 1.0) & ~masked[y0:y1, x0:x1])
+    x, y = (column + x0).astype(np.float64), (row + y0).astype(np.float64)
+    return x, y, linear[row + y0, column + x0].astype(np.float64), sectors_at(ellipse, x, y, NEAR)
 
 
 def _padded(outer: Floats, order: int) -> Floats:
