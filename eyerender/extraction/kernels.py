@@ -16,7 +16,6 @@ MOST_BLOBS = 12  # as in candidates
 SELECTION = 1.6  # as in covariance
 
 
-
 @inlined
 def nearest_on(cx, cy, a, b, cos, sin, x, y, steps):
     """`Place.of` of one point: distance, cos t, sin t, normal (2), curvature, cos u, sin u."""
