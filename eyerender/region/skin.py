@@ -6,7 +6,7 @@ region is one mesh with one map. The map has four channels:
 
     albedo        diffuse reflectance; its mean over the skin about the eye is `skin.albedo`
     slope y, z    d(height)/dy and d(height)/dz of the relief, over the region's frame
-    gloss         weight of the mirror-like part: below 0.5 skin's sheen (rough), above it wet tissue (smooth)
+    gloss         weight of the mirror-like part: below 0.5 skin's sheen (rougher the less oil), above it wet tissue
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ _LINE = CONJUNCTIVA + MARGIN - 1  # the lash line's row
 _TILE_MM, _TILE = 24.0, 640
 _COARSE = 8
 _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
+_STEEPEST = 2.0  # slope of the map, over the region's frame; margins are seen from their edges
 _STRIP = 32  # rows of the map that are made together, so that they stay in the processor's cache
 _HAIR_GLOSS = 0.2
 _WET, _WET_ROOT = 0.93, 0.06  # gloss of wet tissue, and the share of a lash that is wet
@@ -88,7 +89,7 @@ def skin_map(spec: Region) -> Singles:
         out[k, :, 0], out[k, :, 3], height[k] = strip.look(spots[k])
     _slopes(height, y, z, out[:SHEET_ROWS, :, 1:3])
     _normalise(out[:SHEET_ROWS, :, 0], y, z, rows, spec.skin.albedo)
-    for which, (a, g) in enumerate(((spec.lashes.albedo, _HAIR_GLOSS), (spec.brow.albedo, _HAIR_GLOSS), (0.0, 1.0))):
+    for which, (a, g) in enumerate(((spec.lashes.albedo, _HAIR_GLOSS), (spec.brow.albedo, _HAIR_GLOSS), (0.0, _WET))):
         middle = SHEET_ROWS + BANDS * (which + 1) / 4
         band_rows = slice(int(middle - BANDS / 8), int(middle + BANDS / 8))
         out[band_rows] = (a, 0, 0, g)
@@ -252,30 +253,49 @@ class _Strip:
 
     def look(self, spots: Singles) -> tuple[Singles, Singles, Singles]:
         """Albedo, gloss and height (mm) of the relief; `spots` is the light that the freckles leave."""
-        spec, rows = self.spec, self.rows
+        spec = self.spec
         cells, creases, pores = self.cells(), self.creases(), self.pores()
-        height = (self.relief(cells) - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases) * self.lid
+        oil, wet = self.oil(), self.wet()
+        height = self.relief(cells, oil) - (1 - oil) * (0.03 * pores + 0.17 * spec.skin.wrinkles * creases)
+        height = height * self.lid + spec.tears.unevenness * self.lumps()
         if np.any(self.flesh):
-            bumps = 0.02 + 0.06 * spec.tears.unevenness
-            height = height + bumps * self.flesh * self.field(6, (18, 60), (18, 60))
-        height = height + 0.12 * spec.tears.unevenness * self.margin_bumps()
+            bumps = 0.03 + 0.10 * spec.tears.unevenness
+            height = height + bumps * self.flesh * self.field(6, (10, 36), (10, 36))
         # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
         open_ = 1 + 0.10 * (cells - 0.5) - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
-        wet = _WET * (1 - step(rows, _LINE - 0.5, _LINE + 2.0))
-        # Oil forms films of varying thickness, most at the glands of the lash roots. It mirrors in points where the
-        # skin is smooth and swollen, in short streaks along the lids.
-        oil = 0.55 + 0.2 * self.field(5, (0, 8), (0, 8)) + 0.6 * _bell(self.out_mm, 0.6, 0.9)
-        points = np.maximum(self.tiles.at(8, _places(self.y, self.level), (15, 60), (35, 95)) - 0.4, 0.0)
-        sheen = 0.42 * spec.skin.sheen * np.clip(oil * (0.4 + 0.6 * cells) * (1 - pores) + 5.0 * points, 0.1, 2.2)
-        gloss = np.clip(np.minimum(sheen, 0.45) * self.lid + wet, 0, 1)
+        film = 0.55 + 0.2 * self.field(5, (0, 8), (0, 8))
+        sheen = spec.skin.sheen * np.clip(0.42 * film * (0.4 + 0.6 * cells) * (1 - pores) + oil, 0.04, 0.9)
+        gloss = np.where(wet > 0, wet, np.minimum(sheen, 0.49) * self.lid)
         return self.albedo(open_, spots), gloss, height
 
-    def margin_bumps(self) -> Singles:
-        """Bumps, about 1, of the wet margins: mouths of glands and the edge of the tissue that tears wet."""
-        at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0) * (1 - step(self.rows, _LINE - 2.0, _LINE))
+    def oil(self) -> Singles:
+        """Share, 0 to 1, of skin whose furrows oil fills: pools about the glands of the lash roots, few farther out.
+
+        The skin below is smooth there, so each swelling mirrors a lamp as one streak along the skin's lines.
+        """
+        beside = np.exp(-np.square(self.out_mm * (1 / 6.0)))
+        near = np.maximum(_bell(self.out_mm, 0.9, 1.7), 0.75 * beside)
+        pools = self.tiles.at(8, _places(self.y, self.level), (10, 30), (18, 50))
+        return np.asarray(np.clip((pools + 2.1 * near - 1.0) * 0.9, 0, 0.25 + 0.75 * np.sqrt(beside)))
+
+    def wet(self) -> Singles:
+        """Gloss of the film of tears, which ends in tongues between the roots of the lashes; 0 beyond it.
+
+        More than `_WET` stands for the oil on it.
+        """
+        out: Singles = np.zeros_like(self.y)
+        if np.min(self.rows) < _LINE + 6:
+            tongues = self.tiles.at(43, _places(self.y, self.out_mm / 3), (10, 60), (10, 60))
+            film = 1 - step(self.rows - _LINE - 1.3 - 0.9 * tongues, -0.6, 0.6)
+            out = film * np.clip(0.97 - 0.06 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
+        return out
+
+    def lumps(self) -> Singles:
+        """Height (mm) of the lumps of the wet margins: mouths of glands, and water between the lashes."""
+        at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0) * (1 - step(self.rows, _LINE + 1.5, _LINE + 3.5))
         out: Singles = np.zeros_like(self.y)
         if np.any(at > 0):
-            out = at * self.tiles.at(9, _places(self.y, self.out_mm), (10, 30), (8, 24))
+            out = 0.05 * at * self.tiles.at(9, _places(self.y, self.out_mm), (8, 20), (24, 60))
         return out
 
     def cells(self) -> Singles:
@@ -293,19 +313,23 @@ class _Strip:
             coarse[some] += self.lids[some] * (narrow - coarse[some])
         return np.asarray(coarse * (0.7 + 0.3 * fine))
 
-    def relief(self, cells: Singles) -> Singles:
-        """Height (mm) of the relief: cells separated by furrows, and lines.
+    def relief(self, cells: Singles, oil: Singles) -> Singles:
+        """Height (mm) of the relief: cells separated by furrows, both filled by `oil`, swellings, and lines.
 
         The lines run along the lids and, at the temple, away from the canthus.
         """
         skin, y, z = self.spec.skin, self.y, self.z
         grain = self.field(3, (60, 200), (60, 200))
         swell = self.field(13, (7, 20), (7, 20))
+        level = _places(y, self.level)
+        long, short = self.tiles.at(14, level, (5, 15), (12, 34)), self.tiles.at(15, level, (12, 36), (24, 60))
         sway = 0.5 * self.field(12, (0, 10), (0, 10))
         lines = self.tiles.at(11, _places(y, self.level + sway), (0, 6), (22, 60))
         under = _bell(z, -11.0, 6.0) + 0.7 * _bell(z, 8.0, 4.0) + _bell(y, -21.0, 5.0)
         amount = 0.025 * skin.wrinkles * _hill(y, z, 26.0, 20.0) * under
-        return np.asarray(skin.relief_mm * (cells + 0.03 * grain + 1.3 * swell) - amount * np.abs(lines))
+        fine = (1 - 0.85 * oil) * (cells + 0.03 * grain)
+        height = skin.relief_mm * (fine + 1.3 * swell + 1.6 * long + 0.5 * short)
+        return np.asarray(height - (1 - 0.7 * oil) * amount * np.abs(lines))
 
     def creases(self) -> Singles:
         """Depth, 0 to about 1, of the creases of the lids' thin skin.
@@ -387,8 +411,8 @@ class _Strip:
         skin, y, z, rows, upper = self.spec.skin, self.y, self.z, self.rows, self.upper
         slow = self.field(21, (0, 4), (0, 4))
         blotch = self.field(22, (3, 22), (3, 22))
-        fine = self.field(23, (40, 150), (40, 150))
-        tone = (1 + skin.mottling * (0.06 * slow + 0.026 * blotch + 0.03 * fine)) * open_
+        fine = self.field(23, (70, 260), (70, 260))
+        tone = (1 + skin.mottling * (0.06 * slow + 0.026 * blotch + 0.155 * fine)) * open_
         tone *= 1 - skin.veins * self.veins()
         # The hollow beside the nose and the rim below the lower lid are a little darker, the lash line more so.
         tone *= 1 - 0.20 * _bell(y, 15.5, 5.5) * _bell(z, 5.0, 8.0)
@@ -441,8 +465,8 @@ def _slopes(height: Singles, y: Singles, z: Singles, out: Singles) -> None:
         det = yr * zc - yc * zr
         # Where the sheet is edge-on, the slope over (y, z) is undefined.
         inverse = np.where(np.abs(det) > 1e-5, 1 / np.where(det == 0, 1, det), 0)
-        out[first:end, :, 0] = np.clip((hr * zc - hc * zr) * inverse, -0.5, 0.5)
-        out[first:end, :, 1] = np.clip((hc * yr - hr * yc) * inverse, -0.5, 0.5)
+        out[first:end, :, 0] = np.clip((hr * zc - hc * zr) * inverse, -_STEEPEST, _STEEPEST)
+        out[first:end, :, 1] = np.clip((hc * yr - hr * yc) * inverse, -_STEEPEST, _STEEPEST)
 
 
 def _along_columns(v: Singles) -> Singles:

@@ -7,6 +7,7 @@ sample, each has the light of all lamps, and the samples take the rays to the la
 
 Hairs are thinner than the distance of a pixel's few samples, and every pixel has the same lattice of them. So hairs
 would be rows of dots. The groups of pixels at hairs have several times as many samples; their shading costs no more.
+So have those at menisci, in which the mirror images of lamps are thinner still; there every sample is shaded.
 """
 
 from __future__ import annotations

@@ -79,9 +79,9 @@ def shade_group(
     shading = _GroupShading(values, lights, textures, textures.region, scene, group)
     no = mi.Bool(False)
     depths = tuple(mi.Float(0) for _ in range(4)) if group.layered else ()
-    state = (mi.UInt32(0), no, mi.Float(0), Kept.none(), Kept.none(), Kept.none(), no, no, mi.UInt32(0), depths)
-    names = ("i", "settled", "total", "sheet", "before", "water", "known", "blocked", "failures", "depths")
-    i, settled, total, sheet, before, water, _, _, failures, depths = dr.while_loop(
+    state = (mi.UInt32(0), no, mi.Float(0), Kept.none(), Kept.none(), no, no, mi.UInt32(0), depths)
+    names = ("i", "settled", "total", "sheet", "before", "known", "blocked", "failures", "depths")
+    i, settled, total, sheet, before, _, _, failures, depths = dr.while_loop(
         state, shading.goes_on, shading.trace_sample, labels=names, label="group"
     )
     traced = sheet.weight
@@ -92,7 +92,6 @@ def shade_group(
             (total,), kept.weight > 0, lambda total: shading.add_region(total, kept, on_sheet), lambda total: total
         )
 
-    total = with_region(total, water, False)
     if group.layered:
         globe, *near = depths
         near[1] *= dr.select(traced > 0, sheet.weight / traced, 1)
@@ -140,12 +139,11 @@ class _GroupShading:
         total: mi.Float,
         sheet: Kept,
         before: Kept,
-        water: Kept,
         known: mi.Bool,
         blocked: mi.Bool,
         failures: mi.UInt32,
         depths: tuple[mi.Float, ...],
-    ) -> tuple[mi.UInt32, mi.Bool, mi.Float, Kept, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32, tuple[mi.Float, ...]]:
+    ) -> tuple[mi.UInt32, mi.Bool, mi.Float, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32, tuple[mi.Float, ...]]:
         """Trace one sample: shade the globe if the sample hits it, else keep the hit on the region.
 
         `known` says whether the previous sample has sent its own ray to the lamp, `blocked` whether that ray met
@@ -161,7 +159,9 @@ class _GroupShading:
         on_sheet = skin.on_sheet(face)
         if skin.water is not None:
             film, wet = wetted(skin.water, o, d, view.distance)
-            water = water.with_(wet, j, skin.on_water(film), film.prim_uv, weight, no, no)
+            # Mirror images of lamps in water are smaller than a pixel, so no sample stands for others.
+            drop = Kept.none().with_(wet, j, skin.on_water(film), film.prim_uv, weight, no, no)
+            total = dr.if_stmt((total,), wet, lambda total: self.add_region(total, drop, False), lambda total: total)
             view, d = through_water(values, skin, film, wet, view, o, d)
         if group.layered:
             # Before the branches below: Dr.Jit would reuse their values outside of them.
@@ -195,7 +195,7 @@ class _GroupShading:
         sheet = sheet.with_(view.other & on_sheet, j, face, hit.prim_uv, weight, alone, blocked)
         before = before.with_(view.other & ~on_sheet, j, face, hit.prim_uv, weight, alone, blocked)
         settled = group.plain & view.other & on_sheet & ~alone
-        return i + 1, settled, total, sheet, before, water, known, blocked, failures, depths
+        return i + 1, settled, total, sheet, before, known, blocked, failures, depths
 
     def globe_radiance(self, view: View, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
         """Radiance of the globe along sample j's ray, and failed light paths."""

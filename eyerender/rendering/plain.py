@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Bools, Floats
-from ..region.mesh import HAIRS, RegionMesh
+from ..region.mesh import RegionMesh
 from ..rig.camera import PinholeCamera, Window
 
 _TILE_PX = 8
@@ -53,13 +53,13 @@ def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, wi
 
 
 def fine_pixels(region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> Bools:
-    """Pixels (height, width) of a window at hairs whose roots are at most two pixels thick, and their neighbours.
+    """Pixels (height, width) of a window at menisci and at hairs at most two pixels thick, and their neighbours.
 
     A pixel is marked or not, whatever the window.
     """
     x0, y0, width, height = window
     marked = np.zeros((height + 2, width + 2), dtype=bool)
-    for curve in region.strands[:HAIRS] if region is not None else ():
+    for curve in region.strands if region is not None else ():
         z = (curve + anchor_mm - camera.nodal_point_mm) @ camera.R[2]
         if not curve.size or z.min() < _NEAREST_MM or _HAIR_MM * float(camera.K[0, 0]) > _THICK_PX * z.min():
             continue

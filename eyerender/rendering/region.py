@@ -31,9 +31,10 @@ from .values import aligned
 
 GRID_ROWS, GRID_COLUMNS = 160, 768  # of the finer grid over the sheet on which its light is computed (`subsurface`)
 SHEET_COLUMNS = COLUMNS + 1  # of vertices, because the first column is repeated
-_F0_OIL, _F0_TEARS = 0.03, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
-_ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.042, 0.035
-_OILY = 0.85  # share of skin's sheen in the narrow lobe of its film of oil, which the relief breaks into points
+_F0_OIL, _F0_TEARS = 0.035, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
+_ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.025, 0.03
+_OILY = 0.93  # share of skin's sheen in the narrow lobe of its film of oil, which the relief breaks into points
+_WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
 _RIPPLE = 0.02  # slope of wet tissue
 _NONE = slice(0)
 
@@ -313,15 +314,17 @@ def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, glo
         f = w D F / (4 (l . h)^2),  D = a^2 / (pi ((n . h)^2 (a^2 - 1) + 1)^2)
 
     with h half way between lamp and camera (GGX: Walter et al. 2007; the visibility term: Kelemen, Szirmay-Kalos 2001;
-    F: Schlick 1994). Skin has two lobes: a wide one of its rough surface, and a narrow one of the film of oil on it.
+    F: Schlick 1994). Skin has two lobes: a wide one of its rough surface, and a narrow one of the film of oil on it,
+    which is rougher the thinner it is. Oil on tears, which makes their gloss higher than `_WATER`, mirrors more.
     """
     wet = gloss > 0.5
     normal = dr.select(wet, film_normal(normal), normal)
     half = dr.normalize(to_lamp + to_camera)
     lh = dr.maximum(dr.dot(to_lamp, half), 0.05)
     nh = dr.maximum(dr.dot(normal, half), 0)
-    weight = dr.select(wet, 2 * gloss - 1, gloss * (1 / 0.45))
-    narrow = _ggx(nh, dr.select(wet, _ROUGH_WET, _ROUGH_OIL))
+    water = (2 * gloss - 1) * (1 + 10 * dr.maximum(gloss - _WATER, 0))
+    weight = dr.select(wet, water, gloss * (1 / 0.45))
+    narrow = _ggx(nh, dr.select(wet, _ROUGH_WET, _ROUGH_OIL + 0.25 * dr.maximum(0.4 - gloss, 0)))
     D = dr.select(wet, narrow, _OILY * narrow + (1 - _OILY) * _ggx(nh, mi.Float(_ROUGH_SKIN)))
     return weight * D * _schlick(lh, dr.select(wet, _F0_TEARS, _F0_OIL)) * 0.25 / (lh * lh)
 
