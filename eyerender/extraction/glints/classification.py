@@ -25,6 +25,8 @@ LONG, LONG_TWICE = 2.0, 2.4
 # The cornea mirrors 2 % of a lamp, a point; wet lid margins and skin spread it. Lamps of one rig differ less than this:
 # of rendered eyes in lids, all 1,436 glints but one are above 0.3 of the brightest.
 FAINTEST = 0.2
+# Height in full scales up to which that of a single clipped glint is trusted.
+TALL = 2.5
 # What lies around a glint is not brighter than the iris by more than LIT steps from pupil to iris, except where the
 # glint is near the sclera. There it is still SHINING times as high: 19 such glints of rendered eyes are above 3.4, and
 # 110 highlights of skin and lid margins below 1.8.
@@ -64,11 +66,11 @@ def classify_spots(
         )
         (accepted if reason is None else rejected).append(result)
     faint = "much fainter than the brightest glint, as highlights of skin and lid margins are"
-    least = FAINTEST * max((_shown(glint) for glint in accepted), default=0.0)
+    least = FAINTEST * _height([glint.amplitude for glint in accepted])
     kept = len(large)  # the height of a large patch is not known, only where it is cut
-    bright = accepted[:kept] + [glint for glint in accepted[kept:] if _shown(glint) >= least]
+    bright = accepted[:kept] + [glint for glint in accepted[kept:] if glint.amplitude >= least]
     rejected += [
-        replace(glint, status=Status.REJECTED, reason=faint) for glint in accepted[kept:] if _shown(glint) < least
+        replace(glint, status=Status.REJECTED, reason=faint) for glint in accepted[kept:] if glint.amplitude < least
     ]
     accepted = bright
     reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
@@ -84,9 +86,14 @@ def classify_spots(
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
 
 
-def _shown(glint: GlintResult) -> float:
-    """Height of a glint as the image shows it: what a fit adds above the clipped level is not known well enough."""
-    return min(glint.amplitude, 1.0)
+def _height(amplitudes: list[float]) -> float:
+    """Height of the brightest glint, as far as it is known.
+
+    The fitted height of a strongly clipped glint may be many times too large. So it counts as TALL only, unless the
+    next one is higher than that.
+    """
+    first, second = [0.0, 0.0, *sorted(amplitudes)][:-3:-1]
+    return max(min(first, TALL), second)
 
 
 def _in_patch(patch: Patch, xy: Floats) -> bool:

@@ -80,6 +80,9 @@ def detect_spots(
     half = as_image(cv2.resize(smooth, blocks, interpolation=cv2.INTER_AREA))
     opened = _opening(half, size)
     flat, stands = _maxima(smooth, half, opened, threshold)
+    row, column = np.divmod(flat, smooth.shape[1])
+    around = (column + x0 - cx) ** 2 + (row + y0 - cy) ** 2 < reach**2  # the corners of the crop are beyond
+    flat, stands = flat[around], stands[around]
     if flat.size == 0:
         return _no_spots()
     order = np.argsort(-stands, kind="stable")[:MOST_PEAKS]
