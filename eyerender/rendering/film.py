@@ -3,7 +3,8 @@
 In front of an eye region, which fills the image, `shade_group` lets several samples of a pixel share the shading of the
 skin and the rays from there to the lamps. The groups of a pixel take the lamps in turn. A lamp used by c of G groups
 counts G / c times, so that every lamp has its exact share in every pixel. On the globe, which is shaded for every
-sample, each has the light of all lamps, and the samples take the rays to the lamps in turn in the same way.
+sample, each has the light of all lamps, and the samples take the rays to the lamps in turn in the same way. The sun,
+whose shadows are dark and sharp, is never taken in turn.
 
 Hairs are thinner than the distance of a pixel's few samples, and every pixel has the same lattice of them. So hairs
 would be rows of dots. The groups of pixels at hairs have several times as many samples; their shading costs no more.
@@ -24,7 +25,7 @@ from ..arrays import Bools, Floats, Ints, frozen
 from ..rig.camera import Window
 from .groups import Group, shade_group
 from .sampling import Sampler, Samples, camera_ray, lattice_generator
-from .values import Lamp, Lights, Values, aligned
+from .values import SMALL, Lamp, Lights, Values, aligned
 from .view import Textures, meet
 
 _LANES = 2**24  # samples at a time; more are rendered in several passes
@@ -35,7 +36,6 @@ _FEW_LAMPS = 2  # with so few lamps shadows are dark, and they are sampled finel
 _TIMES, _ENOUGH = 3, 32  # times as many samples at hairs, unless a pixel has more than enough
 _MANY = 8  # samples, of which even pixels need the first four alone
 _EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and between it and its neighbours
-_SMALL = 0.02  # radius over distance of lamps whose shadows are so fine
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,22 +297,21 @@ def _groups(
         return o, d, cosine * cosine
 
     lights = shown.lights
-    # A frame without lamps has a dark one.
-    lamps, groups, all_samples = dr.maximum(lights.count, 1), dr.opaque(mi.UInt32, spp // size), samples.count
+    groups, all_samples, suns = dr.opaque(mi.UInt32, spp // size), samples.count, lights.suns
+    # A frame without lamps has a dark one. The sun comes first, and the others are taken in turn.
+    others = dr.maximum(lights.count, 1) - suns
+    lamps = dr.maximum(others, 1)
 
-    def asked(j: mi.UInt32) -> mi.UInt32:
-        return dr.select(all_samples < lamps, (all_samples + lamps - 1 - number(j)) // all_samples, 1)
+    def count_of(i: mi.UInt32, users: mi.UInt32) -> mi.UInt32:
+        return dr.select(users < others, (users + others - 1 - i) // users, dr.minimum(others, 1)) + suns
 
-    def lamp(j: mi.UInt32, k: mi.UInt32) -> tuple[Lamp, mi.Float]:
-        which = number(j) % lamps + k * all_samples
-        users = dr.maximum((all_samples + lamps - 1 - which) // lamps, 1)
-        return lights[which], mi.Float(all_samples) / mi.Float(users)
+    def in_turn(i: mi.UInt32, k: mi.UInt32, users: mi.UInt32) -> tuple[Lamp, mi.Float]:
+        first = k < suns
+        which = i % lamps + (k - suns) * users
+        share = mi.Float(users) / mi.Float(dr.maximum((users + lamps - 1 - which) // lamps, 1))
+        return lights[dr.select(first, lights.count - 1, which)], dr.select(first, 1, share)
 
-    def shared(k: mi.UInt32) -> tuple[Lamp, mi.Float]:
-        which = group % lamps + k * groups
-        return lights[which], mi.Float(groups) / mi.Float(dr.maximum((groups + lamps - 1 - which) // lamps, 1))
-
-    several = groups < lamps
+    several = groups < others
     parts, radiance, failures = shade_group(
         shown.values,
         lights,
@@ -323,11 +322,12 @@ def _groups(
             ray,
             lambda j: samples.pair(number(j), 0),
             samples.pair(dr.select(several, group, group // lamps), 0),
-            asked,
-            lamp,
-            dr.select(several, (groups + lamps - 1 - group) // groups, 1),
-            shared,
-            (lamps <= _FEW_LAMPS) & ~several & dr.opaque(mi.Bool, lights.widest < _SMALL),
+            lambda j: count_of(number(j), all_samples),
+            lambda j, k: in_turn(number(j), k, all_samples),
+            count_of(group, groups),
+            lambda k: in_turn(group, k, groups),
+            (suns > 0) | ((lamps <= _FEW_LAMPS) & ~several & dr.opaque(mi.Bool, lights.widest < SMALL)),
+            suns > 0,
             _plain(plain, window, u, v),
             layered,
         ),

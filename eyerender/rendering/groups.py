@@ -35,8 +35,9 @@ class Group:
         lamp: the k-th of these lamps, and its weight.
         lamps: number of lamps that the whole group uses where it meets the region.
         shared: the k-th of these lamps, and its weight.
-        fine: whether pairs of samples send rays of their own to the lamp about the lids and on hairs, where lashes cast
-            shadows finer than a pixel. There is one lamp then.
+        fine: whether pairs of samples send rays of their own to the group's first lamp about the lids and on hairs,
+            where lashes cast shadows finer than a pixel.
+        sharp: whether every sample does so, and everywhere: the lamp is the sun.
         plain: whether the samples' pixel shows nothing but the sheet of skin.
         layered: whether the parts of the sum, and their distances, are wanted one by one.
     """
@@ -50,6 +51,7 @@ class Group:
     lamps: mi.UInt32
     shared: Callable[[mi.UInt32], tuple[Lamp, mi.Float]]
     fine: mi.Bool
+    sharp: mi.Bool
     plain: mi.Bool
     layered: bool = False
 
@@ -180,10 +182,10 @@ class _GroupShading:
         if self.soft:
             alone &= ~on_sheet
         else:
-            alone &= ~on_sheet | (at.y * at.y + at.z * at.z < _LIDS_MM * _LIDS_MM)
+            alone &= ~on_sheet | group.sharp | (at.y * at.y + at.z * at.z < _LIDS_MM * _LIDS_MM)
 
-        # Two samples share one ray.
-        known &= (i & 1) == 1
+        # Two samples share one ray, unless the shadows are sharp.
+        known &= ((i & 1) == 1) & ~group.sharp
         asked = alone & ~known
 
         def own_ray(_: mi.Bool) -> mi.Bool:
@@ -303,9 +305,11 @@ class _GroupShading:
             if soft:
                 assert self.textures.tissues is not None
                 return k + 1, total + lit * kept.weight * self.textures.tissues.skin_sees(lamp.number, *on_map)
-            asked = (kept.shared > 0) & (lit > faint)
+            first = group.fine & (k == 0)
+            shared = dr.select(first, kept.shared, kept.weight)
+            asked = (shared > 0) & (lit > faint)
             blocked = self.skin_blocked(lamp, source, view.point, on_sheet, asked)
-            return k + 1, total + lit * (kept.clear + dr.select(blocked, 0, kept.shared))
+            return k + 1, total + lit * (dr.select(first, kept.clear, 0) + dr.select(blocked, 0, shared))
 
         return dr.while_loop((mi.UInt32(0), total), more, lamp_light, labels=("k", "total"), label="its lamps")[1]
 

@@ -24,7 +24,7 @@ from .values import Lights, Values
 from .view import Textures, iris_height
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
-_CELL_PX, _LEAST, _MOST = 0.5, 128, 448  # size of a cell in the picture, cells across
+_CELL_PX, _LEAST, _MOST = 0.5, 320, 448  # size of a cell in the picture, cells across: fewer would flatten slopes
 _STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for what stands before a lamp
 _FIXED_POINT_STEPS = 4
 _SPARE_MM, _RAISED_MM = 0.1, 0.2

@@ -76,7 +76,8 @@ class Stage:
         `lit`: whether radiance is wanted, not only what is seen where.
         """
         place = self._place(job)
-        job = replace(job, lights=(*job.lights, *sun_lamps(job.ambient, job.anchor_mm)))
+        suns = sun_lamps(job.ambient, job.anchor_mm)
+        job = replace(job, lights=(*job.lights, *suns))
         region = place if isinstance(place, RegionScene) else None
         structure = Structure(
             kinds(job.eye),
@@ -90,7 +91,7 @@ class Stage:
         values = Values(structure, parameters_of(job), boundary_waves(job.eye), tables(job.eye))
         if job.mesh_edge_mm is not None:
             values.surfaces = meshed(values.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
-        lights = Lights(light_table(job.lights, job.M, job.t))
+        lights = Lights(light_table(job.lights, job.M, job.t), len(suns))
         textures = self._textures_of(job)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
 _POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
+SMALL = 0.02  # the same of lamps whose shadows of hairs are finer than a pixel
 _LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner radius, 2 unused
 
 
@@ -147,12 +148,13 @@ class Lights:
     """The lamps in the eye frame, (n, 10) numbers in one buffer; kernels do not depend on their number.
 
     `widest` is the largest radius over the distance from the eye, `points` how many points stand for each lamp at the
-    nodes of a grid, and `gridded` whether lamps of that size may have grids. `on_iris` and `on_matte` are their light
+    nodes of a grid, and `gridded` whether lamps of that size may have grids. `suns` is 1 if the last lamp is a sun with
+    sharp shadows, else 0. `on_iris` and `on_matte` are their light
     in the plane of the iris and on matte surfaces where grids of it are used, and `relief` is the iris' relief in their
     light.
     """
 
-    def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
+    def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]], suns: int = 0) -> None:
         self._len = len(table)
         self.on_iris: IrisLight | None = None
         self.on_matte: MatteLight | None = None
@@ -162,6 +164,7 @@ class Lights:
         self.points = 1 if self.widest < _POINT_LIKE and not np.any(table[:, 9] > 0) else 4
         self.gridded = self.widest < _LARGE
         self.count = dr.opaque(mi.UInt32, len(table))
+        self.suns = dr.opaque(mi.UInt32, suns if self._len and table[-1, 6] < SMALL * away[-1] else 0)
         rows = np.zeros((max(len(table), 1), _LIGHT_ROW), np.float32)
         rows[: len(table), : table.shape[1]] = table
         self._buffer = mi.Float(aligned(rows.ravel()))

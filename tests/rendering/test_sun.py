@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.region.anatomy import Region
 from eyerender.rig.imaging import Ambient, Sun
 from tests.support.render_oracles import RINGS_MM, centroid, cos4, flux_on_rings, mirror_pixel, ring_points
-from tests.support.render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of, remote_rig
+from tests.support.render_rigs import BLACK, PLAIN, LampRig, eye_of, head_rig, job_of, remote_rig
 
 pytestmark = pytest.mark.render
 
@@ -80,3 +81,15 @@ def test_lids_and_brow_shade_it(renderer):
         shares.append(np.mean(renderer.radiance(job, spp=4)[sclera] > 1e-4))
     assert shares[0] < 0.05
     assert shares[1] > 0.8
+
+
+def test_shadows_of_lashes_are_smooth_beside_lamps(renderer):
+    # Six lamps share the rays of four samples, but the sun has one of each; in turn, it would leave .32.
+    rig = head_rig()
+    sun = Sun(azimuth_deg=-60.0, elevation_deg=40.0, irradiance_w_m2=20.0)
+    look = PLAIN.model_copy(update={"scattering": None})
+    job = job_of(eye_of("E2"), rig, rig.window(160, 120), look=look, region=Region(), ambient=Ambient(sun=sun))
+    few, many = (renderer.radiance(replace(job, interreflection=False), spp=n) for n in (4, 64))
+    sclera = ndimage.binary_erosion(renderer.labels(job).part == 1)
+    assert sclera.sum() > 400
+    assert np.sqrt(np.mean((few - many)[sclera] ** 2)) / many[sclera].mean() < 0.1
