@@ -456,7 +456,7 @@ def _ranked(values, rank):
 
 
 @inlined
-def _quantile(values, share):
+def quantile_of(values, share):
     """`statistics.quantile` of values (n,), which stay as they are."""
     if values.size == 0:
         return math.nan
@@ -475,7 +475,7 @@ def _quantile(values, share):
 
 @inlined
 def median_of(values):
-    return _quantile(values, 0.5)
+    return quantile_of(values, 0.5)
 
 
 @compiled
@@ -518,7 +518,7 @@ def ridges(gx, gy, magnitude, covered, ellipse, half_band, floor):
             if gx[y, x] * u + gy[y, x] * v > 0.7 * strength * max(math.sqrt(u * u + v * v), 1e-12):
                 row[n], column[n], here[n] = y, x, strength
                 n += 1
-    least = 0.35 * _quantile(here[:n], 0.9) if n else 0.0
+    least = 0.35 * quantile_of(here[:n], 0.9) if n else 0.0
     found = 0
     for i in range(n):
         y, x, strength = row[i], column[i], here[i]
@@ -605,7 +605,7 @@ def interior(crop, hidden, ellipse, end):
         if covered < 0.5 * middle:
             break
     inside = inside[:n_inside]
-    spread = _quantile(inside, 0.75) - _quantile(inside, 0.25) if n_inside >= 8 else 0.0
+    spread = quantile_of(inside, 0.75) - quantile_of(inside, 0.25) if n_inside >= 8 else 0.0
     return median_of(ring[:n_ring]) - median_of(core[:n_core]), n_core, n_ring, spread
 
 

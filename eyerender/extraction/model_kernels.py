@@ -232,21 +232,23 @@ def displacements(x, y, level, use, numbers, displaced):
 
 
 @compiled
-def band(linear, masked, ellipse, outer, inner):
+def band(linear, masked, corner, ellipse, outer, inner):
     cx, cy, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
     reach = outer[0] + 2.0
-    x0, x1 = max(0, math.floor(cx - reach)), min(linear.shape[1], math.ceil(cx + reach) + 1)
-    y0, y1 = max(0, math.floor(cy - reach)), min(linear.shape[0], math.ceil(cy + reach) + 1)
+    left, top = corner
+    x0, x1 = max(left, math.floor(cx - reach)), min(left + linear.shape[1], math.ceil(cx + reach) + 1)
+    y0, y1 = max(top, math.floor(cy - reach)), min(top + linear.shape[0], math.ceil(cy + reach) + 1)
     size, n = max(x1 - x0, 0) * max(y1 - y0, 0), 0
     x, y, level, bins = np.empty(size), np.empty(size), np.empty(size), np.empty(size, dtype=np.int64)
     for row in range(y0, y1):
         for column in range(x0, x1):
             dx, dy = column - cx, row - cy
             p, q = dx * cos + dy * sin, dy * cos - dx * sin
-            out2, in2 = (p / outer[0]) ** 2 + (q / outer[1]) ** 2, (p / inner[0]) ** 2 + (q / inner[1]) ** 2
-            if out2 < 1.0 < in2 and not masked[row, column]:
-                x[n], y[n], level[n] = column, row, linear[row, column]
+            if (p / outer[0]) ** 2 + (q / outer[1]) ** 2 >= 1.0 or masked[row - top, column - left]:
+                continue
+            if (p / inner[0]) ** 2 + (q / inner[1]) ** 2 > 1.0:
+                x[n], y[n], level[n] = column, row, linear[row - top, column - left]
                 place = nearest_on(cx, cy, a, b, cos, sin, x[n], y[n], NEAR)
                 bins[n] = sector_at(place[6], place[7], SECTORS)
                 n += 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import cv2
@@ -17,9 +18,9 @@ from .glints.detection import Spots, detect_spots, widest
 from .glints.fits import SpotFit, joined
 from .glints.fitting import fit_spots
 from .glints.gaussian_model import Limits
-from .glints.subtraction import affected_pixels, subtract_spots, well_fitted
+from .glints.subtraction import affected_pixels, part_about, subtract_spots, well_fitted
 from .glints.windows import window_radius
-from .preprocessing import DN, Image, Prepared, invert, prepare
+from .preprocessing import DN, Part, Prepared, invert, prepare
 from .pupil.consensus import median_off
 from .pupil.covariance import boundary_deviation
 from .pupil.edge_model import SECTORS, EdgeModel
@@ -145,29 +146,31 @@ def _refined(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tu
     Returns:
         The fit, None where it contradicts the edges, and the spots.
     """
-    cleared = _cleared(prepared, found, spots, fit)
+    part = part_about(found.image.linear, found.boundary.ellipse)
+    cleared = _cleared(prepared, part, found, spots, fit)
     first = _boundary_fit(found, cleared)
     on_boundary = None if first is None else _on_boundary(spots, fit, first.model)
     if first is None or on_boundary is None:
         return first, fit
     # A spot and the boundary below it were each fitted with a rough estimate of the other.
-    fit = _fitted_again(prepared, found.image, spots, fit, on_boundary, first.model)
-    again = _cleared(prepared, found, spots, fit)
-    if cv2.norm(again[0], cleared[0], cv2.NORM_INF) < SAME_LIGHT * prepared.noise_dn:
+    fit = _fitted_again(prepared, found, spots, fit, on_boundary, first.model)
+    again = _cleared(prepared, part, found, spots, fit)
+    if cv2.norm(again[0].linear, cleared[0].linear, cv2.NORM_INF) < SAME_LIGHT * prepared.noise_dn:
         return first, fit
     return _boundary_fit(found, again, first) or first, fit
 
 
-def _cleared(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[Image, Bools]:
-    """Image without the light of well-fitted spots, and mask of the pixels that other spots affect."""
+def _cleared(prepared: Prepared, part: Part, found: Found, spots: Spots, fit: SpotFit) -> tuple[Part, Bools]:
+    """A part of the image without the light of well-fitted spots, and mask of the pixels that other spots affect."""
     if found.image.inverted:
-        return found.image.linear, affected_pixels(prepared, spots)
+        upright = part_about(prepared.linear, found.boundary.ellipse)
+        return part, affected_pixels(prepared, upright, spots)
     known = well_fitted(prepared, fit)
-    linear, bright = subtract_spots(prepared, fit, known, found.boundary.ellipse)
-    return linear, bright | affected_pixels(prepared, spots, ~known)
+    dark, bright = subtract_spots(part, prepared.noise_dn, fit, known, found.boundary.ellipse)
+    return dark, bright | affected_pixels(prepared, part, spots, ~known)
 
 
-def _boundary_fit(found: Found, cleared: tuple[Image, Bools], before: PixelFit | None = None) -> PixelFit | None:
+def _boundary_fit(found: Found, cleared: tuple[Part, Bools], before: PixelFit | None = None) -> PixelFit | None:
     try:
         scatter = found.boundary.residual_px
         fit = refine(cleared[0], found.model, found.sectors, cleared[1], found.image.noise_dn, scatter, before)
@@ -184,12 +187,16 @@ def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> Bools | None:
 
 
 def _fitted_again(
-    prepared: Prepared, work: Prepared, spots: Spots, fit: SpotFit, on_boundary: Bools, model: EdgeModel
+    prepared: Prepared, found: Found, spots: Spots, fit: SpotFit, on_boundary: Bools, model: EdgeModel
 ) -> SpotFit:
     """Fit the spots on the boundary again with the refined boundary, and use these fits where they are no worse."""
-    linear, _ = subtract_spots(prepared, fit, fit.converged & ~on_boundary, model.ellipse)
-    starts = (spots.xy_px[on_boundary], spots.width_px[on_boundary], spots.height_dn[on_boundary])
-    again = fit_spots(linear, _background(work, model), *starts, _limits(prepared, model)).fit
+    part = part_about(prepared.linear, found.boundary.ellipse)
+    part, _ = subtract_spots(part, prepared.noise_dn, fit, fit.converged & ~on_boundary, model.ellipse)
+    corner = np.array(part.corner)
+    about = replace(model, ellipse=model.ellipse.shifted(-corner))
+    starts = (spots.xy_px[on_boundary] - corner, spots.width_px[on_boundary], spots.height_dn[on_boundary])
+    again = fit_spots(part.linear, _background(found.image, about), *starts, _limits(prepared, model)).fit
+    again = replace(again, xy_px=again.xy_px + corner)
     good = again.converged & (again.residual_dn < 1.05 * fit.residual_dn[on_boundary])
     index = np.arange(fit.converged.size)
     index[np.nonzero(on_boundary)[0][good]] = fit.converged.size + np.nonzero(good)[0]

@@ -44,6 +44,19 @@ class Prepared:
     inverted: bool = False
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A part of an image.
+
+    Attributes:
+        linear: (h, w) its levels, DN.
+        corner: column and row of its first pixel.
+    """
+
+    linear: Image
+    corner: tuple[int, int]
+
+
 def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | str:
     """Prepare an image, or give the reason why nothing can be found in it.
 

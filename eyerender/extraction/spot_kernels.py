@@ -10,7 +10,9 @@ import math
 import numpy as np
 
 from .jit import compiled, inlined, summing
+from .kernels import median_of, quantile_of
 
+UNEXPLAINED = 2.0  # as in fitting
 # As in gaussian_model.
 LOST_PX, STEPS, SMALL_GAIN, ROUGH, ROUGH_SHARE, STALLED = 12.0, 8, (5e-2, 5e-3), 3.0, 0.05, 0.97
 
@@ -271,23 +273,46 @@ def windows(linear, start, centre, radius):
     return first, spot[:count].copy(), plane[:, :count].copy(), data[:count].copy()
 
 
+@inlined
+def _bright_moments(plane, begin, end, rest, level, out):
+    """Write the second moments (2, 2) of the part of a spot's pixels above a third of their height over a level."""
+    top = 0.0
+    for i in range(begin, end):
+        top = max(top, rest[i] - level)
+    total = x = y = xx = xy = yy = 0.0
+    for i in range(begin, end):
+        weight, dx, dy = max(rest[i] - level - 0.35 * top, 0.0), plane[1, i], plane[2, i]
+        total, x, y = total + weight, x + weight * dx, y + weight * dy
+        xx, xy, yy = xx + weight * dx * dx, xy + weight * dx * dy, yy + weight * dy * dy
+    total = max(total, 1e-12)
+    x, y = x / total, y / total
+    out[0, 0], out[1, 1] = xx / total - x * x, yy / total - y * y
+    out[0, 1] = out[1, 0] = xy / total - x * y
+
+
 @compiled
-def bright_moments(first, plane, patch):
-    out = np.empty((first.size - 1, 2, 2))
-    for k in range(first.size - 1):
-        top = 0.0
-        for i in range(first[k], first[k + 1]):
-            top = max(top, patch[i])
-        total = x = y = xx = xy = yy = 0.0
-        for i in range(first[k], first[k + 1]):
-            weight, dx, dy = max(patch[i] - 0.35 * top, 0.0), plane[1, i], plane[2, i]
-            total, x, y = total + weight, x + weight * dx, y + weight * dy
-            xx, xy, yy = xx + weight * dx * dx, xy + weight * dx * dy, yy + weight * dy * dy
-        total = max(total, 1e-12)
-        x, y = x / total, y / total
-        out[k, 0, 0], out[k, 1, 1] = xx / total - x * x, yy / total - y * y
-        out[k, 0, 1] = out[k, 1, 0] = xy / total - x * y
-    return out
+def reported(first, plane, centre, theta, gram, used, rest, noise, penalty, blur_px):
+    n, k = theta.shape
+    covariance, moments, level, misfit = np.empty((n, 2, 2)), np.zeros((n, 2, 2)), np.empty(n), np.empty(n)
+    ridge = 1e-9 * np.eye(k)
+    for s in range(n):
+        own, pull = theta[s], 0.0
+        for j in range(k):
+            for m in range(k):
+                pull += own[j] * penalty[j, m] * own[m]
+        cost = max(gram[s, k, k] - pull, 0.0)
+        inverse, scale = np.linalg.inv(gram[s, :k, :k] + ridge), max(cost / max(used[s] - k, 1.0), 1.0)
+        covariance[s] = inverse[:2, :2] * scale
+        x, y = own[0] - centre[s, 0], own[1] - centre[s, 1]
+        level[s] = own[5] + own[6] * x + own[7] * y
+        if k > 8:
+            t = (x * math.cos(own[9]) + y * math.sin(own[9]) - own[10]) / blur_px
+            level[s] += own[8] * 0.5 * math.erfc(-t * _ROOT_HALF)
+        misfit[s] = math.sqrt(cost / max(used[s], 1.0)) * noise
+        moments[s, 0, 0], moments[s, 1, 1] = math.exp(2.0 * own[3]), math.exp(2.0 * own[4])
+        if misfit[s] > UNEXPLAINED * noise:
+            _bright_moments(plane, first[s], first[s + 1], rest, level[s], moments[s])
+    return covariance, level, misfit, moments
 
 
 @inlined
@@ -367,7 +392,8 @@ def ring(linear, xy, wide, converged, i):
             if outside and _clear(xy, near, wide, column, row):
                 out[count] = linear[row, column]
                 count += 1
-    return out[:count].copy()
+    out = out[:count]
+    return count, median_of(out), quantile_of(out, 0.97)
 
 
 @compiled

@@ -148,8 +148,8 @@ def _objection(
         return f"too wide for a glint: sigma {wide:.1f} px"
     if look.height < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
         return "too faint for a glint"
-    beside = _beside(fit, i, prepared.linear)
-    if beside.size and median(beside) > max(lit_dn, look.height / SHINING):
+    beside = _ring(prepared.linear, fit.xy_px, fit.sigma_px.max(axis=1), fit.converged, i)
+    if beside[1] > max(lit_dn, look.height / SHINING):
         return "before something much brighter than the iris, as highlights of skin are"
     if wide > 2.5 and not _outshines(fit, i, beside):
         return "no brighter than what lies beside it, as a corner of sclera between lid and iris is"
@@ -158,14 +158,12 @@ def _objection(
     return None
 
 
-def _beside(fit: SpotFit, i: int, linear: Image) -> Image:
-    """Levels (n,) of the pixels in a ring around spot i, without other spots."""
-    return _ring(linear, fit.xy_px, fit.sigma_px.max(axis=1), fit.converged, i)
-
-
 @twin
-def _ring(linear: Image, xy: Floats, wide: Floats, converged: Bools, i: int) -> Image:
-    """Do what `_beside` does, for spots at xy (n, 2) of sigma `wide` (n,)."""
+def _ring(linear: Image, xy: Floats, wide: Floats, converged: Bools, i: int) -> tuple[int, float, float]:
+    """Number, median and 97 % quantile of the levels in a ring around spot i, without other spots.
+
+    The spots are at xy (n, 2) and have sigma `wide` (n,). The levels are NaN where there is no pixel.
+    """
     x, y = xy[i]
     reach = 3.5 * wide[i] + 1.0
     x0, x1 = max(0, math.floor(x - reach)), min(linear.shape[1], math.ceil(x + reach) + 1)
@@ -176,15 +174,17 @@ def _ring(linear: Image, xy: Floats, wide: Floats, converged: Bools, i: int) -> 
     near = converged & (apart2 < (1.5 * reach + 3.0 * wide + 1.0) ** 2) & (np.arange(wide.size) != i)
     for k in np.flatnonzero(near):
         ring &= (columns - xy[k, 0]) ** 2 + (rows - xy[k, 1]) ** 2 > (3.0 * wide[k]) ** 2
-    return np.asarray(linear[y0:y1, x0:x1][ring])
+    levels = linear[y0:y1, x0:x1][ring]
+    return levels.size, median(levels), quantile(levels, 0.97)
 
 
-def _outshines(fit: SpotFit, i: int, beside: Image) -> bool:
+def _outshines(fit: SpotFit, i: int, beside: tuple[int, float, float]) -> bool:
     """Whether a spot's peak is above the brightest surroundings (without other spots) by half its own height.
 
     This test is for wide spots only, because a narrow spot cannot be anything but a glint.
     """
-    if beside.size < 8:
+    count, _, brightest = beside
+    if count < 8:
         return True
     height = min(float(fit.amplitude_dn[i]), DN)
-    return float(fit.background_dn[i]) + height - quantile(beside, 0.97) > 0.5 * height
+    return float(fit.background_dn[i]) + height - brightest > 0.5 * height

@@ -18,7 +18,7 @@ from ...arrays import Bools, Floats, Indices
 from ..compiled import twin
 from ..preprocessing import Image
 from .fits import SpotFit, no_spots
-from .gaussian_model import PARAMETERS, SAME_LIGHT, Descent, Limits, descend, lost, prior, promising
+from .gaussian_model import PARAMETERS, SAME_LIGHT, WITH_EDGE, Descent, Limits, descend, lost, prior, promising
 from .windows import Others, SpotPixels, cut, window_radius
 
 # Rounds of several steps each. A spot that still moves by WANDERING_PX after PATIENCE rounds is abandoned. The second
@@ -174,48 +174,48 @@ def _ring_level(pixels: SpotPixels, rest: Floats) -> Floats:
 def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blur_px: float | None = None) -> SpotFit:
     """Convert the end of a descent to a fit; `rest` (P,) is the image minus B and the other spots' light."""
     theta, noise = ended.theta, limits.noise_dn
-    k = theta.shape[1]
     penalty = prior(limits, blur_px is not None)
-    data_cost = np.maximum(ended.gram[:, k, k] - np.einsum("nk,nk->n", theta @ penalty, theta), 0.0)
-    inverse = np.linalg.inv(ended.gram[:, :k, :k] + 1e-9 * np.eye(k))
-    # A misfit beyond the noise counts as more noise.
-    scale = np.maximum(data_cost / np.maximum(ended.used - k, 1.0), 1.0)
-    at = theta[:, :2] - pixels.centre
-    level = theta[:, 5] + (theta[:, 6:8] * at).sum(axis=1)
-    if blur_px is not None:
-        height, turn, offset = theta[:, 8:].T
-        level += height * ndtr((at[:, 0] * np.cos(turn) + at[:, 1] * np.sin(turn) - offset) / blur_px)
-    misfit, sigma = np.sqrt(data_cost / np.maximum(ended.used, 1.0)) * noise, np.exp(theta[:, 3:5])
+    windows = (pixels.first, pixels.plane, pixels.centre)
+    blur = 1.0 if blur_px is None else blur_px
+    covariance, level, misfit, moments = _reported(*windows, theta, ended.gram, ended.used, rest, noise, penalty, blur)
     return SpotFit(
         xy_px=theta[:, :2].copy(),
-        covariance=np.asarray(inverse[:, :2, :2] * scale[:, None, None], dtype=np.float64),
+        covariance=covariance,
         amplitude_dn=np.exp(theta[:, 2]),
-        sigma_px=sigma,
+        sigma_px=np.exp(theta[:, 3:5]),
         background_dn=level + pixels.middle_dn,
         residual_dn=misfit,
-        moments_px2=_moments(pixels, rest, level, misfit > UNEXPLAINED * noise, sigma),
+        moments_px2=moments,
         clipped=pixels.total(pixels.clip).astype(np.intp),
         converged=ended.settled & np.isfinite(theta).all(axis=1) & (ended.used >= 12),
     )
 
 
-def _moments(pixels: SpotPixels, rest: Floats, level: Floats, which: Bools, sigma: Floats) -> Floats:
-    """Second moments (n, 2, 2) of the part of each spot above a third of its height.
-
-    The background `level` (n,) is subtracted first. Spots outside `which` get the moments of their fit.
-    """
-    out = np.zeros((level.size, 2, 2))
-    out[:, 0, 0], out[:, 1, 1] = (sigma * sigma).T
-    index = np.flatnonzero(which)
-    if index.size == 0:
-        return out
-    if index.size < level.size:
-        rest, level, pixels = rest[pixels.rows(index)], level[index], pixels.taken(index)
-    out[index] = _bright_moments(pixels.first, pixels.plane, rest - level[pixels.spot])
-    return out
-
-
 @twin
+def _reported(
+    first: Indices, plane: Floats, centre: Floats, theta: Floats, gram: Floats, used: Floats, rest: Floats,
+    noise: float, penalty: Floats, blur_px: float,
+) -> tuple[Floats, Floats, Floats, Floats]:  # fmt: skip
+    """Compute covariance (n, 2, 2), level at the centre beyond B (n,), misfit (n,) and moments (n, 2, 2) of fits."""
+    k = theta.shape[1]
+    data_cost = np.maximum(gram[:, k, k] - np.einsum("nk,nk->n", theta @ penalty, theta), 0.0)
+    inverse = np.linalg.inv(gram[:, :k, :k] + 1e-9 * np.eye(k))
+    # A misfit beyond the noise counts as more noise.
+    scale = np.maximum(data_cost / np.maximum(used - k, 1.0), 1.0)
+    at = theta[:, :2] - centre
+    level = theta[:, 5] + (theta[:, 6:8] * at).sum(axis=1)
+    if k == WITH_EDGE:
+        height, turn, offset = theta[:, 8:].T
+        level += height * ndtr((at[:, 0] * np.cos(turn) + at[:, 1] * np.sin(turn) - offset) / blur_px)
+    misfit = np.sqrt(data_cost / np.maximum(used, 1.0)) * noise
+    moments = np.zeros((level.size, 2, 2))
+    moments[:, 0, 0], moments[:, 1, 1] = np.exp(2.0 * theta[:, 3:5]).T
+    odd = misfit > UNEXPLAINED * noise
+    patch = rest - level.repeat(np.diff(first))
+    moments[odd] = _bright_moments(first, plane, patch)[odd]
+    return inverse[:, :2, :2] * scale[:, None, None], level, misfit, moments
+
+
 def _bright_moments(first: Indices, plane: Floats, patch: Floats) -> Floats:
     """Second moments (n, 2, 2) of the part of each patch above a third of its highest level (at least 0)."""
     out = np.empty((first.size - 1, 2, 2))

@@ -9,13 +9,16 @@ import numpy as np
 from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse
 from ..compiled import twin
-from ..preprocessing import Image, Prepared
+from ..preprocessing import Image, Part, Prepared
+from ..pupil.glare import around
 from .detection import Spots
 from .fits import SpotFit, profile
+from .windows import LARGEST_PX
 
 # In noise standard deviations: the largest residual of a spot whose light is subtracted; the light above which a pixel
 # is left out even so; the faintest light that matters.
 WELL_FITTED, BRIGHT, FAINT = 3.0, 3.0, 0.2
+SPARE_PX = 36.0  # the band of the pixel model and the centres of spots reach so far beyond the boundary
 
 
 def well_fitted(prepared: Prepared, fit: SpotFit) -> Bools:
@@ -23,8 +26,14 @@ def well_fitted(prepared: Prepared, fit: SpotFit) -> Bools:
     return np.asarray(fit.converged & (fit.residual_dn < WELL_FITTED * prepared.noise_dn))
 
 
-def affected_pixels(prepared: Prepared, spots: Spots, which: Bools | None = None) -> Bools:
-    """Mask (h, w) of pixels affected by spots (`which` of them, or all), clutter or saturation.
+def part_about(linear: Image, ellipse: Ellipse) -> Part:
+    """Cut out what the pixel model and the spots on the boundary need, even if the boundary is up to 1.4 as large."""
+    columns, rows = around(ellipse, 1.4 * float(ellipse.semi_axes_px[0]) + LARGEST_PX + SPARE_PX, linear.shape)
+    return Part(np.ascontiguousarray(linear[rows, columns]), (columns.start, rows.start))
+
+
+def affected_pixels(prepared: Prepared, part: Part, spots: Spots, which: Bools | None = None) -> Bools:
+    """Mask (h, w) of a part's pixels affected by spots (`which` of them, or all), clutter or saturation.
 
     The extent of a spot follows from its detected height and width.
     """
@@ -32,7 +41,7 @@ def affected_pixels(prepared: Prepared, spots: Spots, which: Bools | None = None
     parts = zip((spots.xy_px[own], spots.width_px[own], spots.height_dn[own]), spots.clutter, strict=True)
     xy, width, height = (np.concatenate(part) for part in parts)
     radius = 1.2 * _reach(width, height, prepared.noise_dn) + 1.0
-    return _covered(prepared.linear, prepared.clip_dn, xy, radius)
+    return _covered(part.linear, prepared.clip_dn, xy - np.array(part.corner), radius)
 
 
 @twin
@@ -46,27 +55,29 @@ def _covered(linear: Image, clip_dn: float, xy: Floats, radius: Floats) -> Bools
     return np.asarray(mask)
 
 
-def subtract_spots(prepared: Prepared, fit: SpotFit, which: Bools, about: Ellipse) -> tuple[Image, Bools]:
+def subtract_spots(part: Part, noise_dn: float, fit: SpotFit, which: Bools, about: Ellipse) -> tuple[Part, Bools]:
     """Subtract the light of spots from the image where it reaches an ellipse.
 
     A fit describes the flanks of a spot far better than the circle of `affected_pixels`. It is not relied on where the
     light exceeds three standard deviations of the noise.
 
     Args:
-        prepared: the image.
+        part: a part of the image.
+        noise_dn: standard deviation of a pixel's noise.
         fit: the spots' fits.
         which: (n,) spots to subtract.
         about: the ellipse, the pupil boundary.
 
     Returns:
-        The image (h, w) without that light, and the mask (h, w) of pixels where the light is too bright.
+        The part without that light, and the mask (h, w) of pixels where the light is too bright.
     """
     reach = float(about.semi_axes_px[0]) + 10.0 + 8.0 * fit.sigma_px.max(axis=1, initial=0.0)
     near = which & (np.hypot(*(fit.xy_px - about.centre_px).T) < reach)
     sigma, height = fit.sigma_px[near], fit.amplitude_dn[near]
-    spots = np.column_stack([fit.xy_px[near], sigma, height])
-    radius = _reach(sigma.max(axis=1, initial=0.0), height, prepared.noise_dn) + 1.0
-    return _subtracted(prepared.linear, spots, radius, BRIGHT * prepared.noise_dn)
+    spots = np.column_stack([fit.xy_px[near] - np.array(part.corner), sigma, height])
+    radius = _reach(sigma.max(axis=1, initial=0.0), height, noise_dn) + 1.0
+    linear, bright = _subtracted(part.linear, spots, radius, BRIGHT * noise_dn)
+    return Part(linear, part.corner), bright
 
 
 @twin

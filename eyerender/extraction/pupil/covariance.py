@@ -224,9 +224,10 @@ def _inverse(matrix: Floats) -> Floats:
 
 def to_axes(covariance: Floats, ellipse: Ellipse) -> Floats:
     """Covariance of (cx, cy, a, b, angle) from that of the shape matrix: d angle = d ab / (a - b)."""
-    a, b = ellipse.semi_axes_px
-    jacobian = np.eye(SHAPE)
+    a, b = ellipse.semi_axes_px.tolist()
     # The standard deviation of the angle is at most that of a uniform orientation, pi / sqrt(12).
     floor = math.sqrt(covariance[4, 4] * 12.0) / math.pi
-    jacobian[4, 4] = 1.0 / max(float(a - b), floor, 1e-9)
-    return np.asarray(jacobian @ covariance @ jacobian.T)
+    out = np.array(covariance)
+    out[4] /= max(a - b, floor, 1e-9)
+    out[:, 4] /= max(a - b, floor, 1e-9)
+    return out

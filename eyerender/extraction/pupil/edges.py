@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -86,7 +87,9 @@ def find_edges(
     half_band = max(band, 4.0 / b)
     floor = 3.5 * noise_dn / (2.0 * math.sqrt(2.0 * math.pi) * sigma**2)
     beside = 2 * math.ceil(sigma) + 1
-    covered = np.asarray(cv2.dilate(hidden.view(np.uint8), np.ones((beside, beside), np.uint8)), dtype=np.uint8)
+    covered = hidden.view(np.uint8)
+    if cleared.patch is not None:
+        covered = np.asarray(cv2.dilate(covered, np.ones((beside, beside), np.uint8)), dtype=np.uint8)
     cx, cy = ellipse.centre_px.tolist()
     about = (cx - x0, cy - y0, *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)
     points, normals, widths, row, column = _ridges(gx, gy, magnitude, covered, about, half_band, floor)
@@ -178,15 +181,20 @@ def edge_noise_px(step_dn: float, *, noise_dn: float, sigma_filter: float, sigma
 
 def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
     """Derivatives of a Gaussian, normalised so that a ramp of 1 DN per px gives 1."""
-    t = np.arange(-math.ceil(4.0 * sigma), math.ceil(4.0 * sigma) + 1, dtype=np.float64)
-    smooth = np.exp(-0.5 * (t / sigma) ** 2)
-    smooth /= smooth.sum()
-    slope = t * smooth
-    slope /= (t * slope).sum()
+    smooth, slope = _filters(sigma)
     return (
         as_image(cv2.sepFilter2D(crop, cv2.CV_32F, slope, smooth, borderType=cv2.BORDER_REPLICATE)),
         as_image(cv2.sepFilter2D(crop, cv2.CV_32F, smooth, slope, borderType=cv2.BORDER_REPLICATE)),
     )
+
+
+@lru_cache(maxsize=64)
+def _filters(sigma: float) -> tuple[Floats, Floats]:
+    """Weights of a Gaussian, and of its derivative."""
+    t = np.arange(-math.ceil(4.0 * sigma), math.ceil(4.0 * sigma) + 1, dtype=np.float64)
+    smooth = np.exp(-0.5 * (t / sigma) ** 2)
+    smooth /= smooth.sum()
+    return smooth, t * smooth / (t * t * smooth).sum()
 
 
 def _outward(ellipse: tuple[float, ...], column: Indices, row: Indices) -> tuple[Floats, Floats, Floats]:

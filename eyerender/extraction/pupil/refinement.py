@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...arrays import Bools, Floats, Indices
-from ...geometry.ellipse import Ellipse, fit_ellipse_direct
+from ...geometry.ellipse import Ellipse
 from ..compiled import twin
-from ..preprocessing import Image
+from ..preprocessing import Image, Part
 from .covariance import SHAPE, distance_slopes, hidden_part, sector_excess, to_axes, towards_round
 from .edge_model import NEAR, SECTORS, EdgeModel, Place, sectors_at
 from .least_squares import FIXED, Normal, Pixels, Prior, Solution, Sums, fitted
 from .occlusion import clear_of_lids, visible_part
+from .stretches import direct_fits
 
 # Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
 # side of the iris more, by a few hundredths of the step. Noise hides that from a test, but it shifts the centre.
@@ -89,7 +90,7 @@ class PixelFit:
 
 
 def refine(
-    linear: Image,
+    part: Part,
     start: EdgeModel,
     sectors: Bools,
     masked: Bools,
@@ -103,20 +104,20 @@ def refine(
     """
     if before is not None:
         start_at = (before.model, before.uneven_px, before.sectors)
-        ended = _fitted(linear, start, sectors, masked, noise_dn, start_at, before.outward, TURNS[2])
+        ended = _fitted(part, start, sectors, masked, noise_dn, start_at, before.outward, TURNS[2])
         return ended if isinstance(ended, str) else _report(ended, noise_dn, scatter_px)
-    wide = _fitted(linear, start, sectors, masked, noise_dn, None, WIDE, TURNS[0])
+    wide = _fitted(part, start, sectors, masked, noise_dn, None, WIDE, TURNS[0])
     if isinstance(wide, str):
         return wide
     if wide.variance < UNEXPLAINED * noise_dn**2 and not _rough(wide.model, wide.prior.uneven_px):
         return _report(wide, noise_dn, scatter_px)
     start_at = (wide.model, wide.prior.uneven_px, wide.seen)
-    narrow = _fitted(linear, start, sectors, masked, noise_dn, start_at, NARROW, TURNS[1])
+    narrow = _fitted(part, start, sectors, masked, noise_dn, start_at, NARROW, TURNS[1])
     return _report(wide if isinstance(narrow, str) else narrow, noise_dn, scatter_px)
 
 
 def _fitted(
-    linear: Image,
+    part: Part,
     start: EdgeModel,
     sectors: Bools,
     masked: Bools,
@@ -132,10 +133,10 @@ def _fitted(
     is uneven, displacements of its sectors are fitted too.
 
     Args:
-        linear: the image, DN.
+        part: the part of the image about the boundary.
         start: model from the edges.
         sectors: (SECTORS,) parts of the outline with edge points.
-        masked: (h, w) pixels that glints affect or the sensor clipped.
+        masked: (h, w) its pixels that glints affect or the sensor clipped.
         noise_dn: standard deviation of a pixel's noise.
         before: model, unevenness and sectors of an earlier fit of the same boundary to start from.
         outward: how far the band of pixels reaches beyond the boundary, in widths of the blur.
@@ -143,7 +144,7 @@ def _fitted(
     """
     model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before[0]
     prior = Prior.of(start, noise_dn, 0.0 if before is None else before[1])
-    x, y, level, bins = _near_boundary(linear, model, masked, outward)
+    x, y, level, bins = _near_boundary(part, model, masked, outward)
     use = np.ones(x.size, dtype=bool)
     # A lid must not decide the order of the outer level.
     seen = clear_of_lids(sectors, start) if before is None else before[2]
@@ -184,7 +185,7 @@ def _rough(model: EdgeModel, uneven_px: float) -> bool:
 
 
 def _near_boundary(
-    linear: Image, model: EdgeModel, masked: Bools, reach_out: float
+    part: Part, model: EdgeModel, masked: Bools, reach_out: float
 ) -> tuple[Floats, Floats, Floats, Indices]:
     """Pixels near the boundary, as (x, y, level, sector).
 
@@ -196,25 +197,24 @@ def _near_boundary(
     inward, outward = min(4.0 * sigma + 1.0, 0.8 * b), min(reach_out * sigma + 1.0, OUTWARD_PX)
     # Inside the larger concentric ellipse and outside the smaller one: a cheap cover of the band.
     outer, inner = (a + outward, b + outward), (max(a - inward, 0.5), max(b - inward, 0.5))
-    return _band(linear, masked, ellipse.numbers(), outer, inner)
+    return _band(part.linear, masked, part.corner, ellipse.numbers(), outer, inner)
 
 
 @twin
 def _band(
-    linear: Image, masked: Bools, ellipse: tuple[float, ...], outer: tuple[float, float], inner: tuple[float, float]
-) -> tuple[Floats, Floats, Floats, Indices]:
-    """Pixels (x, y, level, sector) between two ellipses of these semi-axes, concentric with an ellipse."""
+    linear: Image, masked: Bools, corner: tuple[int, int], ellipse: tuple[float, ...],
+    outer: tuple[float, float], inner: tuple[float, float],
+) -> tuple[Floats, Floats, Floats, Indices]:  # fmt: skip
+    """Pixels (x, y, level, sector) of a part of an image between two ellipses of these semi-axes about another one."""
     cx, cy, _, _, angle = ellipse
-    reach = outer[0] + 2.0
-    x0, x1 = max(0, math.floor(cx - reach)), min(linear.shape[1], math.ceil(cx + reach) + 1)
-    y0, y1 = max(0, math.floor(cy - reach)), min(linear.shape[0], math.ceil(cy + reach) + 1)
-    dx, dy = np.arange(x0, x1)[None, :] - cx, np.arange(y0, y1)[:, None] - cy
+    dx = np.arange(corner[0], corner[0] + linear.shape[1])[None, :] - cx
+    dy = np.arange(corner[1], corner[1] + linear.shape[0])[:, None] - cy
     cos, sin = math.cos(angle), math.sin(angle)
     p, q = dx * cos + dy * sin, dy * cos - dx * sin
     out2, in2 = ((p / axes[0]) ** 2 + (q / axes[1]) ** 2 for axes in (outer, inner))
-    row, column = np.nonzero((out2 < 1.0) & (in2 > 1.0) & ~masked[y0:y1, x0:x1])
-    x, y = (column + x0).astype(np.float64), (row + y0).astype(np.float64)
-    return x, y, linear[row + y0, column + x0].astype(np.float64), sectors_at(ellipse, x, y, NEAR)
+    row, column = np.nonzero((out2 < 1.0) & (in2 > 1.0) & ~masked)
+    x, y = (column + corner[0]).astype(np.float64), (row + corner[1]).astype(np.float64)
+    return x, y, linear[row, column].astype(np.float64), sectors_at(ellipse, x, y, NEAR)
 
 
 def _padded(outer: Floats, order: int) -> Floats:
@@ -296,6 +296,6 @@ def _through(start: Ellipse, displaced: Floats) -> tuple[Ellipse, Floats]:
     slopes = distance_slopes(start, place)
     outline = start.points_at(place.cos_t, place.sin_t)
     normals = -slopes[:2].T
-    fit = fit_ellipse_direct(outline - displaced[:, None] * normals)
+    fit = direct_fits((outline - displaced[:, None] * normals)[None])[0]
     by_displaced = np.asarray(np.linalg.solve(slopes @ slopes.T, slopes), dtype=np.float64)
-    return Ellipse(fit.centre_px, fit.semi_axes_px, float(fit.angle_rad)), by_displaced
+    return Ellipse.of(fit), by_displaced
