@@ -12,6 +12,7 @@ import numpy as np
 from .jit import compiled, inlined
 
 SECTORS, NEAR = 48, 2  # as in edge_model
+DARK, SHADED = 0.35, 0.6  # as in outline
 MOST_BLOBS = 12  # as in candidates
 SELECTION = 1.6  # as in covariance
 
@@ -678,27 +679,35 @@ def overlap(first, second):
 
 
 @compiled
-def along(ellipse, points, others, linear, corner, patch, away, limits):
+def along(ellipse, points, others, linear, corner, patch, away, levels):
     cx, cy, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
-    held, dark, reach = np.zeros(SECTORS, dtype=np.bool_), limits[0], limits[1]
+    held, (pupil, dark) = np.zeros(SECTORS, dtype=np.bool_), levels
     for i in range(points.shape[0]):
         place = nearest_on(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], NEAR)
         held[sector_at(place[6], place[7], SECTORS)] = True
-    hollow = beyond = within = 0
+    inside, outside = np.empty(SECTORS, dtype=np.float32), np.empty(SECTORS, dtype=np.float32)
     for k in range(SECTORS):
+        inside[k] = _beside(ellipse, k, SECTORS, -away[0], linear, corner, patch)
+        outside[k] = _beside(ellipse, k, SECTORS, away[0], linear, corner, patch)
+    step = float(np.median((outside - inside)[held])) if held.any() else 0.0
+    hollow = beyond = within = shaded = pale = mirrored = 0
+    for k in range(SECTORS):
+        bright = inside[k] > pupil + DARK * step
         if held[k]:
-            continue
-        inside = _beside(ellipse, k, SECTORS, -away, linear, corner, patch)
-        hollow += inside < dark and _beside(ellipse, k, SECTORS, away, linear, corner, patch) < dark
+            shaded += outside[k] < pupil + SHADED * step
+            pale += bright
+        else:
+            hollow += inside[k] < dark and outside[k] < dark
+            mirrored += bright and outside[k] - inside[k] > DARK * step
     for i in range(others.shape[0]):
         dx, dy = others[i, 0] - cx, others[i, 1] - cy
         p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
         radius, u, v = math.sqrt(p * p + q * q), p / a, q / b
         distance = (radius - 1.0) * radius / max(math.sqrt(u * u + v * v), 1e-12)
-        beyond += distance > reach
-        within += distance < -reach
-    return hollow, beyond, within
+        beyond += distance > away[1]
+        within += distance < -away[1]
+    return hollow, beyond, within, shaded, pale, mirrored
 
 
 @compiled

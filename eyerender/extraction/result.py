@@ -37,6 +37,10 @@ class Goodness:
         open: share of the outline without edge points that is dark on both sides, as no boundary is.
         beyond: edge points outside the ellipse, per point that it fits.
         within: edge points inside it, per point that it fits.
+        shaded: share of the outline that has an edge point with less than the iris' light outside.
+        pale: share of the outline that has an edge point with more than the pupil's light inside.
+        mirrored: share of the outline without edge points where a bright inside meets a brighter outside, as below a
+            reflection that covers both.
     """
 
     support: float
@@ -56,6 +60,9 @@ class Goodness:
     open: float = 0.0
     beyond: float = 0.0
     within: float = 0.0
+    shaded: float = 0.0
+    pale: float = 0.0
+    mirrored: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
