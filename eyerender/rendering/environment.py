@@ -33,6 +33,7 @@ from ..rig.surroundings import paint
 from ..spec import file_digest
 from .exr import second_thread
 from .panels import Panels
+from .parameters import leaves
 
 _WIDTH, _HEIGHT = 1024, 512
 _FINE, _BLOCKS, _NORMALS = 256, 32, 48  # rows from which blocks are summed, and of blocks and normals
@@ -260,6 +261,8 @@ def _texture(values: NDArray[np.float32]) -> Any:
 
 class Ambience:
     """Even light, panels and surroundings for the integrator; kernels do not depend on the numbers."""
+
+    DRJIT_STRUCT = leaves("_panels", "_texture", "_table", "_even", "_scale", "_rows", "_ceiling", "_axes")
 
     def __init__(
         self,

@@ -39,6 +39,7 @@ from .chamber import (
 from .chamber import TURNS as IRIS_TURNS
 from .frame import RenderJob, globe_of
 from .lighting import onto_points, through_cornea
+from .parameters import leaves
 from .places import (
     GLOBE_COLUMNS,
     MAP_SIDE,
@@ -81,6 +82,11 @@ class Received:
     Every surface has four numbers a place: irradiance from other surfaces, share of the sky that is open, whole
     irradiance (what a mirror image of the place shows), and 0. Without exchange all of it is dark and open.
     """
+
+    DRJIT_STRUCT = leaves(
+        "on", "_between", "_columns", "_rows", "_centre", "_first", "_per_mm", "_root2", "_reach2", "_plane", "_ends",
+        "_globe", "_other", "_iris",
+    )  # fmt: skip
 
     def __init__(
         self,

@@ -24,7 +24,8 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints, frozen
 from ..rig.camera import Window
 from .groups import Group, shade_group
-from .sampling import Sampler, Samples, camera_ray, lattice_generator
+from .recorded import recorded
+from .sampling import Pattern, Sampler, Samples, camera_ray, lattice_generator
 from .values import SMALL, Lamp, Lights, Values, aligned
 from .view import Textures, meet
 
@@ -52,6 +53,24 @@ class Exposed:
     textures: Textures
     plain: Callable[[Window], tuple[Bools, int]]
     fine: Callable[[Window], Bools]
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """A window and its groups of samples on the device.
+
+    Attributes:
+        corner: its first pixel on the sensor.
+        size: its width and height.
+        numbers: columns of packets, groups of a pixel in this pass, number of the first, groups of a pixel, samples of
+            a group, and how many times as many there are in fine pixels.
+        plain: size of the plain tiles (px), and their rows and columns.
+    """
+
+    corner: tuple[mi.Int32, mi.Int32]
+    size: tuple[mi.UInt32, mi.UInt32]
+    numbers: tuple[mi.UInt32, ...]
+    plain: tuple[mi.UInt32, ...]
 
 
 def pixels_of(pixel: mi.UInt32, window: Window) -> tuple[mi.Int32, mi.Int32]:
@@ -127,9 +146,9 @@ def _sums(
     return [t.reshape(height, width) for t in totals], failed
 
 
-def _samples(u: mi.Int32, v: mi.Int32, spp: int, seed: int, fine: mi.Bool | bool = False, times: int = 1) -> Samples:
+def _samples(u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = False) -> Samples:
     # Samples depend on a pixel's place on the whole sensor, so they are the same in every window.
-    return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), spp, seed, fine=fine, times=times)
+    return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), pattern, fine)
 
 
 def _adaptive(
@@ -237,7 +256,7 @@ def _taken(
 ) -> tuple[list[mi.Float], mi.UInt32]:
     """What samples k of pixels show, and their failed light paths."""
     u, v = pixels_of(pixel, window)
-    samples = _samples(u, v, spp, seed)
+    samples = _samples(u, v, Pattern.of(spp, seed))
     spot = samples.in_pixel(k)
     o, d, cosine = camera_ray(shown.values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
     seen, _, _ = integrator.sample(shown.scene, Sampler(samples, k), mi.Ray3f(mi.Point3f(o), d))
@@ -265,39 +284,63 @@ def _groups(
     layered: bool,
 ) -> tuple[list[Floats], int]:
     """Sums over `count` groups of each pixel, one group per lane; sample j of group g is number g size + j."""
+    columns, rows = (-(-n // _TILE) for n in window[2:])  # the last tiles may extend beyond the window
+    times = _TIMES if spp <= _ENOUGH else 1
+    tiles, across = plain
+    numbers = (columns, count, first, spp // size, size, times)
+    grid = _Grid(
+        (dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])),
+        *(tuple(dr.opaque(mi.UInt32, n) for n in part) for part in (window[2:], numbers, (across, *tiles.shape))),
+    )
+    fine, seen = (mi.UInt8(aligned(marks.ravel().astype(np.uint8))) for marks in (shown.fine(window), tiles))
+    lanes, failures = _shaded(
+        *(shown.values, shown.lights, shown.textures, shown.scene, grid, Pattern.of(spp, seed, times), fine, seen),
+        dr.opaque(mi.Bool, shown.lights.widest < SMALL), rows * columns * count, layered,
+    )  # fmt: skip
+
+    def summed(lane: mi.Float) -> Floats:
+        tiles = lane.numpy().reshape(rows, columns, count, _TILE, _TILE).sum(axis=2, dtype=float)
+        seen = tiles.transpose(0, 2, 1, 3).reshape(rows * _TILE, columns * _TILE)[: window[3], : window[2]]
+        return np.asarray(seen.reshape(-1))
+
+    return [summed(lane) for lane in lanes], int(dr.sum(failures).numpy()[0])
+
+
+@recorded
+def _shaded(
+    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, grid: _Grid, pattern: Pattern, fine: mi.UInt8,
+    plain: mi.UInt8, small: mi.Bool, packets: int, layered: bool,
+) -> tuple[list[mi.Float], mi.UInt32]:  # fmt: skip
+    """What groups of samples show, one group per lane, and their failed light paths."""
     # Embree traces sixteen neighbouring lanes together. They are one group of 4 x 4 pixels each, so that their camera
     # rays are close and their lamp rays go the same way.
-    columns, rows = (-(-n // _TILE) for n in window[2:])  # the last tiles may extend beyond the window
-    index = dr.arange(mi.UInt32, rows * columns * _TILE * _TILE * count)
+    index = dr.arange(mi.UInt32, packets * _TILE * _TILE)
     packet = index // (_TILE * _TILE)
     lane = index - packet * (_TILE * _TILE)
-    tile = packet // dr.opaque(mi.UInt32, count)
-    row = tile // dr.opaque(mi.UInt32, columns)
-    x = (tile - row * dr.opaque(mi.UInt32, columns)) * _TILE + lane % _TILE
+    columns, count, first, groups, size, times = grid.numbers
+    tile = packet // count
+    row = tile // columns
+    x = (tile - row * columns) * _TILE + lane % _TILE
     y = row * _TILE + lane // _TILE
-    u = mi.Int32(x) + dr.opaque(mi.Int32, window[0])
-    v = mi.Int32(y) + dr.opaque(mi.Int32, window[1])
-    group = packet - tile * dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-    inside = (x < dr.opaque(mi.UInt32, window[2])) & (y < dr.opaque(mi.UInt32, window[3]))
-    times = _TIMES if spp <= _ENOUGH else 1
-    fine = (
-        dr.gather(mi.UInt8, mi.UInt8(shown.fine(window).ravel()), y * dr.opaque(mi.UInt32, window[2]) + x, inside) > 0
-    )
-    samples = _samples(u, v, spp, seed, fine, times)
-    more = dr.select(fine, dr.opaque(mi.UInt32, times), 1)
-    each = dr.opaque(mi.UInt32, size) * more
+    u, v = mi.Int32(x) + grid.corner[0], mi.Int32(y) + grid.corner[1]
+    group = packet - tile * count + first
+    width, height = grid.size
+    inside = (x < width) & (y < height)
+    finely = dr.gather(mi.UInt8, fine, y * width + x, inside) > 0
+    samples = _samples(u, v, pattern, finely)
+    more = dr.select(finely, times, 1)
+    each = size * more
 
     def number(j: mi.UInt32) -> mi.UInt32:
         return group * each + j
 
     def ray(j: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
         spot = samples.in_pixel(number(j))
-        o, d, cosine = camera_ray(shown.values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
+        o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
         cosine = cosine * cosine
         return o, d, cosine * cosine
 
-    lights = shown.lights
-    groups, all_samples, suns = dr.opaque(mi.UInt32, spp // size), samples.count, lights.suns
+    all_samples, suns = samples.count, lights.suns
     # A frame without lamps has a dark one. The sun comes first, and the others are taken in turn.
     others = dr.maximum(lights.count, 1) - suns
     lamps = dr.maximum(others, 1)
@@ -311,12 +354,15 @@ def _groups(
         share = mi.Float(users) / mi.Float(dr.maximum((users + lamps - 1 - which) // lamps, 1))
         return lights[dr.select(first, lights.count - 1, which)], dr.select(first, 1, share)
 
+    across, tile_rows, tile_columns = grid.plain
+    # Lanes may be outside.
+    place = dr.minimum(y // across, tile_rows - 1) * tile_columns + dr.minimum(x // across, tile_columns - 1)
     several = groups < others
     parts, radiance, failures = shade_group(
-        shown.values,
+        values,
         lights,
-        shown.textures,
-        shown.scene,
+        textures,
+        scene,
         Group(
             each,
             ray,
@@ -326,9 +372,9 @@ def _groups(
             lambda j, k: in_turn(number(j), k, all_samples),
             count_of(group, groups),
             lambda k: in_turn(group, k, groups),
-            (suns > 0) | ((lamps <= _FEW_LAMPS) & ~several & dr.opaque(mi.Bool, lights.widest < SMALL)),
+            (suns > 0) | ((lamps <= _FEW_LAMPS) & ~several & small),
             suns > 0,
-            _plain(plain, window, u, v),
+            dr.gather(mi.UInt8, plain, place) > 0,
             layered,
         ),
     )
@@ -337,21 +383,4 @@ def _groups(
     lanes = [x for p in parts for x in (p.radiance, p.weight * one, p.near * one)] if layered else [radiance]
     lanes = [x / mi.Float(more) for x in lanes]
     dr.eval(lanes, failures)
-
-    def summed(lane: mi.Float) -> Floats:
-        tiles = lane.numpy().reshape(rows, columns, count, _TILE, _TILE).sum(axis=2, dtype=float)
-        seen = tiles.transpose(0, 2, 1, 3).reshape(rows * _TILE, columns * _TILE)[: window[3], : window[2]]
-        return np.asarray(seen.reshape(-1))
-
-    return [summed(lane) for lane in lanes], int(dr.sum(failures).numpy()[0])
-
-
-def _plain(plain: tuple[Bools, int], window: Window, u: mi.Int32, v: mi.Int32) -> mi.Bool:
-    """Whether pixels of a window show nothing but skin."""
-    tiles, across = plain
-    x, y, size, rows, columns = (dr.opaque(mi.Int32, k) for k in (*window[:2], across, *tiles.shape))
-    row, column = (
-        dr.minimum((v - y) // size, rows - 1),
-        dr.minimum((u - x) // size, columns - 1),
-    )  # lanes may be outside
-    return dr.gather(mi.UInt32, mi.UInt32(aligned(tiles.ravel().astype(np.uint32))), row * columns + column) > 0
+    return lanes, failures

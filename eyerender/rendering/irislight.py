@@ -17,6 +17,8 @@ import mitsuba as mi
 
 from .lampviews import LampViews
 from .lightgrid import LightGrid
+from .parameters import leaves
+from .recorded import recorded
 from .values import Lights, Values
 
 _SIDE = 80
@@ -25,6 +27,8 @@ _SPARE_MM = 0.3  # beyond the root of the iris
 
 class IrisLight:
     """The light of the lamps in the plane of the iris."""
+
+    DRJIT_STRUCT = leaves("_values", "_points", "_used", "_half", "_grid")
 
     def __init__(self, values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None) -> None:
         """Prepare the grid.
@@ -53,16 +57,25 @@ class IrisLight:
     def make(self) -> None:
         """Fill the grid, once."""
         if self._grid is None:
-            self._grid = LightGrid(_SIDE)
+            grid = LightGrid(_SIDE)
             if self._lights.gridded:
-                self._grid.fill(self._on_grid(*self._grid.nodes()))
+                grid.rows = self._rows(self._lights, self._scene, self._views)
+            self._grid = grid
 
-    def _on_grid(self, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
+    @recorded
+    def _rows(self, lights: Lights, scene: mi.Scene, views: LampViews | None) -> mi.Float:
+        """Numbers of the filled grid."""
+        grid = LightGrid(_SIDE)
+        grid.fill(self._on_grid(lights, scene, views, *grid.nodes()))
+        return grid.rows
+
+    def _on_grid(
+        self, lights: Lights, scene: mi.Scene, views: LampViews | None, column: mi.UInt32, row: mi.UInt32
+    ) -> mi.Float:
         """Irradiance at points of the grid; negative where anything may hide a lamp, or a path was not found."""
         from .lighting import LampPath, behind
 
-        values, lights = self._values, self._lights
-        stop = values.stop
+        values, stop = self._values, self._values.stop
         a, b = (self._half * (mi.Float(k) * (2 / (_SIDE - 1)) - 1) for k in (column, row))
         x = stop.centre + a * stop.u + b * stop.v
         points = self._points
@@ -76,12 +89,12 @@ class IrisLight:
             lamp = lights[i]
             turn = (mi.Float(k - i * points) + 0.5) * (0.5 * dr.pi)
             source = lamp.point(dr.select(points > 1, 0.5, 0), *dr.sincos(turn))
-            path = LampPath.to(values, self._scene, lamp, source, x, within)
+            path = LampPath.to(values, scene, lamp, source, x, within)
             total += dr.select(path.blocked, 0, path.gain)
             hidden |= path.failed
-            if self._views is not None:
+            if views is not None:
                 entry = values.point_to_scene(path.entry)
-                hidden |= path.enters & (path.blocked | ~self._views.clear(i, entry, path.enters))
+                hidden |= path.enters & (path.blocked | ~views.clear(i, entry, path.enters))
             return k + 1, total, hidden
 
         state = (mi.UInt32(0), mi.Float(0), mi.Bool(False))

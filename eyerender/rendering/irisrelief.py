@@ -18,13 +18,17 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from .parameters import leaves
+from .recorded import recorded
 from .surfaces import Surface
 from .values import Lights, Values
 from .view import Textures, iris_height
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
 _CELL_PX, _LEAST, _MOST = 0.5, 320, 448  # size of a cell in the picture, cells across: fewer would flatten slopes
+_STEP = 16  # in the number of cells across: a new number has Dr.Jit record anew
 _STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for what stands before a lamp
 _FIXED_POINT_STEPS = 4
 _SPARE_MM, _RAISED_MM = 0.1, 0.2
@@ -32,6 +36,8 @@ _SPARE_MM, _RAISED_MM = 0.1, 0.2
 
 class IrisRelief:
     """Height of the iris above its plane and the lamps' light on it, on a grid over the plane."""
+
+    DRJIT_STRUCT = leaves("_values", "_half", "_count", "_on", "_each", "_heights", "_shades")
 
     def __init__(self, values: Values, lights: Lights, scene: mi.Scene, textures: Textures, px_per_mm: float) -> None:
         """Prepare the grid.
@@ -46,9 +52,10 @@ class IrisRelief:
         self._values, self._lights, self._scene, self._textures = values, lights, scene, textures
         self._half = values.iris.root_radius + _SPARE_MM
         across = 2 * float(self._half.numpy()[0]) * px_per_mm / _CELL_PX
-        self._side = int(min(max(across, _LEAST), _MOST))
+        self._side = int(min(max(_STEP * np.ceil(across / _STEP), _LEAST), _MOST))
         self._count = dr.opaque(mi.UInt32, self._side)
         self._on = dr.opaque(mi.Bool, textures.raised)
+        self._each = dr.opaque(mi.UInt32, lights.points)
         self._heights: mi.Float | None = None
         self._shades: mi.Float | None = None
 
@@ -81,18 +88,30 @@ class IrisRelief:
             self._heights = self._shades = dr.zeros(mi.Float, 4)
             dr.make_opaque(self._heights)
             return
-        index = dr.arange(mi.UInt32, self._side * self._side)
+        lanes = _COARSE * _COARSE * self._lights.points * max(len(self._lights), 1)
+        self._heights, self._shades = self._filled(
+            self._lights, self._scene, self._textures.heights, self._side**2, lanes
+        )
+
+    @recorded
+    def _filled(
+        self, lights: Lights, scene: mi.Scene, pattern: mi.Texture2f, cells: int, lanes: int
+    ) -> tuple[mi.Float, mi.Float]:
+        """Both grids, with so many cells, from so many paths of light."""
+        index = dr.arange(mi.UInt32, cells)
         row = index // self._count
         column = index - row * self._count
         x = self._place(mi.Float(column), mi.Float(row), self._count)
-        heights = iris_height(self._values, self._textures, x)
+        heights = iris_height(self._values, pattern, x)
         dr.eval(heights)
-        self._heights = self._packed(heights, column, row)
-        dr.eval(self._heights)
-        shades = self._lit(heights, column, row, x)
+        packed = self._packed(heights, column, row)
+        dr.eval(packed)
+        lamps = self._lamps(lights, scene, lanes)
+        shades = self._lit(lights, lamps, heights, packed, column, row, x)
         dr.eval(shades)
-        self._shades = self._packed(shades, column, row)
-        dr.eval(self._shades)
+        shades = self._packed(shades, column, row)
+        dr.eval(shades)
+        return packed, shades
 
     def _place(self, column: mi.Float, row: mi.Float, count: mi.UInt32) -> mi.Vector3f:
         """Point of the plane at a place of a grid with `count` places across."""
@@ -117,31 +136,28 @@ class IrisRelief:
         """The four corners of every cell, side by side."""
         last = self._count - 1
         right, below = dr.minimum(column + 1, last), dr.minimum(row + 1, last)
-        out = dr.zeros(mi.Float, 4 * self._side * self._side)
+        out = dr.zeros(mi.Float, 4 * dr.width(values))
         index = 4 * (row * self._count + column)
         for k, (i, j) in enumerate(((column, row), (right, row), (column, below), (right, below))):
             dr.scatter(out, dr.gather(mi.Float, values, j * self._count + i), index + k)
         return out
 
-    def _lamps(self) -> tuple[mi.Float, mi.UInt32]:
-        """E, E t_u, E t_v and E' of points of the lamps at coarse places, in rows; the number of these points."""
+    def _lamps(self, lights: Lights, scene: mi.Scene, lanes: int) -> mi.Float:
+        """E, E t_u, E t_v and E' of points of the lamps at coarse places, in rows."""
         from .lighting import LampPath
 
-        values, lights = self._values, self._lights
-        points = lights.points
-        count = dr.opaque(mi.UInt32, _COARSE)
-        index = dr.arange(mi.UInt32, _COARSE * _COARSE * points * max(len(lights), 1))
+        values, each, count = self._values, self._each, mi.UInt32(_COARSE)
+        index = dr.arange(mi.UInt32, lanes)
         spot = index // (_COARSE * _COARSE)
         place = index - spot * (_COARSE * _COARSE)
         row = place // count
         x = self._place(mi.Float(place - row * count), mi.Float(row), count)
-        each = dr.opaque(mi.UInt32, points)
         lamp = lights[spot // each]
         turn = (mi.Float(spot - (spot // each) * each) + 0.5) * (0.5 * dr.pi)
         source = lamp.point(dr.select(each > 1, 0.5, 0), *dr.sincos(turn))
         normal = values.stop.normal
-        path = LampPath.to(values, self._scene, lamp, source, x, lights.count > 0)
-        above = LampPath.to(values, self._scene, lamp, source, x + _RAISED_MM * normal, lights.count > 0)
+        path = LampPath.to(values, scene, lamp, source, x, lights.count > 0)
+        above = LampPath.to(values, scene, lamp, source, x + _RAISED_MM * normal, lights.count > 0)
         lit = dr.select(path.blocked, 0, path.gain)
         more = dr.select(above.gain > 0, (above.gain - path.gain) / _RAISED_MM, 0)
         lateral = _arrival(values.surfaces, source, path.entry, normal)
@@ -150,9 +166,18 @@ class IrisRelief:
         for k, value in enumerate(rows):
             dr.scatter(out, dr.select(lit > 0, value, 0), 4 * index + k)
         dr.eval(out)
-        return out, lights.count * each
+        return out
 
-    def _lit(self, heights: mi.Float, column: mi.UInt32, row: mi.UInt32, x: mi.Vector3f) -> mi.Float:
+    def _lit(
+        self,
+        lights: Lights,
+        lamps: mi.Float,
+        heights: mi.Float,
+        packed: mi.Float,
+        column: mi.UInt32,
+        row: mi.UInt32,
+        x: mi.Vector3f,
+    ) -> mi.Float:
         """The q of the module's docstring at points of the grid."""
         last, stop = self._count - 1, self._values.stop
         per = mi.Float(last) / (2 * self._half)
@@ -166,8 +191,7 @@ class IrisRelief:
         hv = slope(below * self._count + column, above * self._count + column, below - above)
         h = dr.gather(mi.Float, heights, row * self._count + column)
         steep = dr.max(dr.sqrt(hu * hu + hv * hv))
-        lamps, spots = self._lamps()
-        coarse = dr.opaque(mi.UInt32, _COARSE)
+        spots, coarse = lights.count * self._each, mi.UInt32(_COARSE)
         i, j, s, t = self._cell(x, coarse)
         place = j * coarse + i
 
@@ -181,17 +205,15 @@ class IrisRelief:
             way = tu * stop.u + tv * stop.v
             asked = (both.x > 0) & (facing > 0) & (dr.norm(way) * steep > 1)
             here = dr.maximum(both.x + h * both.w, 0)
-            return k + 1, whole + both.x, seen + here * facing * (1 - self._hidden(x, h, way, asked))
+            return k + 1, whole + both.x, seen + here * facing * (1 - self._hidden(packed, x, h, way, asked))
 
         state = (mi.UInt32(0), mi.Float(0) * h, mi.Float(0) * h)
         labels = ("k", "whole", "seen")
         _, whole, seen = dr.while_loop(state, lambda k, *_: k < spots, lamp, labels=labels, label="relief")
         return dr.select(whole > 0, seen / whole * dr.rsqrt(1 + hu * hu + hv * hv), 1)
 
-    def _hidden(self, x: mi.Vector3f, h: mi.Float, way: mi.Vector3f, asked: mi.Bool) -> mi.Float:
+    def _hidden(self, packed: mi.Float, x: mi.Vector3f, h: mi.Float, way: mi.Vector3f, asked: mi.Bool) -> mi.Float:
         """Share by which heights beside points hide what lies in the direction `way`, 0 to 1."""
-        assert self._heights is not None
-        packed = self._heights
 
         def step(k: mi.UInt32, hidden: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             part = mi.Float(k + 1) / _STEPS

@@ -23,6 +23,7 @@ import numpy as np
 from ..arrays import Floats
 from ..region.mesh import HAIRS, RegionMesh
 from ..rig.light import Lamp
+from .parameters import leaves
 from .values import aligned
 
 if TYPE_CHECKING:
@@ -44,6 +45,8 @@ class LampViews:
         reach_mm: distance from this origin within which skin matters.
         region: the posed region; None for one whose sheet is not known to be one surface, where every cell is marked.
     """
+
+    DRJIT_STRUCT = leaves("_table", "_known", "_marks")
 
     def __init__(self, lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float, region: RegionScene | None) -> None:
         reach = min(reach_mm, _REACH_MM)

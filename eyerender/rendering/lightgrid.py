@@ -9,16 +9,20 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .parameters import leaves
+
 _BENT = 0.004  # largest third difference of a cell over its irradiance
 
 
 class LightGrid:
     """Irradiance at the nodes of a grid of `side` by `side`."""
 
+    DRJIT_STRUCT = leaves("side", "rows")
+
     def __init__(self, side: int) -> None:
         self.side = side
-        self._rows = dr.full(mi.Float, -1, 4 * side * side)
-        dr.make_opaque(self._rows)
+        self.rows = dr.full(mi.Float, -1, 4 * side * side)
+        dr.make_opaque(self.rows)
 
     def nodes(self) -> tuple[mi.UInt32, mi.UInt32]:
         """Column and row of all nodes, in row order."""
@@ -52,8 +56,8 @@ class LightGrid:
             four = [value + dr.gather(mi.Float, more, place) for value, place in zip(four, places[1], strict=True)]
         first = dr.abs(four[0])
         for k, value in enumerate((dr.select(good, first, -first), *four[1:])):
-            dr.scatter(self._rows, value, 4 * index + k)
-        dr.eval(self._rows)
+            dr.scatter(self.rows, value, 4 * index + k)
+        dr.eval(self.rows)
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Bool]:
         """Irradiance at places in units of cells, and whether it is known there."""
@@ -63,7 +67,7 @@ class LightGrid:
         wu, wv = _weights(u - mi.Float(i)), _weights(v - mi.Float(j))
         total, known = mi.Float(0), mi.Bool(inside)
         for k, weight in enumerate(wv):
-            row = dr.gather(mi.Vector4f, self._rows, (j + k - 1) * side + i, inside)
+            row = dr.gather(mi.Vector4f, self.rows, (j + k - 1) * side + i, inside)
             if k == 1:
                 known &= row.x > 0
             total += weight * (wu[0] * dr.abs(row.x) + wu[1] * row.y + wu[2] * row.z + wu[3] * row.w)

@@ -18,6 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .parameters import leaves
+
 _WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
 
 
@@ -34,6 +36,8 @@ class Rectangle:
 
 class Panels:
     """The rectangles of a frame, (n, 13) numbers in one buffer; kernels do not depend on their number."""
+
+    DRJIT_STRUCT = leaves("count", "_buffer")
 
     def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
         self.count = dr.opaque(mi.UInt32, len(table))

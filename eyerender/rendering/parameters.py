@@ -18,8 +18,21 @@ if TYPE_CHECKING:
 
 Kind = Literal["quadric", "biconic", "measured"]
 _Tree = TypeVar("_Tree")
+_Record = TypeVar("_Record")
 
 
+def leaves(*names: str) -> dict[str, Any]:
+    """Names of the attributes that Dr.Jit finds in the objects of a class, which keeps them as its `DRJIT_STRUCT`."""
+    return dict.fromkeys(names, Any)
+
+
+def traversed(record: type[_Record]) -> type[_Record]:
+    """Let Dr.Jit find all fields of a dataclass whose annotations it cannot resolve."""
+    record.DRJIT_STRUCT = leaves(*(f.name for f in fields(record)))  # type: ignore[attr-defined, arg-type]
+    return record
+
+
+@traversed
 @dataclass(frozen=True, slots=True)
 class SurfaceParameters:
     """One refracting surface in the eye frame, lengths in mm.
@@ -40,6 +53,7 @@ class SurfaceParameters:
     film: mi.Float | None = None
 
 
+@traversed
 @dataclass(frozen=True, slots=True)
 class StopParameters:
     """The aperture stop: centre, normal, directions u and v of its semi-axes (all (3,)), and the semi-axes (mm)."""
@@ -51,6 +65,7 @@ class StopParameters:
     axes: tuple[mi.Float, mi.Float]
 
 
+@traversed
 @dataclass(frozen=True, slots=True)
 class IrisParameters:
     """The iris.
@@ -67,6 +82,7 @@ class IrisParameters:
     convexity: mi.Float
 
 
+@traversed
 @dataclass(frozen=True, slots=True)
 class LimbusParameters:
     """The limbus and the cornea before it.
@@ -88,6 +104,7 @@ class LimbusParameters:
     bulge_radius: mi.Float
 
 
+@traversed
 @dataclass(frozen=True, slots=True)
 class ScleraParameters:
     """The sclera: centre (3,) and radius of the sphere (mm), mean albedo and contrast of the texture."""
@@ -98,6 +115,7 @@ class ScleraParameters:
     contrast: mi.Float
 
 
+@traversed
 @dataclass(frozen=True, slots=True)
 class PoseParameters:
     """The pose x_scene = columns x_eye + shift: three columns of the rotation (3,) each, and the shift (3,) mm."""
@@ -106,6 +124,7 @@ class PoseParameters:
     shift: mi.Vector3f
 
 
+@traversed
 @dataclass(frozen=True, slots=True)
 class CameraParameters:
     """Camera as the kernels use it.
@@ -123,6 +142,7 @@ class CameraParameters:
     distortion: tuple[mi.Float, ...]
 
 
+@traversed
 @dataclass(frozen=True, slots=True)
 class ImageParameters:
     """The stop's Gaussian image seen from outside: lateral magnification, and shift along x (mm)."""
@@ -131,6 +151,7 @@ class ImageParameters:
     shift: mi.Float
 
 
+@traversed
 @dataclass(frozen=True, slots=True)
 class Parameters:
     """All parameters of a frame; eye frame and scene's frame are in mm.

@@ -11,11 +11,15 @@ import mitsuba as mi
 import numpy as np
 
 from ..eye.fundus import CELLS, EDGE, FundusLight
+from .parameters import leaves
+from .recorded import recorded
 from .values import Lights, Values, aligned
 
 
 class PupilLight:
     """Radiance in air (mW/mm^2/sr) that leaves the pupil, before the transmittance of the cornea."""
+
+    DRJIT_STRUCT = leaves("_cells")
 
     def __init__(self, values: Values, lights: Lights, scene: mi.Scene, returned: FundusLight) -> None:
         """Prepare the grid.
@@ -51,25 +55,30 @@ class PupilLight:
             self._cells = dr.zeros(mi.Float, CELLS * CELLS)
             dr.make_opaque(self._cells)
             return
-        from .lighting import LampPath
+        self._cells = _filled(self._values, self._lights, self._scene, mi.Float(self._factors))
 
-        values, lights, factors = self._values, self._lights, mi.Float(self._factors)
-        index = dr.arange(mi.UInt32, CELLS * CELLS)
-        row = index // CELLS
-        u, v = ((mi.Float(k) + 0.5) * (2 * EDGE / CELLS) - EDGE for k in (index - row * CELLS, row))
-        a, b = values.stop.axes
-        # Points beyond the margin get the light of the nearest point within it.
-        shrink = dr.rcp(dr.maximum(dr.sqrt(u * u + v * v), 1))
-        x = values.stop.centre + (u * shrink * a) * values.stop.u + (v * shrink * b) * values.stop.v
 
-        def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            factor = dr.gather(mi.Float, factors, i * (CELLS * CELLS) + index)
-            lamp = lights[i]
-            path = LampPath.to(values, self._scene, lamp, lamp.position, x, factor > 0)
-            return i + 1, total + dr.select(path.blocked, 0, path.gain * factor)
+@recorded
+def _filled(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float) -> mi.Float:
+    """Numbers of the grid, from the return factors of the lamps."""
+    from .lighting import LampPath
 
-        state = (mi.UInt32(0), mi.Float(0) * x.x)
-        labels = ("i", "total")
-        _, total = dr.while_loop(state, lambda i, _: i < lights.count, body, labels=labels, label="light of the fundus")
-        dr.eval(total)
-        self._cells = total
+    index = dr.arange(mi.UInt32, CELLS * CELLS)
+    row = index // CELLS
+    u, v = ((mi.Float(k) + 0.5) * (2 * EDGE / CELLS) - EDGE for k in (index - row * CELLS, row))
+    a, b = values.stop.axes
+    # Points beyond the margin get the light of the nearest point within it.
+    shrink = dr.rcp(dr.maximum(dr.sqrt(u * u + v * v), 1))
+    x = values.stop.centre + (u * shrink * a) * values.stop.u + (v * shrink * b) * values.stop.v
+
+    def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        factor = dr.gather(mi.Float, factors, i * (CELLS * CELLS) + index)
+        lamp = lights[i]
+        path = LampPath.to(values, scene, lamp, lamp.position, x, factor > 0)
+        return i + 1, total + dr.select(path.blocked, 0, path.gain * factor)
+
+    state = (mi.UInt32(0), mi.Float(0) * x.x)
+    labels = ("i", "total")
+    _, total = dr.while_loop(state, lambda i, _: i < lights.count, body, labels=labels, label="light of the fundus")
+    dr.eval(total)
+    return total

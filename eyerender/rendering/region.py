@@ -26,6 +26,7 @@ from ..region.lids import ROWS
 from ..region.mapcache import kept
 from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh, sheet_ends
 from ..region.skin import SHEET_ROWS, skin_texels
+from .parameters import leaves
 from .surround import clear_between, rays_between
 from .values import aligned
 
@@ -142,7 +143,7 @@ def _mean_slopes(pixels: NDArray[np.float16]) -> dict[int, mi.Float]:
 
 
 def _floats(values: Floats) -> mi.Float:
-    return mi.Float(values.astype(np.float32).ravel())
+    return mi.Float(aligned(values.astype(np.float32).ravel()))
 
 
 def _water(layout: RegionLayout) -> slice:
@@ -185,6 +186,10 @@ class SkinGeometry:
 
     `water` holds the menisci, which are not in the scene because light passes through them; None if they are opaque.
     """
+
+    DRJIT_STRUCT = leaves(
+        "_map", "water", "is_sheet", "_corners", "_buffer", "_received", "_moving", "_first_still", "_sheet", "_mirror"
+    )
 
     def __init__(
         self,

@@ -20,6 +20,7 @@ from .integrator import integrator_class
 from .labels import PartLabels, depths_mm, highlights, part_labels
 from .lighting import through_cornea
 from .occlusion import lid_margins_px
+from .recorded import uncollected
 from .region import RegionScene
 from .splat import add_glints
 from .stage import Stage
@@ -79,6 +80,7 @@ class Renderer:
         """
         return self._beside.submit(self._traced(job, spp, moments, after).developed)
 
+    @uncollected
     def _traced(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob], after: RenderJob | None) -> Traced:
         shots = moments or (job,)
         spp = max(1, (spp or self.spp) // len(shots))

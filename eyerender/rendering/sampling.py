@@ -13,6 +13,7 @@ shadows show noise and no bands. Nothing depends on threads, on the window, or o
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -25,6 +26,7 @@ from .values import Values
 _PHI = 1.324717957244746
 _ALPHA = tuple(round(_PHI ** -(k + 1) * 2**32) for k in range(2))
 _UNDISTORT_STEPS = 8
+_CALLS = 3  # pairs of further numbers of a sample
 
 
 @lru_cache(maxsize=64)
@@ -48,22 +50,32 @@ def lattice_generator(count: int) -> int:
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """The samples of all pixels of a frame: numbers and generators of two lattices, and keys of the further numbers."""
+
+    lattices: tuple[tuple[mi.UInt32, mi.UInt32], tuple[mi.UInt32, mi.UInt32]]
+    keys: tuple[mi.UInt32, ...]
+
+    @classmethod
+    def of(cls, count: int, seed: int, times: int = 1) -> Pattern:
+        """Make the pattern of `count` samples, `times` as many in fine pixels."""
+        lattices = (
+            (dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, lattice_generator(n))) for n in (count, count * times)
+        )
+        states = (np.random.SeedSequence([seed, call]).generate_state(1)[0] for call in range(_CALLS))
+        few, many = lattices
+        return cls((few, many), tuple(dr.opaque(mi.UInt32, int(state)) for state in states))
+
+
 class Samples:
     """The `count` samples of the pixels of a frame, for lanes with a place on the sensor (`pixel`)."""
 
-    def __init__(
-        self, pixel: mi.UInt32, count: int, seed: int, calls: int = 3, fine: mi.Bool | bool = False, times: int = 1
-    ) -> None:
-        self.pixel = pixel
-        # Where `fine`, a pixel has `times` as many samples.
-        self.count, self._a = (
-            dr.select(fine, dr.opaque(mi.UInt32, f(count * times)), dr.opaque(mi.UInt32, f(count)))
-            for f in (int, lattice_generator)
-        )
-        self._keys = [
-            dr.opaque(mi.UInt32, int(np.random.SeedSequence([seed, call]).generate_state(1)[0]))
-            for call in range(calls)
-        ]
+    def __init__(self, pixel: mi.UInt32, pattern: Pattern, fine: mi.Bool | bool = False) -> None:
+        self.pixel, self._keys = pixel, pattern.keys
+        # Where `fine`, a pixel has more samples.
+        (few, one), (many, other) = pattern.lattices
+        self.count, self._a = dr.select(fine, many, few), dr.select(fine, other, one)
 
     def in_pixel(self, k: mi.UInt32) -> mi.Point2f:
         """Place of sample `k` in the pixel, [0, 1)^2."""

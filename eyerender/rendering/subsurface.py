@@ -34,6 +34,7 @@ from ..region.mesh import RegionMesh
 from ..region.skin import BANDS, SHEET_ROWS, sheet_place
 from .frame import globe_of
 from .lighting import irradiance, lamp_blocked
+from .parameters import leaves
 from .region import GRID_COLUMNS, GRID_ROWS, SHEET_COLUMNS
 from .values import Lights, Values, aligned
 from .view import EPSILON_MM
@@ -164,21 +165,23 @@ class _Places:
 class TissueLight:
     """Light of the lamps on skin and globe, each after its way through the tissue."""
 
+    DRJIT_STRUCT = leaves("_size", "_skin", "_globe", "_values")
+
     def __init__(
-        self, grid: SheetGrid, skin: tuple[mi.Float, mi.Float], globe: tuple[mi.Float, mi.Float], values: Values
+        self, size: Size, skin: tuple[mi.Float, mi.Float], globe: tuple[mi.Float, mi.Float], values: Values
     ) -> None:
         """Take light of cells, and the shares of each lamp that they see, on skin and globe."""
-        self._grid, self._skin, self._globe, self._values = grid, skin, globe, values
+        self._size, self._skin, self._globe, self._values = size, skin, globe, values
 
     def on_skin(self, u: mi.Float, v: mi.Float) -> mi.Float:
         """Irradiance (mW/mm^2) at coordinates of the map of the skin."""
-        return self._grid.between(mi.Float, self._skin[0], *self._grid.place(u, v), 0)
+        return self._size.between(mi.Float, self._skin[0], *self._size.place(u, v), 0)
 
     def skin_sees(self, lamp: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.Float:
         """Share of a lamp that the skin sees at coordinates of its map."""
-        grid = self._grid
-        first = lamp * grid.count(1)
-        return dr.clip(grid.between(mi.Float, self._skin[1], *grid.place(u, v), 1, first), 0, 1)
+        size = self._size
+        first = lamp * size.count(1)
+        return dr.clip(size.between(mi.Float, self._skin[1], *size.place(u, v), 1, first), 0, 1)
 
     def on_globe(self, x: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
@@ -219,7 +222,7 @@ def tissue_light(
     sheet = make.sheet(skin, thick)
     loss = transmitted(job.region.skin.albedo, scattering.skin_per_mm)
     globe = GlobeGrid.of(place.posed, globe_of(job.eye, job.M, job.t - job.anchor_mm), _SPARE * thin)
-    return TissueLight(skin, sheet, make.globe(globe, skin, sheet[0], thin, loss), values)
+    return TissueLight(skin.size, sheet, make.globe(globe, skin.size, sheet[0], thin, loss), values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,12 +239,12 @@ class _Maker:
         """Light on the skin after its way through the tissue, and how much of each lamp coarse cells see."""
         straight, seen = self._from_lamps(grid)
         index = grid.sent[0]
-        columns = grid.size[1]
+        columns = grid.size.columns
         row, column = index // columns, index % columns
         across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / mi.Float(columns))
         _, n = self.skin.sheet_point(grid.vertex_row(row, mi.Float(0.5)), across)
         relief = dr.gather(mi.Vector2f, self.skin.relief[grid.rows], index)
-        flux = grid.between(mi.Vector4f, straight, mi.Float(row), mi.Float(column), 1)
+        flux = grid.size.between(mi.Vector4f, straight, mi.Float(row), mi.Float(column), 1)
         facing = dr.dot(mi.Vector3f(flux.x, flux.y, flux.z), self.skin.tilted(n, relief.x, relief.y))
         return grid.spread(grid.whole(dr.maximum(facing, 0)), length_mm), seen
 
@@ -255,7 +258,7 @@ class _Maker:
             The vectors, and for each lamp the share of it that each cell sees.
         """
         values, lights, skin = self.values, self.lights, self.skin
-        cells, columns = grid.rows * grid.columns // 4, grid.size[1] // 2
+        cells, columns = grid.rows * grid.columns // 4, grid.size.columns // 2
         straight = dr.zeros(mi.Float, 4 * cells)
         seen = dr.zeros(mi.Float, max(len(lights), 1) * cells)
         index = grid.sent[1]
@@ -300,7 +303,7 @@ class _Maker:
                 state, lambda k, *_: k < count, at_point, labels=labels, label="points of a lamp"
             )
             share = dr.rcp(dr.maximum(mi.Float(count), 1))
-            dr.scatter(seen, free * share, i * grid.count(1) + index)
+            dr.scatter(seen, free * share, i * grid.size.count(1) + index)
             return i + 1, total + flux * share
 
         state = (mi.UInt32(0), mi.Vector3f(0) * x.x)
@@ -314,7 +317,7 @@ class _Maker:
         return straight, seen
 
     def globe(
-        self, grid: GlobeGrid, skin: SheetGrid, sheet: mi.Float, length_mm: float, loss_per_mm: float
+        self, grid: GlobeGrid, skin: Size, sheet: mi.Float, length_mm: float, loss_per_mm: float
     ) -> tuple[mi.Float, mi.Float]:
         """Light on the globe between the lids after its way through the sclera, and how much of each lamp cells see."""
         # What comes through a lid varies slowly, so it is found for two by two cells.
@@ -376,7 +379,7 @@ class _Maker:
         met &= (y.y * y.y + y.z * y.z < dr.square(values.limbus.radius)) & (y.x > values.limbus.floor) & (t < away)
         return o - dr.select(met, t, away) * d, dr.normalize(dr.select(met, front.vector_out(facing), d))
 
-    def _through_lids(self, index: mi.UInt32, grid: SheetGrid, sheet: mi.Float, loss_per_mm: float) -> mi.Float:
+    def _through_lids(self, index: mi.UInt32, size: Size, sheet: mi.Float, loss_per_mm: float) -> mi.Float:
         """Irradiance of two by two cells of the globe by way of lids on them: exp(-k t) of that on the lid's skin."""
         values, skin, half = self.values, self.skin, _SIDE // 2
         n = _globe_direction(2 * mi.Float(index // half) + 0.5, 2 * mi.Float(index % half) + 0.5)
@@ -388,7 +391,7 @@ class _Maker:
         face = dr.select(outer.is_valid(), skin.face(outer), face)
         uv = dr.select(outer.is_valid(), outer.prim_uv, inner.prim_uv)
         under = inner.is_valid() & skin.on_sheet(face)
-        lit = grid.between(mi.Float, sheet, *grid.place(*skin.map_place(face, uv, under)), 0)
+        lit = size.between(mi.Float, sheet, *size.place(*skin.map_place(face, uv, under)), 0)
         return dr.select(under, lit * dr.exp(-loss_per_mm * last), 0)
 
     def _next(self, o: mi.Vector3f, d: mi.Vector3f, first: mi.Float, active: mi.Bool) -> mi.PreliminaryIntersection3f:
@@ -398,6 +401,43 @@ class _Maker:
         hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         hit.t += first
         return hit
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Numbers of rows and columns of a grid over the skin, on the device; the columns close."""
+
+    rows: mi.UInt32
+    columns: mi.UInt32
+
+    def count(self, level: int) -> mi.UInt32:
+        """Number of cells of the grid reduced by 2^level."""
+        return (self.rows * self.columns) >> (2 * level)
+
+    def place(self, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Row and column at coordinates of the map."""
+        rows, columns = (mi.Float(n) for n in (self.rows, self.columns))
+        return v * ((SHEET_ROWS + BANDS) / SHEET_ROWS) * rows - 0.5, u * columns - 0.5
+
+    def between(
+        self,
+        kind: Any,
+        buffer: mi.Float,
+        row: mi.Float,
+        column: mi.Float,
+        level: int,
+        first: mi.UInt32 | int = 0,
+    ) -> Any:
+        """Numbers between the cells of the grid reduced by 2^level, at places in units of its finest cells.
+
+        `first` is the number of the first cell in the buffer.
+        """
+        rows, columns, scale = self.rows >> level, self.columns >> level, 1 / (1 << level)
+        u = (column + 0.5) * scale - 0.5
+        u = dr.select(u < 0, u + mi.Float(columns), u)
+        j = dr.minimum(mi.UInt32(u), columns - 1)
+        right = dr.select(j + 1 < columns, j + 1, 0)
+        return _between(kind, buffer, (row + 0.5) * scale - 0.5, u - mi.Float(j), (j, right), (rows, columns), first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -417,7 +457,7 @@ class SheetGrid:
 
     rows: int
     columns: int
-    size: tuple[mi.UInt32, mi.UInt32]
+    size: Size
     cells: Ints
     sent: tuple[mi.UInt32, ...]
     edges: mi.Float
@@ -451,7 +491,7 @@ class SheetGrid:
         return cls(
             rows,
             columns,
-            (dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns)),
+            Size(dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns)),
             cells[0],
             tuple(_numbers(c) for c in cells),
             *(mi.Float(aligned(t.astype(np.float32).ravel())) for t in (edges, metric)),
@@ -472,45 +512,16 @@ class SheetGrid:
         places, light = _Places.of(length_mm), mi.Float(0)
         # The farther light has come, the more evenly it is spread, and the fewer cells tell it.
         for level, rings_of in reversed(list(enumerate(_LEVEL_RINGS))):
-            index, columns, size = self.sent[level], self.size[1] >> level, float(1 << level)
+            index, columns, size = self.sent[level], self.size.columns >> level, float(1 << level)
             row, column = ((mi.Float(n) + 0.5) * size - 0.5 for n in (index // columns, index % columns))
             wider, light = light, places.share((row, column), read, *rings_of)
             if level + 1 < len(_LEVEL_RINGS):
-                light += self.between(mi.Float, wider, row, column, level + 1)
+                light += self.size.between(mi.Float, wider, row, column, level + 1)
             dr.eval(light)
             everywhere = dr.zeros(mi.Float, self.rows * self.columns >> 2 * level)
             dr.scatter(everywhere, light, index)
             light = everywhere
         return light
-
-    def count(self, level: int) -> mi.UInt32:
-        """Number of cells of the grid reduced by 2^level."""
-        return (self.size[0] * self.size[1]) >> (2 * level)
-
-    def place(self, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Row and column at coordinates of the map."""
-        rows, columns = (mi.Float(n) for n in self.size)
-        return v * ((SHEET_ROWS + BANDS) / SHEET_ROWS) * rows - 0.5, u * columns - 0.5
-
-    def between(
-        self,
-        kind: Any,
-        buffer: mi.Float,
-        row: mi.Float,
-        column: mi.Float,
-        level: int,
-        first: mi.UInt32 | int = 0,
-    ) -> Any:
-        """Numbers between the cells of the grid reduced by 2^level, at places in units of its finest cells.
-
-        `first` is the number of the first cell in the buffer.
-        """
-        rows, columns, scale = self.size[0] >> level, self.size[1] >> level, 1 / (1 << level)
-        u = (column + 0.5) * scale - 0.5
-        u = dr.select(u < 0, u + mi.Float(columns), u)
-        j = dr.minimum(mi.UInt32(u), columns - 1)
-        right = dr.select(j + 1 < columns, j + 1, 0)
-        return _between(kind, buffer, (row + 0.5) * scale - 0.5, u - mi.Float(j), (j, right), (rows, columns), first)
 
     def whole(self, values: mi.Float) -> Singles:
         """Numbers (rows, columns) of all cells, 0 for those that do not matter."""
@@ -525,14 +536,14 @@ class SheetGrid:
 
     def step(self, row: mi.Float, column: mi.Float, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Go x mm along a row and y mm across: the new row and column, and the size of a cell (mm)."""
-        columns, around = SHEET_COLUMNS - 1, mi.Float(self.size[1])
+        columns, around = SHEET_COLUMNS - 1, mi.Float(self.size.columns)
         i = mi.UInt32(row + 0.5)
         j = mi.UInt32((column + 0.5) * (columns / around) + 0.5)
         m = dr.gather(mi.Vector4f, self.metric, i * columns + dr.select(j < columns, j, 0))
         down = y * m.z
         column += (x - m.y * down) * m.x
         column -= dr.floor(column / around) * around
-        return dr.clip(row + down, 0, mi.Float(self.size[0]) - 1), dr.minimum(column, around - 0.51), m.w
+        return dr.clip(row + down, 0, mi.Float(self.size.rows) - 1), dr.minimum(column, around - 0.51), m.w
 
 
 @dataclass(frozen=True, slots=True)

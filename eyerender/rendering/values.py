@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .parameters import Kind, Parameters, packed, rebuilt
+from .parameters import Kind, Parameters, leaves, packed, rebuilt
 from .surfaces import Surface
 
 if TYPE_CHECKING:
@@ -61,6 +61,11 @@ class Structure:
 
 class Values:
     """The parameters of a frame on the device, and the shape of the pupil's boundary (`boundary`)."""
+
+    DRJIT_STRUCT = leaves(
+        "structure", "boundary", "surfaces", "stop", "iris", "limbus", "sclera", "image", "pose", "camera",
+        "inner_index", "pupil_albedo", "globe_reach", "backdrop_x", "ambient_irradiance",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -120,6 +125,8 @@ class PupilBoundary:
     `waves` (n, 2) are the z_k = c_k - i s_k, k from 1, as pairs. An ellipse has none and costs nothing.
     """
 
+    DRJIT_STRUCT = leaves("count", "_buffer")
+
     def __init__(self, waves: np.ndarray[Any, np.dtype[np.float64]]) -> None:
         self.count = dr.opaque(mi.UInt32, len(waves))
         table = np.zeros((HARMONICS, 2), np.float32)
@@ -153,6 +160,8 @@ class Lights:
     in the plane of the iris and on matte surfaces where grids of it are used, and `relief` is the iris' relief in their
     light.
     """
+
+    DRJIT_STRUCT = leaves("count", "suns", "_buffer", "on_iris", "on_matte", "relief")
 
     def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]], suns: int = 0) -> None:
         self._len = len(table)

@@ -17,6 +17,7 @@ from ..region.iris import WIDTH_MM, DrawnPattern, iris_maps
 from ..region.look import Look
 from ..region.mapcache import kept
 from ..region.texture import sclera_texture
+from .parameters import traversed
 from .surround import HALF_MM
 from .values import Values
 
@@ -87,6 +88,7 @@ class View:
         return dr.rcp(dr.maximum(dr.select(deep, inside, self.distance * dr.dot(d, forward)), 1e-3))
 
 
+@traversed
 @dataclass(frozen=True, slots=True)
 class Textures:
     """Maps of the eye: relative albedo (mean 1) and height (mm) of the iris over (angle, pupil to root), the sclera's.
@@ -374,14 +376,14 @@ def _on_iris(texture: mi.Texture2f, s: mi.Float, turn: mi.Float) -> mi.Float:
     return texture.eval(mi.Point2f(turn, (1 + s * (rows - 2)) / rows))[0]
 
 
-def iris_height(values: Values, textures: Textures, x: mi.Vector3f) -> mi.Float:
-    """Height (mm) of the iris above points of its plane, 0 in the pupil and beyond the root.
+def iris_height(values: Values, heights: mi.Texture2f, x: mi.Vector3f) -> mi.Float:
+    """Height (mm) of the iris above points of its plane, 0 in the pupil and beyond the root, by the map of its heights.
 
     The pattern stretches with the iris. A narrow iris is as steep as a wide one, so its heights are less.
     """
     s, turn, left, width = _iris_place(values, x)
     bulge = values.iris.convexity * dr.minimum(width / WIDTH_MM, 1) * 4 * s * (1 - s)
-    pattern = values.iris.relief * dr.minimum(width / _WIDE_MM, 1) * _on_iris(textures.heights, s, turn)
+    pattern = values.iris.relief * dr.minimum(width / _WIDE_MM, 1) * _on_iris(heights, s, turn)
     return dr.select((s > 0) & (left > 0), bulge + pattern, 0)
 
 

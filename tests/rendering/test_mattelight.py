@@ -19,7 +19,7 @@ def test_the_grids_change_no_pixel(renderer, monkeypatch, model, name, pose):
     found, part = renderer.radiance(job, spp=4), renderer.labels(job).part
     grids = renderer.bind(job)[0].lights.on_matte
     grids.make()
-    used = [float(np.mean(g._rows.numpy()[::4] > 0)) for g in grids._grids]
+    used = [float(np.mean(g.rows.numpy()[::4] > 0)) for g in grids._grids]
     assert min(used) > 0.2
     monkeypatch.setattr(stage, "MatteLight", lambda *_: None)
     truth = renderer.radiance(job, spp=4)
