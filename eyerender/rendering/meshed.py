@@ -26,6 +26,7 @@ from ..arrays import Bools, Floats
 from ..eye.meshes import Patch, cornea_patches
 from ..eye.model import EyeModel
 from ..geometry.surfaces import Surface as ExactSurface
+from .parameters import leaves
 from .surfaces import Bundle, NormalForm, Surface
 from .values import aligned
 
@@ -57,6 +58,8 @@ class Mirror(NamedTuple):
 
 class SurfaceMesh:
     """One surface as a mesh, in its own frame (+x outward, mm), on host and device."""
+
+    DRJIT_STRUCT = leaves("scene", "_corners", "_records")
 
     def __init__(self, patch: Patch, surface: ExactSurface) -> None:
         self.rotation, self.origin = np.asarray(surface.rotation), np.asarray(surface.origin_mm)
