@@ -12,7 +12,7 @@ import numpy as np
 from .jit import compiled, inlined, summing
 from .kernels import NEAR, SECTORS, factored, median_of, nearest_on, sector_at, solved
 
-SHAPE, STILL_PX, KURTOSIS = 5, 5e-3, (-1.5, 3.0)  # as in covariance and least_squares
+SHAPE, STILL_PX, KURTOSIS = 5, 1.5e-2, (-1.5, 3.0)  # as in covariance and least_squares
 OUTLIER, FARTHEST, UNEVEN = 5.0, 3.5, 0.01  # as in occlusion and consensus
 _ROOT_HALF = math.sqrt(0.5)
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)

@@ -163,14 +163,14 @@ def _from_float(array: NDArray[np.generic], gamma: float) -> Image | str:
 
 
 def estimate_noise(linear: Image) -> float:
-    """Estimate the noise at about 20,000 places.
+    """Estimate the noise at about 10,000 places.
 
     sigma = 1.4826 median|d| / 2, d = I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1)
 
     The difference removes any plane, and the median ignores edges. Source: Immerkaer (1996), with a median for the
     mean.
     """
-    difference = _differences(linear, max(1, int(np.sqrt(linear.size / 20_000))))
+    difference = _differences(linear, max(1, int(np.sqrt(linear.size / 10_000))))
     # Flat areas that clipping made constant contain no information on the noise.
     moving = np.count_nonzero(difference)
     if moving < 0.05 * difference.size:

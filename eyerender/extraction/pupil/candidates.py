@@ -29,6 +29,9 @@ ANGLES = 48  # samples around a blob
 MOST_BLOBS = 12  # that are ranked
 # Share of the thresholds, darkest first, that is tried first. The others are tried if these give no candidate.
 DARKER = 0.6
+# The statistics inside an ellipse of this semi-axis are good enough. From twice that on, every second pixel of every
+# second row is taken, from three times that on every third.
+INSIDE_PX = 16.0
 SPOT_PX = 5.0  # radius of the glints that are removed first
 # Contours after which a sweep ends. Eyes have 20 to 2,000 in all its levels; noise and fine texture have tens of
 # thousands, which take half a second.
@@ -299,7 +302,9 @@ def inspect_interior(cleared: Cleared, ellipse: Ellipse, blur_px: float, noise_d
     crop, hidden = cleared.cut(columns, rows)
     (cx, cy) = ellipse.centre_px.tolist()
     end = min(0.85, 1.0 - 2.5 * blur_px / b)
-    about = (cx - columns.start, cy - rows.start, a, b, ellipse.angle_rad)
+    every = max(1, int(a / INSIDE_PX))
+    crop, hidden = np.ascontiguousarray(crop[::every, ::every]), np.ascontiguousarray(hidden[::every, ::every])
+    about = ((cx - columns.start) / every, (cy - rows.start) / every, a / every, b / every, ellipse.angle_rad)
     darker, core, ring, between = _interior(crop, hidden, about, end)
     spread = math.sqrt(max((0.7413 * between) ** 2 - noise_dn**2, 0.0))
     if end < 0.6 or core < 5 or ring < 5:

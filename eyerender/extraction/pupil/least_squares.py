@@ -25,7 +25,7 @@ FIXED = SHAPE + 7
 # lean).
 HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
 KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond them the edge would not be monotonic
-STILL_PX = 5e-3  # a fit ends with a step smaller than this
+STILL_PX = 1.5e-2  # a fit ends with a step smaller than this
 
 
 @dataclass(frozen=True, slots=True, eq=False)
