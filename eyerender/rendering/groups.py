@@ -18,7 +18,7 @@ from .water import through_water, wetted
 if TYPE_CHECKING:
     from .region import SkinGeometry
 
-_FAINT = 1e-3  # highlights so weak, relative to the other light, need no ray for their shadow
+_FAINT = 1e-3  # highlights so weak, relative to the other light or to a white surface, need no ray for their shadow
 _LIDS_MM = 18.0  # about the axis of the unrotated eye: the region of the lids, where lashes cast shadows
 
 
@@ -307,7 +307,7 @@ class _GroupShading:
                 return k + 1, total + lit * kept.weight * self.textures.tissues.skin_sees(lamp.number, *on_map)
             first = group.fine & (k == 0)
             shared = dr.select(first, kept.shared, kept.weight)
-            asked = (shared > 0) & (lit > faint)
+            asked = (shared > 0) & (lit > faint) & (lit > _FAINT * dr.inv_pi * share * outer)
             blocked = self.skin_blocked(lamp, source, view.point, on_sheet, asked)
             return k + 1, total + lit * (dr.select(first, kept.clear, 0) + dr.select(blocked, 0, shared))
 
