@@ -27,14 +27,15 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ..arrays import Bools, Floats, Ints, Singles
+from ..arrays import Bools, Floats, Ints
 from ..optics.diffusion import half_space_length_mm, rings, slab_length_mm, transmitted
 from ..region.globe import Globe
 from ..region.mesh import RegionMesh
 from ..region.skin import BANDS, SHEET_ROWS, sheet_place
 from .frame import globe_of
 from .lighting import irradiance, lamp_blocked
-from .parameters import leaves
+from .parameters import leaves, traversed
+from .recorded import recorded
 from .region import GRID_COLUMNS, GRID_ROWS, SHEET_COLUMNS
 from .values import Lights, Values, aligned
 from .view import EPSILON_MM
@@ -67,30 +68,43 @@ _ALPHA = (0.7548776662466927, 0.5698402909980532)
 class Pyramid:
     """A grid of numbers with its reductions by 2, 4, ..., read bilinearly; `around` says whether the columns close."""
 
-    def __init__(self, rows: int, columns: int, around: bool) -> None:
-        self.rows, self.columns, self._around = rows, columns, around
-        self._size = dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns)
+    def __init__(self, cells: int, size: tuple[mi.UInt32, mi.UInt32], around: bool) -> None:
+        """Prepare for so many numbers, in so many rows and columns."""
+        self._finest, self._size, self._around = cells, size, around
         self._cells: mi.Float | None = None
 
-    def fill(self, values: Singles) -> None:
-        """Set the numbers (rows, columns)."""
-        levels, level = [], np.asarray(values, dtype=np.float32).reshape(self.rows, self.columns)
-        for k in range(_LEVELS):
+    def fill(self, values: mi.Float) -> None:
+        """Set the numbers, row by row."""
+        dr.eval(values)
+        counts = [self._finest >> 2 * k for k in range(_LEVELS)]
+        self._cells = dr.zeros(mi.Float, 4 * sum(counts))
+        for k, count in enumerate(counts):
+            index = dr.arange(mi.UInt32, count)
+            rows, columns = (n >> k for n in self._size)
+            row = index // columns
+            column = index - row * columns
             if k:
-                level = 0.25 * (level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2])
-            four = np.empty((*level.shape, 4), np.float32)
-            four[..., 0], four[:, :-1, 1] = level, level[:, 1:]
-            four[:, -1, 1] = level[:, 0 if self._around else -1]
-            four[:-1, :, 2:], four[-1, :, 2:] = four[1:, :, :2], four[-1, :, :2]
-            levels.append(four.reshape(-1, 4))
-        self._cells = mi.Float(aligned(np.concatenate(levels).ravel()))
+                first, down = 4 * row * columns + 2 * column, 2 * columns
+                a, b, c, d = (dr.gather(mi.Float, values, first + n) for n in (0, down, 1, down + 1))
+                values = 0.25 * (a + b + c + d)
+                dr.eval(values)
+            right = dr.select(column + 1 < columns, column + 1, 0 if self._around else column)
+            below = dr.minimum(row + 1, rows - 1)
+            place = self._first(rows * columns) + index
+            for n, (i, j) in enumerate(((row, column), (row, right), (below, column), (below, right))):
+                dr.scatter(self._cells, dr.gather(mi.Float, values, i * columns + j), 4 * place + n)
+        dr.eval(self._cells)
+
+    def _first(self, cells: mi.UInt32) -> mi.UInt32:
+        """Number of the first cell of the level that has so many of them."""
+        return (self._size[0] * self._size[1] - cells) // 3 * 4
 
     def at(self, row: mi.Float, column: mi.Float, level: mi.UInt32 | int, active: mi.Bool | bool = True) -> mi.Float:
         """Numbers at places in units of the finest cells, whose middles are at integers."""
         level = mi.UInt32(level)
         scale = dr.rcp(mi.Float(mi.UInt32(1) << level))
         rows, columns = (n >> level for n in self._size)
-        first = (self._size[0] * self._size[1] - rows * columns) // 3 * 4
+        first = self._first(rows * columns)
         v = dr.clip((row + 0.5) * scale - 0.5, 0, mi.Float(rows) - 1)
         u = (column + 0.5) * scale - 0.5
         if self._around:
@@ -110,7 +124,7 @@ def _level(size_mm: mi.Float, cell_mm: mi.Float) -> mi.UInt32:
 
 
 @dataclass(frozen=True, slots=True)
-class _Places:
+class Places:
     """Places in the tangent plane that stand for equal shares of the light: (x, y, dx, dy) in mm, row by row.
 
     Walks go out from the middle over places of growing distance; dx and dy are the steps. Places of a walk alternate
@@ -120,7 +134,8 @@ class _Places:
     table: mi.Float
 
     @classmethod
-    def of(cls, length_mm: float) -> _Places:
+    def of(cls, length_mm: float) -> Places:
+        """Make the places for light that spreads so far."""
         turn = 2 * np.pi * (np.arange(_TURNS)[:, None] + 0.5 + 0.5 * (np.arange(_RINGS) % 2)) / _TURNS
         place = rings(_RINGS)[:, None] * length_mm * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
         steps = np.diff(place, axis=1, prepend=np.zeros((_TURNS, 1, 2)))
@@ -142,7 +157,7 @@ class _Places:
             first: the first of the rings.
             last: the ring after the last one.
         """
-        inner, count = dr.opaque(mi.UInt32, first), dr.opaque(mi.UInt32, last - first)
+        inner, count = mi.UInt32(first), mi.UInt32(last - first)
 
         def more(k: mi.UInt32, *_: object) -> mi.Bool:
             return k < count * _TURNS
@@ -215,38 +230,79 @@ def tissue_light(
     scattering = job.look.scattering
     assert scattering is not None
     assert job.region is not None
-    make = _Maker(values, lights, place.scene, place.skin, views)
     thick = half_space_length_mm(job.region.skin.albedo, scattering.skin_per_mm)
     thin = slab_length_mm(job.look.sclera_albedo, scattering.sclera_per_mm)
     skin = SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px)
-    sheet = make.sheet(skin, thick)
-    loss = transmitted(job.region.skin.albedo, scattering.skin_per_mm)
     globe = GlobeGrid.of(place.posed, globe_of(job.eye, job.M, job.t - job.anchor_mm), _SPARE * thin)
-    return TissueLight(skin.size, sheet, make.globe(globe, skin.size, sheet[0], thin, loss), values)
+    wide, count = lights.widest >= _SMALL, max(len(lights), 1)
+    rays = -(-_RAYS // count)
+    make = _Maker(
+        values,
+        lights,
+        place.scene,
+        place.skin,
+        views,
+        place.skin.relief[skin.rows],
+        dr.opaque(mi.Bool, wide),
+        (dr.opaque(mi.UInt32, max(rays, _WIDE_RAYS if wide else 1)), dr.opaque(mi.UInt32, rays)),
+        dr.opaque(mi.Float, transmitted(job.region.skin.albedo, scattering.skin_per_mm)),
+        count,
+    )
+    sheet, between = make.both(skin, globe, Places.of(thick), Places.of(thin))
+    return TissueLight(skin.size, sheet, between, values)
 
 
+@traversed
 @dataclass(frozen=True, slots=True)
 class _Maker:
-    """What the grids of a frame are computed from."""
+    """What the grids of a frame are computed from.
+
+    Attributes:
+        values: the scene's numbers.
+        lights: the lamps.
+        scene: the posed region.
+        skin: its surface.
+        views: the lamps' views of it.
+        relief: slopes of the cells of the skin's grid.
+        wide: whether some lamp is too wide for one point.
+        rays: number of rays to each lamp from cells of skin and globe.
+        loss_per_mm: of light on its way through a lid.
+        lamps: number of lamps, at least 1.
+    """
 
     values: Values
     lights: Lights
     scene: mi.Scene
     skin: SkinGeometry
     views: LampViews
+    relief: mi.Float
+    wide: mi.Bool
+    rays: tuple[mi.UInt32, mi.UInt32]
+    loss_per_mm: mi.Float
+    lamps: int
 
-    def sheet(self, grid: SheetGrid, length_mm: float) -> tuple[mi.Float, mi.Float]:
-        """Light on the skin after its way through the tissue, and how much of each lamp coarse cells see."""
+    @recorded
+    def both(
+        self, skin: SheetGrid, globe: GlobeGrid, thick: Places, thin: Places
+    ) -> tuple[tuple[mi.Float, mi.Float], tuple[mi.Float, mi.Float]]:
+        """Light on skin and globe after its way through the tissue, and how much of each lamp cells see there."""
+        light, seen = self._sheet(skin, thick)
+        return (light, seen), self._globe(globe, skin.size, light, thin)
+
+    def _sheet(self, grid: SheetGrid, places: Places) -> tuple[mi.Float, mi.Float]:
+        """Light on the skin, and how much of each lamp coarse cells see."""
         straight, seen = self._from_lamps(grid)
         index = grid.sent[0]
         columns = grid.size.columns
         row, column = index // columns, index % columns
         across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / mi.Float(columns))
         _, n = self.skin.sheet_point(grid.vertex_row(row, mi.Float(0.5)), across)
-        relief = dr.gather(mi.Vector2f, self.skin.relief[grid.rows], index)
+        relief = dr.gather(mi.Vector2f, self.relief, index)
         flux = grid.size.between(mi.Vector4f, straight, mi.Float(row), mi.Float(column), 1)
         facing = dr.dot(mi.Vector3f(flux.x, flux.y, flux.z), self.skin.tilted(n, relief.x, relief.y))
-        return grid.spread(grid.whole(dr.maximum(facing, 0)), length_mm), seen
+        whole = dr.zeros(mi.Float, grid.rows * grid.columns)
+        dr.scatter(whole, dr.maximum(facing, 0), index)
+        return grid.spread(whole, places), seen
 
     def _from_lamps(self, grid: SheetGrid) -> tuple[mi.Float, mi.Float]:
         """Light straight from the lamps at coarse cells.
@@ -260,13 +316,11 @@ class _Maker:
         values, lights, skin = self.values, self.lights, self.skin
         cells, columns = grid.rows * grid.columns // 4, grid.size.columns // 2
         straight = dr.zeros(mi.Float, 4 * cells)
-        seen = dr.zeros(mi.Float, max(len(lights), 1) * cells)
+        seen = dr.zeros(mi.Float, self.lamps * cells)
         index = grid.sent[1]
         row, column = index // columns, index % columns
         centre = values.point_to_scene(values.sclera.centre)
-        wide = lights.widest >= _SMALL
-        points = dr.opaque(mi.UInt32, max(-(-_RAYS // max(len(lights), 1)), _WIDE_RAYS if wide else 1))
-        spread = dr.opaque(mi.Bool, wide)
+        points, spread = self.rays[0], self.wide
         shifts = [mi.sample_tea_32(index, mi.UInt32(key)) for key in _KEYS]
 
         def place(s: mi.Float, t: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -316,27 +370,22 @@ class _Maker:
         dr.eval(straight, seen)
         return straight, seen
 
-    def globe(
-        self, grid: GlobeGrid, skin: Size, sheet: mi.Float, length_mm: float, loss_per_mm: float
-    ) -> tuple[mi.Float, mi.Float]:
-        """Light on the globe between the lids after its way through the sclera, and how much of each lamp cells see."""
+    def _globe(self, grid: GlobeGrid, size: Size, sheet: mi.Float, places: Places) -> tuple[mi.Float, mi.Float]:
+        """Light on the globe between the lids, and how much of each lamp cells see."""
         # What comes through a lid varies slowly, so it is found for two by two cells.
-        half, row, column = _SIDE // 2, *np.divmod(grid.under, _SIDE)
-        coarse = row // 2 * half + column // 2
-        wanted = np.flatnonzero(np.bincount(coarse, minlength=half * half))
-        under = np.zeros(half * half, np.float32)
-        under[wanted] = self._through_lids(_numbers(wanted), skin, sheet, loss_per_mm).numpy()
-        cells = np.zeros(_SIDE * _SIDE, np.float32)
-        cells[grid.under] = under[coarse]
-        lit, seen = self._on_globe(_numbers(grid.between))
-        cells[grid.between] += lit.numpy()
-        return grid.spread(cells, self.values.sclera.radius, length_mm), seen
+        coarse = dr.zeros(mi.Float, _SIDE * _SIDE // 4)
+        dr.scatter(coarse, self._through_lids(grid.coarse, size, sheet), grid.coarse)
+        cells = dr.zeros(mi.Float, _SIDE * _SIDE)
+        dr.scatter(cells, dr.gather(mi.Float, coarse, grid.over), grid.under)
+        lit, seen = self._on_globe(grid.between)
+        dr.scatter(cells, dr.gather(mi.Float, cells, grid.between) + lit, grid.between)
+        return grid.spread(cells, self.values.sclera.radius, places), seen
 
     def _on_globe(self, index: mi.UInt32) -> tuple[mi.Float, mi.Float]:
         """Irradiance of cells of the grid over the globe straight from the lamps; shares of each lamp that they see."""
         values, lights = self.values, self.lights
-        seen = dr.zeros(mi.Float, max(len(lights), 1) * _SIDE * _SIDE)
-        points = dr.opaque(mi.UInt32, -(-_RAYS // max(len(lights), 1)))
+        seen = dr.zeros(mi.Float, self.lamps * _SIDE * _SIDE)
+        points = self.rays[1]
         shifts = [mi.sample_tea_32(index, mi.UInt32(key)) for key in _KEYS]
 
         def of_lamp(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
@@ -379,7 +428,7 @@ class _Maker:
         met &= (y.y * y.y + y.z * y.z < dr.square(values.limbus.radius)) & (y.x > values.limbus.floor) & (t < away)
         return o - dr.select(met, t, away) * d, dr.normalize(dr.select(met, front.vector_out(facing), d))
 
-    def _through_lids(self, index: mi.UInt32, size: Size, sheet: mi.Float, loss_per_mm: float) -> mi.Float:
+    def _through_lids(self, index: mi.UInt32, size: Size, sheet: mi.Float) -> mi.Float:
         """Irradiance of two by two cells of the globe by way of lids on them: exp(-k t) of that on the lid's skin."""
         values, skin, half = self.values, self.skin, _SIDE // 2
         n = _globe_direction(2 * mi.Float(index // half) + 0.5, 2 * mi.Float(index % half) + 0.5)
@@ -392,7 +441,7 @@ class _Maker:
         uv = dr.select(outer.is_valid(), outer.prim_uv, inner.prim_uv)
         under = inner.is_valid() & skin.on_sheet(face)
         lit = size.between(mi.Float, sheet, *size.place(*skin.map_place(face, uv, under)), 0)
-        return dr.select(under, lit * dr.exp(-loss_per_mm * last), 0)
+        return dr.select(under, lit * dr.exp(-self.loss_per_mm * last), 0)
 
     def _next(self, o: mi.Vector3f, d: mi.Vector3f, first: mi.Float, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """First hit along rays beyond a distance and within a lid's thickness; its t counts from the start."""
@@ -448,8 +497,7 @@ class SheetGrid:
         rows: number of its rows.
         columns: number of its columns, which close.
         size: the same on the device.
-        cells: numbers of its cells that matter.
-        sent: the same on the device, and the cells about them on the grid reduced by 2 and by 4.
+        sent: numbers of its cells that matter, and of the cells about them on the grid reduced by 2 and by 4.
         edges: row of the sheet's vertices at the edges of the grid's rows.
         metric: for each row and column of vertices: columns per mm along the row, a, rows per mm across it, size of a
             cell (mm). A place x mm along and y mm across is y per-mm rows and (x - a rows) per-mm columns away.
@@ -458,7 +506,6 @@ class SheetGrid:
     rows: int
     columns: int
     size: Size
-    cells: Ints
     sent: tuple[mi.UInt32, ...]
     edges: mi.Float
     metric: mi.Float
@@ -487,19 +534,17 @@ class SheetGrid:
         marks = [near[i + (share > 0.5)][:, np.arange(columns) * near.shape[1] // columns]]
         for _ in _LEVEL_RINGS[1:]:
             marks.append(_grown(marks[-1].reshape(len(marks[-1]) // 2, 2, -1, 2).any(axis=(1, 3))))
-        cells = [np.flatnonzero(m) if m.any() else np.zeros(1, dtype=np.int64) for m in marks]
         return cls(
             rows,
             columns,
             Size(dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns)),
-            cells[0],
-            tuple(_numbers(c) for c in cells),
+            tuple(_numbers(np.flatnonzero(m)) for m in marks),
             *(mi.Float(aligned(t.astype(np.float32).ravel())) for t in (edges, metric)),
         )
 
-    def spread(self, irradiance: Singles, length_mm: float) -> mi.Float:
-        """What leaves the skin, cell by cell, of the light that falls on it (rows, columns)."""
-        straight = Pyramid(self.rows, self.columns, True)
+    def spread(self, irradiance: mi.Float, places: Places) -> mi.Float:
+        """What leaves the skin, cell by cell, of the light that falls on it, to places about each."""
+        straight = Pyramid(self.rows * self.columns, (self.size.rows, self.size.columns), True)
         straight.fill(irradiance)
 
         def read(
@@ -509,7 +554,7 @@ class SheetGrid:
             row, column, cell = self.step(row, column, way.x, way.y)
             return straight.at(row, column, _level(_FOOTPRINT * distance, cell)), row, column
 
-        places, light = _Places.of(length_mm), mi.Float(0)
+        light = mi.Float(0)
         # The farther light has come, the more evenly it is spread, and the fewer cells tell it.
         for level, rings_of in reversed(list(enumerate(_LEVEL_RINGS))):
             index, columns, size = self.sent[level], self.size.columns >> level, float(1 << level)
@@ -522,12 +567,6 @@ class SheetGrid:
             dr.scatter(everywhere, light, index)
             light = everywhere
         return light
-
-    def whole(self, values: mi.Float) -> Singles:
-        """Numbers (rows, columns) of all cells, 0 for those that do not matter."""
-        out = np.zeros(self.rows * self.columns, np.float32)
-        out[self.cells] = values.numpy()
-        return out.reshape(self.rows, self.columns)
 
     def vertex_row(self, row: mi.UInt32, share: mi.Float) -> mi.Float:
         """Row of the sheet's vertices at a share of the grid's rows."""
@@ -548,10 +587,19 @@ class SheetGrid:
 
 @dataclass(frozen=True, slots=True)
 class GlobeGrid:
-    """Cells of the grid over the globe: those between the lids, and those under the lids whose light gets there."""
+    """Numbers of cells of the grid over the globe.
 
-    between: Ints
-    under: Ints
+    Attributes:
+        between: those between the lids.
+        under: those under the lids whose light gets there.
+        coarse: cells of the grid reduced by 2 that hold the latter.
+        over: the one of these for each of `under`.
+    """
+
+    between: mi.UInt32
+    under: mi.UInt32
+    coarse: mi.UInt32
+    over: mi.UInt32
 
     @classmethod
     def of(cls, posed: RegionMesh, globe: Globe, reach_mm: float) -> GlobeGrid:
@@ -566,13 +614,15 @@ class GlobeGrid:
         beside = np.maximum(upper[0, 1] - y, y - upper[-1, 1])
         away = np.maximum(over, beside)
         between, under = np.flatnonzero(away < _EDGE_MM), np.flatnonzero((away > 0) & (away < reach_mm))
-        return cls(*(cells if cells.size else np.zeros(1, dtype=np.int64) for cells in (between, under)))
+        over = under // _SIDE // 2 * (_SIDE // 2) + under % _SIDE // 2
+        return cls(*(_numbers(cells) for cells in (between, under, np.unique(over), over)))
 
-    def spread(self, irradiance: Singles, radius_mm: mi.Float, length_mm: float) -> mi.Float:
-        """What leaves the globe between the lids, cell by cell, of the light that falls on it (side * side,)."""
-        straight, light = Pyramid(_SIDE, _SIDE, False), dr.zeros(mi.Float, _SIDE * _SIDE)
+    def spread(self, irradiance: mi.Float, radius_mm: mi.Float, places: Places) -> mi.Float:
+        """What leaves the globe between the lids, cell by cell, of the light that falls on it, to places about each."""
+        side, light = mi.UInt32(_SIDE), dr.zeros(mi.Float, _SIDE * _SIDE)
+        straight = Pyramid(_SIDE * _SIDE, (side, side), False)
         straight.fill(irradiance)
-        index = _numbers(self.between)
+        index = self.between
         start = mi.Float(index // _SIDE), mi.Float(index % _SIDE)
         n = _globe_direction(*start)
         across = dr.normalize(mi.Vector3f(-n.y, n.x, 0))
@@ -585,7 +635,7 @@ class GlobeGrid:
             row, column = _globe_place(cosine * n + out)
             return straight.at(row, column, _level(_FOOTPRINT * distance, _WIDTH / _SIDE * radius_mm)), row, column
 
-        dr.scatter(light, _Places.of(length_mm).share(start, read), index)
+        dr.scatter(light, places.share(start, read), index)
         return light
 
 
@@ -616,7 +666,8 @@ def _between(
 
 
 def _numbers(cells: Ints) -> mi.UInt32:
-    return mi.UInt32(aligned(cells.astype(np.uint32)))
+    """Numbers of cells on the device, at least one of them."""
+    return mi.UInt32(aligned((cells if cells.size else np.zeros(1)).astype(np.uint32)))
 
 
 def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -> Bools:

@@ -42,21 +42,30 @@ def grids(renderer, bound):
     across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / sheet.columns)
     x, _ = place.skin.sheet_point(sheet.vertex_row(row, mi.Float(0.5)), across)
     on_sheet = np.zeros((sheet.rows * sheet.columns, 3), np.float32)
-    on_sheet[sheet.cells] = x.numpy().T
+    on_sheet[sheet.sent[0].numpy()] = x.numpy().T
     globe = light.GlobeGrid.of(place.posed, globe_of(bound.eye, bound.M, bound.t - bound.anchor_mm), 8.0)
     n = light._globe_direction(*(mi.Float(k) for k in np.divmod(np.arange(light._SIDE**2), light._SIDE)))
     on_globe = float(bound.eye.sclera.radius_mm) * n.numpy().T
     return sheet, on_sheet.reshape(sheet.rows, sheet.columns, 3), globe, on_globe, shown.values.sclera.radius
 
 
+def spread(grid, lit, length_mm, *radius):
+    """What leaves a grid's cells of the light that falls on them, as NumPy arrays."""
+    import mitsuba as mi
+
+    from eyerender.rendering.subsurface import Places
+
+    return grid.spread(mi.Float(lit.astype(np.float32).ravel()), *radius, Places.of(length_mm)).numpy()
+
+
 def test_even_light_stays_even(renderer):
     sheet, at, globe, _, radius = grids(renderer, job(region=BARE))
-    out = sheet.spread(np.ones(at.shape[:2], np.float32), 0.7).numpy()
-    assert len(sheet.cells) > 0.9 * out.size
-    assert out[sheet.cells] == pytest.approx(1.0, abs=1e-5)
+    out, cells = spread(sheet, np.ones(at.shape[:2]), 0.7), sheet.sent[0].numpy()
+    assert len(cells) > 0.9 * out.size
+    assert out[cells] == pytest.approx(1.0, abs=1e-5)
     side = 192
-    out = globe.spread(np.ones(side * side, np.float32), radius, 0.4).numpy()
-    assert out[globe.between] == pytest.approx(1.0, abs=1e-5)
+    out = spread(globe, np.ones(side * side), 0.4, radius)
+    assert out[globe.between.numpy()] == pytest.approx(1.0, abs=1e-5)
 
 
 def lit_share(away: np.ndarray, width: np.ndarray | float) -> np.ndarray:
@@ -72,31 +81,31 @@ def test_shadow_edges_have_their_shape_on_skin_and_globe(renderer, name, rows, t
     away, along = at[..., 1] - 2.0, np.gradient(at, axis=1)
     level = np.abs(along[..., 1]) / np.maximum(np.linalg.norm(along, axis=-1), 1e-6) > 0.95
     known = np.zeros(away.size, bool)
-    known[sheet.cells] = True
+    known[sheet.sent[0].numpy()] = True
     near = level & known.reshape(away.shape) & (np.abs(away) < 2.5) & (at[..., 2] < -9.0) & (at[..., 2] > -14.0)
     assert near.sum() > 100
     lit = lit_share(away, np.abs(along[..., 1]))
-    out = sheet.spread(lit, 0.65).numpy().reshape(away.shape)[near]
+    out = spread(sheet, lit, 0.65).reshape(away.shape)[near]
     # Six rings of six places are good to 0.017 on a plane; the rows of cells are bent and of unequal width.
     worst = np.abs(out - edge(away[near], 0.65)).max()
     assert worst < tolerance
     side = 192
     away = on_globe[:, 1] - 1.0
     inside = np.zeros(side * side, bool)
-    inside[globe.between] = True
+    inside[globe.between.numpy()] = True
     inside &= np.abs(away) < 2.0
     assert inside.sum() > 500
-    out = globe.spread(lit_share(away, 0.16), radius, 0.38).numpy()[inside]
+    out = spread(globe, lit_share(away, 0.16), 0.38, radius)[inside]
     worst = np.abs(out - edge(away[inside], 0.38)).max()
     assert worst < 0.03
 
 
 @pytest.mark.parametrize("name", ["remote", "head"])
 def test_smooth_skin_and_sclera_reflect_as_much_as_before(renderer, name):
-    spread = job(name, region=BARE)
-    matte = replace(spread, look=spread.look.model_copy(update={"scattering": None}))
-    soft, hard = (renderer.radiance(j, spp=4) for j in (spread, matte))
-    part = renderer.labels(spread).part
+    soft_job = job(name, region=BARE)
+    matte = replace(soft_job, look=soft_job.look.model_copy(update={"scattering": None}))
+    soft, hard = (renderer.radiance(j, spp=4) for j in (soft_job, matte))
+    part = renderer.labels(soft_job).part
     edges = np.s_[:20, :], np.s_[-20:, :]  # forehead or upper lid, and cheek
     if name == "remote":
         for skin in edges:
@@ -105,7 +114,8 @@ def test_smooth_skin_and_sclera_reflect_as_much_as_before(renderer, name):
     assert 0.9 * hard[part == 1].sum() < soft[part == 1].sum() < hard[part == 1].sum()
     iris = ndimage.binary_erosion(part == 2, iterations=3)  # pixels of its edge show some of the sclera and the lids
     assert soft[iris].sum() == pytest.approx(hard[iris].sum(), rel=3e-3)
-    # Shadows are softer: the sum of squared differences of neighbours is smaller.
+    # Shadows are softer: the sum of squared differences of neighbours is smaller, but for the lamps' images in tears.
+    soft, hard = (np.minimum(picture, 2 * hard.mean()) for picture in (soft, hard))
     assert np.square(np.diff(soft, axis=0)).sum() < np.square(np.diff(hard, axis=0)).sum()
 
 
