@@ -17,58 +17,101 @@ MOST_BLOBS = 12  # as in candidates
 SELECTION = 1.6  # as in covariance
 
 
+BLOCK = 128  # points whose numbers stay in the first-level cache
+_LIMITS = [math.tan(math.radians(7.5 * k)) for k in range(1, 6)]  # of the sectors within an eighth of the outline
+_FIRST, _SECOND, _THIRD, _FOURTH, _FIFTH = _LIMITS
+
+
 @inlined
-def nearest_on(cx, cy, a, b, cos, sin, x, y, steps):
-    """`Place.of` of one point: distance, cos t, sin t, normal (2), curvature, cos u, sin u."""
-    dx, dy = x - cx, y - cy
-    p, q = dx * cos + dy * sin, dy * cos - dx * sin
-    c, s = p / a, q / b
-    scale = 1.0 / max(math.sqrt(c * c + s * s), 1e-300)
-    c, s = c * scale, s * scale
-    eccentric = a * a - b * b
+def places(ellipse, x, y, start, count, steps, out):
+    """`Place.of` of `count` points from `start` on, as columns of out (8 BLOCK,), one after the other.
+
+    These are loops over simple sums, which the compiler turns into vector instructions.
+    """
+    cx, cy, a, b, angle = ellipse
+    cos, sin, eccentric = math.cos(angle), math.sin(angle), a * a - b * b
+    for i in range(count):
+        dx, dy = x[start + i] - cx, y[start + i] - cy
+        p, q = dx * cos + dy * sin, dy * cos - dx * sin
+        c, s = p / a, q / b
+        scale = 1.0 / max(math.sqrt(c * c + s * s), 1e-300)
+        out[BLOCK + i], out[2 * BLOCK + i], out[6 * BLOCK + i], out[7 * BLOCK + i] = c * scale, s * scale, p, q
     if eccentric > 1e-9 * a * a:
-        ap, bq = a * p, b * q
         for _ in range(steps):
-            value = eccentric * c * s - ap * s + bq * c
-            slope = eccentric * (c * c - s * s) - ap * c - bq * s
-            turn = min(max(value / min(slope, -1e-9), -0.3), 0.3)
-            c, s = c + turn * s, s - turn * c
-            scale = 1.0 / math.sqrt(c * c + s * s)
-            c, s = c * scale, s * scale
-    nx, ny = b * c, a * s
-    scale = 1.0 / math.sqrt(nx * nx + ny * ny)
-    nx, ny = nx * scale, ny * scale
-    distance = (p - a * c) * nx + (q - b * s) * ny
-    return distance, c, s, nx, ny, a * b * scale * scale * scale, c * cos - s * sin, s * cos + c * sin
+            for i in range(count):
+                c, s, ap, bq = out[BLOCK + i], out[2 * BLOCK + i], a * out[6 * BLOCK + i], b * out[7 * BLOCK + i]
+                value = eccentric * c * s - ap * s + bq * c
+                slope = eccentric * (c * c - s * s) - ap * c - bq * s
+                turn = min(max(value / min(slope, -1e-9), -0.3), 0.3)
+                c, s = c + turn * s, s - turn * c
+                scale = 1.0 / math.sqrt(c * c + s * s)
+                out[BLOCK + i], out[2 * BLOCK + i] = c * scale, s * scale
+    for i in range(count):
+        c, s, p, q = out[BLOCK + i], out[2 * BLOCK + i], out[6 * BLOCK + i], out[7 * BLOCK + i]
+        nx, ny = b * c, a * s
+        scale = 1.0 / math.sqrt(nx * nx + ny * ny)
+        nx, ny = nx * scale, ny * scale
+        out[i] = (p - a * c) * nx + (q - b * s) * ny
+        out[3 * BLOCK + i], out[4 * BLOCK + i], out[5 * BLOCK + i] = nx, ny, a * b * scale * scale * scale
+        out[6 * BLOCK + i], out[7 * BLOCK + i] = c * cos - s * sin, s * cos + c * sin
 
 
 @inlined
-def sector_at(cos_u, sin_u, sectors):
-    share = math.atan2(sin_u, cos_u) / (2.0 * math.pi) + 0.5
-    return int(share * sectors) % sectors
+def sector_at(c, s):
+    """`sector_of` of a direction, without its angle: by the ratio of the smaller to the larger component."""
+    x, y = abs(c), abs(s)
+    t = min(x, y) / max(x, y)
+    k = (t >= _FIRST) + (t >= _SECOND) + (t >= _THIRD) + (t >= _FOURTH) + (t >= _FIFTH)
+    k = k if y <= x else 11 - k
+    k = k if c >= 0.0 else 23 - k
+    return 24 + k if s >= 0.0 else 23 - k
+
+
+@inlined
+def _sectors(ellipse, x, y, steps, out):
+    """Write the sector of each point."""
+    place = np.empty(8 * BLOCK)
+    for start in range(0, x.size, BLOCK):
+        count = min(BLOCK, x.size - start)
+        places(ellipse, x, y, start, count, steps, place)
+        for i in range(count):
+            out[start + i] = sector_at(place[6 * BLOCK + i], place[7 * BLOCK + i])
+
+
+@inlined
+def _holding(ellipse, points, steps):
+    """Whether each sector holds a point."""
+    flat, own = points.T.copy(), np.empty(points.shape[0], dtype=np.int64)
+    _sectors(ellipse, flat[0], flat[1], steps, own)
+    out = np.zeros(SECTORS, dtype=np.bool_)
+    for k in own:
+        out[k] = True
+    return out
 
 
 @compiled
 def edge_sums(ellipse, points, sectors):
-    cx, cy, a, b, angle = ellipse
-    cos, sin = math.cos(angle), math.sin(angle)
+    cos, sin = math.cos(ellipse[4]), math.sin(ellipse[4])
     matrix, scores, slopes = np.zeros((5, 5)), np.zeros((5, sectors)), np.zeros((5, sectors))
-    count, row = np.zeros(sectors, dtype=np.int64), np.empty(5)
-    for i in range(points.shape[0]):
-        distance, c, s, nx, ny, _, cos_u, sin_u = nearest_on(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], 3)
-        row[0], row[1] = ny * sin - nx * cos, -nx * sin - ny * cos
-        row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
-        k = sector_at(cos_u, sin_u, 3 * sectors) // 3
-        count[k] += 1
-        for j in range(5):
-            scores[j, k] += row[j] * distance
-            slopes[j, k] += row[j]
-            for m in range(j + 1):
-                matrix[j, m] += row[j] * row[m]
+    number, row, place, flat = np.zeros(sectors, dtype=np.int64), np.empty(5), np.empty(8 * BLOCK), points.T.copy()
+    for start in range(0, points.shape[0], BLOCK):
+        count = min(BLOCK, points.shape[0] - start)
+        places(ellipse, flat[0], flat[1], start, count, 3, place)
+        for i in range(count):
+            c, s, nx, ny = place[BLOCK + i], place[2 * BLOCK + i], place[3 * BLOCK + i], place[4 * BLOCK + i]
+            row[0], row[1] = ny * sin - nx * cos, -nx * sin - ny * cos
+            row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
+            k = sector_at(place[6 * BLOCK + i], place[7 * BLOCK + i]) * sectors // SECTORS
+            number[k] += 1
+            for j in range(5):
+                scores[j, k] += row[j] * place[i]
+                slopes[j, k] += row[j]
+                for m in range(j + 1):
+                    matrix[j, m] += row[j] * row[m]
     for j in range(5):
         for m in range(j):
             matrix[m, j] = matrix[j, m]
-    return matrix, scores, slopes, count
+    return matrix, scores, slopes, number
 
 
 @inlined
@@ -348,7 +391,7 @@ def _seen(ellipse, points, chosen):
         if chosen[i]:
             dx, dy = points[i, 0] - cx, points[i, 1] - cy
             p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
-            held[sector_at(p, q, SECTORS)] = True
+            held[sector_at(p, q)] = True
             radius2, u, v = p * p + q * q, p / a, q / b
             square += (math.sqrt(radius2) - 1.0) ** 2 * radius2 / max(u * u + v * v, 1e-24)
             count += 1
@@ -637,12 +680,7 @@ def levels_beside(ellipse, away_px, sectors, linear, corner, patch):
 
 @compiled
 def held(ellipse, points):
-    cx, cy, a, b, angle = ellipse
-    cos, sin = math.cos(angle), math.sin(angle)
-    hit, grown = np.zeros(SECTORS, dtype=np.bool_), np.empty(SECTORS, dtype=np.bool_)
-    for i in range(points.shape[0]):
-        place = nearest_on(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], 3)
-        hit[sector_at(place[6], place[7], SECTORS)] = True
+    hit, grown = _holding(ellipse, points, 3), np.empty(SECTORS, dtype=np.bool_)
     for k in range(SECTORS):
         grown[k] = hit[k] or hit[k - 1] or hit[(k + 1) % SECTORS]
     for k in range(SECTORS):
@@ -682,10 +720,7 @@ def overlap(first, second):
 def along(ellipse, points, others, linear, corner, patch, away, levels):
     cx, cy, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
-    held, (pupil, dark) = np.zeros(SECTORS, dtype=np.bool_), levels
-    for i in range(points.shape[0]):
-        place = nearest_on(cx, cy, a, b, cos, sin, points[i, 0], points[i, 1], NEAR)
-        held[sector_at(place[6], place[7], SECTORS)] = True
+    held, (pupil, dark) = _holding(ellipse, points, NEAR), levels
     inside, outside = np.empty(SECTORS, dtype=np.float32), np.empty(SECTORS, dtype=np.float32)
     for k in range(SECTORS):
         inside[k] = _beside(ellipse, k, SECTORS, -away[0], linear, corner, patch)
@@ -806,10 +841,6 @@ def levels_about(linear, ellipse, angles):
 
 @compiled
 def sectors_at(ellipse, x, y, steps):
-    cx, cy, a, b, angle = ellipse
-    cos, sin = math.cos(angle), math.sin(angle)
     out = np.empty(x.size, dtype=np.int64)
-    for i in range(x.size):
-        place = nearest_on(cx, cy, a, b, cos, sin, x[i], y[i], steps)
-        out[i] = sector_at(place[6], place[7], SECTORS)
+    _sectors(ellipse, x, y, steps, out)
     return out

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from .jit import compiled, inlined, summing
-from .kernels import NEAR, SECTORS, factored, median_of, nearest_on, sector_at, solved
+from .kernels import BLOCK, NEAR, SECTORS, factored, median_of, places, sector_at, sectors_at, solved
 
 SHAPE, STILL_PX, KURTOSIS = 5, 1.5e-2, (-1.5, 3.0)  # as in covariance and least_squares
 OUTLIER, FARTHEST, UNEVEN = 5.0, 3.5, 0.01  # as in occlusion and consensus
@@ -25,105 +25,96 @@ _BELL = _DENSITY * np.exp(-0.5 * _STEPS**2)
 
 
 @inlined
-def _edge(distance, curvature, sigma, kurtosis):
-    """`Profile.of` of one pixel."""
-    z = min(max(distance / sigma, -float(LAST)), float(LAST))
-    at = int(z * FINE + (LAST * FINE + 0.5))
-    near = at * (1.0 / FINE) - LAST
-    d, n2, bell = z - near, near * near, _BELL[at]
-    second, third, fourth = 0.5 * (n2 - 1.0), near * (3.0 - n2) / 6.0, (n2 * (n2 - 6.0) + 3.0) / 24.0
-    density = bell * (1.0 + d * (-near + d * (second + d * (third + d * fourth))))
-    series = 1.0 + d * (-0.5 * near + d * (second / 3.0 + d * (0.25 * third + d * 0.2 * fourth)))
-    step, z2, half = _PHI[at] + bell * d * series, z * z, 0.5 * curvature
-    tails = z * (3.0 - z2) * density / 24.0
-    bend = density * (1.0 + (kurtosis / 24.0) * (z2 * (z2 - 6.0) + 3.0))
-    edge = step + half * sigma * density + kurtosis * tails
-    by_distance = bend / sigma - half * z * density
-    by_sigma = half * (1.0 + z2) * density - z * bend / sigma
-    return edge, by_distance, by_sigma, tails, distance * step + sigma * density, step, density
+def _edges(place, count, sigma, kurtosis, out):
+    """`Profile.of` of `count` pixels at a place, as columns of out (7 BLOCK,), one after the other."""
+    for i in range(count):
+        z, half = min(max(place[i] / sigma, -float(LAST)), float(LAST)), 0.5 * place[5 * BLOCK + i]
+        at = int(z * FINE + (LAST * FINE + 0.5))
+        near = at * (1.0 / FINE) - LAST
+        d, n2, bell, z2 = z - near, near * near, _BELL[at], z * z
+        second, third, fourth = 0.5 * (n2 - 1.0), near * (3.0 - n2) / 6.0, (n2 * (n2 - 6.0) + 3.0) / 24.0
+        density = bell * (1.0 + d * (-near + d * (second + d * (third + d * fourth))))
+        series = 1.0 + d * (-0.5 * near + d * (second / 3.0 + d * (0.25 * third + d * 0.2 * fourth)))
+        step, tails = _PHI[at] + bell * d * series, z * (3.0 - z2) * density / 24.0
+        bend = density * (1.0 + (kurtosis / 24.0) * (z2 * (z2 - 6.0) + 3.0))
+        out[i] = step + half * sigma * density + kurtosis * tails
+        out[BLOCK + i] = bend / sigma - half * z * density
+        out[2 * BLOCK + i] = half * (1.0 + z2) * density - z * bend / sigma
+        out[3 * BLOCK + i], out[4 * BLOCK + i] = tails, place[i] * step + sigma * density
+        out[5 * BLOCK + i], out[6 * BLOCK + i] = step, density
 
 
 @inlined
-def _outer_level(outer, cos_u, sin_u, basis):
-    """The outer level, with the harmonics written to `basis`."""
-    basis[0] = 1.0
-    level, c, s = outer[0], 1.0, 0.0
-    for k in range(1, outer.size, 2):
-        c, s = c * cos_u - s * sin_u, s * cos_u + c * sin_u
-        basis[k], basis[k + 1] = c, s
-        level += outer[k] * c + outer[k + 1] * s
-    return level
+def _turned(place, count, basis):
+    """Turn the harmonics in basis (2 BLOCK,) to the next order."""
+    for i in range(count):
+        c, s, cu, su = basis[i], basis[BLOCK + i], place[6 * BLOCK + i], place[7 * BLOCK + i]
+        basis[i], basis[BLOCK + i] = c * cu - s * su, s * cu + c * su
+
+
+@inlined
+def _outer_levels(place, count, outer, basis, out):
+    """Write the outer levels of `count` pixels."""
+    out[:count], basis[:count], basis[BLOCK : BLOCK + count] = outer[0], 1.0, 0.0
+    for j in range(1, outer.size, 2):
+        _turned(place, count, basis)
+        for i in range(count):
+            out[i] += outer[j] * basis[i] + outer[j + 1] * basis[BLOCK + i]
 
 
 @compiled
 def levels(numbers, displaced, x, y):
-    cx, cy, a, b, angle, sigma, inner_dn, slope, kurtosis, lean_x, lean_y = numbers[:11]
-    cos, sin = math.cos(angle), math.sin(angle)
-    outer, out = numbers[11:], np.empty(x.size)
-    basis, n = np.empty(outer.size), displaced.size
-    for i in range(x.size):
-        distance, _, _, _, _, curvature, cu, su = nearest_on(cx, cy, a, b, cos, sin, x[i], y[i], 3)
+    ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
+    inner_dn, slope, _, lean_x, lean_y = numbers[6:11]
+    place, edge, basis = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(2 * BLOCK)
+    out, outer, n = np.empty(x.size), np.empty(BLOCK), displaced.size
+    for start in range(0, x.size, BLOCK):
+        count = min(BLOCK, x.size - start)
+        places(ellipse, x, y, start, count, 3, place)
         if n:
-            at = (math.atan2(su, cu) / (2.0 * math.pi) + 0.5) * n - 0.5
-            low = math.floor(at)
-            first = displaced[int(low) % n]
-            distance += first + (at - low) * (displaced[int(low + 1.0) % n] - first)
-        edge, _, _, _, ramp, _, _ = _edge(distance, curvature, sigma, kurtosis)
-        inner = inner_dn + lean_x * cu + lean_y * su
-        out[i] = inner + (_outer_level(outer, cu, su, basis) - inner) * edge + slope * ramp
+            for i in range(count):
+                at = (math.atan2(place[7 * BLOCK + i], place[6 * BLOCK + i]) / (2.0 * math.pi) + 0.5) * n - 0.5
+                low = math.floor(at)
+                first = displaced[int(low) % n]
+                place[i] += first + (at - low) * (displaced[int(low + 1.0) % n] - first)
+        _edges(place, count, numbers[5], numbers[8], edge)
+        _outer_levels(place, count, numbers[11:], basis, outer)
+        for i in range(count):
+            inner = inner_dn + lean_x * place[6 * BLOCK + i] + lean_y * place[7 * BLOCK + i]
+            out[start + i] = inner + (outer[i] - inner) * edge[i] + slope * edge[4 * BLOCK + i]
     return out
 
 
-BLOCK = 128  # pixels whose rows stay in the first-level cache
-
-
 @inlined
-def _edges(distance, bend, count, sigma, kurtosis, out):
-    """`Profile.of` of `count` pixels: `_edge` of each, as columns of out (7, n)."""
-    for i in range(count):
-        profile = _edge(distance[i], bend[i], sigma, kurtosis)
-        for j in range(7):
-            out[j, i] = profile[j]
-
-
-@inlined
-def _places(ellipse, x, y, count, out):
-    """`nearest_on` of `count` pixels, as columns of out (8, n)."""
-    cx, cy, a, b, angle = ellipse
-    cos, sin = math.cos(angle), math.sin(angle)
-    for i in range(count):
-        place = nearest_on(cx, cy, a, b, cos, sin, x[i], y[i], NEAR)
-        for j in range(8):
-            out[j, i] = place[j]
-
-
-@inlined
-def _rows(place, edge, level, count, numbers, basis, rows, residual, steep):
+def _rows(place, edge, level, start, count, numbers, basis, rows, residual, steep):
     """Write the slopes of the level by the parameters, the residuals, and the slopes by the distance."""
     cos, sin = math.cos(numbers[4]), math.sin(numbers[4])
     inner_dn, slope, _, lean_x, lean_y = numbers[6:11]
     outer = numbers[11:]
+    residual[:count], basis[:count], basis[BLOCK : BLOCK + count] = outer[0], 1.0, 0.0
     for i in range(count):
-        residual[i], rows[11, i] = outer[0], edge[0, i]
-        basis[0, i], basis[1, i] = 1.0, 0.0
+        rows[11 * BLOCK + i] = edge[i]
     for j in range(1, outer.size, 2):
+        _turned(place, count, basis)
+        first = (11 + j) * BLOCK
         for i in range(count):
-            c = basis[0, i] * place[6, i] - basis[1, i] * place[7, i]
-            s = basis[1, i] * place[6, i] + basis[0, i] * place[7, i]
-            basis[0, i], basis[1, i] = c, s
-            rows[11 + j, i], rows[12 + j, i] = c * edge[0, i], s * edge[0, i]
-            residual[i] += outer[j] * c + outer[j + 1] * s
+            rows[first + i], rows[first + BLOCK + i] = basis[i] * edge[i], basis[BLOCK + i] * edge[i]
+            residual[i] += outer[j] * basis[i] + outer[j + 1] * basis[BLOCK + i]
     for i in range(count):
-        c, s, nx, ny, cu, su = place[1, i], place[2, i], place[3, i], place[4, i], place[6, i], place[7, i]
+        cu, su = place[6 * BLOCK + i], place[7 * BLOCK + i]
         inner = inner_dn + lean_x * cu + lean_y * su
-        step, within = residual[i] - inner, 1.0 - edge[0, i]
-        steepness = step * edge[1, i] + slope * edge[5, i]
-        residual[i] = level[i] - (inner + step * edge[0, i] + slope * edge[4, i])
-        steep[i] = steepness
-        rows[0, i], rows[1, i] = (ny * sin - nx * cos) * steepness, (-nx * sin - ny * cos) * steepness
-        rows[2, i], rows[3, i], rows[4, i] = -nx * c * steepness, -ny * s * steepness, (-nx * s - ny * c) * steepness
-        rows[5, i], rows[6, i], rows[7, i] = step * edge[2, i] + slope * edge[6, i], within, edge[4, i]
-        rows[8, i], rows[9, i], rows[10, i] = step * edge[3, i], within * cu, within * su
+        step, within = residual[i] - inner, 1.0 - edge[i]
+        steep[i] = step * edge[BLOCK + i] + slope * edge[5 * BLOCK + i]
+        residual[i] = level[start + i] - (inner + step * edge[i] + slope * edge[4 * BLOCK + i])
+        rows[5 * BLOCK + i] = step * edge[2 * BLOCK + i] + slope * edge[6 * BLOCK + i]
+        rows[6 * BLOCK + i], rows[7 * BLOCK + i] = within, edge[4 * BLOCK + i]
+        rows[8 * BLOCK + i] = step * edge[3 * BLOCK + i]
+        rows[9 * BLOCK + i], rows[10 * BLOCK + i] = within * cu, within * su
+    for i in range(count):
+        c, s, nx, ny = place[BLOCK + i], place[2 * BLOCK + i], place[3 * BLOCK + i], place[4 * BLOCK + i]
+        rows[i], rows[BLOCK + i] = (ny * sin - nx * cos) * steep[i], (-nx * sin - ny * cos) * steep[i]
+        rows[2 * BLOCK + i], rows[3 * BLOCK + i] = -nx * c * steep[i], -ny * s * steep[i]
+        rows[4 * BLOCK + i] = (-nx * s - ny * c) * steep[i]
 
 
 @summing
@@ -166,18 +157,17 @@ def _add_weighted(rows, begin, end, residual, steep, k, pull, across):
 def pixel_sums(x, y, level, index, numbers, displaced):
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
     sectors, size = displaced.size, numbers.size
-    matrix, basis = np.zeros((size, size)), np.empty((2, BLOCK))
-    place, edge = np.empty((8, BLOCK)), np.empty((7, BLOCK))
-    rows, residual, steep = np.empty((size, BLOCK)), np.empty(BLOCK), np.empty(BLOCK)
-    pull, across = np.zeros((size, sectors)), np.zeros((size, sectors))
+    matrix, basis, place, edge = np.zeros((size, size)), np.empty(2 * BLOCK), np.empty(8 * BLOCK), np.empty(7 * BLOCK)
+    flat, residual, steep = np.empty(size * BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    rows, pull, across = flat.reshape(size, BLOCK), np.zeros((size, sectors)), np.zeros((size, sectors))
     along, square, cost = np.zeros(sectors), np.zeros(sectors), 0.0
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
-        _places(ellipse, x[start:], y[start:], count, place)
+        places(ellipse, x, y, start, count, NEAR, place)
         for i in range(count):
-            place[0, i] += displaced[index[start + i]]
-        _edges(place[0], place[5], count, numbers[5], numbers[8], edge)
-        _rows(place, edge, level[start:], count, numbers, basis, rows, residual, steep)
+            place[i] += displaced[index[start + i]]
+        _edges(place, count, numbers[5], numbers[8], edge)
+        _rows(place, edge, level, start, count, numbers, basis, flat, residual, steep)
         _add_products(rows, count, matrix)
         begin = 0
         while begin < count:  # the pixels of a sector follow each other
@@ -195,30 +185,48 @@ def pixel_sums(x, y, level, index, numbers, displaced):
     return matrix, cost, pull, across, along, square
 
 
-@compiled
-def displacements(x, y, level, use, numbers, displaced):
-    cx, cy, a, b, angle, sigma, inner_dn, slope, kurtosis, lean_x, lean_y = numbers[:11]
-    cos, sin = math.cos(angle), math.sin(angle)
-    outer, n = numbers[11:], x.size
-    bins, residual, basis = np.empty(n, dtype=np.int64), np.empty(n), np.empty(outer.size)
-    place, steepness = np.empty((n, 4)), np.empty(n)
+@inlined
+def _look(x, y, numbers):
+    """Sector, distance, curvature, inner level and step of each pixel."""
+    ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
+    bins, out = np.empty(x.size, dtype=np.int64), np.empty((4, x.size))
+    place, basis, outer = np.empty(8 * BLOCK), np.empty(2 * BLOCK), np.empty(BLOCK)
+    for start in range(0, x.size, BLOCK):
+        count = min(BLOCK, x.size - start)
+        places(ellipse, x, y, start, count, NEAR, place)
+        _outer_levels(place, count, numbers[11:], basis, outer)
+        for i in range(count):
+            cu, su = place[6 * BLOCK + i], place[7 * BLOCK + i]
+            inner = numbers[6] + numbers[9] * cu + numbers[10] * su
+            bins[start + i] = sector_at(cu, su)
+            out[0, start + i], out[1, start + i] = place[i], place[5 * BLOCK + i]
+            out[2, start + i], out[3, start + i] = inner, outer[i] - inner
+    return bins, out
+
+
+@inlined
+def _displacements(x, y, level, use, numbers, displaced):
+    """`occlusion._displacements`."""
+    bins, look = _look(x, y, numbers)
+    sigma, slope, n = numbers[5], numbers[7], x.size
+    place, edge, residual, steep = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(n), np.empty(n)
     whole, weight, further = displaced.copy(), np.empty(SECTORS), np.empty(SECTORS)
-    for i in range(n):
-        distance, _, _, _, _, curvature, cu, su = nearest_on(cx, cy, a, b, cos, sin, x[i], y[i], NEAR)
-        inner = inner_dn + lean_x * cu + lean_y * su
-        place[i, 0], place[i, 1], place[i, 2] = distance, curvature, inner
-        place[i, 3] = _outer_level(outer, cu, su, basis) - inner
-        bins[i] = sector_at(cu, su, SECTORS)
     for _ in range(2):
         weight[:], further[:] = 0.0, 0.0
+        for start in range(0, n, BLOCK):
+            count = min(BLOCK, n - start)
+            for i in range(count):
+                place[i], place[5 * BLOCK + i] = look[0, start + i] + whole[bins[start + i]], look[1, start + i]
+            _edges(place, count, sigma, numbers[8], edge)
+            for i in range(count):
+                step = look[3, start + i]
+                steep[start + i] = step * edge[BLOCK + i] + slope * edge[5 * BLOCK + i]
+                expected = look[2, start + i] + step * edge[i] + slope * edge[4 * BLOCK + i]
+                residual[start + i] = level[start + i] - expected
         for i in range(n):
-            k = bins[i]
-            edge, by_d, _, _, ramp, ramp_d, _ = _edge(place[i, 0] + whole[k], place[i, 1], sigma, kurtosis)
-            residual[i] = level[i] - (place[i, 2] + place[i, 3] * edge + slope * ramp)
-            steepness[i] = place[i, 3] * by_d + slope * ramp_d
             if use[i]:
-                weight[k] += steepness[i] ** 2
-                further[k] += steepness[i] * residual[i]
+                weight[bins[i]] += steep[i] ** 2
+                further[bins[i]] += steep[i] * residual[i]
         largest = 0.0
         for k in range(SECTORS):
             further[k] = min(max(further[k] / weight[k], -sigma), sigma) if weight[k] > 1e-9 else 0.0
@@ -227,20 +235,19 @@ def displacements(x, y, level, use, numbers, displaced):
         if largest < 0.1 * sigma:
             break
     for i in range(n):
-        residual[i] -= steepness[i] * further[bins[i]]
+        residual[i] -= steep[i] * further[bins[i]]
     return bins, residual, whole, weight
 
 
 @compiled
 def band(linear, masked, corner, ellipse, outer, inner):
-    cx, cy, a, b, angle = ellipse
-    cos, sin = math.cos(angle), math.sin(angle)
-    reach = outer[0] + 2.0
+    cx, cy, _, _, angle = ellipse
+    cos, sin, reach = math.cos(angle), math.sin(angle), outer[0] + 2.0
     left, top = corner
     x0, x1 = max(left, math.floor(cx - reach)), min(left + linear.shape[1], math.ceil(cx + reach) + 1)
     y0, y1 = max(top, math.floor(cy - reach)), min(top + linear.shape[0], math.ceil(cy + reach) + 1)
     size, n = max(x1 - x0, 0) * max(y1 - y0, 0), 0
-    x, y, level, bins = np.empty(size), np.empty(size), np.empty(size), np.empty(size, dtype=np.int64)
+    x, y, level = np.empty(size), np.empty(size), np.empty(size)
     for row in range(y0, y1):
         for column in range(x0, x1):
             dx, dy = column - cx, row - cy
@@ -249,10 +256,9 @@ def band(linear, masked, corner, ellipse, outer, inner):
                 continue
             if (p / inner[0]) ** 2 + (q / inner[1]) ** 2 > 1.0:
                 x[n], y[n], level[n] = column, row, linear[row - top, column - left]
-                place = nearest_on(cx, cy, a, b, cos, sin, x[n], y[n], NEAR)
-                bins[n] = sector_at(place[6], place[7], SECTORS)
                 n += 1
-    return x[:n].copy(), y[:n].copy(), level[:n].copy(), bins[:n].copy()
+    x, y = x[:n].copy(), y[:n].copy()
+    return x, y, level[:n].copy(), sectors_at(ellipse, x, y, NEAR)
 
 
 @compiled
@@ -384,7 +390,7 @@ def _uneven2(seen, whole, weight, by_noise):
 
 @compiled
 def visible(x, y, level, use, seen, sectors, numbers, displaced, noise_dn):
-    bins, residual, whole, weight = displacements(x, y, level, use, numbers, displaced)
+    bins, residual, whole, weight = _displacements(x, y, level, use, numbers, displaced)
     by_noise = noise_dn**2 / np.maximum(weight, 1e-9)
     uneven2 = _uneven2(seen, whole, weight, by_noise)
     some, n = np.empty(x.size), 0
