@@ -4,7 +4,7 @@
     fit_confidence.py [--rendered DIR] [--count 1200] [--faces 60] [--processes 2] [--write]
 
 It uses development seeds only (below 10,000): `count` mixed images, a sixth as many without an eye, a tenth as many of
-each hard condition, and `faces` of each row of hard_eyes.py, which are rendered into DIR where they are not there yet.
+each other condition, and `faces` of each row of hard_eyes.py, which are rendered into DIR where they are not there yet.
 All hypotheses of the search are judged, the likeliest few also by the pixel model. The calibration is that of the
 hypotheses that the search would choose. `--write` replaces the table in scoring.py.
 """
@@ -40,9 +40,10 @@ Array = NDArray[np.float64]
 METHODS: tuple[Literal["fast", "refined"], ...] = ("fast", "refined")
 PRIOR_VARIANCE = 20.0
 SCALE_VARIANCE, TAILS = 5.0, 8.0  # of the covariance's factor: prior of its weights, degrees of freedom
+LEVELS = (0.68, 0.95)  # of the ellipses of centres
 FOLDS = 10
 REFINED_OF_IMAGE = 3  # hypotheses of an image to which the pixel model is fitted
-HARD = ("ring-light", "jpeg", "grey-pupil", "any-size", "eight-glints")
+HARD = ("ring-light", "jpeg", "grey-pupil", "any-size", "eight-glints", "clean", "noise2", "texture6", "lid")
 Task = tuple[str, int]
 
 
@@ -164,8 +165,9 @@ def scale_of(columns: Array, away: Array, row: list[str]) -> Array:
     """Weights of the covariance's factor f, from the first right ellipse of every image.
 
     The squared distances of two coordinates in standard deviations are f times those of a Student distribution of
-    TAILS degrees of freedom, so that single large errors do not decide. Then f is multiplied so that it holds 68 %.
-    Every kind of image counts alike.
+    TAILS degrees of freedom, so that single large errors do not decide. Real errors have longer tails than a normal
+    distribution. So f is then multiplied until the 68 % ellipses hold as much more than 68 % of the centres as the
+    95 % ellipses hold less than 95 %. Every kind of image counts alike.
     """
     kinds, kind, count = np.unique(row, return_inverse=True, return_counts=True)
     share = len(row) / (kinds.size * count[kind].astype(np.float64))
@@ -180,9 +182,10 @@ def scale_of(columns: Array, away: Array, row: list[str]) -> Array:
     found = minimize(cost, np.zeros(columns.shape[1]), jac=True, method="L-BFGS-B", options={"maxiter": 5000})
     weights = np.asarray(found.x)
     scaled = away * np.exp(-columns @ weights)
-    order = np.argsort(scaled)
-    within = np.cumsum(share[order]) / share.sum()
-    weights[0] += math.log(float(scaled[order][np.searchsorted(within, 0.68)]) / (-2.0 * math.log(1.0 - 0.68)))
+    factors = np.concatenate([scaled / (-2.0 * math.log(1.0 - level)) for level in LEVELS])
+    order = np.argsort(factors)
+    within = np.cumsum(np.tile(share, len(LEVELS))[order]) / share.sum()
+    weights[0] += math.log(float(factors[order][np.searchsorted(within, sum(LEVELS))]))
     return weights
 
 
