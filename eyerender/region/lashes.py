@@ -204,7 +204,7 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
     root, points, straight = points[:, :1], points[:, 1:], straight[:, 1:]
     rows = slice(CONJUNCTIVA + MARGIN - 1, CONJUNCTIVA + MARGIN + LID + _REACH_ROWS)
     skin, normals = sheet.vertices[rows].reshape(-1, 3), sheet.normals[rows].reshape(-1, 3)
-    tree = cKDTree(skin)
+    tree = cKDTree(skin, balanced_tree=False, compact_nodes=False)  # it is built in half the time
     out, k = points.copy(), points.shape[1]
 
     def lift(at: Floats, within: float, least: Floats) -> Floats:

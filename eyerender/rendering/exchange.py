@@ -23,7 +23,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..arrays import Bools, Floats, Ints
+from ..eye.model import EyeModel
 from ..region.globe import Globe
+from ..region.look import Look
 from .chamber import (
     IRIS,
     IRIS_RINGS,
@@ -230,11 +232,29 @@ class _Seen:
         return self.mean(self.weight * np.where(self.lit >= 0, more, 0))
 
 
+@dataclass(frozen=True, slots=True)
+class _Interior:
+    """The chamber of an eye, and the shares by which its places and the sectors of the limbus light each place."""
+
+    chamber: Chamber
+    exchange: Floats
+    limbus: Floats
+
+    @classmethod
+    def of(cls, eye: EyeModel, film_index: float, look: Look) -> _Interior:
+        """Compute it for an eye, with its pupil, and a look."""
+        chamber = chamber_of(eye, film_index)
+        albedo = shares(eye, chamber, look.pupil_albedo, look.iris_albedo, look.limbus_albedo)
+        limbus = through_limbus(eye, chamber, look.limbus_width_mm) * look.limbus_transmittance
+        return cls(chamber, chamber.exchange * albedo, limbus)
+
+
 class Exchange:
     """Computes what the places of a frame receive; keeps what does not change between frames of a subject."""
 
     def __init__(self) -> None:
         self._skins: list[tuple[RegionScene, Globe, SkinPlaces]] = []
+        self._interior: tuple[EyeModel, float, Look, _Interior] | None = None
 
     def received(
         self, job: RenderJob, values: Values, lights: Lights, panels: Lights, textures: Textures,
@@ -257,7 +277,7 @@ class Exchange:
         grid = globe_places(globe, None if region is None else region.posed)
         skin = None if region is None else self._skin(region, globe)
         points, normals, plane = _others(job, globe, region, skin)
-        frame = _Frame(job, grid, chamber_of(job.eye, job.film_index), skin, points, normals, plane)
+        frame = _Frame(job, grid, self._inside(job), skin, points, normals, plane)
         if not job.interreflection and not values.structure.ambient:
             return frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
@@ -265,6 +285,14 @@ class Exchange:
         lamps, more = (_direct_inside(values, some, place.scene, frame.chamber) for some in (lights, panels))
         seen = _seen(values, lights, textures, place, numbers, frame)
         return frame.solved(region, direct, ambient, lamps, more, seen)
+
+    def _inside(self, job: RenderJob) -> _Interior:
+        """The chamber of a job's eye. Frames often have the same one, and comparing eyes takes longer than needed."""
+        known = self._interior
+        if known is None or known[0] is not job.eye or known[1:3] != (job.film_index, job.look):
+            known = job.eye, job.film_index, job.look, _Interior.of(job.eye, job.film_index, job.look)
+            self._interior = known
+        return known[3]
 
     def _skin(self, region: RegionScene, globe: Globe) -> SkinPlaces:
         """Places on the skin of a region, chosen with the eye straight ahead: no earlier pose may change a picture."""
@@ -283,11 +311,16 @@ class _Frame:
 
     job: RenderJob
     grid: GlobePlaces
-    chamber: Chamber
+    interior: _Interior
     skin: SkinPlaces | None
     points: Floats
     normals: Floats
     plane: tuple[float, float, float]
+
+    @property
+    def chamber(self) -> Chamber:
+        """The chamber of the eye."""
+        return self.interior.chamber
 
     @property
     def on_globe(self) -> int:
@@ -376,10 +409,7 @@ class _Frame:
         start = np.concatenate([direct + arriving, lamps + panels + inside.mean(inside.sky)])
         total, entered, within = start, np.zeros(PLACES), np.zeros(PLACES)
         if job.interreflection:
-            look = job.look
-            albedo = shares(job.eye, self.chamber, look.pupil_albedo, look.iris_albedo, look.limbus_albedo)
-            exchange = self.chamber.exchange * albedo
-            limbus = through_limbus(job.eye, self.chamber, look.limbus_width_mm) * look.limbus_transmittance
+            exchange, limbus = self.interior.exchange, self.interior.limbus
             here, there = (part.correction(direct) for part in seen)
             for _ in range(_ROUNDS):
                 arrived = outside.mean(outside.weight * total[targets[0]]) + here

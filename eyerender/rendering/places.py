@@ -68,8 +68,7 @@ def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
     away = np.linalg.norm(p - middle[group], axis=1)
     order = np.lexsort((away, group))
     chosen = solid[order[np.searchsorted(group[order], np.arange(len(first)))]]
-    spread = _spread(mesh, chosen, size[first])
-    nearest = np.asarray(spread.tocsr().argmax(axis=1)).reshape(-1)
+    spread, nearest = _spread(mesh, chosen, size[first])
     out = _from_globe(globe, mesh.vertices[chosen])
     away = np.linalg.norm(out, axis=1)
     over = (away < globe.radius_mm + _LID_MM) & (np.sum(out * mesh.normals[chosen], axis=1) > 0.2 * away)
@@ -84,8 +83,11 @@ def _from_globe(globe: Globe, points: Floats) -> Floats:
     return np.asarray(points - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
 
 
-def _spread(mesh: RegionMesh, chosen: Ints, size: Floats) -> Any:
-    """Weights of the nearest places at every vertex: less with distance and where the skin faces another way."""
+def _spread(mesh: RegionMesh, chosen: Ints, size: Floats) -> tuple[Any, Ints]:
+    """Weights of the nearest places at every vertex, and the place with the greatest.
+
+    A place has less weight with distance and where the skin faces another way.
+    """
     k = min(_NEIGHBOURS, len(chosen))
     at, normals = mesh.vertices[chosen], mesh.normals[chosen]
     distance, index = cKDTree(at).query(mesh.vertices, k=k)
@@ -93,8 +95,11 @@ def _spread(mesh: RegionMesh, chosen: Ints, size: Floats) -> Any:
     facing = np.einsum("vi,vki->vk", mesh.normals, normals[index])
     weight = np.exp(-np.square(distance / size[index])) * np.maximum(facing, 0.02) ** 3 + 1e-9
     weight /= weight.sum(axis=1, keepdims=True)
-    rows = np.repeat(np.arange(len(distance)), k)
-    return csr_array((weight.ravel().astype(np.float32), (rows, index.ravel())), shape=(len(distance), len(chosen)))
+    weight = weight.astype(np.float32)
+    rows = np.arange(len(distance))
+    best = index[rows, np.argmax(weight, axis=1)]
+    spread = csr_array((weight.ravel(), (np.repeat(rows, k), index.ravel())), shape=(len(distance), len(chosen)))
+    return spread, best.astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -615,7 +615,8 @@ class GlobeGrid:
         away = np.maximum(over, beside)
         between, under = np.flatnonzero(away < _EDGE_MM), np.flatnonzero((away > 0) & (away < reach_mm))
         over = under // _SIDE // 2 * (_SIDE // 2) + under % _SIDE // 2
-        return cls(*(_numbers(cells) for cells in (between, under, np.unique(over), over)))
+        coarse = np.flatnonzero(np.bincount(over, minlength=_SIDE * _SIDE // 4))
+        return cls(*(_numbers(cells) for cells in (between, under, coarse, over)))
 
     def spread(self, irradiance: mi.Float, radius_mm: mi.Float, places: Places) -> mi.Float:
         """What leaves the globe between the lids, cell by cell, of the light that falls on it, to places about each."""
