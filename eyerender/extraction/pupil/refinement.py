@@ -24,8 +24,8 @@ ORDERS = (1, 2, 4, 6, 8)
 # better, but texture changes it with the distance. Where the wide band shows texture, the narrow one takes a third off
 # the error of the centre (rendered development images with textured irises).
 WIDE, NARROW = 3.0, 1.0
-# What shows texture: a larger reduced chi^2, or a boundary more uneven than this share of its radius. Drawn ellipses
-# are uneven by up to 0.002 (where their iris has texture), rendered pupils by 0.004 and more.
+# What shows texture: a larger reduced chi^2, or a boundary more uneven than this share of its radius. Nine in ten
+# rendered pupils are, and one in twenty drawn ellipses in a textured iris.
 UNEXPLAINED, ROUGH = 1.5, 0.003
 # Largest distance outside the boundary, px, however wide the blur: the light changes across the iris, and not linearly.
 OUTWARD_PX = 8.0
