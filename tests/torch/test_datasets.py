@@ -251,3 +251,18 @@ def test_bad_arguments_are_one_line(folder, spec, tmp_path):
         with pytest.raises(InputError) as refused:
             make()
         assert words in str(refused.value)
+
+
+def test_the_example_for_recorded_images_outlines_them(folder, tmp_path):
+    recorded = tmp_path / "recorded"
+    recorded.mkdir()
+    source = next((folder / "images").rglob("*.png"))
+    (recorded / "eye.png").write_bytes(source.read_bytes())
+    (recorded / "broken.png").write_bytes(b"no picture")
+    script = [sys.executable, ROOT / "examples" / "segment_recorded.py", folder, "--epochs", "1"]
+    done = subprocess.run(
+        [*script, "--apply", recorded, "--overlays", tmp_path / "out"], capture_output=True, text=True, check=True
+    )
+    assert "loss" in done.stdout
+    assert "broken.png: cannot be read" in done.stderr
+    assert [f.name for f in (tmp_path / "out").iterdir()] == ["eye.png"]
