@@ -671,6 +671,15 @@ def _beside(ellipse, k, sectors, away, linear, corner, patch):
 
 
 @compiled
+def standing_out(crop, level, bright, by):
+    out = np.empty(crop.shape, dtype=np.uint8)
+    for y in range(crop.shape[0]):
+        for x in range(crop.shape[1]):
+            out[y, x] = crop[y, x] > bright and crop[y, x] - level[y, x] > by
+    return out
+
+
+@compiled
 def levels_beside(ellipse, away_px, sectors, linear, corner, patch):
     out = np.empty(sectors, dtype=np.float32)
     for k in range(sectors):

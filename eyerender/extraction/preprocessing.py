@@ -93,7 +93,7 @@ def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | st
     noise = max(estimate_noise(linear), quantum / np.sqrt(12.0), 1e-3)
     # Sensor noise is added after the wells are full, so clipped pixels scatter slightly below full scale.
     if np.isfinite(clip):
-        clip -= float(np.clip(3.0 * noise, 0.004 * DN, 0.02 * DN))
+        clip -= min(max(3.0 * noise, 0.004 * DN), 0.02 * DN)
     return Prepared(linear, clip, float(noise))
 
 

@@ -62,9 +62,8 @@ def test_an_outline_without_the_lids_margin(covered, seed):
     points[hidden, 1] = height
     points += rng.normal(0.0, 0.05, points.shape)
     normals[hidden] = [0.0, -1.0]
-    edges = EdgePoints(
-        points, normals, np.ones(120), np.zeros((120, 2), dtype=np.intp), np.ones(120, dtype=bool), 1.0, 1.0
-    )
+    nowhere = np.zeros(120, dtype=np.intp)
+    edges = EdgePoints(points, normals, (nowhere, nowhere), np.ones(120, dtype=bool), 1.0, 1.0)
     through_all = ams_fit(points)
     assert through_all is not None
     assert iou(through_all, truth) < 0.9

@@ -123,9 +123,11 @@ class _Look:
     @staticmethod
     def of_all(spots: Spots, fit: SpotFit) -> list[_Look]:
         gap = fit.xy_px - spots.xy_px
+        (xx, xy), (_, yy) = fit.moments_px2.transpose(1, 2, 0)
+        mean, apart = 0.5 * (xx + yy) + _PIXEL, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
         columns = (
             fit.converged, fit.sigma_px.min(axis=1), fit.sigma_px.max(axis=1), fit.amplitude_dn, fit.residual_dn,
-            np.sqrt((gap * gap).sum(axis=1)), *np.sqrt(np.linalg.eigvalsh(fit.moments_px2) + _PIXEL).T,
+            np.sqrt((gap * gap).sum(axis=1)), np.sqrt(np.maximum(mean - apart, 0.0)), np.sqrt(mean + apart),
         )  # fmt: skip
         return [_Look(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 

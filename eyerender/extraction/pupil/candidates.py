@@ -71,7 +71,7 @@ def find_candidates(
             pupil are as dark as the pupil and form one blob with it at every threshold.
     """
     linear, noise_dn = prepared.linear, prepared.noise_dn
-    factor = int(np.clip(shape.least_px // 3.5, 1, 4))
+    factor = int(min(max(shape.least_px // 3.5, 1), 4))
     while factor < 8 and linear.size / factor**2 > 160_000:
         factor += 1
     small = _reduced(linear, factor, cv2.MORPH_CLOSE if prepared.inverted else cv2.MORPH_OPEN)

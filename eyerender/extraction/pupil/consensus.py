@@ -70,9 +70,8 @@ def fit_boundary(edges: EdgePoints, candidate: Candidate, shape: Shape, expected
     """
     if edges.points_px.shape[0] < 8:
         return f"only {edges.points_px.shape[0]} edge points around the darkest blob"
-    uneven = UNEVEN * float(np.sqrt(np.prod(candidate.ellipse.semi_axes_px)))
-    expected_px = float(np.hypot(expected_noise_px, uneven))
-    tolerance = float(np.clip(3.5 * expected_px, 0.35, 2.5))
+    uneven = UNEVEN * math.sqrt(math.prod(candidate.ellipse.semi_axes_px.tolist()))
+    tolerance = min(max(3.5 * math.hypot(expected_noise_px, uneven), 0.35), 2.5)
     start = _consensus(edges, candidate, shape, tolerance)
     if start is None:
         return "no ellipse passes through the edges around the darkest blob"

@@ -29,8 +29,7 @@ class EdgePoints:
     Attributes:
         points_px: (n, 2) ridge of the gradient, not corrected for curvature.
         normals: (n, 2) unit normals, from dark to bright.
-        strength: (n,) gradient, DN per px.
-        ridge: (m, 2) row and column of all pixels of ridges, before the tests.
+        ridge: (m,) rows and (m,) columns of all pixels of ridges, before the tests.
         kept: (m,) which of them became edge points.
         sigma_px: width of the whole smoothing (optics, pixel and filter), measured across the edge.
         filter_px: sigma of the filter alone.
@@ -38,15 +37,14 @@ class EdgePoints:
 
     points_px: Floats
     normals: Floats
-    strength: Floats
-    ridge: Indices
+    ridge: tuple[Indices, Indices]
     kept: Bools
     sigma_px: float
     filter_px: float
 
     def arcs(self) -> Indices:
         """Label (n,) of the connected piece that each point lies on."""
-        row, column = (self.ridge - self.ridge.min(axis=0)).T
+        row, column = (one - one.min() for one in self.ridge)
         mask = np.zeros((row.max() + 1, column.max() + 1), np.uint8)
         mask[row, column] = 1
         _, labels = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
@@ -106,10 +104,9 @@ def find_edges(
     return EdgePoints(
         points[keep] + np.array([x0, y0]),
         normals[keep],
-        magnitude[row, column][keep].astype(np.float64),
-        np.stack([row, column], axis=-1),
+        (row, column),
         keep,
-        float(np.clip(spread, sigma, 8.0)),
+        min(max(spread, sigma), 8.0),
         sigma,
     )
 
@@ -164,7 +161,7 @@ def _at_the_iris(
 
 def filter_sigma(step_dn: float, noise_dn: float, b: float) -> float:
     """Width of the derivative filter: 1 px for a clear edge, up to 2.5 px (and b / 6) for a noisy one."""
-    return float(np.clip(9.0 * noise_dn / max(step_dn, 1e-6), 1.0, max(1.0, min(2.5, b / 6.0))))
+    return min(max(9.0 * noise_dn / max(step_dn, 1e-6), 1.0), max(1.0, min(2.5, b / 6.0)))
 
 
 def edge_noise_px(step_dn: float, *, noise_dn: float, sigma_filter: float, sigma_total: float) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ...arrays import Bools
+from ...arrays import Bools, Bytes
 from ...geometry.ellipse import Ellipse
 from ..compiled import twin
 from ..preprocessing import Image, as_image
@@ -26,6 +26,7 @@ NOISE = 6.0  # in standard deviations: what noise alone does not reach in any pi
 # Flank of a glint below these limits, px. A glint of sigma 2 and four steps falls from one step to a tenth of one in
 # 1.1 sigma.
 FLANK_PX = 3
+_DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * FLANK_PX + 1, 2 * FLANK_PX + 1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,9 +123,14 @@ def without_glare(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: fl
     side = 2 * math.ceil(max(11.0, b) / 4.0) + 1
     opened = cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     level = as_image(cv2.resize(opened, (crop.shape[1], crop.shape[0]), interpolation=cv2.INTER_LINEAR))
-    glint = (crop > bright) & (crop - level > STANDS_OUT * step_dn + NOISE * noise_dn)
-    if not glint.any():
+    glint = _standing_out(crop, level, bright, STANDS_OUT * step_dn + NOISE * noise_dn)
+    if not np.count_nonzero(glint):
         return Cleared(linear)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * FLANK_PX + 1, 2 * FLANK_PX + 1))
-    wide = cv2.dilate(glint.astype(np.uint8), disc).astype(bool)
+    wide = cv2.dilate(glint, _DISC).view(bool)
     return Cleared(linear, (columns.start, rows.start), np.where(wide, level, crop), wide)
+
+
+@twin
+def _standing_out(crop: Image, level: Image, bright: float, by: float) -> Bytes:
+    """1 where a pixel is brighter than a level everywhere and than the level around it by `by`, else 0."""
+    return ((crop > bright) & (crop - level > by)).astype(np.uint8)

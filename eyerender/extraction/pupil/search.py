@@ -308,7 +308,6 @@ def _doubled(found: Found, work: Prepared) -> Found:
         replace(
             edges,
             points_px=2.0 * edges.points_px + 0.5,
-            strength=0.5 * edges.strength,
             sigma_px=2.0 * edges.sigma_px,
             filter_px=2.0 * edges.filter_px,
         ),
