@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 
@@ -84,17 +85,17 @@ def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | st
         linear, clip, quantum = scaled, float("inf"), 0.0
     else:
         linear, clip, quantum = _from_integers(array, bit_depth, gamma)
-    levels = linear if array.dtype.kind == "f" else array  # the smallest type takes the least time
-    if levels.min() == levels.max():
+    noise = estimate_noise(linear)
+    if noise == 0.0 and linear.min() == linear.max():
         level = float(linear[0, 0])
         name = "all black" if level == 0.0 else "all white" if level >= clip else "of one grey level"
         return f"the image is {name}"
     # Rounding to integers adds noise of 1/sqrt(12) of a step.
-    noise = max(estimate_noise(linear), quantum / np.sqrt(12.0), 1e-3)
+    noise = max(noise, quantum / math.sqrt(12.0), 1e-3)
     # Sensor noise is added after the wells are full, so clipped pixels scatter slightly below full scale.
     if np.isfinite(clip):
         clip -= min(max(3.0 * noise, 0.004 * DN), 0.02 * DN)
-    return Prepared(linear, clip, float(noise))
+    return Prepared(linear, clip, noise)
 
 
 def _checked(image: object) -> NDArray[np.generic]:
@@ -125,9 +126,10 @@ def _from_integers(array: NDArray[np.generic], bit_depth: int | None, gamma: flo
     if isinstance(bits, bool) or not 1 <= bits <= 16:
         raise InputError(f"must be between 1 and 16, not {bits!r}", path="bit_depth")
     full = (1 << bits) - 1
-    low, high = int(array.min()), int(array.max())
-    if high > full or low < 0:
-        raise InputError(f"holds levels {low} to {high}, outside the {bits} bits stated", path="bit_depth")
+    if array.dtype.kind == "i" or bits < 8 * array.dtype.itemsize:
+        low, high = int(array.min()), int(array.max())
+        if high > full or low < 0:
+            raise InputError(f"holds levels {low} to {high}, outside the {bits} bits stated", path="bit_depth")
     if gamma == 1.0:
         out = image_buffer(array.shape)
         if full == DN:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import islice
+from typing import Any
 
 import cv2
 import numpy as np
@@ -98,10 +99,15 @@ def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance:
     If all points are about as close to their ellipse as noise allows, no others are tried.
     """
     points = edges.points_px
-    whole = _sane(direct_fits(points[None]), candidate, shape)
-    if whole.shape[0] and _support(points, edges.normals, whole, tolerance)[0] > ALL_AGREE * _most(points, whole)[0]:
-        return Ellipse.of(whole[0])
-    fits = np.concatenate([whole, _sane(_random_fits(edges, candidate), candidate, shape)])
+    whole = direct_fits(points[None])
+    a, b = whole[0, 2:4].tolist()
+    if _sane(a, b, candidate, shape):
+        most = points.shape[0] / math.sqrt(math.pi * (a + b))  # if all points were on the ellipse
+        if _support(points, edges.normals, whole, tolerance)[0] > ALL_AGREE * most:
+            return Ellipse.of(whole[0])
+    fits = np.concatenate([whole, _random_fits(edges, candidate)])
+    with np.errstate(invalid="ignore"):
+        fits = fits[_sane(fits[:, 2], fits[:, 3], candidate, shape)]
     if fits.shape[0] == 0:
         return None
     # Every third point suffices to choose the ellipses that are worth counting with all points.
@@ -133,14 +139,11 @@ def _random_fits(edges: EdgePoints, candidate: Candidate) -> Floats:
     return direct_fits(points[index])
 
 
-def _sane(fits: Floats, candidate: Candidate, shape: Shape) -> Floats:
-    """Those of the fits (n, 5) that have a plausible size and shape."""
-    a, b = fits[:, 2], fits[:, 3]
-    a0, b0 = candidate.ellipse.semi_axes_px
-    with np.errstate(invalid="ignore"):
-        sane = (a < 2.2 * a0) & (b > 0.4 * b0) & (b > shape.aspect * a)
-        sane &= (a <= shape.most_px) & (b >= 0.8 * shape.least_px)
-    return np.asarray(fits[sane])
+def _sane(a: Any, b: Any, candidate: Candidate, shape: Shape) -> Any:
+    """Whether semi-axes, numbers or arrays, are plausible; those that are NaN are not."""
+    a0, b0 = candidate.ellipse.semi_axes_px.tolist()
+    alike = (a < 2.2 * a0) & (b > 0.4 * b0) & (b > shape.aspect * a)
+    return alike & (a <= shape.most_px) & (b >= 0.8 * shape.least_px)
 
 
 @twin
@@ -162,11 +165,6 @@ def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) ->
     # The score is per length of outline, so that a large loose ellipse does not win by points of other edges.
     score: Floats = np.einsum("mn,mn->m", closeness, agree) / np.sqrt(np.pi * (a + b)[:, 0])
     return score
-
-
-def _most(points: Floats, fits: Floats) -> Floats:
-    """Value (m,) of `_support` if all points were on every ellipse."""
-    return np.asarray(points.shape[0] / np.sqrt(np.pi * fits[:, 2:4].sum(axis=1)))
 
 
 def _polished(

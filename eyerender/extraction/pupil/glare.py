@@ -114,7 +114,7 @@ def without_glare(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: fl
     """
     a, b = ellipse.semi_axes_px.tolist()
     columns, rows = around(ellipse, 1.4 * a + 8.0, linear.shape)
-    crop = linear[rows, columns]
+    crop = np.ascontiguousarray(linear[rows, columns])
     bright = inside_dn + (1.0 + ABOVE_IRIS) * step_dn + NOISE * noise_dn
     if crop.shape[0] < 4 or crop.shape[1] < 4 or not crop.max() > bright:
         return Cleared(linear)
