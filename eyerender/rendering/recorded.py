@@ -5,13 +5,14 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import drjit as dr
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 _KEPT = 16  # recordings of a function, one for each set of sizes
+_played: list[Any] = []
 
 
 def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -21,7 +22,14 @@ def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:
     make arrays of NumPy's. Whatever changes between frames must be among the arguments.
     """
     played = dr.freeze(function, limit=_KEPT, warn_after=10 * _KEPT, auto_opaque=False)
+    _played.append(played)
     return uncollected(played)
+
+
+def forget() -> None:
+    """Forget all recordings, because the code that they play has been replaced."""
+    for played in _played:
+        played.clear()
 
 
 def uncollected(function: Callable[_P, _R]) -> Callable[_P, _R]:

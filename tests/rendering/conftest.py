@@ -26,3 +26,16 @@ def renderer(backend: Any) -> Renderer:
     from eyerender.rendering.renderer import Renderer
 
     return Renderer(backend, spp=16)
+
+
+@pytest.fixture(autouse=True)
+def _recordings(request):
+    """Tests that replace code have no recordings of the code before, and leave none."""
+    if "monkeypatch" not in request.fixturenames or "renderer" not in request.fixturenames:
+        yield
+        return
+    from eyerender.rendering.recorded import forget
+
+    forget()
+    yield
+    forget()

@@ -17,6 +17,7 @@ def test_masks_mark_where_mirrored_light_exceeds_half_of_the_scattered(renderer,
     import mitsuba as mi
 
     from eyerender.rendering import lighting
+    from eyerender.rendering.recorded import forget
     from eyerender.rendering.renderer import Renderer
 
     given = load_scene("desktop_tracker").with_({"image.window_px": [260, 180], "image.interreflection": False})
@@ -25,6 +26,7 @@ def test_masks_mark_where_mirrored_light_exceeds_half_of_the_scattered(renderer,
     marked, part = done.highlights, done.labels.part
     shiny = renderer.radiance(job, spp=64)
     monkeypatch.setattr(lighting, "sheen", lambda *_: mi.Float(0))
+    forget()
     matte = Renderer(renderer.backend).radiance(job, spp=64)
     ratio = (shiny - matte) / matte
     assert 20 < marked.sum() < 0.05 * marked.size

@@ -27,6 +27,7 @@ def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_
 
     from eyerender.rendering import stage
     from eyerender.rendering.lampviews import LampViews
+    from eyerender.rendering.recorded import forget
 
     monkeypatch.setattr(stage, "IrisLight", lambda *_: None)  # which uses the views too
 
@@ -46,6 +47,7 @@ def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_
         return mi.Bool(False)
 
     monkeypatch.setattr(LampViews, "clear", never)
+    forget()
     truth = renderer.radiance(job, spp=4)
     assert asked
     assert np.mean(truth > 0) > 0.9
