@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gc
+from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -11,25 +13,63 @@ import drjit as dr
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-_KEPT = 16  # recordings of a function, one for each set of sizes
-_played: list[Any] = []
+_KEPT = 16  # recordings of a function with given plain values, one for each set of sizes of its arrays
+_VARIANTS = 32  # sets of plain values for which a function keeps recordings
+_played: list[OrderedDict[Any, Any]] = []
 
 
 def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Make a function of Dr.Jit arrays, and of records of them, play its kernels back.
 
-    Its other arguments, such as numbers of lanes, make recordings of their own. It may not read arrays to the host, or
-    make arrays of NumPy's. Whatever changes between frames must be among the arguments.
+    Its plain values, such as numbers of lanes and whether something is on, make recordings of their own. It may not
+    read arrays to the host, or make arrays of NumPy's. Whatever changes between frames must be among the arguments.
+
+    Dr.Jit compares plain values, too, but misses the change of one that is also found before it: it takes a call with
+    (True, False, True) for one with (True, False, False). So they choose the recordings here.
     """
-    played = dr.freeze(function, limit=_KEPT, warn_after=10 * _KEPT, auto_opaque=False)
-    _played.append(played)
+    variants: OrderedDict[Any, Any] = OrderedDict()
+    _played.append(variants)
+
+    @wraps(function)
+    def played(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        plain: list[Any] = []
+        _collect((args, kwargs), plain)
+        key = tuple(plain)
+        if key not in variants:
+            # A run over many subjects may record often without being wrong, so there is no warning.
+            variants[key] = dr.freeze(function, limit=_KEPT, warn_after=2**31 - 1, auto_opaque=False)
+            if len(variants) > _VARIANTS:
+                variants.popitem(last=False)
+        variants.move_to_end(key)
+        return variants[key](*args, **kwargs)  # type: ignore[no-any-return]
+
     return uncollected(played)
+
+
+def _collect(value: Any, plain: list[Any]) -> None:
+    """Append the plain values in an argument, and the types of what else it holds, in their order."""
+    if value is None or isinstance(value, bool | int | float | str):
+        plain += (type(value), value)
+    elif isinstance(value, tuple | list):
+        plain += (type(value), len(value))
+        for item in value:
+            _collect(item, plain)
+    elif isinstance(value, dict):
+        plain += (dict, *value)
+        _collect(list(value.values()), plain)
+    else:
+        plain.append(type(value))
+        names = getattr(type(value), "DRJIT_STRUCT", None)
+        if not names and is_dataclass(value):
+            names = [field.name for field in fields(value)]
+        for name in names or ():
+            _collect(getattr(value, name), plain)
 
 
 def forget() -> None:
     """Forget all recordings, because the code that they play has been replaced."""
-    for played in _played:
-        played.clear()
+    for variants in _played:
+        variants.clear()
 
 
 def uncollected(function: Callable[_P, _R]) -> Callable[_P, _R]:
