@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 from torch.utils.data import ConcatDataset, DataLoader, default_collate
-from train_segmentation import PARTS, UNet, loss_of
+from train_segmentation import PARTS, UNet, train
 
 from eyerender.torch import FolderDataset
 
@@ -78,7 +78,7 @@ def shrunk(item: dict[str, Any]) -> dict[str, Any]:
     return {"image": image, "mask": F.interpolate(item["mask"][None, None].float(), size)[0, 0].to(torch.uint8)}
 
 
-def train(folders: list[Path], epochs: int) -> UNet:
+def trained(folders: list[Path], epochs: int) -> UNet:
     """Train a network on all images of the folders."""
     read = ConcatDataset([FolderDataset(folder, parts=("image", "mask"), transform=shrunk) for folder in folders])
     loader = DataLoader(
@@ -89,18 +89,7 @@ def train(folders: list[Path], epochs: int) -> UNet:
         collate_fn=lambda batch: default_collate([varied(item) for item in batch]),
     )
     network = UNet()
-    optimiser = torch.optim.AdamW(network.parameters(), lr=3e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=epochs * len(loader))
-    for epoch in range(epochs):
-        total = 0.0
-        for batch in loader:
-            loss = loss_of(network(batch["image"]), batch["mask"])
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            total += loss.item()
-        print(f"epoch {epoch + 1:2d} of {epochs}: loss {total / len(loader):.4f}", flush=True)
+    train(network, loader, epochs, change=None, rate=3e-3)  # the items are changed one by one
     return network.eval()
 
 
@@ -127,7 +116,7 @@ def main() -> int:
     parser.add_argument("--overlays", type=Path, required=True, help="the folder for the pictures with outlines")
     options = parser.parse_args()
     torch.manual_seed(0)
-    network = train(options.folders, options.epochs)
+    network = trained(options.folders, options.epochs)
     options.overlays.mkdir(parents=True, exist_ok=True)
     for file in sorted(f for f in options.apply.iterdir() if f.suffix.lower() in (".png", ".jpg", ".jpeg")):
         recorded = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)

@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from torch.utils.data import DataLoader
 
 from eyerender.torch import FolderDataset
 
+Change = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 PARTS = ("background", "sclera", "iris", "pupil", "frame")
 MUST = 0.9
 
@@ -96,15 +98,19 @@ def loss_of(logits: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
     return F.cross_entropy(logits, masks) + 1 - ((2 * both + 1) / (all_ + 1)).mean()
 
 
-def train(network: nn.Module, loader: DataLoader[Any], epochs: int) -> None:
-    """Train a network and print its loss after each epoch."""
-    optimiser = torch.optim.AdamW(network.parameters(), lr=4e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 4e-3, total_steps=epochs * len(loader))
+def train(
+    network: nn.Module, loader: DataLoader[Any], epochs: int, change: Change | None = varied, rate: float = 4e-3
+) -> None:
+    """Train a network on batches, each changed at random, and print its loss after each epoch."""
+    optimiser = torch.optim.AdamW(network.parameters(), lr=rate)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * len(loader))
     for epoch in range(epochs):
         network.train()
         total = 0.0
         for batch in loader:
-            images, masks = varied(batch["image"], batch["mask"])
+            images, masks = batch["image"], batch["mask"]
+            if change is not None:
+                images, masks = change(images, masks)
             loss = loss_of(network(images), masks)
             optimiser.zero_grad()
             loss.backward()
