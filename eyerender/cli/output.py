@@ -16,7 +16,9 @@ from ..files import write_json
 
 def say(text: str) -> None:
     """Print a line of log on stderr."""
-    print(text, file=sys.stderr, flush=True)
+    # In one piece: an interrupt between text and line end would join two lines.
+    sys.stderr.write(f"{text}\n")
+    sys.stderr.flush()
 
 
 class Heed:
