@@ -208,7 +208,10 @@ def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = 
     source = str(path)
     with opened(path, limit=limit, follow=follow) as file:
         try:
-            data = file.read(limit + 1)
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size + 1)  # Python takes memory for all that it is asked to read
+            if len(data) > size:  # the file has grown
+                data += file.read(limit + 1 - len(data))
         except OSError as error:
             raise InputError(f"cannot be read ({error.strerror or error})", source=source) from None
     if len(data) > limit:

@@ -92,7 +92,7 @@ def test_common_loaders_show_the_images_as_they_are(tiny, tmp_path):
     """The decoder "pil" of webdataset and `convert("L")`.
 
     The scene has no veiling glare, so its pupils are nearly black: the darker half has 4 codes or more with gamma and
-    gain, and 2 at most in linear copies without a gain.
+    gain, and 3 at most in linear copies without a gain.
     """
     import webdataset as wds
 
@@ -112,7 +112,7 @@ def test_common_loaders_show_the_images_as_they_are(tiny, tmp_path):
             assert np.mean(picture == 255) < 0.02
             assert pupil_codes(picture, mask) >= 4
             plain = np.asarray(Image.open(tmp_path / "plain" / "images" / f"{name}.png"))
-            assert pupil_codes(plain, mask) <= 2
+            assert pupil_codes(plain, mask) <= 3
             seen += 1
     assert seen == 24
 

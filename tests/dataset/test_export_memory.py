@@ -12,7 +12,7 @@ import pytest
 from eyerender.dataset.export import FORMATS, export
 from eyerender.dataset.shard import sum_of
 from eyerender.errors import InputError
-from tests.support.fabricated import fabricate, peak_bytes
+from tests.support.fabricated import SHARD, fabricate, peak_bytes
 
 pytestmark = pytest.mark.render
 BAR_BYTES, ROWS = 300 * 2**20, 200_000  # what so many images may take above the base process
@@ -58,8 +58,8 @@ COLLECTING = ("coco", "ellseg")
 
 @pytest.mark.parametrize("format", [f if f in COLLECTING else pytest.param(f, marks=pytest.mark.slow) for f in FORMATS])
 def test_an_image_more_takes_few_bytes_more(folders, tmp_path, format):
-    # Parquet collects 100 rows of each split; so many images fill that.
-    few, many = (400, 600) if format == "parquet" else (50, 250)
+    # The files of two shards are listed at a time; Parquet collects 100 rows of each split. So many images fill these.
+    few, many = (1600, 2000) if format == "parquet" else (2 * SHARD, 4 * SHARD)
     argv = [str(folders(few)), str(folders(many)), str(tmp_path / "out"), format]
     done = subprocess.run([sys.executable, "-c", GROWTH, *argv], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -14,7 +14,7 @@ import numpy as np
 
 from eyerender.imagefile import read_image, write_png
 
-SHARD = 1000
+SHARD = 100
 FRAMES = 50  # a subject
 SPLITS = ("train", "train", "validation", "test")
 
