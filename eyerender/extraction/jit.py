@@ -1,14 +1,19 @@
 """How the compiled functions are compiled. Numba keeps the machine code in $XDG_CACHE_HOME/eyerender/kernels.
 
 Numba compiles a function again when its own file changed, but not when another file did from which it calls a
-function. So the machine code is kept in a folder of a name that depends on all files of compiled functions.
+function. So the machine code is kept in a folder of a name that depends on all files of compiled functions. When such
+a folder is made, those of other versions that nothing has used for thirty days are removed.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
+import shutil
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -16,17 +21,31 @@ from numba import njit
 from numba.core import config as numba_config
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+_DIGITS, _UNUSED_S = 16, 30 * 86400.0
 config: Any = numba_config  # it makes its attributes at run time
 
 
 def _folder() -> Path:
     """Folder of the machine code of these files as they are."""
     sources = sorted(Path(__file__).parent.glob("*kernels.py"))
-    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:_DIGITS]
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eyerender" / "kernels" / digest
 
 
-FOLDER = str(_folder())
+def used(folder: Path) -> Path:
+    """Mark a folder of machine code as used; if it does not exist yet, remove old ones beside it."""
+    with suppress(OSError):
+        if folder.exists():
+            os.utime(folder)
+        else:
+            for other in folder.parent.iterdir():
+                ours = re.fullmatch(f"[0-9a-f]{{{_DIGITS}}}", other.name) and other.is_dir() and not other.is_symlink()
+                if ours and time.time() - other.stat().st_mtime > _UNUSED_S:
+                    shutil.rmtree(other, ignore_errors=True)  # numba compiles again what another process misses
+    return folder
+
+
+FOLDER = str(used(_folder()))
 
 
 def compiled(function: Function) -> Function:

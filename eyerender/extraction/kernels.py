@@ -13,6 +13,7 @@ from .jit import compiled, inlined
 
 SECTORS, NEAR = 48, 2  # as in edge_model
 DARK, SHADED = 0.35, 0.6  # as in outline
+WEAK = 0.2  # as in edges
 MOST_BLOBS = 12  # as in candidates
 SELECTION = 1.6  # as in covariance
 
@@ -361,12 +362,12 @@ def _taubin(points, chosen, out):
 
 
 @compiled
-def settled(points, normals, start, sigma_px, tolerance, free):
+def settled(points, normals, start, sigma_px, tolerance):
     n = points.shape[0]
     ellipse, moved, nothing = start.copy(), np.empty((n, 2)), np.zeros(3)
     distance, chosen, inliers = np.empty(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     for turn in range(5):
-        reach = 2.0 * tolerance if turn == 0 and not free else tolerance
+        reach = 2.0 * tolerance if turn == 0 else tolerance
         count = _select(points, normals, ellipse, sigma_px, reach, turn >= 1, moved, distance, chosen)
         if count < 8:
             return count, ellipse, chosen, moved, nothing
@@ -562,7 +563,7 @@ def ridges(gx, gy, magnitude, covered, ellipse, half_band, floor):
             if gx[y, x] * u + gy[y, x] * v > 0.7 * strength * max(math.sqrt(u * u + v * v), 1e-12):
                 row[n], column[n], here[n] = y, x, strength
                 n += 1
-    least = 0.35 * quantile_of(here[:n], 0.9) if n else 0.0
+    least = WEAK * quantile_of(here[:n], 0.9) if n else 0.0
     found = 0
     for i in range(n):
         y, x, strength = row[i], column[i], here[i]
@@ -605,14 +606,14 @@ def _nearest(image, x, y):
 
 @compiled
 def at_the_iris(smooth, points, normals, depth, limits):
-    dark, faint, bright = limits
+    dark, bright, rise = limits
     out = np.empty(points.shape[0], dtype=np.bool_)
     for i in range(out.size):
         x, y, u, v = points[i, 0], points[i, 1], depth * normals[i, 0], depth * normals[i, 1]
         out[i] = (
             _nearest(smooth, x - u, y - v) < dark
-            and _nearest(smooth, x + u, y + v) > faint
             and _nearest(smooth, x + 0.5 * u, y + 0.5 * v) < bright
+            and _nearest(smooth, x + 1.5 * u, y + 1.5 * v) - _nearest(smooth, x + u, y + v) < rise
         )
     return out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
@@ -12,7 +13,7 @@ import numpy as np
 from ..arrays import Bools, Floats
 from ..geometry.ellipse import signed_distance
 from .glints.bloomed import bloomed_glints
-from .glints.classification import classify_spots
+from .glints.classification import Eye, classify_spots
 from .glints.deblending import give_edges, split_blends
 from .glints.detection import Spots, detect_spots, widest
 from .glints.fits import SpotFit, joined
@@ -25,7 +26,7 @@ from .pupil.consensus import median_off
 from .pupil.covariance import boundary_deviation
 from .pupil.edge_model import SECTORS, EdgeModel
 from .pupil.glare import NO_PATCH, levels_beside
-from .pupil.refinement import PixelFit, refine
+from .pupil.refinement import LID, PixelFit, refine
 from .pupil.scoring import pupil_of
 from .pupil.search import SURE, Found, search
 from .result import Extraction, PupilResult
@@ -106,24 +107,43 @@ def explained(prepared: Prepared, found: Found, settings: ExtractionSettings) ->
     noise = prepared.noise_dn / DN
     model = found.model
     refined = settings.method == "refined"
-    pupil = None if refined else pupil_of(found, None, settings)  # glints do not affect a fast fit
-    if pupil is not None and not pupil.ok:
+    pupil = pupil_of(found, None, settings)
+    if not refined and not pupil.ok:
         return Extraction(pupil, (), (), noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     spots, fit = _fit_spots(prepared, found, spots)
-    if pupil is None:
+    if refined:
         pixels, fit = _refined(prepared, found, spots, fit)
-        model = model if pixels is None else pixels.model
-        pupil = pupil_of(found, pixels, settings)
-        if pixels is not None and pupil.confidence < min(found.confidence, SURE):
-            model, pupil = found.model, pupil_of(found, None, settings)  # the edges are more certain than the pixels
+        by_pixels = None if pixels is None else pupil_of(found, pixels, settings)
+        if pixels is not None and by_pixels is not None and _better(by_pixels, pupil):
+            model, pupil = pixels.model, by_pixels
     if not pupil.ok:
         return Extraction(pupil, (), (), noise, size)
-    step = abs(model.step_dn)
-    large = bloomed_glints(prepared, model.ellipse, step)
-    iris = _iris_level(prepared, found, model)
-    accepted, rejected = classify_spots(spots, fit, prepared, step, model.sigma_px, iris, settings, large)
+    large = bloomed_glints(prepared, model.ellipse, abs(model.step_dn))
+    iris, step = _iris_level(prepared, found, model), model.step_dn
+    inside = iris + step if found.image.inverted else iris - step
+    eye = Eye(model.ellipse, model.sigma_px, inside, iris, found.boundary.support)
+    accepted, rejected = classify_spots(spots, fit, eye, settings, large)
     return Extraction(pupil, accepted, rejected, noise, size)
+
+
+def _better(pixels: PupilResult, edges: PupilResult) -> bool:
+    """Whether the pupil by the pixels is as certain as that by the edges.
+
+    Where a lid cuts the outline, it must also be closer to the truth by the covariances: the lid's shadow reaches the
+    pixels beside the edges.
+    """
+    if pixels.goodness is None or edges.goodness is None:
+        return pixels.ok
+    cut = edges.goodness.gap > LID and _deviation(pixels) > _deviation(edges)
+    return pixels.confidence >= min(edges.confidence, SURE) and not cut
+
+
+def _deviation(pupil: PupilResult) -> float:
+    """Standard deviation of a pupil's boundary, px; infinite if it is missing."""
+    if pupil.ellipse is None or pupil.covariance is None:
+        return math.inf
+    return boundary_deviation(pupil.ellipse, pupil.covariance)
 
 
 def _iris_level(prepared: Prepared, found: Found, model: EdgeModel) -> float:
@@ -204,14 +224,7 @@ def _fitted_again(
 
 
 def _agrees(fit: PixelFit, found: Found) -> bool:
-    """Whether the refined boundary agrees with the edges and is at least as certain as they are.
-
-    Noise and texture may move it, but no more. Where glints leave too few pixels, it is not used.
-    """
-    by_edges = boundary_deviation(found.boundary.ellipse, found.boundary.covariance)
-    # Both are estimates from a few dozen sectors, which scatter by a fifth or more.
-    if boundary_deviation(fit.ellipse, fit.covariance) > 3.0 * by_edges:
-        return False
+    """Whether the refined boundary agrees with the edges. Noise and texture may move it, but no more."""
     boundary = found.boundary
     points = found.edges.points_px[boundary.inliers]
     off = median_off(fit.ellipse.numbers(), points, found.edges.sigma_px)

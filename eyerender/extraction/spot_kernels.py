@@ -10,7 +10,6 @@ import math
 import numpy as np
 
 from .jit import compiled, inlined, summing
-from .kernels import median_of, quantile_of
 
 UNEXPLAINED = 2.0  # as in fitting
 # As in gaussian_model.
@@ -365,35 +364,6 @@ def _add_products(rows, begin, end, out):
             for i in range(begin, end):
                 total += rows[j, i] * rows[m, i]
             out[j, m] += total
-
-
-@inlined
-def _clear(xy, near, wide, x, y):
-    """Whether a point lies in the disc of no spot that is near."""
-    for k in range(wide.size):
-        if near[k] and (x - xy[k, 0]) ** 2 + (y - xy[k, 1]) ** 2 <= (3.0 * wide[k]) ** 2:
-            return False
-    return True
-
-
-@compiled
-def ring(linear, xy, wide, converged, i):
-    x, y, reach = xy[i, 0], xy[i, 1], 3.5 * wide[i] + 1.0
-    near, count = np.empty(wide.size, dtype=np.bool_), 0
-    for k in range(wide.size):
-        apart2 = (xy[k, 0] - x) ** 2 + (xy[k, 1] - y) ** 2
-        near[k] = converged[k] and k != i and apart2 < (1.5 * reach + 3.0 * wide[k] + 1.0) ** 2
-    x0, x1 = max(0, math.floor(x - reach)), min(linear.shape[1], math.ceil(x + reach) + 1)
-    y0, y1 = max(0, math.floor(y - reach)), min(linear.shape[0], math.ceil(y + reach) + 1)
-    out = np.empty(max(x1 - x0, 0) * max(y1 - y0, 0), dtype=np.float32)
-    for row in range(y0, y1):
-        for column in range(x0, x1):
-            outside = (column - x) ** 2 + (row - y) ** 2 > (2.2 * wide[i]) ** 2
-            if outside and _clear(xy, near, wide, column, row):
-                out[count] = linear[row, column]
-                count += 1
-    out = out[:count]
-    return count, median_of(out), quantile_of(out, 0.97)
 
 
 @compiled

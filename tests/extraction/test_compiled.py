@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import time
 
 import numpy as np
 import pytest
@@ -78,3 +80,22 @@ def test_extraction_is_the_same_with_and_without(without, monkeypatch):
         np.testing.assert_allclose(other.ellipse.centre_px, pupil.ellipse.centre_px, atol=1e-4)
         np.testing.assert_allclose(other.ellipse.semi_axes_px, pupil.ellipse.semi_axes_px, atol=1e-4)
         assert other.confidence == pytest.approx(pupil.confidence, abs=1e-4)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra `fast`")
+def test_machine_code_of_other_versions_is_removed_once_it_is_old(tmp_path):
+    from eyerender.extraction.jit import used
+
+    new, old, recent, other = (tmp_path / name for name in ("0" * 16, "a" * 16, "b" * 16, "mine"))
+    month_ago = time.time() - 31 * 86400
+    for folder in (old, recent, other):
+        folder.mkdir()
+        (folder / "code.nbc").write_bytes(b"x")
+    for folder in (old, other):
+        os.utime(folder, (month_ago, month_ago))
+    assert used(new) == new
+    assert sorted(tmp_path.iterdir()) == [recent, other]  # only what the package itself named
+    os.utime(recent, (month_ago, month_ago))
+    used(recent)  # marks it
+    used(new)
+    assert recent.exists()

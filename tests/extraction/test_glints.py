@@ -61,7 +61,7 @@ def test_a_strongly_clipped_glint_hides_no_other():
 def test_a_glint_before_bright_sclera_is_found():
     drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[1])
     x, y = drawing.label["pupil"]["centre_px"]
-    y += 2.0 * drawing.label["pupil"]["semi_axes_px"][0]
+    y += 1.5 * drawing.label["pupil"]["semi_axes_px"][0]
     image = drawing.image.astype(np.float64)
     image[round(y) - 3 :] = 190.0
     ideal._add_glint(image, {"xy": np.array([x, y + 4.0]), "sigma": 1.0}, 3000.0)

@@ -8,10 +8,6 @@ import pytest
 import make_ideal_images as ideal
 from eyerender.extraction import FAST, REFINED, extract
 from eyerender.extraction.glints.prescreening import bell_shaped
-from eyerender.extraction.pupil.consensus import BoundaryFit, ams_fit, boundaries_without_stretch
-from eyerender.extraction.pupil.covariance import EdgeSums
-from eyerender.extraction.pupil.edges import EdgePoints
-from eyerender.extraction.settings import Shape
 from eyerender.geometry.ellipse import Ellipse, iou
 
 
@@ -42,36 +38,6 @@ def test_a_later_look_does_not_take_the_iris(seed):
 def test_no_later_look_finds_a_pupil_where_no_eye_is():
     sure = [extract(ideal.draw_no_eye(seed)).pupil.confidence > 0.8 for seed in range(12)]
     assert sum(sure) <= 1  # a small blurred letter o is a dark ring with a faint middle
-
-
-@pytest.mark.parametrize("covered", [0.25, 0.4])
-@pytest.mark.parametrize("seed", range(4))
-def test_an_outline_without_the_lids_margin(covered, seed):
-    rng = np.random.default_rng(seed)
-    truth = Ellipse(np.array([60.0, 50.0]), np.array([16.0, rng.uniform(13.0, 16.0)]), rng.uniform(0.0, np.pi))
-    turn = np.linspace(0.0, 2.0 * np.pi, 120, endpoint=False)
-    cos, sin = np.cos(truth.angle_rad), np.sin(truth.angle_rad)
-    u, v = truth.semi_axes_px[0] * np.cos(turn), truth.semi_axes_px[1] * np.sin(turn)
-    points = truth.centre_px + np.stack([u * cos - v * sin, u * sin + v * cos], axis=-1)
-    slope = np.stack([np.cos(turn) / truth.semi_axes_px[0], np.sin(turn) / truth.semi_axes_px[1]], axis=-1)
-    normals = slope @ np.array([[cos, sin], [-sin, cos]])
-    normals /= np.hypot(*normals.T)[:, None]
-    # The lid's margin: a chord from boundary to boundary in place of the arc above it.
-    height = np.quantile(points[:, 1], covered)
-    hidden = points[:, 1] < height
-    points[hidden, 1] = height
-    points += rng.normal(0.0, 0.05, points.shape)
-    normals[hidden] = [0.0, -1.0]
-    nowhere = np.zeros(120, dtype=np.intp)
-    edges = EdgePoints(points, normals, (nowhere, nowhere), np.ones(120, dtype=bool), 1.0, 1.0)
-    through_all = ams_fit(points)
-    assert through_all is not None
-    assert iou(through_all, truth) < 0.9
-    sums = EdgeSums.of(through_all, points)
-    boundary = BoundaryFit(through_all, np.ones(120, dtype=bool), points, 1.0, 0.0, 1.0, sums, np.eye(5))
-    boundaries = boundaries_without_stretch(edges, boundary, Shape(7.0, 100.0, 0.3, 0.2), 0.1)
-    # The points are shifted outward by the curvature of a blurred edge, sigma^2 / (2 r) = 0.03 px: 0.5 % of the area.
-    assert max(iou(one.ellipse, truth) for one in boundaries) > 0.95
 
 
 def _spots(rng: np.random.Generator, sigma: float, height: float, noise: float) -> tuple[np.ndarray, np.ndarray]:

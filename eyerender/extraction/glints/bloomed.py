@@ -21,9 +21,9 @@ from ..result import GlintResult
 # The cornea's reflections lie within its radius of 6 mm, which is 1.5 to 3 radii of a pupil of 4 to 8 mm.
 REACH = 1.8  # from the pupil's centre, in semi-axes a
 NEARLY = 0.92  # share of the brightest level near the pupil that counts as saturated (compression lowers some pixels)
-LEAST_PX = 30  # pixels of a patch; a smaller one is a Gaussian spot
+LEAST_PX, LEAST = 30, 0.03  # area of a patch in pixels and in b^2; a smaller one is a Gaussian spot or on a lid margin
 LONGEST, THICKEST = 1.1, 0.7  # largest sides of the patch in semi-axes b; a lid margin's highlight is longer
-STANDS_OUT = 2.0  # steps from pupil to iris by which a patch is brighter than what surrounds it
+STANDS_OUT = 1.5  # steps from pupil to iris by which a patch is brighter than what surrounds it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,14 +52,15 @@ def bloomed_glints(prepared: Prepared, ellipse: Ellipse, step_dn: float) -> list
         return []
     saturated = min(prepared.clip_dn, NEARLY * float(crop.max()))
     bright = (crop >= saturated).view(np.uint8)
-    if np.count_nonzero(bright) < LEAST_PX:
+    least = max(LEAST_PX, LEAST * b * b)
+    if np.count_nonzero(bright) < least:
         return []
     count, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
     out = []
     for k in range(1, count):
         left, top, w, h, area = stats[k].tolist()
         inside = left > 0 and top > 0 and left + w < crop.shape[1] and top + h < crop.shape[0]
-        if area < LEAST_PX or not inside or max(w, h) > LONGEST * b or min(w, h) > THICKEST * b:
+        if area < least or not inside or max(w, h) > LONGEST * b or min(w, h) > THICKEST * b:
             continue
         patch = _patch(crop, labels == k, max(prepared.noise_dn, 1e-3), step_dn, prepared.clip_dn)
         corner = np.array([x0, y0], dtype=np.float64)

@@ -1,4 +1,10 @@
-"""Classification of fitted spots: which are glints, and the reasons why other reflections are not."""
+"""Classification of fitted spots: which are glints, and the reasons why other reflections are not.
+
+A spot's features (what is behind it, how far from the pupil it lies, its shape and height) give a first logit of the
+probability that it is a glint of the cornea. The likeliest one is then what the others are compared with: lamps of one
+rig are reflected about equally high and wide. The weights of both steps are maximum a-posteriori estimates (logistic
+regression) from development images; `scripts/fit_glints.py` makes them.
+"""
 
 from __future__ import annotations
 
@@ -8,71 +14,96 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import Bools, Floats, frozen
+from ...arrays import Floats, frozen
+from ...geometry.ellipse import Ellipse
 from ...status import Status
-from ..compiled import twin
-from ..preprocessing import DN, Image, Prepared
+from ..preprocessing import DN
 from ..result import GlintResult
 from ..settings import ExtractionSettings
-from ..statistics import median, quantile
 from .bloomed import Patch
-from .detection import Spots, optics_sigma, widest
+from .detection import Spots, optics_sigma
 from .fits import SpotFit
 
-# Largest ratio of length to width of a glint's bright patch, and largest product of that ratio and the fit's. True
-# glints of the development images are below 1.99 and 2.2.
-LONG, LONG_TWICE = 2.0, 2.4
-# The cornea mirrors 2 % of a lamp, a point; wet lid margins and skin spread it. Lamps of one rig differ less than this:
-# of rendered eyes in lids, all 1,436 glints but one are above 0.3 of the brightest.
-FAINTEST = 0.2
-# Height in full scales up to which that of a single clipped glint is trusted.
-TALL = 2.5
-# What lies around a glint is not brighter than the iris by more than LIT steps from pupil to iris, except where the
-# glint is near the sclera. There it is still SHINING times as high: 19 such glints of rendered eyes are above 3.4, and
-# 110 highlights of skin and lid margins below 1.8.
-LIT, SHINING = 0.9, 2.5
+# Heights in full scales up to which that of a single clipped glint is trusted, and up to which heights are compared.
+TALL, HIGHEST = 2.5, 10.0
+# Steps by which the ground may be brighter than the iris; more is no worse, because the sclera is as bright.
+BRIGHTEST = 1.4
+# A large saturated patch is this many times as wide as the spots that are glints, at most.
+WIDER = 2.0
+# A spot is accepted if it is a glint with at least these odds.
+LEAST_ODDS = 2.0
+LIKELIEST = 12.0  # largest logit that counts
+# Reasons for which a spot is refused, in the order of the features.
+GROUNDS = (
+    "before something brighter than the iris, as highlights of skin are",
+    "far from the pupil, as highlights of skin are",
+    "not as wide as the optics' image of a lamp",
+    "elongated, as reflections off the sclera and wet lid margins are",
+    "too faint for a glint",
+    "much fainter than the brightest glint, as highlights of skin and lid margins are",
+    "not as wide as the likeliest glint",
+)
+USUAL = (0.0, 0.0, 0.0, 0.0, math.log(10.0))  # features of a glint that speaks for itself, in the order of the reasons
+
+# Made by scripts/fit_glints.py: weights of the features and 1, and of the comparison.
+FIRST = np.array([-5.14, -2.86, -1.46, -5.29, 1.63, 4.18, -0.267])
+SECOND = np.array([0.85, 3.32, 3.7, -3.44, 0.798])
 
 _PIXEL = 1.0 / 12.0  # variance of a pixel; without it a spot of one row of pixels would be a line
 
 
+@dataclass(frozen=True, slots=True)
+class Eye:
+    """What spots are judged by.
+
+    Attributes:
+        ellipse: the pupil.
+        blur_px: blur of its edge.
+        pupil_dn: level inside it.
+        iris_dn: level just outside it.
+        support: share of its boundary that is seen.
+    """
+
+    ellipse: Ellipse
+    blur_px: float
+    pupil_dn: float
+    iris_dn: float
+    support: float
+
+
 def classify_spots(
-    spots: Spots,
-    fit: SpotFit,
-    prepared: Prepared,
-    step_dn: float,
-    blur_px: float,
-    iris_dn: float,
-    settings: ExtractionSettings,
-    large: Sequence[Patch] = (),
+    spots: Spots, fit: SpotFit, eye: Eye, settings: ExtractionSettings, large: Sequence[Patch] = ()
 ) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
-    """Divide spots into (accepted, rejected), brightest first; spots of `large` patches are part of those."""
-    lit_dn = iris_dn + LIT * step_dn
-    accepted: list[GlintResult] = [patch.glint for patch in large]
+    """Divide spots into (accepted, rejected), brightest first; spots of `large` patches are part of those.
+
+    Args:
+        spots: the spots.
+        fit: their fits.
+        eye: the eye.
+        settings: settings of the extractor.
+        large: large saturated glints.
+    """
     rejected: list[GlintResult] = []
-    looks = _Look.of_all(spots, fit)
+    reasons = _objections(fit, eye, [patch.glint.amplitude for patch in large])
+    sigma = np.sqrt(fit.sigma_px.prod(axis=1))
+    alone = [not any(_in_patch(patch, xy) for patch in large) for xy in spots.xy_px]
+    widths = [width for width, reason, apart in zip(sigma, reasons, alone, strict=True) if reason is None and apart]
+    large = [patch for patch in large if patch.glint.sigma_px < WIDER * max(widths, default=math.inf)]
+    accepted = [patch.glint for patch in large]
     for i in np.argsort(-fit.amplitude_dn, kind="stable").tolist():
-        look = looks[i]
+        reason, converged = reasons[i], bool(fit.converged[i])
         if any(_in_patch(patch, spots.xy_px[i]) for patch in large):
             continue
-        reason = _objection(look, fit, i, prepared, step_dn, blur_px, lit_dn)
         result = GlintResult(
             status=Status.OK if reason is None else Status.REJECTED,
             reason=reason,
-            xy_px=frozen(fit.xy_px[i]) if look.converged else frozen(spots.xy_px[i]),
-            covariance=frozen(fit.covariance[i]) if look.converged else None,
-            amplitude=look.height / DN,
-            sigma_px=math.sqrt(look.wide * look.narrow),
+            xy_px=frozen(fit.xy_px[i]) if converged else frozen(spots.xy_px[i]),
+            covariance=frozen(fit.covariance[i]) if converged else None,
+            amplitude=float(fit.amplitude_dn[i]) / DN,
+            sigma_px=float(sigma[i]),
             saturated=bool(fit.clipped[i] > 0),
         )
         (accepted if reason is None else rejected).append(result)
-    faint = "much fainter than the brightest glint, as highlights of skin and lid margins are"
-    least = FAINTEST * _height([glint.amplitude for glint in accepted])
-    kept = len(large)  # the height of a large patch is not known, only where it is cut
-    bright = accepted[:kept] + [glint for glint in accepted[kept:] if glint.amplitude >= least]
-    rejected += [
-        replace(glint, status=Status.REJECTED, reason=faint) for glint in accepted[kept:] if glint.amplitude < least
-    ]
-    accepted = bright
     reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
     surplus = [replace(glint, status=Status.REJECTED, reason=reason) for glint in accepted[settings.max_glints :]]
     strip = "a strip or a broad patch, as reflections off the sclera and wet lid margins are"
@@ -86,14 +117,81 @@ def classify_spots(
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
 
 
-def _height(amplitudes: list[float]) -> float:
-    """Height of the brightest glint, as far as it is known.
+def features(fit: SpotFit, eye: Eye) -> Floats:
+    """Features (n, 7) of spots on which the first logit depends.
 
-    The fitted height of a strongly clipped glint may be many times too large. So it counts as TALL only, unless the
-    next one is higher than that.
+    They are: by how much the ground is brighter than the pupil or iris that should be there, in steps from pupil to
+    iris; the distance outside the pupil in semi-axes a; the logarithms of the width over the blur, of the elongation
+    (of the fit and of the bright patch) and of the height in steps; the visible share of the pupil boundary; and 1.
     """
-    first, second = [0.0, 0.0, *sorted(amplitudes)][:-3:-1]
-    return max(min(first, TALL), second)
+    step, wide2 = abs(eye.iris_dn - eye.pupil_dn), fit.sigma_px**2 + _PIXEL
+    width = wide2.prod(axis=1) ** 0.25
+    (xx, xy), (_, yy) = fit.moments_px2.transpose(1, 2, 0)
+    mean, apart = 0.5 * (xx + yy) + _PIXEL, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+    stretch = (mean + apart) / np.maximum(mean - apart, 1e-3) * wide2.max(axis=1) / wide2.min(axis=1)
+    offset = fit.xy_px - eye.ellipse.centre_px
+    cos, sin = math.cos(eye.ellipse.angle_rad), math.sin(eye.ellipse.angle_rad)
+    scaled = (offset @ np.array([[cos, -sin], [sin, cos]])) / eye.ellipse.semi_axes_px
+    beyond = np.hypot(*offset.T) * (1.0 - 1.0 / np.maximum(np.hypot(*scaled.T), 1e-6))
+    expected = eye.iris_dn + (eye.pupil_dn - eye.iris_dn) * np.clip(-beyond / (2.0 * width + 1.0), 0.0, 1.0)
+    columns = (
+        np.clip((fit.background_dn - expected) / step, 0.0, BRIGHTEST),
+        np.clip(beyond / eye.ellipse.semi_axes_px[0], 0.0, 4.0),
+        np.minimum(np.abs(np.log(width / eye.blur_px)), 1.5),
+        np.minimum(0.5 * np.log(stretch), 2.0),
+        np.log(np.clip(fit.amplitude_dn / step, 0.2, 60.0)),
+        np.full(width.size, eye.support),
+        np.ones(width.size),
+    )
+    return np.stack(columns, axis=1)
+
+
+def compared(fit: SpotFit, logit: Floats, heights: Sequence[float]) -> Floats:
+    """Features (n, 5) on which the second logit depends.
+
+    They are the first logit; whether the spot is another one than the likeliest; and for those, the logarithms of its
+    height over that of the brightest glint and of its width over the likeliest one's; and 1.
+
+    Args:
+        fit: the n spots.
+        logit: (n,) the first logit.
+        heights: of large glints, in full scales.
+    """
+    best = int(np.argmax(logit))
+    height, width = np.clip(fit.amplitude_dn / DN, 1e-3, HIGHEST), (fit.sigma_px**2 + _PIXEL).prod(axis=1) ** 0.25
+    # The fitted height of a strongly clipped glint may be many times too large. So it counts as TALL only, unless the
+    # next one is higher than that.
+    likely = sorted([*heights, *height[logit > 0.0].tolist()]) or [float(height[best])]
+    top = max(min(likely[-1], TALL), likely[-2] if len(likely) > 1 else 0.0)
+    other = (np.arange(logit.size) != best) / (1.0 + math.exp(-float(np.clip(logit[best], -30.0, 30.0))))
+    columns = (
+        np.clip(logit, -LIKELIEST, LIKELIEST),
+        other,
+        other * np.clip(np.log(height / top), -3.0, 0.0),
+        other * np.minimum(np.abs(np.log(width / width[best])), 1.0),
+        np.ones(logit.size),
+    )
+    return np.stack(columns, axis=1)
+
+
+def _objections(fit: SpotFit, eye: Eye, heights: Sequence[float]) -> list[str | None]:
+    """Reasons (n,) why spots are not glints, None for glints."""
+    reasons: list[str | None] = ["the spot's fit did not converge"] * fit.converged.size
+    index = np.flatnonzero(fit.converged)
+    if index.size == 0:
+        return reasons
+    fit = fit.taken(index)
+    first = features(fit, eye)
+    logit = first @ FIRST
+    second = compared(fit, logit, heights)
+    glint = second @ SECOND > math.log(LEAST_ODDS)
+    against = np.concatenate([(first[:, :5] - USUAL) * FIRST[:5] * SECOND[0], second[:, 2:4] * SECOND[2:4]], axis=1)
+    sharp = fit.sigma_px.max(axis=1) < 0.5 * optics_sigma(eye.blur_px)
+    for k, i in enumerate(index.tolist()):
+        reasons[i] = None if glint[k] else GROUNDS[int(np.argmin(against[k]))]
+        if sharp[k]:
+            reasons[i] = f"sharper than the optics (sigma {fit.sigma_px[k].max():.1f} px): a bad pixel"
+    return reasons
 
 
 def _in_patch(patch: Patch, xy: Floats) -> bool:
@@ -101,92 +199,3 @@ def _in_patch(patch: Patch, xy: Floats) -> bool:
     height, width = patch.pixels.shape
     column, row = (int(v) for v in np.rint(xy))
     return 0 <= row < height and 0 <= column < width and bool(patch.pixels[row, column])
-
-
-@dataclass(frozen=True, slots=True)
-class _Look:
-    """Appearance of a fitted spot.
-
-    It holds sigma across and along, height and residual in DN, the distance from the bright pixel, and the standard
-    deviations of the bright patch across and along.
-    """
-
-    converged: bool
-    narrow: float
-    wide: float
-    height: float
-    residual: float
-    moved: float
-    short: float
-    long: float
-
-    @staticmethod
-    def of_all(spots: Spots, fit: SpotFit) -> list[_Look]:
-        gap = fit.xy_px - spots.xy_px
-        (xx, xy), (_, yy) = fit.moments_px2.transpose(1, 2, 0)
-        mean, apart = 0.5 * (xx + yy) + _PIXEL, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-        columns = (
-            fit.converged, fit.sigma_px.min(axis=1), fit.sigma_px.max(axis=1), fit.amplitude_dn, fit.residual_dn,
-            np.sqrt((gap * gap).sum(axis=1)), np.sqrt(np.maximum(mean - apart, 0.0)), np.sqrt(mean + apart),
-        )  # fmt: skip
-        return [_Look(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
-
-
-def _objection(
-    look: _Look, fit: SpotFit, i: int, prepared: Prepared, step_dn: float, blur_px: float, lit_dn: float
-) -> str | None:
-    """Reason why spot i is not a glint, or None."""
-    if not look.converged:
-        return "the spot's fit did not converge"
-    if look.moved > max(2.5, 2.0 * look.wide):
-        return f"no spot: the fit moved {look.moved:.1f} px from the bright pixel"
-    if look.wide < 0.5 * optics_sigma(blur_px):
-        return f"sharper than the optics (sigma {look.wide:.1f} px): a bad pixel"
-    ratio, fitted = look.long / look.short, math.sqrt((look.wide**2 + _PIXEL) / (look.narrow**2 + _PIXEL))
-    if ratio > LONG or ratio * fitted > LONG_TWICE:
-        return f"elongated {max(ratio, fitted):.1f} : 1, as reflections off the sclera and wet lid margins are"
-    wide = max(look.wide, look.long)
-    if wide > widest(blur_px):
-        return f"too wide for a glint: sigma {wide:.1f} px"
-    if look.height < max(5.0 * prepared.noise_dn, 0.4 * step_dn):
-        return "too faint for a glint"
-    beside = _ring(prepared.linear, fit.xy_px, fit.sigma_px.max(axis=1), fit.converged, i)
-    if beside[1] > max(lit_dn, look.height / SHINING):
-        return "before something much brighter than the iris, as highlights of skin are"
-    if wide > 2.5 and not _outshines(fit, i, beside):
-        return "no brighter than what lies beside it, as a corner of sclera between lid and iris is"
-    if look.residual > max(0.3 * min(look.height, DN), 3.0 * prepared.noise_dn):
-        return "no spot: the bright patch is not bell-shaped"
-    return None
-
-
-@twin
-def _ring(linear: Image, xy: Floats, wide: Floats, converged: Bools, i: int) -> tuple[int, float, float]:
-    """Number, median and 97 % quantile of the levels in a ring around spot i, without other spots.
-
-    The spots are at xy (n, 2) and have sigma `wide` (n,). The levels are NaN where there is no pixel.
-    """
-    x, y = xy[i]
-    reach = 3.5 * wide[i] + 1.0
-    x0, x1 = max(0, math.floor(x - reach)), min(linear.shape[1], math.ceil(x + reach) + 1)
-    y0, y1 = max(0, math.floor(y - reach)), min(linear.shape[0], math.ceil(y + reach) + 1)
-    columns, rows = np.arange(x0, x1), np.arange(y0, y1)[:, None]
-    ring = (columns - x) ** 2 + (rows - y) ** 2 > (2.2 * wide[i]) ** 2
-    apart2 = ((xy - xy[i]) ** 2).sum(axis=1)
-    near = converged & (apart2 < (1.5 * reach + 3.0 * wide + 1.0) ** 2) & (np.arange(wide.size) != i)
-    for k in np.flatnonzero(near):
-        ring &= (columns - xy[k, 0]) ** 2 + (rows - xy[k, 1]) ** 2 > (3.0 * wide[k]) ** 2
-    levels = linear[y0:y1, x0:x1][ring]
-    return levels.size, median(levels), quantile(levels, 0.97)
-
-
-def _outshines(fit: SpotFit, i: int, beside: tuple[int, float, float]) -> bool:
-    """Whether a spot's peak is above the brightest surroundings (without other spots) by half its own height.
-
-    This test is for wide spots only, because a narrow spot cannot be anything but a glint.
-    """
-    count, _, brightest = beside
-    if count < 8:
-        return True
-    height = min(float(fit.amplitude_dn[i]), DN)
-    return float(fit.background_dn[i]) + height - brightest > 0.5 * height

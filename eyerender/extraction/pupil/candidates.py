@@ -57,9 +57,7 @@ class Candidate:
     rough: bool = False
 
 
-def find_candidates(
-    prepared: Prepared, shape: Shape, most: int = 4, *, levels: int = LEVELS, without_lines: bool = False
-) -> list[Candidate]:
+def find_candidates(prepared: Prepared, shape: Shape, most: int = 4, *, levels: int = LEVELS) -> list[Candidate]:
     """Find up to `most` candidates, best first; the list is empty if nothing dark and round stands out.
 
     Args:
@@ -67,18 +65,12 @@ def find_candidates(
         shape: sizes and shapes to look for.
         most: number of candidates.
         levels: thresholds at even grey levels.
-        without_lines: fill dark lines thinner than the smallest pupil first. Lid shadows and lashes that touch the
-            pupil are as dark as the pupil and form one blob with it at every threshold.
     """
     linear, noise_dn = prepared.linear, prepared.noise_dn
     factor = int(min(max(shape.least_px // 3.5, 1), 4))
     while factor < 8 and linear.size / factor**2 > 160_000:
         factor += 1
     small = _reduced(linear, factor, cv2.MORPH_CLOSE if prepared.inverted else cv2.MORPH_OPEN)
-    if without_lines:
-        width = 2 * max(1, round(0.7 * shape.least_px / factor)) + 1
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
-        small = as_image(cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel))
     noise = noise_dn / (1.5 * factor) + 0.1  # after averaging factor^2 pixels and a 3 x 3 Gaussian
     limits = _levels(small, levels)
     dark = round(DARKER * limits.size)

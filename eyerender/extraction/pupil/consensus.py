@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 import cv2
 import numpy as np
 
 from ...arrays import Bools, Floats
-from ...geometry.ellipse import Ellipse, from_cv2, signed_distance
+from ...geometry.ellipse import Ellipse, fit_ellipse_direct, from_cv2, signed_distance
 from ..compiled import twin
 from ..settings import Shape
 from ..statistics import median
 from .candidates import Candidate
 from .covariance import EdgeSums, edge_covariance, hidden_part, to_axes, towards_round
-from .edge_model import NEAR, sectors_at
+from .edge_model import NEAR, longest_gap, sectors_at
 from .edges import EdgePoints
-from .stretches import Cuts, direct_fits, turn_of
 
 SECTORS = 48  # sectors of the outline, to measure support
 PIECES = 16  # arcs are cut at these sectors, to separate a lid margin from the boundary it joins
@@ -77,20 +75,6 @@ def fit_boundary(edges: EdgePoints, candidate: Candidate, shape: Shape, expected
     if start is None:
         return "no ellipse passes through the edges around the darkest blob"
     return _polished(edges, start, shape, tolerance)
-
-
-def boundaries_without_stretch(
-    edges: EdgePoints, boundary: BoundaryFit, shape: Shape, expected_noise_px: float
-) -> list[BoundaryFit]:
-    """Alternative boundaries: the best fit for each width of the stretch that is left out.
-
-    The points left out must lie inside the new ellipse, as those of a lid margin that crosses the pupil do.
-    """
-    cuts = Cuts.of(edges.points_px[boundary.inliers], boundary.ellipse, 8, (0.2, 0.3, 0.42, 0.52), 2.0)
-    of_width = (cuts.inside(cuts.width == width, lambda residual: 2.0 * residual) for width in np.unique(cuts.width))
-    tolerance = max(0.35, 3.5 * expected_noise_px)
-    boundaries = (_polished(edges, one, shape, tolerance, free=True) for some in of_width for one in islice(some, 1))
-    return [one for one in boundaries if isinstance(one, BoundaryFit)]
 
 
 def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance: float) -> Ellipse | None:
@@ -167,14 +151,10 @@ def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) ->
     return score
 
 
-def _polished(
-    edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float, *, free: bool = False
-) -> BoundaryFit | str:
+def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float) -> BoundaryFit | str:
     """Select points and refit with AMS until the selection settles."""
     begun = np.array(start.numbers())
-    count, found, inliers, points, seen = _settled(
-        edges.points_px, edges.normals, begun, edges.sigma_px, tolerance, free
-    )
+    count, found, inliers, points, seen = _settled(edges.points_px, edges.normals, begun, edges.sigma_px, tolerance)
     if 0 <= count < 8:
         return f"only {count} edge points agree on one ellipse"
     if count < 0:
@@ -200,7 +180,7 @@ def _polished(
 
 @twin
 def _settled(
-    points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float, free: bool
+    points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float
 ) -> tuple[int, Floats, Bools, Floats, Floats]:
     """Select points and refit with AMS until the selection settles.
 
@@ -212,8 +192,7 @@ def _settled(
         normals: (n, 2).
         start: (5,) centre, semi-axes and angle.
         sigma_px: width of the whole smoothing.
-        tolerance: largest distance of a selected point, px.
-        free: whether the first selection, too, is limited to the tolerance, not to twice that.
+        tolerance: largest distance of a selected point, px; twice that for the first selection.
 
     Returns:
         How many points were selected (fewer than 8: too few; -1: they span no ellipse), the ellipse (5,), which points
@@ -225,7 +204,7 @@ def _settled(
         shift = np.minimum(0.5 * sigma_px**2 * curvature, 0.15 * float(ellipse.semi_axes_px[1]))
         moved, distance = points + shift[:, None] * outward, distance + shift
         agree = np.einsum("nk,nk->n", outward, normals) > 0.9
-        reach = 2.0 * tolerance if turn == 0 and not free else tolerance
+        reach = 2.0 * tolerance if turn == 0 else tolerance
         chosen = (np.abs(distance) < reach) & agree
         if turn >= 1 and chosen.sum() >= 8:
             spread = 1.4826 * median(np.abs(distance[chosen] - median(distance[chosen])))
@@ -269,12 +248,9 @@ def outline_support(ellipse: Ellipse, points: Floats) -> tuple[float, float]:
     The outline is divided into SECTORS (equal steps of the parameter). The second value is the share of the longest run
     of sectors without a point.
     """
-    sector = (turn_of(points, ellipse) * SECTORS).astype(np.intp) % SECTORS
-    held = np.unique(sector)
-    if held.size == 0:
-        return 0.0, 1.0
-    rows = np.diff(np.append(held, held[0] + SECTORS)) - 1
-    return held.size / SECTORS, float(rows.max()) / SECTORS
+    held = np.zeros(SECTORS, dtype=bool)
+    held[(turn_of(points, ellipse) * SECTORS).astype(np.intp) % SECTORS] = True
+    return float(held.mean()), longest_gap(held)
 
 
 @twin
@@ -296,3 +272,18 @@ def relative_to(ellipse: Ellipse, points: Floats) -> tuple[Floats, Floats, Float
     normals = np.stack([u * cos - v * sin, u * sin + v * cos], axis=-1) / slope[:, None]
     # With (cos t, sin t) = (p, q) / radius: a b / (a^2 sin^2 t + b^2 cos^2 t)^1.5, and slope is its root over a b.
     return (radius - 1.0) * radius / slope, normals, (radius / slope) ** 3 / (a * b) ** 2
+
+
+@twin
+def direct_fits(points: Floats) -> Floats:
+    """Direct ellipses (m, 5) through points (m, k, 2): centre, semi-axes and angle; NaN where there is none."""
+    fit = fit_ellipse_direct(points)
+    return np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])
+
+
+def turn_of(points: Floats, ellipse: Ellipse) -> Floats:
+    """Position (n,) of points along the outline, 0..1 by the ellipse's parameter."""
+    dx, dy = (points - ellipse.centre_px).T
+    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
+    a, b = ellipse.semi_axes_px
+    return np.asarray(np.arctan2((dy * cos - dx * sin) / b, (dx * cos + dy * sin) / a) / (2.0 * np.pi) + 0.5)

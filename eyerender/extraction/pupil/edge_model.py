@@ -268,3 +268,11 @@ def harmonics(cos_u: Floats, sin_u: Floats, order: int) -> Floats:
         np.subtract(out[k - 2] * cos_u, out[k - 1] * sin_u, out=out[k])
         np.add(out[k - 1] * cos_u, out[k - 2] * sin_u, out=out[k + 1])
     return out
+
+
+def longest_gap(held: Bools) -> float:
+    """Share of the outline in the longest run of sectors that are not held; 1 if none is."""
+    at = np.flatnonzero(held)
+    if at.size == 0:
+        return 1.0
+    return float(np.diff(np.append(at, at[0] + held.size)).max() - 1) / held.size

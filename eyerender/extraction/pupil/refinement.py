@@ -11,11 +11,11 @@ from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse
 from ..compiled import twin
 from ..preprocessing import Image, Part
+from .consensus import direct_fits
 from .covariance import SHAPE, distance_slopes, hidden_part, sector_excess, to_axes, towards_round
-from .edge_model import NEAR, SECTORS, EdgeModel, Place, sectors_at
+from .edge_model import NEAR, SECTORS, EdgeModel, Place, longest_gap, sectors_at
 from .least_squares import FIXED, Normal, Pixels, Prior, Solution, Sums, fitted
 from .occlusion import clear_of_lids, visible_part
-from .stretches import direct_fits
 
 # Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
 # side of the iris more, by a few hundredths of the step. Noise hides that from a test, but it shifts the centre.
@@ -24,6 +24,9 @@ ORDERS = (1, 2, 4, 6, 8)
 # better, but texture changes it with the distance. Where the wide band shows texture, the narrow one takes a third off
 # the error of the centre (rendered development images with textured irises).
 WIDE, NARROW = 3.0, 1.0
+# Share of the outline in a gap between edge points that only a lid makes. The model then explains no sector without
+# edge points: the shadow of a lid looks like a shaded iris, which its outer level follows.
+LID = 0.3
 # What shows texture: a larger reduced chi^2, or a boundary more uneven than this share of its radius. Nine in ten
 # rendered pupils are, and one in twenty drawn ellipses in a textured iris.
 UNEXPLAINED, ROUGH = 1.5, 0.003
@@ -148,6 +151,7 @@ def _fitted(
     use = np.ones(x.size, dtype=bool)
     # A lid must not decide the order of the outer level.
     seen = clear_of_lids(sectors, start) if before is None else before[2]
+    allowed = sectors | (longest_gap(sectors) < LID)
     displaced = np.zeros(SECTORS) if model.displaced is None else model.displaced.copy()
     for turn in range(turns):
         pixels = Pixels.of(x, y, level, bins, use, seen)
@@ -160,7 +164,7 @@ def _fitted(
             return "the pixel model's fit ran away from the edges"
         displaced[pixels.sector] = found.displaced
         visible = visible_part(model, displaced, x, y, level, use, seen, sectors, noise_dn)
-        new_seen = clear_of_lids(visible.explained, model)
+        new_seen = clear_of_lids(visible.explained & allowed, model)
         same = bool((visible.use == use).all() and (new_seen == seen).all())
         same &= abs(visible.uneven_px - prior.uneven_px) < max(0.2 * prior.uneven_px, 0.01)
         if not same:

@@ -21,7 +21,7 @@ from ..preprocessing import Prepared, as_image
 from ..result import Goodness, PupilResult
 from ..settings import Shape
 from .candidates import Candidate, Interior, candidate_at, find_candidates, find_inside, inspect_interior
-from .consensus import BoundaryFit, boundaries_without_stretch, fit_boundary
+from .consensus import BoundaryFit, fit_boundary
 from .edge_model import SECTORS, EdgeModel, Place, sector_of
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glare import Cleared, without_glare
@@ -38,7 +38,6 @@ MOVED, GROWN = 4.0, 0.7
 ROUGH = 0.8  # overlap with its boundary below which a rough candidate's edges are found again, about the boundary
 SAME = 0.95  # candidates of at least this overlap have the same boundary
 LIKELY = 0.5  # share of the best candidate's score below which no later look starts from a candidate
-MOST_CUT = 2  # boundaries that are also tried without a stretch
 # Work after which a search ends: boundaries, and the pixels about each in units of this many. That is about 0.1 s on a
 # quiet core. In 1,697 development images, 2 of the right boundaries came after more than 50, none after 60.
 MOST_WORK, PIXELS_OF_UNIT = 60.0, 40_000.0
@@ -172,35 +171,22 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, Found | str
 
     1. the best candidate at a quarter of the scale, then those of a less reduced image, and those inside each that has
        a dark core
-    2. pupils that lids cut: each boundary without the stretch that may be a lid, and rounder starts
-    3. the image without dark lines, which lashes and the shadows of lids are
-    4. the image at half scale, where block compression and texture are finer than the edges
-    5. pupils smaller than USUAL_PX
+    2. pupils that lids cut: circles as wide as flat blobs
+    3. the image at half scale, where block compression and texture are finer than the edges
+    4. pupils smaller than USUAL_PX
     """
     usual = replace(shape, least_px=max(shape.least_px, min(USUAL_PX, 0.5 * shape.most_px)))
     tried: list[Candidate] = []
-    found: list[Found] = []
 
     def bounded(candidates: Sequence[Candidate]) -> Iterator[Found | str]:
         for candidate in candidates:
             if not any(_same(candidate.ellipse, one.ellipse) for one in tried):
                 tried.append(candidate)
-                for boundary in _with_inner(work, candidate, shape):
-                    if isinstance(boundary, Found):
-                        found.append(boundary)
-                    yield boundary
+                yield from _with_inner(work, candidate, shape)
 
     yield from ((False, one) for one in bounded(_large(work, shape)))
     yield from ((False, one) for one in bounded(find_candidates(work, usual)))
-    likely = sorted((one for one in found if one.core_dn <= 0.0), key=lambda one: -one.confidence)[:MOST_CUT]
-    for one in likely:
-        for cut in _without_stretch(one, shape):
-            yield True, replace(one, boundary=cut)
-            yield from ((True, found) for found in bounded([replace(one.candidate, ellipse=cut.ellipse)]))
     yield from ((True, one) for one in bounded(list(_rounder(_best(tried), shape))))
-    if not work.inverted:
-        lineless = _best(find_candidates(work, usual, without_lines=True))
-        yield from ((True, one) for one in bounded([*lineless, *_rounder(lineless, shape)]))
     yield from ((True, one) for one in _at_half_scale(work, shape))
     if shape.least_px < usual.least_px:
         small = replace(shape, most_px=2.0 * usual.least_px)
@@ -271,17 +257,6 @@ def _rounder(candidates: Sequence[Candidate], shape: Shape) -> Iterator[Candidat
         for side in (0.0, 1.0, -1.0):
             centre = candidate.ellipse.centre_px + side * 0.9 * (a - b) * across
             yield replace(candidate, ellipse=Ellipse(centre, np.array([a, a]), 0.0))
-
-
-def _without_stretch(found: Found, shape: Shape) -> list[BoundaryFit]:
-    edges, candidate = found.edges, found.candidate
-    noise = edge_noise_px(
-        candidate.step_dn,
-        noise_dn=found.image.noise_dn,
-        sigma_filter=edges.filter_px,
-        sigma_total=edges.sigma_px,
-    )
-    return boundaries_without_stretch(edges, found.boundary, shape, noise)
 
 
 def _at_half_scale(work: Prepared, shape: Shape) -> Iterator[Found | str]:
