@@ -16,6 +16,8 @@ from .errors import InputError
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Reals = NDArray[np.floating[Any]]
+"""Numbers of single or double precision."""
 Ints = NDArray[np.int64]
 Indices = NDArray[np.intp]
 Bytes = NDArray[np.uint8]

@@ -5,7 +5,7 @@ python scripts/bake_meshes.py [FOLDER]      (default: meshes)
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 from eyerender import load_eye
@@ -14,6 +14,8 @@ from eyerender.rendering.export import bake_meshes
 ROOT = Path(__file__).resolve().parent.parent
 
 if __name__ == "__main__":
-    out = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "meshes"
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "meshes")
+    out = parser.parse_args().folder
     for name in ("E2", "E5"):
         print(bake_meshes(load_eye(name).build(), out / name, rings=12, sectors=48))

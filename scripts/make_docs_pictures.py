@@ -7,6 +7,7 @@ The report's picture needs PySide6, in this environment or in that of the Python
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
@@ -141,4 +142,6 @@ def main(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "docs" / "images")
+    main(parser.parse_args().folder)

@@ -5,6 +5,7 @@ python scripts/make_mesh_curve.py [FILE]      (default: docs/images/mesh_curve.p
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from dataclasses import replace
@@ -32,7 +33,9 @@ CURVES = (
 
 def main() -> int:
     """Measure, print and draw."""
-    target = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images" / "mesh_curve.png"
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path, nargs="?", default=ROOT / "docs" / "images" / "mesh_curve.png")
+    target = parser.parse_args().file
     backend = choose_backend("auto")
     from eyerender.rendering.renderer import Renderer
     from tests.support.mesh_errors import mesh_errors, mesh_job

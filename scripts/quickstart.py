@@ -1,11 +1,13 @@
 """The quickstart in Python: python scripts/quickstart.py out/twin (what `eyerender quickstart` does, step by step)."""
 
-import sys
+import argparse
 from pathlib import Path
 
 import eyerender as er
 
-out = Path(sys.argv[1])
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("folder", type=Path)
+out = parser.parse_args().folder
 scene = er.load_scene("quickstart")  # eyes, rig, targets: a YAML file; try eye="E1"
 
 truth = er.AnalyticObserver().observe(scene.frames())  # ray optics: apparent pupil and glints

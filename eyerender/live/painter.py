@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..arrays import Bytes, Floats
+from ..arrays import Bytes, Floats, Reals
 from ..backends.choose import BackendChoice
 from ..capture import EyeImage, check_windows, make_renderer, moments, render_job, stored
 from ..errors import EyerenderError, one_line
@@ -344,7 +344,7 @@ def _job(frame: Frames, draw: int) -> RenderJob:
     return replace(job, seed=seed, sensor=quiet, lens=clear, labels=False)
 
 
-def developed(job: RenderJob, irradiance: Floats) -> tuple[Floats, NDArray[np.uint16]]:
+def developed(job: RenderJob, irradiance: Floats) -> tuple[Reals, NDArray[np.uint16]]:
     """Irradiance (h, w) and codes of the sensor for the mean of all passes of a job.
 
     Vignetting, openings, scattered light and the sensor belong to the window as a whole, so bands and coarse pixels

@@ -14,10 +14,12 @@ right to 0.016 of the full light.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.optimize import brentq
 
-from ..arrays import Floats
+from ..arrays import Floats, frozen
 
 _TAIL = 60.0  # in units of d, beyond all light
 
@@ -43,9 +45,10 @@ def radius_of(share: float) -> float:
     return float(brentq(lambda r: float(share_within(r)) - share, 0.0, _TAIL))
 
 
+@lru_cache(maxsize=8)
 def rings(count: int) -> Floats:
     """Radii (count,), in units of d, of rings that stand for equal shares of the light: each at its own median."""
-    return np.array([radius_of((k + 0.5) / count) for k in range(count)])
+    return frozen([radius_of((k + 0.5) / count) for k in range(count)])
 
 
 def transmitted(albedo: float, scattering_per_mm: float) -> float:

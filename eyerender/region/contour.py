@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Floats
+from ..geometry.vectors import crosses, dots, lengths
 from .anatomy import Region
 from .globe import Globe
 
@@ -63,7 +64,7 @@ def step(x: NDArray[Any] | float, low: float, high: float) -> NDArray[Any]:
 
 def unit(v: Floats) -> Floats:
     """Unit vectors (..., 3)."""
-    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))
+    return np.asarray(v / np.maximum(lengths(v)[..., None], 1e-12))
 
 
 def canthi(spec: Region) -> tuple[Floats, Floats]:
@@ -88,8 +89,8 @@ def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
     point = globe.pushed_out(point, film)
     sideways = np.sign(a) * np.abs(a) ** 6
     flat = unit(np.stack([np.zeros_like(a), sideways, np.sin(angle) + 0.02 * upper], axis=-1))
-    away = unit(flat - normal * np.sum(flat * normal, axis=-1, keepdims=True))
-    along_lid = unit(np.cross(away, normal) * upper[:, None])
+    away = unit(flat - normal * dots(flat, normal)[..., None])
+    along_lid = unit(crosses(away, normal) * upper[:, None])
     along_lid = along_lid * np.where(along_lid[:, 1:2] < 0, -1.0, 1.0)
     return Contour(
         angle=angle, along=a, upper=upper, point=point, normal=normal, away=away, along_lid=along_lid, openness=openness

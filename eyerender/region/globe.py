@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from ..arrays import ArrayValue, Floats, frozen
 from ..geometry.surfaces import Surface
+from ..geometry.vectors import lengths
 
 _POLAR, _TURNS = 241, 96
 _WIDEST = np.radians(40.0)
@@ -90,13 +91,13 @@ class Globe(ArrayValue):
     def clearance(self, points: Floats) -> Floats:
         """Distance (n,) mm of points (n, 3) from the globe along the line from its centre; negative inside."""
         away = points - self.centre
-        distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-9)
+        distance = np.maximum(lengths(away), 1e-9)
         return np.asarray(distance - self.radial(away / distance[..., None]))
 
     def pushed_out(self, points: Floats, clearance_mm: Floats | float) -> Floats:
         """Move points that are closer to the globe than `clearance_mm` outwards along the line from its centre."""
         away = points - self.centre
-        distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-9)
+        distance = np.maximum(lengths(away), 1e-9)
         direction = away / distance[..., None]
         least = self.radius_mm + np.broadcast_to(clearance_mm, distance.shape)
         if self.cornea is not None:

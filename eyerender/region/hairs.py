@@ -11,6 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..arrays import ArrayValue, Floats, Ints, frozen
+from ..geometry.vectors import crosses
 from .contour import unit
 
 SEGMENTS = 6
@@ -35,8 +36,8 @@ class Hairs(ArrayValue):
         # Each hair has one reference direction, across its chord, so that its tube does not twist.
         chord = unit(p[:, -1] - p[:, 0])
         helper = np.where(np.abs(chord[:, 1:2]) < 0.8, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-        e1 = unit(np.cross(along, helper[:, None, :]))
-        e2 = np.cross(along, e1)
+        e1 = unit(crosses(along, helper[:, None, :]))
+        e2 = crosses(along, e1)
         angle = 2 * np.pi * np.arange(3) / 3
         ring = np.cos(angle)[:, None] * e1[:, :, None, :] + np.sin(angle)[:, None] * e2[:, :, None, :]
         return np.asarray((p[:, :, None, :] + self.radii[:, :, None, None] * ring).reshape(-1, 3))

@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from ..arrays import Singles
 from ..spec import Spec
-from .noise import nearest_two, passed
+from .noise import band_noise, nearest_two
 
 RADIAL, ANGULAR = 256, 1024
 WIDTH_MM, MARGIN_MM = 3.8, 2.0  # of the iris that strengths and means refer to: from margin to root, and the margin
@@ -79,8 +79,8 @@ def _noise(
     """Gaussian noise of unit variance, band-passed: `rows`, `columns` are (low, high) cycles over the whole extent."""
     h, w = shape
     if periodic_rows:
-        return passed(rng.standard_normal(shape), columns, rows)
-    field = passed(rng.standard_normal((2 * h, w)), columns, (2 * rows[0], 2 * rows[1]))[:h]
+        return band_noise(rng, shape, columns, rows)
+    field = band_noise(rng, (2 * h, w), columns, (2 * rows[0], 2 * rows[1]))[:h]
     return np.asarray(field / field.std(dtype=float).astype(np.float32))
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
+from ..geometry.vectors import dots, lengths
 from .anatomy import Lashes, Region
 from .contour import step, unit
 from .globe import Globe
@@ -211,12 +212,12 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
         distance, nearest = tree.query(at, distance_upper_bound=within)
         known = np.isfinite(distance)
         nearest = np.where(known, nearest, 0)
-        above = np.sum((at - skin[nearest]) * normals[nearest], axis=-1)
+        above = dots(at - skin[nearest], normals[nearest])
         return np.asarray(normals[nearest] * np.where(known, np.maximum(least - above, 0), 0)[..., None])
 
     push = lift(out, np.inf, _ABOVE_MM)
     everywhere = np.concatenate([_ABOVE_MM, _ABOVE_MM[:-1], _ABOVE_MM[1:]])
-    out += push / np.maximum(np.linalg.norm(push, axis=-1, keepdims=True) / 1.2, 1.0)
+    out += push / np.maximum(lengths(push)[..., None] / 1.2, 1.0)
     active, left = np.arange(len(out)), np.zeros(len(out))
     for turn in range(16):
         some = out[active]
@@ -236,9 +237,9 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
             break
     # A lash that was deformed too much for want of room is reduced to its root.
     way = np.diff(out, axis=1)
-    pieces, rest = (np.linalg.norm(v, axis=-1) for v in (way, np.diff(straight, axis=1)))
+    pieces, rest = (lengths(v) for v in (way, np.diff(straight, axis=1)))
     spoilt = ((pieces / np.maximum(rest, 1e-9)).max(axis=1) > 1.7) | (left > _CAUGHT_MM)
-    along = np.sum(way[:, 1:] * way[:, :-1], axis=-1)
+    along = dots(way[:, 1:], way[:, :-1])
     spoilt |= np.any(along < _KINK * pieces[:, 1:] * pieces[:, :-1], axis=1)
     out[spoilt] = root[spoilt] + 0.0005 * (straight[spoilt] - root[spoilt])
     # Lashes that turn inwards are moved off the globe.

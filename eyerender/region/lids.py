@@ -21,6 +21,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..arrays import ArrayValue, Floats, Ints, frozen
+from ..geometry.vectors import crosses, dots, lengths
 from .anatomy import Region
 from .contour import COLUMNS, LATERAL, Contour, canthi, contour, step, unit
 from .face import face_depth
@@ -84,8 +85,8 @@ def grid_normals(vertices: Floats) -> Floats:
     out = np.empty_like(vertices)
     out[1:-1] = vertices[2:] - vertices[:-2]
     out[0], out[-1] = vertices[1] - vertices[0], vertices[-1] - vertices[-2]
-    normal = np.cross(out, across)
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = crosses(out, across)
+    length = lengths(normal)[..., None]
     # Where rows meet in a point, the neighbour's normal is used.
     normal = np.where(length > 1e-9, normal, np.array([1.0, 0.0, 0.0]))
     return unit(normal)
@@ -121,7 +122,7 @@ def _margin(spec: Region, globe: Globe, c: Contour) -> tuple[Floats, Floats]:
 def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     """Rows from below the globe's surface to the inner edge (exclusive)."""
     away = c.point - globe.centre
-    distance = np.linalg.norm(away, axis=-1)
+    distance = lengths(away)
     on_globe = step(distance - globe.radial(unit(away)), 0.6, 0.05)
     # It starts under the lids. In the corners of the fissure it starts on lines across them: beside the nose a crescent
     # about the cornea, the plica; at the temple where the globe's tangent leads to the canthus, so that the white
@@ -149,7 +150,7 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     rows = rows + (plica + caruncle)[..., None] * c.normal
     # Long pieces are chords of the globe (0.7 of its radius for the cornea), so the points are raised until their
     # middles are outside, too.
-    sag = np.sum((c.point - reach) ** 2, axis=-1) / CONJUNCTIVA**2 / (8 * 0.7 * globe.radius_mm)
+    sag = dots(c.point - reach, c.point - reach) / CONJUNCTIVA**2 / (8 * 0.7 * globe.radius_mm)
     film = spec.lids.film_mm * on_globe + 0.05 * (1 - on_globe) + sag
     clear = globe.pushed_out(rows, np.where(u[..., 0] > 0, film, -_DIP_MM))
     return np.asarray(clear)
@@ -291,7 +292,7 @@ def _epicanthus(spec: Region, c: Contour, v: Floats, x: Floats, y: Floats, z: Fl
 def _fullness(spec: Region, c: Contour, y: Floats, z: Floats) -> Floats:
     """Filling (mm) of the hollow above the lid as the lid comes down and brings its skin and fat along."""
     shut = 1 - min(c.openness, 1.0)
-    return np.asarray(spec.lids.fill_mm * shut * np.exp(-(((z - 10.5) / 6.0) ** 2) - ((y - 1.0) / 18.0) ** 4))
+    return np.asarray(spec.lids.fill_mm * shut * np.exp(-(((z - 10.5) / 6.0) ** 2) - np.square((y - 1.0) / 18.0) ** 2))
 
 
 def skin_depth(spec: Region, globe: Globe, y: Floats, z: Floats) -> Floats:

@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 
 from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
+from ..geometry.vectors import lengths
 from .anatomy import Region
 from .brow import brow
 from .contour import COLUMNS, Contour, contour
@@ -130,7 +131,7 @@ def _round(hairs: Hairs, tubes: Floats) -> Floats:
     if len(tubes) == 0:
         return np.zeros((0, 3))
     away = tubes - np.repeat(hairs.points.reshape(-1, 3), 3, axis=0)
-    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-12))
+    return np.asarray(away / np.maximum(lengths(away)[..., None], 1e-12))
 
 
 def _margins(fissure: Contour) -> tuple[Floats, Floats]:

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from ..arrays import Floats, Indices, Singles
 
-_NEGLIGIBLE = 4.0  # times a band's upper end, where its gain is 1e-7
-_BLOCK, _CANDIDATES = 8, 18
+_NEGLIGIBLE = 3.0  # times a band's upper end, where its gain is 1e-4
+_BLOCK, _CANDIDATES = 8, 12  # one place in twenty thousand would need more candidates
 
 
 def gain(f: Floats, low: float, high: float) -> Floats:
@@ -21,24 +21,34 @@ def gain(f: Floats, low: float, high: float) -> Floats:
     return np.asarray(out * (1 - np.exp(-((f / low) ** 2))) if low > 0 else out)
 
 
-def passed(white: Floats, across: tuple[float, float], up: tuple[float, float]) -> Singles:
-    """Band-passed copy (h, w) of periodic white noise, of unit variance; `(low, high)` cycles over width and height."""
-    h, w = white.shape
-    # Only the columns of the spectrum that the band keeps are computed.
+def band_noise(
+    rng: np.random.Generator, shape: tuple[int, int], across: tuple[float, float], up: tuple[float, float]
+) -> Singles:
+    """Gaussian noise (h, w) of unit variance that is periodic both ways; `(low, high)` cycles over width and height.
+
+    Only the waves that the band keeps are drawn.
+    """
+    h, w = shape
     kept = min(w // 2 + 1, int(_NEGLIGIBLE * across[1]) + 2)
-    spectrum = fft.fft(fft.rfft(white.astype(np.float32), axis=1)[:, :kept], axis=0)
-    spectrum *= (gain(np.abs(fft.fftfreq(h) * h), *up)[:, None] * gain(np.arange(kept), *across)).astype(np.float32)
+    f = np.abs(fft.fftfreq(h) * h)
+    rows = np.flatnonzero(f <= _NEGLIGIBLE * up[1])
+    waves = rng.standard_normal((len(rows), 2 * kept), np.float32).view(np.complex64)
+    waves *= (gain(f[rows], *up)[:, None] * gain(np.arange(kept, dtype=float), *across)).astype(np.float32)
+    spectrum = np.zeros((h, kept), np.complex64)
+    spectrum[rows] = waves
     spectrum[0, 0] = 0
     # Columns stand for two frequencies, +k and -k, except the first and, for even widths, the last of all.
     single = [0, w // 2] if kept == w // 2 + 1 and w % 2 == 0 else [0]
+    for column in spectrum.T[single]:
+        column[:] = (column + np.roll(column[::-1], 1).conj()) * np.float32(np.sqrt(0.5))
     power = 2 * np.vdot(spectrum, spectrum).real - sum(np.vdot(c, c).real for c in spectrum.T[single])
     spectrum *= np.float32(h * w / np.sqrt(power + 1e-30))
-    return np.asarray(fft.irfft(fft.ifft(spectrum, axis=0), n=w, axis=1))
+    return np.asarray(fft.irfft(fft.ifft(spectrum, axis=0, overwrite_x=True), n=w, axis=1))
 
 
 def band(seed: int, size: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
     """Gaussian noise of unit variance on a periodic square (rows: up), `(low, high)` cycles over the square."""
-    return passed(np.random.default_rng((0xBA4D, seed)).standard_normal((size, size)), across, up)
+    return band_noise(np.random.default_rng((0xBA4D, seed)), (size, size), across, up)
 
 
 def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Singles:
@@ -98,9 +108,12 @@ class Padded:
     """A square tile made ready for `Places`: every value with its difference to the next one in its row."""
 
     def __init__(self, tile: Singles) -> None:
-        wide = np.pad(tile, ((0, 2), (0, 3)), mode="wrap")
-        pairs = np.empty((len(tile) + 2, tile.shape[1] + 2), np.complex64)
-        pairs.real, pairs.imag = wide[:, :-1], np.diff(wide, axis=1)
+        n = len(tile)
+        pairs = np.empty((n + 2, n + 2), np.complex64)
+        pairs.real[:n, :n], pairs.imag[:n, : n - 1] = tile, np.diff(tile, axis=1)
+        pairs.imag[:n, n - 1] = tile[:, 0] - tile[:, -1]
+        pairs[:n, n:] = pairs[:n, :2]
+        pairs[n:] = pairs[:2]
         self.pairs = pairs.ravel()
 
 

@@ -130,13 +130,14 @@ def _normalise(albedo: Singles, y: Singles, z: Singles, rows: Floats, wanted: fl
 
     A window of one eye shows this skin. Farther out the tone is up to 7 % lighter. Wet tissue stays as it is.
     """
-    some = rows > _LINE
-    near = np.hypot(y[some], z[some]) < _SHOWN_MM
-    (yr, yc), (zr, zc) = (np.gradient(v[some]) for v in (y, z))
-    area = np.abs(yr * zc - yc * zr) * near
+    some = np.flatnonzero(rows > _LINE)[:: _COARSE // 2]  # enough of the map, whose columns are fewer still
+    y, z, seen = (v[some, ::_COARSE] for v in (y, z, albedo))
+    (yr, yc), (zr, zc) = (np.gradient(v) for v in (y, z))
+    area = np.abs(yr * zc - yc * zr) * (np.hypot(y, z) < _SHOWN_MM)
     share = step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN)[:, None]
-    gain = wanted * np.sum(area, dtype=float) / np.sum(albedo[some] * area, dtype=float)
-    np.minimum(albedo * (1 + share * (gain - 1)), 0.95, out=albedo)
+    gain = wanted * np.sum(area, dtype=float) / np.sum(seen * area, dtype=float)
+    albedo *= (1 + share * (gain - 1)).astype(np.float32)
+    np.minimum(albedo, 0.95, out=albedo)
 
 
 def skin_texels(spec: Region) -> NDArray[np.float16]:
@@ -179,10 +180,14 @@ class _Tiles:
 
     def at(self, number: int, places: Places, across: tuple[float, float], up: tuple[float, float]) -> Singles:
         """Values of a band of noise (see `noise.band`) at places."""
-        key = number, across, up
-        if key not in self._made:
-            self._made[key] = Padded(band(self.spec.seed + number, _TILE, across, up))
-        return places.sample(self._made[key])
+        return self.mixed(places, (1.0, number, across, up))
+
+    def mixed(self, places: Places, *parts: tuple[float, int, tuple[float, float], tuple[float, float]]) -> Singles:
+        """Values of a sum of bands of noise at places, each with a factor."""
+        if parts not in self._made:
+            bands = [factor * band(self.spec.seed + number, _TILE, *ends) for factor, number, *ends in parts]
+            self._made[parts] = Padded(np.sum(bands, axis=0, dtype=np.float32))
+        return places.sample(self._made[parts])
 
     @cached_property
     def net(self) -> Padded:
@@ -322,13 +327,13 @@ class _Strip:
         grain = self.field(3, (60, 200), (60, 200))
         swell = self.field(13, (7, 20), (7, 20))
         level = _places(y, self.level)
-        long, short = self.tiles.at(14, level, (5, 15), (12, 34)), self.tiles.at(15, level, (12, 36), (24, 60))
+        along = self.tiles.mixed(level, (1.6, 14, (5, 15), (12, 34)), (0.5, 15, (12, 36), (24, 60)))
         sway = 0.5 * self.field(12, (0, 10), (0, 10))
         lines = self.tiles.at(11, _places(y, self.level + sway), (0, 6), (22, 60))
         under = _bell(z, -11.0, 6.0) + 0.7 * _bell(z, 8.0, 4.0) + _bell(y, -21.0, 5.0)
         amount = 0.025 * skin.wrinkles * _hill(y, z, 26.0, 20.0) * under
         fine = (1 - 0.85 * oil) * (cells + 0.03 * grain)
-        height = skin.relief_mm * (fine + 1.3 * swell + 1.6 * long + 0.5 * short)
+        height = skin.relief_mm * (fine + 1.3 * swell + along)
         return np.asarray(height - (1 - 0.7 * oil) * amount * np.abs(lines))
 
     def creases(self) -> Singles:
@@ -409,10 +414,9 @@ class _Strip:
     def albedo(self, open_: Singles, spots: Singles) -> Singles:
         """Diffuse reflectance; `open_` is the light that leaves the furrows."""
         skin, y, z, rows, upper = self.spec.skin, self.y, self.z, self.rows, self.upper
-        slow = self.field(21, (0, 4), (0, 4))
-        blotch = self.field(22, (3, 22), (3, 22))
-        fine = self.field(23, (70, 260), (70, 260))
-        tone = (1 + skin.mottling * (0.06 * slow + 0.026 * blotch + 0.155 * fine)) * open_
+        slow, blotch, fine = ((c, c) for c in ((0, 4), (3, 22), (70, 260)))
+        mottled = self.tiles.mixed(self.places, (0.06, 21, *slow), (0.026, 22, *blotch), (0.155, 23, *fine))
+        tone = (1 + skin.mottling * mottled) * open_
         tone *= 1 - skin.veins * self.veins()
         # The hollow beside the nose and the rim below the lower lid are a little darker, the lash line more so.
         tone *= 1 - 0.20 * _bell(y, 15.5, 5.5) * _bell(z, 5.0, 8.0)
@@ -426,7 +430,7 @@ class _Strip:
         # Where the conjunctiva lies on the globe, it is as white as the adjacent sclera.
         white = Look().sclera_albedo
         moist = white + step(rows, 1.0, CONJUNCTIVA - 1.0) * (skin.wet_albedo - white)
-        moist = moist * (1 - 0.40 * self.flesh) * (1 + 0.04 * blotch + 0.04 * fine)
+        moist = moist * (1 - 0.40 * self.flesh) * (1 + 0.25 * mottled)
         s = step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN)
         return np.asarray(np.clip(moist + s * (outer - moist), 0.02, 0.95))
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 
 import numpy as np
 from scipy import fft
 
 from ..arrays import Floats, Singles
-from .noise import passed
+from .noise import band_noise
 
 Texture = Singles
 
@@ -24,8 +23,8 @@ def _noise(
     """Gaussian noise of unit variance, band-passed: `rows`, `columns` are (low, high) cycles over the whole extent."""
     h, w = shape
     if periodic_rows:
-        return passed(rng.standard_normal(shape), columns, rows)
-    field = passed(rng.standard_normal((2 * h, w)), columns, (2 * rows[0], 2 * rows[1]))[:h]
+        return band_noise(rng, shape, columns, rows)
+    field = band_noise(rng, (2 * h, w), columns, (2 * rows[0], 2 * rows[1]))[:h]
     return np.asarray(field / field.std(dtype=float).astype(np.float32))
 
 
@@ -66,42 +65,49 @@ def sclera_texture(seed: int, size: int = 768) -> Texture:
 
 def _vessels(rng: np.random.Generator, size: int) -> Singles:
     """Loss of light over the vessels of a globe's front, (size, size)."""
-    places: list[list[int]] = [[], [], []]
-    weights: list[list[float]] = [[], [], []]
     limbus = 0.29 / 0.6 / 2 * size / np.pi * 1.02  # 29 degrees of polar angle, in pixels of the map
-    uniform, normal, half = rng.random, rng.standard_normal, size / 2
-    hypot, atan2, sin, cos = math.hypot, math.atan2, math.sin, math.cos
-
-    def grow(x: float, y: float, heading: float, weight: float, steps: int, level: int) -> None:
-        place, share = places[min(level, 2)], weights[min(level, 2)]
-        for _ in range(steps):
-            r = hypot(x - half, y - half)
-            if r < limbus * (1.05 + 0.65 * uniform()) or not (1 < x < size - 2 and 1 < y < size - 2):
-                return
-            inward = atan2(half - y, half - x)
-            heading += 0.16 * normal() + 0.02 * sin(inward - heading)
-            x, y = x + 0.8 * cos(heading), y + 0.8 * sin(heading)
-            place.append(int(y) * size + int(x))
-            share.append(weight)
-            weight *= 0.9985
-            if level < 3 and uniform() < 0.012:
-                grow(x, y, heading + rng.choice([-1, 1]) * rng.uniform(0.3, 0.8), weight * 0.7, steps // 2, level + 1)
-
-    for _ in range(70):
-        a = rng.uniform(0, 2 * np.pi)
-        r = size * rng.uniform(0.36, 0.48)
-        grow(
-            half + r * math.cos(a), half + r * math.sin(a), a + np.pi + rng.normal(0, 0.5), rng.uniform(0.3, 1),
-            int(rng.integers(120, 420)), int(rng.integers(0, 3)),
-        )  # fmt: skip
+    half, count = size / 2, 70
+    start, away = rng.uniform(0, 2 * np.pi, count), size * rng.uniform(0.36, 0.48, count)
+    steps = rng.integers(120, 420, count)
+    # Each column is the tip of a vessel. All of them grow together, and a branch joins them.
+    tips = np.stack(
+        [
+            half + away * np.cos(start), half + away * np.sin(start), start + np.pi + rng.normal(0, 0.5, count),
+            rng.uniform(0.3, 1, count), steps, steps, rng.integers(0, 3, count),
+        ]
+    )  # fmt: skip
+    grown: list[tuple[Floats, Floats, Floats]] = [(np.zeros(0),) * 3]
+    while tips.size:
+        x, y, heading, weight, left, steps, level = tips
+        ends = limbus * (1.05 + 0.65 * rng.random(x.size))
+        inside = (np.minimum(x, y) > 1) & (np.maximum(x, y) < size - 2)
+        tips = tips[:, (np.hypot(x - half, y - half) >= ends) & inside & (left > 0)]
+        x, y, heading, weight, left, steps, level = tips
+        inward = np.arctan2(half - y, half - x)
+        heading += 0.16 * rng.standard_normal(x.size) + 0.02 * np.sin(inward - heading)
+        x += 0.8 * np.cos(heading)
+        y += 0.8 * np.sin(heading)
+        grown.append((np.minimum(level, 2), y.astype(int) * size + x.astype(int), weight.copy()))
+        weight *= 0.9985
+        left -= 1
+        branches = tips[:, (level < 3) & (rng.random(x.size) < 0.012)]
+        if branches.size:
+            n = branches.shape[1]
+            branches[2] += rng.choice([-1, 1], n) * rng.uniform(0.3, 0.8, n)
+            branches[3] *= 0.7
+            branches[5] = branches[5] // 2
+            branches[4], branches[6] = branches[5], branches[6] + 1
+            tips = np.concatenate([tips, branches], axis=1)
+    layers, places, weights = (np.concatenate(v) for v in zip(*grown, strict=True))
     f2 = np.square(fft.fftfreq(size))[:, None] + np.square(fft.rfftfreq(size))
     blurred = np.zeros(f2.shape, np.complex64)
-    for place, share, width in zip(places, weights, (2.2, 1.4, 0.9), strict=True):
-        layer = np.bincount(place, share, minlength=size * size).reshape(size, size).astype(np.float32)
+    for k, width in enumerate((2.2, 1.4, 0.9)):
+        some = layers == k
+        layer = np.bincount(places[some].astype(int), weights[some], minlength=size * size)
         gain = 0.16 * width * np.exp(-2 * (np.pi * width) ** 2 * f2)
         if width > 1:  # wider vessels have a soft halo
             gain += 0.25 * np.exp(-2 * (np.pi * 5.0) ** 2 * f2)
-        blurred += gain.astype(np.float32) * fft.rfft2(layer)
+        blurred += gain.astype(np.float32) * fft.rfft2(layer.reshape(size, size).astype(np.float32))
     return np.asarray(fft.irfft2(blurred, s=(size, size)))
 
 

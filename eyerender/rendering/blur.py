@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Reals
 from ..rig import defocus
 from .frame import RenderJob
 from .region import RegionScene
@@ -54,7 +54,7 @@ class Blur:
         reach = defocus.reach_px(float(np.max(sizes)) if layered else subject)
         return cls(job, subject, layered, reach)
 
-    def of_pictures(self, pictures: Floats) -> Floats:
+    def of_pictures(self, pictures: Reals) -> Reals:
         """Blur a picture, smaller by the reach on every side.
 
         Args:

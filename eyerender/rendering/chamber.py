@@ -309,7 +309,7 @@ class _Rays:
 
 
 def _traced(walls: _Walls, o: Floats, d: Floats, layer: Ints) -> _Arrived:
-    """Follow rays until they arrive at the plane or the wall; what leaves at the first refraction by the front is kept.
+    """Follow rays until they arrive at the plane or the wall; what first leaves through the front is kept.
 
     The cornea's back refracts them; it mirrors only what it mirrors totally.
     """
@@ -363,9 +363,9 @@ def _to_surfaces(walls: _Walls, rays: _Rays) -> tuple[Floats, Floats]:
 
 
 def _mirrored(walls: _Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tuple[Ints, Floats, Floats, Floats]]:
-    """Mirror rays at the inner side of the front; also what leaves the eye there of those that are the first time.
+    """Mirror rays at the inner side of the front; also what leaves the eye there of those of which nothing has left.
 
-    `first` tells for every ray whether it has not been there yet.
+    `first` tells for every ray whether it is such a one.
     """
     n, w = walls.front[0].normal(rays.o), rays.d
     cosine = np.sum(n * w, axis=1)
@@ -373,7 +373,7 @@ def _mirrored(walls: _Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tuple[In
     go = first[rays.number] & (mirrored < 1)
     full = rays.weight * walls.indices[0] ** 2 * (1 - mirrored)
     gone = rays.number[go], rays.o[go], _refracted(w[go], -n[go], walls.indices[0]), full[go]
-    first[rays.number] = False
+    first[rays.number[go]] = False
     rays.d = w - 2 * cosine[:, None] * n
     weak = mirrored < _WEAK
     rays.weight = rays.weight * np.where(weak, _FEW * mirrored, mirrored)

@@ -6,9 +6,10 @@ place i, K rays of a cosine-distributed pattern find the places j that it sees:
 
     E_i = E0_i + (1 / K) sum_k w_ik E_j(k)
 
-E0 is the light straight from lamps, panels and surroundings. w is the albedo, with the losses at the cornea where the
-ray goes through it. The rays of the iris are those that leave the eye; what the cornea mirrors back into the chamber
-comes from `chamber`. The equations are solved by iteration, so every number of reflections is included.
+E0 is the light straight from lamps, panels and surroundings, and on the skin about the eye that of lamps which the
+cornea mirrors: up to a sixth of the light on the lids' margins. w is the albedo, with the losses at the cornea where
+the ray goes through it. The rays of the iris are those that leave the eye; what the cornea mirrors back into the
+chamber comes from `chamber`. The equations are solved by iteration, so every number of reflections is included.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from scipy.spatial import cKDTree
 
 from ..arrays import Bools, Floats, Ints
 from ..eye.model import EyeModel
+from ..geometry.vectors import dots, lengths
 from ..region.globe import Globe
 from ..region.look import Look
 from .chamber import (
@@ -40,7 +42,8 @@ from .chamber import (
 )
 from .chamber import TURNS as IRIS_TURNS
 from .frame import RenderJob, globe_of
-from .lighting import onto_points, through_cornea
+from .lighting import off_cornea, onto_points, through_cornea
+from .manifold import CORNEA_MM
 from .parameters import leaves
 from .places import (
     GLOBE_COLUMNS,
@@ -73,6 +76,7 @@ _FAR_MM = 17.0  # distance from the eye beyond which skin is far
 _ROUNDS = 6
 _START_MM = 0.02
 _SMALL, _SPOTS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
+_CLOSE_MM = 10.5  # from the cornea's centre to skin that it mirrors lamps to
 _TOUCHING_MM = 0.3  # a place most of whose rays are stopped this near is covered
 _ALPHA = (0.7548776662466927, 0.5698402909980532)
 _SHUFFLED = 0x9E3779B1
@@ -282,9 +286,10 @@ class Exchange:
             return frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
         direct, ambient = _direct(values, lights, panels, place.scene, textures, frame)
+        mirrored = _mirrored(values, lights, place.scene, frame)
         lamps, more = (_direct_inside(values, some, place.scene, frame.chamber) for some in (lights, panels))
         seen = _seen(values, lights, textures, place, numbers, frame)
-        return frame.solved(region, direct, ambient, lamps, more, seen)
+        return frame.solved(region, direct, mirrored, ambient, lamps, more, seen)
 
     def _inside(self, job: RenderJob) -> _Interior:
         """The chamber of a job's eye. Frames often have the same one, and comparing eyes takes longer than needed."""
@@ -392,8 +397,8 @@ class _Frame:
         return out
 
     def solved(
-        self, region: RegionScene | None, direct: Floats, ambient: tuple[Floats, Floats, Floats, Floats], lamps: Floats,
-        panels: Floats, seen: tuple[_Seen, _Seen],
+        self, region: RegionScene | None, direct: Floats, mirrored: Floats,
+        ambient: tuple[Floats, Floats, Floats, Floats], lamps: Floats, panels: Floats, seen: tuple[_Seen, _Seen],
     ) -> Received:  # fmt: skip
         """Solve for the irradiance of all places."""
         job, outside, inside = self.job, *seen
@@ -412,7 +417,7 @@ class _Frame:
             exchange, limbus = self.interior.exchange, self.interior.limbus
             here, there = (part.correction(direct) for part in seen)
             for _ in range(_ROUNDS):
-                arrived = outside.mean(outside.weight * total[targets[0]]) + here
+                arrived = outside.mean(outside.weight * total[targets[0]]) + here + mirrored
                 entered = inside.mean(inside.weight * total[targets[1]]) + there
                 within = exchange @ total[self.outside :] + limbus @ total[self.outside - IRIS_TURNS : self.outside]
                 total = start + np.append(arrived, entered + within)
@@ -504,6 +509,25 @@ def _direct(
     dr.eval(ambient)
     soft, hard, free, shaded = (np.asarray(part.numpy(), dtype=float) for part in ambient)
     return lit, (soft, hard, free, shaded)
+
+
+def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) -> Floats:
+    """Irradiance of places outside the eye from the lamps by way of the cornea: of skin near it that may face it."""
+    total, job = np.zeros(frame.outside), frame.job
+    if frame.skin is None or not len(lights) or not job.interreflection:
+        return total
+    bulge = job.M @ (np.asarray(job.eye.front[0].origin_mm) - [CORNEA_MM, 0, 0]) + (job.t - job.anchor_mm)
+    way = bulge - frame.points
+    near = (lengths(way) < _CLOSE_MM) & (dots(way, frame.normals) > -0.5 * CORNEA_MM)
+    rows = np.column_stack([frame.points, frame.normals])[near]
+    if len(rows):
+        index = dr.arange(mi.UInt32, len(rows))
+        n = _rows(rows)(index)
+        normal = mi.Vector3f(*n[3:])
+        x, facing = values.point_to_eye(mi.Vector3f(*n[:3]) + _START_MM * normal), values.vector_to_eye(normal)
+        lit = _over_lamps(lights, index, lambda u, v: off_cornea(values, lights, scene, x, facing, u, v))
+        total[frame.on_globe + np.flatnonzero(near)] = lit
+    return total
 
 
 def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, chamber: Chamber) -> Floats:

@@ -15,18 +15,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, frozen
+from ..arrays import Bools, Ints, Singles, frozen
 from ..rig.camera import Window
 from .groups import Group, shade_group
 from .recorded import recorded
-from .sampling import Pattern, Sampler, Samples, camera_ray, lattice_generator
-from .values import SMALL, Lamp, Lights, Values, aligned
+from .sampling import Pattern, Samples, camera_ray, lattice_generator
+from .shading import shade
+from .values import SMALL, Lamp, Lights, Values, aligned, quotient
 from .view import Textures, meet
 
 _LANES = 2**24  # samples at a time; more are rendered in several passes
@@ -44,7 +45,7 @@ class Exposed:
     """A bound frame for rendering: its Mitsuba scene, its numbers, its lamps and its textures.
 
     `plain` returns which tiles of a window show nothing but skin, and their size (px); `fine` which of its pixels
-    (height, width) may show hairs thinner than a pixel.
+    (height, width) may show menisci, or hairs thinner than a pixel, and whether the others show no menisci.
     """
 
     scene: mi.Scene
@@ -52,7 +53,7 @@ class Exposed:
     lights: Lights
     textures: Textures
     plain: Callable[[Window], tuple[Bools, int]]
-    fine: Callable[[Window], Bools]
+    fine: Callable[[Window], tuple[Bools, bool]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,30 +94,24 @@ def group_size(spp: int, soft: bool = False) -> int:
     return size
 
 
-def mean_radiance(
-    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, spp: int, seed: int
-) -> tuple[Floats, int]:
+def mean_radiance(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
     """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
-    (total,), failed = _sums(integrator, shown, window, spp=spp, seed=seed, layered=False)
+    (total,), failed = _sums(shown, window, spp=spp, seed=seed, layered=False)
     # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
-    return np.maximum(total / spp, 0), failed
+    return np.maximum(total / np.float32(spp), 0), failed
 
 
-def mean_parts(
-    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, spp: int, seed: int
-) -> tuple[Floats, int]:
+def mean_parts(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
     """Parts of the scene from front to back: hairs and tears, skin, globe; or surround and globe; failed light paths.
 
     The array (parts, 3, height, width) holds the radiance of each part (their sum is that of `mean_radiance`), the
     share of the pixel's samples that show the part, and that share times their mean inverse depth (1/mm).
     """
-    sums, failed = _sums(integrator, shown, window, spp=spp, seed=seed, layered=True)
-    return np.reshape(sums, (-1, 3, *sums[0].shape)) / spp, failed
+    sums, failed = _sums(shown, window, spp=spp, seed=seed, layered=True)
+    return np.asarray(np.reshape(sums, (-1, 3, *sums[0].shape)) / np.float32(spp), dtype=np.float32), failed
 
 
-def _sums(
-    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, *, spp: int, seed: int, layered: bool
-) -> tuple[list[Floats], int]:
+def _sums(shown: Exposed, window: Window, *, spp: int, seed: int, layered: bool) -> tuple[list[Singles], int]:
     """Sums over the samples of each pixel, (height, width): radiance; or radiance, weight, nearness of each part."""
     width, height = window[2:]
     for grid in (shown.lights.on_iris, shown.lights.on_matte, shown.lights.relief):
@@ -124,10 +119,10 @@ def _sums(
             grid.make()
     grouped = shown.values.structure.region
     if not grouped and not layered and spp >= _MANY:
-        total, failed = _adaptive(integrator, shown, window, spp, seed)
-        return [total], failed
+        total, failed = _adaptive(shown, window, spp, seed)
+        return [total.reshape(height, width)], failed
     size = group_size(spp, shown.values.structure.scattering) if grouped else 1
-    totals: list[Floats] = []
+    totals: list[Singles] = []
     failed = 0
     each = max(1, min(spp // size, _LANES // (width * height * size)))
     plain = shown.plain(window) if grouped else None
@@ -138,9 +133,7 @@ def _sums(
                 shown, window, plain, spp=spp, seed=seed, first=first, count=count, size=size, layered=layered
             )
         else:
-            seen, failures = _singles(
-                integrator, shown, window, spp=spp, seed=seed, first=first, count=count, layered=layered
-            )
+            seen, failures = _singles(shown, window, spp=spp, seed=seed, first=first, count=count, layered=layered)
         totals = [a + b for a, b in zip(totals, seen, strict=True)] if totals else seen
         failed += failures
     return [t.reshape(height, width) for t in totals], failed
@@ -151,10 +144,8 @@ def _samples(u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = 
     return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), pattern, fine)
 
 
-def _adaptive(
-    integrator: mi.SamplingIntegrator, shown: Exposed, window: Window, spp: int, seed: int
-) -> tuple[Floats, int]:
-    """Sums of radiance over the samples of each pixel, (height, width); failed light paths.
+def _adaptive(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
+    """Sums of radiance over the samples of each pixel, (height * width,); failed light paths.
 
     Four samples of each pixel are taken first. Where they agree, and their mean is not far from those of the eight
     neighbours, no edge crosses the pixel, and they stand for all samples. The pixels around the window are looked at,
@@ -163,51 +154,58 @@ def _adaptive(
     width, height = window[2:]
     wide = (window[0] - 1, window[1] - 1, width + 2, height + 2)
     first = _first_samples(spp)
-    every = np.arange((width + 2) * (height + 2))
+    failed, take = mi.UInt32(0), _taken_by(shown, wide, spp, seed)
 
-    def lanes(pixels: Ints, numbers: Ints) -> tuple[mi.Float, int]:
-        index = dr.arange(mi.UInt32, len(pixels) * len(numbers))
+    def lanes(pixels: mi.UInt32, numbers: Ints) -> mi.Float:
+        """Radiance of samples with these numbers, those of each pixel side by side."""
+        nonlocal failed
+        index = dr.arange(mi.UInt32, dr.width(pixels) * len(numbers))
         each = dr.opaque(mi.UInt32, len(numbers))
         place = index // each
-        pixel = dr.gather(mi.UInt32, mi.UInt32(aligned(pixels.astype(np.uint32))), place)
+        pixel = dr.gather(mi.UInt32, pixels, place)
         k = dr.gather(mi.UInt32, mi.UInt32(aligned(numbers.astype(np.uint32))), index - place * each)
-        (radiance,), failures = _taken(integrator, shown, wide, spp=spp, seed=seed, pixel=pixel, k=k, layered=False)
-        return radiance, int(dr.sum(failures).numpy()[0])
+        (radiance,), failures = take(pixel, k, False)
+        failed += failures
+        return radiance
 
     # Few pixels at a time, because there may be more than can be held.
-    stretch = max(1, _LANES // len(first))
-    parts, failed = [], 0
-    for start in range(0, every.size, stretch):
-        radiance, more = lanes(every[start : start + stretch], first)
-        failed += more
-        parts.append(
-            [
-                dr.block_reduce(op, radiance, len(first)).numpy()
-                for op in (dr.ReduceOp.Add, dr.ReduceOp.Min, dr.ReduceOp.Max)
-            ]
-        )
-    total, least, most = (np.concatenate(p).reshape(height + 2, width + 2) for p in zip(*parts, strict=True))
-    uneven_px = (most - least)[1:-1, 1:-1] > _EVEN * most[1:-1, 1:-1]
-    highest = _of_neighbours(np.maximum, total)
-    uneven_px |= highest - _of_neighbours(np.minimum, total) > _STEP * highest
-    total = total[1:-1, 1:-1].astype(float)
-    row, column = np.nonzero(uneven_px)
-    uneven = (row + 1) * (width + 2) + column + 1
-    total[~uneven_px] *= spp / len(first)
-    rest = np.setdiff1d(np.arange(spp), first)
-    count = int(np.clip(_LANES // max(len(uneven), 1), 1, len(rest)))
-    for start in range(0, len(rest) if len(uneven) else 0, count):
-        numbers = rest[start : start + count]
-        radiance, more = lanes(uneven, numbers)
-        failed += more
-        total[row, column] += dr.block_sum(radiance, len(numbers)).numpy()
-    return total, failed
+    count, stretch = (width + 2) * (height + 2), _LANES // len(first)
+    ends = [(start, min(start + stretch, count)) for start in range(0, count, stretch)]
+    parts = [lanes(dr.arange(mi.UInt32, *span), first) for span in ends]
+    total, places = _with_uneven(parts[0] if len(parts) == 1 else dr.concat(parts), (width, height), spp)
+    if uneven := dr.width(places):
+        rest = np.setdiff1d(np.arange(spp), first)
+        at_once = int(np.clip(_LANES // uneven, 1, len(rest)))
+        pixels = places + 2 * (places // dr.opaque(mi.UInt32, width)) + dr.opaque(mi.UInt32, width + 3)
+        dr.eval(pixels)
+        for start in range(0, len(rest), at_once):
+            numbers = rest[start : start + at_once]
+            more = dr.block_sum(lanes(pixels, numbers), len(numbers))
+            dr.scatter(total, dr.gather(mi.Float, total, places) + more, places)
+    return total.numpy(), int(failed.numpy()[0])
 
 
-def _of_neighbours(better: Callable[..., Floats], values: Floats) -> Floats:
-    """Least or greatest values of three by three pixels, (height - 2, width - 2)."""
-    across = better(better(values[:, :-2], values[:, 1:-1]), values[:, 2:])
-    return better(better(across[:-2], across[1:-1]), across[2:])
+def _with_uneven(radiance: mi.Float, size: tuple[int, int], spp: int) -> tuple[mi.Float, mi.UInt32]:
+    """Sums of four samples in the pixels of a window, those of even pixels for all samples, and the uneven pixels.
+
+    `radiance` holds four samples of each pixel of the window and of a border of one pixel about it.
+    """
+    width = dr.opaque(mi.UInt32, size[0])
+    four = dr.gather(mi.Vector4f, radiance, dr.arange(mi.UInt32, (size[0] + 2) * (size[1] + 2)))
+    total, most = dr.sum(four), dr.max(four)
+    apart = most - dr.min(four) > _EVEN * most
+    dr.eval(total, apart)
+    index = dr.arange(mi.UInt32, size[0] * size[1])
+    across = width + 2
+    place = index + 2 * (index // width)  # of the upper left neighbour
+    around = [dr.gather(mi.Float, total, place + i * across + j) for i in range(3) for j in range(3)]
+    highest, lowest = around[0], around[0]
+    for value in around[1:]:
+        highest, lowest = dr.maximum(highest, value), dr.minimum(lowest, value)
+    uneven = dr.gather(mi.Bool, apart, place + across + 1) | (highest - lowest > _STEP * highest)
+    sums = around[4] * dr.select(uneven, 1, dr.opaque(mi.Float, spp / 4))
+    dr.eval(sums, uneven)
+    return sums, dr.compress(uneven)
 
 
 @lru_cache(maxsize=16)
@@ -224,51 +222,49 @@ def _first_samples(count: int) -> Ints:
 
 
 def _singles(
-    integrator: mi.SamplingIntegrator,
-    shown: Exposed,
-    window: Window,
-    *,
-    spp: int,
-    seed: int,
-    first: int,
-    count: int,
-    layered: bool,
-) -> tuple[list[Floats], int]:
+    shown: Exposed, window: Window, *, spp: int, seed: int, first: int, count: int, layered: bool
+) -> tuple[list[Singles], int]:
     """Sums over `count` samples of each pixel, one per lane."""
     index = dr.arange(mi.UInt32, window[2] * window[3] * count)
     n = dr.opaque(mi.UInt32, count)
     pixel = index // n
     k = index - pixel * n + dr.opaque(mi.UInt32, first)
-    lanes, failures = _taken(integrator, shown, window, spp=spp, seed=seed, pixel=pixel, k=k, layered=layered)
-    return [dr.block_sum(x, count).numpy().astype(float) for x in lanes], int(dr.sum(failures).numpy()[0])
+    lanes, failed = _taken_by(shown, window, spp, seed)(pixel, k, layered)
+    return [dr.block_sum(x, count).numpy() for x in lanes], int(failed.numpy()[0])
 
 
+def _taken_by(
+    shown: Exposed, window: Window, spp: int, seed: int
+) -> Callable[[mi.UInt32, mi.UInt32, bool], tuple[list[mi.Float], mi.UInt32]]:
+    """The function that takes samples of a window's pixels."""
+    corner = dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])
+    width, pattern = dr.opaque(mi.UInt32, window[2]), Pattern.of(spp, seed)
+    return partial(_taken, shown.values, shown.lights, shown.textures, shown.scene, corner, width, pattern)
+
+
+@recorded
 def _taken(
-    integrator: mi.SamplingIntegrator,
-    shown: Exposed,
-    window: Window,
-    *,
-    spp: int,
-    seed: int,
-    pixel: mi.UInt32,
-    k: mi.UInt32,
-    layered: bool,
-) -> tuple[list[mi.Float], mi.UInt32]:
-    """What samples k of pixels show, and their failed light paths."""
-    u, v = pixels_of(pixel, window)
-    samples = _samples(u, v, Pattern.of(spp, seed))
-    spot = samples.in_pixel(k)
-    o, d, cosine = camera_ray(shown.values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
-    seen, _, _ = integrator.sample(shown.scene, Sampler(samples, k), mi.Ray3f(mi.Point3f(o), d))
+    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, corner: tuple[mi.Int32, mi.Int32],
+    width: mi.UInt32, pattern: Pattern, pixel: mi.UInt32, k: mi.UInt32, layered: bool,
+) -> tuple[list[mi.Float], mi.UInt32]:  # fmt: skip
+    """What samples k of pixels show, and the number of their failed light paths."""
+    row = pixel // width
+    u, v = mi.Int32(pixel - row * width) + corner[0], mi.Int32(row) + corner[1]
+    samples = _samples(u, v, pattern)
+    spot, on_lamp = samples.in_pixel(k), samples.pair(k, 0)
+    o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
+    seen = shade(values, lights, textures, scene, o, d, mi.Bool(True), on_lamp.x, on_lamp.y)
     cosine = cosine * cosine
-    lanes, failures = [seen[0] * cosine * cosine], integrator.failures
+    lanes = [seen.radiance * cosine * cosine]
     if layered:
-        view, _ = meet(shown.values, shown.scene, o, d, True)
-        near = view.nearness(shown.values, d)
+        view, _ = meet(values, scene, o, d, True)
+        near = view.nearness(values, d)
         parts = (view.other, view.cornea | view.sclera)
         lanes = [dr.select(part, x, 0) for part in parts for x in (lanes[0], mi.Float(1), near)]
-    dr.eval(lanes, failures)  # together, because a separate reduction would trace everything again
-    return lanes, failures
+    dr.eval(lanes, seen.failures)  # together, because a separate reduction would trace everything again
+    failed = dr.sum(seen.failures)
+    dr.eval(failed)
+    return lanes, failed
 
 
 def _groups(
@@ -282,7 +278,7 @@ def _groups(
     count: int,
     size: int,
     layered: bool,
-) -> tuple[list[Floats], int]:
+) -> tuple[list[Singles], int]:
     """Sums over `count` groups of each pixel, one group per lane; sample j of group g is number g size + j."""
     columns, rows = (-(-n // _TILE) for n in window[2:])  # the last tiles may extend beyond the window
     times = _TIMES if spp <= _ENOUGH else 1
@@ -292,26 +288,25 @@ def _groups(
         (dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])),
         *(tuple(dr.opaque(mi.UInt32, n) for n in part) for part in (window[2:], numbers, (across, *tiles.shape))),
     )
-    fine, seen = (mi.UInt8(aligned(marks.ravel().astype(np.uint8))) for marks in (shown.fine(window), tiles))
+    finely, dry = shown.fine(window)
+    fine, seen = (mi.UInt8(aligned(marks.ravel().astype(np.uint8))) for marks in (finely, tiles))
     lanes, failures = _shaded(
         *(shown.values, shown.lights, shown.textures, shown.scene, grid, Pattern.of(spp, seed, times), fine, seen),
-        dr.opaque(mi.Bool, shown.lights.widest < SMALL), rows * columns * count, layered,
+        dr.opaque(mi.Bool, dry), dr.opaque(mi.Bool, shown.lights.widest < SMALL),
+        rows * columns * count, window[2] * window[3], layered,
     )  # fmt: skip
-
-    def summed(lane: mi.Float) -> Floats:
-        tiles = lane.numpy().reshape(rows, columns, count, _TILE, _TILE).sum(axis=2, dtype=float)
-        seen = tiles.transpose(0, 2, 1, 3).reshape(rows * _TILE, columns * _TILE)[: window[3], : window[2]]
-        return np.asarray(seen.reshape(-1))
-
-    return [summed(lane) for lane in lanes], int(dr.sum(failures).numpy()[0])
+    return [lane.numpy() for lane in lanes], int(failures.numpy()[0])
 
 
 @recorded
 def _shaded(
     values: Values, lights: Lights, textures: Textures, scene: mi.Scene, grid: _Grid, pattern: Pattern, fine: mi.UInt8,
-    plain: mi.UInt8, small: mi.Bool, packets: int, layered: bool,
+    plain: mi.UInt8, dry: mi.Bool, small: mi.Bool, packets: int, pixels: int, layered: bool,
 ) -> tuple[list[mi.Float], mi.UInt32]:  # fmt: skip
-    """What groups of samples show, one group per lane, and their failed light paths."""
+    """Sums over what the groups of each pixel show, in the order of the pixels, and the number of failed light paths.
+
+    There is one group per lane; a packet is a group of each pixel of a tile.
+    """
     # Embree traces sixteen neighbouring lanes together. They are one group of 4 x 4 pixels each, so that their camera
     # rays are close and their lamp rays go the same way.
     index = dr.arange(mi.UInt32, packets * _TILE * _TILE)
@@ -346,12 +341,12 @@ def _shaded(
     lamps = dr.maximum(others, 1)
 
     def count_of(i: mi.UInt32, users: mi.UInt32) -> mi.UInt32:
-        return dr.select(users < others, (users + others - 1 - i) // users, dr.minimum(others, 1)) + suns
+        return dr.select(users < others, quotient(users + others - 1 - i, users), dr.minimum(others, 1)) + suns
 
     def in_turn(i: mi.UInt32, k: mi.UInt32, users: mi.UInt32) -> tuple[Lamp, mi.Float]:
         first = k < suns
-        which = i % lamps + (k - suns) * users
-        share = mi.Float(users) / mi.Float(dr.maximum((users + lamps - 1 - which) // lamps, 1))
+        which = i - quotient(i, lamps) * lamps + (k - suns) * users
+        share = mi.Float(users) / mi.Float(dr.maximum(quotient(users + lamps - 1 - which, lamps), 1))
         return lights[dr.select(first, lights.count - 1, which)], dr.select(first, 1, share)
 
     across, tile_rows, tile_columns = grid.plain
@@ -375,6 +370,7 @@ def _shaded(
             (suns > 0) | ((lamps <= _FEW_LAMPS) & ~several & small),
             suns > 0,
             dr.gather(mi.UInt8, plain, place) > 0,
+            finely | ~dry,
             layered,
         ),
     )
@@ -383,4 +379,17 @@ def _shaded(
     lanes = [x for p in parts for x in (p.radiance, p.weight * one, p.near * one)] if layered else [radiance]
     lanes = [x / mi.Float(more) for x in lanes]
     dr.eval(lanes, failures)
-    return lanes, failures
+    pixel = dr.arange(mi.UInt32, pixels)
+    y = pixel // width
+    x = pixel - y * width
+    at = (y // _TILE * columns + x // _TILE) * count * _TILE**2 + y % _TILE * _TILE + x % _TILE
+
+    def add(k: mi.UInt32, *sums: mi.Float) -> tuple[mi.UInt32, *tuple[mi.Float, ...]]:
+        at_k = at + k * _TILE**2
+        return k + 1, *(total + dr.gather(mi.Float, lane, at_k) for total, lane in zip(sums, lanes, strict=True))
+
+    state = (mi.UInt32(0), *(mi.Float(0) for _ in lanes))
+    _, *sums = dr.while_loop(state, lambda k, *_: k < count, add, label="groups of a pixel")
+    failed = dr.sum(failures)
+    dr.eval(sums, failed)
+    return sums, failed

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -306,9 +307,14 @@ def _node_counts(xy: Floats, sigma_px: float) -> tuple[int, int]:
 
 def disc_basis(light: Lamp) -> tuple[Floats, Floats]:
     """Two unit vectors (3,) across a lamp's axis."""
-    axis = light.axis
-    e1 = normalize(np.cross(axis, (1.0, 0.0, 0.0) if abs(axis[0]) < 0.6 else (0.0, 1.0, 0.0)))
-    return e1, np.cross(axis, e1)
+    return _across(*light.axis.tolist())
+
+
+@lru_cache(maxsize=256)  # lamps keep their axes from frame to frame
+def _across(x: float, y: float, z: float) -> tuple[Floats, Floats]:
+    axis = np.array([x, y, z])
+    e1 = normalize(np.cross(axis, (1.0, 0.0, 0.0) if abs(x) < 0.6 else (0.0, 1.0, 0.0)))
+    return frozen(e1), frozen(np.cross(axis, e1))
 
 
 def disc_points(light: Lamp, point: Floats) -> Floats:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 
 from .lighting import lamp_blocked, on_relief, straight, through_cornea
+from .region import film_normal, glossy_normal
 from .shading import direct, indirect, off_eye
 from .values import Lamp, Lights, Values
 from .view import Textures, View, look_at_skin, meet, outer_albedo
-from .water import through_water, wetted
+from .water import parts_of, through_water, wetted
 
 if TYPE_CHECKING:
     from .region import SkinGeometry
@@ -39,6 +40,7 @@ class Group:
             where lashes cast shadows finer than a pixel.
         sharp: whether every sample does so, and everywhere: the lamp is the sun.
         plain: whether the samples' pixel shows nothing but the sheet of skin.
+        wet: whether it may show menisci.
         layered: whether the parts of the sum, and their distances, are wanted one by one.
     """
 
@@ -53,6 +55,7 @@ class Group:
     fine: mi.Bool
     sharp: mi.Bool
     plain: mi.Bool
+    wet: mi.Bool
     layered: bool = False
 
 
@@ -154,17 +157,19 @@ class _GroupShading:
         values, group, skin = self.values, self.group, self.skin
         j = self.number(i)
         o, d, weight = group.ray(j)
-        no = mi.Bool(False)
+
         view, hit = meet(values, self.scene, o, d, mi.Bool(True))
         at = o + hit.t * d
         face = skin.face(hit)
         on_sheet = skin.on_sheet(face)
         if skin.water is not None:
-            film, wet = wetted(skin.water, o, d, view.distance)
-            # Mirror images of lamps in water are smaller than a pixel, so no sample stands for others.
-            drop = Kept.none().with_(wet, j, skin.on_water(film), film.prim_uv, weight, no, no)
-            total = dr.if_stmt((total,), wet, lambda total: self.add_region(total, drop, False), lambda total: total)
-            view, d = through_water(values, skin, film, wet, view, o, d)
+            total, d, *parts = dr.if_stmt(
+                (total, d, *parts_of(view)),
+                group.wet,
+                lambda total, d, *parts: self.past_water(total, d, View(*parts), o, j, weight),
+                lambda *unchanged: unchanged,
+            )
+            view = View(*parts)
         if group.layered:
             # Before the branches below: Dr.Jit would reuse their values outside of them.
             weight_globe, *near = depths
@@ -199,6 +204,18 @@ class _GroupShading:
         settled = group.plain & view.other & on_sheet & ~alone
         return i + 1, settled, total, sheet, before, known, blocked, failures, depths
 
+    def past_water(
+        self, total: mi.Float, d: mi.Vector3f, view: View, o: mi.Vector3f, j: mi.UInt32, weight: mi.Float
+    ) -> tuple[Any, ...]:
+        """Add what menisci mirror to `total`; the direction in air, and the parts of the view, of what is behind."""
+        values, skin, no = self.values, self.skin, mi.Bool(False)
+        film, wet = wetted(skin.water, o, d, view.distance)
+        # Mirror images of lamps in water are smaller than a pixel, so no sample stands for others.
+        drop = Kept.none().with_(wet, j, skin.on_water(film), film.prim_uv, weight, no, no)
+        total = dr.if_stmt((total,), wet, lambda total: self.add_region(total, drop, False), lambda total: total)
+        view, d = through_water(values, skin, film, wet, view, o, d)
+        return total, d, *parts_of(view)
+
     def globe_radiance(self, view: View, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
         """Radiance of the globe along sample j's ray, and failed light paths."""
         values, lights, textures, scene, group = self.values, self.lights, self.textures, self.scene, self.group
@@ -217,9 +234,13 @@ class _GroupShading:
         """
         values, lights, group = self.values, self.lights, self.group
 
+        mirror = (film_normal(seen.normal), back)
+        u, v = group.spot(j)
+        turn = dr.sincos(v * (2 * dr.pi))
+
         def lit_by(lamp: Lamp, matte: mi.Float) -> tuple[mi.Vector3f, mi.Float]:
-            source = self.lamp_point(lamp, j)
-            return source, direct(seen, matte, *straight(lamp, source, seen, back))
+            source = lamp.point(u, *turn)
+            return source, direct(seen, matte, *straight(lamp, source, seen, mirror))
 
         if self.soft:
             # What went through the tissue is known, and what remains is the film's highlight.
@@ -292,15 +313,16 @@ class _GroupShading:
             inside, matte = direct(view, view.albedo, on_skin, mi.Float(0)), mi.Float(0)
         total += (rest + inside) * kept.weight
         faint = _FAINT * inside
+        mirror = (glossy_normal(view.normal, view.gloss), -values.vector_to_eye(d))
+        turn = dr.sincos(group.shared_spot.y * (2 * dr.pi))
 
         def more(k: mi.UInt32, *_: object) -> mi.Bool:
             return k < group.lamps
 
         def lamp_light(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             lamp, share = group.shared(k)
-            spot = group.shared_spot
-            source = lamp.point(spot.x, *dr.sincos(spot.y * (2 * dr.pi)))
-            outer, shine = straight(lamp, source, view, -values.vector_to_eye(d))
+            source = lamp.point(group.shared_spot.x, *turn)
+            outer, shine = straight(lamp, source, view, mirror)
             lit = direct(view, matte, outer, shine) * share
             if soft:
                 assert self.textures.tissues is not None

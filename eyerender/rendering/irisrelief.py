@@ -27,7 +27,7 @@ from .values import Lights, Values
 from .view import Textures, iris_height
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
-_CELL_PX, _LEAST, _MOST = 0.5, 320, 448  # size of a cell in the picture, cells across: fewer would flatten slopes
+_CELL_PX, _LEAST, _MOST = 0.6, 320, 448  # size of a cell in the picture, cells across: fewer would flatten slopes
 _STEP = 16  # in the number of cells across: a new number has Dr.Jit record anew
 _STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for what stands before a lamp
 _FIXED_POINT_STEPS = 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +14,7 @@ from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..rig.camera import Window
 from .film import Exposed, pixels_of
 from .lighting import lamp_blocked, straight
+from .region import glossy_normal
 from .sampling import camera_ray
 from .view import View, hidden, look, meet, meet_globe, outer_albedo
 from .water import on_water
@@ -71,13 +73,13 @@ def highlights(shown: Exposed, window: Window) -> Bools:
         view = look(values, textures, shown.scene, o, d, mi.Bool(True))
         albedo = outer_albedo(values, textures, view)  # of what is below the water
         view = on_water(values, textures, view, o, d)
-        back = -values.vector_to_eye(d)
+        mirror = (glossy_normal(view.normal, view.gloss), -values.vector_to_eye(d))
 
         def add(
-            k: mi.UInt32, shine: mi.Float, even: mi.Float, view: View = view, back: mi.Vector3f = back
+            k: mi.UInt32, shine: mi.Float, even: mi.Float, view: View = view, mirror: Any = mirror
         ) -> tuple[mi.UInt32, mi.Float, mi.Float]:
             lamp = lights[k]
-            received, sheen = straight(lamp, lamp.position, view, back)
+            received, sheen = straight(lamp, lamp.position, view, mirror)
             barred = lamp_blocked(
                 values, shown.scene, view.point, lamp.position, view.other, ~view.cornea, received > 0
             )

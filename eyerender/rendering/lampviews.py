@@ -24,7 +24,7 @@ from ..arrays import Floats
 from ..region.mesh import HAIRS, RegionMesh
 from ..rig.light import Lamp
 from .parameters import leaves
-from .values import aligned
+from .values import aligned, quotient
 
 if TYPE_CHECKING:
     from .region import RegionScene, SkinGeometry
@@ -129,7 +129,7 @@ class LampViews:
             return k < count
 
         def mark(k: mi.UInt32) -> mi.UInt32:
-            row = k // columns
+            row = quotient(k, columns)
             u, v = first[0] + mi.Int32(k - row * columns), first[1] + mi.Int32(row)
             near = edge.distance2(mi.Float(u) + 0.5, mi.Float(v) + 0.5) < reach * reach
             inside = (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)

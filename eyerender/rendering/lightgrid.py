@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from .parameters import leaves
 
-_BENT = 0.004  # largest third difference of a cell over its irradiance
+BENT = 0.004  # largest third difference of a cell over its irradiance
 
 
 class LightGrid:
@@ -49,7 +49,7 @@ class LightGrid:
             bent = dr.maximum(bent, dr.abs(e[0] - 3 * e[1] + 3 * e[2] - e[3]))
         for value in (v for line in near for v in line):
             least, most = dr.minimum(least, value), dr.maximum(most, value)
-        good = (least > 0) & (bent <= _BENT * most)
+        good = (least > 0) & (bent <= BENT * most)
         good &= (column > 0) & (row > 0) & (column < side - 2) & (row < side - 2)
         four = near[1]
         if more is not None:
@@ -64,7 +64,7 @@ class LightGrid:
         side = self.side
         inside = active & (u >= 0) & (v >= 0) & (u < side - 1) & (v < side - 1)
         i, j = mi.UInt32(u), mi.UInt32(v)
-        wu, wv = _weights(u - mi.Float(i)), _weights(v - mi.Float(j))
+        wu, wv = weights(u - mi.Float(i)), weights(v - mi.Float(j))
         total, known = mi.Float(0), mi.Bool(inside)
         for k, weight in enumerate(wv):
             row = dr.gather(mi.Vector4f, self.rows, (j + k - 1) * side + i, inside)
@@ -74,7 +74,7 @@ class LightGrid:
         return dr.select(known, dr.maximum(total, 0), 0), known
 
 
-def _weights(s: mi.Float) -> tuple[mi.Float, ...]:
+def weights(s: mi.Float) -> tuple[mi.Float, ...]:
     """Weights of four neighbours at the place s, 0 to 1 between the second and the third."""
     r = 1 - s
     return -0.5 * s * r * r, 1 + s * s * (1.5 * s - 2.5), 1 + r * r * (1.5 * r - 2.5), -0.5 * r * s * s

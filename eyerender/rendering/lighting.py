@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 
 from .manifold import connect
-from .region import sheen
+from .region import glossy_normal, sheen
 from .surfaces import Surface
-from .values import Lamp, Lights, Values
+from .values import ALL, BITS, Lamp, Lights, Values
 from .view import EPSILON_MM, View, meet_sphere, opacity
 
 if TYPE_CHECKING:
@@ -75,24 +75,26 @@ def _globe_blocks(
     return blocked | (met & cornea & (t > EPSILON_MM) & (t < distance))
 
 
-def straight(lamp: Lamp, source: mi.Vector3f, view: View, back: mi.Vector3f | None = None) -> tuple[mi.Float, mi.Float]:
+def straight(
+    lamp: Lamp, source: mi.Vector3f, view: View, mirror: tuple[mi.Vector3f, mi.Vector3f] | None = None
+) -> tuple[mi.Float, mi.Float]:
     """Light that a lamp gives to matte points in air when nothing stands in the way.
 
     Args:
         lamp: the lamp.
         source: points of the lamp.
         view: the points that are lit.
-        back: unit direction of the viewer (eye frame), if their sheen is wanted.
+        mirror: normal of what mirrors and unit direction of the viewer (eye frame), if their sheen is wanted.
 
     Returns:
-        Irradiance (mW/mm^2), and the radiance of the sheen towards `back`.
+        Irradiance (mW/mm^2), and the radiance of the sheen towards the viewer.
     """
     to = source - view.point
     inv2 = dr.rcp(dr.squared_norm(to))
     to *= dr.sqrt(inv2)
     cosine = dr.dot(to, view.normal)
     received = dr.select(view.matte & (cosine > 0), lamp.radiant_intensity(-to) * cosine * inv2, 0)
-    return received, mi.Float(0) if back is None else received * sheen(view.normal, to, back, view.gloss)
+    return received, mi.Float(0) if mirror is None else received * sheen(mirror[0], to, mirror[1], view.gloss)
 
 
 def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vector3f) -> mi.Float:
@@ -175,7 +177,7 @@ def light(
         one = dr.minimum(mi.UInt32(u * count), lights.count - 1)
         lamp: Lamp = lights[one]
         source = lamp.point(u * count - mi.Float(one), *dr.sincos(v * (2 * dr.pi)))
-        direct, shine = straight(lamp, source, view, back)
+        direct, shine = straight(lamp, source, view, (glossy_normal(view.normal, view.gloss), back))
         blocked = lamp_blocked(values, scene, view.point, source, view.other, ~view.cornea, direct > 0)
         share = dr.select(blocked, 0, count)
         bent, failures = through_cornea(values, lights, scene, view.inner, view.lit_inside, u, v)
@@ -215,26 +217,65 @@ def through_cornea(
     u, v: place on each lamp's disc, [0, 1). normal: unit normals at the points; None for those of the plane. surfaces:
     those in front of the points; None for all.
     """
-    bent, rest = mi.Float(0), inside & behind((surfaces or values.surfaces)[-1], inner)
+    bent, left, rest = mi.Float(0), mi.UInt32(ALL), inside & behind((surfaces or values.surfaces)[-1], inner)
     if lights.on_iris is not None:
-        bent, known = lights.on_iris.at(inner, inside)
-        rest &= ~known
+        bent, left = lights.on_iris.at(inner, inside)
+    many = lights.count > BITS
     sine, cosine = dr.sincos(v * (2 * dr.pi))
 
     def more(i: mi.UInt32, *_: object) -> mi.Bool:
         return rest & (i < lights.count)
 
-    def body(i: mi.UInt32, bent: mi.Float, failures: mi.UInt32) -> tuple[mi.UInt32, mi.Float, mi.UInt32]:
+    def body(
+        i: mi.UInt32, left: mi.UInt32, bent: mi.Float, failures: mi.UInt32
+    ) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.UInt32]:
         lamp: Lamp = lights[i]
         path = LampPath.to(values, scene, lamp, lamp.point(u, sine, cosine), inner, rest, normal, surfaces)
         failed = dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
-        return i + 1, bent + dr.select(path.blocked, 0, path.gain), failures + failed
+        left &= left - 1
+        following = dr.select(many, i + 1, dr.tzcnt(left))
+        return following, left, bent + dr.select(path.blocked, 0, path.gain), failures + failed
 
-    state = (mi.UInt32(0), bent, mi.UInt32(0))
-    _, bent, failures = dr.while_loop(state, more, body, labels=("i", "bent", "failures"), label="lamps")
+    # Of the lamps whose light is not known, the next one is at the lowest bit; without bits the number is too high.
+    first = dr.select(left == 0, lights.count, dr.select(many, 0, dr.tzcnt(left)))
+    state, labels = (first, left, bent, mi.UInt32(0)), ("i", "left", "bent", "failures")
+    _, _, bent, failures = dr.while_loop(state, more, body, labels=labels, label="lamps")
     if normal is None and lights.relief is not None:
         bent *= lights.relief.share(inner, inside)
     return bent, failures
+
+
+def off_cornea(
+    values: Values,
+    lights: Lights,
+    scene: mi.Scene,
+    x: mi.Vector3f,
+    normal: mi.Vector3f,
+    u: mi.Float,
+    v: mi.Float,
+) -> mi.Float:
+    """Irradiance (mW/mm^2) of points before the eye (eye frame) from all lamps by way of the cornea as a mirror.
+
+    u, v: place on each lamp's disc, [0, 1).
+    """
+    sine, cosine = dr.sincos(v * (2 * dr.pi))
+    front, reach = values.surfaces[:1], values.limbus.radius
+
+    def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        lamp: Lamp = lights[i]
+        source = lamp.point(u, sine, cosine)
+        path = connect(front, source, x, normal, x, reach, mi.Bool(True), mirror=True)
+        local = front[0].point_in(path.entry)
+        out = dr.sqrt(local.y * local.y + local.z * local.z)
+        there = path.found & (out < reach)
+        blocked = lamp_blocked(values, scene, path.entry, source, True, False, there)
+        blocked |= lamp_blocked(values, scene, path.entry, x, True, False, there & ~blocked)
+        lit = lamp.radiant_intensity(path.leaving) * path.transfer * (1 - opacity(values, out))
+        return i + 1, total + dr.select(there & ~blocked, lit, 0)
+
+    state, labels = (mi.UInt32(0), mi.Float(0) * x.x), ("i", "total")
+    _, total = dr.while_loop(state, lambda i, _: i < lights.count, body, labels=labels, label="mirrored lamps")
+    return total
 
 
 def behind(surface: Surface, x: mi.Vector3f) -> mi.Bool:

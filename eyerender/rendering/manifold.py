@@ -26,6 +26,8 @@ TOLERANCE_MM = 1e-4  # changes the irradiance by less than 1e-4 of itself; float
 _STANDOFF_MM = 15.0
 _STEP_MM = 2.5
 _GRAZING = 0.01
+CORNEA_MM = 7.8  # radius of corneas, about
+_BISECTIONS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +54,8 @@ def connect(
     aim: mi.Vector3f,
     reach: mi.Float,
     active: mi.Bool,
+    *,
+    mirror: bool = False,
 ) -> Connection:
     """Paths from `lamp` to `x` through all `surfaces`, all points in the eye frame (mm).
 
@@ -63,9 +67,10 @@ def connect(
         aim: where the straight line from the lamp is aimed at first: near the image of `x` seen from outside.
         reach: radius about the front surface's axis (mm) beyond which no path enters.
         active: lanes that matter.
+        mirror: whether the light comes to points before the first surface, which mirrors it, the only one.
     """
     front = surfaces[0]
-    start = _entry_guess(front, lamp, aim)
+    start = _mirror_guess(front, lamp, aim) if mirror else _entry_guess(front, lamp, aim)
 
     def going(y: mi.Vector3f, last: mi.Vector3f, step: mi.UInt32, on: mi.Bool, *_: object) -> mi.Bool:
         return on
@@ -78,7 +83,7 @@ def connect(
         distance = dr.norm(d)
         d /= distance
         e1, e2 = mi.coordinate_system(d)
-        b, passed, c = front.bend(Bundle(y, d, distance * e1, distance * e2, e1, e2), form)
+        b, passed, c = front.bend(Bundle(y, d, distance * e1, distance * e2, e1, e2), form, mirror=mirror)
         y1, y2 = b.da, b.db
         over = c < _GRAZING  # beyond the horizon, go half the way back
         ok = ~over
@@ -127,7 +132,28 @@ def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vect
     t, ok = front.hit(ol, dl)
     straight = ol + t * dl
     good = ok & (-dr.dot(front.normal(straight), dl) > 0.25)
-    centre = mi.Vector3f(-7.8, 0, 0)
+    centre = mi.Vector3f(-CORNEA_MM, 0, 0)
     half = dr.normalize(dr.normalize(front.point_in(lamp) - centre) + mi.Vector3f(1, 0, 0))
-    local = dr.select(good, straight, centre + 7.8 * half)
+    local = dr.select(good, straight, centre + CORNEA_MM * half)
     return front.vector_out(local) + front.origin
+
+
+def _mirror_guess(front: Surface, lamp: mi.Vector3f, x: mi.Vector3f) -> mi.Vector3f:
+    """First guess of the point that mirrors a lamp to `x`: that of a sphere, by bisection between both directions.
+
+    Of the two last points it is that nearer to the lamp, because Newton's method must not start in its shadow.
+    """
+    centre = mi.Vector3f(-CORNEA_MM, 0, 0)
+    a, b = front.point_in(lamp) - centre, front.point_in(x) - centre
+    to_lamp, to_x = dr.normalize(a), dr.normalize(b)
+
+    def normal(share: mi.Float) -> mi.Vector3f:
+        return dr.normalize(to_x + share * (to_lamp - to_x))
+
+    low, high = mi.Float(0), mi.Float(1)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        n = normal(middle)
+        near = dr.dot(n, dr.normalize(b - CORNEA_MM * n)) > dr.dot(n, dr.normalize(a - CORNEA_MM * n))
+        low, high = dr.select(near, middle, low), dr.select(near, high, middle)
+    return front.vector_out(centre + CORNEA_MM * normal(high)) + front.origin

@@ -18,6 +18,7 @@ import mitsuba as mi
 
 from .lightgrid import LightGrid
 from .lighting import irradiance, lamp_blocked
+from .parameters import leaves
 from .values import Lights, Values
 from .view import GLOBE_EDGE, View, globe_map
 
@@ -30,6 +31,8 @@ _LOW, _SLOPE = 0.1, 0.6  # cosines: of a lamp about to set, and of one that the 
 
 class MatteLight:
     """The light that matte surfaces of a bare eye receive from lamps, and the globe from other surfaces."""
+
+    DRJIT_STRUCT = leaves("_values", "_used", "_reach", "_grids")
 
     def __init__(self, values: Values, lights: Lights, scene: mi.Scene, received: Received, reach_mm: float) -> None:
         """Prepare the grids.

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Bools, Floats
-from ..region.mesh import RegionMesh
+from ..region.mesh import HAIRS, RegionMesh
 from ..rig.camera import PinholeCamera, Window
 
 _TILE_PX = 8
@@ -52,23 +52,27 @@ def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, wi
     return (outlines[1] != 0) & (outlines[0] == 0) & ~marked, tile
 
 
-def fine_pixels(region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> Bools:
+def fine_pixels(
+    region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Floats, window: Window
+) -> tuple[Bools, bool]:
     """Pixels (height, width) of a window at menisci and at hairs at most two pixels thick, and their neighbours.
 
-    A pixel is marked or not, whatever the window.
+    The second result tells whether all menisci are marked. A pixel is marked or not, whatever the window.
     """
     x0, y0, width, height = window
     marked = np.zeros((height + 2, width + 2), dtype=bool)
-    for curve in region.strands if region is not None else ():
+    curves = [] if region is None else list(region.strands)
+    # Menisci are grids, of which the strands are the rows.
+    curves += [grid.transpose(1, 0, 2) for grid in curves[HAIRS:]]
+    every = True
+    for curve in (c for c in curves if c.size):
         z = (curve + anchor_mm - camera.nodal_point_mm) @ camera.R[2]
-        if not curve.size or z.min() < _NEAREST_MM or _HAIR_MM * float(camera.K[0, 0]) > _THICK_PX * z.min():
+        if z.min() < _NEAREST_MM or _HAIR_MM * float(camera.K[0, 0]) > _THICK_PX * z.min():
+            every = False
             continue
         xy = camera.project(curve + anchor_mm)[0] - (x0 - 1, y0 - 1)
-        ends = np.stack([xy[:, :-1], xy[:, 1:]], axis=-2).reshape(-1, 2, 2)
         # Pieces beside the window need no points.
-        near = (ends.max(axis=1) > -1) & (ends.min(axis=1) < (width + 3, height + 3))
-        ends = ends[near[:, 0] & near[:, 1]]
-        start, way = ends[:, 0], ends[:, 1] - ends[:, 0]
+        start, way = _pieces(xy, (height + 2, width + 2))
         count = np.ceil(np.hypot(way[:, 0], way[:, 1]) / _FINE_STEP_PX).astype(int) + 1
         step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         column, row = (
@@ -80,21 +84,23 @@ def fine_pixels(region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Flo
     out = marked[1:-1, 1:-1].copy()
     for beside in (marked[:-2, 1:-1], marked[2:, 1:-1], marked[1:-1, :-2], marked[1:-1, 2:]):
         out |= beside
-    return out
+    return out, every
 
 
-def _pieces(xy: Floats, shape: tuple[int, int]) -> Floats:
-    """Straight pieces (m, 2, 2) of polylines (n, k, 2) that come near the tiles."""
-    ends = np.stack([xy[:, :-1], xy[:, 1:]], axis=-2).reshape(-1, 2, 2)
-    limit = np.array(shape[::-1]) + 1.0
-    return ends[np.all((ends.max(axis=1) > -1) & (ends.min(axis=1) < limit), axis=1)]
+def _pieces(xy: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Straight pieces of polylines (n, k, 2) that come near a grid of so many cells: start and way (m, 2)."""
+    a, b = xy[:, :-1].reshape(-1, 2), xy[:, 1:].reshape(-1, 2)
+    near = (np.maximum(a, b) > -1) & (np.minimum(a, b) < (shape[1] + 1, shape[0] + 1))
+    near = near[:, 0] & near[:, 1]
+    start = a[near]
+    return start, b[near] - start
 
 
-def _mark(marked: Bools, pieces: Floats, step: float, reach: float) -> None:
+def _mark(marked: Bools, pieces: tuple[Floats, Floats], step: float, reach: float) -> None:
     """Mark the tiles within `reach`, at most half a tile, of points of the pieces that are `step` tiles apart."""
     rows, columns = marked.shape
-    start, way = pieces[:, 0], pieces[:, 1] - pieces[:, 0]
-    count = np.ceil(np.linalg.norm(way, axis=1) / step).astype(int) + 1
+    start, way = pieces
+    count = np.ceil(np.sqrt(way[:, 0] ** 2 + way[:, 1] ** 2) / step).astype(int) + 1
     which = np.repeat(np.arange(len(count)), count)
     share = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)) / np.maximum(count - 1, 1)[which]
     xy = start[which] + share[:, None] * way[which]

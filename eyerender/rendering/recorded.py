@@ -6,7 +6,7 @@ import gc
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
-from functools import wraps
+from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import drjit as dr
@@ -26,6 +26,8 @@ def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     Dr.Jit compares plain values, too, but misses the change of one that is also found before it: it takes a call with
     (True, False, True) for one with (True, False, False). So they choose the recordings here.
+
+    The first call is not recorded: where every frame shows another subject, nothing would ever be played back.
     """
     variants: OrderedDict[Any, Any] = OrderedDict()
     _played.append(variants)
@@ -36,10 +38,16 @@ def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:
         _collect((args, kwargs), plain)
         key = tuple(plain)
         if key not in variants:
-            # A run over many subjects may record often without being wrong, so there is no warning.
-            variants[key] = dr.freeze(function, limit=_KEPT, warn_after=2**31 - 1, auto_opaque=False)
+            variants[key] = None
             if len(variants) > _VARIANTS:
                 variants.popitem(last=False)
+            dr.eval(args, kwargs)  # as a recording does, so that the kernels are the same
+            result = function(*args, **kwargs)
+            dr.eval(result)
+            return result
+        if variants[key] is None:
+            # A run over many subjects may record often without being wrong, so there is no warning.
+            variants[key] = dr.freeze(function, limit=_KEPT, warn_after=2**31 - 1, auto_opaque=False)
         variants.move_to_end(key)
         return variants[key](*args, **kwargs)  # type: ignore[no-any-return]
 
@@ -59,15 +67,25 @@ def _collect(value: Any, plain: list[Any]) -> None:
         _collect(list(value.values()), plain)
     else:
         plain.append(type(value))
-        names = getattr(type(value), "DRJIT_STRUCT", None)
-        if not names and is_dataclass(value):
-            names = [field.name for field in fields(value)]
-        for name in names or ():
+        for name in _names(type(value)):  # type: ignore[arg-type]  # classes are hashable
             _collect(getattr(value, name), plain)
 
 
+@cache
+def _names(kind: type) -> tuple[str, ...]:
+    """Names of what objects of a class hold that Dr.Jit finds."""
+    names = getattr(kind, "DRJIT_STRUCT", None)
+    if not names and is_dataclass(kind):
+        names = [field.name for field in fields(kind)]
+    return tuple(names or ())
+
+
 def forget() -> None:
-    """Forget all recordings, because the code that they play has been replaced."""
+    """Forget all recordings.
+
+    They are useless once there are new shapes, because each has all shapes as inputs, and once the code that they play
+    has been replaced.
+    """
     for variants in _played:
         variants.clear()
 

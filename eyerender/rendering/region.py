@@ -64,7 +64,7 @@ class RegionScene:
         if self.moving:
             film = slice(int(layout.face_ends[0]), int(layout.face_ends[1]))
             parts |= _instance("moving", _mesh(posed, slice(0, moved[0]), slice(0, moved[1]), without=film))
-            water = mi.load_dict({"type": "scene", "film": _mesh(posed, _water(layout), film)})
+            water = mi.load_dict({"type": "scene", **_instance("film", _mesh(posed, _water(layout), film))})
             self._water: Any = mi.traverse(water)
         if moved[1] < len(layout.faces):
             still = _mesh(posed, slice(moved[0], None), slice(moved[1], None))
@@ -108,7 +108,7 @@ class RegionScene:
         n, before, self.posed = self._vertices, self.posed, posed
         if self.moving:
             self._params["moving.mesh.vertex_positions"] = _floats(posed.vertices[:n])
-            self._water["film.vertex_positions"] = _floats(posed.vertices[_water(posed.layout)])
+            self._water["film.mesh.vertex_positions"] = _floats(posed.vertices[_water(posed.layout)])
             self._water.update()
         if not np.array_equal(before.vertices[n:], posed.vertices[n:]):
             mesh = "still.mesh" if self.moving else "still"
@@ -241,6 +241,13 @@ class SkinGeometry:
             turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * corner + 1)
         return mi.Vector3f(place.x, place.y, place.z), dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
 
+    def sheet_row(self, row: mi.Float, column: mi.UInt32) -> mi.Vector3f:
+        """Points of the sheet at fractional rows, in columns of its vertices."""
+        i = mi.UInt32(dr.clip(row, 0, ROWS - 1.001))
+        a, b = (dr.gather(mi.Vector4f, self._buffer, 2 * ((i + k) * SHEET_COLUMNS + column)) for k in (0, 1))
+        place = a + (row - mi.Float(i)) * (b - a)
+        return mi.Vector3f(place.x, place.y, place.z)
+
     def map_place(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Coordinates of the map at barycentric coordinates `uv` of triangles."""
         corner = dr.gather(mi.Vector4u, self._corners, face, active)
@@ -314,7 +321,7 @@ def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:
 
 
 def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, gloss: mi.Float) -> mi.Float:
-    """Mirror-like reflectance f (1/sr) of skin (gloss below 0.5) and of wet tissue (above).
+    """Mirror-like reflectance f (1/sr) of skin (gloss below 0.5) and of wet tissue (above), about a `glossy_normal`.
 
         f = w D F / (4 (l . h)^2),  D = a^2 / (pi ((n . h)^2 (a^2 - 1) + 1)^2)
 
@@ -323,7 +330,6 @@ def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, glo
     which is rougher the thinner it is. Oil on tears, which makes their gloss higher than `_WATER`, mirrors more.
     """
     wet = gloss > 0.5
-    normal = dr.select(wet, film_normal(normal), normal)
     half = dr.normalize(to_lamp + to_camera)
     lh = dr.maximum(dr.dot(to_lamp, half), 0.05)
     nh = dr.maximum(dr.dot(normal, half), 0)
@@ -339,6 +345,11 @@ def _ggx(nh: mi.Float, a: mi.Float) -> mi.Float:
     a2 = a * a
     base = nh * nh * (a2 - 1) + 1
     return a2 * dr.inv_pi / (base * base)
+
+
+def glossy_normal(normal: mi.Vector3f, gloss: mi.Float) -> mi.Vector3f:
+    """Normal (eye frame) of what mirrors: of skin itself, or of the tear film on wet tissue."""
+    return dr.select(gloss > 0.5, film_normal(normal), normal)
 
 
 def film_normal(normal: mi.Vector3f) -> mi.Vector3f:

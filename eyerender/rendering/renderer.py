@@ -16,7 +16,6 @@ from ..rig import psf
 from .blur import Blur
 from .film import Exposed, mean_parts, mean_radiance
 from .frame import RenderJob
-from .integrator import integrator_class
 from .labels import PartLabels, depths_mm, highlights, part_labels
 from .lighting import through_cornea
 from .occlusion import lid_margins_px
@@ -47,7 +46,6 @@ class Renderer:
     def __init__(self, backend: Backend, *, spp: int = 16, obstacles: Sequence[Obstacle] = ()) -> None:
         self.backend = backend
         self.spp = spp
-        self._integrator = integrator_class()()
         self._stage = Stage(obstacles)
         self._beside = ThreadPoolExecutor(1, "develop")
 
@@ -106,18 +104,18 @@ class Renderer:
         radiance = pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0)
         return Traced(job, radiance, glints / len(shots), blur, mirrored, labels, failed, margins, bright)
 
-    def _pictures(self, job: RenderJob, shown: Exposed, blur: Blur, spp: int) -> tuple[Floats, int]:
+    def _pictures(self, job: RenderJob, shown: Exposed, blur: Blur, spp: int) -> tuple[Singles, int]:
         """Radiance of a window, or its parts, with the border that the lens needs, and failed light paths."""
         pad = blur.reach + psf.margin(job.sensor.psf_sigma_px)
         x0, y0, width, height = job.window
         padded = (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad)
         look = mean_parts if blur.layered else mean_radiance
-        return look(self._integrator, shown, padded, spp, job.seed)
+        return look(shown, padded, spp, job.seed)
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
         """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), before lens and glints."""
         shown, _ = self.bind(job)
-        return mean_radiance(self._integrator, shown, job.window, spp or self.spp, job.seed)[0]
+        return mean_radiance(shown, job.window, spp or self.spp, job.seed)[0].astype(float)
 
     def iris_irradiance(self, job: RenderJob, points_mm: Floats) -> Floats:
         """Irradiance (n,) mW/mm^2 of points (n, 3) of the iris' plane (eye frame, mm) from all lamps.
@@ -143,8 +141,6 @@ class Renderer:
     def bind(self, job: RenderJob, *, lit: bool = True) -> tuple[Exposed, Surround | RegionScene]:
         """Set up a job's frame on the device, with the surroundings of its eye.
 
-        The integrator uses it until the next call. `lit`: whether radiance is wanted, not only what is seen where.
+        It is valid until the next call. `lit`: whether radiance is wanted, not only what is seen where.
         """
-        shown, place = self._stage.set(job, lit=lit)
-        self._integrator.bind(shown.values, shown.lights, shown.textures)
-        return shown, place
+        return self._stage.set(job, lit=lit)

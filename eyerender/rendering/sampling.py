@@ -52,7 +52,11 @@ def lattice_generator(count: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """The samples of all pixels of a frame: numbers and generators of two lattices, and keys of the further numbers."""
+    """The samples of all pixels of a frame: numbers and steps of two lattices, and keys of the further numbers.
+
+    A step is the lattice's generator over its number, in units of 2^-32, so that wrapping takes the place of a
+    remainder: processors divide whole numbers one by one.
+    """
 
     lattices: tuple[tuple[mi.UInt32, mi.UInt32], tuple[mi.UInt32, mi.UInt32]]
     keys: tuple[mi.UInt32, ...]
@@ -61,7 +65,8 @@ class Pattern:
     def of(cls, count: int, seed: int, times: int = 1) -> Pattern:
         """Make the pattern of `count` samples, `times` as many in fine pixels."""
         lattices = (
-            (dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, lattice_generator(n))) for n in (count, count * times)
+            (dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, -(-(lattice_generator(n) << 32) // n) & 0xFFFFFFFF))
+            for n in (count, count * times)
         )
         states = (np.random.SeedSequence([seed, call]).generate_state(1)[0] for call in range(_CALLS))
         few, many = lattices
@@ -75,12 +80,12 @@ class Samples:
         self.pixel, self._keys = pixel, pattern.keys
         # Where `fine`, a pixel has more samples.
         (few, one), (many, other) = pattern.lattices
-        self.count, self._a = dr.select(fine, many, few), dr.select(fine, other, one)
+        self.count, self._step = dr.select(fine, many, few), dr.select(fine, other, one)
 
     def in_pixel(self, k: mi.UInt32) -> mi.Point2f:
         """Place of sample `k` in the pixel, [0, 1)^2."""
         scale = dr.rcp(mi.Float(self.count))
-        return mi.Point2f((mi.Float(k) + 0.5) * scale, (mi.Float((k * self._a) % self.count) + 0.5) * scale)
+        return mi.Point2f((mi.Float(k) + 0.5) * scale, mi.Float((k * self._step) >> 8) * 2.0**-24 + 0.5 * scale)
 
     def pair(self, k: mi.UInt32, call: int) -> mi.Point2f:
         """Two further numbers of sample `k`, [0, 1)^2: each call of a pixel has its own shift."""
@@ -91,19 +96,6 @@ class Samples:
                 for shift, alpha in zip(tea(self.pixel, self._keys[call]), _ALPHA, strict=True)
             )
         )
-
-
-class Sampler:
-    """Sample `k` with the interface of Mitsuba's integrators."""
-
-    def __init__(self, samples: Samples, k: mi.UInt32) -> None:
-        self._samples, self._k, self._calls = samples, k, 0
-
-    def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
-        """Next pair, [0, 1)^2."""
-        del active
-        self._calls += 1
-        return self._samples.pair(self._k, self._calls - 1)
 
 
 def camera_ray(values: Values, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:

@@ -40,6 +40,7 @@ from .mattelight import MatteLight
 from .meshed import Meshes, meshed
 from .plain import fine_pixels, plain_tiles
 from .pupillight import PupilLight
+from .recorded import forget
 from .region import Expected, RegionScene
 from .subsurface import TissueLight, tissue_light
 from .surround import Obstacle, Surround
@@ -123,7 +124,7 @@ class Stage:
             lights.relief = IrisRelief(values, lights, place.scene, textures, px_per_mm)
         _spread(job, values, lights, textures, place)
 
-        def fine(window: Window) -> Bools:
+        def fine(window: Window) -> tuple[Bools, bool]:
             return fine_pixels(None if region is None else region.posed, job.camera, anchor, window)
 
         return Exposed(place.scene, values, lights, textures, plain, fine), place
@@ -139,6 +140,7 @@ class Stage:
         if key not in self._regions:
             if len(self._regions) >= _REGIONS:
                 self._regions.pop(next(iter(self._regions)))
+            forget()
             self._regions[key] = place_scene(job.region, globe)
         place = self._regions[key]
         place.expected, self._expected = self._expected, None

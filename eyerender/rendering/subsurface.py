@@ -19,13 +19,12 @@ Where a lid lies on the globe, the globe receives what the lid transmits.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy import ndimage
 
 from ..arrays import Bools, Floats, Ints
 from ..optics.diffusion import half_space_length_mm, rings, slab_length_mm, transmitted
@@ -37,7 +36,7 @@ from .lighting import irradiance, lamp_blocked
 from .parameters import leaves, traversed
 from .recorded import recorded
 from .region import GRID_COLUMNS, GRID_ROWS, SHEET_COLUMNS
-from .values import Lights, Values, aligned
+from .values import Lights, Values, aligned, quotient
 from .view import EPSILON_MM
 
 if TYPE_CHECKING:
@@ -163,7 +162,7 @@ class Places:
             return k < count * _TURNS
 
         def body(k: mi.UInt32, total: mi.Float, row: mi.Float, column: mi.Float) -> tuple[Any, ...]:
-            turn = k // count
+            turn = quotient(k, count)
             begins = k == turn * count
             row, column = dr.select(begins, start[0], row), dr.select(begins, start[1], column)
             place = dr.gather(mi.Vector4f, self.table, turn * _RINGS + inner + k - turn * count)
@@ -286,7 +285,7 @@ class _Maker:
         self, skin: SheetGrid, globe: GlobeGrid, thick: Places, thin: Places
     ) -> tuple[tuple[mi.Float, mi.Float], tuple[mi.Float, mi.Float]]:
         """Light on skin and globe after its way through the tissue, and how much of each lamp cells see there."""
-        light, seen = self._sheet(skin, thick)
+        light, seen = self._sheet(skin.measured(self.skin), thick)
         return (light, seen), self._globe(globe, skin.size, light, thin)
 
     def _sheet(self, grid: SheetGrid, places: Places) -> tuple[mi.Float, mi.Float]:
@@ -499,8 +498,10 @@ class SheetGrid:
         size: the same on the device.
         sent: numbers of its cells that matter, and of the cells about them on the grid reduced by 2 and by 4.
         edges: row of the sheet's vertices at the edges of the grid's rows.
+        middles: the same in their middles.
         metric: for each row and column of vertices: columns per mm along the row, a, rows per mm across it, size of a
-            cell (mm). A place x mm along and y mm across is y per-mm rows and (x - a rows) per-mm columns away.
+            cell (mm). A place x mm along and y mm across is y per-mm rows and (x - a rows) per-mm columns away. None
+            before it is `measured`.
     """
 
     rows: int
@@ -508,7 +509,8 @@ class SheetGrid:
     size: Size
     sent: tuple[mi.UInt32, ...]
     edges: mi.Float
-    metric: mi.Float
+    middles: mi.Float
+    metric: mi.Float | None = None
 
     @classmethod
     def of(cls, posed: RegionMesh, job: RenderJob, spare_mm: float, spare_px: int) -> SheetGrid:
@@ -519,28 +521,41 @@ class SheetGrid:
         edges = sheet_place(np.arange(rows + 1.0) * texels - 0.5)
         sheet = posed.vertices[: posed.layout.vertex_ends[0]].reshape(-1, SHEET_COLUMNS, 3)[:, :-1]
         near = _in_window(sheet + job.anchor_mm, job, spare_mm, spare_px)
-        sheet = sheet.astype(np.float32)
         middle = sheet_place((np.arange(rows, dtype=float) + 0.5) * texels - 0.5)
-        i = np.minimum(middle.astype(int), len(sheet) - 2)
-        share = (middle - i).astype(np.float32)
-        x = sheet[i] + share[:, None, None] * (sheet[i + 1] - sheet[i])
-        along = (np.roll(x, -1, axis=1) - np.roll(x, 1, axis=1)) * (0.5 * x.shape[1] / columns)
-        down = np.gradient(x, axis=0)
-        width = np.maximum(np.linalg.norm(along, axis=-1), 1e-6)
-        a = np.sum(along * down, axis=-1) / width
-        height = np.sqrt(np.maximum(np.sum(down * down, axis=-1) - a * a, 0))
-        width, height = np.maximum(width, _FINEST_MM), np.maximum(height, _FINEST_MM)
-        metric = np.stack([1 / width, a, 1 / height, np.maximum(width, height)], axis=-1)
-        marks = [near[i + (share > 0.5)][:, np.arange(columns) * near.shape[1] // columns]]
+        marks = [near[np.rint(middle).astype(int)][:, np.arange(columns) * near.shape[1] // columns]]
         for _ in _LEVEL_RINGS[1:]:
-            marks.append(_grown(marks[-1].reshape(len(marks[-1]) // 2, 2, -1, 2).any(axis=(1, 3))))
+            rows_of = marks[-1][::2] | marks[-1][1::2]
+            marks.append(_grown(rows_of[:, ::2] | rows_of[:, 1::2]))
         return cls(
             rows,
             columns,
             Size(dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns)),
             tuple(_numbers(np.flatnonzero(m)) for m in marks),
-            *(mi.Float(aligned(t.astype(np.float32).ravel())) for t in (edges, metric)),
+            *(mi.Float(aligned(rows_of.astype(np.float32))) for rows_of in (edges, middle)),
         )
+
+    def measured(self, skin: SkinGeometry) -> SheetGrid:
+        """The same grid with its metric on a posed surface."""
+        columns, last = SHEET_COLUMNS - 1, mi.UInt32(self.rows - 1)
+        index = dr.arange(mi.UInt32, self.rows * columns)
+        i = index // columns
+        j = index - i * columns
+
+        def point(i: mi.UInt32, j: mi.UInt32) -> mi.Vector3f:
+            return skin.sheet_row(dr.gather(mi.Float, self.middles, i), j)
+
+        before, after = dr.select(j > 0, j - 1, columns - 1), dr.select(j + 1 < columns, j + 1, 0)
+        above, below = dr.maximum(i, 1) - 1, dr.minimum(i + 1, last)
+        along = (point(i, after) - point(i, before)) * (0.5 * columns / mi.Float(self.size.columns))
+        down = (point(below, j) - point(above, j)) / mi.Float(below - above)
+        width = dr.maximum(dr.norm(along), 1e-6)
+        a = dr.dot(along, down) / width
+        height = dr.maximum(dr.sqrt(dr.maximum(dr.squared_norm(down) - a * a, 0)), _FINEST_MM)
+        width = dr.maximum(width, _FINEST_MM)
+        metric = dr.zeros(mi.Float, 4 * self.rows * columns)
+        dr.scatter(metric, mi.Vector4f(dr.rcp(width), a, dr.rcp(height), dr.maximum(width, height)), index)
+        dr.eval(metric)
+        return replace(self, metric=metric)
 
     def spread(self, irradiance: mi.Float, places: Places) -> mi.Float:
         """What leaves the skin, cell by cell, of the light that falls on it, to places about each."""
@@ -679,13 +694,16 @@ def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -
     spare = spare_px + spare_mm * float(max(camera.K[0, 0], camera.K[1, 1])) / depth
     with np.errstate(invalid="ignore"):
         inside = np.abs(xy - (x0 + 0.5 * width, y0 + 0.5 * height)) < 0.5 * np.array([width, height]) + spare[..., None]
-    return _grown(front & inside.all(axis=-1))
+    return _grown(front & inside[..., 0] & inside[..., 1])
 
 
 def _grown(marked: Bools) -> Bools:
     """Marks of a grid, whose columns close, and of all neighbours."""
-    around = np.pad(marked, ((0, 0), (1, 1)), "wrap")
-    return np.asarray(ndimage.binary_dilation(around, np.ones((3, 3)))[:, 1:-1])
+    out = marked | np.roll(marked, 1, axis=1) | np.roll(marked, -1, axis=1)
+    grown = out.copy()
+    grown[1:] |= out[:-1]
+    grown[:-1] |= out[1:]
+    return grown
 
 
 def _globe_place(n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:

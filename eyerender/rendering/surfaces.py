@@ -244,15 +244,18 @@ class Surface:
         out, share, c = self.bend(there, self._normal_form(self.point_in(there.y)) if form is None else form)
         return out, share, ok & (c > 1e-4)
 
-    def bend(self, b: Bundle, form: NormalForm) -> tuple[Bundle, mi.Float, mi.Float]:
-        """Refract a bundle whose ray has reached the surface: the bundle behind, 1 - F, and the cosine of incidence."""
+    def bend(self, b: Bundle, form: NormalForm, *, mirror: bool = False) -> tuple[Bundle, mi.Float, mi.Float]:
+        """Refract or mirror a bundle whose ray has reached the surface: the bundle, its share, cosine of incidence."""
         d = self.vector_in(b.w)
         N, inv, hessian = form
         c = -dr.dot(N, d)
         c2 = dr.sqrt(dr.maximum(1 - self.eta * self.eta * (1 - c * c), 1e-6))
-        k = self.eta * c - c2
-        w = self.eta * d + k * N
-        slope = self.eta - self.eta * self.eta * c / c2
+        mirrored = self.mirrored(c, c2)
+        # A mirror is a surface of one index behind which the cosine is the opposite.
+        eta, after = (1.0, -c) if mirror else (self.eta, c2)
+        k = eta * c - after
+        w = eta * d + k * N
+        slope = 2.0 if mirror else eta - eta * eta * c / after
         moved, turned = [], []
         for v0, e0 in ((b.da, b.wa), (b.db, b.wb)):
             e, v = self.vector_in(e0), self.vector_in(v0)
@@ -261,8 +264,8 @@ class Surface:
             dN = h - N * dr.dot(N, h)
             dc = -(dr.dot(e, N) + dr.dot(d, dN))
             moved.append(self.vector_out(dy))
-            turned.append(self.vector_out(self.eta * e + dc * slope * N + k * dN))
-        return Bundle(b.y, self.vector_out(w), *moved, *turned), 1 - self.mirrored(c, c2), c
+            turned.append(self.vector_out(eta * e + dc * slope * N + k * dN))
+        return Bundle(b.y, self.vector_out(w), *moved, *turned), mirrored if mirror else 1 - mirrored, c
 
 
 def _form_of(jet: tuple[mi.Float, ...]) -> NormalForm:

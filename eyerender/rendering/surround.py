@@ -19,6 +19,7 @@ from ..arrays import ArrayValue, Bools, Floats, Ints
 from ..region.look import Look
 from ..region.mapcache import kept
 from ..region.texture import skin_texture
+from .parameters import leaves
 from .values import aligned
 
 HALF_MM = 500.0
@@ -49,6 +50,8 @@ class SurroundGeometry:
     Kernels read them from buffers and do not call methods of Mitsuba's shapes and materials: the code of such a call
     depends on how many objects the process has made.
     """
+
+    DRJIT_STRUCT = leaves("_corners", "_vertices", "_map")
 
     def __init__(self, faces: Ints) -> None:
         corners = np.zeros((len(faces), 4), np.uint32)  # four entries, which are gathered together

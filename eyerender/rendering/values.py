@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
 _POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
 SMALL = 0.02  # the same of lamps whose shadows of hairs are finer than a pixel
+ALL, BITS = 0xFFFFFFFF, 32  # marks of lamps
 _LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner radius, 2 unused
 
 
@@ -40,6 +41,11 @@ def aligned(values: NDArray[Any]) -> NDArray[Any]:
     copy = memory[start : start + values.nbytes].view(values.dtype).reshape(values.shape)
     copy[...] = values
     return copy
+
+
+def quotient(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
+    """Whole part of a / b for numbers below a million: processors divide whole numbers one by one."""
+    return mi.UInt32((mi.Float(a) + 0.5) / mi.Float(b))
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,7 @@ def on_water(values: Values, textures: Textures, view: View, o: mi.Vector3f, d: 
         return view
     film, wet = wetted(region.water, o, d, view.distance)
     water = look_at_skin(values, region, region.on_water(film), film.prim_uv, d, wet)
-    return View(*(dr.select(wet, a, b) for a, b in zip(_parts(water), _parts(view), strict=True)))
+    return View(*(dr.select(wet, a, b) for a, b in zip(parts_of(water), parts_of(view), strict=True)))
 
 
 def through_water(
@@ -73,14 +73,15 @@ def through_water(
         # Below the water nothing mirrors the lamps.
         seen, view = (replace(v, gloss=mi.Float(0), mirrored=mi.Float(0)) for v in (seen, view))
         return dr.select(found, way, d), *(
-            dr.select(found, a, b) for a, b in zip(_parts(seen), _parts(view), strict=True)
+            dr.select(found, a, b) for a, b in zip(parts_of(seen), parts_of(view), strict=True)
         )
 
-    d, *parts = dr.if_stmt((d, *_parts(view)), wet, bent, lambda *unchanged: unchanged)
+    d, *parts = dr.if_stmt((d, *parts_of(view)), wet, bent, lambda *unchanged: unchanged)
     return View(*parts), d
 
 
-def _parts(view: View) -> tuple[Any, ...]:
+def parts_of(view: View) -> tuple[Any, ...]:
+    """Fields of a view but for the last one, which `meet_globe` does not set."""
     return tuple(getattr(view, f.name) for f in fields(View) if f.name != "level")
 
 

@@ -66,7 +66,7 @@ class Traced(ArrayValue):
     """
 
     job: RenderJob
-    radiance: Floats
+    radiance: Singles
     glints: Floats
     blur: Blur
     mirrored: Mirrored
@@ -83,16 +83,17 @@ class Traced(ArrayValue):
         """
         job, labels, mirrored, highlights = self.job, self.labels, self.mirrored, self.highlights
         seen = (job.lens, job.camera, job.window)
-        picture = psf.blur(self.blur.of_pictures(self.radiance), job.sensor.psf_sigma_px) + self.glints
-        picture = stray.framed(picture * defocus.vignette(*seen), *seen)
-        blurred = stray.scattered(picture, *seen)
-        irradiance = frozen(blurred * exposure.radiance_to_irradiance(job.sensor), np.float32)
+        # Single precision is finer than the samples' noise, and takes half the time.
+        picture = psf.blur(self.blur.of_pictures(self.radiance).astype(np.float32), job.sensor.psf_sigma_px)
+        picture = picture + self.glints
+        if job.lens.vignetting > 0:
+            picture *= defocus.vignette(*seen)
+        picture = stray.scattered(stray.framed(picture, *seen), *seen)
+        irradiance = frozen(picture * np.float32(exposure.radiance_to_irradiance(job.sensor)), np.float32)
         if not np.all(np.isfinite(irradiance)):
             raise InputError("the numbers of the scene are too extreme: its image is not finite")
         # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
-        dn = exposure.recorded(
-            job.sensor, job.camera, job.window, irradiance.astype(float), job.wavelength_nm, job.seed
-        )
+        dn = exposure.recorded(job.sensor, job.camera, job.window, irradiance, job.wavelength_nm, job.seed)
         covered = stray.covered(job.lens, job.sensor, job.camera, job.window)
         if covered is not None:
             labels = labels.behind(covered) if labels is not None else None

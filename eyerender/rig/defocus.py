@@ -26,7 +26,7 @@ from functools import lru_cache
 import numpy as np
 from scipy import fft, ndimage, special
 
-from ..arrays import ArrayValue, Bools, Floats, Singles
+from ..arrays import ArrayValue, Bools, Floats, Reals, Singles
 from ..errors import InputError
 from ..rig.camera import Window
 from .camera import PinholeCamera
@@ -118,7 +118,7 @@ def _transfer(diameter_px: float, shape: tuple[int, int]) -> Singles:
     return np.asarray(found, dtype=np.float32)
 
 
-def defocused(picture: Floats, diameter_px: float) -> Floats:
+def defocused(picture: Reals, diameter_px: float) -> Reals:
     """Convolve the image with a disc; the result is smaller by `reach_px` on every side."""
     m = reach_px(diameter_px)
     if m == 0:
@@ -142,8 +142,8 @@ class Layer(ArrayValue):
         confusion_px: diameter of the circle of confusion; without meaning where the coverage is 0.
     """
 
-    radiance: Floats
-    coverage: Floats
+    radiance: Reals
+    coverage: Reals
     confusion_px: Floats
 
 
@@ -189,7 +189,7 @@ class _Convolution:
         height, width = (fft.next_fast_len(n + reach, real=True) for n in shape)
         self._size = (height, width)
 
-    def of(self, picture: Floats, diameter_px: float) -> Floats:
+    def of(self, picture: Reals, diameter_px: float) -> Floats:
         """Fourier transform of a picture convolved with a disc."""
         return np.asarray(fft.rfft2(picture.astype(np.float32), self._size) * _transfer(diameter_px, self._size))
 
@@ -197,7 +197,7 @@ class _Convolution:
         """Picture of a Fourier transform."""
         return np.asarray(fft.irfft2(transform, self._size)[: self._shape[0], : self._shape[1]])
 
-    def spread(self, pictures: Sequence[Floats], diameters: Floats) -> list[Floats]:
+    def spread(self, pictures: Sequence[Reals], diameters: Floats) -> list[Floats]:
         """Spread every pixel of some pictures over the disc of its own diameter, mixed from two kernels."""
         sizes = _sizes(float(diameters.min()), float(diameters.max()))
         totals: list[Floats | float] = [0.0] * len(pictures)

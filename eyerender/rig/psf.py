@@ -7,10 +7,12 @@ grid) would then have different lenses.
 
 from __future__ import annotations
 
-import numpy as np
-from scipy import ndimage, signal, special
+from collections.abc import Sequence
 
-from ..arrays import Floats
+import numpy as np
+from scipy import signal, special
+
+from ..arrays import Floats, Reals
 from ..rig.camera import Window
 
 
@@ -26,13 +28,26 @@ def kernel(sigma_px: float) -> Floats:
     return np.asarray(weights / weights.sum())
 
 
-def blur(image: Floats, sigma_px: float) -> Floats:
-    """Convolve `image`; the result is smaller by `margin` pixels on every side."""
+def blur(image: Reals, sigma_px: float) -> Reals:
+    """Convolve `image`; the result is smaller by `margin` pixels on every side and has the image's precision."""
     if sigma_px == 0:
         return image
-    m, k = margin(sigma_px), kernel(sigma_px)
-    out = ndimage.correlate1d(ndimage.correlate1d(image, k, axis=0), k, axis=1)
-    return np.asarray(out[m:-m, m:-m])
+    k = kernel(sigma_px).astype(image.dtype)
+    m, (height, width) = len(k) // 2, image.shape
+    down = _symmetric([image[i : height - 2 * m + i] for i in range(2 * m + 1)], k)
+    return _symmetric([down[:, i : width - 2 * m + i] for i in range(2 * m + 1)], k)
+
+
+def _symmetric(shifted: Sequence[Reals], weights: Reals) -> Reals:
+    """Weighted sum of shifted pictures; the weights are the same forwards and backwards."""
+    m = len(weights) // 2
+    out = shifted[m] * weights[m]
+    pair = np.empty_like(out)
+    for i in range(m):
+        np.add(shifted[i], shifted[2 * m - i], out=pair)
+        pair *= weights[i]
+        out += pair
+    return np.asarray(out)
 
 
 def splat(

@@ -16,36 +16,40 @@ from functools import lru_cache
 import numpy as np
 from scipy import fft, ndimage, special
 
-from ..arrays import Bools, Floats, frozen
+from ..arrays import Bools, Reals, Singles, frozen
 from .camera import PinholeCamera, Window
 from .imaging import Lens, Opening
 from .sensor import Sensor
 
 
-def framed(picture: Floats, lens: Lens, camera: PinholeCamera, window: Window) -> Floats:
-    """Picture (h, w) behind the lens' openings; radiances in mW/mm^2/sr."""
+def framed(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
+    """Picture (h, w) behind the lens' openings, in its own precision; radiances in mW/mm^2/sr."""
     for opening in lens.openings:
-        through = transmission(opening, camera, window)
-        picture = picture * through + 1e-3 * opening.radiance_w_m2_sr * (1 - through)
+        rim = 1e-3 * opening.radiance_w_m2_sr
+        picture = (picture - rim) * transmission(opening, camera, window)
+        picture += rim
     return picture
 
 
-def scattered(picture: Floats, lens: Lens, camera: PinholeCamera, window: Window) -> Floats:
-    """Picture (h, w) with ghost and glare."""
+def scattered(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
+    """Picture (h, w) with ghost and glare, in its own precision."""
     if lens.ghost > 0:
         picture = (1 - lens.ghost) * picture + lens.ghost * ghost(picture, lens, camera, window)
     if lens.glare > 0:
-        picture = picture + lens.glare * (veil(picture, lens.glare_radius_px) - picture)
+        glare = veil(picture, lens.glare_radius_px)
+        glare *= lens.glare
+        glare += (1 - lens.glare) * picture
+        return glare
     return picture
 
 
-def transmission(opening: Opening, camera: PinholeCamera, window: Window) -> Floats:
+def transmission(opening: Opening, camera: PinholeCamera, window: Window) -> Singles:
     """Share (h, w) of the light that an opening lets through to each pixel of a window."""
     return _transmission(opening, tuple(camera.resolution_px), tuple(window))
 
 
 @lru_cache(maxsize=8)  # it is the same in every frame of a camera
-def _transmission(opening: Opening, resolution_px: tuple[int, int], window: Window) -> Floats:
+def _transmission(opening: Opening, resolution_px: tuple[int, int], window: Window) -> Singles:
     half = resolution_px[0] / 2
     x0, y0, width, height = window
     x = (np.arange(x0, x0 + width) + 0.5 - resolution_px[0] / 2) / half - opening.centre[0]
@@ -61,11 +65,11 @@ def _transmission(opening: Opening, resolution_px: tuple[int, int], window: Wind
     slope = np.hypot((u / size) ** (p - 1) / opening.half_size[0], (v / size) ** (p - 1) / opening.half_size[1])
     inside_px = half * (1 - most * size) / slope
     if opening.edge_px == 0:
-        return frozen(inside_px >= 0)
-    return frozen(special.ndtr(inside_px / opening.edge_px))
+        return frozen(inside_px >= 0, np.float32)
+    return frozen(special.ndtr(inside_px / opening.edge_px), np.float32)
 
 
-def ghost(picture: Floats, lens: Lens, camera: PinholeCamera, window: Window) -> Floats:
+def ghost(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
     """The picture turned by 180 degrees about the optical axis, scaled by m and blurred.
 
     G(x) = I(c + (c - x) / m) / m^2, from the light of the window alone.
@@ -79,16 +83,18 @@ def ghost(picture: Floats, lens: Lens, camera: PinholeCamera, window: Window) ->
     return np.asarray(ndimage.gaussian_filter(turned, lens.ghost_blur_px, mode="constant"))
 
 
-def veil(picture: Floats, radius_px: float) -> Floats:
+def veil(picture: Reals, radius_px: float) -> Reals:
     """The picture (h, w) convolved with the glare's kernel, continued by its mirror image."""
-    damped = fft.dctn(picture, type=2) * _damping(picture.shape, radius_px)
-    return np.asarray(np.maximum(fft.idctn(damped, type=2), 0))
+    waves = fft.dctn(picture, type=2)
+    waves *= _damping(picture.shape, radius_px)
+    spread = fft.idctn(waves, type=2, overwrite_x=True)
+    return np.asarray(np.maximum(spread, 0, out=spread))
 
 
 @lru_cache(maxsize=8)
-def _damping(shape: tuple[int, ...], radius_px: float) -> Floats:
+def _damping(shape: tuple[int, ...], radius_px: float) -> Singles:
     rows, columns = (np.pi * np.arange(n) / n for n in shape)
-    return frozen(np.exp(-radius_px * np.hypot(rows[:, None], columns[None, :])))
+    return frozen(np.exp(-radius_px * np.hypot(rows[:, None], columns[None, :])), np.float32)
 
 
 def covered(lens: Lens, sensor: Sensor, camera: PinholeCamera, window: Window) -> Bools | None:
@@ -98,17 +104,28 @@ def covered(lens: Lens, sensor: Sensor, camera: PinholeCamera, window: Window) -
     """
     if not lens.openings and not any(sensor.border_px):
         return None
+    return _covered(lens.openings, sensor.border_px, tuple(camera.resolution_px), tuple(window))
+
+
+@lru_cache(maxsize=8)  # it is the same in every frame of a camera
+def _covered(
+    openings: tuple[Opening, ...], border_px: tuple[int, ...], resolution_px: tuple[int, int], window: Window
+) -> Bools:
     through = np.ones((window[3], window[2]))
-    for opening in lens.openings:
-        through = through * transmission(opening, camera, window)
-    return np.asarray((through < 0.5) | border(sensor, camera, window))
+    for opening in openings:
+        through = through * _transmission(opening, resolution_px, window)
+    return frozen((through < 0.5) | _border(border_px, resolution_px, window), np.bool_)
 
 
 def border(sensor: Sensor, camera: PinholeCamera, window: Window) -> Bools:
     """Pixels (h, w) of a window in the sensor's border, which holds no picture."""
+    return _border(sensor.border_px, tuple(camera.resolution_px), window)
+
+
+def _border(border_px: tuple[int, ...], resolution_px: tuple[int, ...], window: Window) -> Bools:
     x0, y0, width, height = window
-    left, top, right, bottom = sensor.border_px
+    left, top, right, bottom = border_px
     x, y = np.arange(x0, x0 + width), np.arange(y0, y0 + height)
-    columns = (x < left) | (x >= camera.resolution_px[0] - right)
-    rows = (y < top) | (y >= camera.resolution_px[1] - bottom)
+    columns = (x < left) | (x >= resolution_px[0] - right)
+    rows = (y < top) | (y >= resolution_px[1] - bottom)
     return np.asarray(rows[:, None] | columns[None, :])

@@ -80,13 +80,12 @@ CASES: dict[str, tuple[str, Callable[[int], Camera], int, int, list[list[float]]
     "region E4 head-mounted": ("E4", head, 96, 3, LOW, {"region": REGION}),
 }
 IRIS_PATHS = 5e7
-# Known differences, whose cause is not found.
+# Known differences: by how much we are too dark. Traced rays give the first: lamps by way of the cornea's front, which
+# mirrors them from inside. The causes of the others are not found.
 DARK = {
-    ("iris E4", "outer iris"): 0.011,
-    ("eye E4 head-mounted", "outer iris"): 0.017,
-    ("region E2 head-mounted", "outer iris"): 0.017,
-    ("region E4 head-mounted", "middle iris"): 0.010,
-    ("region E4 head-mounted", "outer iris"): 0.037,
+    ("eye E4 head-mounted", "outer iris"): 0.007,
+    ("region E4 head-mounted", "outer iris"): 0.026,
+    ("region E4 head-mounted", "other"): -0.006,
 }
 
 
@@ -112,9 +111,9 @@ def plain(renderer, monkeypatch):
 
 @pytest.mark.parametrize("case", CASES)
 def test_all_light_of_lamps_against_path(plain, tmp_path, case):
-    # .5 % and two standard errors of the oracle in rings of the iris, on sclera, and on surround or skin. Some outer
-    # rings have less light than the oracle's; DARK states by how much. The iris has a picture of its own with finer
-    # pixels, because few of a coarse picture lie wholly in one ring.
+    # .5 % and two standard errors of the oracle in rings of the iris, on sclera, and on surround or skin. DARK states
+    # what is known to differ. The iris has a picture of its own with finer pixels, because few of a coarse picture
+    # lie wholly in one ring.
     model, camera, side, times, places, more = CASES[case]
     look = FLAT.model_copy(update={k: v for k, v in more.items() if k != "region"})
     whole, fine = (

@@ -23,9 +23,10 @@ def test_the_grid_gives_the_light_of_exact_paths(renderer, model, name):
     x = np.asarray(eye.stop.centre_mm) + np.outer(rho * np.cos(turn), u) + np.outer(rho * np.sin(turn), v)
     grid = renderer.bind(job)[0].lights.on_iris
     grid.make()
-    found, known = (k.numpy() for k in grid.at(mi.Vector3f(*x.astype(np.float32).T), mi.Bool(True)))
-    known = known.astype(bool)
-    assert np.mean(known[rho < 3.0]) > 0.9  # the others lie at edges of shadows, of which a wide limbus throws more
+    found, left = (k.numpy() for k in grid.at(mi.Vector3f(*x.astype(np.float32).T), mi.Bool(True)))
+    known = left == 0
+    lacked = left[rho < 3.0, None] >> np.arange(len(job.lights)) & 1
+    assert np.mean(lacked) < 0.05  # at edges of shadows, of which a wide limbus throws more
     error = np.abs(found[known] / renderer.iris_irradiance(job, x)[known] - 1)
     assert np.sqrt(np.mean(error**2)) < 2e-4
     assert np.quantile(error, 0.995) < 1e-3
@@ -39,7 +40,7 @@ def test_shadows_on_the_iris_keep_their_edges(renderer):
     shown.lights.on_iris = None
     from eyerender.rendering.film import mean_radiance
 
-    truth, _ = mean_radiance(renderer._integrator, shown, job.window, 4, job.seed)
+    truth, _ = mean_radiance(shown, job.window, 4, job.seed)
     part = renderer.labels(job).part
     iris = (part == 2) | (part == 3)
     assert iris.sum() > 3000

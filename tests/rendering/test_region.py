@@ -221,7 +221,7 @@ def test_hairs_are_sampled_more_finely(renderer, monkeypatch):
     monkeypatch.setattr(film, "_TIMES", 1)
     (plain,) = images(renderer, region=spec, spp=8)
     job = render_job(scene(region=spec).frames(), 0)
-    fine = renderer.bind(job)[0].fine(job.window)
+    fine, _ = renderer.bind(job)[0].fine(job.window)
     assert 0.02 < fine.mean() < 0.4
     error = [np.std((p.irradiance - many.irradiance)[fine]) for p in (few, plain)]
     assert error[0] < 0.75 * error[1]
@@ -233,5 +233,6 @@ def test_which_pixels_are_fine_does_not_depend_on_the_window(renderer):
     job = render_job(scene(region={}).frames(), 0)
     x0, y0 = job.window[:2]
     shown = renderer.bind(job)[0]
-    whole, part = shown.fine(job.window), shown.fine((x0 + 30, y0 + 20, 90, 70))
+    (whole, dry), (part, _) = shown.fine(job.window), shown.fine((x0 + 30, y0 + 20, 90, 70))
+    assert dry
     assert np.array_equal(part, whole[20:90, 30:120])

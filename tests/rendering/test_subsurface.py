@@ -37,7 +37,7 @@ def grids(renderer, bound):
     from eyerender.rendering.region import SHEET_COLUMNS
 
     shown, place = renderer.bind(bound)
-    sheet = light.SheetGrid.of(place.posed, bound, 100.0, 0)
+    sheet = light.SheetGrid.of(place.posed, bound, 100.0, 0).measured(place.skin)
     row, column = sheet.sent[0] // sheet.columns, sheet.sent[0] % sheet.columns
     across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / sheet.columns)
     x, _ = place.skin.sheet_point(sheet.vertex_row(row, mi.Float(0.5)), across)
