@@ -42,6 +42,7 @@ from .chamber import (
 )
 from .chamber import TURNS as IRIS_TURNS
 from .frame import RenderJob, globe_of
+from .kept import KeptForEye
 from .lighting import off_cornea, onto_points, through_cornea
 from .manifold import CORNEA_MM
 from .parameters import leaves
@@ -258,7 +259,7 @@ class Exchange:
 
     def __init__(self) -> None:
         self._skins: list[tuple[RegionScene, Globe, SkinPlaces]] = []
-        self._interior: tuple[EyeModel, float, Look, _Interior] | None = None
+        self._interiors: KeptForEye[_Interior] = KeptForEye()
 
     def received(
         self, job: RenderJob, values: Values, lights: Lights, panels: Lights, textures: Textures,
@@ -292,12 +293,9 @@ class Exchange:
         return frame.solved(region, direct, mirrored, ambient, lamps, more, seen)
 
     def _inside(self, job: RenderJob) -> _Interior:
-        """The chamber of a job's eye. Frames often have the same one, and comparing eyes takes longer than needed."""
-        known = self._interior
-        if known is None or known[0] is not job.eye or known[1:3] != (job.film_index, job.look):
-            known = job.eye, job.film_index, job.look, _Interior.of(job.eye, job.film_index, job.look)
-            self._interior = known
-        return known[3]
+        """The chamber of a job's eye."""
+        film, look = job.film_index, job.look
+        return self._interiors.get(job.eye, (film, look), lambda: _Interior.of(job.eye, film, look))
 
     def _skin(self, region: RegionScene, globe: Globe) -> SkinPlaces:
         """Places on the skin of a region, chosen with the eye straight ahead: no earlier pose may change a picture."""

@@ -16,11 +16,16 @@ E'_l and t_l change slowly and are computed on a coarse grid.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .parameters import leaves
+from .frame import RenderJob
+from .kept import KeptForEye
+from .parameters import leaves, traversed
 from .recorded import recorded
 from .surfaces import Surface
 from .values import Lights, Values
@@ -30,8 +35,31 @@ _COARSE = 20  # places across, at which the lamps' directions are computed
 _CELL_PX, _LEAST, _MOST = 0.6, 320, 448  # size of a cell in the picture, cells across: fewer would flatten slopes
 _STEP = 16  # in the number of cells across: a new number has Dr.Jit record anew
 _STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for what stands before a lamp
+_BLOCK, _SLANT = 4, 0.6  # cells of a block across; lateral motion per mm of light that is not very slanting
 _FIXED_POINT_STEPS = 4
 _SPARE_MM, _RAISED_MM = 0.1, 0.2
+
+
+@traversed
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """The heights of an iris on a grid, which do not depend on the pose.
+
+    Attributes:
+        heights: of the cells, mm.
+        corners: the heights of the four corners of every cell, side by side.
+        slopes: of the cells along the grid's rows and columns.
+        steepest: largest slope.
+        highest: largest height, mm.
+        near: largest height about each block of cells, as far as light comes from that is not very slanting, mm.
+    """
+
+    heights: mi.Float
+    corners: mi.Float
+    slopes: tuple[mi.Float, mi.Float]
+    steepest: mi.Float
+    highest: mi.Float
+    near: mi.Float
 
 
 class IrisRelief:
@@ -39,19 +67,25 @@ class IrisRelief:
 
     DRJIT_STRUCT = leaves("_values", "_half", "_count", "_on", "_each", "_heights", "_shades")
 
-    def __init__(self, values: Values, lights: Lights, scene: mi.Scene, textures: Textures, px_per_mm: float) -> None:
+    def __init__(
+        self, job: RenderJob, values: Values, lights: Lights, scene: mi.Scene, textures: Textures,
+        shapes: KeptForEye[Shape],
+    ) -> None:  # fmt: skip
         """Prepare the grid.
 
         Args:
-            values: the scene's numbers.
-            lights: the lamps.
+            job: the job of the frame.
+            values: its numbers.
+            lights: its lamps.
             scene: what may stand in the way.
             textures: the maps of the iris.
-            px_per_mm: pixels of the picture per mm.
+            shapes: the heights of irises that other frames have computed.
         """
         self._values, self._lights, self._scene, self._textures = values, lights, scene, textures
+        self._job, self._shapes = job, shapes
         self._half = values.iris.root_radius + _SPARE_MM
-        across = 2 * float(self._half.numpy()[0]) * px_per_mm / _CELL_PX
+        self._half_mm = float(np.float32(job.eye.iris_root_radius_mm) + np.float32(_SPARE_MM))
+        across = 2 * self._half_mm * float(job.camera.scale_at(job.t)) / _CELL_PX
         self._side = int(min(max(_STEP * np.ceil(across / _STEP), _LEAST), _MOST))
         self._count = dr.opaque(mi.UInt32, self._side)
         self._on = dr.opaque(mi.Bool, textures.raised)
@@ -89,29 +123,69 @@ class IrisRelief:
             dr.make_opaque(self._heights)
             return
         lanes = _COARSE * _COARSE * self._lights.points * max(len(self._lights), 1)
-        self._heights, self._shades = self._filled(
-            self._lights, self._scene, self._textures.heights, self._side**2, lanes
+        cells, job = self._side**2, self._job
+        # The iris' own heights do not depend on the pose.
+        blocks = -(-self._side // _BLOCK)
+        about = int(np.ceil((_REACH_MM * _SLANT * self._side / (2 * self._half_mm) + 2) / _BLOCK))
+        shape = self._shapes.get(
+            job.eye,
+            (self._side, job.look.iris_seed, job.look.iris),
+            lambda: Shape(*self._shape(self._textures.heights, cells, blocks, about)),
         )
+        self._shades = self._shaded(self._lights, self._scene, shape, cells, lanes)
+        self._heights = shape.corners
 
     @recorded
-    def _filled(
-        self, lights: Lights, scene: mi.Scene, pattern: mi.Texture2f, cells: int, lanes: int
-    ) -> tuple[mi.Float, mi.Float]:
-        """Both grids, with so many cells, from so many paths of light."""
-        index = dr.arange(mi.UInt32, cells)
-        row = index // self._count
-        column = index - row * self._count
-        x = self._place(mi.Float(column), mi.Float(row), self._count)
-        heights = iris_height(self._values, pattern, x)
+    def _shape(self, pattern: mi.Texture2f, cells: int, blocks: int, about: int) -> tuple[Any, ...]:
+        """The fields of a `Shape` with so many cells; `blocks` across, of which so many are `about` each."""
+        column, row = self._cells(cells)
+        heights = iris_height(self._values, pattern, self._place(mi.Float(column), mi.Float(row), self._count))
         dr.eval(heights)
-        packed = self._packed(heights, column, row)
-        dr.eval(packed)
+        last = self._count - 1
+        per = mi.Float(last) / (2 * self._half)
+
+        def slope(high: mi.UInt32, low: mi.UInt32, apart: mi.UInt32) -> mi.Float:
+            return (dr.gather(mi.Float, heights, high) - dr.gather(mi.Float, heights, low)) * per / mi.Float(apart)
+
+        left, right = dr.maximum(column, 1) - 1, dr.minimum(column + 1, last)
+        above, below = dr.maximum(row, 1) - 1, dr.minimum(row + 1, last)
+        hu = slope(row * self._count + right, row * self._count + left, right - left)
+        hv = slope(below * self._count + column, above * self._count + column, below - above)
+        corners = self._packed(heights, column, row)
+        dr.eval(hu, hv, corners)
+        steepest, highest = dr.max(dr.sqrt(hu * hu + hv * hv)), dr.max(heights)
+        index = dr.arange(mi.UInt32, blocks * blocks)
+        down = index // blocks
+        across = index - down * blocks
+        largest = mi.Float(0)
+        for k in range(_BLOCK * _BLOCK):
+            i, j = dr.minimum(across * _BLOCK + k % _BLOCK, last), dr.minimum(down * _BLOCK + k // _BLOCK, last)
+            largest = dr.maximum(largest, dr.gather(mi.Float, heights, j * self._count + i))
+        dr.eval(largest)
+        near = mi.Float(0)
+        for k in range((2 * about + 1) ** 2):
+            i, j = (mi.Int32(n) + m - about for n, m in ((across, k % (2 * about + 1)), (down, k // (2 * about + 1))))
+            i, j = (mi.UInt32(dr.clip(n, 0, blocks - 1)) for n in (i, j))
+            near = dr.maximum(near, dr.gather(mi.Float, largest, j * blocks + i))
+        dr.eval(steepest, highest, near)
+        return heights, corners, (hu, hv), steepest, highest, near
+
+    @recorded
+    def _shaded(self, lights: Lights, scene: mi.Scene, shape: Shape, cells: int, lanes: int) -> mi.Float:
+        """The q of the module's docstring at so many cells, from so many paths of light."""
+        column, row = self._cells(cells)
         lamps = self._lamps(lights, scene, lanes)
-        shades = self._lit(lights, lamps, heights, packed, column, row, x)
+        shades = self._lit(lights, lamps, shape, column, row)
         dr.eval(shades)
         shades = self._packed(shades, column, row)
         dr.eval(shades)
-        return packed, shades
+        return shades
+
+    def _cells(self, cells: int) -> tuple[mi.UInt32, mi.UInt32]:
+        """Columns and rows of all cells, row by row."""
+        index = dr.arange(mi.UInt32, cells)
+        row = index // self._count
+        return index - row * self._count, row
 
     def _place(self, column: mi.Float, row: mi.Float, count: mi.UInt32) -> mi.Vector3f:
         """Point of the plane at a place of a grid with `count` places across."""
@@ -136,10 +210,10 @@ class IrisRelief:
         """The four corners of every cell, side by side."""
         last = self._count - 1
         right, below = dr.minimum(column + 1, last), dr.minimum(row + 1, last)
+        corners = ((column, row), (right, row), (column, below), (right, below))
         out = dr.zeros(mi.Float, 4 * dr.width(values))
-        index = 4 * (row * self._count + column)
-        for k, (i, j) in enumerate(((column, row), (right, row), (column, below), (right, below))):
-            dr.scatter(out, dr.gather(mi.Float, values, j * self._count + i), index + k)
+        four = mi.Vector4f(*(dr.gather(mi.Float, values, j * self._count + i) for i, j in corners))
+        dr.scatter(out, four, row * self._count + column)
         return out
 
     def _lamps(self, lights: Lights, scene: mi.Scene, lanes: int) -> mi.Float:
@@ -163,34 +237,17 @@ class IrisRelief:
         lateral = _arrival(values.surfaces, source, path.entry, normal)
         rows = (lit, lit * dr.dot(lateral, values.stop.u), lit * dr.dot(lateral, values.stop.v), more)
         out = dr.zeros(mi.Float, 4 * dr.width(index))
-        for k, value in enumerate(rows):
-            dr.scatter(out, dr.select(lit > 0, value, 0), 4 * index + k)
+        dr.scatter(out, mi.Vector4f(*(dr.select(lit > 0, value, 0) for value in rows)), index)
         dr.eval(out)
         return out
 
-    def _lit(
-        self,
-        lights: Lights,
-        lamps: mi.Float,
-        heights: mi.Float,
-        packed: mi.Float,
-        column: mi.UInt32,
-        row: mi.UInt32,
-        x: mi.Vector3f,
-    ) -> mi.Float:
-        """The q of the module's docstring at points of the grid."""
-        last, stop = self._count - 1, self._values.stop
-        per = mi.Float(last) / (2 * self._half)
-
-        def slope(high: mi.UInt32, low: mi.UInt32, apart: mi.UInt32) -> mi.Float:
-            return (dr.gather(mi.Float, heights, high) - dr.gather(mi.Float, heights, low)) * per / mi.Float(apart)
-
-        left, right = dr.maximum(column, 1) - 1, dr.minimum(column + 1, last)
-        above, below = dr.maximum(row, 1) - 1, dr.minimum(row + 1, last)
-        hu = slope(row * self._count + right, row * self._count + left, right - left)
-        hv = slope(below * self._count + column, above * self._count + column, below - above)
-        h = dr.gather(mi.Float, heights, row * self._count + column)
-        steep = dr.max(dr.sqrt(hu * hu + hv * hv))
+    def _lit(self, lights: Lights, lamps: mi.Float, shape: Shape, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
+        """The q of the module's docstring at cells of the grid."""
+        stop, cell = self._values.stop, row * self._count + column
+        x = self._place(mi.Float(column), mi.Float(row), self._count)
+        h, hu, hv = (dr.gather(mi.Float, values, cell) for values in (shape.heights, *shape.slopes))
+        across = (self._count + (_BLOCK - 1)) // _BLOCK
+        near = dr.gather(mi.Float, shape.near, row // _BLOCK * across + column // _BLOCK)
         spots, coarse = lights.count * self._each, mi.UInt32(_COARSE)
         i, j, s, t = self._cell(x, coarse)
         place = j * coarse + i
@@ -203,28 +260,38 @@ class IrisRelief:
             tu, tv = both.y * inv, both.z * inv
             facing = dr.maximum(1 - tu * hu - tv * hv, 0)
             way = tu * stop.u + tv * stop.v
-            asked = (both.x > 0) & (facing > 0) & (dr.norm(way) * steep > 1)
+            slant = dr.norm(way)
+            asked = (both.x > 0) & (facing > 0) & (slant * shape.steepest > 1)
+            above = dr.select(slant < _SLANT, near, shape.highest) - h
             here = dr.maximum(both.x + h * both.w, 0)
-            return k + 1, whole + both.x, seen + here * facing * (1 - self._hidden(packed, x, h, way, asked))
+            hidden = self._hidden(shape.corners, x, h, way, dr.select(asked, above, 0))
+            return k + 1, whole + both.x, seen + here * facing * (1 - hidden)
 
         state = (mi.UInt32(0), mi.Float(0) * h, mi.Float(0) * h)
         labels = ("k", "whole", "seen")
         _, whole, seen = dr.while_loop(state, lambda k, *_: k < spots, lamp, labels=labels, label="relief")
         return dr.select(whole > 0, seen / whole * dr.rsqrt(1 + hu * hu + hv * hv), 1)
 
-    def _hidden(self, packed: mi.Float, x: mi.Vector3f, h: mi.Float, way: mi.Vector3f, asked: mi.Bool) -> mi.Float:
-        """Share by which heights beside points hide what lies in the direction `way`, 0 to 1."""
+    def _hidden(self, corners: mi.Float, x: mi.Vector3f, h: mi.Float, way: mi.Vector3f, above: mi.Float) -> mi.Float:
+        """Share by which heights beside points hide what lies in the direction `way`, 0 to 1.
+
+        above: how much higher than the points these heights are at most, mm.
+        """
+
+        def rise(k: mi.UInt32) -> mi.Float:
+            part = mi.Float(k + 1) / _STEPS
+            return _REACH_MM * part * part
 
         def step(k: mi.UInt32, hidden: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            part = mi.Float(k + 1) / _STEPS
-            up = _REACH_MM * part * part
-            over = self._on_grid(packed, x + up * way, asked) - h - up
+            up = rise(k)
+            over = self._on_grid(corners, x + up * way, mi.Bool(True)) - h - up
             return k + 1, dr.maximum(hidden, dr.clip(over / (_SOFT * up + 0.004), 0, 1))
 
+        def more(k: mi.UInt32, _: mi.Float) -> mi.Bool:
+            return (k < _STEPS) & (rise(k) < above)
+
         state = (mi.UInt32(0), mi.Float(0) * h)
-        return dr.while_loop(
-            state, lambda k, _: asked & (k < _STEPS), step, labels=("k", "hidden"), label="shadows of the relief"
-        )[1]
+        return dr.while_loop(state, more, step, labels=("k", "hidden"), label="shadows of the relief")[1]
 
 
 def _arrival(

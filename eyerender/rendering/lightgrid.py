@@ -55,8 +55,7 @@ class LightGrid:
         if more is not None:
             four = [value + dr.gather(mi.Float, more, place) for value, place in zip(four, places[1], strict=True)]
         first = dr.abs(four[0])
-        for k, value in enumerate((dr.select(good, first, -first), *four[1:])):
-            dr.scatter(self.rows, value, 4 * index + k)
+        dr.scatter(self.rows, mi.Vector4f(dr.select(good, first, -first), *four[1:]), index)
         dr.eval(self.rows)
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Bool]:

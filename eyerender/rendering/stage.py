@@ -34,7 +34,8 @@ from .frame import (
 )
 from .head import place_scene
 from .irislight import IrisLight
-from .irisrelief import IrisRelief
+from .irisrelief import IrisRelief, Shape
+from .kept import KeptForEye
 from .lampviews import LampViews
 from .mattelight import MatteLight
 from .meshed import Meshes, meshed
@@ -62,6 +63,7 @@ class Stage:
         self._maps = Maps()
         self.meshes = Meshes()
         self._exchange = Exchange()
+        self._shapes: KeptForEye[Shape] = KeptForEye()
         self._expected: Expected | None = None
 
     def expect(self, job: RenderJob, beside: Executor) -> None:
@@ -120,8 +122,7 @@ class Stage:
             panels = Lights(light_table(parts, job.M, job.t))
             received = self._exchange.received(job, values, lights, panels, textures, place)
             textures = replace(textures, received=received)
-            px_per_mm = float(job.camera.scale_at(job.t))
-            lights.relief = IrisRelief(values, lights, place.scene, textures, px_per_mm)
+            lights.relief = IrisRelief(job, values, lights, place.scene, textures, self._shapes)
         _spread(job, values, lights, textures, place)
 
         def fine(window: Window) -> tuple[Bools, bool]:
