@@ -95,9 +95,18 @@ class Surface:
         The origin must be within some centimetres, or single precision costs more than a micrometre. A measured surface
         is replaced by the conic that is like it, which is enough for shadows and first guesses; `meet` is exact.
         """
+        t, ok = self._near(o, d)
+        if self.kind == "biconic":
+            t, ok, _ = self._refined(o, d, t, ok, 1)
+        return t, ok
+
+    def _near(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool]:
+        """The same for the quadric that a surface is, or is like: that of a biconic has its curvatures at the apex."""
         if self.kind == "biconic":
             Ry, Rz, py, pz, _ = self.shape
-            ax, ay, az, b, c = 0.5 * (py + pz), 1, 1, 0.5 * (Ry + Rz), 0
+            b, c = 0.5 * (Ry + Rz), 0
+            ay, az = b / Ry, b / Rz
+            ax = 0.5 * (py * ay + pz * az)
         elif self.kind == "measured":
             b, ax, *_ = self.shape
             ay, az, c = 1, 1, 0
@@ -109,37 +118,34 @@ class Surface:
         D = B * B - A * C
         # C / q is the near root without cancellation, also where A passes through zero (hyperboloids).
         q = dr.sqrt(dr.maximum(D, 0)) - B
-        t = C / q
-        ok = (D > 0) & (q > 0)
-        if self.kind == "biconic":
-            for _ in range(3):
-                value, slope = self._sag_form(o + t * d)
-                step = value / dr.dot(slope, d)
-                t -= step
-            # For a ray that meets the quadric and just misses the biconic, Newton's steps jump by centimetres.
-            ok &= dr.abs(step) < _SETTLED_MM
-        return t, ok
+        return C / q, (D > 0) & (q > 0)
 
     def meet(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool, mi.Vector3f]:
         """Distance and success as from `hit`, exact for every surface, and the outward unit normal there."""
-        t, ok = self.hit(o, d)
-        if self.kind != "measured":
+        t, ok = self._near(o, d)
+        if self.kind == "quadric":
             return t, ok, self.normal(o + t * d)
-        t, ok, jet = self._refined(o, d, t, ok, 1)
+        t, ok, jet = self._refined(o, d, t, ok, 2 if self.kind == "biconic" else 1)
         return t, ok, dr.normalize(mi.Vector3f(1, jet[1], jet[2]))
 
     def _refined(
         self, o: mi.Vector3f, d: mi.Vector3f, t: mi.Float, ok: mi.Bool, order: int
     ) -> tuple[mi.Float, mi.Bool, tuple[mi.Float, ...]]:
-        """Two Newton steps from the conic to a measured surface, and its sag where the second one began.
+        """Two Newton steps from the quadric to a biconic or measured surface, and its sag where the second one began.
 
-        The conic is within 0.1 mm, the first step within 1 um, where the slopes are as good as exact.
+        The conic of a measured surface is within 0.1 mm and the first step within 1 um, where the slopes are as good as
+        exact. For order 2, the second derivatives take the slopes on to the hit.
         """
         value, slope = self._sag_form(o + t * d)
         t -= value / dr.dot(slope, d)
         x = o + t * d
         jet = self._sag(x.y, x.z, order)
         step = (x.x + jet[0]) / (d.x + jet[1] * d.y + jet[2] * d.z)
+        if order == 2:
+            g, gy, gz, gyy, gyz, gzz = jet
+            y, z = step * d.y, step * d.z
+            jet = (g, gy - gyy * y - gyz * z, gz - gyz * y - gzz * z, gyy, gyz, gzz)
+        # A ray that meets the quadric and just misses the surface jumps by centimetres.
         return t - step, ok & (dr.abs(step) < _SETTLED_MM), jet
 
     def _sag_form(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f]:
@@ -235,9 +241,9 @@ class Surface:
     def refract_bundle(self, b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
         """Enter the eye with ray differentials: the bundle behind, the transmittance 1 - F, and success."""
         o, d = self.point_in(b.y), self.vector_in(b.w)
-        t, ok = self.hit(o, d)
+        t, ok = self._near(o, d)
         form: NormalForm | None = None
-        if self.kind == "measured":
+        if self.kind != "quadric":
             t, ok, jet = self._refined(o, d, t, ok, 2)
             form = _form_of(jet)
         there = Bundle(b.y + t * b.w, b.w, b.da + t * b.wa, b.db + t * b.wb, b.wa, b.wb)
