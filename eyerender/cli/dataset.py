@@ -16,8 +16,8 @@ from .output import Heed, emit, progress, say
 @app.command(name="generate")
 def generate(
     spec: str,
-    folder: Annotated[Path | None, Parameter(name="DIR")] = None,
     /,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     *,
     workers: int | None = None,
     shard: str | None = None,
@@ -41,7 +41,7 @@ def generate(
 
     Args:
         spec: A dataset file, or the name of a shipped one.
-        folder: The folder to write.
+        output: The folder to write.
         workers: Number of worker processes (default: one per processor, as far as memory allows).
         shard: K/N: make only every N-th shard, starting with the K-th (1 <= K <= N). Use it for array jobs that write
             to one folder.
@@ -59,14 +59,14 @@ def generate(
     part = _part(shard)
     if measure and not dry_run:
         raise InputError("needs --dry-run", source="--measure")
-    if folder is None and not dry_run:
-        raise InputError("give the folder to write", source="DIR")
+    if output is None and not dry_run:
+        raise InputError("give the folder to write", source="--output")
     if overwrite and shard is not None:
         raise InputError(
             "cannot be combined with --shard, because other jobs may be writing to the folder", source="--overwrite"
         )
     heed = Heed(strict)
-    if folder is None or dry_run:
+    if output is None or dry_run:
         from ..dataset.estimate import estimate
 
         found = estimate(
@@ -87,7 +87,7 @@ def generate(
     with progress("generating") as steps:
         done = run(
             spec,
-            folder,
+            output,
             eye=eye,
             seed=seed,
             count=count,
@@ -203,8 +203,8 @@ def validate(
 @app.command(name="export-dataset")
 def export_dataset(
     folder: Annotated[Path, Parameter(name="DIR")],
-    out: Annotated[Path, Parameter(name="OUT")],
     /,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
     *,
     format: Literal["webdataset", "coco", "csv", "parquet", "openeds", "ellseg", "teyed"],
     bits: Literal[8, 16] = 8,
@@ -217,7 +217,7 @@ def export_dataset(
 
     Args:
         folder: A folder written by generate.
-        out: The folder to write.
+        output: The folder to write.
         format: The layout.
         bits: Bits per pixel of the images: 8, or 16 for webdataset, coco, csv and parquet.
         encoding: Linear, or with a gamma of 2.2 (default: gamma for 8 bits, linear for 16 bits).
@@ -226,10 +226,12 @@ def export_dataset(
     from ..dataset.export import export
 
     with progress("exporting") as steps:
-        done = export(folder, format, out, bits=bits, encoding=encoding, gain=gain, overwrite=overwrite, progress=steps)
+        done = export(
+            folder, format, output, bits=bits, encoding=encoding, gain=gain, overwrite=overwrite, progress=steps
+        )
     image = done["image"]
     how = f"{bits} bits, {image['encoding']}, gain {image['gain']:g}"
-    emit(done, f"{done['images']} images as {format} in {out} ({how})", json)
+    emit(done, f"{done['images']} images as {format} in {output} ({how})", json)
     return 0
 
 

@@ -15,8 +15,8 @@ from .output import Heed, emit
 @app.command(name="export-scene")
 def export_scene(
     scene: str,
-    folder: Annotated[Path, Parameter(name="DIR")],
     /,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
     *,
     eye: EyeModel = None,
     frame: int = 0,
@@ -30,7 +30,7 @@ def export_scene(
 
     Args:
         scene: A scene file, or the name of a shipped scene.
-        folder: The folder to write.
+        output: The folder to write.
         frame: The frame of the scene, counted from 0.
         side: The eye, right or left (default: the first one that the frame shows).
         spp: Samples per pixel requested in the file; the stock path integrator needs many.
@@ -42,9 +42,9 @@ def export_scene(
     heed = Heed(strict)
     loaded = load_scene(scene, eye=eye)
     heed(loaded.warnings())
-    data = write(loaded, folder, frame=frame, side=side, spp=spp, overwrite=overwrite)
+    data = write(loaded, output, frame=frame, side=side, spp=spp, overwrite=overwrite)
     name = data["scene"]
     emit(
-        data, f"{folder / name}\nrender it with any stock integrator: mitsuba -m scalar_rgb {folder / name}", json, heed
+        data, f"{output / name}\nrender it with any stock integrator: mitsuba -m scalar_rgb {output / name}", json, heed
     )
     return 0
