@@ -122,6 +122,10 @@ def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
                 _publish(stage, final)
             finally:
                 shutil.rmtree(stage, ignore_errors=True)
+    except InputError:
+        raise
+    except EyerenderError as error:  # nobody knows the stage
+        raise type(error)(str(error).replace(str(stage), str(final))) from None
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
     finally:

@@ -291,7 +291,10 @@ def test_a_full_disk_is_one_error_and_leaves_nothing(tmp_path):
     if mounted.returncode != 0:
         pytest.skip("this machine does not let a tmpfs be mounted")
     try:
-        with pytest.raises(EyerenderError, match="No space left on device"), staged(small / "out") as folder:
+        with (
+            pytest.raises(EyerenderError, match=r"small/out/a\.png.*No space left on device"),
+            staged(small / "out") as folder,
+        ):
             write_png(folder / "a.png", np.random.default_rng(3).integers(0, 65536, (400, 400)).astype(np.uint16))
         assert list(small.iterdir()) == []
     finally:
