@@ -18,6 +18,7 @@ from ..region.look import Look
 from ..region.mapcache import kept
 from ..region.texture import sclera_texture
 from .parameters import traversed
+from .surfaces import Bundle
 from .surround import HALF_MM
 from .values import Values
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 EPSILON_MM = 2e-3  # points closer than this are the same in single precision
 _NEAR_MM = 20.0
+_DEEPEST = 0.75  # least inverse depth of the image of an iris, relative to the cornea's: grazing rays come from afar
 GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of maps of the globe
 _FAR = float(np.finfo(np.float32).max)
 _WET = 0.91  # gloss of the sclera
@@ -76,16 +78,39 @@ class View:
         return self.cornea | self.sclera | self.other
 
     def nearness(self, values: Values, d: mi.Vector3f) -> mi.Float:
-        """Inverse depth (1/mm) of what camera rays along d (scene's frame) show, behind the cornea of its image.
+        """Inverse depth (1/mm) of what camera rays along d (scene's frame) show.
 
-        The paraxial image of the iris is where the rays that leave the cornea seem to come from.
+        Behind the cornea it is the change of direction that keeps a ray on its place in the plane of the iris while the
+        pinhole moves across the optical axis: by the mean of moves in two directions, because the image is astigmatic.
         """
-        scale, shift = values.image.scale, values.image.shift
-        image = mi.Vector3f(self.inner.x + shift, self.inner.y * scale, self.inner.z * scale)
         forward = values.camera.forward
-        inside = dr.dot(values.point_to_scene(image) - values.camera.centre, forward)
+        near = dr.rcp(dr.maximum(self.distance * dr.dot(d, forward), 1e-3))
         deep = self.lit_inside & (self.opacity < 0.5)
-        return dr.rcp(dr.maximum(dr.select(deep, inside, self.distance * dr.dot(d, forward)), 1e-3))
+        return dr.if_stmt(
+            (mi.Vector3f(d), near),
+            deep,
+            lambda d, near: dr.clip(self._nearness_inside(values, d), _DEEPEST * near, near),
+            lambda _, near: near,
+        )
+
+    def _nearness_inside(self, values: Values, d: mi.Vector3f) -> mi.Float:
+        """The same of lanes that show the plane of the iris."""
+        camera, front = values.camera, values.surfaces[0]
+        cosine = dr.dot(d, camera.forward)
+        turned = [values.vector_to_eye(cosine * (e - d * dr.dot(e, d))) for e in (camera.right, camera.down)]
+        moved = [values.vector_to_eye(e) for e in (camera.right, camera.down)]
+        y, form = front.on_surface(self.point)
+        w, none = values.vector_to_eye(d), mi.Vector3f(0)
+        at = []
+        for points, ways in (([self.distance * e for e in turned], turned), (moved, [none, none])):
+            bundle = front.bend(Bundle(y, w, *points, *ways), form)[0]
+            for surface in values.surfaces[1:]:
+                bundle = surface.refract_bundle(bundle)[0]
+            s = dr.dot(values.stop.centre - bundle.y, values.stop.normal) / dr.dot(bundle.w, values.stop.normal)
+            at.append((bundle.w, bundle.da + s * bundle.wa, bundle.db + s * bundle.wb))
+        (w, a, b), (_, p, q) = at
+        both = dr.dot(w, dr.cross(p, b)) + dr.dot(w, dr.cross(a, q))
+        return 0.5 * both / dr.dot(w, dr.cross(a, b))
 
 
 @traversed

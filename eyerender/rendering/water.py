@@ -70,8 +70,11 @@ def through_water(
         way = dr.select(enters & leaves, outside, d)
         seen = meet_globe(values, x + (deep / cosine) * inside, way)
         found = enters & leaves & (seen.cornea | seen.sclera)
-        # Below the water nothing mirrors the lamps.
-        seen, view = (replace(v, gloss=mi.Float(0), mirrored=mi.Float(0)) for v in (seen, view))
+        # Below the water nothing mirrors the lamps. The distance is that at which the depth is the one without water.
+        forward = values.camera.forward
+        dry, distance = mi.Float(0), view.distance * (dr.dot(d, forward) / dr.dot(way, forward))
+        seen = replace(seen, distance=distance)
+        seen, view = (replace(v, gloss=dry, mirrored=dry) for v in (seen, view))
         return dr.select(found, way, d), *(
             dr.select(found, a, b) for a, b in zip(parts_of(seen), parts_of(view), strict=True)
         )
