@@ -29,7 +29,7 @@ _SPARE_MM = 0.3  # beyond the root of the iris
 class IrisLight:
     """The light of the lamps in the plane of the iris."""
 
-    DRJIT_STRUCT = leaves("_values", "_points", "_used", "_half", "_cells", "_left")
+    DRJIT_STRUCT = leaves("_stop", "_points", "_used", "_half", "_cells", "_left")
 
     def __init__(self, values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None) -> None:
         """Prepare the grid.
@@ -41,6 +41,7 @@ class IrisLight:
             views: the lamps' views of an eye region; None for a bare eye.
         """
         self._values, self._lights, self._scene, self._views = values, lights, scene, views
+        self._stop = values.stop
         self._points = dr.opaque(mi.UInt32, lights.points)
         self._used = dr.opaque(mi.Bool, lights.gridded)
         self._half = values.iris.root_radius + _SPARE_MM
@@ -53,7 +54,7 @@ class IrisLight:
         Bit l of the second result stands for lamp l. Of more than 32 lamps it lacks all or none.
         """
         assert self._cells is not None
-        stop = self._values.stop
+        stop = self._stop
         q = x - stop.centre
         scale = 0.5 * (_SIDE - 1) / self._half
         u, v = (dr.dot(q, axis) * scale + 0.5 * (_SIDE - 1) for axis in (stop.u, stop.v))
@@ -71,19 +72,21 @@ class IrisLight:
         if self._cells is not None:
             return
         if self._lights.gridded and len(self._lights):
-            self._cells, self._left = self._filled(self._lights, self._scene, self._views, len(self._lights))
+            self._cells, self._left = self._filled(
+                self._values, self._lights, self._scene, self._views, len(self._lights)
+            )
         else:
             self._cells, self._left = dr.zeros(mi.Float, 16 * _NODES), dr.full(mi.UInt32, ALL, _NODES)
             dr.make_opaque(self._cells, self._left)
 
     @recorded
     def _filled(
-        self, lights: Lights, scene: mi.Scene, views: LampViews | None, lamps: int
+        self, values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, lamps: int
     ) -> tuple[mi.Float, mi.UInt32]:
         """Sixteen numbers of each cell, and the lamps that they lack."""
         index = dr.arange(mi.UInt32, _NODES * lamps)
         lamp = index // _NODES
-        lit = self._at_nodes(lights, scene, views, lamp, index - lamp * _NODES)
+        lit = self._at_nodes(values, lights, scene, views, lamp, index - lamp * _NODES)
         dr.eval(lit)
         cell = dr.arange(mi.UInt32, _NODES)
         row = cell // _SIDE
@@ -124,12 +127,12 @@ class IrisLight:
         return cells, left
 
     def _at_nodes(
-        self, lights: Lights, scene: mi.Scene, views: LampViews | None, i: mi.UInt32, node: mi.UInt32
+        self, values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, i: mi.UInt32, node: mi.UInt32
     ) -> mi.Float:
         """Irradiance of lamps i at nodes; negative where anything may hide them, or a path was not found."""
         from .lighting import LampPath, behind
 
-        values, stop = self._values, self._values.stop
+        stop = self._stop
         row = node // _SIDE
         a, b = (self._half * (mi.Float(k) * (2 / (_SIDE - 1)) - 1) for k in (node - row * _SIDE, row))
         x = stop.centre + a * stop.u + b * stop.v

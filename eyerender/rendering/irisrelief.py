@@ -65,7 +65,7 @@ class Shape:
 class IrisRelief:
     """Height of the iris above its plane and the lamps' light on it, on a grid over the plane."""
 
-    DRJIT_STRUCT = leaves("_values", "_half", "_count", "_on", "_each", "_heights", "_shades")
+    DRJIT_STRUCT = leaves("_stop", "_half", "_count", "_on", "_each", "_heights", "_shades")
 
     def __init__(
         self, job: RenderJob, values: Values, lights: Lights, scene: mi.Scene, textures: Textures,
@@ -83,6 +83,7 @@ class IrisRelief:
         """
         self._values, self._lights, self._scene, self._textures = values, lights, scene, textures
         self._job, self._shapes = job, shapes
+        self._stop = values.stop
         self._half = values.iris.root_radius + _SPARE_MM
         self._half_mm = float(np.float32(job.eye.iris_root_radius_mm) + np.float32(_SPARE_MM))
         across = 2 * self._half_mm * float(job.camera.scale_at(job.t)) / _CELL_PX
@@ -130,16 +131,18 @@ class IrisRelief:
         shape = self._shapes.get(
             job.eye,
             (self._side, job.look.iris_seed, job.look.iris),
-            lambda: Shape(*self._shape(self._textures.heights, cells, blocks, about)),
+            lambda: Shape(*self._shape(self._values, self._textures.heights, cells, blocks, about)),
         )
-        self._shades = self._shaded(self._lights, self._scene, shape, cells, lanes)
+        self._shades = self._shaded(self._values, self._lights, self._scene, shape, cells, lanes)
         self._heights = shape.corners
 
     @recorded
-    def _shape(self, pattern: mi.Texture2f, cells: int, blocks: int, about: int) -> tuple[Any, ...]:
+    def _shape(
+        self, values: Values, pattern: mi.Texture2f, cells: int, blocks: int, about: int
+    ) -> tuple[Any, ...]:
         """The fields of a `Shape` with so many cells; `blocks` across, of which so many are `about` each."""
         column, row = self._cells(cells)
-        heights = iris_height(self._values, pattern, self._place(mi.Float(column), mi.Float(row), self._count))
+        heights = iris_height(values, pattern, self._place(mi.Float(column), mi.Float(row), self._count))
         dr.eval(heights)
         last = self._count - 1
         per = mi.Float(last) / (2 * self._half)
@@ -171,10 +174,12 @@ class IrisRelief:
         return heights, corners, (hu, hv), steepest, highest, near
 
     @recorded
-    def _shaded(self, lights: Lights, scene: mi.Scene, shape: Shape, cells: int, lanes: int) -> mi.Float:
+    def _shaded(
+        self, values: Values, lights: Lights, scene: mi.Scene, shape: Shape, cells: int, lanes: int
+    ) -> mi.Float:
         """The q of the module's docstring at so many cells, from so many paths of light."""
         column, row = self._cells(cells)
-        lamps = self._lamps(lights, scene, lanes)
+        lamps = self._lamps(values, lights, scene, lanes)
         shades = self._lit(lights, lamps, shape, column, row)
         dr.eval(shades)
         shades = self._packed(shades, column, row)
@@ -189,12 +194,12 @@ class IrisRelief:
 
     def _place(self, column: mi.Float, row: mi.Float, count: mi.UInt32) -> mi.Vector3f:
         """Point of the plane at a place of a grid with `count` places across."""
-        stop, per = self._values.stop, 2 * self._half / mi.Float(count - 1)
+        stop, per = self._stop, 2 * self._half / mi.Float(count - 1)
         return stop.centre + (column * per - self._half) * stop.u + (row * per - self._half) * stop.v
 
     def _cell(self, x: mi.Vector3f, count: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float]:
         """Column and row of the cell of a point, and the place in it."""
-        stop = self._values.stop
+        stop = self._stop
         q, most = x - stop.centre, mi.Float(count) - 1.001
         scale = 0.5 * mi.Float(count - 1) / self._half
         u, v = (dr.clip((dr.dot(q, axis) + self._half) * scale, 0, most) for axis in (stop.u, stop.v))
@@ -216,11 +221,11 @@ class IrisRelief:
         dr.scatter(out, four, row * self._count + column)
         return out
 
-    def _lamps(self, lights: Lights, scene: mi.Scene, lanes: int) -> mi.Float:
+    def _lamps(self, values: Values, lights: Lights, scene: mi.Scene, lanes: int) -> mi.Float:
         """E, E t_u, E t_v and E' of points of the lamps at coarse places, in rows."""
         from .lighting import LampPath
 
-        values, each, count = self._values, self._each, mi.UInt32(_COARSE)
+        each, count = self._each, mi.UInt32(_COARSE)
         index = dr.arange(mi.UInt32, lanes)
         spot = index // (_COARSE * _COARSE)
         place = index - spot * (_COARSE * _COARSE)
@@ -243,7 +248,7 @@ class IrisRelief:
 
     def _lit(self, lights: Lights, lamps: mi.Float, shape: Shape, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
         """The q of the module's docstring at cells of the grid."""
-        stop, cell = self._values.stop, row * self._count + column
+        stop, cell = self._stop, row * self._count + column
         x = self._place(mi.Float(column), mi.Float(row), self._count)
         h, hu, hv = (dr.gather(mi.Float, values, cell) for values in (shape.heights, *shape.slopes))
         across = (self._count + (_BLOCK - 1)) // _BLOCK

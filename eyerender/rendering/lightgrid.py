@@ -19,25 +19,29 @@ class LightGrid:
 
     DRJIT_STRUCT = leaves("side", "rows")
 
-    def __init__(self, side: int) -> None:
+    def __init__(self, side: int, rows: mi.Float | None = None) -> None:
+        """Make a grid from its rows (see `rows_of`); without them nothing is known."""
         self.side = side
-        self.rows = dr.full(mi.Float, -1, 4 * side * side)
-        dr.make_opaque(self.rows)
+        if rows is None:
+            rows = dr.full(mi.Float, -1, 4 * side * side)
+            dr.make_opaque(rows)
+        self.rows = rows
 
-    def nodes(self) -> tuple[mi.UInt32, mi.UInt32]:
-        """Column and row of all nodes, in row order."""
-        index = dr.arange(mi.UInt32, self.side * self.side)
-        row = index // self.side
-        return index - row * self.side, row
+    @staticmethod
+    def nodes(side: int) -> tuple[mi.UInt32, mi.UInt32]:
+        """Column and row of all nodes of a grid, in row order."""
+        index = dr.arange(mi.UInt32, side * side)
+        row = index // side
+        return index - row * side, row
 
-    def fill(self, irradiance: mi.Float, more: mi.Float | None = None) -> None:
-        """Set the irradiance of the nodes, negative where it is not known.
+    @classmethod
+    def rows_of(cls, side: int, irradiance: mi.Float, more: mi.Float | None = None) -> mi.Float:
+        """The numbers of a grid from the irradiance of its nodes, negative where it is not known.
 
-        `more` is added. It is known to change slowly, so it does not decide which cells are used.
+        `more` is added. It is known to change slowly, so it does not decide which cells are used. Both must have been
+        evaluated.
         """
-        side = self.side
-        dr.eval(irradiance, more)
-        column, row = self.nodes()
+        column, row = cls.nodes(side)
         index = row * side + column
         places = [
             [mi.UInt32(dr.clip(mi.Int32(index) + dv * side + du, 0, side**2 - 1)) for du in range(-1, 3)]
@@ -55,8 +59,9 @@ class LightGrid:
         if more is not None:
             four = [value + dr.gather(mi.Float, more, place) for value, place in zip(four, places[1], strict=True)]
         first = dr.abs(four[0])
-        dr.scatter(self.rows, mi.Vector4f(dr.select(good, first, -first), *four[1:]), index)
-        dr.eval(self.rows)
+        rows = dr.zeros(mi.Float, 4 * side * side)
+        dr.scatter(rows, mi.Vector4f(dr.select(good, first, -first), *four[1:]), index)
+        return rows
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Bool]:
         """Irradiance at places in units of cells, and whether it is known there."""

@@ -19,6 +19,7 @@ import mitsuba as mi
 from .lightgrid import LightGrid
 from .lighting import irradiance, lamp_blocked
 from .parameters import leaves
+from .recorded import recorded
 from .values import Lights, Values
 from .view import GLOBE_EDGE, View, globe_map
 
@@ -32,7 +33,7 @@ _LOW, _SLOPE = 0.1, 0.6  # cosines: of a lamp about to set, and of one that the 
 class MatteLight:
     """The light that matte surfaces of a bare eye receive from lamps, and the globe from other surfaces."""
 
-    DRJIT_STRUCT = leaves("_values", "_used", "_reach", "_grids")
+    DRJIT_STRUCT = leaves("_used", "_reach", "_grids")
 
     def __init__(self, values: Values, lights: Lights, scene: mi.Scene, received: Received, reach_mm: float) -> None:
         """Prepare the grids.
@@ -50,10 +51,10 @@ class MatteLight:
         self._reach = dr.opaque(mi.Float, reach_mm)
         self._grids: tuple[LightGrid, LightGrid] | None = None
 
-    def at(self, view: View) -> tuple[mi.Float, mi.Bool]:
+    def at(self, values: Values, view: View) -> tuple[mi.Float, mi.Bool]:
         """Irradiance (mW/mm^2) at points that are seen, and whether it is known: not on the rim of the cornea."""
         assert self._grids is not None
-        values, (globe, plane) = self._values, self._grids
+        globe, plane = self._grids
         middle = 0.5 * (_SIDE - 1)
 
         def on_plane(point: mi.Vector3f) -> tuple[mi.Float, mi.Bool]:
@@ -72,45 +73,61 @@ class MatteLight:
         """Fill the grids, once."""
         if self._grids is not None:
             return
-        self._grids = LightGrid(_SIDE), LightGrid(_SIDE)
         if not self._lights.gridded:
+            self._grids = LightGrid(_SIDE), LightGrid(_SIDE)
             return
-        values, (globe, plane) = self._values, self._grids
-        column, row = globe.nodes()
-        a, b = (mi.Float(k) * (2 / (_SIDE - 1)) - 1 for k in (column, row))
-        polar = dr.sqrt(a * a + b * b)
-        sine, cosine = dr.sincos(polar * GLOBE_EDGE)
-        share = dr.select(polar > 0, sine / polar, 0)
-        normal = mi.Vector3f(cosine, a * share, b * share)
-        x = values.sclera.centre + values.sclera.radius * normal
-        # Under the cornea the grid goes on as if there were none, because cells at its rim have nodes there.
-        local = values.surfaces[0].point_in(x)
-        outside = (local.y * local.y + local.z * local.z > dr.square(values.limbus.radius)) | (normal.x < 0)
-        globe.fill(self._lit(x, normal, mi.Bool(False), outside), self._received.globe(values.point_to_scene(x)).x)
-        seen = mi.Vector3f(values.backdrop_x, self._reach * a, self._reach * b)
-        yes, normal = mi.Bool(True), values.vector_to_eye(mi.Vector3f(1, 0, 0))
-        plane.fill(self._lit(values.point_to_eye(seen), normal, yes, yes))
+        globe, plane = _filled(self._values, self._lights, self._scene, self._received, self._points, self._reach)
+        self._grids = LightGrid(_SIDE, globe), LightGrid(_SIDE, plane)
 
-    def _lit(self, x: mi.Vector3f, normal: mi.Vector3f, sphere: mi.Bool, cornea: mi.Bool) -> mi.Float:
-        """Irradiance of all lamps at points (eye frame), which the globe's sphere and the cornea may keep from them.
 
-        Under the cornea, where that is not asked, a lamp that stands low may be hidden from points just beyond the rim.
-        Such points are not known.
-        """
-        values, lights, points = self._values, self._lights, self._points
+@recorded
+def _filled(
+    values: Values, lights: Lights, scene: mi.Scene, received: Received, points: mi.UInt32, reach: mi.Float
+) -> tuple[mi.Float, mi.Float]:
+    """Numbers of the grids over the globe and over the plane."""
+    column, row = LightGrid.nodes(_SIDE)
+    a, b = (mi.Float(k) * (2 / (_SIDE - 1)) - 1 for k in (column, row))
+    polar = dr.sqrt(a * a + b * b)
+    sine, cosine = dr.sincos(polar * GLOBE_EDGE)
+    share = dr.select(polar > 0, sine / polar, 0)
+    normal = mi.Vector3f(cosine, a * share, b * share)
+    x = values.sclera.centre + values.sclera.radius * normal
+    # Under the cornea the grid goes on as if there were none, because cells at its rim have nodes there.
+    local = values.surfaces[0].point_in(x)
+    outside = (local.y * local.y + local.z * local.z > dr.square(values.limbus.radius)) | (normal.x < 0)
+    on_globe = _lit(values, lights, scene, points, x, normal, mi.Bool(False), outside)
+    more = received.globe(values.point_to_scene(x)).x
+    seen = values.point_to_eye(mi.Vector3f(values.backdrop_x, reach * a, reach * b))
+    yes, normal = mi.Bool(True), values.vector_to_eye(mi.Vector3f(1, 0, 0))
+    on_plane = _lit(values, lights, scene, points, seen, normal, yes, yes)
+    dr.eval(on_globe, more, on_plane)
+    rows = LightGrid.rows_of(_SIDE, on_globe, more), LightGrid.rows_of(_SIDE, on_plane)
+    dr.eval(rows)
+    return rows
 
-        def body(k: mi.UInt32, total: mi.Float, doubtful: mi.Bool) -> tuple[mi.UInt32, mi.Float, mi.Bool]:
-            i = k // points
-            lamp = lights[i]
-            turn = (mi.Float(k - i * points) + 0.5) * (0.5 * dr.pi)
-            source = lamp.point(dr.select(points > 1, 0.5, 0), *dr.sincos(turn))
-            lit = irradiance(lamp, source, x, normal)
-            blocked = lamp_blocked(values, self._scene, x, source, sphere, cornea, lit > 0)
-            cosine = dr.dot(dr.normalize(source - x), normal)
-            doubtful = doubtful | (~cornea & (cosine > -_LOW) & (cosine < _SLOPE))
-            return k + 1, total + dr.select(blocked, 0, lit), doubtful
 
-        state, count = (mi.UInt32(0), mi.Float(0) * x.x, mi.Bool(False)), lights.count * points
-        labels = ("k", "total", "doubtful")
-        _, total, doubtful = dr.while_loop(state, lambda k, *_: k < count, body, labels=labels, label="lamps on a grid")
-        return dr.select(doubtful, -1, total / mi.Float(points))
+def _lit(
+    values: Values, lights: Lights, scene: mi.Scene, points: mi.UInt32, x: mi.Vector3f, normal: mi.Vector3f,
+    sphere: mi.Bool, cornea: mi.Bool,
+) -> mi.Float:  # fmt: skip
+    """Irradiance of all lamps at points (eye frame), which the globe's sphere and the cornea may keep from them.
+
+    Under the cornea, where that is not asked, a lamp that stands low may be hidden from points just beyond the rim.
+    Such points are not known.
+    """
+
+    def body(k: mi.UInt32, total: mi.Float, doubtful: mi.Bool) -> tuple[mi.UInt32, mi.Float, mi.Bool]:
+        i = k // points
+        lamp = lights[i]
+        turn = (mi.Float(k - i * points) + 0.5) * (0.5 * dr.pi)
+        source = lamp.point(dr.select(points > 1, 0.5, 0), *dr.sincos(turn))
+        lit = irradiance(lamp, source, x, normal)
+        blocked = lamp_blocked(values, scene, x, source, sphere, cornea, lit > 0)
+        cosine = dr.dot(dr.normalize(source - x), normal)
+        doubtful = doubtful | (~cornea & (cosine > -_LOW) & (cosine < _SLOPE))
+        return k + 1, total + dr.select(blocked, 0, lit), doubtful
+
+    state, count = (mi.UInt32(0), mi.Float(0) * x.x, mi.Bool(False)), lights.count * points
+    labels = ("k", "total", "doubtful")
+    _, total, doubtful = dr.while_loop(state, lambda k, *_: k < count, body, labels=labels, label="lamps on a grid")
+    return dr.select(doubtful, -1, total / mi.Float(points))

@@ -56,19 +56,24 @@ def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 def _collect(value: Any, plain: list[Any]) -> None:
     """Append the plain values in an argument, and the types of what else it holds, in their order."""
-    if value is None or isinstance(value, bool | int | float | str):
-        plain += (type(value), value)
-    elif isinstance(value, tuple | list):
-        plain += (type(value), len(value))
+    kind = type(value)
+    plain.append(kind)
+    if kind in _PLAIN:
+        plain.append(value)
+    elif kind is tuple or kind is list:
+        plain.append(len(value))
         for item in value:
             _collect(item, plain)
-    elif isinstance(value, dict):
-        plain += (dict, *value)
-        _collect(list(value.values()), plain)
+    elif kind is dict:
+        plain.extend(value)
+        for item in value.values():
+            _collect(item, plain)
     else:
-        plain.append(type(value))
-        for name in _names(type(value)):  # type: ignore[arg-type]  # classes are hashable
+        for name in _names(kind):
             _collect(getattr(value, name), plain)
+
+
+_PLAIN = {type(None), bool, int, float, str}
 
 
 @cache

@@ -49,7 +49,7 @@ def shade(
     view = on_relief(lights, look(values, textures, scene, o, d, active))
     known, outer_known = mi.Bool(False), mi.Float(0)
     if lights.on_matte is not None:
-        outer_known, known = lights.on_matte.at(view)
+        outer_known, known = lights.on_matte.at(values, view)
     outer, shine, inner, failures = light(values, lights, scene, view, -values.vector_to_eye(d), u, v, known)
     outer += outer_known
     albedo = outer_albedo(values, textures, view)
