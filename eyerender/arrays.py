@@ -7,7 +7,9 @@ the hash that the dataclass machinery cannot provide (arrays compare element by 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, Self
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +37,27 @@ def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
         array = array.copy()
         array.flags.writeable = False
     return array
+
+
+_Value = TypeVar("_Value")
+_Result = TypeVar("_Result")
+_REMEMBERED = 8
+
+
+def remembered(function: Callable[[_Value], _Result]) -> Callable[[_Value], _Result]:
+    """Keep a function's results for the last few values, compared by identity: comparing arrays may take longer."""
+    known: list[tuple[_Value, _Result]] = []
+
+    @wraps(function)
+    def found(value: _Value) -> _Result:
+        for one, result in known:
+            if one is value:
+                return result
+        result = function(value)
+        known[:] = [*known[1 - _REMEMBERED :], (value, result)]
+        return result
+
+    return found
 
 
 class ArrayValue:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, frozen, remembered
 from ..errors import InputError
 from ..geometry.surfaces import Surface
 from ..optics.solve import apparent_points
@@ -35,6 +35,7 @@ def entrance_pupil_mm(eye: EyeModel, *, points: int = POINTS) -> float:
     return _diameter(eye.front, tuple(float(n) for n in eye.front_indices), eye.stop, points)
 
 
+@remembered
 def entrance_pupil(eye: EyeModel) -> tuple[Floats, float]:
     """Centre (3,) mm and lateral magnification of the paraxial image of the stop, seen from air.
 
@@ -50,7 +51,7 @@ def entrance_pupil(eye: EyeModel) -> tuple[Floats, float]:
         out = n_out / (n / depth - (n - n_out) / R)
         scale *= n * out / (n_out * depth)
         x = apex - out
-    return np.array([x, *(scale * eye.stop.centre_mm[1:])]), scale
+    return frozen([x, *(scale * eye.stop.centre_mm[1:])]), scale
 
 
 def stop_for_entrance(

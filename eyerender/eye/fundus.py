@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats
+from ..arrays import ArrayValue, Floats, frozen, remembered
 from .entrance import entrance_pupil
 from .model import EyeModel
 
@@ -33,6 +33,7 @@ _DISC_DEG, _DISC_RADIUS_DEG = (15.5, -1.5), 2.9
 # Delori and Pflibsen 1989, table I, at 805 nm: 10.37 % at the fovea, 11.27 % beside it, 12.52 % nasally.
 _FOVEA_SHARE, _FOVEA_DEG = 0.92, 2.5
 _NODES = 169  # points of the pupil
+_VANISHED = 210.0  # squared gap, in sigma^2, beyond which a Gaussian is 0 in single precision
 _REACH = 12.0  # halo widths, beyond which a lamp returns less than a hundred-thousandth of its halo's peak
 
 
@@ -134,14 +135,17 @@ def _sums(seen: Floats, lit: Floats, sigma: float, fall: float) -> tuple[Floats,
     x *= x
     y *= y
     square, ones = np.add(x, y, out=x), np.ones(len(lit), np.float32)
-    np.multiply(square, np.float32(-0.5 / sigma**2), out=y)
-    core = np.exp(y, out=y) @ ones
+    core = np.zeros(square.shape[:-1])
+    if np.min(square) < _VANISHED * sigma**2:
+        np.multiply(square, np.float32(-0.5 / sigma**2), out=y)
+        core = np.exp(y, out=y) @ ones
     np.sqrt(square, out=square)
     square *= np.float32(-1 / fall)
     halo = np.exp(square, out=square) @ ones
     return np.asarray(core, dtype=float), np.asarray(halo, dtype=float)
 
 
+@remembered
 def retinal_scale_mm(eye: EyeModel) -> float:
     """Height on the retina per angle (rad) in air about the entrance pupil, mm.
 
@@ -163,6 +167,7 @@ def _retina_area_mm2(eye: EyeModel) -> float:
     return float(4 * np.pi * (float(eye.sclera.radius_mm) - 1.0) ** 2)
 
 
+@remembered
 def _pupil_nodes(eye: EyeModel) -> tuple[Floats, float]:
     """Points (n, 2) of the stop in units of its semi-axes, and the area (mm^2) of the stop for which each stands."""
     k = np.arange(_NODES)
@@ -172,7 +177,7 @@ def _pupil_nodes(eye: EyeModel) -> tuple[Floats, float]:
     if eye.stop.contour.shape[-1]:
         radius = radius * eye.stop.relative_radius(angle)
     side = float(eye.stop.handed)
-    return np.stack([side * radius * np.cos(angle), radius * np.sin(angle)], -1), area / _NODES
+    return frozen(np.stack([side * radius * np.cos(angle), radius * np.sin(angle)], -1)), area / _NODES
 
 
 def _direction(way: Floats, axis: Floats, plane: Floats) -> Floats:

@@ -28,6 +28,7 @@ from ..eye.model import EyeModel
 from ..geometry.vectors import dots, lengths
 from ..region.globe import Globe
 from ..region.look import Look
+from ..rig.imaging import Ambient
 from .chamber import (
     IRIS,
     IRIS_RINGS,
@@ -45,7 +46,7 @@ from .frame import RenderJob, globe_of
 from .kept import KeptForEye
 from .lighting import off_cornea, onto_points, through_cornea
 from .manifold import CORNEA_MM
-from .parameters import leaves
+from .parameters import leaves, traversed
 from .places import (
     GLOBE_COLUMNS,
     MAP_SIDE,
@@ -61,10 +62,12 @@ from .places import (
     plane_places,
     skin_places,
 )
+from .recorded import recorded
 from .values import aligned
 from .view import Textures, appearance, iris_albedo, meet, outer_albedo
 
 if TYPE_CHECKING:
+    from .lampviews import LampViews
     from .region import RegionScene
     from .surfaces import Surface
     from .surround import Surround
@@ -239,19 +242,31 @@ class _Seen:
 
 @dataclass(frozen=True, slots=True)
 class _Interior:
-    """The chamber of an eye, and the shares by which its places and the sectors of the limbus light each place."""
+    """The chamber of an eye, and what does not depend on the eye's pose.
+
+    Attributes:
+        chamber: the chamber.
+        exchange: shares by which its places light each other.
+        limbus: shares by which the sectors of the limbus light the places.
+        rows: on the device, the places, their normals, and whether they are in the eye.
+        leaving: on the device, the first rays that leave the eye from each place.
+    """
 
     chamber: Chamber
     exchange: Floats
     limbus: Floats
+    rows: mi.Float
+    leaving: mi.Float
 
     @classmethod
-    def of(cls, eye: EyeModel, film_index: float, look: Look) -> _Interior:
-        """Compute it for an eye, with its pupil, and a look."""
+    def of(cls, eye: EyeModel, film_index: float, look: Look, leaving: int) -> _Interior:
+        """Compute it for an eye, with its pupil, and a look, with so many rays that leave."""
         chamber = chamber_of(eye, film_index)
         albedo = shares(eye, chamber, look.pupil_albedo, look.iris_albedo, look.limbus_albedo)
         limbus = through_limbus(eye, chamber, look.limbus_width_mm) * look.limbus_transmittance
-        return cls(chamber, chamber.exchange * albedo, limbus)
+        rows = np.column_stack([chamber.points, chamber.normals, chamber.valid])
+        rays = chamber.leaving[:, :leaving]
+        return cls(chamber, chamber.exchange * albedo, limbus, _sent(rows.ravel()), _sent(rays.ravel()))
 
 
 class Exchange:
@@ -286,16 +301,17 @@ class Exchange:
         if not job.interreflection and not values.structure.ambient:
             return frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
-        direct, ambient = _direct(values, lights, panels, place.scene, textures, frame)
+        outer = _sent(frame.outer.ravel())
+        direct, ambient = _direct(values, lights, panels, place.scene, textures, frame, outer)
         mirrored = _mirrored(values, lights, place.scene, frame)
-        lamps, more = (_direct_inside(values, some, place.scene, frame.chamber) for some in (lights, panels))
-        seen = _seen(values, lights, textures, place, numbers, frame)
+        lamps, more = (_direct_inside(values, some, place.scene, frame.interior.rows) for some in (lights, panels))
+        seen = _seen(values, lights, textures, place, numbers, frame, outer)
         return frame.solved(region, direct, mirrored, ambient, lamps, more, seen)
 
     def _inside(self, job: RenderJob) -> _Interior:
         """The chamber of a job's eye."""
-        film, look = job.film_index, job.look
-        return self._interiors.get(job.eye, (film, look), lambda: _Interior.of(job.eye, film, look))
+        film, look, leaving = job.film_index, job.look, _leaving(job.ambient)
+        return self._interiors.get(job.eye, (film, look, leaving), lambda: _Interior.of(job.eye, film, look, leaving))
 
     def _skin(self, region: RegionScene, globe: Globe) -> SkinPlaces:
         """Places on the skin of a region, chosen with the eye straight ahead: no earlier pose may change a picture."""
@@ -306,6 +322,11 @@ class Exchange:
         places = skin_places(region.at_rest(rest), rest)
         self._skins = [*self._skins[-3:], (region, rest, places)]
         return places
+
+
+def _leaving(ambient: Ambient) -> int:
+    """Number of rays that leave the eye from each place of the chamber, more where they look for light."""
+    return LEAVING if ambient.map is not None or ambient.irradiance_w_m2 > 0 else _LEAVING
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,12 +370,6 @@ class _Frame:
             skin[:] = np.where(np.linalg.norm(self.points, axis=1) < _FAR_MM, _NEAR_RAYS, _FAR_RAYS)
             skin[len(self.skin.vertices) :] = _FAR_RAYS
         return np.append(0, np.cumsum(count))
-
-    @property
-    def leaving(self) -> int:
-        """Number of rays that leave the eye from each place of the chamber, more where they look for light."""
-        ambient = self.job.ambient
-        return LEAVING if ambient.map is not None or ambient.irradiance_w_m2 > 0 else _LEAVING
 
     @property
     def outer(self) -> Floats:
@@ -457,13 +472,9 @@ def _others(
     return points, np.tile([1.0, 0.0, 0.0], (len(points), 1)), (float(centre[1]), float(centre[2]), inner)
 
 
-def _rows(table: Floats) -> Any:
-    buffer, width = _sent(table.ravel()), table.shape[1]
-
-    def of(i: mi.UInt32, active: mi.Bool | bool = True) -> list[mi.Float]:
-        return [dr.gather(mi.Float, buffer, i * width + k, active) for k in range(width)]
-
-    return of
+def _row(buffer: mi.Float, width: int, i: mi.UInt32, active: mi.Bool | bool = True) -> list[mi.Float]:
+    """Rows i of a table with so many columns."""
+    return [dr.gather(mi.Float, buffer, i * width + k, active) for k in range(width)]
 
 
 def _spots(i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
@@ -473,40 +484,52 @@ def _spots(i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
 
 
 def _direct(
-    values: Values, lights: Lights, panels: Lights, scene: mi.Scene, textures: Textures, frame: _Frame
+    values: Values, lights: Lights, panels: Lights, scene: mi.Scene, textures: Textures, frame: _Frame, outer: mi.Float
 ) -> tuple[Floats, tuple[Floats, Floats, Floats, Floats]]:
-    """Irradiance of places outside the eye.
+    """Irradiance of places outside the eye, whose points and normals are in `outer`.
 
     Straight from the lamps; from ambient light without shadows: what is soft, and the rest; this rest from its parts,
     without and with shadows.
     """
-    outer = frame.outer
-    index = dr.arange(mi.UInt32, len(outer))
-    n = _rows(outer)(index)
-    x, normal = mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:])
-    on_globe = index < dr.opaque(mi.UInt32, frame.on_globe)
-    on_globe |= index >= dr.opaque(mi.UInt32, frame.outside - IRIS_TURNS)
-    start = values.point_to_eye(x + _START_MM * normal)
-    facing = values.vector_to_eye(normal)
-    views, sheet = textures.lamp_views, dr.opaque(mi.UInt32, frame.on_globe + frame.on_skin)
-    lit = _over_lamps(
-        lights,
-        index,
-        lambda u, v: onto_points(
-            values, lights, scene, start, facing, ~on_globe, u, v, views, ~on_globe & (index < sheet)
-        )[0],
-    )
-    ambient = [mi.Float(0) * x.x] * 4
+    count = frame.outside
+    kinds = tuple(dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.on_skin, count - IRIS_TURNS))
+    ways = values, scene, outer, kinds
+    lit = _over_lamps(lights, count, lambda k: _onto_outer(*ways, lights, textures.lamp_views, k, count)[0])
+    soft = hard = free = shaded = np.zeros(count)
     if values.structure.ambient:
         assert textures.ambience is not None
-        ambient[:2] = textures.ambience.irradiances(x, normal)
+        index = dr.arange(mi.UInt32, count)
+        n = _row(outer, 6, index)
+        both = textures.ambience.irradiances(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
+        dr.eval(both)
+        soft, hard = (np.asarray(part.numpy(), dtype=float) for part in both)
     if len(panels):
-        middle = mi.Float(0)
-        shaded, free = onto_points(values, panels, scene, start, facing, ~on_globe, middle, middle)
-        ambient[2:] = free, shaded
-    dr.eval(ambient)
-    soft, hard, free, shaded = (np.asarray(part.numpy(), dtype=float) for part in ambient)
+        parts = _onto_outer(*ways, panels, None, None, count)
+        shaded, free = (np.asarray(part.numpy(), dtype=float) for part in parts)
     return lit, (soft, hard, free, shaded)
+
+
+@recorded
+def _onto_outer(
+    values: Values, scene: mi.Scene, outer: mi.Float, kinds: tuple[mi.UInt32, ...], lights: Lights,
+    views: LampViews | None, k: mi.UInt32 | None, count: int,
+) -> tuple[mi.Float, mi.Float]:  # fmt: skip
+    """Irradiance of places outside the eye from lamps, with and without shadows.
+
+    `kinds` are the numbers of places on the globe and on skin, and of those before the limbus. Every k has other places
+    on the lamps' discs; without it these are the discs' middles.
+    """
+    index = dr.arange(mi.UInt32, count)
+    n = _row(outer, 6, index)
+    x, normal = mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:])
+    globe, skin, rim = kinds
+    away = (index >= globe) & (index < rim)
+    start, facing = values.point_to_eye(x + _START_MM * normal), values.vector_to_eye(normal)
+    u, v = (mi.Float(0), mi.Float(0)) if k is None else _spots(index + k * count)
+    sheet = away & (index < globe + skin)
+    found = onto_points(values, lights, scene, start, facing, away, u, v, views, sheet)
+    dr.eval(found)
+    return found
 
 
 def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) -> Floats:
@@ -520,44 +543,48 @@ def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) ->
     rows = np.column_stack([frame.points, frame.normals])[near]
     if len(rows):
         index = dr.arange(mi.UInt32, len(rows))
-        n = _rows(rows)(index)
+        n = _row(_sent(rows.ravel()), 6, index)
         normal = mi.Vector3f(*n[3:])
         x, facing = values.point_to_eye(mi.Vector3f(*n[:3]) + _START_MM * normal), values.vector_to_eye(normal)
-        lit = _over_lamps(lights, index, lambda u, v: off_cornea(values, lights, scene, x, facing, u, v))
+        lit = _over_lamps(
+            lights, len(rows), lambda k: off_cornea(values, lights, scene, x, facing, *_spots(index + k * len(rows)))
+        )
         total[frame.on_globe + np.flatnonzero(near)] = lit
     return total
 
 
-def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, chamber: Chamber) -> Floats:
-    """Irradiance (PLACES,) of the chamber's places straight from lamps."""
+def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float) -> Floats:
+    """Irradiance (PLACES,) of the chamber's places straight from lamps; rows hold them as in `_Interior`."""
     if len(lights) == 0:
         return np.zeros(PLACES)
-    rows = np.column_stack([chamber.points, chamber.normals, chamber.valid])
+    return _over_lamps(lights, PLACES, lambda k: _inside(values, lights, scene, rows, k))
+
+
+@recorded
+def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, k: mi.UInt32) -> mi.Float:
+    """Irradiance of the chamber's places from lamps; every k has other places on their discs."""
+
+    def of(begin: int, end: int, surfaces: tuple[Surface, ...]) -> mi.Float:
+        index = dr.arange(mi.UInt32, end - begin)
+        n = _row(rows, 7, index + begin)
+        x, inside, normal = mi.Vector3f(*n[:3]), n[6] > 0, mi.Vector3f(*n[3:6])
+        u, v = _spots(index + k * (end - begin))
+        return through_cornea(values, lights, scene, x, inside, u, v, normal=normal, surfaces=surfaces)[0]
+
     if len(values.surfaces) == 1:
-        return _through(values, lights, scene, rows, values.surfaces)
+        return of(0, PLACES, values.surfaces)
     # The wall is the rim of the cornea, in front of its back.
-    wall = _through(values, lights, scene, rows[IRIS:], values.surfaces[:-1])
-    return np.concatenate([_through(values, lights, scene, rows[:IRIS], values.surfaces), wall])
+    parts = of(0, IRIS, values.surfaces), of(IRIS, PLACES, values.surfaces[:-1])
+    dr.eval(parts)
+    return dr.concat(parts)
 
 
-def _through(values: Values, lights: Lights, scene: mi.Scene, rows: Floats, surfaces: tuple[Surface, ...]) -> Floats:
-    """Irradiance of places behind some of the surfaces; rows hold points, normals, and whether they are in the eye."""
-    index = dr.arange(mi.UInt32, len(rows))
-    n = _rows(rows)(index)
-    x, inside, normal = mi.Vector3f(*n[:3]), n[6] > 0, mi.Vector3f(*n[3:6])
-    return _over_lamps(
-        lights,
-        index,
-        lambda u, v: through_cornea(values, lights, scene, x, inside, u, v, normal=normal, surfaces=surfaces)[0],
-    )
-
-
-def _over_lamps(lights: Lights, index: mi.UInt32, light: Callable[[mi.Float, mi.Float], mi.Float]) -> Floats:
-    """Mean of `light` (u, v) over places on the lamps' discs; one is enough for small lamps."""
+def _over_lamps(lights: Lights, width: int, light: Callable[[mi.UInt32], mi.Float]) -> Floats:
+    """Mean (width,) of `light` over places on the lamps' discs, which are numbered; one is enough for small lamps."""
     count = 1 if lights.widest < _SMALL else _SPOTS
-    total = np.zeros(dr.width(index))
+    total = np.zeros(width)
     for k in range(count):
-        total += light(*_spots(index + dr.opaque(mi.UInt32, k * dr.width(index)))).numpy()
+        total += light(dr.opaque(mi.UInt32, k)).numpy()
     return total / count
 
 
@@ -571,32 +598,26 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
 
 
 def _seen(
-    values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame
-) -> tuple[_Seen, _Seen]:
+    values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame,
+    outer: mi.Float,
+) -> tuple[_Seen, _Seen]:  # fmt: skip
     """What the rays of the places outside and of those in the chamber meet."""
     start = frame.first_ray
     first = int(start[-1])
-    lanes = first + PLACES * frame.leaving
-    index = dr.arange(mi.UInt32, lanes)
-    split = dr.opaque(mi.UInt32, first)
-    outside = index < split
+    leaving = _leaving(frame.job.ambient)
+    lanes = first + PLACES * leaving
     of_place = np.repeat(np.arange(frame.outside, dtype=np.uint32), np.diff(start))
-    row = dr.gather(mi.UInt32, mi.UInt32(aligned(of_place)), index, outside)
-    n = _rows(frame.outer)(row, outside)
-    normal = mi.Vector3f(*n[3:])
-    o = mi.Vector3f(*n[:3]) + _START_MM * normal
-    d = _pattern(normal, index)
-    rays = _rows(frame.chamber.leaving[:, : frame.leaving].reshape(-1, 7))(index - split, ~outside)
-    o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
-    d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
-    gain = dr.select(outside, 1, rays[6])
-    target, weight, open_, distance, spot = _met(values, textures, place, numbers, o, d, gain > 0, frame)
-    sky = mi.Float(0) * o.x
-    if values.structure.ambient:
-        assert textures.ambience is not None
-        sky = dr.pi * textures.ambience.soft(d, outside | open_) * gain
-    results = (target, weight * gain, mi.Float(distance < _TOUCHING_MM), dr.select(open_, sky, 0), sky)
-    dr.eval(results, spot)
+    stands_for, count = mi.Int32(0), 0
+    if frame.skin is not None:
+        count = len(frame.skin.vertices)
+        table = np.stack([frame.skin.nearest, frame.skin.behind + count], axis=1).astype(np.int32)
+        stands_for = mi.Int32(aligned(table.ravel()))
+    split, on_globe, outside, on_skin = (dr.opaque(mi.UInt32, n) for n in (first, frame.on_globe, frame.outside, count))
+    kinds = _Kinds(on_globe, outside, on_skin, stands_for)
+    results, spot = _rays_of(
+        values, textures, place.scene, numbers, mi.UInt32(aligned(of_place)), outer, frame.interior.leaving,
+        split, kinds, lanes,
+    )  # fmt: skip
     host = [r.numpy() for r in results]
     host.append(np.full(lanes, -1.0))
     if frame.skin is not None and len(lights):
@@ -604,8 +625,49 @@ def _seen(
         host[-1][lane] = _at_spots(values, lights, place.scene, textures, spot, lane)
     return (
         _Seen(start[:-1], *(h[:first] for h in host)),
-        _Seen(np.arange(PLACES) * frame.leaving, *(h[first:] for h in host)),
+        _Seen(np.arange(PLACES) * leaving, *(h[first:] for h in host)),
     )
+
+
+@traversed
+@dataclass(frozen=True, slots=True)
+class _Kinds:
+    """Numbers of places on the globe, outside the eye, and on skin, and the places for both sides of vertices."""
+
+    on_globe: mi.UInt32
+    outside: mi.UInt32
+    on_skin: mi.UInt32
+    stands_for: mi.Int32
+
+
+@recorded
+def _rays_of(
+    values: Values, textures: Textures, scene: mi.Scene, numbers: Received, of_place: mi.UInt32, outer: mi.Float,
+    leaving: mi.Float, split: mi.UInt32, kinds: _Kinds, lanes: int,
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:  # fmt: skip
+    """What the rays of places meet: the columns of `_Seen` but for the last, and places on skin (see `_met`).
+
+    The first rays, as many as `split`, belong to places outside the eye, whose numbers are in `of_place`.
+    """
+    index = dr.arange(mi.UInt32, lanes)
+    outside = index < split
+    row = dr.gather(mi.UInt32, of_place, index, outside)
+    n = _row(outer, 6, row, outside)
+    normal = mi.Vector3f(*n[3:])
+    o = mi.Vector3f(*n[:3]) + _START_MM * normal
+    d = _pattern(normal, index)
+    rays = _row(leaving, 7, index - split, ~outside)
+    o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
+    d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
+    gain = dr.select(outside, 1, rays[6])
+    target, weight, open_, distance, spot = _met(values, textures, scene, numbers, o, d, gain > 0, kinds)
+    sky = mi.Float(0) * o.x
+    if values.structure.ambient:
+        assert textures.ambience is not None
+        sky = dr.pi * textures.ambience.soft(d, outside | open_) * gain
+    results = (target, weight * gain, mi.Float(distance < _TOUCHING_MM), dr.select(open_, sky, 0), sky)
+    dr.eval(results, spot)
+    return results, spot
 
 
 def _at_spots(
@@ -631,29 +693,28 @@ def _at_spots(
 
 
 def _met(
-    values: Values, textures: Textures, place: Surround | RegionScene, numbers: Received, o: mi.Vector3f,
-    d: mi.Vector3f, active: mi.Bool, frame: _Frame,
+    values: Values, textures: Textures, scene: mi.Scene, numbers: Received, o: mi.Vector3f, d: mi.Vector3f,
+    active: mi.Bool, kinds: _Kinds,
 ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float, tuple[mi.Bool, mi.Vector3f, mi.Vector3f]]:  # fmt: skip
     """What is met along rays.
 
     The place, the share of its irradiance that is sent back, whether nothing is met, the distance, and for the outer
     side of the sheet of skin (a mark) point and normal in the eye frame.
     """
-    view, hit = meet(values, place.scene, o, d, active, coherent=False)
+    view, hit = meet(values, scene, o, d, active, coherent=False)
     view = appearance(values, textures, view, hit, d)
     albedo = outer_albedo(values, textures, view)
     # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.
     s, t = _spots(dr.arange(mi.UInt32, dr.width(o)) * mi.UInt32(_SHUFFLED))
-    first = dr.opaque(mi.UInt32, frame.on_globe)
+    first = kinds.on_globe
     at = values.point_to_scene(view.point)
-    if textures.region is not None and frame.skin is not None:
-        face, count = textures.region.face(hit), len(frame.skin.vertices)
-        table = np.stack([frame.skin.nearest, frame.skin.behind + count], axis=1).astype(np.int32)
+    if textures.region is not None:
+        face = textures.region.face(hit)
         inner = textures.region.from_behind(face, hit.prim_uv, d, view.other)
         corner = textures.region.corner(face, hit.prim_uv, s, view.other)
-        which = dr.gather(mi.Int32, mi.Int32(aligned(table.ravel())), 2 * corner + dr.select(inner, 1, 0), view.other)
+        which = dr.gather(mi.Int32, kinds.stands_for, 2 * corner + dr.select(inner, 1, 0), view.other)
         other = first + mi.UInt32(which)
-        matte = view.other & (~inner | (which >= dr.opaque(mi.Int32, count)))
+        matte = view.other & (~inner | (which >= mi.Int32(kinds.on_skin)))
         on_skin = view.other & ~inner & textures.region.on_sheet(face)
     else:
         on_skin = mi.Bool(False)
@@ -671,7 +732,7 @@ def _met(
     cell = mi.UInt32(dr.clip(depth + s, 0, IRIS_RINGS - 1)) * IRIS_TURNS + dr.select(sector < IRIS_TURNS, sector, 0)
     behind = dr.select(view.pupil, values.pupil_albedo, iris_albedo(values, textures, view.inner))
     inside = view.passed * behind / (values.inner_index * values.inner_index)
-    target = dr.select(through, dr.opaque(mi.UInt32, frame.outside) + cell, dr.select(view.other, other, on_globe))
+    target = dr.select(through, kinds.outside + cell, dr.select(view.other, other, on_globe))
     back = dr.select(through, inside, dr.select(view.other & ~matte, 0, albedo))
     back = dr.select(view.met, back, 0)
     distance = dr.select(view.met, view.distance, 1e9)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayValue, Floats, frozen
+from ..arrays import ArrayValue, Floats, frozen, remembered
 from ..errors import InputError
 from ..eye.entrance import entrance_pupil
 from ..eye.fundus import FundusLight, Spread, fundus_light
@@ -143,23 +143,12 @@ def tables(eye: EyeModel) -> tuple[NDArray[np.float32] | None, ...]:
 def parameters_of(job: RenderJob) -> Parameters:
     """Compute the parameters of a frame on the host."""
     eye, look, anchor, camera = job.eye, job.look, job.anchor_mm, job.camera
-    indices = np.asarray(eye.front_indices, dtype=float)
-    surfaces = tuple(
-        _surface_parameters(surface, before / index, float(eye.limbus_radius_mm))
-        for surface, index, before in zip(eye.front, indices, [1.0, *indices[:-1]], strict=True)
-    )
-    surfaces = (replace(surfaces[0], film=1 / job.film_index), *surfaces[1:])
-    front, stop, sclera = eye.front[0], eye.stop, eye.sclera
-    entrance_mm, magnification = entrance_pupil(eye)
-    angle = np.linspace(0, 2 * np.pi, 64)
-    edge = front.sag(eye.limbus_radius_mm * np.cos(angle), eye.limbus_radius_mm * np.sin(angle))
-    ring = eye.limbus_radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    rim = front.origin_mm + np.column_stack([edge, ring]) @ np.asarray(front.rotation).T
-    bulge = 0.5 * (rim.mean(axis=0) + apex_of(front))
-    cornea_reach = float(np.linalg.norm(apex_of(front) - sclera.centre_mm))
+    still = _still(eye)
+    surfaces = (replace(still.surfaces[0], film=1 / job.film_index), *still.surfaces[1:])
+    stop, sclera = eye.stop, eye.sclera
     return Parameters(
         surfaces=surfaces,
-        inner_index=float(indices[-1]),
+        inner_index=float(eye.front_indices[-1]),
         stop=StopParameters(
             centre=stop.centre_mm,
             normal=stop.rotation[:, 0],
@@ -177,14 +166,14 @@ def parameters_of(job: RenderJob) -> Parameters:
         ),
         limbus=LimbusParameters(
             radius=eye.limbus_radius_mm,
-            floor=float(np.min(edge)) - 2.0,
+            floor=still.floor,
             gain=1 / max(look.limbus_width_mm, 1e-6),
             albedo=look.limbus_albedo,
-            bulge=bulge,
-            bulge_radius=float(np.max(np.linalg.norm(rim - bulge, axis=1))) + 0.05,
+            bulge=still.bulge,
+            bulge_radius=still.bulge_radius,
         ),
         sclera=ScleraParameters(sclera.centre_mm, sclera.radius_mm, look.sclera_albedo, look.sclera_contrast),
-        image=ImageParameters(magnification, float(entrance_mm[0] - stop.centre_mm[0])),
+        image=still.image,
         pose=PoseParameters((job.M[:, 0], job.M[:, 1], job.M[:, 2]), job.t - anchor),
         camera=CameraParameters(
             centre=camera.nodal_point_mm - anchor,
@@ -196,9 +185,46 @@ def parameters_of(job: RenderJob) -> Parameters:
             distortion=tuple(camera.distortion),
         ),
         pupil_albedo=look.pupil_albedo,
-        globe_reach=max(float(sclera.radius_mm), cornea_reach) + 0.5,
+        globe_reach=still.globe_reach,
         backdrop_x=-look.backdrop_distance_mm,
         ambient_irradiance=job.ambient.irradiance_w_m2 * 1e-3,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Still:
+    """Parameters that depend on the eye alone; the surfaces have no film."""
+
+    surfaces: tuple[SurfaceParameters, ...]
+    image: ImageParameters
+    floor: float
+    bulge: Floats
+    bulge_radius: float
+    globe_reach: float
+
+
+@remembered
+def _still(eye: EyeModel) -> _Still:
+    indices = np.asarray(eye.front_indices, dtype=float)
+    surfaces = tuple(
+        _surface_parameters(surface, before / index, float(eye.limbus_radius_mm))
+        for surface, index, before in zip(eye.front, indices, [1.0, *indices[:-1]], strict=True)
+    )
+    front, sclera = eye.front[0], eye.sclera
+    entrance_mm, magnification = entrance_pupil(eye)
+    angle = np.linspace(0, 2 * np.pi, 64)
+    edge = front.sag(eye.limbus_radius_mm * np.cos(angle), eye.limbus_radius_mm * np.sin(angle))
+    ring = eye.limbus_radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rim = front.origin_mm + np.column_stack([edge, ring]) @ np.asarray(front.rotation).T
+    bulge = 0.5 * (rim.mean(axis=0) + apex_of(front))
+    cornea_reach = float(np.linalg.norm(apex_of(front) - sclera.centre_mm))
+    return _Still(
+        surfaces=surfaces,
+        image=ImageParameters(magnification, float(entrance_mm[0] - eye.stop.centre_mm[0])),
+        floor=float(np.min(edge)) - 2.0,
+        bulge=bulge,
+        bulge_radius=float(np.max(np.linalg.norm(rim - bulge, axis=1))) + 0.05,
+        globe_reach=max(float(sclera.radius_mm), cornea_reach) + 0.5,
     )
 
 

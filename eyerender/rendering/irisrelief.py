@@ -137,9 +137,7 @@ class IrisRelief:
         self._heights = shape.corners
 
     @recorded
-    def _shape(
-        self, values: Values, pattern: mi.Texture2f, cells: int, blocks: int, about: int
-    ) -> tuple[Any, ...]:
+    def _shape(self, values: Values, pattern: mi.Texture2f, cells: int, blocks: int, about: int) -> tuple[Any, ...]:
         """The fields of a `Shape` with so many cells; `blocks` across, of which so many are `about` each."""
         column, row = self._cells(cells)
         heights = iris_height(values, pattern, self._place(mi.Float(column), mi.Float(row), self._count))

@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from .parameters import leaves
+from .values import aligned
 
 _WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
 
@@ -42,7 +43,7 @@ class Panels:
     def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
         self.count = dr.opaque(mi.UInt32, len(table))
         data = np.ascontiguousarray(table, dtype=np.float32).reshape(-1)
-        self._buffer = mi.Float(data if data.size else np.zeros(_WIDTH, np.float32))
+        self._buffer = mi.Float(aligned(data if data.size else np.zeros(_WIDTH, np.float32)))
 
     def __getitem__(self, i: mi.UInt32) -> Rectangle:
         row = [dr.gather(mi.Float, self._buffer, i * _WIDTH + k) for k in range(_WIDTH)]

@@ -69,7 +69,7 @@ def _collect(value: Any, plain: list[Any]) -> None:
         for item in value.values():
             _collect(item, plain)
     else:
-        for name in _names(kind):
+        for name in _names(kind):  # type: ignore[arg-type]  # classes are hashable
             _collect(getattr(value, name), plain)
 
 
