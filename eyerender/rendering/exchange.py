@@ -494,7 +494,9 @@ def _direct(
     count = frame.outside
     kinds = tuple(dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.on_skin, count - IRIS_TURNS))
     ways = values, scene, outer, kinds
-    lit = _over_lamps(lights, count, lambda k: _onto_outer(*ways, lights, textures.lamp_views, k, count)[0])
+    lit = _over_lamps(
+        lights, count, lambda k: _onto_outer(*ways, lights, textures.lamp_views, _number(k * count), count)[0]
+    )
     soft = hard = free = shaded = np.zeros(count)
     if values.structure.ambient:
         assert textures.ambience is not None
@@ -512,12 +514,12 @@ def _direct(
 @recorded
 def _onto_outer(
     values: Values, scene: mi.Scene, outer: mi.Float, kinds: tuple[mi.UInt32, ...], lights: Lights,
-    views: LampViews | None, k: mi.UInt32 | None, count: int,
+    views: LampViews | None, first: mi.UInt32 | None, count: int,
 ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
     """Irradiance of places outside the eye from lamps, with and without shadows.
 
-    `kinds` are the numbers of places on the globe and on skin, and of those before the limbus. Every k has other places
-    on the lamps' discs; without it these are the discs' middles.
+    `kinds` are the numbers of places on the globe and on skin, and of those before the limbus. Places on the
+    lamps' discs begin with the number `first`; without it these are the discs' middles.
     """
     index = dr.arange(mi.UInt32, count)
     n = _row(outer, 6, index)
@@ -525,7 +527,7 @@ def _onto_outer(
     globe, skin, rim = kinds
     away = (index >= globe) & (index < rim)
     start, facing = values.point_to_eye(x + _START_MM * normal), values.vector_to_eye(normal)
-    u, v = (mi.Float(0), mi.Float(0)) if k is None else _spots(index + k * count)
+    u, v = (mi.Float(0), mi.Float(0)) if first is None else _spots(index + first)
     sheet = away & (index < globe + skin)
     found = onto_points(values, lights, scene, start, facing, away, u, v, views, sheet)
     dr.eval(found)
@@ -547,7 +549,9 @@ def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) ->
         normal = mi.Vector3f(*n[3:])
         x, facing = values.point_to_eye(mi.Vector3f(*n[:3]) + _START_MM * normal), values.vector_to_eye(normal)
         lit = _over_lamps(
-            lights, len(rows), lambda k: off_cornea(values, lights, scene, x, facing, *_spots(index + k * len(rows)))
+            lights,
+            len(rows),
+            lambda k: off_cornea(values, lights, scene, x, facing, *_spots(index + _number(k * len(rows)))),
         )
         total[frame.on_globe + np.flatnonzero(near)] = lit
     return total
@@ -557,7 +561,7 @@ def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Flo
     """Irradiance (PLACES,) of the chamber's places straight from lamps; rows hold them as in `_Interior`."""
     if len(lights) == 0:
         return np.zeros(PLACES)
-    return _over_lamps(lights, PLACES, lambda k: _inside(values, lights, scene, rows, k))
+    return _over_lamps(lights, PLACES, lambda k: _inside(values, lights, scene, rows, _number(k)))
 
 
 @recorded
@@ -579,12 +583,17 @@ def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, k: 
     return dr.concat(parts)
 
 
-def _over_lamps(lights: Lights, width: int, light: Callable[[mi.UInt32], mi.Float]) -> Floats:
+def _number(n: int) -> mi.UInt32:
+    """A number that no kernel is compiled for."""
+    return dr.opaque(mi.UInt32, n)
+
+
+def _over_lamps(lights: Lights, width: int, light: Callable[[int], mi.Float]) -> Floats:
     """Mean (width,) of `light` over places on the lamps' discs, which are numbered; one is enough for small lamps."""
     count = 1 if lights.widest < _SMALL else _SPOTS
     total = np.zeros(width)
     for k in range(count):
-        total += light(dr.opaque(mi.UInt32, k)).numpy()
+        total += light(k).numpy()
     return total / count
 
 
