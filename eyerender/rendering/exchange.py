@@ -494,9 +494,7 @@ def _direct(
     count = frame.outside
     kinds = tuple(dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.on_skin, count - IRIS_TURNS))
     ways = values, scene, outer, kinds
-    lit = _over_lamps(
-        lights, count, lambda k: _onto_outer(*ways, lights, textures.lamp_views, _number(k * count), count)[0]
-    )
+    lit = _over_lamps(lights, count, lambda first: _onto_outer(*ways, lights, textures.lamp_views, first, count)[0])
     soft = hard = free = shaded = np.zeros(count)
     if values.structure.ambient:
         assert textures.ambience is not None
@@ -549,9 +547,7 @@ def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) ->
         normal = mi.Vector3f(*n[3:])
         x, facing = values.point_to_eye(mi.Vector3f(*n[:3]) + _START_MM * normal), values.vector_to_eye(normal)
         lit = _over_lamps(
-            lights,
-            len(rows),
-            lambda k: off_cornea(values, lights, scene, x, facing, *_spots(index + _number(k * len(rows)))),
+            lights, len(rows), lambda first: off_cornea(values, lights, scene, x, facing, *_spots(index + first))
         )
         total[frame.on_globe + np.flatnonzero(near)] = lit
     return total
@@ -561,18 +557,18 @@ def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Flo
     """Irradiance (PLACES,) of the chamber's places straight from lamps; rows hold them as in `_Interior`."""
     if len(lights) == 0:
         return np.zeros(PLACES)
-    return _over_lamps(lights, PLACES, lambda k: _inside(values, lights, scene, rows, _number(k)))
+    return _over_lamps(lights, PLACES, lambda first: _inside(values, lights, scene, rows, first))
 
 
 @recorded
-def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, k: mi.UInt32) -> mi.Float:
-    """Irradiance of the chamber's places from lamps; every k has other places on their discs."""
+def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, first: mi.UInt32) -> mi.Float:
+    """Irradiance of the chamber's places from lamps; places on their discs begin with the number `first`."""
 
     def of(begin: int, end: int, surfaces: tuple[Surface, ...]) -> mi.Float:
         index = dr.arange(mi.UInt32, end - begin)
         n = _row(rows, 7, index + begin)
         x, inside, normal = mi.Vector3f(*n[:3]), n[6] > 0, mi.Vector3f(*n[3:6])
-        u, v = _spots(index + k * (end - begin))
+        u, v = _spots(index + first)
         return through_cornea(values, lights, scene, x, inside, u, v, normal=normal, surfaces=surfaces)[0]
 
     if len(values.surfaces) == 1:
@@ -583,17 +579,12 @@ def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, k: 
     return dr.concat(parts)
 
 
-def _number(n: int) -> mi.UInt32:
-    """A number that no kernel is compiled for."""
-    return dr.opaque(mi.UInt32, n)
-
-
-def _over_lamps(lights: Lights, width: int, light: Callable[[int], mi.Float]) -> Floats:
-    """Mean (width,) of `light` over places on the lamps' discs, which are numbered; one is enough for small lamps."""
+def _over_lamps(lights: Lights, width: int, light: Callable[[mi.UInt32], mi.Float]) -> Floats:
+    """Mean (width,) of `light` over places on the lamps' discs, which begin with a number; small lamps need one."""
     count = 1 if lights.widest < _SMALL else _SPOTS
     total = np.zeros(width)
     for k in range(count):
-        total += light(k).numpy()
+        total += light(dr.opaque(mi.UInt32, k * width)).numpy()
     return total / count
 
 

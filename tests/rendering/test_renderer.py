@@ -65,7 +65,8 @@ def test_later_frames_launch_the_kernels_of_the_first(renderer):
         replace(first, look=first.look.model_copy(update={"iris_seed": 4, "iris_albedo": 0.2, "limbus_width_mm": 0.0})),
         replace(first, sensor=Sensor(psf_sigma_px=1.3, bit_depth=8)),
     ]
-    assert kernels(renderer, jobs) == kernels(renderer, [first])
+    known = kernels(renderer, [first])  # first, because what depends on the eye alone is made once
+    assert kernels(renderer, jobs) <= known
 
 
 def test_another_number_of_surfaces_has_kernels_of_its_own_and_keeps_them(renderer):
