@@ -273,7 +273,7 @@ class Exchange:
     """Computes what the places of a frame receive; keeps what does not change between frames of a subject."""
 
     def __init__(self) -> None:
-        self._skins: list[tuple[RegionScene, Globe, SkinPlaces]] = []
+        self._skins: list[tuple[tuple[Any, ...], Globe, SkinPlaces]] = []  # of subjects
         self._interiors: KeptForEye[_Interior] = KeptForEye()
 
     def received(
@@ -317,10 +317,10 @@ class Exchange:
         """Places on the skin of a region, chosen with the eye straight ahead: no earlier pose may change a picture."""
         rest = replace(globe, M=np.eye(3), t=np.zeros(3))
         for known, still, places in self._skins:
-            if known is region and still == rest:
+            if still == rest and known == region.subject:
                 return places
         places = skin_places(region.at_rest(rest), rest)
-        self._skins = [*self._skins[-3:], (region, rest, places)]
+        self._skins = [*self._skins[-3:], (region.subject, rest, places)]
         return places
 
 

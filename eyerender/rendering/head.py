@@ -14,15 +14,15 @@ from ..region.globe import Globe
 from ..region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
 from ..region.headspec import Head
 from ..region.mesh import RegionMesh
-from .region import RegionScene
+from .region import Expected, RegionScene
 
 _DEPTH_MM = 4.0
 _RINGS, _TURNS = 40, 240
 
 
-def place_scene(spec: Region, globe: Globe) -> RegionScene:
-    """Make the scene of a spec: its head mesh, or the procedural region."""
-    return RegionScene(spec, globe) if spec.head is None else HeadScene(spec, globe)
+def place_scene(spec: Region, globe: Globe, expected: Expected | None) -> RegionScene:
+    """Make the scene of a spec: its head mesh, or the procedural region, whose mesh may be known."""
+    return (RegionScene if spec.head is None else HeadScene)(spec, globe, expected)
 
 
 class HeadScene(RegionScene):
@@ -35,14 +35,14 @@ class HeadScene(RegionScene):
     parts = HEAD_PARTS
     moving = 0  # the mesh is fixed
 
-    def __init__(self, spec: Region, globe: Globe) -> None:
-        super().__init__(spec, globe)
+    def __init__(self, spec: Region, globe: Globe, expected: Expected | None = None) -> None:
+        super().__init__(spec, globe, expected)
         self._refuse_crossing(spec, globe)
 
-    def show(self, spec: Region, globe: Globe) -> RegionMesh:
+    def show(self, spec: Region, globe: Globe, expected: Expected | None = None) -> RegionMesh:
         """Turn to an eye and its pose; the mesh itself moves only with the place of the globe at rest."""
         new = self._shown != (spec, globe)
-        posed = super().show(spec, globe)
+        posed = super().show(spec, globe, expected)
         if new:
             self._refuse_crossing(spec, globe)
         return posed

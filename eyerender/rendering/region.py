@@ -1,4 +1,4 @@
-"""The eye region in Mitsuba: triangles with one map, moved in place; a subject's topology is constant.
+"""The eye region in Mitsuba: triangles with one map, moved in place, of one subject after another.
 
 The triangles are in the scene's frame (the world's axes, origin at the apex of the unrotated eye) as two instances: the
 parts that move with the eye, and the fixed brow. A pose rebuilds the tree over the first alone. Mitsuba lets Embree
@@ -45,42 +45,63 @@ Expected: TypeAlias = tuple[Region, Globe, "Future[RegionMesh]"]
 
 
 class RegionScene:
-    """The Mitsuba scene of one subject's eye region; `show` moves it."""
+    """The Mitsuba scene of an eye region; `show` moves it, and `fill` gives it to another subject."""
 
     obstructed = True
     parts: tuple[str, ...] = PARTS
     moving = 3  # the first parts, which the eye moves
-    expected: Expected | None = None
 
-    def __init__(self, spec: Region, globe: Globe) -> None:
-        posed = self._posed(spec, globe)
-        layout = posed.layout
-        moved = [int(ends[self.moving - 1]) if self.moving else 0 for ends in (layout.vertex_ends, layout.face_ends)]
-        self._vertices, faces = moved
+    def __init__(self, spec: Region, globe: Globe, expected: Expected | None = None) -> None:
+        posed = self._made(spec, globe, expected)
+        meshes = {name: _mesh(posed, *cut) for name, cut in self._cuts(posed.layout).items()}
         # Without robust intersections rays slip between the triangles of a large face on some processors. An instance
         # cannot have them, but its triangles are small.
         parts: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True}
-        water = None
-        if self.moving:
-            film = slice(int(layout.face_ends[0]), int(layout.face_ends[1]))
-            parts |= _instance("moving", _mesh(posed, slice(0, moved[0]), slice(0, moved[1]), without=film))
-            water = mi.load_dict({"type": "scene", **_instance("film", _mesh(posed, _water(layout), film))})
-            self._water: Any = mi.traverse(water)
-        if moved[1] < len(layout.faces):
-            still = _mesh(posed, slice(moved[0], None), slice(moved[1], None))
-            parts |= _instance("still", still) if self.moving else {"still": still}
+        film = meshes.pop("film", None)
+        for name, mesh in meshes.items():
+            parts |= _instance(name, mesh) if self.moving else {name: mesh}
         self.scene = mi.load_dict(parts)
-        self._params: Any = mi.traverse(self.scene)
+        self._params: dict[str, Any] = dict.fromkeys(meshes, mi.traverse(self.scene))
+        self._water = None if film is None else mi.load_dict({"type": "scene", **_instance("film", film)})
+        if self._water is not None:
+            self._params["film"] = mi.traverse(self._water)
+        self._dress(spec, globe, posed)
+
+    def _cuts(self, layout: RegionLayout) -> dict[str, tuple[slice, slice, slice]]:
+        """The vertices and faces of each mesh, and those faces that nothing meets."""
+        moved = [int(ends[self.moving - 1]) if self.moving else 0 for ends in (layout.vertex_ends, layout.face_ends)]
+        still = {"still": (slice(moved[0], None), slice(moved[1], None), _NONE)} if moved[1] < len(layout.faces) else {}
+        if not self.moving:
+            return still
+        water, film = (slice(int(ends[0]), int(ends[1])) for ends in (layout.vertex_ends, layout.face_ends))
+        return {"moving": (slice(0, moved[0]), slice(0, moved[1]), film), "film": (water, film, _NONE), **still}
+
+    def _dress(self, spec: Region, globe: Globe, posed: RegionMesh) -> None:
+        """Take the appearance of a subject."""
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
         pixels = aligned(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         moving = next((s for s in self.scene.shapes() if s.id() == "shown_moving"), None)
-        self.skin = SkinGeometry(
-            look, pixels, layout, faces, moving, -1.0 if globe.mirrored else 1.0, self._inner(), water
-        )
+        moved = self._cuts(posed.layout)["moving"][1].stop if self.moving else 0
+        mirror = -1.0 if globe.mirrored else 1.0
+        self.skin = SkinGeometry(look, pixels, posed.layout, moved, moving, mirror, self._inner(), self._water)
         self.skin.pose(posed)
         self._shown: tuple[Region, Globe] | None = (spec, globe)
         self.posed = posed
+        self.subject = self.key(spec, globe)
+
+    def takes(self, spec: Region) -> bool:
+        """Whether the scene has the meshes that a subject needs."""
+        return self.moving > 0 and spec.head is None and ("still" in self._params) == (spec.brow.count > 0)
+
+    def fill(self, spec: Region, globe: Globe, expected: Expected | None) -> None:
+        """Show another subject with the same shapes, so that recordings can still be played back."""
+        posed = self._made(spec, globe, expected)
+        for name, cut in self._cuts(posed.layout).items():
+            self._params[name][f"{name}.mesh.faces"] = _faces(posed.layout, *cut)
+            self._send(name, posed)
+        self._update()
+        self._dress(spec, globe, posed)
 
     @staticmethod
     def key(spec: Region, globe: Globe) -> tuple[Any, ...]:
@@ -88,12 +109,10 @@ class RegionScene:
         files = () if spec.head is None else file_states(spec.head)
         return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files
 
-    def show(self, spec: Region, globe: Globe) -> RegionMesh:
+    def show(self, spec: Region, globe: Globe, expected: Expected | None = None) -> RegionMesh:
         """Move lids and lashes to a pose and a blink."""
         if self._shown != (spec, globe):
-            expected, self.expected = self.expected, None
-            known = expected is not None and expected[:2] == (spec, globe)
-            posed = expected[2].result() if expected is not None and known else self._posed(spec, globe)
+            posed = self._made(spec, globe, expected)
             if posed is not self.posed:
                 self._move(posed)
             self._shown = (spec, globe)
@@ -105,16 +124,26 @@ class RegionScene:
         return self._posed(self._shown[0].model_copy(update={"blink": 0.0}), globe)
 
     def _move(self, posed: RegionMesh) -> None:
-        n, before, self.posed = self._vertices, self.posed, posed
-        if self.moving:
-            self._params["moving.mesh.vertex_positions"] = _floats(posed.vertices[:n])
-            self._water["film.mesh.vertex_positions"] = _floats(posed.vertices[_water(posed.layout)])
-            self._water.update()
-        if not np.array_equal(before.vertices[n:], posed.vertices[n:]):
-            mesh = "still.mesh" if self.moving else "still"
-            self._params[f"{mesh}.vertex_positions"] = _floats(posed.vertices[n:])
-        self._params.update()
+        before, self.posed = self.posed, posed
+        for name, (vertices, *_) in self._cuts(posed.layout).items():
+            if name != "still" or not np.array_equal(before.vertices[vertices], posed.vertices[vertices]):
+                self._send(name, posed)
+        self._update()
         self.skin.pose(posed)
+
+    def _send(self, name: str, posed: RegionMesh) -> None:
+        """Set the vertices of a mesh."""
+        place = f"{name}.mesh" if self.moving else name
+        self._params[name][f"{place}.vertex_positions"] = _floats(posed.vertices[self._cuts(posed.layout)[name][0]])
+
+    def _update(self) -> None:
+        for params in self._params.values():
+            params.update()  # does nothing where nothing was set
+
+    def _made(self, spec: Region, globe: Globe, expected: Expected | None) -> RegionMesh:
+        """The posed mesh, which another thread may have made."""
+        known = expected is not None and expected[:2] == (spec, globe)
+        return expected[2].result() if expected is not None and known else self._posed(spec, globe)
 
     def _posed(self, spec: Region, globe: Globe) -> RegionMesh:
         return region_mesh(spec, globe)
@@ -146,18 +175,19 @@ def _floats(values: Floats) -> mi.Float:
     return mi.Float(aligned(values.astype(np.float32).ravel()))
 
 
-def _water(layout: RegionLayout) -> slice:
-    """Vertices of the menisci."""
-    return slice(int(layout.vertex_ends[0]), int(layout.vertex_ends[1]))
-
-
-def _mesh(posed: RegionMesh, vertices: slice, faces: slice, without: slice = _NONE) -> mi.Mesh:
-    """Make a mesh of some of the triangles. Those `without` keep their numbers, but nothing meets them."""
-    corners, triangles = posed.vertices[vertices], posed.layout.faces[faces] - (vertices.start or 0)
+def _faces(layout: RegionLayout, vertices: slice, faces: slice, without: slice) -> mi.UInt32:
+    """Some of the triangles, with numbers of some of the vertices. Nothing meets those `without`."""
+    triangles = layout.faces[faces] - (vertices.start or 0)
     triangles[without] = 0
-    mesh = mi.Mesh("region", len(corners), len(triangles))
+    return mi.UInt32(aligned(triangles.astype(np.uint32).ravel()))
+
+
+def _mesh(posed: RegionMesh, vertices: slice, faces: slice, without: slice) -> mi.Mesh:
+    """Make a mesh of some of the triangles."""
+    corners, triangles = posed.vertices[vertices], _faces(posed.layout, vertices, faces, without)
+    mesh = mi.Mesh("region", len(corners), len(triangles) // 3)
     params = mi.traverse(mesh)
-    params["faces"] = mi.UInt32(triangles.astype(np.uint32).ravel())
+    params["faces"] = triangles
     params["vertex_positions"] = _floats(corners)
     params.update()
     return mesh

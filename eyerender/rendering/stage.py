@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -11,6 +12,8 @@ import numpy as np
 
 from ..arrays import Bools, frozen
 from ..errors import InputError
+from ..region.anatomy import Region
+from ..region.globe import Globe
 from ..region.mesh import region_mesh
 from ..rig import psf
 from ..rig.camera import Window
@@ -59,7 +62,8 @@ class Stage:
     def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
         self._surround = Surround(obstacles)
         self._textures: dict[Any, Textures] = {}
-        self._regions: dict[Any, RegionScene] = {}
+        self._regions: dict[Any, RegionScene] = {}  # the one that was used last is last
+        self._replaced: deque[Any] = deque(maxlen=_REGIONS)  # subjects whose scenes others took
         self._maps = Maps()
         self.meshes = Meshes()
         self._exchange = Exchange()
@@ -137,15 +141,32 @@ class Stage:
         if self._surround.obstructed:
             raise InputError("obstacles cannot be combined with an eye region")
         globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
-        key = RegionScene.key(job.region, globe)
-        if key not in self._regions:
-            if len(self._regions) >= _REGIONS:
-                self._regions.pop(next(iter(self._regions)))
-            forget()
-            self._regions[key] = place_scene(job.region, globe)
-        place = self._regions[key]
-        place.expected, self._expected = self._expected, None
-        place.show(job.region, globe)
+        expected, self._expected = self._expected, None
+        place = self._region(job.region, globe, expected)
+        place.show(job.region, globe, expected)
+        return place
+
+    def _region(self, spec: Region, globe: Globe, expected: Expected | None) -> RegionScene:
+        """The scene of a subject.
+
+        A subject never seen before takes over that of another one, so recordings last. One that comes back after that
+        gets a scene of its own, because subjects that take turns would else fill one again and again.
+        """
+        key = RegionScene.key(spec, globe)
+        place = self._regions.pop(key, None)
+        if place is None:
+            full, back = len(self._regions) >= _REGIONS, key in self._replaced
+            oldest = next((k for k, kept in self._regions.items() if kept.takes(spec)), None)
+            if oldest is None or (back and not full):
+                if full:
+                    self._regions.pop(next(iter(self._regions)))
+                forget()
+                place = place_scene(spec, globe, expected)
+            else:
+                place = self._regions.pop(oldest)
+                self._replaced.append(oldest)
+                place.fill(spec, globe, expected)
+        self._regions[key] = place
         return place
 
     def _textures_of(self, job: RenderJob) -> Textures:

@@ -128,6 +128,33 @@ def test_two_runs_are_the_same(renderer):
     assert labels_of(a) == labels_of(b)
 
 
+def test_subjects_share_a_scene_and_its_recordings(renderer):
+    """A subject with other numbers of hairs is shown as by a renderer that has seen none before it."""
+    from eyerender.rendering import recorded
+
+    few = {"seed": 2, "lashes": {"upper_count": 70, "lower_count": 20}, "brow": {"count": 150}}
+
+    def jobs(region):
+        s = scene(poses=((4, 2), (-6, 3)), region=region)
+        return [replace(render_job(s.frames(), row), window=(300, 144, 40, 32), labels=False) for row in (0, 1)]
+
+    def pictures(by, region):
+        return [by.render(job, spp=2).irradiance for job in jobs(region)]
+
+    recorded.forget()
+    by = make_renderer("auto", 1)
+    one = pictures(by, {})
+    known = [(variants, key) for variants in recorded._played for key in variants]
+    place = by.bind(jobs({})[0], lit=False)[1]
+    found = pictures(by, few)
+    assert by.bind(jobs(few)[0], lit=False)[1] is place
+    assert known
+    assert all(key in variants for variants, key in known)
+    assert np.array_equal(pictures(by, {}), one)
+    assert by.bind(jobs(few)[0], lit=False)[1] is not by.bind(jobs({})[0], lit=False)[1]  # they take turns
+    assert np.array_equal(pictures(make_renderer("auto", 1), few), found)
+
+
 @pytest.mark.parametrize("place", [(600.0, 0.0, -120.0), (42.0, -38.0, -16.0)])
 def test_tiles_said_to_be_plain_show_nothing_but_skin(renderer, monkeypatch, place):
     """Rays through them meet the sheet, and the picture is what it is without them."""
