@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.spatial import cKDTree
 
-from ..arrays import Floats, Indices, Singles
+from ..arrays import Floats, Singles
 
 _NEGLIGIBLE = 3.0  # times a band's upper end, where its gain is 1e-4
 _BLOCK, _CANDIDATES = 8, 12  # one place in twenty thousand would need more candidates
@@ -122,19 +122,25 @@ class Places:
 
     def __init__(self, size: int, x: NDArray[Any], y: NDArray[Any], period_mm: float) -> None:
         (column, self._du), (row, self._dv) = (self._split(c * np.float32(1 / period_mm), size) for c in (x, y))
-        self._at = row * (size + 2) + column
-        self._below = self._at + (size + 2)
+        self._at, self._width = (row * np.int32(size + 2) + column).astype(np.intp), size + 2
 
     @staticmethod
-    def _split(turns: Singles, size: int) -> tuple[Indices, Singles]:
+    def _split(turns: Singles, size: int) -> tuple[Any, Singles]:
         """Whole and fractional part of coordinates in texels, the whole ones from 0 to `size`."""
-        texels = (turns - np.floor(turns)) * np.float32(size)
-        whole = texels.astype(np.intp)
-        return whole, texels - whole.astype(np.float32)
+        turns -= np.floor(turns)
+        turns *= np.float32(size)
+        whole = turns.astype(np.int32)
+        turns -= whole.astype(np.float32)
+        return whole, turns
 
     def sample(self, tile: Padded) -> Singles:
         """Values of one tile, in the shape of the places."""
-        low, high = tile.pairs.take(self._at), tile.pairs.take(self._below)
+        low = tile.pairs.take(self._at)
         out: Singles = low.real + self._du * low.imag
-        out += self._dv * (high.real + self._du * high.imag - out)
+        tile.pairs[self._width :].take(self._at, out=low, mode="clip")  # without `clip` NumPy makes a copy of `out`
+        below = self._du * low.imag
+        below += low.real
+        below -= out
+        below *= self._dv
+        out += below
         return out

@@ -246,7 +246,7 @@ class _Strip:
         self.near = self.lid * (1 - step(rows, ROWS - 18, ROWS - 8))
         # Coordinate z (mm) straightened so that lines along the lids are level.
         self.level = z + 0.017 * np.minimum(y * y, 480.0) * np.tanh(z * 0.25)
-        self.places = _places(y, z)
+        self.places, self.along = _places(y, z), _places(y, self.level)
         self.within = 1 - step(rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
         # The fold of the plica darkens the conjunctiva towards the caruncle.
         self.flesh = step(np.cos(self.turn).astype(np.float32), 0.60, 0.85) * self.within * step(rows, 0.0, 2.2)
@@ -280,7 +280,7 @@ class _Strip:
         """
         beside = np.exp(-np.square(self.out_mm * (1 / 6.0)))
         near = np.maximum(_bell(self.out_mm, 0.9, 1.7), 0.75 * beside)
-        pools = self.tiles.at(8, _places(self.y, self.level), (10, 30), (18, 50))
+        pools = self.tiles.at(8, self.along, (10, 30), (18, 50))
         return np.asarray(np.clip((pools + 2.1 * near - 1.0) * 0.9, 0, 0.25 + 0.75 * np.sqrt(beside)))
 
     def wet(self) -> Singles:
@@ -326,8 +326,7 @@ class _Strip:
         skin, y, z = self.spec.skin, self.y, self.z
         grain = self.field(3, (60, 200), (60, 200))
         swell = self.field(13, (7, 20), (7, 20))
-        level = _places(y, self.level)
-        along = self.tiles.mixed(level, (1.6, 14, (5, 15), (12, 34)), (0.5, 15, (12, 36), (24, 60)))
+        along = self.tiles.mixed(self.along, (1.6, 14, (5, 15), (12, 34)), (0.5, 15, (12, 36), (24, 60)))
         sway = 0.5 * self.field(12, (0, 10), (0, 10))
         lines = self.tiles.at(11, _places(y, self.level + sway), (0, 6), (22, 60))
         under = _bell(z, -11.0, 6.0) + 0.7 * _bell(z, 8.0, 4.0) + _bell(y, -21.0, 5.0)
