@@ -121,6 +121,7 @@ class Places:
     """Places (x, y) mm on a periodic square, at which any tiles of one size are sampled by linear interpolation."""
 
     def __init__(self, size: int, x: NDArray[Any], y: NDArray[Any], period_mm: float) -> None:
+        self.size = size
         (column, self._du), (row, self._dv) = (self._split(c * np.float32(1 / period_mm), size) for c in (x, y))
         self._at, self._width = (row * np.int32(size + 2) + column).astype(np.intp), size + 2
 

@@ -37,6 +37,7 @@ LASH_U = (0.05, 0.4)  # coordinate u of an upper lash's root, and how far its ti
 _LINE = CONJUNCTIVA + MARGIN - 1  # the lash line's row
 _TILE_MM, _TILE = 24.0, 640
 _COARSE = 8
+_SLOW, _SLOW_TILE = 4, 320  # rows and columns of the map from one place of a slow field to the next; side of its tiles
 _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
 _STEEPEST = 2.0  # slope of the map, over the region's frame; margins are seen from their edges
 _STRIP = 32  # rows of the map that are made together, so that they stay in the processor's cache
@@ -81,11 +82,13 @@ def skin_map(spec: Region) -> Singles:
     y, z, out_mm = (_over_grid(v, rows, columns) for v in (closed[..., 1], closed[..., 2], _from_line(rest)))
     turn = 2 * np.pi * columns / rest.shape[1]
     tiles, spots = _Tiles(spec), _spots(spec.seed, y, z)
+    some = slice(None, None, _SLOW)
+    slow = _Slow(tiles, y[some, some], z[some, some], out_mm[some, some], np.sin(turn[some]) > 0)
     out = np.zeros((SHEET_ROWS + BANDS, _COLUMNS, 4), np.float32)
     height = np.empty((SHEET_ROWS, _COLUMNS), np.float32)
     for first in range(0, SHEET_ROWS, _STRIP):
         k = slice(first, first + _STRIP)
-        strip = _Strip(tiles, y[k], z[k], out_mm[k], rows[k, None].astype(np.float32), turn[None, :])
+        strip = _Strip(tiles, y[k], z[k], out_mm[k], rows[k, None].astype(np.float32), turn[None, :], slow, k)
         out[k, :, 0], out[k, :, 3], height[k] = strip.look(spots[k])
     _slopes(height, y, z, out[:SHEET_ROWS, :, 1:3])
     _normalise(out[:SHEET_ROWS, :, 0], y, z, rows, spec.skin.albedo)
@@ -184,10 +187,11 @@ class _Tiles:
 
     def mixed(self, places: Places, *parts: tuple[float, int, tuple[float, float], tuple[float, float]]) -> Singles:
         """Values of a sum of bands of noise at places, each with a factor."""
-        if parts not in self._made:
-            bands = [factor * band(self.spec.seed + number, _TILE, *ends) for factor, number, *ends in parts]
-            self._made[parts] = Padded(np.sum(bands, axis=0, dtype=np.float32))
-        return places.sample(self._made[parts])
+        key = places.size, *parts
+        if key not in self._made:
+            bands = [factor * band(self.spec.seed + number, places.size, *ends) for factor, number, *ends in parts]
+            self._made[key] = Padded(np.sum(bands, axis=0, dtype=np.float32))
+        return places.sample(self._made[key])
 
     @cached_property
     def net(self) -> Padded:
@@ -214,8 +218,71 @@ class _Tiles:
         return low.astype(np.float32), (high - low).astype(np.float32)
 
 
-def _places(y: NDArray[Any], z: NDArray[Any]) -> Places:
-    return Places(_TILE, y, z, 2 * _TILE_MM)
+def _places(y: NDArray[Any], z: NDArray[Any], size: int = _TILE) -> Places:
+    return Places(size, y, z, 2 * _TILE_MM)
+
+
+class _Slow:
+    """Fields that change slowly, made at every fourth row and column of the map, and interpolated linearly between.
+
+    Args:
+        tiles: the subject's noise.
+        y: place in the region's frame, mm, at these rows and columns.
+        z: the same.
+        out_mm: distance over the sheet from the lash line.
+        upper: whether a column is above the fissure.
+    """
+
+    def __init__(self, tiles: _Tiles, y: Singles, z: Singles, out_mm: Singles, upper: Bools) -> None:
+        skin, places = tiles.spec.skin, _places(y, z, _SLOW_TILE)
+
+        def of_lids(number: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
+            """Noise over the lids, of its own on each."""
+            out = np.empty_like(y)
+            for side, mine in enumerate((upper, ~upper)):
+                at = _places(y[:, mine], out_mm[:, mine], _SLOW_TILE)
+                out[:, mine] = tiles.at(number + side, at, across, up)
+            return out
+
+        # The hollow beside the nose and the rim below the lower lid are a little darker.
+        shade = 1 - 0.20 * _bell(y, 15.5, 5.5) * _bell(z, 5.0, 8.0)
+        shade *= 1 - 0.06 * _bell(z, -12.0, 5.0) * _bell(y, 4.0, 14.0)
+        shade *= 1 - _hollows(tiles.hollows, y, z)
+        under = _bell(z, -11.0, 6.0) + 0.7 * _bell(z, 8.0, 4.0) + _bell(y, -21.0, 5.0)
+        fields = {
+            "shade": shade,
+            "lines": 0.025 * skin.wrinkles * _hill(y, z, 26.0, 20.0) * under,
+            "film": 0.55 + 0.2 * tiles.at(5, places, (0, 8), (0, 8)),
+            "sway": 0.5 * tiles.at(12, places, (0, 10), (0, 10)),
+            "pores": np.maximum(0.55 + 0.25 * tiles.at(42, places, (0, 5), (0, 5)), 0.1),
+            "bent": 0.25 * of_lids(31, (0, 9), (0, 6)),
+            "wide": step(of_lids(37, (1, 7), (4, 16)), -0.7, 1.6),
+            "fine": step(of_lids(39, (2, 12), (6, 22)), -0.9, 1.0),
+            "way": 2.0 * tiles.at(51, places, (0, 4), (0, 4)),
+            "veins": step(tiles.at(54, places, (0, 5), (0, 5)), -0.6, 0.9) * _hill(y, z, 22.0, 17.0),
+        }
+        # The last rows are continued, and the columns close.
+        self._fields = {
+            name: np.pad(np.pad(field, ((0, 1), (0, 0)), "edge"), ((0, 0), (0, 1)), "wrap")
+            for name, field in fields.items()
+        }
+
+    def at(self, name: str, rows: slice) -> Singles:
+        """Values of a field in rows of the map, from a multiple of `_SLOW` to another one."""
+        known = self._fields[name][rows.start // _SLOW : rows.stop // _SLOW + 1]
+        part = (np.arange(_SLOW, dtype=np.float32) / _SLOW)[:, None]
+        down = (known[:-1, None] + part * np.diff(known, axis=0)[:, None]).reshape(-1, known.shape[1])
+        left, steps = down[:, :-1], np.diff(down, axis=1)
+        out: Singles = np.empty((len(down), left.shape[1], _SLOW), np.float32)
+        for k in range(_SLOW):
+            out[..., k] = left + np.float32(k / _SLOW) * steps
+        return out.reshape(len(down), -1)
+
+
+def _hollows(behind: Padded, y: Singles, z: Singles) -> Singles:
+    """Loss of light, -0.05 to 0.25, where the face is hollow."""
+    y, z = (np.clip(v + 76.0, 0, 151.999) for v in (y, z))
+    return np.asarray(np.clip(0.05 * Places(153, y, z, 153.0).sample(behind), -0.05, 0.25))
 
 
 @dataclass
@@ -229,6 +296,8 @@ class _Strip:
         out_mm: distance over the sheet from the lash line.
         rows: row of the sheet, (rows, 1).
         turn: angle about the fissure, (1, columns).
+        slow: the fields that change slowly.
+        strip: the rows of the map.
     """
 
     tiles: _Tiles
@@ -237,6 +306,8 @@ class _Strip:
     out_mm: Singles
     rows: Singles
     turn: Singles
+    slow: _Slow
+    strip: slice
 
     def __post_init__(self) -> None:
         rows, y, z = self.rows, self.y, self.z
@@ -256,6 +327,10 @@ class _Strip:
         """Band of noise at the places of the strip."""
         return self.tiles.at(number, self.places, across, up)
 
+    def slowly(self, name: str) -> Singles:
+        """Values of a slow field."""
+        return self.slow.at(name, self.strip)
+
     def look(self, spots: Singles) -> tuple[Singles, Singles, Singles]:
         """Albedo, gloss and height (mm) of the relief; `spots` is the light that the freckles leave."""
         spec = self.spec
@@ -268,8 +343,8 @@ class _Strip:
             height = height + bumps * self.flesh * self.field(6, (10, 36), (10, 36))
         # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
         open_ = 1 + 0.10 * (cells - 0.5) - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
-        film = 0.55 + 0.2 * self.field(5, (0, 8), (0, 8))
-        sheen = spec.skin.sheen * np.clip(0.42 * film * (0.4 + 0.6 * cells) * (1 - pores) + oil, 0.04, 0.9)
+        film = 0.42 * self.slowly("film") * (0.4 + 0.6 * cells) * (1 - pores)
+        sheen = spec.skin.sheen * np.clip(film + oil, 0.04, 0.9)
         gloss = np.where(wet > 0, wet, np.minimum(sheen, 0.49) * self.lid)
         return self.albedo(open_, spots), gloss, height
 
@@ -323,17 +398,14 @@ class _Strip:
 
         The lines run along the lids and, at the temple, away from the canthus.
         """
-        skin, y, z = self.spec.skin, self.y, self.z
+        skin, y = self.spec.skin, self.y
         grain = self.field(3, (60, 200), (60, 200))
-        swell = self.field(13, (7, 20), (7, 20))
         along = self.tiles.mixed(self.along, (1.6, 14, (5, 15), (12, 34)), (0.5, 15, (12, 36), (24, 60)))
-        sway = 0.5 * self.field(12, (0, 10), (0, 10))
-        lines = self.tiles.at(11, _places(y, self.level + sway), (0, 6), (22, 60))
-        under = _bell(z, -11.0, 6.0) + 0.7 * _bell(z, 8.0, 4.0) + _bell(y, -21.0, 5.0)
-        amount = 0.025 * skin.wrinkles * _hill(y, z, 26.0, 20.0) * under
+        swell = self.field(13, (7, 20), (7, 20))
+        lines = self.tiles.at(11, _places(y, self.level + self.slowly("sway")), (0, 6), (22, 60))
         fine = (1 - 0.85 * oil) * (cells + 0.03 * grain)
         height = skin.relief_mm * (fine + 1.3 * swell + along)
-        return np.asarray(height - (1 - 0.7 * oil) * amount * np.abs(lines))
+        return np.asarray(height - (1 - 0.7 * oil) * self.slowly("lines") * np.abs(lines))
 
     def creases(self) -> Singles:
         """Depth, 0 to about 1, of the creases of the lids' thin skin.
@@ -345,25 +417,25 @@ class _Strip:
         reach = step(out_mm, 0.4, 2.0) * np.exp(-np.square(np.maximum(out_mm - 7.0, 0) * 0.2))
         reach = reach * step(np.abs(self.upper), 0.05, 0.5) * np.exp(-((np.square(y * (1 / 21.0))) ** 3))
         depth = np.zeros_like(y)
+        if not np.any(reach > 1e-3):
+            return depth
+        sway, some, less = (self.slowly(name) for name in ("bent", "wide", "fine"))
         for side in (0, 1):
             mine = (reach > 1e-3) & ((self.upper > 0) == (side == 0))
             if not np.any(mine):
                 continue
             at, v = y[mine], out_mm[mine]
-            straight = _places(at, v)
-            bent = _places(at, v + 0.25 * tiles.at(31 + side, straight, (0, 9), (0, 6)))
+            bent = _places(at, v + sway[mine])
             wide = _bell(tiles.at(33 + side, bent, (0, 1.6), (10, 26)), 0.0, 0.20)
             fine = _bell(tiles.at(35 + side, bent, (0, 4.5), (30, 72)), 0.0, 0.30)
-            some = step(tiles.at(37 + side, straight, (1, 7), (4, 16)), -0.7, 1.6)
-            less = step(tiles.at(39 + side, straight, (2, 12), (6, 22)), -0.9, 1.0)
-            depth[mine] = reach[mine] * (0.75 * wide * some + 0.5 * fine * less)
+            depth[mine] = reach[mine] * (0.75 * wide * some[mine] + 0.5 * fine * less[mine])
         return depth
 
     def pores(self) -> Singles:
         """Pits, 0 to 1, a third of a millimetre wide, on cheek, nose and forehead; the lids have almost none."""
         spots = np.maximum(self.field(41, (20, 42), (20, 42)) - 1.25, 0.0)
-        much = (0.55 + 0.25 * self.field(42, (0, 5), (0, 5))) * (1 - 0.9 * self.lids)
-        return np.asarray(self.spec.skin.pores * np.clip(1.7 * spots * np.maximum(much, 0.1), 0, 1))
+        much = np.maximum(self.slowly("pores") * (1 - 0.9 * self.lids), 0.1)
+        return np.asarray(self.spec.skin.pores * np.clip(1.7 * spots * much, 0, 1))
 
     def under_brow(self) -> Singles:
         """Loss of light between the brow's hairs, and in the points of short ones below it and between the brows."""
@@ -387,42 +459,33 @@ class _Strip:
         out[inside] = min(self.spec.brow.count / 470, 1.0) * np.clip(0.16 * hairs + 0.30 * short * points, 0, 0.5)
         return out
 
-    def hollows(self) -> Singles:
-        """Loss of light, -0.05 to 0.25, where the face is hollow."""
-        y, z = (np.clip(v + 76.0, 0, 151.999) for v in (self.y, self.z))
-        behind = Places(153, y, z, 153.0).sample(self.tiles.hollows)
-        return np.asarray(np.clip(0.05 * behind, -0.05, 0.25))
-
     def veins(self) -> Singles:
         """Loss of light, 0 to about 0.2, over the veins under the lids' skin: broad, blurred and scattered."""
-        tiles, lids = self.tiles, _hill(self.y, self.z, 22.0, 17.0)
+        tiles, where = self.tiles, self.slowly("veins")
         out: Singles = np.zeros_like(self.y)
-        some = lids > 1e-2
+        some = where > 1e-3
         if not np.any(some):
             return out
         y, z = self.y[some], self.z[some]
-        straight = _places(y, z)
-        way = z + 2.0 * tiles.at(51, straight, (0, 4), (0, 4))
+        way = z + self.slowly("way")[some]
         bent = _places(y + 0.6 * way, 1.3 * way)
         course = _bell(tiles.at(52, bent, (0, 5), (0, 8)), 0.0, 0.13)
         thin = _bell(tiles.at(53, _places(y, way), (2, 9), (2, 9)), 0.0, 0.11)
-        where = step(tiles.at(54, straight, (0, 5), (0, 5)), -0.6, 0.9) * lids[some]
-        out[some] = where * (0.17 * course + 0.09 * thin)
+        out[some] = where[some] * (0.17 * course + 0.09 * thin)
         return out
 
     def albedo(self, open_: Singles, spots: Singles) -> Singles:
         """Diffuse reflectance; `open_` is the light that leaves the furrows."""
-        skin, y, z, rows, upper = self.spec.skin, self.y, self.z, self.rows, self.upper
+        skin, rows, upper = self.spec.skin, self.rows, self.upper
         slow, blotch, fine = ((c, c) for c in ((0, 4), (3, 22), (70, 260)))
         mottled = self.tiles.mixed(self.places, (0.06, 21, *slow), (0.026, 22, *blotch), (0.155, 23, *fine))
         tone = (1 + skin.mottling * mottled) * open_
         tone *= 1 - skin.veins * self.veins()
-        # The hollow beside the nose and the rim below the lower lid are a little darker, the lash line more so.
-        tone *= 1 - 0.20 * _bell(y, 15.5, 5.5) * _bell(z, 5.0, 8.0)
-        tone *= 1 - 0.06 * _bell(z, -12.0, 5.0) * _bell(y, 4.0, 14.0)
+        tone *= self.slowly("shade")
+        # The lash line is darker.
         tone *= 1 - 0.34 * _bell(rows, _LINE, 2.6) * np.abs(upper)
         tone *= 1 - 0.06 * step(rows, CONJUNCTIVA + MARGIN, CONJUNCTIVA + MARGIN + LID) * self.near * (upper > 0)
-        tone *= (1 - self.under_brow()) * (1 - self.hollows())
+        tone *= 1 - self.under_brow()
         # In the crease, skin lies against skin.
         tone *= 1 - 0.12 * _bell(rows, CONJUNCTIVA + MARGIN + LID - 0.7, 0.9) * step(upper, 0.12, 0.75)
         outer = skin.albedo * tone * spots
