@@ -460,6 +460,7 @@ class Bench:
             "headset": (self._scene_job("headset", 4), 4),
             "desktop window": (self._scene_job("desktop_tracker", 0), 4),
             "full-frame bare E2": (self._full_frame("E2"), 16),
+            "bare window 100x100": (self._small_window(), 16),
         }
         threads = dr.thread_count()
         if self.backend.name == "llvm":
@@ -632,6 +633,20 @@ class Bench:
         wall, cpu = 1e3 * np.median(times, axis=0)
         yield row("fixed cost of a frame, CPU (median of 60)", cpu, "ms", 15)
         yield row("fixed cost of a frame, wall (median of 60)", wall, "ms")
+        small = self._small_window()
+
+        def run() -> None:
+            for made in [self.renderer.begin(self._turned(small, k)) for k in range(count)]:
+                made.result()
+
+        count = 20 if self.small else 60
+        run()
+        yield row("bare windows 100x100, 1 LED, 16 spp, labels, in a run", count / cpu_of(run, 3)[0], "per CPU s")
+
+    def _small_window(self) -> Any:
+        """Job of a bare eye in a window of 100 x 100 px of a remote camera."""
+        rig = self.rigs.remote_rig()
+        return self.rigs.job_of(self.rigs.eye_of("E2"), rig, rig.window(100, 100))
 
     def memory(self) -> Iterable[Row]:
         """Growth of the resident memory between two frames, everything varied."""

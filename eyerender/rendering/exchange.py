@@ -63,7 +63,7 @@ from .places import (
     skin_places,
 )
 from .recorded import recorded
-from .values import aligned
+from .values import aligned, one_by_one
 from .view import Textures, appearance, iris_albedo, meet, outer_albedo
 
 if TYPE_CHECKING:
@@ -120,10 +120,7 @@ class Received:
         self._between = globe.columns == GLOBE_COLUMNS
         self._columns, self._rows = globe.columns, globe.rows
         numbers = np.concatenate([globe.table, [chamber.root_mm**2, chamber.reach_mm**2], plane])
-        buffer = _sent(numbers)
-        tail = range(numbers.size - 5, numbers.size)
-        n = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in (*range(5), *tail)]
-        dr.eval(n)
+        n = one_by_one(np.append(numbers[:5], numbers[-5:]).astype(np.float32))
         self._centre, self._first, self._per_mm = mi.Vector3f(*n[:3]), n[3], n[4]
         self._root2, self._reach2, self._plane = n[5], n[6], n[7:]
         self._ends = _sent(globe.table[5:])
@@ -236,6 +233,8 @@ class _Seen:
 
     def correction(self, direct: Floats) -> Floats:
         """What the lamps' light at the points that are met adds to that of the places there, `direct`."""
+        if not np.any(self.lit >= 0):
+            return np.zeros(len(self.first))
         more = self.lit - direct[np.minimum(self.target, len(direct) - 1)]
         return self.mean(self.weight * np.where(self.lit >= 0, more, 0))
 

@@ -14,8 +14,10 @@ from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..rig.camera import Window
 from .film import Exposed, pixels_of
 from .lighting import lamp_blocked, straight
+from .recorded import recorded
 from .region import glossy_normal
 from .sampling import camera_ray
+from .values import Values
 from .view import View, hidden, look, meet, meet_globe, outer_albedo
 from .water import on_water
 
@@ -48,15 +50,28 @@ class PartLabels(ArrayValue):
 
 def part_labels(shown: Exposed, window: Window) -> PartLabels:
     """Compute the labels of a window. Rays that miss the globe are not traced."""
-    o, d = _centre_rays(shown, window)
-    alone = meet_globe(shown.values, o, d)
+    corner, width = (dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])), dr.opaque(mi.UInt32, window[2])
+    found = _parts(shown.values, shown.scene, corner, width, window[2] * window[3])
+    shape = (window[3], window[2])
+    return PartLabels(*(frozen(x.numpy().reshape(shape), np.uint8) for x in found))
+
+
+@recorded
+def _parts(
+    values: Values, scene: mi.Scene, corner: tuple[mi.Int32, mi.Int32], width: mi.UInt32, pixels: int
+) -> tuple[mi.UInt8, mi.UInt8]:
+    """What the centres of pixels show, with and without occluders."""
+    pixel = dr.arange(mi.UInt32, pixels)
+    row = pixel // width
+    u, v = mi.Int32(pixel - row * width) + corner[0], mi.Int32(row) + corner[1]
+    o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
+    alone = meet_globe(values, o, d)
     clear = alone.cornea & (alone.opacity < 0.5)
     inside = dr.select(alone.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
     amodal = dr.select(clear, inside, dr.select(alone.cornea | alone.sclera, mi.UInt8(SCLERA), mi.UInt8(BACKGROUND)))
-    part = dr.select(hidden(shown.values, shown.scene, alone, o, d), mi.UInt8(BACKGROUND), amodal)
+    part = dr.select(hidden(values, scene, alone, o, d), mi.UInt8(BACKGROUND), amodal)
     dr.eval(amodal, part)
-    shape = (window[3], window[2])
-    return PartLabels(*(frozen(x.numpy().reshape(shape), np.uint8) for x in (part, amodal)))
+    return part, amodal
 
 
 def highlights(shown: Exposed, window: Window) -> Bools:

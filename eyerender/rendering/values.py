@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .parameters import Kind, Parameters, leaves, packed, rebuilt
+from .recorded import recorded
 from .surfaces import Surface
 
 if TYPE_CHECKING:
@@ -41,6 +42,19 @@ def aligned(values: NDArray[Any]) -> NDArray[Any]:
     copy = memory[start : start + values.nbytes].view(values.dtype).reshape(values.shape)
     copy[...] = values
     return copy
+
+
+def one_by_one(numbers: NDArray[np.float32]) -> list[mi.Float]:
+    """Send numbers to the device as arrays of size one, in one transfer and one kernel."""
+    return _apart(mi.Float(aligned(numbers)), dr.opaque(mi.UInt32, 0), numbers.size)
+
+
+@recorded
+def _apart(buffer: mi.Float, first: mi.UInt32, count: int) -> list[mi.Float]:
+    # Places that are known when a kernel is compiled would be copied one by one.
+    numbers = [dr.gather(mi.Float, buffer, first + k) for k in range(count)]
+    dr.eval(numbers)
+    return numbers
 
 
 def quotient(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
@@ -80,11 +94,7 @@ class Values:
         waves: np.ndarray[Any, np.dtype[np.float64]],
         tables: Sequence[NDArray[np.float32] | None],
     ) -> None:
-        numbers = packed(parameters)
-        buffer = mi.Float(aligned(numbers))
-        scalars = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in range(numbers.size)]
-        dr.eval(scalars)
-        left = iter(scalars)
+        left = iter(one_by_one(packed(parameters)))
 
         def leaf(size: int) -> mi.Float | mi.Vector3f | tuple[mi.Float, ...]:
             part = [next(left) for _ in range(size)]
