@@ -606,14 +606,16 @@ def _nearest(image, x, y):
 
 @compiled
 def at_the_iris(smooth, points, normals, depth, limits):
-    dark, bright, rise = limits
+    pupil, dark, iris, clear, bright, rise = limits
     out = np.empty(points.shape[0], dtype=np.bool_)
     for i in range(out.size):
         x, y, u, v = points[i, 0], points[i, 1], depth * normals[i, 0], depth * normals[i, 1]
+        behind, ahead = _nearest(smooth, x - u, y - v), _nearest(smooth, x + u, y + v)
+        mirrored = behind - pupil >= dark and behind - pupil < iris and ahead - behind > clear
         out[i] = (
-            _nearest(smooth, x - u, y - v) < dark
-            and _nearest(smooth, x + 0.5 * u, y + 0.5 * v) < bright
-            and _nearest(smooth, x + 1.5 * u, y + 1.5 * v) - _nearest(smooth, x + u, y + v) < rise
+            (behind - pupil < dark or mirrored)
+            and _nearest(smooth, x + 0.5 * u, y + 0.5 * v) - (behind if mirrored else pupil) < bright
+            and _nearest(smooth, x + 1.5 * u, y + 1.5 * v) - ahead < rise
         )
     return out
 

@@ -22,6 +22,9 @@ DARK, BRIGHT = 0.5, 1.5
 # By how much the level may still rise, in steps, half as far again: it goes on rising in the shadow of a lid and at its
 # margin. Of nine properties of edge points, this one tells best which lie beside the outline (rendered eyes in lids).
 RISE = 0.2
+# By how much an edge inside a mirrored window rises, in steps. Behind the window's light there is the whole step, while
+# texture and shadows have less. (0.5 adds edges in the irises of recorded frames.)
+MIRRORED = 0.7
 # A ridge is too weak below this share of a strong one's slope. The pupil's edge has a third of its step in the shadow
 # of a lid. (0.1 gives the same answers on rendered eyes in lids, 0.35 loses one in twelve of `stress`.)
 WEAK = 0.2
@@ -67,7 +70,8 @@ def find_edges(
     """Find edge points within `band` times the semi-axes of the candidate's outline (and at least 4 px).
 
     A gradient ridge is kept if it points outward (within 45 deg of the candidate's normal), exceeds the noise, and has
-    dark pupil behind it and an iris ahead: nothing as bright as skin or the sclera, nor a level that keeps rising.
+    dark pupil behind it and an iris ahead: nothing as bright as skin or the sclera, nor a level that keeps rising. A
+    window that the cornea mirrors adds its light to both.
 
     The sub-pixel position, along the gradient's larger component, is the vertex of the parabola through the logarithms
     of three magnitudes. It is exact for a Gaussian-blurred straight edge. Source: Devernay (1995), with the logarithm.
@@ -101,7 +105,7 @@ def find_edges(
     noise_smooth = noise_dn / (2.0 * math.sqrt(math.pi) * max(0.7, 0.7 * sigma))
     step, error = candidate.step_dn, 4.0 * noise_smooth
     dark, bright, rise = max(DARK * step, error), max(BRIGHT * step, step + error), max(RISE * step, error)
-    limits = (candidate.inside_dn + dark, candidate.inside_dn + bright, rise)
+    limits = (candidate.inside_dn, dark, step, max(MIRRORED * step, error), bright, rise)
     keep = _at_the_iris(smooth, points, normals, depth, limits)
     spread = sigma * 1.1
     if keep.sum() >= 8:
@@ -152,16 +156,21 @@ def _ridges(
 
 
 @twin
-def _at_the_iris(
-    smooth: Image, points: Floats, normals: Floats, depth: float, limits: tuple[float, float, float]
-) -> Bools:
+def _at_the_iris(smooth: Image, points: Floats, normals: Floats, depth: float, limits: tuple[float, ...]) -> Bools:
     """Whether there is pupil behind points and iris ahead of them.
 
-    The level `depth` px behind is below the first of the limits, and that half as far ahead below the second one. From
-    `depth` px ahead to half as far again, the level rises by less than the third one.
+    The limits are the pupil's level and, above it, the dark one, an iris' level, the rise at an edge inside a mirrored
+    window, the bright one, and the rise farther ahead. The level `depth` px behind is dark. Or it is darker than an
+    iris, and the level `depth` px ahead exceeds it by the rise inside a window, whose light then counts as the pupil's.
+    The level half as far ahead is not bright. From `depth` px ahead to half as far again, the level rises by less than
+    the last limit.
     """
+    pupil, dark, iris, clear, bright, rise = limits
     behind, near, ahead, far = (_nearest(smooth, points + away * depth * normals) for away in (-1.0, 0.5, 1.0, 1.5))
-    return np.asarray((behind < limits[0]) & (near < limits[1]) & (far - ahead < limits[2]))
+    above = behind - np.float32(pupil)
+    mirrored = (above >= dark) & (above < iris) & (ahead - behind > clear)
+    base = np.where(mirrored, behind, np.float32(pupil))
+    return np.asarray(((above < dark) | mirrored) & (near - base < bright) & (far - ahead < rise))
 
 
 def filter_sigma(step_dn: float, noise_dn: float, b: float) -> float:
