@@ -41,6 +41,7 @@ _WEAK, _FEW = 0.25, 4  # of the rays of which the cornea mirrors less, one of fo
 _ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find
 _STEPS = 20  # crossings and mirrorings of a ray
 _NEAR_MM = 1e-6
+_AHEAD_MM = 1e-4  # hits are looked for from here on: a root cannot be computed from a point of the surface itself
 _BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
 _WALL_MM = 1.0  # thickness of the sclera
 
@@ -324,9 +325,10 @@ def _traced(walls: _Walls, o: Floats, d: Floats, layer: Ints) -> _Arrived:
         wall = np.where(rays.layer == walls.layer, walls.to_wall(rays.o, rays.d), np.inf)
         nearest = np.minimum(np.minimum(plane, wall), np.minimum(outer, inner))
         known = np.isfinite(nearest)
-        arrives = known & (nearest == np.minimum(plane, wall))
+        # Where the rim of a tilted cornea is above the wall's edge, rays pass between them: they meet the wall there.
+        arrives = ~known | (nearest == np.minimum(plane, wall))
         at = rays.o + np.where(known, nearest, 0)[:, None] * rays.d
-        ends.append((rays.number[arrives], rays.weight[arrives], at[arrives], (wall < plane)[arrives]))
+        ends.append((rays.number[arrives], rays.weight[arrives], at[arrives], (~known | (wall < plane))[arrives]))
         rays.o = at
         known &= ~arrives
         outwards = nearest == outer
@@ -357,8 +359,8 @@ def _to_surfaces(walls: _Walls, rays: _Rays) -> tuple[Floats, Floats]:
             t[(np.hypot(local[:, 1], local[:, 2]) > walls.limbus) | (hit[:, 0] < walls.top - 1e-6)] = np.inf
         outer[here] = t
         here = rays.layer == k
-        hit = surface.hit(components(rays.o[here]), components(rays.d[here]), True)
-        inner[here] = np.where(hit.ok & (hit.distance > _NEAR_MM), hit.distance, np.inf)
+        hit = surface.hit(components(rays.o[here] + _AHEAD_MM * rays.d[here]), components(rays.d[here]), True)
+        inner[here] = np.where(hit.ok & (hit.distance > 0), hit.distance + _AHEAD_MM, np.inf)
     return outer, inner
 
 
@@ -398,8 +400,8 @@ def _crossed(walls: _Walls, rays: _Rays, k: int, *, outwards: bool) -> _Rays:
 
 def _outward(surface: Surface, o: Floats, d: Floats) -> Floats:
     """Distance (n,) to a surface from inside, infinite where it is not met."""
-    hit = surface.hit(components(o), components(d), False)
-    return np.where(hit.ok & (hit.distance > _NEAR_MM), hit.distance, np.inf)
+    hit = surface.hit(components(o + _AHEAD_MM * d), components(d), False)
+    return np.where(hit.ok & (hit.distance > 0), hit.distance + _AHEAD_MM, np.inf)
 
 
 def _refracted(d: Floats, n: Floats, eta: float) -> Floats:

@@ -80,11 +80,9 @@ CASES: dict[str, tuple[str, Callable[[int], Camera], int, int, list[list[float]]
     "region E4 head-mounted": ("E4", head, 96, 3, LOW, {"region": REGION}),
 }
 IRIS_PATHS = 5e7
-# Known differences: by how much we are too dark. Traced rays give the first: lamps by way of the cornea's front, which
-# mirrors them from inside. The causes of the others are not found.
+# Known differences: by how much we are too dark. Their causes are not found.
 DARK = {
-    ("eye E4 head-mounted", "outer iris"): 0.007,
-    ("region E4 head-mounted", "outer iris"): 0.026,
+    ("region E4 head-mounted", "outer iris"): 0.016,
     ("region E4 head-mounted", "other"): -0.006,
 }
 

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from eyerender.eye.meshes import chamber_rim
 from eyerender.imagefolder import IRIS
+from eyerender.rendering.chamber import IRIS as PLANE
 from eyerender.rendering.chamber import TURNS, chamber_of, through_limbus
 from tests.support.render_rigs import BLACK, PLAIN, eye_of, head_rig, job_of, remote_rig
 
@@ -47,6 +48,24 @@ def test_the_rim_is_lit_all_around(renderer, model):
     # its own shadow is five to fifty times too dark.
     ratio = seen.ravel()[lit] / expected[lit]
     assert np.all(np.abs(ratio - 1) < 0.3)
+
+
+@pytest.mark.parametrize("model", ["E1", "E2", "E3", "E4", "E5"])
+def test_all_light_of_the_chamber_arrives_or_leaves(model):
+    # Without absorption. Weights are those of radiance, which changes with the square of the index.
+    eye = eye_of(model)
+    chamber = chamber_of(eye, 1.3314)
+    index = np.asarray(eye.front_indices, dtype=float)
+    beside_wall = index[0] if len(index) > 1 else index[-1]
+    away = chamber.leaving[..., 6].mean(axis=1) / index[-1] ** 2
+    plane, wall = chamber.exchange[:, :PLANE].sum(axis=1), chamber.exchange[:, PLANE:].sum(axis=1)
+    share = plane + wall * (beside_wall / index[-1]) ** 2 + away
+    share[PLANE:] *= (index[-1] / beside_wall) ** 2
+    # A ray that is mirrored in part and leaves the next time is not followed out, and 256 rays have some noise.
+    assert share[:PLANE][chamber.valid[:PLANE]].mean() == pytest.approx(1, abs=3e-3)
+    assert share[PLANE:][chamber.valid[PLANE:]].mean() == pytest.approx(1, abs=3e-3)
+    edge = slice(PLANE - 3 * TURNS, PLANE)
+    assert share[edge][chamber.valid[edge]].mean() == pytest.approx(1, abs=0.01)
 
 
 def test_light_through_the_rim_reaches_the_places_of_the_chamber_as_traced_rays_say():
