@@ -208,7 +208,9 @@ def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...
         M, t = rigid_motion(Poses.listing([azimuth], [elevation]), middle.eye)
         apex = middle.anchor_mm + np.array(motion.head_mm_s) * time_s
         seed = int(np.random.SeedSequence([middle.seed, k]).generate_state(1, np.uint64)[0])
-        out.append(replace(middle, M=M[0], t=t[0] + apex, apex_mm=apex, seed=seed, labels=False))
+        # At the middle, the job itself: the renderer sees that it need not be set up again.
+        moved = {"M": M[0], "t": t[0] + apex, "apex_mm": apex} if time_s else {}
+        out.append(replace(middle, **moved, seed=seed, labels=False))
     return tuple(out)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -85,6 +85,7 @@ class Renderer:
         blur: Blur | None = None
         front = None if job.mesh_edge_mm is None else self._stage.meshes.of(job.eye, job.mesh_edge_mm)[0]
         pictures, glints, failed = [], np.zeros((job.window[3], job.window[2])), 0
+        marks: tuple[Any, ...] | None = None
         for shot in shots:
             shown, place = self.bind(shot)
             if after is not None and shot is shots[-1] and not moments:
@@ -94,13 +95,13 @@ class Renderer:
             pictures.append(picture)
             mirrored = add_glints(shot, place, glints, blur, front)
             failed += missed
+            if shot.M is job.M and shot.t is job.t:
+                marks = mirrored, *_marks(job, shown, place)
         assert blur is not None
-        if moments:
-            shown, place = self.bind(job)
-            mirrored = add_glints(job, place, np.zeros_like(glints), blur, front)
-        margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
-        labels = part_labels(shown, job.window) if job.labels else None
-        bright = highlights(shown, job.window) if job.highlights else None
+        if marks is None:  # no moment is the middle of the exposure
+            shown, place = self.bind(job, lit=False)
+            marks = add_glints(job, place, np.zeros_like(glints), blur, front), *_marks(job, shown, place)
+        mirrored, labels, margins, bright = marks
         radiance = pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0)
         return Traced(job, radiance, glints / len(shots), blur, mirrored, labels, failed, margins, bright)
 
@@ -144,3 +145,10 @@ class Renderer:
         It is valid until the next call. `lit`: whether radiance is wanted, not only what is seen where.
         """
         return self._stage.set(job, lit=lit)
+
+
+def _marks(job: RenderJob, shown: Exposed, place: Surround | RegionScene) -> tuple[Any, ...]:
+    """Labels, margins of the lids (px) and highlights of a window, as far as they are wanted."""
+    labels = part_labels(shown, job.window) if job.labels else None
+    margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
+    return labels, margins, highlights(shown, job.window) if job.highlights else None
