@@ -40,7 +40,7 @@ from .shard import (
 from .spec import DatasetSpec
 from .worker import Job
 
-MEMORY_A_WORKER = 0.8e9  # bytes, measured resident size with head-room
+MEMORY_A_WORKER = 0.9e9  # bytes, measured resident size with head-room
 
 
 class Engine(Protocol):

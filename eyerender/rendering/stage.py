@@ -8,6 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from ..arrays import Bools, frozen
@@ -52,6 +53,7 @@ from .values import Lights, Structure, Values
 from .view import Textures
 
 _REGIONS, _TEXTURES = 4, 8  # kept
+_REMEMBERED = 32  # subjects; then recordings are made anew, because those of sizes that never come back take 3 MB each
 _FARTHEST_MM = 60.0  # of places in the plane of a surround that have a grid
 _NOTHING_PLAIN = frozen(np.zeros((1, 1)), np.bool_)
 
@@ -63,6 +65,7 @@ class Stage:
         self._surround = Surround(obstacles)
         self._textures: dict[Any, Textures] = {}
         self._regions: dict[Any, RegionScene] = {}  # the one that was used last is last
+        self._filled = 0
         self._replaced: deque[Any] = deque(maxlen=_REGIONS)  # subjects whose scenes others took
         self._maps = Maps()
         self.meshes = Meshes()
@@ -165,6 +168,10 @@ class Stage:
             else:
                 place = self._regions.pop(oldest)
                 self._replaced.append(oldest)
+                self._filled += 1
+                if self._filled % _REMEMBERED == 0:
+                    forget()
+                    dr.flush_malloc_cache()
                 place.fill(spec, globe, expected)
         self._regions[key] = place
         return place
