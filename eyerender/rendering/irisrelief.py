@@ -131,13 +131,17 @@ class IrisRelief:
         shape = self._shapes.get(
             job.eye,
             (self._side, job.look.iris_seed, job.look.iris),
-            lambda: Shape(*self._shape(self._values, self._textures.heights, cells, blocks, about)),
+            lambda: Shape(
+                *self._shape(self._values, self._textures.heights, cells, blocks, dr.opaque(mi.UInt32, about))
+            ),
         )
         self._shades = self._shaded(self._values, self._lights, self._scene, shape, cells, lanes)
         self._heights = shape.corners
 
     @recorded
-    def _shape(self, values: Values, pattern: mi.Texture2f, cells: int, blocks: int, about: int) -> tuple[Any, ...]:
+    def _shape(
+        self, values: Values, pattern: mi.Texture2f, cells: int, blocks: int, about: mi.UInt32
+    ) -> tuple[Any, ...]:
         """The fields of a `Shape` with so many cells; `blocks` across, of which so many are `about` each."""
         column, row = self._cells(cells)
         heights = iris_height(values, pattern, self._place(mi.Float(column), mi.Float(row), self._count))
@@ -156,18 +160,24 @@ class IrisRelief:
         dr.eval(hu, hv, corners)
         steepest, highest = dr.max(dr.sqrt(hu * hu + hv * hv)), dr.max(heights)
         index = dr.arange(mi.UInt32, blocks * blocks)
-        down = index // blocks
-        across = index - down * blocks
+        count = last // _BLOCK + 1  # the same as `blocks`, but no kernel is compiled for it
+        down = index // count
+        across = index - down * count
         largest = mi.Float(0)
         for k in range(_BLOCK * _BLOCK):
             i, j = dr.minimum(across * _BLOCK + k % _BLOCK, last), dr.minimum(down * _BLOCK + k // _BLOCK, last)
             largest = dr.maximum(largest, dr.gather(mi.Float, heights, j * self._count + i))
         dr.eval(largest)
-        near = mi.Float(0)
-        for k in range((2 * about + 1) ** 2):
-            i, j = (mi.Int32(n) + m - about for n, m in ((across, k % (2 * about + 1)), (down, k // (2 * about + 1))))
-            i, j = (mi.UInt32(dr.clip(n, 0, blocks - 1)) for n in (i, j))
-            near = dr.maximum(near, dr.gather(mi.Float, largest, j * blocks + i))
+        wide = 2 * about + 1
+
+        def beside(k: mi.UInt32, most: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            j = k // wide
+            i = across + (k - j * wide)
+            i, j = (dr.clip(mi.Int32(n) - mi.Int32(about), 0, mi.Int32(count) - 1) for n in (i, down + j))
+            return k + 1, dr.maximum(most, dr.gather(mi.Float, largest, mi.UInt32(j) * count + mi.UInt32(i)))
+
+        state = (mi.UInt32(0), dr.zeros(mi.Float, blocks * blocks))
+        near = dr.while_loop(state, lambda k, _: k < wide * wide, beside, label="blocks beside")[1]
         dr.eval(steepest, highest, near)
         return heights, corners, (hu, hv), steepest, highest, near
 

@@ -83,16 +83,20 @@ def test_labels_show_the_outline(renderer, side):
 def test_other_margins_compile_nothing(renderer):
     import drjit as dr
 
+    from eyerender.rendering.renderer import Renderer
+
     rig = head_rig()
     eyes = [eye_with(c) for c in (None, CONTOUR, ContourSpec(cosines=(0.0,) * 31 + (0.002,)))]
+    renderer = Renderer(renderer.backend)  # it knows no eye yet
     hashes = []
-    renderer.render(job_of(eyes[0], rig, (300, 220, 32, 32)), spp=1)  # the first frame also makes what others keep
     for eye in eyes:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             renderer.render(job_of(eye, rig, (300, 220, 32, 32)), spp=1)
             hashes.append({kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])})
-    assert hashes[0] == hashes[1] == hashes[2]
+    # The first frame also makes what others keep.
+    assert hashes[1]
+    assert hashes[1] == hashes[2] <= hashes[0]
 
 
 def drawn_scene(rig_name, side, seed, pupil_mm=4.0):
