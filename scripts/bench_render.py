@@ -78,7 +78,7 @@ class Bench:
         import mitsuba as mi
 
         from eyerender.arrays import frozen
-        from eyerender.rendering.film import pixels_of
+        from eyerender.rendering.film import pixels_of, window_of
         from eyerender.rendering.sampling import camera_ray
         from eyerender.rendering.view import look
         from eyerender.rig.camera import Camera
@@ -111,7 +111,7 @@ class Bench:
         job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
         shown, surround = self.renderer.bind(job)
         values = shown.values
-        u, v = pixels_of(dr.arange(mi.UInt32, n * n), job.window)
+        u, v = pixels_of(dr.arange(mi.UInt32, n * n), *window_of(job.window))
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
         view = look(values, shown.textures, surround.scene, o, d, True)
         inner = view.inner.numpy().T

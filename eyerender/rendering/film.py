@@ -74,14 +74,15 @@ class _Grid:
     plain: tuple[mi.UInt32, ...]
 
 
-def pixels_of(pixel: mi.UInt32, window: Window) -> tuple[mi.Int32, mi.Int32]:
-    """Full-sensor pixel coordinates, as signed integers, of the window's pixels in row order."""
-    width = dr.opaque(mi.UInt32, window[2])
+def window_of(window: Window) -> tuple[tuple[mi.Int32, mi.Int32], mi.UInt32]:
+    """A window on the device: its first pixel, and its width."""
+    return (dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])), dr.opaque(mi.UInt32, window[2])
+
+
+def pixels_of(pixel: mi.UInt32, corner: tuple[mi.Int32, mi.Int32], width: mi.UInt32) -> tuple[mi.Int32, mi.Int32]:
+    """Full-sensor pixel coordinates, as signed integers, of a window's pixels in row order."""
     row = pixel // width
-    column = pixel - row * width
-    u = mi.Int32(column) + dr.opaque(mi.Int32, window[0])
-    v = mi.Int32(row) + dr.opaque(mi.Int32, window[1])
-    return u, v
+    return mi.Int32(pixel - row * width) + corner[0], mi.Int32(row) + corner[1]
 
 
 def group_size(spp: int, soft: bool = False) -> int:
@@ -237,9 +238,9 @@ def _taken_by(
     shown: Exposed, window: Window, spp: int, seed: int
 ) -> Callable[[mi.UInt32, mi.UInt32, bool], tuple[list[mi.Float], mi.UInt32]]:
     """The function that takes samples of a window's pixels."""
-    corner = dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])
-    width, pattern = dr.opaque(mi.UInt32, window[2]), Pattern.of(spp, seed)
-    return partial(_taken, shown.values, shown.lights, shown.textures, shown.scene, corner, width, pattern)
+    return partial(
+        _taken, shown.values, shown.lights, shown.textures, shown.scene, *window_of(window), Pattern.of(spp, seed)
+    )
 
 
 @recorded
@@ -248,8 +249,7 @@ def _taken(
     width: mi.UInt32, pattern: Pattern, pixel: mi.UInt32, k: mi.UInt32, layered: bool,
 ) -> tuple[list[mi.Float], mi.UInt32]:  # fmt: skip
     """What samples k of pixels show, and the number of their failed light paths."""
-    row = pixel // width
-    u, v = mi.Int32(pixel - row * width) + corner[0], mi.Int32(row) + corner[1]
+    u, v = pixels_of(pixel, corner, width)
     samples = _samples(u, v, pattern)
     spot, on_lamp = samples.in_pixel(k), samples.pair(k, 0)
     o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .lampviews import LampViews
-from .lightgrid import BENT, weights
+from .lightgrid import BENT, about, unevenness, weights
 from .parameters import leaves
 from .recorded import recorded
 from .values import ALL, BITS, Lights, Values
@@ -91,8 +91,7 @@ class IrisLight:
         cell = dr.arange(mi.UInt32, _NODES)
         row = cell // _SIDE
         column = cell - row * _SIDE
-        places = [mi.Int32(cell) + (dv * _SIDE + du) for dv in range(-1, 3) for du in range(-1, 3)]
-        places = [mi.UInt32(dr.clip(place, 0, _NODES - 1)) for place in places]
+        places = about(cell, _SIDE)
         many = lights.count > BITS
 
         def sum_up(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
@@ -104,11 +103,7 @@ class IrisLight:
 
         def add(k: mi.UInt32, left: mi.UInt32, *sums: mi.Float) -> tuple[mi.UInt32 | mi.Float, ...]:
             v = [dr.gather(mi.Float, lit, k * _NODES + place) for place in places]
-            bent, least, most = mi.Float(0), v[0], v[0]
-            for e in [v[n : n + 4] for n in range(0, 16, 4)] + [v[n::4] for n in range(4)]:
-                bent = dr.maximum(bent, dr.abs(e[0] - 3 * e[1] + 3 * e[2] - e[3]))
-            for value in v[1:]:
-                least, most = dr.minimum(least, value), dr.maximum(most, value)
+            bent, least, most = unevenness(v)
             good = (least >= 0) & (bent <= BENT * dr.maximum(most, usual))
             left |= dr.select(good, 0, dr.select(many, ALL, mi.UInt32(1) << k))
             return k + 1, left, *(s + dr.select(good, value, 0) for s, value in zip(sums, v, strict=True))
@@ -143,8 +138,7 @@ class IrisLight:
             return within & (k < points)
 
         def body(k: mi.UInt32, total: mi.Float, hidden: mi.Bool) -> tuple[mi.UInt32, mi.Float, mi.Bool]:
-            turn = (mi.Float(k) + 0.5) * (0.5 * dr.pi)
-            source = lamp.point(dr.select(points > 1, 0.5, 0), *dr.sincos(turn))
+            source = lamp.node(k, points)
             path = LampPath.to(values, scene, lamp, source, x, within)
             total += dr.select(path.blocked, 0, path.gain)
             hidden |= path.failed

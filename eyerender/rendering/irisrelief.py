@@ -240,8 +240,7 @@ class IrisRelief:
         row = place // count
         x = self._place(mi.Float(place - row * count), mi.Float(row), count)
         lamp = lights[spot // each]
-        turn = (mi.Float(spot - (spot // each) * each) + 0.5) * (0.5 * dr.pi)
-        source = lamp.point(dr.select(each > 1, 0.5, 0), *dr.sincos(turn))
+        source = lamp.node(spot - (spot // each) * each, each)
         normal = values.stop.normal
         path = LampPath.to(values, scene, lamp, source, x, lights.count > 0)
         above = LampPath.to(values, scene, lamp, source, x + _RAISED_MM * normal, lights.count > 0)

@@ -12,7 +12,7 @@ import numpy as np
 from ..arrays import ArrayValue, Bools, Bytes, Singles, frozen
 from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..rig.camera import Window
-from .film import Exposed, pixels_of
+from .film import Exposed, pixels_of, window_of
 from .lighting import lamp_blocked, straight
 from .recorded import recorded
 from .region import glossy_normal
@@ -50,8 +50,7 @@ class PartLabels(ArrayValue):
 
 def part_labels(shown: Exposed, window: Window) -> PartLabels:
     """Compute the labels of a window. Rays that miss the globe are not traced."""
-    corner, width = (dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])), dr.opaque(mi.UInt32, window[2])
-    found = _parts(shown.values, shown.scene, corner, width, window[2] * window[3])
+    found = _parts(shown.values, shown.scene, *window_of(window), window[2] * window[3])
     shape = (window[3], window[2])
     return PartLabels(*(frozen(x.numpy().reshape(shape), np.uint8) for x in found))
 
@@ -61,9 +60,7 @@ def _parts(
     values: Values, scene: mi.Scene, corner: tuple[mi.Int32, mi.Int32], width: mi.UInt32, pixels: int
 ) -> tuple[mi.UInt8, mi.UInt8]:
     """What the centres of pixels show, with and without occluders."""
-    pixel = dr.arange(mi.UInt32, pixels)
-    row = pixel // width
-    u, v = mi.Int32(pixel - row * width) + corner[0], mi.Int32(row) + corner[1]
+    u, v = pixels_of(dr.arange(mi.UInt32, pixels), corner, width)
     o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
     alone = meet_globe(values, o, d)
     clear = alone.cornea & (alone.opacity < 0.5)
@@ -115,19 +112,14 @@ def highlights(shown: Exposed, window: Window) -> Bools:
 
 def depths_mm(shown: Exposed, window: Window) -> Singles:
     """Distances (height, width) of the first surfaces from the nodal point, infinite where there is none."""
-    o, d = _centre_rays(shown, window)
+    o, d = _rays(shown, window, mi.Float(0), mi.Float(0))
     view, _ = meet(shown.values, shown.scene, o, d, True)
     depth = dr.select(view.met, view.distance, dr.inf)
     return frozen(depth.numpy().reshape(window[3], window[2]), np.float32)
 
 
-def _centre_rays(shown: Exposed, window: Window) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Camera rays through the centres of a window's pixels."""
-    return _rays(shown, window, mi.Float(0), mi.Float(0))
-
-
 def _rays(shown: Exposed, window: Window, right: mi.Float, down: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Camera rays through places beside the centres of a window's pixels (px)."""
-    u, v = pixels_of(dr.arange(mi.UInt32, window[2] * window[3]), window)
+    u, v = pixels_of(dr.arange(mi.UInt32, window[2] * window[3]), *window_of(window))
     o, d, _ = camera_ray(shown.values, mi.Float(u) + right, mi.Float(v) + down)
     return o, d

@@ -43,21 +43,14 @@ class LightGrid:
         """
         column, row = cls.nodes(side)
         index = row * side + column
-        places = [
-            [mi.UInt32(dr.clip(mi.Int32(index) + dv * side + du, 0, side**2 - 1)) for du in range(-1, 3)]
-            for dv in range(-1, 3)
-        ]
-        near = [[dr.gather(mi.Float, irradiance, place) for place in line] for line in places]
-        bent, least, most = mi.Float(0), mi.Float(dr.inf), mi.Float(0)
-        for e in (*near, *zip(*near, strict=True)):
-            bent = dr.maximum(bent, dr.abs(e[0] - 3 * e[1] + 3 * e[2] - e[3]))
-        for value in (v for line in near for v in line):
-            least, most = dr.minimum(least, value), dr.maximum(most, value)
+        places = about(index, side)
+        near = [dr.gather(mi.Float, irradiance, place) for place in places]
+        bent, least, most = unevenness(near)
         good = (least > 0) & (bent <= BENT * most)
         good &= (column > 0) & (row > 0) & (column < side - 2) & (row < side - 2)
-        four = near[1]
+        four = near[4:8]
         if more is not None:
-            four = [value + dr.gather(mi.Float, more, place) for value, place in zip(four, places[1], strict=True)]
+            four = [value + dr.gather(mi.Float, more, place) for value, place in zip(four, places[4:8], strict=True)]
         first = dr.abs(four[0])
         rows = dr.zeros(mi.Float, 4 * side * side)
         dr.scatter(rows, mi.Vector4f(dr.select(good, first, -first), *four[1:]), index)
@@ -76,6 +69,22 @@ class LightGrid:
                 known &= row.x > 0
             total += weight * (wu[0] * dr.abs(row.x) + wu[1] * row.y + wu[2] * row.z + wu[3] * row.w)
         return dr.select(known, dr.maximum(total, 0), 0), known
+
+
+def about(index: mi.UInt32, side: int) -> list[mi.UInt32]:
+    """The sixteen nodes about cells of a grid, row by row."""
+    places = (mi.Int32(index) + dv * side + du for dv in range(-1, 3) for du in range(-1, 3))
+    return [mi.UInt32(dr.clip(place, 0, side**2 - 1)) for place in places]
+
+
+def unevenness(near: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Largest third difference, least and greatest of the values at the nodes `about` cells."""
+    bent, least, most = mi.Float(0), near[0], near[0]
+    for e in [near[n : n + 4] for n in range(0, 16, 4)] + [near[n::4] for n in range(4)]:
+        bent = dr.maximum(bent, dr.abs(e[0] - 3 * e[1] + 3 * e[2] - e[3]))
+    for value in near[1:]:
+        least, most = dr.minimum(least, value), dr.maximum(most, value)
+    return bent, least, most
 
 
 def weights(s: mi.Float) -> tuple[mi.Float, ...]:

@@ -119,8 +119,7 @@ def _lit(
     def body(k: mi.UInt32, total: mi.Float, doubtful: mi.Bool) -> tuple[mi.UInt32, mi.Float, mi.Bool]:
         i = k // points
         lamp = lights[i]
-        turn = (mi.Float(k - i * points) + 0.5) * (0.5 * dr.pi)
-        source = lamp.point(dr.select(points > 1, 0.5, 0), *dr.sincos(turn))
+        source = lamp.node(k - i * points, points)
         lit = irradiance(lamp, source, x, normal)
         blocked = lamp_blocked(values, scene, x, source, sphere, cornea, lit > 0)
         cosine = dr.dot(dr.normalize(source - x), normal)

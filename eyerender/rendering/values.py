@@ -222,6 +222,11 @@ class Lamp:
         r = dr.sqrt(inner + u * (self.radius * self.radius - inner))
         return self.position + (r * cosine) * e1 + (r * sine) * e2
 
+    def node(self, k: mi.UInt32, count: mi.UInt32) -> mi.Vector3f:
+        """Point k of the `count` that stand for the lamp at the nodes of a grid: its middle, or four about it."""
+        turn = (mi.Float(k) + 0.5) * (0.5 * dr.pi)
+        return self.point(dr.select(count > 1, 0.5, 0), *dr.sincos(turn))
+
     def radiant_intensity(self, direction: mi.Vector3f) -> mi.Float:
         """Radiant intensity (mW/sr) into a unit direction that leaves the lamp."""
         c = dr.dot(direction, self.axis)
