@@ -124,7 +124,7 @@ def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
                 shutil.rmtree(stage, ignore_errors=True)
     except InputError:
         raise
-    except EyerenderError as error:  # nobody knows the stage
+    except EyerenderError as error:  # the user knows the folder, but not the stage in it
         raise type(error)(str(error).replace(str(stage), str(final))) from None
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None

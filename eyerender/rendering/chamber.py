@@ -365,9 +365,9 @@ def _to_surfaces(walls: _Walls, rays: _Rays) -> tuple[Floats, Floats]:
 
 
 def _mirrored(walls: _Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tuple[Ints, Floats, Floats, Floats]]:
-    """Mirror rays at the inner side of the front; also what leaves the eye there of those of which nothing has left.
+    """Mirror rays at the inner side of the front; also returns what leaves the eye there for the first time.
 
-    `first` tells for every ray whether it is such a one.
+    `first` marks the rays of which nothing has left.
     """
     n, w = walls.front[0].normal(rays.o), rays.d
     cosine = np.sum(n * w, axis=1)

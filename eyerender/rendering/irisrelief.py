@@ -142,7 +142,10 @@ class IrisRelief:
     def _shape(
         self, values: Values, pattern: mi.Texture2f, cells: int, blocks: int, about: mi.UInt32
     ) -> tuple[Any, ...]:
-        """The fields of a `Shape` with so many cells; `blocks` across, of which so many are `about` each."""
+        """Compute the fields of a `Shape` of so many cells.
+
+        There are so many `blocks` across. Those up to `about` away from a block are near it.
+        """
         column, row = self._cells(cells)
         heights = iris_height(values, pattern, self._place(mi.Float(column), mi.Float(row), self._count))
         dr.eval(heights)

@@ -27,7 +27,7 @@ def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:
     Dr.Jit compares plain values, too, but misses the change of one that is also found before it: it takes a call with
     (True, False, True) for one with (True, False, False). So they choose the recordings here.
 
-    The first call is not recorded: what is called once, as before new shapes, would never be played back.
+    The first call is not recorded, because the recording of a function that is called once is never played back.
     """
     variants: OrderedDict[Any, Any] = OrderedDict()
     _played.append(variants)
