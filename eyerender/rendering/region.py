@@ -1,9 +1,10 @@
 """The eye region in Mitsuba: triangles with one map, moved in place, of one subject after another.
 
 The triangles are in the scene's frame (the world's axes, origin at the apex of the unrotated eye) as two instances: the
-parts that move with the eye, and the fixed brow. A pose rebuilds the tree over the first alone. Mitsuba lets Embree
-build an instance's tree without the spatial splits of a scene's own meshes, which takes a third of the time. The
-appearance of a hit is read from buffers of our own (`SkinGeometry`), so kernels do not change.
+parts that move with the eye, and the fixed brow. A pose sends the vertices of the first alone, but Mitsuba 3.9 builds
+both trees again. It lets Embree build an instance's tree without the spatial splits of a scene's own meshes, which
+takes a third of the time. The appearance of a hit is read from buffers of our own (`SkinGeometry`), so kernels do not
+change.
 """
 
 from __future__ import annotations
