@@ -45,7 +45,7 @@ class Exposed:
     """A bound frame for rendering: its Mitsuba scene, its numbers, its lamps and its textures.
 
     `plain` returns which tiles of a window show nothing but skin, and their size (px); `fine` which of its pixels
-    (height, width) may show menisci, or hairs thinner than a pixel, and whether the others show no menisci.
+    (height, width) may show menisci, or hairs thinner than a pixel, and which of them may show menisci.
     """
 
     scene: mi.Scene
@@ -53,7 +53,7 @@ class Exposed:
     lights: Lights
     textures: Textures
     plain: Callable[[Window], tuple[Bools, int]]
-    fine: Callable[[Window], tuple[Bools, bool]]
+    fine: Callable[[Window], tuple[Bools, Bools]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,11 +288,11 @@ def _groups(
         (dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])),
         *(tuple(dr.opaque(mi.UInt32, n) for n in part) for part in (window[2:], numbers, (across, *tiles.shape))),
     )
-    finely, dry = shown.fine(window)
-    fine, seen = (mi.UInt8(aligned(marks.ravel().astype(np.uint8))) for marks in (finely, tiles))
+    finely, wet = shown.fine(window)
+    fine, seen = (mi.UInt8(aligned(marks.ravel().astype(np.uint8))) for marks in (finely + 2 * wet, tiles))
     lanes, failures = _shaded(
         *(shown.values, shown.lights, shown.textures, shown.scene, grid, Pattern.of(spp, seed, times), fine, seen),
-        dr.opaque(mi.Bool, dry), dr.opaque(mi.Bool, shown.lights.widest < SMALL),
+        dr.opaque(mi.Bool, shown.lights.widest < SMALL),
         rows * columns * count, window[2] * window[3], layered,
     )  # fmt: skip
     return [lane.numpy() for lane in lanes], int(failures.numpy()[0])
@@ -301,7 +301,7 @@ def _groups(
 @recorded
 def _shaded(
     values: Values, lights: Lights, textures: Textures, scene: mi.Scene, grid: _Grid, pattern: Pattern, fine: mi.UInt8,
-    plain: mi.UInt8, dry: mi.Bool, small: mi.Bool, packets: int, pixels: int, layered: bool,
+    plain: mi.UInt8, small: mi.Bool, packets: int, pixels: int, layered: bool,
 ) -> tuple[list[mi.Float], mi.UInt32]:  # fmt: skip
     """Sums over what the groups of each pixel show, in the order of the pixels, and the number of failed light paths.
 
@@ -321,7 +321,8 @@ def _shaded(
     group = packet - tile * count + first
     width, height = grid.size
     inside = (x < width) & (y < height)
-    finely = dr.gather(mi.UInt8, fine, y * width + x, inside) > 0
+    marks = dr.gather(mi.UInt8, fine, y * width + x, inside)
+    finely = (marks & 1) > 0
     samples = _samples(u, v, pattern, finely)
     more = dr.select(finely, times, 1)
     each = size * more
@@ -370,7 +371,7 @@ def _shaded(
             (suns > 0) | ((lamps <= _FEW_LAMPS) & ~several & small),
             suns > 0,
             dr.gather(mi.UInt8, plain, place) > 0,
-            finely | ~dry,
+            marks > 1,
             layered,
         ),
     )

@@ -54,18 +54,20 @@ def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, wi
 
 def fine_pixels(
     region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Floats, window: Window
-) -> tuple[Bools, bool]:
+) -> tuple[Bools, Bools]:
     """Pixels (height, width) of a window at menisci and at hairs at most two pixels thick, and their neighbours.
 
-    The second result tells whether all menisci are marked. A pixel is marked or not, whatever the window.
+    The second result marks those that may show menisci: all if these are too close. A pixel is marked or not,
+    whatever the window.
     """
     x0, y0, width, height = window
-    marked = np.zeros((height + 2, width + 2), dtype=bool)
+    fine, wet = (np.zeros((height + 2, width + 2), dtype=bool) for _ in range(2))
     curves = [] if region is None else list(region.strands)
     # Menisci are grids, of which the strands are the rows.
-    curves += [grid.transpose(1, 0, 2) for grid in curves[HAIRS:]]
+    water = [*curves[HAIRS:], *(grid.transpose(1, 0, 2) for grid in curves[HAIRS:])]
     every = True
-    for curve in (c for c in curves if c.size):
+    marks = [(c, marked) for some, marked in ((curves[:HAIRS], fine), (water, wet)) for c in some if c.size]
+    for curve, marked in marks:
         z = (curve + anchor_mm - camera.nodal_point_mm) @ camera.R[2]
         if z.min() < _NEAREST_MM or _HAIR_MM * float(camera.K[0, 0]) > _THICK_PX * z.min():
             every = False
@@ -81,10 +83,16 @@ def fine_pixels(
         )
         inside = (column >= 0) & (column < width + 2) & (row >= 0) & (row < height + 2)
         marked[row[inside], column[inside]] = True
+    fine |= wet
+    return _with_beside(fine), _with_beside(wet) | (not every)
+
+
+def _with_beside(marked: Bools) -> Bools:
+    """Marks of a grid without its border, and of what is beside them."""
     out = marked[1:-1, 1:-1].copy()
     for beside in (marked[:-2, 1:-1], marked[2:, 1:-1], marked[1:-1, :-2], marked[1:-1, 2:]):
         out |= beside
-    return out, every
+    return out
 
 
 def _pieces(xy: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:

@@ -132,7 +132,7 @@ class Stage:
             lights.relief = IrisRelief(job, values, lights, place.scene, textures, self._shapes)
         _spread(job, values, lights, textures, place)
 
-        def fine(window: Window) -> tuple[Bools, bool]:
+        def fine(window: Window) -> tuple[Bools, Bools]:
             return fine_pixels(None if region is None else region.posed, job.camera, anchor, window)
 
         return Exposed(place.scene, values, lights, textures, plain, fine), place
