@@ -57,17 +57,21 @@ def fine_pixels(
 ) -> tuple[Bools, Bools]:
     """Pixels (height, width) of a window at menisci and at hairs at most two pixels thick, and their neighbours.
 
-    The second result marks those that may show menisci: all if these are too close. A pixel is marked or not,
-    whatever the window.
+    The second result marks those that may show menisci, which are all pixels if a meniscus is too close. Marks do not
+    depend on the window.
     """
-    x0, y0, width, height = window
-    fine, wet = (np.zeros((height + 2, width + 2), dtype=bool) for _ in range(2))
     curves = [] if region is None else list(region.strands)
     # Menisci are grids, of which the strands are the rows.
     water = [*curves[HAIRS:], *(grid.transpose(1, 0, 2) for grid in curves[HAIRS:])]
-    every = True
-    marks = [(c, marked) for some, marked in ((curves[:HAIRS], fine), (water, wet)) for c in some if c.size]
-    for curve, marked in marks:
+    (fine, _), (wet, every) = (_drawn(some, camera, anchor_mm, window) for some in (curves[:HAIRS], water))
+    return _with_beside(fine | wet), _with_beside(wet) | (not every)
+
+
+def _drawn(curves: list[Floats], camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, bool]:
+    """Pixels on curves in a window and a border of one pixel about it; whether no curve is too close to be drawn."""
+    x0, y0, width, height = window
+    marked, every = np.zeros((height + 2, width + 2), dtype=bool), True
+    for curve in (c for c in curves if c.size):
         z = (curve + anchor_mm - camera.nodal_point_mm) @ camera.R[2]
         if z.min() < _NEAREST_MM or _HAIR_MM * float(camera.K[0, 0]) > _THICK_PX * z.min():
             every = False
@@ -83,8 +87,7 @@ def fine_pixels(
         )
         inside = (column >= 0) & (column < width + 2) & (row >= 0) & (row < height + 2)
         marked[row[inside], column[inside]] = True
-    fine |= wet
-    return _with_beside(fine), _with_beside(wet) | (not every)
+    return marked, every
 
 
 def _with_beside(marked: Bools) -> Bools:
