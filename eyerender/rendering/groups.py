@@ -246,11 +246,11 @@ class _GroupShading:
             # What went through the tissue is known, and what remains is the film's highlight.
             tissues = self.textures.tissues
             assert tissues is not None
-            covered = ~seen.cornea | (seen.opacity > 0)
+            covered, share = ~seen.cornea | (seen.opacity > 0), tissues.globe_sees(seen.point)
 
             def shine(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
                 lamp = lights[i]
-                return i + 1, total + lit_by(lamp, mi.Float(0))[1] * tissues.globe_sees(lamp.number, seen.point)
+                return i + 1, total + lit_by(lamp, mi.Float(0))[1] * share(lamp.number)
 
             state = (mi.UInt32(0), direct(seen, albedo, tissues.on_globe(seen.point), mi.Float(0)))
             labels = ("i", "total")
@@ -304,12 +304,13 @@ class _GroupShading:
         _, d, _ = group.ray(kept.j)
         view = look_at_skin(values, self.skin, kept.face, kept.uv, d, kept.weight > 0)
         rest = off_eye(values, self.textures, self.scene, view, d, view.albedo, view.received)
-        inside, matte, on_map = mi.Float(0), view.albedo, (mi.Float(0), mi.Float(0))
+        inside, matte, sees = mi.Float(0), view.albedo, None
         soft = self.soft and on_sheet
         if soft:
-            assert self.textures.tissues is not None
+            tissues = self.textures.tissues
+            assert tissues is not None
             on_map = self.skin.map_place(kept.face, kept.uv, kept.weight > 0)
-            on_skin = self.textures.tissues.on_skin(*on_map)
+            on_skin, sees = tissues.on_skin(*on_map), tissues.skin_sees(*on_map)
             inside, matte = direct(view, view.albedo, on_skin, mi.Float(0)), mi.Float(0)
         total += (rest + inside) * kept.weight
         faint = _FAINT * inside
@@ -324,9 +325,8 @@ class _GroupShading:
             source = lamp.point(group.shared_spot.x, *turn)
             outer, shine = straight(lamp, source, view, mirror)
             lit = direct(view, matte, outer, shine) * share
-            if soft:
-                assert self.textures.tissues is not None
-                return k + 1, total + lit * kept.weight * self.textures.tissues.skin_sees(lamp.number, *on_map)
+            if sees is not None:
+                return k + 1, total + lit * kept.weight * sees(lamp.number)
             first = group.fine & (k == 0)
             shared = dr.select(first, kept.shared, kept.weight)
             asked = (shared > 0) & (lit > faint) & (lit > _FAINT * dr.inv_pi * share * outer)

@@ -284,8 +284,9 @@ class SkinGeometry:
         corner = dr.gather(mi.Vector4u, self._corners, face, active)
         u, v = mi.Float(0), mi.Float(0)
         for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), (corner.x, corner.y, corner.z), strict=True):
-            u += weight * dr.gather(mi.Float, self._buffer, 8 * i + 3, active)
-            v += weight * dr.gather(mi.Float, self._buffer, 8 * i + 7, active)
+            # As in `surface`, so that Dr.Jit gathers them only once.
+            u += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i, active).w
+            v += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i + 1, active).w
         return u, v
 
     def tilted(self, normal: mi.Vector3f, slope_y: mi.Float, slope_z: mi.Float) -> mi.Vector3f:

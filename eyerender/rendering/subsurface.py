@@ -179,35 +179,40 @@ class Places:
 class TissueLight:
     """Light of the lamps on skin and globe, each after its way through the tissue."""
 
-    DRJIT_STRUCT = leaves("_size", "_skin", "_globe", "_values")
+    DRJIT_STRUCT = leaves("_size", "_skin", "_globe", "_values", "_lamps")
 
     def __init__(
-        self, size: Size, skin: tuple[mi.Float, mi.Float], globe: tuple[mi.Float, mi.Float], values: Values
+        self,
+        size: Size,
+        skin: tuple[mi.Float, mi.Float],
+        globe: tuple[mi.Float, mi.Float],
+        values: Values,
+        lamps: mi.UInt32,
     ) -> None:
-        """Take light of cells, and the shares of each lamp that they see, on skin and globe."""
-        self._size, self._skin, self._globe, self._values = size, skin, globe, values
+        """Take light of cells, and the shares of so many lamps that they see, cell by cell, on skin and globe."""
+        self._size, self._skin, self._globe, self._values, self._lamps = size, skin, globe, values, lamps
 
     def on_skin(self, u: mi.Float, v: mi.Float) -> mi.Float:
         """Irradiance (mW/mm^2) at coordinates of the map of the skin."""
         return self._size.between(mi.Float, self._skin[0], *self._size.place(u, v), 0)
 
-    def skin_sees(self, lamp: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.Float:
-        """Share of a lamp that the skin sees at coordinates of its map."""
-        size = self._size
-        first = lamp * size.count(1)
-        return dr.clip(size.between(mi.Float, self._skin[1], *size.place(u, v), 1, first), 0, 1)
+    def skin_sees(self, u: mi.Float, v: mi.Float) -> Callable[[mi.UInt32], mi.Float]:
+        """Shares of the lamps, by their numbers, that the skin sees at coordinates of its map."""
+        cells = self._size.cells(*self._size.place(u, v), 1)
+        return lambda lamp: dr.clip(cells.of(mi.Float, self._skin[1], self._lamps, lamp), 0, 1)
 
     def on_globe(self, x: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
         row, column = self._place(x)
         u = dr.clip(column, 0, _SIDE - 1.001)
         j = mi.UInt32(u)
-        return _between(mi.Float, self._globe[0], row, u - mi.Float(j), (j, j + 1), (_SIDE, _SIDE))
+        return _Cells.at(row, u - mi.Float(j), (j, j + 1), (_SIDE, _SIDE)).of(mi.Float, self._globe[0])
 
-    def globe_sees(self, lamp: mi.UInt32, x: mi.Vector3f) -> mi.Float:
-        """Share of a lamp that points of the globe (eye frame) see."""
+    def globe_sees(self, x: mi.Vector3f) -> Callable[[mi.UInt32], mi.Float]:
+        """Shares of the lamps, by their numbers, that points of the globe (eye frame) see."""
         row, column = (mi.UInt32(dr.clip(p + 0.5, 0, _SIDE - 1)) for p in self._place(x))
-        return dr.gather(mi.Float, self._globe[1], (lamp * _SIDE + row) * _SIDE + column)
+        first = (row * _SIDE + column) * self._lamps
+        return lambda lamp: dr.gather(mi.Float, self._globe[1], first + lamp)
 
     def _place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         return _globe_place(self._values.vector_to_scene(x - self._values.sclera.centre))
@@ -248,7 +253,7 @@ def tissue_light(
         count,
     )
     sheet, between = make.both(skin, globe, Places.of(thick), Places.of(thin))
-    return TissueLight(skin.size, sheet, between, values)
+    return TissueLight(skin.size, sheet, between, values, dr.maximum(lights.count, 1))
 
 
 @traversed
@@ -310,7 +315,7 @@ class _Maker:
         (three of four numbers for each cell, scene's frame): the irradiance of a surface with the normal n is F . n.
 
         Returns:
-            The vectors, and for each lamp the share of it that each cell sees.
+            The vectors, and the share of each lamp that each cell sees, cell by cell.
         """
         values, lights, skin = self.values, self.lights, self.skin
         cells, columns = grid.rows * grid.columns // 4, grid.size.columns // 2
@@ -356,7 +361,7 @@ class _Maker:
                 state, lambda k, *_: k < count, at_point, labels=labels, label="points of a lamp"
             )
             share = dr.rcp(dr.maximum(mi.Float(count), 1))
-            dr.scatter(seen, free * share, i * grid.size.count(1) + index)
+            dr.scatter(seen, free * share, index * lights.count + i)
             return i + 1, total + flux * share
 
         state = (mi.UInt32(0), mi.Vector3f(0) * x.x)
@@ -406,7 +411,7 @@ class _Maker:
             state, labels = (mi.UInt32(0), mi.Float(0), mi.Float(0)), ("k", "total", "free")
             _, lit, free = dr.while_loop(state, lambda k, *_: k < points, at_point, labels=labels, label="in cells")
             share = dr.rcp(mi.Float(points))
-            dr.scatter(seen, free * share, i * (_SIDE * _SIDE) + index)
+            dr.scatter(seen, free * share, index * lights.count + i)
             return i + 1, total + lit * share
 
         state = (mi.UInt32(0), mi.Float(0) * mi.Float(index))
@@ -474,18 +479,18 @@ class Size:
         row: mi.Float,
         column: mi.Float,
         level: int,
-        first: mi.UInt32 | int = 0,
     ) -> Any:
-        """Numbers between the cells of the grid reduced by 2^level, at places in units of its finest cells.
+        """Numbers between the cells of the grid reduced by 2^level, at places in units of its finest cells."""
+        return self.cells(row, column, level).of(kind, buffer)
 
-        `first` is the number of the first cell in the buffer.
-        """
+    def cells(self, row: mi.Float, column: mi.Float, level: int) -> _Cells:
+        """Cells of the grid reduced by 2^level, about places in units of its finest cells."""
         rows, columns, scale = self.rows >> level, self.columns >> level, 1 / (1 << level)
         u = (column + 0.5) * scale - 0.5
         u = dr.select(u < 0, u + mi.Float(columns), u)
         j = dr.minimum(mi.UInt32(u), columns - 1)
         right = dr.select(j + 1 < columns, j + 1, 0)
-        return _between(kind, buffer, (row + 0.5) * scale - 0.5, u - mi.Float(j), (j, right), (rows, columns), first)
+        return _Cells.at((row + 0.5) * scale - 0.5, u - mi.Float(j), (j, right), (rows, columns))
 
 
 @dataclass(frozen=True, slots=True)
@@ -663,22 +668,32 @@ def _spots(shift: tuple[mi.UInt32, mi.UInt32], k: mi.UInt32) -> tuple[mi.Float, 
     return u, v
 
 
-def _between(
-    kind: Any,
-    buffer: mi.Float,
-    row: mi.Float,
-    share: mi.Float,
-    beside: tuple[mi.UInt32, mi.UInt32],
-    size: tuple[mi.UInt32 | int, mi.UInt32 | int],
-    first: mi.UInt32 | int = 0,
-) -> Any:
-    """Numbers between rows, and at a share of the way from the first to the second of two columns, of a grid."""
-    v = dr.clip(row, 0, mi.Float(size[0]) - 1.001)
-    i = mi.UInt32(v)
-    t = v - mi.Float(i)
-    a, b, c, d = (dr.gather(kind, buffer, first + p * size[1] + q) for p in (i, i + 1) for q in beside)
-    high, low = a + share * (b - a), c + share * (d - c)
-    return high + t * (low - high)
+@dataclass(frozen=True, slots=True)
+class _Cells:
+    """The four cells of a grid about places, row by row, and the shares of the way across and down between them."""
+
+    numbers: tuple[mi.UInt32, ...]
+    across: mi.Float
+    down: mi.Float
+
+    @classmethod
+    def at(
+        cls,
+        row: mi.Float,
+        across: mi.Float,
+        beside: tuple[mi.UInt32, mi.UInt32],
+        size: tuple[mi.UInt32 | int, mi.UInt32 | int],
+    ) -> _Cells:
+        """Find the cells between rows, at a share of the way from the first to the second of two columns."""
+        v = dr.clip(row, 0, mi.Float(size[0]) - 1.001)
+        i = mi.UInt32(v)
+        return cls(tuple(p * size[1] + q for p in (i, i + 1) for q in beside), across, v - mi.Float(i))
+
+    def of(self, kind: Any, buffer: mi.Float, each: mi.UInt32 | int = 1, which: mi.UInt32 | int = 0) -> Any:
+        """Numbers between the cells, of which each has so many."""
+        a, b, c, d = (dr.gather(kind, buffer, n * each + which) for n in self.numbers)
+        high, low = a + self.across * (b - a), c + self.across * (d - c)
+        return high + self.down * (low - high)
 
 
 def _numbers(cells: Ints) -> mi.UInt32:
