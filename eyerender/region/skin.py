@@ -322,6 +322,7 @@ class _Strip:
         # The fold of the plica darkens the conjunctiva towards the caruncle.
         self.flesh = step(np.cos(self.turn).astype(np.float32), 0.60, 0.85) * self.within * step(rows, 0.0, 2.2)
         self.lids = _hill(y, z, 19.0, 13.0) * self.near
+        self.roots = _bell(self.out_mm, 0.9, 2.4)  # of the lashes
 
     def field(self, number: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
         """Band of noise at the places of the strip."""
@@ -339,19 +340,21 @@ class _Strip:
         height = self.relief(cells, oil) - (1 - oil) * (0.03 * pores + 0.17 * spec.skin.wrinkles * creases)
         height = height * self.lid + spec.tears.unevenness * self.lumps()
         if np.any(self.flesh):
-            bumps = 0.03 + 0.10 * spec.tears.unevenness
+            bumps = 0.075 + 0.25 * spec.tears.unevenness
             height = height + bumps * self.flesh * self.field(6, (10, 36), (10, 36))
         # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
         open_ = 1 + 0.10 * (cells - 0.5) - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
         film = 0.42 * self.slowly("film") * (0.4 + 0.6 * cells) * (1 - pores)
-        sheen = spec.skin.sheen * np.clip(film + oil, 0.04, 0.9)
+        # Only beside the roots of the lashes is the oil thick enough to mirror like water.
+        sheen = spec.skin.sheen * np.clip(film + oil, 0.04, 0.72 + 0.18 * self.roots)
         gloss = np.where(wet > 0, wet, np.minimum(sheen, 0.49) * self.lid)
         return self.albedo(open_, spots), gloss, height
 
     def oil(self) -> Singles:
         """Share, 0 to 1, of skin whose furrows oil fills: pools about the glands of the lash roots, few farther out.
 
-        The skin below is smooth there, so each swelling mirrors a lamp as one streak along the skin's lines.
+        At the roots it makes the skin smooth, so each swelling mirrors a lamp as one streak along the skin's lines.
+        Farther out the film is thinner and follows the relief, so the streaks are soft and grained.
         """
         beside = np.exp(-np.square(self.out_mm * (1 / 6.0)))
         near = np.maximum(_bell(self.out_mm, 0.9, 1.7), 0.75 * beside)
@@ -375,7 +378,7 @@ class _Strip:
         at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0) * (1 - step(self.rows, _LINE + 1.5, _LINE + 3.5))
         out: Singles = np.zeros_like(self.y)
         if np.any(at > 0):
-            out = 0.05 * at * self.tiles.at(9, _places(self.y, self.out_mm), (8, 20), (24, 60))
+            out = 0.09 * at * self.tiles.at(9, _places(self.y, self.out_mm), (8, 20), (24, 60))
         return out
 
     def cells(self) -> Singles:
@@ -403,7 +406,8 @@ class _Strip:
         along = self.tiles.mixed(self.along, (1.6, 14, (5, 15), (12, 34)), (0.5, 15, (12, 36), (24, 60)))
         swell = self.field(13, (7, 20), (7, 20))
         lines = self.tiles.at(11, _places(y, self.level + self.slowly("sway")), (0, 6), (22, 60))
-        fine = (1 - 0.85 * oil) * (cells + 0.03 * grain)
+        filled = 0.2 + 0.65 * self.roots**3
+        fine = (1 - filled * oil) * (cells + 0.03 * grain)
         height = skin.relief_mm * (fine + 1.3 * swell + along)
         return np.asarray(height - (1 - 0.7 * oil) * self.slowly("lines") * np.abs(lines))
 

@@ -34,7 +34,8 @@ from .values import aligned
 GRID_ROWS, GRID_COLUMNS = 160, 768  # of the finer grid over the sheet on which its light is computed (`subsurface`)
 SHEET_COLUMNS = COLUMNS + 1  # of vertices, because the first column is repeated
 _F0_OIL, _F0_TEARS = 0.035, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
-_ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.025, 0.03
+_ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.02, 0.03
+_THICK, _THINNER = 0.42, 0.6  # gloss from which a film of oil is smooth, and its roughness per gloss below
 _OILY = 0.93  # share of skin's sheen in the narrow lobe of its film of oil, which the relief breaks into points
 _WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
 _RIPPLE = 0.02  # slope of wet tissue
@@ -367,7 +368,7 @@ def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, glo
     nh = dr.maximum(dr.dot(normal, half), 0)
     water = (2 * gloss - 1) * (1 + 10 * dr.maximum(gloss - _WATER, 0))
     weight = dr.select(wet, water, gloss * (1 / 0.45))
-    narrow = _ggx(nh, dr.select(wet, _ROUGH_WET, _ROUGH_OIL + 0.25 * dr.maximum(0.4 - gloss, 0)))
+    narrow = _ggx(nh, dr.select(wet, _ROUGH_WET, _ROUGH_OIL + _THINNER * dr.maximum(_THICK - gloss, 0)))
     D = dr.select(wet, narrow, _OILY * narrow + (1 - _OILY) * _ggx(nh, mi.Float(_ROUGH_SKIN)))
     return weight * D * _schlick(lh, dr.select(wet, _F0_TEARS, _F0_OIL)) * 0.25 / (lh * lh)
 
