@@ -16,7 +16,7 @@ from .contour import step
 from .face import face_depth
 from .hairs import Hairs, taper
 
-POINTS = 5
+PLACES = np.array([0.0, 0.25, 0.6, 1.0])  # of a hair's points, as shares of its length; it bends most at its root
 
 
 @lru_cache(maxsize=16)
@@ -41,17 +41,16 @@ def brow(spec: Region) -> Hairs:
     lean = lean + np.radians(5.0) * drift + np.radians(6.0) * np.clip(rng.standard_t(5, n), -3.5, 3.5)
     length = b.length_mm * rng.triangular(0.35, 0.85, 1.0, n) * (0.62 + 0.38 * np.sin(np.pi * np.clip(s, 0, 1) ** 0.8))
     bend = np.radians(26.0) * rng.normal(1.0, 0.45, n) * (1 - 0.3 * head)
-    points = np.empty((n, POINTS, 3))
+    points = np.empty((n, len(PLACES), 3))
     lift = 0.35 + 0.55 * rng.uniform(0, 1, n) + 0.5 * head
-    for j in range(POINTS):
-        u = j / (POINTS - 1)
+    for j, u in enumerate(PLACES):
         if j:
-            turn = lean + bend * (u - 0.5)
-            stride = length / (POINTS - 1)
+            turn = lean + bend * (0.5 * (PLACES[j - 1] + u) - 0.375)
+            stride = length * (u - PLACES[j - 1])
             y, z = y - stride * np.sin(turn), z + stride * np.cos(turn)
         rise = -0.15 if j == 0 else lift * np.sin(np.pi * min(0.62 * u + 0.08, 1.0))
         points[:, j] = np.stack([_skin(spec, y, z) + rise, y, z], axis=-1)
-    return Hairs(frozen(points), frozen(taper(length, b.diameter_mm, POINTS)))
+    return Hairs(frozen(points), frozen(taper(n, b.diameter_mm, PLACES)))
 
 
 def brow_band(spec: Region, s: Floats) -> tuple[Floats, Floats, Floats]:

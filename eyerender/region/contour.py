@@ -15,7 +15,7 @@ Where the contour is in front of the globe it lies on the globe. Beyond a polar 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,11 @@ class Contour(ArrayValue):
     away: Floats
     along_lid: Floats
     openness: float
+
+    def every(self, step: int) -> Contour:
+        """Every `step`-th column, from the first."""
+        arrays = ("angle", "along", "upper", "point", "normal", "away", "along_lid")
+        return replace(self, **{name: getattr(self, name)[::step] for name in arrays})
 
 
 def step(x: NDArray[Any] | float, low: float, high: float) -> NDArray[Any]:

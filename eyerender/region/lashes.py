@@ -29,6 +29,7 @@ _ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # of the points after th
 _REACH_ROWS = 16
 _CAUGHT_MM = 0.3  # a lash that is still this far inside is caught
 _NEAR_COLUMNS = 6
+_NEARLY = 0.2  # share by which the skin that is found may be farther away than the nearest
 _TIP = 0.3  # radius of the tip over that of the root; the map makes thin tips paler instead (`skin.lash_band`)
 _KINK = 0.45  # cosine of the sharpest bend between two pieces; no lash's curl is this sharp
 
@@ -154,7 +155,8 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
         corner = np.flatnonzero(np.abs(np.sin(p.angle)) < 0.75)
         stuck = corner[_through_skin(sheet, p.angle[corner], points[corner, 1:])] if len(corner) else corner
         points[stuck, 1:] = points[stuck, :1] + 0.0005 * (straight[stuck, 1:] - points[stuck, :1])
-    return Hairs(frozen(points), frozen(taper(p.length_mm, spec.lashes.diameter_mm, k, _TIP) * p.stout[:, None]))
+    radii = taper(len(root), spec.lashes.diameter_mm, np.linspace(0, 1, k), _TIP) * p.stout[:, None]
+    return Hairs(frozen(points), frozen(radii))
 
 
 def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
@@ -204,12 +206,12 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
         return points[:, 1:]
     root, points, straight = points[:, :1], points[:, 1:], straight[:, 1:]
     rows = slice(CONJUNCTIVA + MARGIN - 1, CONJUNCTIVA + MARGIN + LID + _REACH_ROWS)
-    skin, normals = sheet.vertices[rows].reshape(-1, 3), sheet.normals[rows].reshape(-1, 3)
+    skin, normals = (v[rows, ::2].reshape(-1, 3) for v in (sheet.vertices, sheet.normals))
     tree = cKDTree(skin, balanced_tree=False, compact_nodes=False)  # it is built in half the time
     out, k = points.copy(), points.shape[1]
 
     def lift(at: Floats, within: float, least: Floats) -> Floats:
-        distance, nearest = tree.query(at, distance_upper_bound=within)
+        distance, nearest = tree.query(at, eps=_NEARLY, distance_upper_bound=within)
         known = np.isfinite(distance)
         nearest = np.where(known, nearest, 0)
         above = dots(at - skin[nearest], normals[nearest])

@@ -1,7 +1,8 @@
 """Lids and skin as one sheet: from the conjunctiva under the lids over their margins out to the face.
 
-The sheet is a grid of `ROWS` rows by columns once around the fissure (see `contour`). Its topology never changes. From
-inside out its rows are:
+The sheet is a grid of `ROWS` rows by columns once around the fissure (see `contour`). Its topology never changes.
+Beyond the lash line, where rows are smooth, every second column lies halfway between its neighbours, and the mesh does
+without it. From inside out the rows are:
 
     conjunctiva   from the globe (just below its surface, so that no gap shows) to the margin's inner edge; off the
                   globe, beside the nose, it carries the plica and the caruncle
@@ -20,15 +21,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats, Ints, frozen
+from ..arrays import ArrayValue, Floats, frozen
 from ..geometry.vectors import crosses, dots, lengths
 from .anatomy import Region
-from .contour import COLUMNS, LATERAL, Contour, canthi, contour, step, unit
+from .contour import LATERAL, Contour, canthi, contour, step, unit
 from .face import face_depth
 from .globe import Globe
 
 CONJUNCTIVA, MARGIN, LID, FACE = 7, 7, 16, 26
 ROWS = CONJUNCTIVA + MARGIN + LID + FACE
+FINE = CONJUNCTIVA + MARGIN  # rows that have their own place in every column; the others have it in every second one
 _DIP_MM = 0.031
 EDGE_MM = 0.26  # depth of the margin's rounded edges
 _FAR_MM = (66.0, 58.0)
@@ -59,9 +61,10 @@ def sheet(spec: Region, globe: Globe) -> Sheet:
     c = contour(spec, globe)
     margin, lash_line = _margin(spec, globe, c)
     conjunctiva = _conjunctiva(spec, globe, c)
-    skin = _skin(spec, globe, c, margin[-1], lash_line)
-    vertices = np.concatenate([conjunctiva, margin, skin])
-    normals = grid_normals(vertices)
+    skin = _skin(spec, globe, c.every(2), lash_line[::2])
+    vertices = np.concatenate([conjunctiva, margin, _halved(skin)])
+    coarse = grid_normals(vertices[FINE - 1 :, ::2])[1:]
+    normals = np.concatenate([grid_normals(vertices[: FINE + 1])[:-1], unit(_halved(coarse))])
     # The conjunctiva leaves the globe without an edge.
     for row, share in enumerate(_ON_GLOBE):
         radial = unit(vertices[row] - globe.centre)
@@ -69,14 +72,14 @@ def sheet(spec: Region, globe: Globe) -> Sheet:
     return Sheet(frozen(vertices), frozen(normals), c, frozen(lash_line))
 
 
-@lru_cache(maxsize=4)
-def faces(rows: int = ROWS, columns: int = COLUMNS) -> Ints:
-    """Triangles (m, 3) of a grid that is closed along its columns, facing outwards for a right eye."""
-    i, j = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
-    k = (j + 1) % columns
-    a, b, c, d = i * columns + j, i * columns + k, (i + 1) * columns + j, (i + 1) * columns + k
-    return frozen(np.concatenate([np.stack([a, c, d], -1).reshape(-1, 3), np.stack([a, d, b], -1).reshape(-1, 3)]),
-                  np.int64)  # fmt: skip
+def _halved(grid: Floats) -> Floats:
+    """Grid (rows, 2 n, 3) with a column halfway between each two of a closed one (rows, n, 3)."""
+    rows, columns, _ = grid.shape
+    out = np.empty((rows, 2 * columns, 3))
+    out[:, ::2] = grid
+    out[:, 1:-1:2] = 0.5 * (grid[:, :-1] + grid[:, 1:])
+    out[:, -1] = 0.5 * (grid[:, -1] + grid[:, 0])
+    return out
 
 
 def grid_normals(vertices: Floats) -> Floats:
@@ -173,13 +176,13 @@ def _spread(c: Contour, y: Floats, z: Floats, y_line: float, nasal: bool) -> Flo
     return out
 
 
-def _skin(spec: Region, globe: Globe, c: Contour, edge: Floats, lash_line: Floats) -> Floats:
-    """Rows from the lash line (exclusive) outwards."""
+def _skin(spec: Region, globe: Globe, c: Contour, lash_line: Floats) -> Floats:
+    """Rows from the lash line (exclusive) outwards, in the columns of a contour."""
     crease = _crease(spec, c)
     v, y, z = _spokes(c, crease, lash_line)
     # Lids move their own skin, and move that of the brow and the cheek less the farther away it is.
     held = step(np.arange(LID + FACE, dtype=float), LID + 0.25 * FACE, LID + 0.72 * FACE)[:, None]
-    y_rest, z_rest = _at_rest(spec.model_copy(update={"blink": 0.0}))
+    y_rest, z_rest = _at_rest(spec.model_copy(update={"blink": 0.0}), len(c.angle))
     y, z = y + held * (y_rest - y), z + held * (z_rest - z)
     x = skin_depth(spec, globe, y, z) + _fullness(spec, c, y, z)
     start = lash_line[:, 0] - skin_depth(spec, globe, lash_line[:, 1], lash_line[:, 2])
@@ -207,10 +210,10 @@ def _spokes(c: Contour, crease: Floats, lash_line: Floats) -> tuple[Floats, Floa
 
 
 @lru_cache(maxsize=8)
-def _at_rest(spec: Region) -> tuple[Floats, Floats]:
+def _at_rest(spec: Region, columns: int) -> tuple[Floats, Floats]:
     """Coordinates y and z (rows, columns) of the skin with the eye open and straight ahead."""
     globe = Globe.sphere()
-    c = contour(spec, globe)
+    c = contour(spec, globe, columns)
     _, lash_line = _margin(spec, globe, c)
     _, y, z = _spokes(c, _crease(spec, c), lash_line)
     return frozen(y), frozen(z)

@@ -15,17 +15,18 @@ import trimesh
 from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
 from ..geometry.vectors import lengths
 from .anatomy import Region
+from .brow import PLACES as BROW_PLACES
 from .brow import brow
 from .contour import COLUMNS, Contour, contour
 from .globe import Globe
 from .hairs import SEGMENTS, Hairs, tube_faces
 from .lashes import lashes
-from .lids import ROWS, grid_normals, sheet
+from .lids import FINE, ROWS, grid_normals, sheet
 from .skin import BROW, LASH, LASH_U, TEAR, band_row, sheet_v
 from .tears import ROWS as TEAR_ROWS
 from .tears import meniscus
 
-PARTS = ("skin", "tears", "lashes", "brow")
+PARTS = ("skin", "lashes", "brow", "tears")
 HAIRS = 2  # the first of a mesh's strands, which are hairs
 
 
@@ -64,7 +65,7 @@ class RegionMesh(ArrayValue):
     strands: tuple[Floats, ...]
 
     def part(self, name: str) -> trimesh.Trimesh:
-        """Return one part as a trimesh: skin, tears, lashes or brow."""
+        """Return one part as a trimesh: skin, lashes, tears or brow."""
         i = PARTS.index(name)
         v0, f0 = (0, 0) if i == 0 else (int(self.layout.vertex_ends[i - 1]), int(self.layout.face_ends[i - 1]))
         v1, f1 = int(self.layout.vertex_ends[i]), int(self.layout.face_ends[i])
@@ -93,8 +94,9 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
     lash = lashes(spec, globe, s)
     hair, hair_tubes, hair_normals = _brow(spec.model_copy(update={"blink": 0.0}))
     lash_tubes = lash.tubes()
-    vertices = np.concatenate([_closed(s.vertices), _closed(tears), lash_tubes, hair_tubes])
-    normals = np.concatenate([_closed(s.normals), _closed(grid_normals(tears)), _round(lash, lash_tubes), hair_normals])
+    vertices = np.concatenate([_of_sheet(s.vertices), lash_tubes, hair_tubes, _closed(tears)])
+    film = _closed(grid_normals(tears))
+    normals = np.concatenate([_of_sheet(s.normals), _round(lash, lash_tubes), hair_normals, film])
     upper, lower = _margins(s.contour)
     curves = [upper, lower, s.vertices[-1], lash.points, hair.points, np.concatenate([tears, tears[:, :1]], axis=1)]
     if globe.mirrored:
@@ -118,11 +120,16 @@ def _closed(grid: Floats) -> Floats:
     return np.concatenate([grid, grid[:, :1]], axis=1).reshape(-1, 3)
 
 
+def _of_sheet(grid: Floats) -> Floats:
+    """Vertices (n, 3) of the sheet from its grid; `sheet_vertices` numbers them."""
+    return np.concatenate([_closed(grid[: FINE + 1]), _closed(grid[FINE + 1 :, ::2])])
+
+
 @lru_cache(maxsize=16)
 def _brow(spec: Region) -> tuple[Hairs, Floats, Floats]:
     """Brow, its tubes and their normals; it does not blink."""
     hairs = brow(spec)
-    tubes = frozen(hairs.tubes())
+    tubes = frozen(hairs.tubes(np.array([1.0, 0.0, 0.0])))
     return hairs, tubes, frozen(_round(hairs, tubes))
 
 
@@ -143,10 +150,10 @@ def _margins(fissure: Contour) -> tuple[Floats, Floats]:
 @lru_cache(maxsize=16)
 def _layout(upper_count: int, lash_count: int, brow_count: int, mirrored: bool) -> RegionLayout:
     parts = [
-        (_grid_faces(ROWS), _grid_uv(ROWS, None)),
-        (_grid_faces(TEAR_ROWS), _grid_uv(TEAR_ROWS, band_row(TEAR))),
+        (sheet_faces(), _sheet_uv()),
         (tube_faces(lash_count, SEGMENTS + 1), _lash_uv(upper_count, lash_count)),
-        (tube_faces(brow_count, 5), _hair_uv(brow_count, 5, band_row(BROW))),
+        (tube_faces(brow_count, len(BROW_PLACES), on_skin=True), _brow_uv(brow_count)),
+        (_tear_faces(), _tear_uv()),
     ]
     faces, uv, start = [], [], 0
     for f, t in parts:
@@ -164,25 +171,67 @@ def _layout(upper_count: int, lash_count: int, brow_count: int, mirrored: bool) 
     )
 
 
-def _grid_faces(rows: int) -> Ints:
+def _tear_faces() -> Ints:
     n = COLUMNS + 1
-    i, j = np.meshgrid(np.arange(rows - 1), np.arange(COLUMNS), indexing="ij")
+    i, j = np.meshgrid(np.arange(TEAR_ROWS - 1), np.arange(COLUMNS), indexing="ij")
     a, b, c, d = i * n + j, i * n + j + 1, (i + 1) * n + j, (i + 1) * n + j + 1
     both = [np.stack([a, c, d], -1).reshape(-1, 3), np.stack([a, d, b], -1).reshape(-1, 3)]
     return np.concatenate(both).astype(np.int64)
 
 
 @lru_cache(maxsize=1)
+def sheet_faces() -> Ints:
+    """Triangles (m, 3) of the sheet, from row to row.
+
+    From the row `FINE` on, cells are two columns wide. That row itself has a vertex in every column for the cells
+    before it. Every second one lies on an edge of the cells after it, which is divided there, so that no gap opens.
+    """
+    out = []
+    for i in range(ROWS - 1):
+        wide = 1 if i < FINE else 2
+        j = np.arange(0, COLUMNS, wide)
+        a, b, c, d = (sheet_vertices(i + k, j + n) for k in (0, 1) for n in (0, wide))
+        middle = sheet_vertices(i, j + 1)
+        upper = [(a, d, middle), (middle, d, b)] if i == FINE else [(a, d, b)]
+        out += [np.stack(corners, axis=-1) for corners in ((a, c, d), *upper)]
+    return frozen(np.concatenate(out), np.int64)
+
+
+def sheet_vertices(row: Ints | int, column: Ints | int) -> Ints:
+    """Numbers of the sheet's vertices in rows and columns of its grid; rows beyond `FINE` have the even columns."""
+    half = COLUMNS // 2
+    coarse = half * (FINE + 1) + (half + 1) * row + column // 2
+    return np.where(np.greater(row, FINE), coarse, (COLUMNS + 1) * row + column)
+
+
+@lru_cache(maxsize=1)
 def sheet_ends() -> Bools:
     """Whether each triangle of the sheet of skin is in its first or last row, which no other row continues."""
-    row = np.arange(2 * (ROWS - 1) * COLUMNS) % ((ROWS - 1) * COLUMNS) // COLUMNS
-    return frozen((row == 0) | (row == ROWS - 2), np.bool_)
+    within = (sheet_vertices(1, 0) <= sheet_faces()) & (sheet_faces() < sheet_vertices(ROWS - 1, 0))
+    return frozen(~within.all(axis=1), np.bool_)
 
 
-def _grid_uv(rows: int, v: float | None) -> Floats:
+@lru_cache(maxsize=1)
+def sheet_neighbours() -> Ints:
+    """Numbers (2, ROWS, COLUMNS) of the vertices at each place of the sheet's grid, or before and after it."""
+    i, j = np.meshgrid(np.arange(ROWS), np.arange(COLUMNS), indexing="ij")
+    odd = np.where(i > FINE, j % 2, 0)
+    return frozen(np.stack([sheet_vertices(i, j - odd), sheet_vertices(i, j + odd)]), np.int64)
+
+
+def _sheet_uv() -> Floats:
     u = np.arange(COLUMNS + 1) / COLUMNS
-    down = sheet_v(np.linspace(0, 1, rows)) if v is None else np.full(rows, v)
-    return np.stack(np.meshgrid(u, down), axis=-1).reshape(-1, 2)
+    v = sheet_v(np.linspace(0, 1, ROWS))
+    parts = (u, v[: FINE + 1]), (u[::2], v[FINE + 1 :])
+    return np.concatenate([_grid_uv(*part) for part in parts])
+
+
+def _grid_uv(u: Floats, v: Floats) -> Floats:
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
+def _tear_uv() -> Floats:
+    return _grid_uv(np.arange(COLUMNS + 1) / COLUMNS, np.full(TEAR_ROWS, band_row(TEAR)))
 
 
 def _lash_uv(upper_count: int, count: int) -> Floats:
@@ -193,5 +242,5 @@ def _lash_uv(upper_count: int, count: int) -> Floats:
     return np.stack([u, np.full_like(u, band_row(LASH))], axis=-1)
 
 
-def _hair_uv(count: int, points: int, v: float) -> Floats:
-    return np.tile([0.5, v], (count * points * 3, 1)).reshape(-1, 2)
+def _brow_uv(count: int) -> Floats:
+    return np.tile([0.5, band_row(BROW)], (count * len(BROW_PLACES) * 3, 1)).reshape(-1, 2)

@@ -7,9 +7,11 @@ along the lids, and short waves bend its surface (`waves`), so lamps appear in i
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, frozen
 from .anatomy import Region
 from .contour import step
 from .globe import Globe
@@ -26,12 +28,13 @@ def waves(spec: Region, count: int) -> Floats:
     return _SLOPE * spec.tears.unevenness * _noise(spec.seed + 1, count, *_SHORT)
 
 
+@lru_cache(maxsize=16)
 def _noise(seed: int, count: int, low: int, high: int) -> Floats:
     """Noise (count,) of mean 0 and variance 1 with `low` to `high` waves around the fissure."""
     rng = np.random.default_rng((0x7EA2, seed))
     turn = rng.uniform(0, 2 * np.pi, high - low)
     angle = 2 * np.pi * np.arange(count)[:, None] / count
-    return np.asarray(np.cos(np.arange(low, high) * angle + turn).sum(axis=1) * np.sqrt(2 / (high - low)))
+    return frozen(np.cos(np.arange(low, high) * angle + turn).sum(axis=1) * np.sqrt(2 / (high - low)))
 
 
 def meniscus(spec: Region, globe: Globe, sheet: Sheet) -> Floats:

@@ -33,7 +33,7 @@ class HeadScene(RegionScene):
     """
 
     parts = HEAD_PARTS
-    moving = 0  # the mesh is fixed
+    fixed = True
 
     def __init__(self, spec: Region, globe: Globe, expected: Expected | None = None) -> None:
         super().__init__(spec, globe, expected)

@@ -1,8 +1,8 @@
 """What the lamps see of an eye region: where nothing but bare skin is in the way, no ray is needed for a shadow.
 
 The view of every lamp, a stereographic map of the directions from its middle, is divided into cells. A cell is marked
-if it may show a hair, a line of tears, an end of the sheet of skin, or a triangle of the sheet that turns its back to
-any point of the lamp. A ray through a cell without marks meets the sheet from its front only. The crossings from the
+if it may show a hair, an end of the sheet of skin, or a triangle of the sheet that turns its back to any point of the
+lamp. A ray through a cell without marks meets the sheet from its front only. The crossings from the
 front, less those from the back, are at most one, because the sheet is one surface with a hole (see `plain`). So a point
 of the sheet in such a cell is the only one there, and the lamp lights it.
 
@@ -74,9 +74,9 @@ class LampViews:
         return _View(*(mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9)), *row[12:15])
 
     def _mark_triangles(self, skin: SkinGeometry, lamps: int) -> None:
-        """Mark the cells that triangles of the sheet and of the line of tears may cover, where they can shade."""
-        faces = dr.opaque(mi.UInt32, skin.before_hairs)
-        index = dr.arange(mi.UInt32, skin.before_hairs * lamps)
+        """Mark the cells that triangles of the sheet may cover, where they can shade."""
+        faces = dr.opaque(mi.UInt32, skin.of_sheet)
+        index = dr.arange(mi.UInt32, skin.of_sheet * lamps)
         lamp = index // faces
         view = self._view(lamp)
         a, b, c, special = skin.corners(index - lamp * faces)

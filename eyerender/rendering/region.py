@@ -1,10 +1,9 @@
 """The eye region in Mitsuba: triangles with one map, moved in place, of one subject after another.
 
-The triangles are in the scene's frame (the world's axes, origin at the apex of the unrotated eye) as two instances: the
-parts that move with the eye, and the fixed brow. A pose sends the vertices of the first alone, but Mitsuba 3.9 builds
-both trees again. It lets Embree build an instance's tree without the spatial splits of a scene's own meshes, which
-takes a third of the time. The appearance of a hit is read from buffers of our own (`SkinGeometry`), so kernels do not
-change.
+The triangles are in the scene's frame (the world's axes, origin at the apex of the unrotated eye) as one instance,
+because Mitsuba lets Embree build an instance's tree without the spatial splits of a scene's own meshes, which takes a
+third of the time. The menisci are a scene of their own. The appearance of a hit is read from buffers of our own
+(`SkinGeometry`), so kernels do not change.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from ..region.anatomy import Region
 from ..region.contour import COLUMNS
 from ..region.globe import Globe
 from ..region.head import file_states
-from ..region.lids import ROWS
+from ..region.lids import FINE, ROWS
 from ..region.mapcache import kept
 from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh, sheet_ends
 from ..region.skin import SHEET_ROWS, skin_texels
@@ -32,14 +31,13 @@ from .surround import clear_between, rays_between
 from .values import aligned
 
 GRID_ROWS, GRID_COLUMNS = 160, 768  # of the finer grid over the sheet on which its light is computed (`subsurface`)
-SHEET_COLUMNS = COLUMNS + 1  # of vertices, because the first column is repeated
+SHEET_COLUMNS = COLUMNS + 1  # of the sheet's grid, because the first column is repeated
 _F0_OIL, _F0_TEARS = 0.035, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
 _ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.02, 0.03
 _THICK, _THINNER = 0.42, 0.6  # gloss from which a film of oil is smooth, and its roughness per gloss below
 _OILY = 0.93  # share of skin's sheen in the narrow lobe of its film of oil, which the relief breaks into points
 _WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
 _RIPPLE = 0.02  # slope of wet tissue
-_NONE = slice(0)
 
 
 Expected: TypeAlias = tuple[Region, Globe, "Future[RegionMesh]"]
@@ -51,42 +49,36 @@ class RegionScene:
 
     obstructed = True
     parts: tuple[str, ...] = PARTS
-    moving = 3  # the first parts, which the eye moves
+    fixed = False  # whether the mesh keeps still, and has no menisci that light passes through
 
     def __init__(self, spec: Region, globe: Globe, expected: Expected | None = None) -> None:
         posed = self._made(spec, globe, expected)
         meshes = {name: _mesh(posed, *cut) for name, cut in self._cuts(posed.layout).items()}
         # Without robust intersections rays slip between the triangles of a large face on some processors. An instance
         # cannot have them, but its triangles are small.
-        parts: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True}
-        film = meshes.pop("film", None)
-        for name, mesh in meshes.items():
-            parts |= _instance(name, mesh) if self.moving else {name: mesh}
-        self.scene = mi.load_dict(parts)
-        self._params: dict[str, Any] = dict.fromkeys(meshes, mi.traverse(self.scene))
-        self._water = None if film is None else mi.load_dict({"type": "scene", **_instance("film", film)})
-        if self._water is not None:
+        robust: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True}
+        solid = {"solid": meshes["solid"]} if self.fixed else _instance("solid", meshes["solid"])
+        self.scene, self._water = mi.load_dict(robust | solid), None
+        self._params: dict[str, Any] = {"solid": mi.traverse(self.scene)}
+        if not self.fixed:
+            self._water = mi.load_dict({"type": "scene", **_instance("film", meshes["film"])})
             self._params["film"] = mi.traverse(self._water)
         self._dress(spec, globe, posed)
 
-    def _cuts(self, layout: RegionLayout) -> dict[str, tuple[slice, slice, slice]]:
-        """The vertices and faces of each mesh, and those faces that nothing meets."""
-        moved = [int(ends[self.moving - 1]) if self.moving else 0 for ends in (layout.vertex_ends, layout.face_ends)]
-        still = {"still": (slice(moved[0], None), slice(moved[1], None), _NONE)} if moved[1] < len(layout.faces) else {}
-        if not self.moving:
-            return still
-        water, film = (slice(int(ends[0]), int(ends[1])) for ends in (layout.vertex_ends, layout.face_ends))
-        return {"moving": (slice(0, moved[0]), slice(0, moved[1]), film), "film": (water, film, _NONE), **still}
+    def _cuts(self, layout: RegionLayout) -> dict[str, tuple[slice, slice]]:
+        """The vertices and faces of each mesh."""
+        if self.fixed:
+            return {"solid": (slice(0, None), slice(0, None))}
+        v, f = (int(ends[-2]) for ends in (layout.vertex_ends, layout.face_ends))
+        return {"solid": (slice(0, v), slice(0, f)), "film": (slice(v, None), slice(f, None))}
 
     def _dress(self, spec: Region, globe: Globe, posed: RegionMesh) -> None:
         """Take the appearance of a subject."""
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
         pixels = aligned(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
-        moving = next((s for s in self.scene.shapes() if s.id() == "shown_moving"), None)
-        moved = self._cuts(posed.layout)["moving"][1].stop if self.moving else 0
         mirror = -1.0 if globe.mirrored else 1.0
-        self.skin = SkinGeometry(look, pixels, posed.layout, moved, moving, mirror, self._inner(), self._water)
+        self.skin = SkinGeometry(look, pixels, posed.layout, mirror, self._inner(), self._water)
         self.skin.pose(posed)
         self._shown: tuple[Region, Globe] | None = (spec, globe)
         self.posed = posed
@@ -94,7 +86,7 @@ class RegionScene:
 
     def takes(self, spec: Region) -> bool:
         """Whether the scene has the meshes that a subject needs."""
-        return self.moving > 0 and spec.head is None and ("still" in self._params) == (spec.brow.count > 0)
+        return not self.fixed and spec.head is None
 
     def fill(self, spec: Region, globe: Globe, expected: Expected | None) -> None:
         """Show another subject with the same shapes, so that recordings can still be played back."""
@@ -126,16 +118,15 @@ class RegionScene:
         return self._posed(self._shown[0].model_copy(update={"blink": 0.0}), globe)
 
     def _move(self, posed: RegionMesh) -> None:
-        before, self.posed = self.posed, posed
-        for name, (vertices, *_) in self._cuts(posed.layout).items():
-            if name != "still" or not np.array_equal(before.vertices[vertices], posed.vertices[vertices]):
-                self._send(name, posed)
+        self.posed = posed
+        for name in self._params:
+            self._send(name, posed)
         self._update()
         self.skin.pose(posed)
 
     def _send(self, name: str, posed: RegionMesh) -> None:
         """Set the vertices of a mesh."""
-        place = f"{name}.mesh" if self.moving else name
+        place = name if self.fixed else f"{name}.mesh"
         self._params[name][f"{place}.vertex_positions"] = _floats(posed.vertices[self._cuts(posed.layout)[name][0]])
 
     def _update(self) -> None:
@@ -177,16 +168,15 @@ def _floats(values: Floats) -> mi.Float:
     return mi.Float(aligned(values.astype(np.float32).ravel()))
 
 
-def _faces(layout: RegionLayout, vertices: slice, faces: slice, without: slice) -> mi.UInt32:
-    """Some of the triangles, with numbers of some of the vertices. Nothing meets those `without`."""
-    triangles = layout.faces[faces] - (vertices.start or 0)
-    triangles[without] = 0
+def _faces(layout: RegionLayout, vertices: slice, faces: slice) -> mi.UInt32:
+    """Some of the triangles, with numbers of some of the vertices."""
+    triangles = layout.faces[faces] - vertices.start
     return mi.UInt32(aligned(triangles.astype(np.uint32).ravel()))
 
 
-def _mesh(posed: RegionMesh, vertices: slice, faces: slice, without: slice) -> mi.Mesh:
+def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
     """Make a mesh of some of the triangles."""
-    corners, triangles = posed.vertices[vertices], _faces(posed.layout, vertices, faces, without)
+    corners, triangles = posed.vertices[vertices], _faces(posed.layout, vertices, faces)
     mesh = mi.Mesh("region", len(corners), len(triangles) // 3)
     params = mi.traverse(mesh)
     params["faces"] = triangles
@@ -219,17 +209,13 @@ class SkinGeometry:
     `water` holds the menisci, which are not in the scene because light passes through them; None if they are opaque.
     """
 
-    DRJIT_STRUCT = leaves(
-        "_map", "water", "is_sheet", "_corners", "_buffer", "_received", "_moving", "_first_still", "_sheet", "_mirror"
-    )
+    DRJIT_STRUCT = leaves("_map", "water", "is_sheet", "_corners", "_buffer", "_received", "_sheet", "_film", "_mirror")
 
     def __init__(
         self,
         look: mi.Texture2f,
         pixels: NDArray[np.float16],
         layout: RegionLayout,
-        moving: int,
-        instance: mi.Shape | None,
         mirror: float,
         inner: Bools | None,
         water: mi.Scene | None,
@@ -239,14 +225,14 @@ class SkinGeometry:
         corners = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
         corners[:, :3] = layout.faces
         corners[: layout.face_ends[0], 3] = False if inner is None else ~inner
-        self.before_hairs, self.is_sheet = int(layout.face_ends[1]), inner is not None
+        self.of_sheet, self.is_sheet = int(layout.face_ends[0]), inner is not None
         self._corners = mi.UInt32(aligned(corners.ravel()))
         self._records = np.zeros((len(layout.uv), 8), np.float32)
         self._records[:, 3], self._records[:, 7] = layout.uv.T
         self._buffer = self._received = mi.Float(0)
-        self._moving, self._first_still = mi.ShapePtr(instance), mi.UInt32(moving)
-        self._sheet, self._mirror = mi.UInt32(int(layout.face_ends[0])), mi.Float(mirror)
-        dr.make_opaque(self._moving, self._first_still, self._sheet, self._mirror)
+        self._sheet, self._film = (mi.UInt32(int(layout.face_ends[k])) for k in (0, -2))
+        self._mirror = mi.Float(mirror)
+        dr.make_opaque(self._sheet, self._film, self._mirror)
 
     def pose(self, posed: RegionMesh) -> None:
         """Update the corners to a pose."""
@@ -260,25 +246,20 @@ class SkinGeometry:
         return *(mi.Vector3f(p.x, p.y, p.z) for p in (a, b, c)), corner.w > 0
 
     def sheet_point(self, row: mi.Float, column: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
-        """Points of the sheet's triangles at fractional rows and columns of its vertices, and the smooth normals."""
+        """Points of the sheet's triangles at fractional rows and columns of its grid, and the smooth normals."""
         i, j = mi.UInt32(dr.clip(row, 0, ROWS - 1.001)), mi.UInt32(dr.clip(column, 0, SHEET_COLUMNS - 1.001))
-        s, t = column - mi.Float(j), row - mi.Float(i)
-        first = i * SHEET_COLUMNS + j
+        wide = dr.select(i < FINE, mi.UInt32(1), 2)
+        j -= j & (wide - 1)
+        s, t = (column - mi.Float(j)) / mi.Float(wide), row - mi.Float(i)
         # Each cell has two triangles, whose common edge runs from its first corner to the opposite one.
         weights = (1 - dr.maximum(s, t), dr.abs(s - t), dr.minimum(s, t))
-        corners = (first, first + dr.select(s > t, 1, SHEET_COLUMNS), first + SHEET_COLUMNS + 1)
+        corners = ((i, j), (dr.select(s > t, i, i + 1), dr.select(s > t, j + wide, j)), (i + 1, j + wide))
         place, turned = mi.Vector4f(0), mi.Vector4f(0)
         for weight, corner in zip(weights, corners, strict=True):
-            place += weight * dr.gather(mi.Vector4f, self._buffer, 2 * corner)
-            turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * corner + 1)
+            vertex = _sheet_vertex(*corner)
+            place += weight * dr.gather(mi.Vector4f, self._buffer, 2 * vertex)
+            turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * vertex + 1)
         return mi.Vector3f(place.x, place.y, place.z), dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
-
-    def sheet_row(self, row: mi.Float, column: mi.UInt32) -> mi.Vector3f:
-        """Points of the sheet at fractional rows, in columns of its vertices."""
-        i = mi.UInt32(dr.clip(row, 0, ROWS - 1.001))
-        a, b = (dr.gather(mi.Vector4f, self._buffer, 2 * ((i + k) * SHEET_COLUMNS + column)) for k in (0, 1))
-        place = a + (row - mi.Float(i)) * (b - a)
-        return mi.Vector3f(place.x, place.y, place.z)
 
     def map_place(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Coordinates of the map at barycentric coordinates `uv` of triangles."""
@@ -301,11 +282,11 @@ class SkinGeometry:
 
     def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
         """Index of the layout's triangle that was hit."""
-        return hit.prim_index + dr.select(hit.instance == self._moving, 0, self._first_still)
+        return mi.UInt32(hit.prim_index)
 
     def on_water(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
         """Index of the layout's triangle of the menisci that was hit."""
-        return hit.prim_index + self._sheet
+        return hit.prim_index + self._film
 
     def on_sheet(self, face: mi.UInt32) -> mi.Bool:
         """Whether a triangle belongs to the sheet of skin, not to what is in front of it."""
@@ -327,7 +308,8 @@ class SkinGeometry:
         for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), corners, strict=True):
             turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i + 1, active)
         n = dr.cross(b - a, c - a)
-        return dr.dot(n, d) * dr.dot(n, mi.Vector3f(turned.x, turned.y, turned.z)) > 0
+        behind = dr.dot(n, d) * dr.dot(n, mi.Vector3f(turned.x, turned.y, turned.z)) > 0
+        return behind & self.on_sheet(face) if self.is_sheet else behind  # hairs are thin, and some are open tubes
 
     def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Surface:
         """Surface at barycentric coordinates `uv` of triangles."""
@@ -342,6 +324,12 @@ class SkinGeometry:
         smooth = dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
         normal = self.tilted(smooth, slope_y, slope_z)
         return Surface(mi.Vector3f(place.x, place.y, place.z), normal, smooth, albedo, gloss, received)
+
+
+def _sheet_vertex(row: mi.UInt32, column: mi.UInt32) -> mi.UInt32:
+    """Numbers of vertices of the sheet, like those of `mesh.sheet_vertices`."""
+    half = COLUMNS // 2
+    return dr.select(row > FINE, half * (FINE + 1) + (half + 1) * row + (column >> 1), SHEET_COLUMNS * row + column)
 
 
 def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:

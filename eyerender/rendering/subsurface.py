@@ -29,7 +29,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints
 from ..optics.diffusion import half_space_length_mm, rings, slab_length_mm, transmitted
 from ..region.globe import Globe
-from ..region.mesh import RegionMesh
+from ..region.mesh import RegionMesh, sheet_neighbours
 from ..region.skin import BANDS, SHEET_ROWS, sheet_place
 from .frame import globe_of
 from .lighting import irradiance, lamp_blocked
@@ -524,8 +524,9 @@ class SheetGrid:
         rows, columns = GRID_ROWS // each, GRID_COLUMNS // each
         texels = SHEET_ROWS // rows
         edges = sheet_place(np.arange(rows + 1.0) * texels - 0.5)
-        sheet = posed.vertices[: posed.layout.vertex_ends[0]].reshape(-1, SHEET_COLUMNS, 3)[:, :-1]
-        near = _in_window(sheet + job.anchor_mm, job, spare_mm, spare_px)
+        sheet = posed.vertices[: posed.layout.vertex_ends[0]]
+        shown = _in_window(sheet + job.anchor_mm, job, spare_mm, spare_px)
+        near = _grown(np.any(shown[sheet_neighbours()], axis=0))
         middle = sheet_place((np.arange(rows, dtype=float) + 0.5) * texels - 0.5)
         marks = [near[np.rint(middle).astype(int)][:, np.arange(columns) * near.shape[1] // columns]]
         for _ in _LEVEL_RINGS[1:]:
@@ -547,7 +548,7 @@ class SheetGrid:
         j = index - i * columns
 
         def point(i: mi.UInt32, j: mi.UInt32) -> mi.Vector3f:
-            return skin.sheet_row(dr.gather(mi.Float, self.middles, i), j)
+            return skin.sheet_point(dr.gather(mi.Float, self.middles, i), mi.Float(j))[0]
 
         before, after = dr.select(j > 0, j - 1, columns - 1), dr.select(j + 1 < columns, j + 1, 0)
         above, below = dr.maximum(i, 1) - 1, dr.minimum(i + 1, last)
@@ -702,14 +703,14 @@ def _numbers(cells: Ints) -> mi.UInt32:
 
 
 def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -> Bools:
-    """Which points (rows, columns, 3) of a grid, whose columns close, or neighbours of them a window shows."""
+    """Which points (n, 3) are in a window, or beside it by no more than what is spare."""
     camera, (x0, y0, width, height) = job.camera, job.window
     xy, front = camera.project(points)
     depth = np.maximum((points - camera.nodal_point_mm) @ camera.R[2], 1.0)
     spare = spare_px + spare_mm * float(max(camera.K[0, 0], camera.K[1, 1])) / depth
     with np.errstate(invalid="ignore"):
         inside = np.abs(xy - (x0 + 0.5 * width, y0 + 0.5 * height)) < 0.5 * np.array([width, height]) + spare[..., None]
-    return _grown(front & inside[..., 0] & inside[..., 1])
+    return np.asarray(front & inside[..., 0] & inside[..., 1])
 
 
 def _grown(marked: Bools) -> Bools:

@@ -8,15 +8,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from trimesh import Trimesh
 
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses, rigid_motion
+from eyerender.geometry.vectors import dots
 from eyerender.region.anatomy import Lashes, Region
+from eyerender.region.brow import brow
+from eyerender.region.contour import COLUMNS, contour
 from eyerender.region.globe import Globe
-from eyerender.region.hairs import SEGMENTS
+from eyerender.region.hairs import SEGMENTS, Hairs, tube_faces
 from eyerender.region.lashes import lashes, plan
-from eyerender.region.lids import CONJUNCTIVA, ROWS, sheet
-from eyerender.region.mesh import region_mesh
+from eyerender.region.lids import CONJUNCTIVA, FACE, FINE, LID, ROWS, _skin, sheet
+from eyerender.region.mesh import region_mesh, sheet_faces
 from eyerender.region.skin import LASH, LASH_U, band_row, skin_map
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
@@ -96,10 +100,10 @@ def check(i):
     spec, eye, globe, mesh = instance(i)
     note = f"instance {i}"
     skin = mesh.part("skin")
-    columns = len(skin.vertices) // ROWS
     assert signed_distance(eye, globe, points_on(skin, skin.faces)).min() > -INTO_MM, note
 
-    grid = np.asarray(skin.vertices).reshape(ROWS, columns, 3)
+    columns = COLUMNS + 1
+    grid = np.asarray(skin.vertices)[: (FINE + 1) * columns].reshape(-1, columns, 3)
     # No gap: the sheet's inner rim lies in the globe's surface, between its vertices too (a chord may bridge the
     # notch of the limbus by a few micrometres).
     rim = np.concatenate([grid[0], (grid[0] + np.roll(grid[0], 1, axis=0)) / 2])
@@ -142,6 +146,48 @@ def test_seeded_instances_hold():
 def test_five_hundred_instances_hold():
     for i in range(500):
         check(i)
+
+
+def test_every_second_column_beyond_the_lash_line_is_enough():
+    """The skin in all columns against the sheet, where every second one lies halfway between others."""
+    off = []
+    for i in range(12):
+        spec, _, globe, _ = instance(i)
+        found, c = sheet(spec, globe), contour(spec, globe)
+        whole = _skin(spec, globe, c, found.lash_line)
+        off.append(np.abs(dots(found.vertices[FINE:] - whole, found.normals[FINE:]))[: LID + FACE // 2])
+    assert np.sqrt(np.mean(np.square(off))) < 0.015  # mm
+    assert np.percentile(off, 99) < 0.05
+    assert np.max(off) < 0.2
+
+
+def test_the_sheet_is_one_surface():
+    """Every edge belongs to two triangles, one in each direction, but for both ends and the seam of the map."""
+    sides = np.concatenate([sheet_faces()[:, k] for k in ([0, 1], [1, 2], [2, 0])])
+    known = {tuple(side) for side in sides.tolist()}
+    assert len(known) == len(sides)
+    single = sum((b, a) not in known for a, b in known)
+    assert single == COLUMNS + COLUMNS // 2 + 2 * (ROWS - 1)
+
+
+def test_open_tubes_have_the_outlines_of_closed_ones():
+    hairs = brow(Region(seed=2))
+    hairs = Hairs(hairs.points[:40], hairs.radii[:40])
+    vertices, points = hairs.tubes(np.array([1.0, 0.0, 0.0])), hairs.points.shape[1]
+    rng = np.random.default_rng(1)
+    hair, piece, share = (
+        rng.integers(40, size=4000),
+        rng.integers(points - 1, size=4000),
+        rng.uniform(0.2, 0.8, (4000, 1)),
+    )
+    start = (1 - share) * hairs.points[hair, piece] + share * hairs.points[hair, piece + 1]
+    start, way = start + rng.normal(0, 0.05, (4000, 3)), rng.normal(size=(4000, 3))
+    closed, open_ = (
+        crossings(start - way, start + way, Trimesh(vertices, tube_faces(40, points, on_skin), process=False))
+        for on_skin in (False, True)
+    )
+    assert 400 < np.count_nonzero(closed) < 3600
+    assert np.mean(closed != open_) < 2e-3  # lines along a hair leave it through its open end
 
 
 def lash_plan(seed, **fields):

@@ -250,7 +250,8 @@ def test_hairs_are_sampled_more_finely(renderer, monkeypatch):
     job = render_job(scene(region=spec).frames(), 0)
     fine, _ = renderer.bind(job)[0].fine(job.window)
     assert 0.02 < fine.mean() < 0.4
-    error = [np.std((p.irradiance - many.irradiance)[fine]) for p in (few, plain)]
+    # Not the standard deviation: a mirror image of the lamp in a drop of water outweighs all hairs.
+    error = [np.percentile(np.abs(p.irradiance - many.irradiance)[fine], 90) for p in (few, plain)]
     assert error[0] < 0.75 * error[1]
     same = ~ndimage.binary_dilation(fine, iterations=5)  # the lens blurs over a few pixels
     assert np.allclose(few.irradiance[same], plain.irradiance[same], rtol=1e-4)
