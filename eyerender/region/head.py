@@ -173,6 +173,7 @@ def placed(head: HeadMesh, globe: Globe, texture: int = 0) -> RegionMesh:
         lower_margin=nothing,
         border=nothing,
         strands=(),
+        radii=(),
     )
 
 

@@ -54,6 +54,7 @@ class RegionMesh(ArrayValue):
         lower_margin: (k, 3) the same for the lower lid.
         border: (k, 3) outer end of the skin, closed.
         strands: curves (n, k, 3) of everything in front of the skin.
+        radii: those of the hairs among them, (n, k) mm.
     """
 
     vertices: Floats
@@ -63,6 +64,7 @@ class RegionMesh(ArrayValue):
     lower_margin: Floats
     border: Floats
     strands: tuple[Floats, ...]
+    radii: tuple[Floats, ...]
 
     def part(self, name: str) -> trimesh.Trimesh:
         """Return one part as a trimesh: skin, lashes, tears or brow."""
@@ -112,6 +114,7 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
         lower_margin=lower,
         border=border,
         strands=tuple(strands),
+        radii=(lash.radii, hair.radii),
     )
 
 

@@ -18,7 +18,7 @@ _TILE_PX = 8
 _STEP_PX = 4.0  # between marked points of a curve
 _SPARE_PX = 1.0
 _HAIR_MM = 0.1  # no hair and no part of a margin is thicker
-_THICK_PX, _FINE_STEP_PX = 2.0, 0.5
+_THICK_PX, _FINE_STEP_PX, _SLACK_PX = 2.0, 0.5, 0.02
 _NEAREST_MM = 3.0  # if hairs are closer to the camera, nothing is plain
 
 
@@ -48,23 +48,59 @@ def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, wi
         xy = (camera.project(curve + anchor_mm)[0] - corner) / tile
         if k < 2:
             outlines.append(_winding(xy[0], shape))
-        _mark(marked, _pieces(xy, shape), _STEP_PX / tile, reach / tile)
+        start, way, _ = _pieces(xy, shape)
+        _mark(marked, (start, way), _STEP_PX / tile, reach / tile)
     return (outlines[1] != 0) & (outlines[0] == 0) & ~marked, tile
 
 
 def fine_pixels(
     region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Floats, window: Window
 ) -> tuple[Bools, Bools]:
-    """Pixels (height, width) of a window at menisci and at hairs at most two pixels thick, and their neighbours.
+    """Pixels (height, width) of a window at menisci and those that hairs at most two pixels thick touch.
 
     The second result marks those that may show menisci, which are all pixels if a meniscus is too close. Marks do not
     depend on the window.
     """
-    curves = [] if region is None else list(region.strands)
+    if region is None:
+        return np.zeros((window[3], window[2]), dtype=bool), np.zeros((window[3], window[2]), dtype=bool)
+    fine = np.zeros((window[3], window[2]), dtype=bool)
+    for curve, radii in zip(region.strands[:HAIRS], region.radii, strict=True):
+        _mark_hairs(fine, curve + anchor_mm, radii, camera, window)
     # Menisci are grids, of which the strands are the rows.
-    water = [*curves[HAIRS:], *(grid.transpose(1, 0, 2) for grid in curves[HAIRS:])]
-    (fine, _), (wet, every) = (_drawn(some, camera, anchor_mm, window) for some in (curves[:HAIRS], water))
-    return _with_beside(fine | wet), _with_beside(wet) | (not every)
+    grids = region.strands[HAIRS:]
+    wet, every = _drawn([*grids, *(grid.transpose(1, 0, 2) for grid in grids)], camera, anchor_mm, window)
+    wet = _with_beside(wet)
+    return fine | wet, wet | (not every)
+
+
+def _mark_hairs(marked: Bools, curves: Floats, radii: Floats, camera: PinholeCamera, window: Window) -> None:
+    """Mark the pixels of a window that hairs touch, unless these are thick or too close."""
+    depth = (curves - camera.nodal_point_mm) @ camera.R[2]
+    focal = float(max(camera.K[0, 0], camera.K[1, 1]))
+    if not curves.size or depth.min() < _NEAREST_MM or _HAIR_MM * focal > _THICK_PX * depth.min():
+        return
+    # Away from the axis the picture is stretched.
+    thick = radii * focal * np.linalg.norm(curves - camera.nodal_point_mm, axis=-1) / depth**2 + _SLACK_PX
+    start, way, ends = _pieces(camera.project(curves)[0] - window[:2], marked.shape, thick)
+    half = np.maximum(*ends.T)
+    # Along x or y, whichever a piece follows more closely, each pixel has a few pixels across it.
+    steep = np.abs(way[:, 1]) > np.abs(way[:, 0])
+    a, b = (np.where(steep, v[:, ::-1].T, v.T) for v in (start, way))
+    slope = b[1] / np.where(b[0] == 0, 1, b[0])
+    first = np.rint(np.minimum(a[0], a[0] + b[0]) - half).astype(int)
+    count = np.rint(np.maximum(a[0], a[0] + b[0]) + half).astype(int) - first + 1
+    which = np.repeat(np.arange(len(count)), count)
+    along = first[which] + np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+    share = np.clip((along - a[0][which]) / np.where(b[0] == 0, 1, b[0])[which], 0, 1)
+    middle = a[1][which] + share * b[1][which]
+    reach = (half * np.sqrt(1 + slope * slope) + 0.5 * np.abs(slope))[which]
+    low, high = (np.rint(middle + side * reach).astype(int) for side in (-1, 1))
+    steep = steep[which]
+    for k in range(int(np.max(high - low, initial=-1)) + 1):
+        across = low + k
+        row, column = np.where(steep, along, across), np.where(steep, across, along)
+        there = (across <= high) & (row >= 0) & (column >= 0) & (row < marked.shape[0]) & (column < marked.shape[1])
+        marked[row[there], column[there]] = True
 
 
 def _drawn(curves: list[Floats], camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, bool]:
@@ -78,7 +114,7 @@ def _drawn(curves: list[Floats], camera: PinholeCamera, anchor_mm: Floats, windo
             continue
         xy = camera.project(curve + anchor_mm)[0] - (x0 - 1, y0 - 1)
         # Pieces beside the window need no points.
-        start, way = _pieces(xy, (height + 2, width + 2))
+        start, way, _ = _pieces(xy, (height + 2, width + 2))
         count = np.ceil(np.hypot(way[:, 0], way[:, 1]) / _FINE_STEP_PX).astype(int) + 1
         step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         column, row = (
@@ -98,13 +134,19 @@ def _with_beside(marked: Bools) -> Bools:
     return out
 
 
-def _pieces(xy: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Straight pieces of polylines (n, k, 2) that come near a grid of so many cells: start and way (m, 2)."""
+def _pieces(xy: Floats, shape: tuple[int, int], values: Floats | None = None) -> tuple[Floats, Floats, Floats]:
+    """Straight pieces of polylines (n, k, 2) that come near a grid of so many cells: start and way (m, 2).
+
+    The third result (m, 2) are `values` (n, k) at the ends of the pieces.
+    """
     a, b = xy[:, :-1].reshape(-1, 2), xy[:, 1:].reshape(-1, 2)
     near = (np.maximum(a, b) > -1) & (np.minimum(a, b) < (shape[1] + 1, shape[0] + 1))
     near = near[:, 0] & near[:, 1]
     start = a[near]
-    return start, b[near] - start
+    ends = np.zeros((len(start), 2))
+    if values is not None:
+        ends = np.stack([values[:, :-1].ravel()[near], values[:, 1:].ravel()[near]], axis=1)
+    return start, b[near] - start, ends
 
 
 def _mark(marked: Bools, pieces: tuple[Floats, Floats], step: float, reach: float) -> None:
