@@ -370,7 +370,7 @@ def _shaded(
             lambda k: in_turn(group, k, groups),
             (suns > 0) | ((lamps <= _FEW_LAMPS) & ~several & small),
             suns > 0,
-            dr.gather(mi.UInt8, plain, place) > 0,
+            (dr.gather(mi.UInt8, plain, place) > 0) & ~finely,
             marks > 1,
             layered,
         ),

@@ -23,9 +23,10 @@ _NEAREST_MM = 3.0  # if hairs are closer to the camera, nothing is plain
 
 
 def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, int]:
-    """Tiles (rows, columns) of a window that show nothing but skin, and the size of a tile in pixels.
+    """Tiles (rows, columns) of a window that show nothing but skin and thin hairs, and the size of a tile in pixels.
 
-    No tile does where the region's border is unknown or hairs come too close to the camera.
+    `fine_pixels` tells where the thin hairs are. No tile is like that where the region's border is unknown or hairs
+    come too close to the camera.
     """
     nothing = np.zeros((1, 1), dtype=bool), max(window[2:])
     if len(region.border) == 0:
@@ -33,6 +34,7 @@ def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, wi
     hole = np.concatenate([region.upper_margin, region.lower_margin[-2:0:-1]])
     closed = [np.concatenate([c, c[:1]])[None] for c in (hole, region.border)]
     curves = [c for c in (*closed, *region.strands) if c.size]
+    hairs = sum(c.size > 0 for c in region.strands[:HAIRS])
     depth = [float(np.min((c + anchor_mm - camera.nodal_point_mm) @ camera.R[2])) for c in curves]
     if min(depth) < _NEAREST_MM:
         return nothing
@@ -45,11 +47,12 @@ def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, wi
     marked = np.zeros(shape, dtype=bool)
     outlines = []
     for k, curve in enumerate(curves):
+        if 2 <= k < 2 + hairs and _thin(depth[k], camera):
+            continue
         xy = (camera.project(curve + anchor_mm)[0] - corner) / tile
         if k < 2:
             outlines.append(_winding(xy[0], shape))
-        start, way, _ = _pieces(xy, shape)
-        _mark(marked, (start, way), _STEP_PX / tile, reach / tile)
+        _mark(marked, _pieces(xy, shape)[:2], _STEP_PX / tile, reach / tile)
     return (outlines[1] != 0) & (outlines[0] == 0) & ~marked, tile
 
 
@@ -73,11 +76,17 @@ def fine_pixels(
     return fine | wet, wet | (not every)
 
 
+def _thin(depth_mm: float, camera: PinholeCamera) -> bool:
+    """Whether hairs that come so close are thin in the picture."""
+    focal = float(max(camera.K[0, 0], camera.K[1, 1]))
+    return depth_mm >= _NEAREST_MM and _HAIR_MM * focal <= _THICK_PX * depth_mm
+
+
 def _mark_hairs(marked: Bools, curves: Floats, radii: Floats, camera: PinholeCamera, window: Window) -> None:
     """Mark the pixels of a window that hairs touch, unless these are thick or too close."""
     depth = (curves - camera.nodal_point_mm) @ camera.R[2]
     focal = float(max(camera.K[0, 0], camera.K[1, 1]))
-    if not curves.size or depth.min() < _NEAREST_MM or _HAIR_MM * focal > _THICK_PX * depth.min():
+    if not curves.size or not _thin(float(depth.min()), camera):
         return
     # Away from the axis the picture is stretched.
     thick = radii * focal * np.linalg.norm(curves - camera.nodal_point_mm, axis=-1) / depth**2 + _SLACK_PX
