@@ -13,7 +13,7 @@ from .lighting import lamp_blocked, on_relief, straight, through_cornea
 from .region import film_normal, glossy_normal
 from .shading import direct, indirect, off_eye
 from .values import Lamp, Lights, Values
-from .view import Textures, View, look_at_skin, meet, outer_albedo
+from .view import RegionHit, Textures, View, behind, look_at_skin, meet_globe, outer_albedo
 from .water import parts_of, through_water, wetted
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ class Group:
     Attributes:
         count: number of samples.
         ray: origin, direction (scene's frame) and weight of sample j.
+        hit: what sample j hits of the region, from what it meets of the globe alone, its origin and its direction.
         spot: place of sample j on the lamps' discs, [0, 1)^2.
         shared_spot: the same for the group. The groups that use a lamp have consecutive places.
         asked: number of lamps to which sample j sends rays where it meets the globe.
@@ -46,6 +47,7 @@ class Group:
 
     count: mi.UInt32
     ray: Callable[[mi.UInt32], tuple[mi.Vector3f, mi.Vector3f, mi.Float]]
+    hit: Callable[[mi.UInt32, View, mi.Vector3f, mi.Vector3f], RegionHit]
     spot: Callable[[mi.UInt32], mi.Point2f]
     shared_spot: mi.Point2f
     asked: Callable[[mi.UInt32], mi.UInt32]
@@ -158,9 +160,10 @@ class _GroupShading:
         j = self.number(i)
         o, d, weight = group.ray(j)
 
-        view, hit = meet(values, self.scene, o, d, mi.Bool(True))
+        view = meet_globe(values, o, d)
+        hit = group.hit(j, view, o, d)
+        view, face = behind(view, hit, mi.Bool(True)), hit.face
         at = o + hit.t * d
-        face = skin.face(hit)
         on_sheet = skin.on_sheet(face)
         if skin.water is not None:
             total, d, *parts = dr.if_stmt(

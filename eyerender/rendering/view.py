@@ -169,6 +169,19 @@ class PlaneHit:
         return self.t < dr.inf
 
 
+@dataclass
+class RegionHit:
+    """Hit of a ray on a triangle (`face`) of an eye region, infinitely far where there is none."""
+
+    t: mi.Float = None
+    face: mi.UInt32 = None
+    prim_uv: mi.Point2f = None
+
+    def is_valid(self) -> mi.Bool:
+        """Whether anything is hit."""
+        return self.t < dr.inf
+
+
 Hit: TypeAlias = "mi.PreliminaryIntersection3f | PlaneHit"
 
 
@@ -217,12 +230,23 @@ def meet(
         hit = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
     else:
         hit = PlaneHit.of(values.backdrop_x, o, d, alone.distance)
+    return behind(alone, hit, active), hit
+
+
+def behind(alone: View, hit: Hit | RegionHit, active: mi.Bool) -> View:
+    """View of rays that meet the globe like `alone` where nothing is hit in front of it."""
     clear = ~hit.is_valid() & active
     on_cornea, on_sclera = alone.cornea & clear, alone.sclera & clear
     other = hit.is_valid() & active
     return replace(
         alone, cornea=on_cornea, sclera=on_sclera, other=other, distance=dr.select(other, hit.t, alone.distance)
-    ), hit
+    )
+
+
+def region_hit(skin: SkinGeometry, scene: mi.Scene, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> RegionHit:
+    """Hits of camera rays on an eye region in front of the globe."""
+    hit = scene.ray_intersect_preliminary(_ray(alone, o, d), coherent=True, active=True)
+    return RegionHit(dr.select(hit.is_valid(), hit.t, dr.inf), skin.face(hit), hit.prim_uv)
 
 
 def hidden(values: Values, scene: mi.Scene, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
