@@ -48,8 +48,8 @@ _EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and betw
 class Exposed:
     """A bound frame for rendering: its Mitsuba scene, its numbers, its lamps and its textures.
 
-    `plain` returns which tiles of a window show nothing but skin, and their size (px); `fine` which of its pixels
-    (height, width) may show menisci, or hairs thinner than a pixel, and which of them may show menisci.
+    `plain` returns which tiles of a window show nothing but skin and thin hairs, and their size (px); `fine` which of
+    its pixels (height, width) may show menisci or thin hairs, and which of them may show menisci.
     """
 
     scene: mi.Scene

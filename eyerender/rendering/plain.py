@@ -2,8 +2,8 @@
 
 The skin is a sheet with a hole, the fissure, that ends at a border. A ray whose pixel lies within the border's outline
 and not within the hole's outline crosses the sheet, because the number of crossings is the difference of the two
-winding numbers. Hairs and the line of tears are in front of the sheet. They and both outlines are marked, with some
-pixels to spare.
+winding numbers. Hairs and the line of tears are in front of the sheet. The tears, hairs that are thick in the picture
+and both outlines are marked, with some pixels to spare, and thin hairs pixel by pixel.
 """
 
 from __future__ import annotations

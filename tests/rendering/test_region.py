@@ -156,8 +156,8 @@ def test_subjects_share_a_scene_and_its_recordings(renderer):
 
 
 @pytest.mark.parametrize("place", [(600.0, 0.0, -120.0), (42.0, -38.0, -16.0)])
-def test_tiles_said_to_be_plain_show_nothing_but_skin(renderer, monkeypatch, place):
-    """Rays through them meet the sheet, and the picture is what it is without them."""
+def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, monkeypatch, place):
+    """Rays through their pixels without hairs meet the sheet, and the picture is what it is without them."""
     import drjit as dr
     import mitsuba as mi
 
@@ -179,7 +179,7 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin(renderer, monkeypatch, pla
     shown, _ = renderer.bind(job)
     tiles, size = shown.plain(job.window)
     width, height = job.window[2:]
-    plain = np.kron(tiles, np.ones((size, size), bool))[:height, :width].ravel()
+    plain = (np.kron(tiles, np.ones((size, size), bool))[:height, :width] & ~shown.fine(job.window)[0]).ravel()
     assert 0.3 < plain.mean() < 0.95
     u, v = pixels_of(dr.arange(mi.UInt32, width * height), *window_of(job.window))
     for du, dv in ((-0.45, -0.45), (0.45, -0.1), (0.0, 0.45)):
@@ -255,6 +255,28 @@ def test_hairs_are_sampled_more_finely(renderer, monkeypatch):
     assert error[0] < 0.75 * error[1]
     same = ~ndimage.binary_dilation(fine, iterations=5)  # the lens blurs over a few pixels
     assert np.allclose(few.irradiance[same], plain.irradiance[same], rtol=1e-4)
+
+
+def test_fine_pixels_are_those_that_hairs_touch(renderer):
+    import mitsuba as mi
+
+    from eyerender.rendering.sampling import camera_ray
+
+    job = render_job(scene(region={}).frames(), 0)
+    x0, y0, width, height = job.window
+    shown, place = renderer.bind(job)
+    fine, wet = shown.fine(job.window)
+    row, column = np.mgrid[y0 : y0 + height, x0 : x0 + width].reshape(2, -1)
+    hairs = np.zeros(height * width, dtype=bool)
+    for k in range(36):
+        right, down = (k % 6 + 0.5) / 6 - 0.5, (k // 6 + 0.5) / 6 - 0.5
+        o, d, _ = camera_ray(shown.values, *(mi.Float(x.astype(np.float32)) for x in (column + right, row + down)))
+        hit = shown.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True, active=True)
+        hairs |= (hit.is_valid() & ~place.skin.on_sheet(place.skin.face(hit))).numpy()
+    hairs = hairs.reshape(fine.shape)
+    assert 0.02 < hairs.mean() < 0.2
+    assert not np.any(hairs & ~fine)
+    assert np.mean(hairs[fine & ~wet]) > 0.6  # others are touched between these rays, or by what skin hides
 
 
 def test_which_pixels_are_fine_does_not_depend_on_the_window(renderer):
