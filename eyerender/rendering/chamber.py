@@ -9,6 +9,7 @@ are traced through the exact surfaces:
 
 with F_k the share that the cornea mirrors, j the place where the mirrored ray arrives, and L_k the radiance that comes
 from outside along the ray that leaves the eye. Both sums depend on the eye alone, and they are linear in its lights.
+For a new pose, one ray is followed outside for each bundle of like rays, from whatever places.
 
 Limbal tissue is translucent. Of the light that falls on it, a share T goes through and leaves its inner side scattered.
 This side is that of the cornea's rim, as far as the rim has turned to sclera (opacity o), and the chamber's wall:
@@ -22,8 +23,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
 from ..eye.meshes import chamber_rim
@@ -36,7 +39,8 @@ ROOT_RINGS = 14  # of these on iris and pupil, the others beyond the root
 IRIS = IRIS_RINGS * TURNS
 LEVELS = 2  # of points on the wall
 PLACES = IRIS + TURNS * LEVELS
-RAYS, LEAVING = 256, 128  # from each point; the first of them are followed out of the eye
+RAYS = 256  # from each point
+_FAR_MM = 8.0  # distance of what rays that leave the eye meet: so far apart are two rays at an angle of 1
 _WEAK, _FEW = 0.25, 4  # of the rays of which the cornea mirrors less, one of four stands for all
 _ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find
 _STEPS = 20  # crossings and mirrorings of a ray
@@ -57,7 +61,7 @@ class Chamber(ArrayValue):
         normals: (PLACES, 3) unit normals into the chamber.
         valid: (PLACES,) whether a place is in the chamber.
         exchange: (PLACES, PLACES) share of the radiosity of each place in the irradiance of each other.
-        leaving: (PLACES, LEAVING, 7) origin and direction of the rays that leave the eye, and n^2 (1 - F), 0 for none.
+        leaving: (PLACES, RAYS, 7) origin and direction of the rays that leave the eye, and n^2 (1 - F), 0 for none.
     """
 
     root_mm: float
@@ -90,6 +94,41 @@ def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
         width_mm: width of the cornea's rim that turns to sclera.
     """
     return _through_limbus(chamber, eye.front[0], float(eye.limbus_radius_mm), float(width_mm))
+
+
+def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
+    """Bundle the rays that leave an eye: those of like origin and direction, from whatever places, are one bundle.
+
+    From the outer iris few rays leave. So none is left out, and one ray of each bundle is followed for all.
+
+    Args:
+        chamber: the chamber of the eye.
+        halvings: how often the rays are halved into bundles.
+
+    Returns:
+        Origin and direction (bundles, 6) of a ray from the middle of each bundle, and the gain (PLACES, bundles),
+        sparse, by which pi times the radiance along it becomes irradiance of each place.
+    """
+    place, ray = np.nonzero(chamber.leaving[..., 6])
+    rays, count = chamber.leaving[place, ray], 2**halvings
+    # Some rays are there twice at first, so that all bundles have the same number.
+    full = -(-len(rays) // count) * count
+    order = np.arange(full) * len(rays) // full
+    at = (rays[:, :6] * np.repeat([1.0, _FAR_MM], 3)).astype(np.float32)
+    for k in range(halvings + 1):
+        order = order.reshape(2**k, -1)
+        away = at[order]
+        away -= away.mean(axis=1, keepdims=True)
+        if k == halvings:
+            break
+        widest = np.argmax(np.einsum("ijk,ijk->ik", away, away), axis=1)
+        along = np.take_along_axis(away, widest[:, None, None], axis=2)[..., 0]
+        order = np.take_along_axis(order, np.argsort(along, axis=1, kind="stable"), axis=1)
+    middle = order[np.arange(count), np.argmin(np.einsum("ijk,ijk->ij", away, away), axis=1)]
+    bundle = np.empty(len(rays), dtype=int)
+    bundle[order] = np.arange(count)[:, None]
+    gain = csr_array((rays[:, 6] / RAYS, (place, bundle)), shape=(PLACES, count))
+    return rays[middle, :6], gain
 
 
 @lru_cache(maxsize=64)
@@ -217,8 +256,7 @@ def _chamber(
     for index, weight in _onto(arrived.back, arrived.on_wall, (root, reach), points, valid):
         np.add.at(exchange, (row[arrived.ray], index), weight * arrived.share / RAYS)
     exchange = _turned(exchange, valid)
-    kept = frozen(leaving[:, :LEAVING])
-    return Chamber(root, reach, frozen(points), frozen(normals), valid, frozen(exchange), kept)
+    return Chamber(root, reach, frozen(points), frozen(normals), valid, frozen(exchange), frozen(leaving))
 
 
 def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...],

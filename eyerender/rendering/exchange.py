@@ -8,8 +8,9 @@ place i, K rays of a cosine-distributed pattern find the places j that it sees:
 
 E0 is the light straight from lamps, panels and surroundings, and on the skin about the eye that of lamps which the
 cornea mirrors: up to a sixth of the light on the lids' margins. w is the albedo, with the losses at the cornea where
-the ray goes through it. The rays of the iris are those that leave the eye; what the cornea mirrors back into the
-chamber comes from `chamber`. The equations are solved by iteration, so every number of reflections is included.
+the ray goes through it. The rays of the iris are those that leave the eye, in bundles; what the cornea mirrors back
+into the chamber comes from `chamber`. The equations are solved by iteration, so every number of reflections is
+included.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ from ..rig.imaging import Ambient
 from .chamber import (
     IRIS,
     IRIS_RINGS,
-    LEAVING,
     PLACES,
     ROOT_RINGS,
     Chamber,
+    bundles,
     chamber_of,
     limbus_points,
     shares,
@@ -74,9 +75,11 @@ if TYPE_CHECKING:
     from .values import Lights, Values
 
 RAYS = 24  # from each place on the globe or about it
-_LEAVING = 32  # rays out of the eye from each place in it, without light from afar
-_NEAR_RAYS, _FAR_RAYS = 16, 8  # from each place on the skin: the fewer ones within lids and far away
-_FAR_MM = 17.0  # distance from the eye beyond which skin is far
+_SKIN_RAYS, _INNER_RAYS = (
+    14,
+    2,
+)  # from each place on the skin, and on the lids' inner sides, which lie in the dark
+_HALVINGS = 14, 15  # of the rays that leave the eye into bundles, without and with light from afar
 _ROUNDS = 6
 _START_MM = 0.02
 _SMALL, _SPOTS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
@@ -209,7 +212,8 @@ class _Seen:
     """What the rays of the places meet: numbers of places, weights, open rays, covered rays; all (rays,).
 
     Attributes:
-        first: (places,) number of the first ray of each place; rays of a place follow each other.
+        shares: (places, rays) share of each ray in the mean over a place's rays, sparse; or (places,) the number of the
+            first ray of each place, where rays of a place follow each other and have like shares.
         target: numbers of the places that are met.
         weight: share of their irradiance that is sent back.
         near: whether something is met very close.
@@ -218,7 +222,7 @@ class _Seen:
         lit: irradiance straight from the lamps at the very point of the skin that is met, -1 where it is not known.
     """
 
-    first: Ints
+    shares: Any
     target: Ints
     weight: Floats
     near: Floats
@@ -228,13 +232,15 @@ class _Seen:
 
     def mean(self, values: Floats) -> Floats:
         """Means (places,) over the rays of each place."""
-        count = np.diff(self.first, append=len(values))
-        return np.asarray(np.add.reduceat(values, self.first) / count)
+        if not isinstance(self.shares, np.ndarray):
+            return np.asarray(self.shares @ values)
+        count = np.diff(self.shares, append=len(values))
+        return np.asarray(np.add.reduceat(values, self.shares) / count)
 
     def correction(self, direct: Floats) -> Floats:
         """What the lamps' light at the points that are met adds to that of the places there, `direct`."""
         if not np.any(self.lit >= 0):
-            return np.zeros(len(self.first))
+            return np.zeros(self.shares.shape[0])
         more = self.lit - direct[np.minimum(self.target, len(direct) - 1)]
         return self.mean(self.weight * np.where(self.lit >= 0, more, 0))
 
@@ -248,7 +254,8 @@ class _Interior:
         exchange: shares by which its places light each other.
         limbus: shares by which the sectors of the limbus light the places.
         rows: on the device, the places, their normals, and whether they are in the eye.
-        leaving: on the device, the first rays that leave the eye from each place.
+        leaving: on the device, a ray for each bundle of those that leave the eye.
+        gain: (places, bundles) gain with which each bundle lights each place, sparse.
     """
 
     chamber: Chamber
@@ -256,16 +263,17 @@ class _Interior:
     limbus: Floats
     rows: mi.Float
     leaving: mi.Float
+    gain: Any
 
     @classmethod
-    def of(cls, eye: EyeModel, film_index: float, look: Look, leaving: int) -> _Interior:
-        """Compute it for an eye, with its pupil, and a look, with so many rays that leave."""
+    def of(cls, eye: EyeModel, film_index: float, look: Look, halvings: int) -> _Interior:
+        """Compute it for an eye, with its pupil, and a look, with so many halvings of the rays that leave."""
         chamber = chamber_of(eye, film_index)
         albedo = shares(eye, chamber, look.pupil_albedo, look.iris_albedo, look.limbus_albedo)
         limbus = through_limbus(eye, chamber, look.limbus_width_mm) * look.limbus_transmittance
         rows = np.column_stack([chamber.points, chamber.normals, chamber.valid])
-        rays = chamber.leaving[:, :leaving]
-        return cls(chamber, chamber.exchange * albedo, limbus, _sent(rows.ravel()), _sent(rays.ravel()))
+        rays, gain = bundles(chamber, halvings)
+        return cls(chamber, chamber.exchange * albedo, limbus, _sent(rows.ravel()), _sent(rays.ravel()), gain)
 
 
 class Exchange:
@@ -309,8 +317,8 @@ class Exchange:
 
     def _inside(self, job: RenderJob) -> _Interior:
         """The chamber of a job's eye."""
-        film, look, leaving = job.film_index, job.look, _leaving(job.ambient)
-        return self._interiors.get(job.eye, (film, look, leaving), lambda: _Interior.of(job.eye, film, look, leaving))
+        film, look, halvings = job.film_index, job.look, _halvings(job.ambient)
+        return self._interiors.get(job.eye, (film, look, halvings), lambda: _Interior.of(job.eye, film, look, halvings))
 
     def _skin(self, region: RegionScene, globe: Globe) -> SkinPlaces:
         """Places on the skin of a region, chosen with the eye straight ahead: no earlier pose may change a picture."""
@@ -323,9 +331,9 @@ class Exchange:
         return places
 
 
-def _leaving(ambient: Ambient) -> int:
-    """Number of rays that leave the eye from each place of the chamber, more where they look for light."""
-    return LEAVING if ambient.map is not None or ambient.irradiance_w_m2 > 0 else _LEAVING
+def _halvings(ambient: Ambient) -> int:
+    """Number of halvings of the rays that leave the eye, more where they look for light."""
+    return _HALVINGS[ambient.map is not None or ambient.irradiance_w_m2 > 0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -366,8 +374,8 @@ class _Frame:
         count = np.full(self.outside, RAYS)
         if self.skin is not None:
             skin = count[self.on_globe : self.outside - IRIS_TURNS]
-            skin[:] = np.where(np.linalg.norm(self.points, axis=1) < _FAR_MM, _NEAR_RAYS, _FAR_RAYS)
-            skin[len(self.skin.vertices) :] = _FAR_RAYS
+            skin[:] = _SKIN_RAYS
+            skin[len(self.skin.vertices) :] = _INNER_RAYS
         return np.append(0, np.cumsum(count))
 
     @property
@@ -603,8 +611,8 @@ def _seen(
     """What the rays of the places outside and of those in the chamber meet."""
     start = frame.first_ray
     first = int(start[-1])
-    leaving = _leaving(frame.job.ambient)
-    lanes = first + PLACES * leaving
+    interior = frame.interior
+    lanes = first + interior.gain.shape[1]
     of_place = np.repeat(np.arange(frame.outside, dtype=np.uint32), np.diff(start))
     stands_for, count = mi.Int32(0), 0
     if frame.skin is not None:
@@ -614,7 +622,7 @@ def _seen(
     split, on_globe, outside, on_skin = (dr.opaque(mi.UInt32, n) for n in (first, frame.on_globe, frame.outside, count))
     kinds = _Kinds(on_globe, outside, on_skin, stands_for)
     results, spot = _rays_of(
-        values, textures, place.scene, numbers, mi.UInt32(aligned(of_place)), outer, frame.interior.leaving,
+        values, textures, place.scene, numbers, mi.UInt32(aligned(of_place)), outer, interior.leaving,
         split, kinds, lanes,
     )  # fmt: skip
     host = [r.numpy() for r in results]
@@ -624,7 +632,7 @@ def _seen(
         host[-1][lane] = _at_spots(values, lights, place.scene, textures, spot, lane)
     return (
         _Seen(start[:-1], *(h[:first] for h in host)),
-        _Seen(np.arange(PLACES) * leaving, *(h[first:] for h in host)),
+        _Seen(interior.gain, *(h[first:] for h in host)),
     )
 
 
@@ -655,16 +663,15 @@ def _rays_of(
     normal = mi.Vector3f(*n[3:])
     o = mi.Vector3f(*n[:3]) + _START_MM * normal
     d = _pattern(normal, index)
-    rays = _row(leaving, 7, index - split, ~outside)
+    rays = _row(leaving, 6, index - split, ~outside)
     o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
     d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
-    gain = dr.select(outside, 1, rays[6])
-    target, weight, open_, distance, spot = _met(values, textures, scene, numbers, o, d, gain > 0, kinds)
+    target, weight, open_, distance, spot = _met(values, textures, scene, numbers, o, d, kinds)
     sky = mi.Float(0) * o.x
     if values.structure.ambient:
         assert textures.ambience is not None
-        sky = dr.pi * textures.ambience.soft(d, outside | open_) * gain
-    results = (target, weight * gain, mi.Float(distance < _TOUCHING_MM), dr.select(open_, sky, 0), sky)
+        sky = dr.pi * textures.ambience.soft(d, outside | open_)
+    results = (target, weight, mi.Float(distance < _TOUCHING_MM), dr.select(open_, sky, 0), sky)
     dr.eval(results, spot)
     return results, spot
 
@@ -693,14 +700,14 @@ def _at_spots(
 
 def _met(
     values: Values, textures: Textures, scene: mi.Scene, numbers: Received, o: mi.Vector3f, d: mi.Vector3f,
-    active: mi.Bool, kinds: _Kinds,
+    kinds: _Kinds,
 ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float, tuple[mi.Bool, mi.Vector3f, mi.Vector3f]]:  # fmt: skip
     """What is met along rays.
 
     The place, the share of its irradiance that is sent back, whether nothing is met, the distance, and for the outer
     side of the sheet of skin (a mark) point and normal in the eye frame.
     """
-    view, hit = meet(values, scene, o, d, active, coherent=False)
+    view, hit = meet(values, scene, o, d, mi.Bool(True), coherent=False)
     view = appearance(values, textures, view, hit, d)
     albedo = outer_albedo(values, textures, view)
     # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.
@@ -735,4 +742,4 @@ def _met(
     back = dr.select(through, inside, dr.select(view.other & ~matte, 0, albedo))
     back = dr.select(view.met, back, 0)
     distance = dr.select(view.met, view.distance, 1e9)
-    return dr.select(back > 0, target, 0), back, active & ~view.met, distance, (on_skin, view.point, view.normal)
+    return dr.select(back > 0, target, 0), back, ~view.met, distance, (on_skin, view.point, view.normal)
