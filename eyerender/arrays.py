@@ -39,6 +39,15 @@ def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
     return array
 
 
+_Array = TypeVar("_Array", bound=NDArray[Any])
+
+
+def sealed(array: _Array) -> _Array:
+    """Make an array read-only that nobody else holds, without the copy of `frozen`."""
+    array.flags.writeable = False
+    return array
+
+
 _Value = TypeVar("_Value")
 _Result = TypeVar("_Result")
 _REMEMBERED = 8

@@ -34,6 +34,10 @@ class Nodes:
     point: Floats
     weight: Floats
 
+    def and_(self, other: Nodes) -> Nodes:
+        """Points of both."""
+        return Nodes(np.concatenate([self.point, other.point]), np.concatenate([self.weight, other.weight]))
+
 
 POINT = Nodes(np.zeros((1, 2)), np.ones(1))
 

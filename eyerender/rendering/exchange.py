@@ -16,15 +16,17 @@ included.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, Reals
 from ..eye.model import EyeModel
 from ..geometry.vectors import dots, lengths
 from ..region.globe import Globe
@@ -50,6 +52,7 @@ from .manifold import CORNEA_MM
 from .parameters import leaves, traversed
 from .places import (
     GLOBE_COLUMNS,
+    GLOBE_ROWS,
     MAP_SIDE,
     PLANE_FIRST_MM,
     PLANE_MM,
@@ -75,11 +78,10 @@ if TYPE_CHECKING:
     from .values import Lights, Values
 
 RAYS = 24  # from each place on the globe or about it
-_SKIN_RAYS, _INNER_RAYS = (
-    14,
-    2,
-)  # from each place on the skin, and on the lids' inner sides, which lie in the dark
+_SKIN_RAYS, _INNER_RAYS = 14, 2  # from places on the skin, and on the lids' inner sides, which lie in the dark
 _HALVINGS = 14, 15  # of the rays that leave the eye into bundles, without and with light from afar
+_LANES = 4096  # there are lanes for so many times as many rays, so that recordings serve many subjects
+_MIRRORED = 256  # and for places that the cornea mirrors lamps to, so that they serve many poses
 _ROUNDS = 6
 _START_MM = 0.02
 _SMALL, _SPOTS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
@@ -128,6 +130,12 @@ class Received:
         self._root2, self._reach2, self._plane = n[5], n[6], n[7:]
         self._ends = _sent(globe.table[5:])
         self._globe, self._other, self._iris = (_sent(t.ravel()) for t in tables)
+
+    def filled(self, globe: Floats, other: Floats, iris: Floats) -> Received:
+        """The same places with other tables."""
+        made = copy(self)
+        made._globe, made._other, made._iris = (_sent(t.ravel()) for t in (globe, other, iris))
+        return made
 
     @property
     def size(self) -> tuple[int, int]:
@@ -180,7 +188,7 @@ class Received:
         return ring, dr.select(turn < 0, turn + TURNS, turn)
 
 
-def _sent(values: Floats) -> mi.Float:
+def _sent(values: Reals) -> mi.Float:
     from .values import aligned
 
     return mi.Float(aligned(np.ascontiguousarray(values, dtype=np.float32)))
@@ -212,8 +220,7 @@ class _Seen:
     """What the rays of the places meet: numbers of places, weights, open rays, covered rays; all (rays,).
 
     Attributes:
-        shares: (places, rays) share of each ray in the mean over a place's rays, sparse; or (places,) the number of the
-            first ray of each place, where rays of a place follow each other and have like shares.
+        shares: (places, rays) share of each ray in the mean over a place's rays, sparse.
         target: numbers of the places that are met.
         weight: share of their irradiance that is sent back.
         near: whether something is met very close.
@@ -222,20 +229,25 @@ class _Seen:
         lit: irradiance straight from the lamps at the very point of the skin that is met, -1 where it is not known.
     """
 
-    shares: Any
+    shares: csr_array
     target: Ints
-    weight: Floats
-    near: Floats
-    sky: Floats
-    free: Floats
-    lit: Floats
+    weight: Reals
+    near: Reals
+    sky: Reals
+    free: Reals
+    lit: Reals
 
-    def mean(self, values: Floats) -> Floats:
+    def mean(self, values: Reals) -> Floats:
         """Means (places,) over the rays of each place."""
-        if not isinstance(self.shares, np.ndarray):
-            return np.asarray(self.shares @ values)
-        count = np.diff(self.shares, append=len(values))
-        return np.asarray(np.add.reduceat(values, self.shares) / count)
+        return np.asarray(self.shares @ values)
+
+    def exchange(self, stand_in: Ints) -> csr_array:
+        """Share of the irradiance of each place that each other receives, with the places that are used for them."""
+        part = self.shares
+        return csr_array(
+            (part.data * self.weight[part.indices], stand_in[self.target][part.indices], part.indptr),
+            shape=(part.shape[0],) * 2,
+        )
 
     def correction(self, direct: Floats) -> Floats:
         """What the lamps' light at the points that are met adds to that of the places there, `direct`."""
@@ -276,11 +288,92 @@ class _Interior:
         return cls(chamber, chamber.exchange * albedo, limbus, _sent(rows.ravel()), _sent(rays.ravel()), gain)
 
 
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """What does not depend on the pose: places on the skin of a subject, and the rays of all places outside the eye.
+
+    Attributes:
+        skin: the places, None for a bare eye.
+        count: (places,) number of rays of each place outside the chamber.
+        of_place: on the device, the place of each ray, of some rays more than there are.
+        stands_for: on the device, the places that stand for both sides of each vertex.
+        near: on the device, the places about every vertex: first the first ones of all vertices, then the second ...
+        weight: on the device, their weights there.
+    """
+
+    skin: SkinPlaces | None
+    count: Ints
+    of_place: mi.UInt32
+    stands_for: mi.Int32
+    near: mi.UInt32
+    weight: mi.Float
+
+    @classmethod
+    def of(cls, on_globe: int, others: int, skin: SkinPlaces | None) -> _Plan:
+        """Plan for so many places on the globe, and so many others before the limbus."""
+        count = np.full(on_globe + others + IRIS_TURNS, RAYS)
+        stands_for, near, weight = mi.Int32(0), mi.UInt32(0), mi.Float(0)
+        if skin is not None:
+            on_skin = len(skin.vertices)
+            count[on_globe : on_globe + others] = _SKIN_RAYS
+            count[on_globe + on_skin : on_globe + others] = _INNER_RAYS
+            table = np.stack([skin.nearest, skin.behind + on_skin], axis=1)
+            stands_for = mi.Int32(aligned(table.astype(np.int32).ravel()))
+            near, weight = mi.UInt32(aligned(skin.near.T.astype(np.uint32).ravel())), _sent(skin.weight.T.ravel())
+        rays = int(count.sum())
+        of_place = np.zeros(-(-rays // _LANES) * _LANES, np.uint32)
+        of_place[:rays] = np.repeat(np.arange(len(count)), count)
+        return cls(skin, count, mi.UInt32(aligned(of_place)), stands_for, near, weight)
+
+    @property
+    def rays(self) -> int:
+        """Number of all rays."""
+        return int(self.count.sum())
+
+    def shares(self, gain: Any) -> csr_array:
+        """Shares as in `_Seen`, with the gain of the rays that leave the eye as in `_Interior`."""
+        ends = np.append(0, np.cumsum(self.count))
+        return csr_array(
+            (
+                np.append(np.repeat(1 / self.count, self.count), gain.data),
+                np.append(np.arange(ends[-1]), ends[-1] + gain.indices),
+                np.append(ends[:-1], ends[-1] + gain.indptr),
+            ),
+            shape=(len(self.count) + gain.shape[0], ends[-1] + gain.shape[1]),
+        )
+
+    def at_vertices(self, places: Floats) -> mi.Float:
+        """Four numbers of every vertex, as in `Received`, from those of places (n, 4); the last is the whole sky."""
+        assert self.skin is not None
+        vertices, each = self.skin.near.shape
+        count = dr.opaque(mi.UInt32, vertices)
+        return _at_vertices(_sent(places.ravel()), self.near, self.weight, count, vertices, each)
+
+
+@recorded
+def _at_vertices(
+    places: mi.Float, near: mi.UInt32, weight: mi.Float, count: mi.UInt32, vertices: int, each: int
+) -> mi.Float:
+    """Four numbers of every vertex from those of `each` places about it."""
+    index = dr.arange(mi.UInt32, vertices)
+    total = mi.Vector4f(0)
+    for k in range(each):
+        place = dr.gather(mi.UInt32, near, index + k * count)
+        total += dr.gather(mi.Float, weight, index + k * count) * dr.gather(mi.Vector4f, places, place)
+    total.y = dr.select(total.w > 0, total.y / total.w, 1)
+    total.w = 0
+    out = dr.zeros(mi.Float, 4 * vertices)
+    dr.scatter(out, total, index)
+    dr.eval(out)
+    return out
+
+
 class Exchange:
     """Computes what the places of a frame receive; keeps what does not change between frames of a subject."""
 
     def __init__(self) -> None:
-        self._skins: list[tuple[tuple[Any, ...], Globe, SkinPlaces]] = []  # of subjects
+        self._skins: list[tuple[tuple[Any, ...], Globe, _Plan]] = []  # of subjects
+        self._bare: _Plan | None = None
         self._interiors: KeptForEye[_Interior] = KeptForEye()
 
     def received(
@@ -302,9 +395,9 @@ class Exchange:
         region = place if isinstance(place, RegionScene) else None
         globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
         grid = globe_places(globe, None if region is None else region.posed)
-        skin = None if region is None else self._skin(region, globe)
-        points, normals, plane = _others(job, globe, region, skin)
-        frame = _Frame(job, grid, self._inside(job), skin, points, normals, plane)
+        plan = self._plan(region, globe)
+        points, normals, plane = _others(job, globe, region, plan.skin)
+        frame = _Frame(job, grid, self._inside(job), plan, points, normals, plane)
         if not job.interreflection and not values.structure.ambient:
             return frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
@@ -313,22 +406,26 @@ class Exchange:
         mirrored = _mirrored(values, lights, place.scene, frame)
         lamps, more = (_direct_inside(values, some, place.scene, frame.interior.rows) for some in (lights, panels))
         seen = _seen(values, lights, textures, place, numbers, frame, outer)
-        return frame.solved(region, direct, mirrored, ambient, lamps, more, seen)
+        return frame.solved(region, numbers, direct, mirrored, ambient, lamps, more, seen)
 
     def _inside(self, job: RenderJob) -> _Interior:
         """The chamber of a job's eye."""
         film, look, halvings = job.film_index, job.look, _halvings(job.ambient)
         return self._interiors.get(job.eye, (film, look, halvings), lambda: _Interior.of(job.eye, film, look, halvings))
 
-    def _skin(self, region: RegionScene, globe: Globe) -> SkinPlaces:
-        """Places on the skin of a region, chosen with the eye straight ahead: no earlier pose may change a picture."""
+    def _plan(self, region: RegionScene | None, globe: Globe) -> _Plan:
+        """Places and rays, chosen with the eye straight ahead: no earlier pose may change a picture."""
+        if region is None:
+            self._bare = self._bare or _Plan.of(MAP_SIDE * MAP_SIDE, RINGS * TURNS, None)
+            return self._bare
         rest = replace(globe, M=np.eye(3), t=np.zeros(3))
-        for known, still, places in self._skins:
+        for known, still, plan in self._skins:
             if still == rest and known == region.subject:
-                return places
-        places = skin_places(region.at_rest(rest), rest)
-        self._skins = [*self._skins[-3:], (region.subject, rest, places)]
-        return places
+                return plan
+        skin = skin_places(region.at_rest(rest), rest)
+        plan = _Plan.of(GLOBE_COLUMNS * GLOBE_ROWS, len(skin.vertices) + len(skin.lids), skin)
+        self._skins = [*self._skins[-3:], (region.subject, rest, plan)]
+        return plan
 
 
 def _halvings(ambient: Ambient) -> int:
@@ -343,7 +440,7 @@ class _Frame:
     job: RenderJob
     grid: GlobePlaces
     interior: _Interior
-    skin: SkinPlaces | None
+    plan: _Plan
     points: Floats
     normals: Floats
     plane: tuple[float, float, float]
@@ -361,22 +458,12 @@ class _Frame:
     @property
     def on_skin(self) -> int:
         """Number of places on the outer side of a region's skin."""
-        return 0 if self.skin is None else len(self.skin.vertices)
+        return 0 if self.plan.skin is None else len(self.plan.skin.vertices)
 
     @property
     def outside(self) -> int:
         """Number of places outside the chamber; the last ones are on the limbus."""
         return len(self.grid.points) + len(self.points) + IRIS_TURNS
-
-    @property
-    def first_ray(self) -> Ints:
-        """Number of the first ray of each place outside the chamber, and the number of all these rays."""
-        count = np.full(self.outside, RAYS)
-        if self.skin is not None:
-            skin = count[self.on_globe : self.outside - IRIS_TURNS]
-            skin[:] = _SKIN_RAYS
-            skin[len(self.skin.vertices) :] = _INNER_RAYS
-        return np.append(0, np.cumsum(count))
 
     @property
     def outer(self) -> Floats:
@@ -396,7 +483,7 @@ class _Frame:
         """Nothing but light straight from the lamps."""
         other = np.tile([0.0, 1.0, 0.0, 0.0], (len(self.points) if region is None else len(region.posed.vertices), 1))
         if region is not None:
-            region.skin.shine(other)
+            region.skin.shine(_sent(other.ravel()))
         return self.received((np.tile([0.0, 1.0, 0.0, 0.0], (self.on_globe, 1)), other, np.zeros(IRIS)))
 
     def _on_iris(self, values: Floats, along: float) -> Floats:
@@ -417,48 +504,48 @@ class _Frame:
         return out
 
     def solved(
-        self, region: RegionScene | None, direct: Floats, mirrored: Floats,
-        ambient: tuple[Floats, Floats, Floats, Floats], lamps: Floats, panels: Floats, seen: tuple[_Seen, _Seen],
+        self, region: RegionScene | None, numbers: Received, direct: Floats, mirrored: Floats,
+        ambient: tuple[Floats, Floats, Floats, Floats], lamps: Floats, panels: Floats, seen: _Seen,
     ) -> Received:  # fmt: skip
-        """Solve for the irradiance of all places."""
-        job, outside, inside = self.job, *seen
+        """Solve for the irradiance of all places, which `numbers` hold without their light."""
+        job, outside = self.job, self.outside
         # What is hidden of soft light is told by the rays, and of the rest by what stands before its parts.
         soft, hard, free, shaded = ambient
-        sky = soft * _over(outside.mean(outside.sky), outside.mean(outside.free))
-        arriving = sky + hard * _over(shaded, free)
-        valid = outside.mean(outside.near)[: self.on_globe] < 0.5
+        sky = seen.mean(seen.sky) if np.any(soft) else np.zeros(outside + PLACES)
+        arriving = hard * _over(shaded, free)
+        if np.any(soft):
+            arriving += soft * _over(sky[:outside], seen.mean(seen.free)[:outside])
+        valid = seen.mean(seen.near)[: self.on_globe] < 0.5
         if region is None:
             valid &= self.grid.points[:, 0] > -job.look.backdrop_distance_mm
-        stand_in = self._stand_in(valid)
-        targets = stand_in[outside.target], stand_in[inside.target]
-        start = np.concatenate([direct + arriving, lamps + panels + inside.mean(inside.sky)])
-        total, entered, within = start, np.zeros(PLACES), np.zeros(PLACES)
+        start = np.concatenate([direct + arriving, lamps + panels + sky[outside:]])
+        total, arrived, within = start, np.zeros(outside + PLACES), np.zeros(PLACES)
         if job.interreflection:
-            exchange, limbus = self.interior.exchange, self.interior.limbus
-            here, there = (part.correction(direct) for part in seen)
+            exchange, inner, limbus = seen.exchange(self._stand_in(valid)), self.interior.exchange, self.interior.limbus
+            more = seen.correction(direct)
+            more[:outside] += mirrored
             for _ in range(_ROUNDS):
-                arrived = outside.mean(outside.weight * total[targets[0]]) + here + mirrored
-                entered = inside.mean(inside.weight * total[targets[1]]) + there
-                within = exchange @ total[self.outside :] + limbus @ total[self.outside - IRIS_TURNS : self.outside]
-                total = start + np.append(arrived, entered + within)
-        numbers = np.zeros((self.outside, 4))
-        numbers[:, 0] = (total - start)[: self.outside]
-        numbers[:, 1], numbers[:, 3] = arriving, soft + hard
-        numbers[:, 2] = total[: self.outside] if job.interreflection else 0
+                arrived = exchange @ total + more
+                within = inner @ total[outside:] + limbus @ total[outside - IRIS_TURNS : outside]
+                total = start + arrived
+                total[outside:] += within
+        table = np.zeros((outside, 4))
+        table[:, 0] = (total - start)[:outside]
+        table[:, 1], table[:, 3] = arriving, soft + hard
+        table[:, 2] = total[:outside] if job.interreflection else 0
         if region is None:
-            numbers[self.on_globe :, 2] *= job.look.backdrop_albedo
+            table[self.on_globe :, 2] *= job.look.backdrop_albedo
         # Between lids the light changes fast from lid to lid, so it is averaged along them only.
         across = (1.0, 1.0 if region is None else 0.0)
-        globe = filled(numbers[: self.on_globe], valid, self.grid.rows, self.grid.columns, across)
-        other = numbers[self.on_globe : self.outside - IRIS_TURNS]
-        if region is not None and self.skin is not None:
-            other = self.skin.spread @ other[: len(self.skin.vertices)]
-        for table in (globe, other):
-            table[:, 1], table[:, 3] = _over(table[:, 1], table[:, 3]), 0
+        globe = filled(table[: self.on_globe], valid, self.grid.rows, self.grid.columns, across)
+        other = table[self.on_globe : outside - IRIS_TURNS]
         if region is not None:
-            region.skin.shine(other)
-        iris = self._on_iris(entered + inside.mean(inside.sky), 1.0) + self._on_iris(within + panels, 0.0)
-        return self.received((globe, other, iris))
+            region.skin.shine(self.plan.at_vertices(other[: self.on_skin]))
+            other = np.zeros((1, 4))
+        for part in (globe, other):
+            part[:, 1], part[:, 3] = _over(part[:, 1], part[:, 3]), 0
+        iris = self._on_iris((arrived + sky)[outside:], 1.0) + self._on_iris(within + panels, 0.0)
+        return numbers.filled(globe, other, iris)
 
 
 def _over(part: Floats, whole: Floats) -> Floats:
@@ -542,22 +629,33 @@ def _onto_outer(
 def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) -> Floats:
     """Irradiance of places outside the eye from the lamps by way of the cornea: of skin near it that may face it."""
     total, job = np.zeros(frame.outside), frame.job
-    if frame.skin is None or not len(lights) or not job.interreflection:
+    if frame.plan.skin is None or not len(lights) or not job.interreflection:
         return total
     bulge = job.M @ (np.asarray(job.eye.front[0].origin_mm) - [CORNEA_MM, 0, 0]) + (job.t - job.anchor_mm)
     way = bulge - frame.points
     near = (lengths(way) < _CLOSE_MM) & (dots(way, frame.normals) > -0.5 * CORNEA_MM)
-    rows = np.column_stack([frame.points, frame.normals])[near]
-    if len(rows):
-        index = dr.arange(mi.UInt32, len(rows))
-        n = _row(_sent(rows.ravel()), 6, index)
-        normal = mi.Vector3f(*n[3:])
-        x, facing = values.point_to_eye(mi.Vector3f(*n[:3]) + _START_MM * normal), values.vector_to_eye(normal)
-        lit = _over_lamps(
-            lights, len(rows), lambda first: off_cornea(values, lights, scene, x, facing, *_spots(index + first))
-        )
-        total[frame.on_globe + np.flatnonzero(near)] = lit
+    places = np.flatnonzero(near)
+    if len(places):
+        lanes = -(-len(places) // _MIRRORED) * _MIRRORED
+        padded = np.append(places, np.full(lanes - len(places), places[0]))
+        rows = _sent(np.column_stack([frame.points[padded], frame.normals[padded]]).ravel())
+        lit = _over_lamps(lights, lanes, lambda first: _off_cornea(values, lights, scene, rows, first, lanes))
+        total[frame.on_globe + places] = lit[: len(places)]
     return total
+
+
+@recorded
+def _off_cornea(
+    values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, first: mi.UInt32, count: int
+) -> mi.Float:
+    """Irradiance of points from lamps by way of the cornea; places on their discs begin with the number `first`."""
+    index = dr.arange(mi.UInt32, count)
+    n = _row(rows, 6, index)
+    normal = mi.Vector3f(*n[3:])
+    x, facing = values.point_to_eye(mi.Vector3f(*n[:3]) + _START_MM * normal), values.vector_to_eye(normal)
+    lit = off_cornea(values, lights, scene, x, facing, *_spots(index + first))
+    dr.eval(lit)
+    return lit
 
 
 def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float) -> Floats:
@@ -607,33 +705,26 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
 def _seen(
     values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame,
     outer: mi.Float,
-) -> tuple[_Seen, _Seen]:  # fmt: skip
+) -> _Seen:  # fmt: skip
     """What the rays of the places outside and of those in the chamber meet."""
-    start = frame.first_ray
-    first = int(start[-1])
-    interior = frame.interior
-    lanes = first + interior.gain.shape[1]
-    of_place = np.repeat(np.arange(frame.outside, dtype=np.uint32), np.diff(start))
-    stands_for, count = mi.Int32(0), 0
-    if frame.skin is not None:
-        count = len(frame.skin.vertices)
-        table = np.stack([frame.skin.nearest, frame.skin.behind + count], axis=1).astype(np.int32)
-        stands_for = mi.Int32(aligned(table.ravel()))
-    split, on_globe, outside, on_skin = (dr.opaque(mi.UInt32, n) for n in (first, frame.on_globe, frame.outside, count))
-    kinds = _Kinds(on_globe, outside, on_skin, stands_for)
+    plan, interior = frame.plan, frame.interior
+    inside = interior.gain.shape[1]
+    rays = plan.rays + inside
+    outside, all_rays = (dr.opaque(mi.UInt32, n) for n in (plan.rays, rays))
+    on_globe, of_outside, on_skin = (dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.outside, frame.on_skin))
+    kinds = _Kinds(on_globe, of_outside, on_skin, plan.stands_for)
     results, spot = _rays_of(
-        values, textures, place.scene, numbers, mi.UInt32(aligned(of_place)), outer, interior.leaving,
-        split, kinds, lanes,
+        values, textures, place.scene, numbers, plan.of_place, outer, interior.leaving, (outside, all_rays), kinds,
+        -(-rays // _LANES) * _LANES,
     )  # fmt: skip
-    host = [r.numpy() for r in results]
-    host.append(np.full(lanes, -1.0))
-    if frame.skin is not None and len(lights):
-        lane = np.append(np.arange(start[frame.on_globe]), np.arange(first, lanes))
-        host[-1][lane] = _at_spots(values, lights, place.scene, textures, spot, lane)
-    return (
-        _Seen(start[:-1], *(h[:first] for h in host)),
-        _Seen(interior.gain, *(h[first:] for h in host)),
-    )
+    lit = np.full(rays, -1.0, np.float32)
+    if plan.skin is not None and len(lights):
+        globe = frame.on_globe * RAYS
+        views, ends = textures.lamp_views, (dr.opaque(mi.UInt32, globe), outside)
+        found = _at_spots(values, lights, place.scene, views, spot, ends, globe + inside).numpy()
+        lit[:globe], lit[plan.rays :] = found[:globe], found[globe:]
+    target, weight, close, sky, free = (r.numpy()[:rays] for r in results)
+    return _Seen(plan.shares(interior.gain), target, weight, close, sky, free, lit)
 
 
 @traversed
@@ -650,23 +741,25 @@ class _Kinds:
 @recorded
 def _rays_of(
     values: Values, textures: Textures, scene: mi.Scene, numbers: Received, of_place: mi.UInt32, outer: mi.Float,
-    leaving: mi.Float, split: mi.UInt32, kinds: _Kinds, lanes: int,
+    leaving: mi.Float, ends: tuple[mi.UInt32, mi.UInt32], kinds: _Kinds, lanes: int,
 ) -> tuple[tuple[Any, ...], tuple[Any, ...]]:  # fmt: skip
     """What the rays of places meet: the columns of `_Seen` but for the last, and places on skin (see `_met`).
 
-    The first rays, as many as `split`, belong to places outside the eye, whose numbers are in `of_place`.
+    The first rays belong to places outside the eye, whose numbers are in `of_place`. The `ends` are their number, and
+    that of all rays; there are more lanes.
     """
     index = dr.arange(mi.UInt32, lanes)
-    outside = index < split
+    split, count = ends
+    outside, inside = index < split, (index >= split) & (index < count)
     row = dr.gather(mi.UInt32, of_place, index, outside)
     n = _row(outer, 6, row, outside)
     normal = mi.Vector3f(*n[3:])
     o = mi.Vector3f(*n[:3]) + _START_MM * normal
     d = _pattern(normal, index)
-    rays = _row(leaving, 6, index - split, ~outside)
+    rays = _row(leaving, 6, index - split, inside)
     o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
     d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
-    target, weight, open_, distance, spot = _met(values, textures, scene, numbers, o, d, kinds)
+    target, weight, open_, distance, spot = _met(values, textures, scene, numbers, o, d, index < count, kinds)
     sky = mi.Float(0) * o.x
     if values.structure.ambient:
         assert textures.ambience is not None
@@ -676,38 +769,44 @@ def _rays_of(
     return results, spot
 
 
+@recorded
 def _at_spots(
-    values: Values, lights: Lights, scene: mi.Scene, textures: Textures, spot: tuple[Any, ...], lane: Ints
-) -> Floats:
-    """Irradiance straight from the lamps at points of the skin that lanes of rays have met, -1 for those of others.
+    values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, spot: tuple[Any, ...],
+    ends: tuple[mi.UInt32, mi.UInt32], lanes: int,
+) -> mi.Float:  # fmt: skip
+    """Irradiance straight from the lamps at points of the skin that rays of globe and chamber have met, else -1.
+
+    The `ends` are the numbers of rays of the globe and of all places outside the eye.
 
     What eye and lids send to each other in the narrow space between them comes from places close by, where the light
     changes within a fraction of the distance of the places.
     """
-    number = mi.UInt32(aligned(lane.astype(np.uint32)))
+    index = dr.arange(mi.UInt32, lanes)
+    globe, outside = ends
+    number = dr.select(index < globe, index, index - globe + outside)
     on_skin, x, normal = (dr.gather(type(part), part, number) for part in spot)
     state = (on_skin, x, normal, number)
 
     def light(_: mi.Bool, x: mi.Vector3f, normal: mi.Vector3f, number: mi.UInt32) -> mi.Float:
         start = x + _START_MM * normal
         u, v = _spots(number * mi.UInt32(_SHUFFLED))
-        return onto_points(
-            values, lights, scene, start, normal, mi.Bool(True), u, v, textures.lamp_views, mi.Bool(True)
-        )[0]
+        return onto_points(values, lights, scene, start, normal, mi.Bool(True), u, v, views, mi.Bool(True))[0]
 
-    return np.asarray(dr.if_stmt(state, on_skin, light, lambda *_: mi.Float(-1)).numpy(), dtype=float)
+    lit = dr.if_stmt(state, on_skin, light, lambda *_: mi.Float(-1))
+    dr.eval(lit)
+    return lit
 
 
 def _met(
     values: Values, textures: Textures, scene: mi.Scene, numbers: Received, o: mi.Vector3f, d: mi.Vector3f,
-    kinds: _Kinds,
+    active: mi.Bool, kinds: _Kinds,
 ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float, tuple[mi.Bool, mi.Vector3f, mi.Vector3f]]:  # fmt: skip
     """What is met along rays.
 
     The place, the share of its irradiance that is sent back, whether nothing is met, the distance, and for the outer
     side of the sheet of skin (a mark) point and normal in the eye frame.
     """
-    view, hit = meet(values, scene, o, d, mi.Bool(True), coherent=False)
+    view, hit = meet(values, scene, o, d, active, coherent=False)
     view = appearance(values, textures, view, hit, d)
     albedo = outer_albedo(values, textures, view)
     # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.
@@ -742,4 +841,4 @@ def _met(
     back = dr.select(through, inside, dr.select(view.other & ~matte, 0, albedo))
     back = dr.select(view.met, back, 0)
     distance = dr.select(view.met, view.distance, 1e9)
-    return dr.select(back > 0, target, 0), back, ~view.met, distance, (on_skin, view.point, view.normal)
+    return dr.select(back > 0, target, 0), back, active & ~view.met, distance, (on_skin, view.point, view.normal)

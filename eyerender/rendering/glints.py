@@ -18,9 +18,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import ArrayValue, Bools, Floats, frozen
 from ..geometry.surfaces import Surface, Xyz, components, join
@@ -42,7 +44,9 @@ _PARALLAX_MM = 0.05
 _MAP_ERROR = 1e-3  # of the extent of a lamp's image
 
 Visibility = Callable[[Floats, Floats], Bools]
-_RIM = rim(16)  # an edge that passes between these points hides less than 0.2 % of a disc
+_ON_RIM = 16  # points: an edge that passes between them hides less than 0.2 % of a disc
+_LEAST = 2, 10  # circles, and points on each, of a wide lamp
+_ROUGH = quadrature(*_LEAST).and_(rim(_ON_RIM))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +105,10 @@ class Image:
         """Points of both images."""
         return Image(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
+    def last(self, count: int) -> Image:
+        """The last points."""
+        return Image(*(getattr(self, f.name)[-count:] for f in fields(self)))
+
 
 @dataclass(frozen=True, slots=True)
 class Glint:
@@ -138,17 +146,18 @@ class GlintScene:
 
     def glints(self, lights: Sequence[Lamp], sigma_px: float) -> list[Glint]:
         """Compute the glint of each lamp, as finely as its size, its edges and the point-spread function require."""
-        wide = [lamp.radius_mm > 0 for lamp in lights]
-        rough = self._trace(lights, [_RIM if w else POINT for w in wide])
-        if not any(wide):
-            return self.seen(rough)
-        counts = [_node_counts(image.xy_px[image.there], sigma_px) for image in rough]
-        whole = self._trace(lights, [quadrature(*n) if w else POINT for n, w in zip(counts, wide, strict=True)])
-        glints = self.seen([a.and_(b) if w else a for a, b, w in zip(whole, rough, wide, strict=True)])
-        for k, glint in enumerate(glints):
-            visible = glint.clear & glint.image.there
+        images = self._trace(lights, [_ROUGH if lamp.radius_mm > 0 else POINT for lamp in lights])
+        rims = {k: images[k].last(_ON_RIM) for k, lamp in enumerate(lights) if lamp.radius_mm > 0}
+        counts = {k: _node_counts(edge.xy_px[edge.there], sigma_px) for k, edge in rims.items()}
+        if more := [k for k, count in counts.items() if count != _LEAST]:
+            finely = self._trace([lights[k] for k in more], [quadrature(*counts[k]) for k in more])
+            for k, image in zip(more, finely, strict=True):
+                images[k] = image.and_(rims[k])
+        glints = self.seen(images)
+        for k, count in counts.items():
+            visible = glints[k].clear & glints[k].image.there
             if np.any(visible) and not np.all(visible):
-                glints[k] = replace(glint, spots=self._cut(lights[k], glint.image, counts[k]))
+                glints[k] = replace(glints[k], spots=self._cut(lights[k], glints[k].image, count))
         return glints
 
     def nearness(self, lights: Sequence[Lamp]) -> Floats:
@@ -170,9 +179,8 @@ class GlintScene:
     def seen(self, images: Sequence[Image]) -> list[Glint]:
         """Glints of images, made of their points that the camera sees."""
         out = []
-        ends = np.cumsum([len(i.energy) for i in images])[:-1]
         ways = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm"))
-        for image, clear in zip(images, np.split(self._clear(*ways), ends), strict=True):
+        for image, clear in zip(images, _parted(self._clear(*ways), [len(i.energy) for i in images]), strict=True):
             lit = clear & image.there & (image.energy > 0)
             out.append(Glint(image, clear, Spots(frozen(image.xy_px[lit]), frozen(image.energy[lit]))))
         return out
@@ -227,8 +235,8 @@ class GlintScene:
     def _trace(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:
         """Images of lamps through the given points of their discs; all lamps in one batch."""
         camera = self.camera
-        points = np.concatenate([disc_points(lamp, n.point) for lamp, n in zip(lights, nodes, strict=True)])
         counts = [len(n.weight) for n in nodes]
+        points = np.concatenate([disc_points(lamp, n.point) for lamp, n in zip(lights, nodes, strict=True)])
         which = np.repeat(np.arange(len(lights)), counts)
         weights = np.concatenate([n.weight for n in nodes])
         axes = np.stack([lamp.axis for lamp in lights]) @ self.M
@@ -260,8 +268,7 @@ class GlintScene:
         there &= found & ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, eyepoint - y)
         energy = np.where(found, weights * strength[which] * lobe * F / np.where(found, J, 1.0) * scale, 0.0)
         mirrors, xy = y @ self.M.T + self.t, camera.pixels_of(x, v)
-        parts = np.cumsum(counts)[:-1]
-        columns = (np.split(a, parts) for a in (points, mirrors, mirrors, xy, energy, there, found))
+        columns = (_parted(a, counts) for a in (points, mirrors, mirrors, xy, energy, there, found))
         return [Image(*c) for c in zip(*columns, strict=True)]
 
     def _mirrors(self, rays: Rays, lamp: Xyz, node: Xyz, found: Bools) -> tuple[Floats, ...]:
@@ -288,13 +295,19 @@ def glint_table(glints: Sequence[Glint]) -> GlintTable:
     place, share = [], []
     for glint in glints:
         xy, energy, whole = glint.spots.xy_px, glint.spots.energy, glint.image.energy.sum()
-        place.append(np.average(xy, axis=0, weights=energy) if len(energy) else np.full(2, np.nan))
+        place.append(energy @ xy / energy.sum() if len(energy) else np.full(2, np.nan))
         seen = energy.sum() / whole if whole > 0 else 0.0
         share.append(seen if seen < 1 - 1e-9 else 1.0)
     energies = np.array([g.spots.energy.sum() for g in glints])
     return GlintTable(
         frozen(np.reshape(place, (-1, 2))), frozen(energies), frozen(share), frozen(energies > 0, np.bool_)
     )
+
+
+def _parted(array: NDArray[Any], counts: Sequence[int]) -> list[NDArray[Any]]:
+    """Parts of an array with so many rows each."""
+    ends = list(accumulate(counts))
+    return [array[end - count : end] for end, count in zip(ends, counts, strict=True)]
 
 
 def _node_counts(xy: Floats, sigma_px: float) -> tuple[int, int]:

@@ -20,10 +20,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Singles
 from ..region.mesh import HAIRS, RegionMesh
 from ..rig.light import Lamp
 from .parameters import leaves
+from .recorded import recorded
 from .values import aligned, quotient
 
 if TYPE_CHECKING:
@@ -54,98 +55,119 @@ class LampViews:
         table = [_frame(lamp, anchor_mm, reach) for lamp in lights] or [[0.0] * _WIDTH]
         self._table = mi.Float(aligned(np.array(table, dtype=np.float32).reshape(-1)))
         self._known = dr.opaque(mi.Bool, region is not None)
-        self._marks = dr.zeros(mi.UInt8, max(len(lights), 1) * _CELLS * _CELLS if region is not None else 1)
-        if region is not None and len(lights):
-            self._mark_triangles(region.skin, len(lights))
-            self._mark_hairs(_pieces(region.posed), len(lights))
+        if region is None:
+            self._marks = dr.zeros(mi.UInt8, 1)
+        else:
+            skin, pieces = region.skin, _pieces(region.posed)
+            counts = skin.of_sheet, len(pieces)
+            hairs = mi.Float(aligned(pieces.ravel() if len(pieces) else np.zeros(8, np.float32)))
+            on_device = dr.opaque(mi.UInt32, counts[0]), dr.opaque(mi.UInt32, counts[1])
+            self._marks = _marked(self._table, skin, hairs, on_device, counts, len(lights))
 
     def clear(self, lamp: mi.UInt32, x: mi.Vector3f, active: mi.Bool) -> mi.Bool:
         """Whether nothing of the region stands between points of the sheet (scene's frame) and any point of a lamp."""
-        view = self._view(lamp)
-        place = view.place(x)
+        place = _View.of(self._table, lamp).place(x)
         u, v = place.u, place.v
         inside = active & self._known & (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
         cell = (lamp * _CELLS + mi.UInt32(v)) * _CELLS + mi.UInt32(u)
         return inside & (dr.gather(mi.UInt8, self._marks, cell, inside) == 0)
 
-    def _view(self, lamp: mi.UInt32) -> _View:
-        four = [dr.gather(mi.Vector4f, self._table, lamp * (_WIDTH // 4) + k) for k in range(_WIDTH // 4)]
-        row = [n for part in four for n in (part.x, part.y, part.z, part.w)]
-        return _View(*(mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9)), *row[12:15])
 
-    def _mark_triangles(self, skin: SkinGeometry, lamps: int) -> None:
-        """Mark the cells that triangles of the sheet may cover, where they can shade."""
-        faces = dr.opaque(mi.UInt32, skin.of_sheet)
-        index = dr.arange(mi.UInt32, skin.of_sheet * lamps)
-        lamp = index // faces
-        view = self._view(lamp)
-        a, b, c, special = skin.corners(index - lamp * faces)
-        normal = dr.cross(b - a, c - a)
-        limit = view.radius * dr.norm(normal)
-        front = dr.minimum(
-            dr.minimum(dr.dot(normal, view.origin - a), dr.dot(normal, view.origin - b)),
-            dr.dot(normal, view.origin - c),
-        )
-        places = [view.place(p) for p in (a, b, c)]
-        edge = _Edge.longest([p.u for p in places], [p.v for p in places])
-        self._mark(lamp, places, mi.Float(0), edge, view.scale, special | (front <= limit))
+@recorded
+def _marked(
+    table: mi.Float, skin: SkinGeometry, hairs: mi.Float, on_device: tuple[mi.UInt32, mi.UInt32],
+    counts: tuple[int, int], lamps: int,
+) -> mi.UInt8:  # fmt: skip
+    """The marks of all lamps, from triangles of the sheet and from pieces of hairs.
 
-    def _mark_hairs(self, pieces: Floats, lamps: int) -> None:
-        """Mark the cells that straight pieces (n, 2, 3) of hairs may cover."""
-        if not len(pieces):
-            return
-        ends = np.zeros((len(pieces), 2, 4), np.float32)
-        ends[..., :3] = pieces
-        table, count = mi.Float(aligned(ends.ravel())), dr.opaque(mi.UInt32, len(pieces))
-        index = dr.arange(mi.UInt32, len(pieces) * lamps)
-        lamp = index // count
-        view = self._view(lamp)
-        four = [dr.gather(mi.Vector4f, table, 2 * (index - lamp * count) + k) for k in (0, 1)]
-        p, q = (view.place(mi.Vector3f(e.x, e.y, e.z)) for e in four)
-        thick = _HAIR_MM * dr.maximum(p.per_mm, q.per_mm)
-        edge = _Edge(p.u, p.v, q.u - p.u, q.v - p.v, thick)
-        self._mark(lamp, [p, q], thick, edge, view.scale, mi.Bool(True))
-
-    def _mark(
-        self, lamp: mi.UInt32, places: Sequence[_Place], thick: mi.Float, edge: _Edge, scale: mi.Float, marked: mi.Bool
-    ) -> None:
-        """Mark the cells within `thick` and the lamp's own size of bodies with these corners, where `marked`."""
-        lowest, highest, spread = [places[0].u, places[0].v], [places[0].u, places[0].v], places[0].wide
-        for p in places[1:]:
-            spread = dr.maximum(spread, p.wide)
-            lowest = [dr.minimum(k, x) for k, x in zip(lowest, (p.u, p.v), strict=True)]
-            highest = [dr.maximum(k, x) for k, x in zip(highest, (p.u, p.v), strict=True)]
-        # Straight edges are arcs in a map, of a radius of one unit at least.
-        slack = spread + 0.02 + (dr.square(highest[0] - lowest[0]) + dr.square(highest[1] - lowest[1])) / (8 * scale)
-        first = [mi.Int32(dr.clip(dr.floor(k - slack - thick), -1, _CELLS)) for k in lowest]
-        last = [mi.Int32(dr.clip(dr.floor(k + slack + thick), -1, _CELLS)) for k in highest]
-        columns = mi.UInt32(dr.maximum(last[0] - first[0] + 1, 0))
-        count = dr.select(marked, columns * mi.UInt32(dr.maximum(last[1] - first[1] + 1, 0)), 0)
-        # What is thin covers few of the cells about it: those near the longest edge.
-        reach = edge.width + slack + 0.71
-        marks = self._marks
-
-        def more(k: mi.UInt32) -> mi.Bool:
-            return k < count
-
-        def mark(k: mi.UInt32) -> mi.UInt32:
-            row = quotient(k, columns)
-            u, v = first[0] + mi.Int32(k - row * columns), first[1] + mi.Int32(row)
-            near = edge.distance2(mi.Float(u) + 0.5, mi.Float(v) + 0.5) < reach * reach
-            inside = (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
-            cell = (lamp * _CELLS + mi.UInt32(v)) * _CELLS + mi.UInt32(u)
-            dr.scatter(marks, mi.UInt8(1), cell, near & inside)
-            return k + 1
-
-        dr.while_loop((mi.UInt32(0),), more, lambda k: (mark(k),), labels=("k",), label="marks")
-        dr.eval(marks)
+    Their `counts` are on the device, too, else they would be compiled into the kernels.
+    """
+    marks = dr.zeros(mi.UInt8, max(lamps, 1) * _CELLS * _CELLS)
+    for count, number, mark in zip(counts, on_device, (_mark_triangles, _mark_hairs), strict=True):
+        if count and lamps:
+            index = dr.arange(mi.UInt32, count * lamps)
+            lamp = index // number
+            mark(marks, lamp, _View.of(table, lamp), index - lamp * number, skin, hairs)
+    return marks
 
 
-def _pieces(region: RegionMesh) -> Floats:
-    """Straight pieces (n, 2, 3) of the hairs of a region."""
+def _mark_triangles(
+    marks: mi.UInt8, lamp: mi.UInt32, view: _View, index: mi.UInt32, skin: SkinGeometry, _: mi.Float
+) -> None:
+    """Mark the cells that triangles of the sheet may cover, where they can shade."""
+    a, b, c, special = skin.corners(index)
+    normal = dr.cross(b - a, c - a)
+    limit = view.radius * dr.norm(normal)
+    front = dr.minimum(
+        dr.minimum(dr.dot(normal, view.origin - a), dr.dot(normal, view.origin - b)),
+        dr.dot(normal, view.origin - c),
+    )
+    places = [view.place(p) for p in (a, b, c)]
+    edge = _Edge.longest([p.u for p in places], [p.v for p in places])
+    _mark(marks, lamp, places, mi.Float(0), edge, view.scale, special | (front <= limit))
+
+
+def _mark_hairs(
+    marks: mi.UInt8, lamp: mi.UInt32, view: _View, index: mi.UInt32, _: SkinGeometry, hairs: mi.Float
+) -> None:
+    """Mark the cells that straight pieces of hairs, two ends of four numbers each, may cover."""
+    four = [dr.gather(mi.Vector4f, hairs, 2 * index + k) for k in (0, 1)]
+    p, q = (view.place(mi.Vector3f(e.x, e.y, e.z)) for e in four)
+    thick = _HAIR_MM * dr.maximum(p.per_mm, q.per_mm)
+    edge = _Edge(p.u, p.v, q.u - p.u, q.v - p.v, thick)
+    _mark(marks, lamp, [p, q], thick, edge, view.scale, mi.Bool(True))
+
+
+def _mark(
+    marks: mi.UInt8,
+    lamp: mi.UInt32,
+    places: Sequence[_Place],
+    thick: mi.Float,
+    edge: _Edge,
+    scale: mi.Float,
+    marked: mi.Bool,
+) -> None:
+    """Mark the cells within `thick` and the lamp's own size of bodies with these corners, where `marked`."""
+    lowest, highest, spread = [places[0].u, places[0].v], [places[0].u, places[0].v], places[0].wide
+    for p in places[1:]:
+        spread = dr.maximum(spread, p.wide)
+        lowest = [dr.minimum(k, x) for k, x in zip(lowest, (p.u, p.v), strict=True)]
+        highest = [dr.maximum(k, x) for k, x in zip(highest, (p.u, p.v), strict=True)]
+    # Straight edges are arcs in a map, of a radius of one unit at least.
+    slack = spread + 0.02 + (dr.square(highest[0] - lowest[0]) + dr.square(highest[1] - lowest[1])) / (8 * scale)
+    first = [mi.Int32(dr.clip(dr.floor(k - slack - thick), -1, _CELLS)) for k in lowest]
+    last = [mi.Int32(dr.clip(dr.floor(k + slack + thick), -1, _CELLS)) for k in highest]
+    columns = mi.UInt32(dr.maximum(last[0] - first[0] + 1, 0))
+    count = dr.select(marked, columns * mi.UInt32(dr.maximum(last[1] - first[1] + 1, 0)), 0)
+    # What is thin covers few of the cells about it: those near the longest edge.
+    reach = edge.width + slack + 0.71
+
+    def more(k: mi.UInt32) -> mi.Bool:
+        return k < count
+
+    def mark(k: mi.UInt32) -> mi.UInt32:
+        row = quotient(k, columns)
+        u, v = first[0] + mi.Int32(k - row * columns), first[1] + mi.Int32(row)
+        near = edge.distance2(mi.Float(u) + 0.5, mi.Float(v) + 0.5) < reach * reach
+        inside = (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
+        cell = (lamp * _CELLS + mi.UInt32(v)) * _CELLS + mi.UInt32(u)
+        dr.scatter(marks, mi.UInt8(1), cell, near & inside)
+        return k + 1
+
+    dr.while_loop((mi.UInt32(0),), more, lambda k: (mark(k),), labels=("k",), label="marks")
+    dr.eval(marks)
+
+
+def _pieces(region: RegionMesh) -> Singles:
+    """Straight pieces (n, 2, 4) of the hairs of a region, whose ends have a 0 as a fourth number."""
     curves = [c for c in region.strands[:HAIRS] if c.size]
-    pieces = [np.stack([c[:, :-1], c[:, 1:]], axis=2).reshape(-1, 2, 3) for c in curves]
-    return np.concatenate(pieces) if pieces else np.zeros((0, 2, 3))
+    pieces = np.zeros((sum(c.shape[0] * (c.shape[1] - 1) for c in curves), 2, 4), np.float32)
+    first = 0
+    for c in curves:
+        part = pieces[first : first + c.shape[0] * (c.shape[1] - 1)].reshape(len(c), -1, 2, 4)
+        part[:, :, 0, :3], part[:, :, 1, :3] = c[:, :-1], c[:, 1:]
+        first += len(c) * (c.shape[1] - 1)
+    return pieces
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +188,13 @@ class _View:
     ) -> None:
         self.origin, self._e1, self._e2, self._axis = origin, e1, e2, axis
         self.scale, self.radius, self._farthest = scalars
+
+    @classmethod
+    def of(cls, table: mi.Float, lamp: mi.UInt32) -> _View:
+        """Read the view of lamps from the table of all."""
+        four = [dr.gather(mi.Vector4f, table, lamp * (_WIDTH // 4) + k) for k in range(_WIDTH // 4)]
+        row = [n for part in four for n in (part.x, part.y, part.z, part.w)]
+        return cls(*(mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9)), *row[12:15])
 
     def place(self, x: mi.Vector3f) -> _Place:
         """Place of points of the scene's frame. The map keeps angles, so its scale is the same in all directions."""

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from ..arrays import ArrayValue, Bools, Floats, Ints
+from ..arrays import ArrayValue, Bools, Floats, Ints, Singles
 from ..region.globe import Globe
 from ..region.mesh import RegionMesh
 
@@ -32,14 +30,16 @@ class SkinPlaces(ArrayValue):
         nearest: (all vertices,) place that stands for each vertex.
         lids: (l,) places on the skin right in front of the globe, whose inner sides close a space about the cornea.
         behind: (all vertices,) index in `lids` of what stands for the inner side of each; -1 for none.
-        spread: (all vertices, n) weights of the places at every vertex.
+        near: (all vertices, k) places about every vertex.
+        weight: (all vertices, k) their weights there.
     """
 
     vertices: Ints
     nearest: Ints
     lids: Ints
     behind: Ints
-    spread: Any
+    near: Ints
+    weight: Singles
 
 
 def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
@@ -68,14 +68,15 @@ def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
     away = np.linalg.norm(p - middle[group], axis=1)
     order = np.lexsort((away, group))
     chosen = solid[order[np.searchsorted(group[order], np.arange(len(first)))]]
-    spread, nearest = _spread(mesh, chosen, size[first])
+    near, weight = _spread(mesh, chosen, size[first])
+    nearest = near[np.arange(len(near)), np.argmax(weight, axis=1)]
     out = _from_globe(globe, mesh.vertices[chosen])
     away = np.linalg.norm(out, axis=1)
     over = (away < globe.radius_mm + _LID_MM) & (np.sum(out * mesh.normals[chosen], axis=1) > 0.2 * away)
     lids = np.flatnonzero(over & (out[:, 0] > 0))
     index = np.full(len(chosen), -1)
     index[lids] = np.arange(len(lids))
-    return SkinPlaces(chosen, nearest, lids, index[nearest], spread)
+    return SkinPlaces(chosen, nearest, lids, index[nearest], near, weight)
 
 
 def _from_globe(globe: Globe, points: Floats) -> Floats:
@@ -83,8 +84,8 @@ def _from_globe(globe: Globe, points: Floats) -> Floats:
     return np.asarray(points - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
 
 
-def _spread(mesh: RegionMesh, chosen: Ints, size: Floats) -> tuple[Any, Ints]:
-    """Weights of the nearest places at every vertex, and the place with the greatest.
+def _spread(mesh: RegionMesh, chosen: Ints, size: Floats) -> tuple[Ints, Singles]:
+    """The nearest places at every vertex, and their weights.
 
     A place has less weight with distance and where the skin faces another way.
     """
@@ -95,11 +96,7 @@ def _spread(mesh: RegionMesh, chosen: Ints, size: Floats) -> tuple[Any, Ints]:
     facing = np.einsum("vi,vki->vk", mesh.normals, normals[index])
     weight = np.exp(-np.square(distance / size[index])) * np.maximum(facing, 0.02) ** 3 + 1e-9
     weight /= weight.sum(axis=1, keepdims=True)
-    weight = weight.astype(np.float32)
-    rows = np.arange(len(distance))
-    best = index[rows, np.argmax(weight, axis=1)]
-    spread = csr_array((weight.ravel(), (np.repeat(rows, k), index.ravel())), shape=(len(distance), len(chosen)))
-    return spread, best.astype(np.int64)
+    return index.astype(np.int64), weight.astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,6 +205,8 @@ def filled(values: Floats, valid: Bools, rows: int, columns: int, across: tuple[
 
 def _blurred(values: Floats, across: tuple[float, float]) -> Floats:
     """Weighted sums of 3 x 3 neighbours."""
-    padded = np.pad(values, ((1, 1), (1, 1), (0, 0)))
+    height, width, count = values.shape
+    padded = np.zeros((height + 2, width + 2, count))
+    padded[1:-1, 1:-1] = values
     rows = across[1] * (padded[:-2] + padded[2:]) + 2 * padded[1:-1]
     return np.asarray(across[0] * (rows[:, :-2] + rows[:, 2:]) + 2 * rows[:, 1:-1])

@@ -276,9 +276,9 @@ class SkinGeometry:
         g = mi.Vector3f(0, self._mirror * slope_y, slope_z)
         return dr.normalize(normal - (g - normal * dr.dot(normal, g)))
 
-    def shine(self, received: Floats) -> None:
-        """Set what every vertex receives from other surfaces, (n, 4) as in `exchange.Received`."""
-        self._received = mi.Float(aligned(received.astype(np.float32).ravel()))
+    def shine(self, received: mi.Float) -> None:
+        """Set what every vertex receives from other surfaces, four numbers each as in `exchange.Received`."""
+        self._received = received
 
     def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
         """Index of the layout's triangle that was hit."""

@@ -21,7 +21,7 @@ from .lighting import through_cornea
 from .occlusion import lid_margins_px
 from .recorded import uncollected
 from .region import RegionScene
-from .splat import add_glints
+from .splat import Patch, mirror_images
 from .stage import Stage
 from .surround import Obstacle, Surround
 from .window import RenderedWindow, Traced
@@ -84,7 +84,8 @@ class Renderer:
         spp = max(1, (spp or self.spp) // len(shots))
         blur: Blur | None = None
         front = None if job.mesh_edge_mm is None else self._stage.meshes.of(job.eye, job.mesh_edge_mm)[0]
-        pictures, glints, failed = [], np.zeros((job.window[3], job.window[2])), 0
+        pictures, failed = [], 0
+        glints: list[Patch] = []
         marks: tuple[Any, ...] | None = None
         for shot in shots:
             shown, place = self.bind(shot)
@@ -93,17 +94,18 @@ class Renderer:
             blur = blur or Blur.of(job, place)
             picture, missed = self._pictures(shot, shown, blur, spp)
             pictures.append(picture)
-            mirrored = add_glints(shot, place, glints, blur, front)
+            mirrored, patches = mirror_images(shot, place, blur, front, 1 / len(shots))
+            glints += patches
             failed += missed
             if shot.M is job.M and shot.t is job.t:
                 marks = mirrored, *_marks(job, shown, place)
         assert blur is not None
         if marks is None:  # no moment is the middle of the exposure
             shown, place = self.bind(job, lit=False)
-            marks = add_glints(job, place, np.zeros_like(glints), blur, front), *_marks(job, shown, place)
+            marks = mirror_images(job, place, blur, front)[0], *_marks(job, shown, place)
         mirrored, labels, margins, bright = marks
         radiance = pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0)
-        return Traced(job, radiance, glints / len(shots), blur, mirrored, labels, failed, margins, bright)
+        return Traced(job, radiance, tuple(glints), blur, mirrored, labels, failed, margins, bright)
 
     def _pictures(self, job: RenderJob, shown: Exposed, blur: Blur, spp: int) -> tuple[Singles, int]:
         """Radiance of a window, or its parts, with the border that the lens needs, and failed light paths."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Bools, Floats, frozen
+from ..arrays import ArrayValue, Bools, Floats, frozen
 from ..rig import defocus, psf
 from ..rig.camera import Window
 from .blur import Blur
@@ -20,6 +20,15 @@ from .region import RegionScene, blockers
 from .surround import Surround
 
 _FRAMED = "occluded by frame"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patch(ArrayValue):
+    """Blurred radiance (rows, columns) of a mirror image on the part of a window that it reaches."""
+
+    rows: slice
+    columns: slice
+    radiance: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +55,12 @@ class Mirrored:
         return Mirrored(glints, self.others, reasons)
 
 
-def add_glints(
-    job: RenderJob, place: Surround | RegionScene, image: Floats, blur: Blur, mesh: SurfaceMesh | None
-) -> Mirrored:
-    """Add the mirror images of a job's lamps and of the sun to its blurred image (height, width).
+def mirror_images(
+    job: RenderJob, place: Surround | RegionScene, blur: Blur, mesh: SurfaceMesh | None, share: float = 1.0
+) -> tuple[Mirrored, list[Patch]]:
+    """The mirror images of a job's lamps and of the sun, and what they add to its blurred image.
 
-    The tables and reasons are those of the lamps alone.
+    The tables and reasons are those of the lamps alone. `share` is that of the exposure for which the job stands.
     """
     eye, anchor, sigma = job.eye, job.anchor_mm, job.sensor.psf_sigma_px
 
@@ -63,7 +72,7 @@ def add_glints(
         np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), job.M, job.t, job.camera, clear, mesh,
     )  # fmt: skip
     count, lamps = len(job.lights), (*job.lights, *sun_lamps(job.ambient, anchor))
-    tables = {}
+    tables, patches = {}, []
     reasons: tuple[str, ...] = ()
     for order in sorted({1, *job.purkinje}):
         if order == 1:
@@ -79,8 +88,9 @@ def add_glints(
             own = order == 1 and job.lens.focus_mm is not None
             nearness = scene.nearness(lamps) if own else np.full((len(glints), 2), np.nan)
             for glint, near in zip(glints, nearness, strict=True):
-                _splat(job, image, glint.spots, defocus.disc(blur.of_image(near)))
-    return Mirrored(tables[1], tuple((order, table) for order, table in tables.items() if order > 1), reasons)
+                patches += _drawn(job, glint.spots, share, defocus.disc(blur.of_image(near)))
+    others = tuple((order, table) for order, table in tables.items() if order > 1)
+    return Mirrored(tables[1], others, reasons), patches
 
 
 def _reason(job: RenderJob, place: Surround | RegionScene, glint: Glint) -> str:
@@ -97,11 +107,10 @@ def _reason(job: RenderJob, place: Surround | RegionScene, glint: Glint) -> str:
     return glint_reason(image.there, open_, names)
 
 
-def _splat(job: RenderJob, image: Floats, spots: Spots, spread: Floats) -> None:
-    """Add the spots of a glint, blurred by the lens and convolved with `spread`."""
-    if len(spots.energy):
-        cosine = job.camera.rays(spots.xy_px) @ job.camera.axis
-        patch, rows, columns = psf.splat(
-            spots.xy_px, spots.energy * cosine**4, job.sensor.psf_sigma_px, job.window, spread
-        )  # fmt: skip
-        image[rows, columns] += patch
+def _drawn(job: RenderJob, spots: Spots, share: float, spread: Floats) -> list[Patch]:
+    """A share of the spots of a glint, blurred by the lens and convolved with `spread`."""
+    if not len(spots.energy):
+        return []
+    energy = share * spots.energy * (job.camera.rays(spots.xy_px) @ job.camera.axis) ** 4
+    patch, rows, columns = psf.splat(spots.xy_px, energy, job.sensor.psf_sigma_px, job.window, spread)
+    return [Patch(rows, columns, patch)]

@@ -15,15 +15,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Ints
+from ..arrays import ArrayValue, Bools, Floats, Ints, Singles
+from ..geometry.vectors import lengths
 from ..region.look import Look
 from ..region.mapcache import kept
 from ..region.texture import skin_texture
 from .parameters import leaves
+from .recorded import recorded
 from .values import aligned
 
 HALF_MM = 500.0
 _TILE_MM = 60.0
+_FEWEST = 64  # rays
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,17 +131,40 @@ class Surround:
 
 def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:
     """Whether nothing of a Mitsuba scene stands between points (n, 3) of its frame; ends not included."""
-    return ~np.asarray(scene.ray_test(rays_between(a, b)).numpy(), dtype=bool)
+    if not len(a):
+        return np.zeros(0, dtype=bool)
+    # Some rays more than there are make few numbers of rays, so that recordings are played back.
+    step = max(1 << len(a).bit_length() >> 3, _FEWEST)
+    count = -(-len(a) // step) * step
+    table = _between(a, b)[np.minimum(np.arange(count), len(a) - 1)]
+    return ~np.asarray(_met(scene, mi.Float(aligned(table.ravel())), count).numpy()[: len(a)], dtype=bool)
+
+
+@recorded
+def _met(scene: mi.Scene, table: mi.Float, count: int) -> mi.Bool:
+    """Whether rays meet anything; the table holds origin, direction and length of each."""
+    met = scene.ray_test(_rays(table, count))
+    dr.eval(met)
+    return met
 
 
 def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> mi.Ray3f:
     """Rays from points (n, 3) towards points b, without the last `margin_mm` at both ends."""
-    length = np.linalg.norm(b - a, axis=-1)
+    table = _between(a, b, margin_mm)
+    return _rays(mi.Float(table.ravel()), len(table))
+
+
+def _between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> Singles:
+    """Origin, direction and length (n, 7) of such rays."""
+    length = lengths(b - a)
     d = (b - a) / length[:, None]
-    table = np.column_stack([a + margin_mm * d, d, length - 2 * margin_mm]).astype(np.float32)
+    return np.column_stack([a + margin_mm * d, d, length - 2 * margin_mm]).astype(np.float32)
+
+
+def _rays(table: mi.Float, count: int) -> mi.Ray3f:
     # The values are gathered from one buffer, else the kernel would depend on the alignment of every NumPy array.
-    buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 7
-    o = [dr.gather(mi.Float, buffer, row + k) for k in range(7)]
+    row = dr.arange(mi.UInt32, count) * 7
+    o = [dr.gather(mi.Float, table, row + k) for k in range(7)]
     ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:6]))
     ray.maxt = o[6]
     return ray

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayValue, Bools, Floats, Singles, frozen
+from ..arrays import ArrayValue, Bools, Singles, frozen, sealed
 from ..errors import InputError
 from ..rig import defocus, exposure, psf, stray
 from ..rig.camera import Window
@@ -15,7 +15,7 @@ from .blur import Blur
 from .frame import RenderJob
 from .glints import GlintTable
 from .labels import PartLabels
-from .splat import Mirrored
+from .splat import Mirrored, Patch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +56,7 @@ class Traced(ArrayValue):
     Attributes:
         job: the frame's job.
         radiance: mean radiance of the pixels with the border that the lens needs, or its parts.
-        glints: (height, width) radiance of the lamps' mirror images, blurred.
+        glints: the lamps' mirror images, blurred.
         blur: the lens.
         mirrored: the glints' places and energies.
         labels: raster labels, if they were requested.
@@ -67,7 +67,7 @@ class Traced(ArrayValue):
 
     job: RenderJob
     radiance: Singles
-    glints: Floats
+    glints: tuple[Patch, ...]
     blur: Blur
     mirrored: Mirrored
     labels: PartLabels | None
@@ -85,11 +85,12 @@ class Traced(ArrayValue):
         seen = (job.lens, job.camera, job.window)
         # Single precision is finer than the samples' noise, and takes half the time.
         picture = psf.blur(self.blur.of_pictures(self.radiance).astype(np.float32), job.sensor.psf_sigma_px)
-        picture = picture + self.glints
+        for patch in self.glints:
+            picture[patch.rows, patch.columns] += patch.radiance
         if job.lens.vignetting > 0:
             picture *= defocus.vignette(*seen)
         picture = stray.scattered(stray.framed(picture, *seen), *seen)
-        irradiance = frozen(picture * np.float32(exposure.radiance_to_irradiance(job.sensor)), np.float32)
+        irradiance = sealed(picture * np.float32(exposure.radiance_to_irradiance(job.sensor)))
         if not np.all(np.isfinite(irradiance)):
             raise InputError("the numbers of the scene are too extreme: its image is not finite")
         # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
@@ -102,7 +103,7 @@ class Traced(ArrayValue):
         return RenderedWindow(
             job.window,
             irradiance,
-            frozen(dn, np.uint16),
+            sealed(dn),
             job.sensor.bit_depth,
             labels,
             mirrored.glints,

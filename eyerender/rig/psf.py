@@ -7,13 +7,17 @@ grid) would then have different lenses.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy import signal, special
 
 from ..arrays import Floats, Reals
 from ..rig.camera import Window
+
+_AT_ONCE = 16  # rows or columns of a blurred picture
 
 
 def margin(sigma_px: float) -> int:
@@ -32,22 +36,32 @@ def blur(image: Reals, sigma_px: float) -> Reals:
     """Convolve `image`; the result is smaller by `margin` pixels on every side and has the image's precision."""
     if sigma_px == 0:
         return image
-    k = kernel(sigma_px).astype(image.dtype)
-    m, (height, width) = len(k) // 2, image.shape
-    down = _symmetric([image[i : height - 2 * m + i] for i in range(2 * m + 1)], k)
-    return _symmetric([down[:, i : width - 2 * m + i] for i in range(2 * m + 1)], k)
+    m, band = margin(sigma_px), _band(sigma_px, image.dtype)
+    height, width = (n - 2 * m for n in image.shape)
+    # A product of matrices takes a fifth of the time of adding shifted pictures.
+    down, out = np.empty((height, width + 2 * m), image.dtype), np.empty((height, width), image.dtype)
+    for of, near, part in _parts(height, m, band):
+        np.matmul(part, image[near], out=down[of])
+    for of, near, part in _parts(width, m, band):
+        np.matmul(down[:, near], part.T, out=out[:, of])
+    return out
 
 
-def _symmetric(shifted: Sequence[Reals], weights: Reals) -> Reals:
-    """Weighted sum of shifted pictures; the weights are the same forwards and backwards."""
-    m = len(weights) // 2
-    out = shifted[m] * weights[m]
-    pair = np.empty_like(out)
-    for i in range(m):
-        np.add(shifted[i], shifted[2 * m - i], out=pair)
-        pair *= weights[i]
-        out += pair
-    return np.asarray(out)
+@lru_cache(maxsize=8)
+def _band(sigma_px: float, dtype: np.dtype[Any]) -> Reals:
+    """Weights of rows in the blurred rows that lie in their middle."""
+    k = kernel(sigma_px)
+    band = np.zeros((_AT_ONCE, _AT_ONCE + len(k) - 1), dtype)
+    for row in range(_AT_ONCE):
+        band[row, row : row + len(k)] = k
+    return band
+
+
+def _parts(count: int, m: int, band: Reals) -> Iterator[tuple[slice, slice, Reals]]:
+    """A few blurred rows of `count` at a time, the rows of the picture about them, and these rows' weights."""
+    for first in range(0, count, _AT_ONCE):
+        end = min(first + _AT_ONCE, count)
+        yield slice(first, end), slice(first, end + 2 * m), band[: end - first, : end - first + 2 * m]
 
 
 def splat(
@@ -75,8 +89,8 @@ def splat(
     rows = slice(max(int(low[1]), 0), min(int(high[1]) + 1, height))
     if columns.stop <= columns.start or rows.stop <= rows.start:
         return np.zeros((0, 0)), slice(0, 0), slice(0, 0)
-    gx = _integrals(np.arange(columns.start, columns.stop, dtype=float) + x0, xy_px[:, 0], sigma_px)
-    gy = _integrals(np.arange(rows.start, rows.stop, dtype=float) + y0, xy_px[:, 1], sigma_px)
+    gx = _integrals(x0 + columns.start, columns.stop - columns.start, xy_px[:, 0], sigma_px)
+    gy = _integrals(y0 + rows.start, rows.stop - rows.start, xy_px[:, 1], sigma_px)
     return np.asarray(gy.T @ (gx * energy[:, None])), rows, columns
 
 
@@ -101,8 +115,8 @@ def _spread(
     return np.asarray(inside), slice(top, bottom), slice(left, right)
 
 
-def _integrals(pixels: Floats, centres: Floats, sigma: float) -> Floats:
-    """Share (n, k) of each Gaussian that falls into each pixel [k - 1/2, k + 1/2]."""
-    edges = np.append(pixels - 0.5, pixels[-1] + 0.5)[None, :] - centres[:, None]
+def _integrals(first: int, count: int, centres: Floats, sigma: float) -> Floats:
+    """Share (n, count) of each Gaussian that falls into each pixel [k - 1/2, k + 1/2], from the first on."""
+    edges = np.arange(first - 0.5, first + count)[None, :] - centres[:, None]
     cumulative = (edges >= 0).astype(float) if sigma == 0 else special.ndtr(edges / sigma)
-    return np.asarray(np.diff(cumulative, axis=1))
+    return np.asarray(cumulative[:, 1:] - cumulative[:, :-1])

@@ -12,6 +12,7 @@ what glare carries over the border comes back from the continuation.
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy import fft, ndimage, special
@@ -21,13 +22,17 @@ from .camera import PinholeCamera, Window
 from .imaging import Lens, Opening
 from .sensor import Sensor
 
+_FADED, _FEW = 14.0, 1 / 3  # r0 k of waves of which the glare leaves a millionth; a share of all waves
+_SUMMED = 128  # terms of a sum at a time
+
 
 def framed(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
     """Picture (h, w) behind the lens' openings, in its own precision; radiances in mW/mm^2/sr."""
     for opening in lens.openings:
         rim = 1e-3 * opening.radiance_w_m2_sr
-        picture = (picture - rim) * transmission(opening, camera, window)
-        picture += rim
+        picture = (picture - rim if rim else picture) * transmission(opening, camera, window)
+        if rim:
+            picture += rim
     return picture
 
 
@@ -38,8 +43,8 @@ def scattered(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window)
     if lens.glare > 0:
         glare = veil(picture, lens.glare_radius_px)
         glare *= lens.glare
-        glare += (1 - lens.glare) * picture
-        return glare
+        picture = (1 - lens.glare) * picture
+        picture += glare
     return picture
 
 
@@ -85,16 +90,41 @@ def ghost(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> 
 
 def veil(picture: Reals, radius_px: float) -> Reals:
     """The picture (h, w) convolved with the glare's kernel, continued by its mirror image."""
-    waves = fft.dctn(picture, type=2)
-    waves *= _damping(picture.shape, radius_px)
-    spread = fft.idctn(waves, type=2, overwrite_x=True)
+    # Products of matrices find the long waves that a wide glare leaves in less time than a fast transform takes.
+    share = _FADED / (np.pi * radius_px)
+    if share < _FEW:
+        down, across = (_cosines(n, int(share * n) + 1, picture.dtype) for n in picture.shape)
+        waves = _product(_product(down, picture), across.T)
+        waves *= _damping(picture.shape, waves.shape, radius_px)
+        spread = down.T @ (waves @ across)
+    else:
+        waves = fft.dctn(picture, type=2)
+        waves *= _damping(picture.shape, waves.shape, radius_px)
+        spread = fft.idctn(waves, type=2, overwrite_x=True)
     return np.asarray(np.maximum(spread, 0, out=spread))
 
 
+def _product(a: Reals, b: Reals) -> Reals:
+    """Product of matrices. Long sums are made in parts, else their last digits depend on the number of threads."""
+    out = a[:, :_SUMMED] @ b[:_SUMMED]
+    for k in range(_SUMMED, len(b), _SUMMED):
+        out += a[:, k : k + _SUMMED] @ b[k : k + _SUMMED]
+    return np.asarray(out)
+
+
 @lru_cache(maxsize=8)
-def _damping(shape: tuple[int, ...], radius_px: float) -> Singles:
-    rows, columns = (np.pi * np.arange(n) / n for n in shape)
+def _damping(shape: tuple[int, ...], counts: tuple[int, ...], radius_px: float) -> Singles:
+    """Factors of the longest waves of a picture, so many down and across."""
+    rows, columns = (np.pi * np.arange(count) / n for count, n in zip(counts, shape, strict=True))
     return frozen(np.exp(-radius_px * np.hypot(rows[:, None], columns[None, :])), np.float32)
+
+
+@lru_cache(maxsize=8)
+def _cosines(n: int, count: int, dtype: np.dtype[Any]) -> Reals:
+    """The longest waves (count, n) of n pixels, which are mirrored at both ends; orthonormal."""
+    waves = np.cos(np.pi / n * np.outer(np.arange(count), np.arange(n) + 0.5)) * np.sqrt(2 / n)
+    waves[0] = np.sqrt(1 / n)
+    return frozen(waves, dtype)
 
 
 def covered(lens: Lens, sensor: Sensor, camera: PinholeCamera, window: Window) -> Bools | None:

@@ -67,6 +67,16 @@ def test_photon_counts_are_quantiles_of_poisson(mean):
     assert np.mean((counts != expected) * stats.norm.pdf(normal)) < 1e-3 * np.mean(stats.norm.pdf(normal))
 
 
+def test_noise_is_drawn_from_the_bits_of_numpys_generator():
+    sensor, mean = Sensor(read_noise_e=0.0, full_well_e=12000.0), 5000.0
+    image = np.full((31, 17), mean / float(electrons(sensor, np.array(1.0), 850.0)), np.float32)
+    bits = np.random.default_rng((0x5E75, 7)).integers(0, 2**16, (2, 31, 17), np.uint16)[0]
+    codes = expose(sensor, image, 850.0, 7)
+    order = np.argsort(bits, axis=None, kind="stable")
+    assert np.all(np.diff(codes.ravel()[order].astype(int)) >= 0)  # a greater number is a greater count
+    assert len(np.unique(codes)) > 100
+
+
 def test_a_pixel_does_not_move_the_noise_of_others():
     rng = np.random.default_rng(1)
     image = rng.uniform(0.0, 0.02, (40, 30))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import fft
 
 from eyerender.rig.camera import Camera
 from eyerender.rig.imaging import Lens, Opening
@@ -43,6 +44,15 @@ def test_the_glares_profile_is_that_of_its_kernel():
     expected = radius / (2 * np.pi * (r**2 + radius**2) ** 1.5)
     # The mirrored continuation adds what lies beyond the border: at most a few per cent here.
     assert spread[200, 200 + r] == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize("radius", [15.0, 80.0])
+def test_the_long_waves_that_a_wide_glare_leaves_are_enough(picture, radius):
+    waves = fft.dctn(picture, type=2, norm="ortho")
+    k = np.hypot(*np.meshgrid(*(np.pi * np.arange(n) / n for n in picture.shape), indexing="ij"))
+    expected = fft.idctn(waves * np.exp(-radius * k), type=2, norm="ortho")
+    # The waves that are left out have a millionth of their height; about single bright pixels there are many of them.
+    assert veil(picture, radius) == pytest.approx(expected, rel=3e-5)
 
 
 def test_a_dark_pupil_gets_the_stated_share_of_a_wide_field():
