@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import ArrayValue, Floats, frozen, remembered
+from ..geometry.vectors import crosses
 from .entrance import entrance_pupil
 from .model import EyeModel
 
@@ -33,6 +34,7 @@ _DISC_DEG, _DISC_RADIUS_DEG = (15.5, -1.5), 2.9
 # Delori and Pflibsen 1989, table I, at 805 nm: 10.37 % at the fovea, 11.27 % beside it, 12.52 % nasally.
 _FOVEA_SHARE, _FOVEA_DEG = 0.92, 2.5
 _NODES = 169  # points of the pupil
+_UP = frozen([0.0, 0.0, 1.0])
 _VANISHED = 210.0  # squared gap, in sigma^2, beyond which a Gaussian is 0 in single precision
 _REACH = 12.0  # halo widths, beyond which a lamp returns less than a hundred-thousandth of its halo's peak
 
@@ -94,9 +96,9 @@ def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: 
     lamps, camera = np.asarray(lamps_mm, float) - centre, np.asarray(camera_mm, float) - centre
     axes = scale * eye.stop.rotation[:, 1:] * eye.stop.semi_axes_mm
     out_of_pupil = camera / np.linalg.norm(camera)
-    e1 = np.cross([0.0, 0.0, 1.0], out_of_pupil)
+    e1 = crosses(_UP, out_of_pupil)
     e1 /= np.linalg.norm(e1)
-    plane = np.stack([e1, np.cross(out_of_pupil, e1)])
+    plane = np.stack([e1, crosses(out_of_pupil, e1)])
 
     line = (np.arange(CELLS) + 0.5) * 2 * EDGE / CELLS - EDGE
     first, second = np.meshgrid(line, line)
@@ -193,9 +195,9 @@ def _relative_reflectance(eye: EyeModel, axis: Floats, plane: Floats, theta: Flo
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
     sight = eye.chief_ray.direction
     # Field angles from the line of sight, temporal and up. A right eye has +y nasal.
-    temporal = np.cross([0.0, 0.0, 1.0], sight) * (-1.0 if eye.side == "right" else 1.0)
+    temporal = crosses(_UP, sight) * (-1.0 if eye.side == "right" else 1.0)
     temporal /= np.linalg.norm(temporal)
-    up = np.cross(sight, temporal) * (1.0 if eye.side == "left" else -1.0)
+    up = crosses(sight, temporal) * (1.0 if eye.side == "left" else -1.0)
     ahead = way @ sight
     field = np.degrees(np.stack([np.arctan2(way @ temporal, ahead), np.arctan2(way @ up, ahead)], -1))
     to_disc = np.linalg.norm(field - np.array(_DISC_DEG), axis=-1)

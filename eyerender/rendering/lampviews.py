@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import Floats, Singles
+from ..geometry.vectors import crosses
 from ..region.mesh import HAIRS, RegionMesh
 from ..rig.light import Lamp
 from .parameters import leaves
@@ -238,14 +239,14 @@ def _frame(lamp: Lamp, anchor_mm: Floats, reach_mm: float) -> list[float]:
     origin = np.asarray(lamp.position_mm - anchor_mm, dtype=float)
     distance = float(np.linalg.norm(origin))
     axis = -origin / distance if distance > 0 else np.array([-1.0, 0.0, 0.0])
-    e1 = np.cross(axis, (0.0, 0.0, 1.0) if abs(axis[2]) < 0.8 else (0.0, 1.0, 0.0))
+    e1 = crosses(axis, np.array((0.0, 0.0, 1.0) if abs(axis[2]) < 0.8 else (0.0, 1.0, 0.0)))
     e1 /= np.linalg.norm(e1)
     widest = np.arcsin(min(reach_mm / max(distance, 1e-9), 1.0))
     half = min(float(np.tan(widest / 2)), _LARGEST)
     return [
         *origin,
         *e1,
-        *np.cross(axis, e1),
+        *crosses(axis, e1),
         *axis,
         0.5 * _CELLS / half,
         float(lamp.radius_mm),

@@ -20,13 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, frozen
 from ..optics.diffusion import half_space_length_mm, rings, slab_length_mm, transmitted
 from ..region.globe import Globe
 from ..region.mesh import RegionMesh, sheet_neighbours
@@ -625,11 +626,8 @@ class GlobeGrid:
     @classmethod
     def of(cls, posed: RegionMesh, globe: Globe, reach_mm: float) -> GlobeGrid:
         """Make the grid of a pose; light gets as far as `reach_mm` from under a lid."""
-        row, column = np.divmod(np.arange(_SIDE * _SIDE), _SIDE)
-        a, b = ((k - 0.5 * (_SIDE - 1)) * (_WIDTH / _SIDE) for k in (column, row))
         centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
-        scale = globe.radius_mm * np.sqrt(np.maximum(1 - 0.25 * (a * a + b * b), 0))
-        y, z = a * scale + centre[1], b * scale + centre[2]
+        y, z = (v + c for v, c in zip(_globe_cells(globe.radius_mm), centre[1:], strict=True))
         upper, lower = (m[np.argsort(m[:, 1])] for m in (posed.upper_margin, posed.lower_margin))
         over = np.maximum(z - np.interp(y, upper[:, 1], upper[:, 2]), np.interp(y, lower[:, 1], lower[:, 2]) - z)
         beside = np.maximum(upper[0, 1] - y, y - upper[-1, 1])
@@ -659,6 +657,15 @@ class GlobeGrid:
 
         dr.scatter(light, places.share(start, read), index)
         return light
+
+
+@lru_cache(maxsize=4)
+def _globe_cells(radius_mm: float) -> tuple[Floats, Floats]:
+    """Places (y, z) of the cells of the grid over the globe about its middle, mm."""
+    row, column = np.divmod(np.arange(_SIDE * _SIDE), _SIDE)
+    a, b = ((k - 0.5 * (_SIDE - 1)) * (_WIDTH / _SIDE) for k in (column, row))
+    scale = radius_mm * np.sqrt(np.maximum(1 - 0.25 * (a * a + b * b), 0))
+    return frozen(a * scale), frozen(b * scale)
 
 
 def _spots(shift: tuple[mi.UInt32, mi.UInt32], k: mi.UInt32) -> tuple[mi.Float, mi.Float]:
