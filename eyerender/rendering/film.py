@@ -420,6 +420,7 @@ def _shaded(
         scene,
         Group(
             each,
+            finely & values.structure.scattering,
             ray,
             hit,
             lambda j: samples.pair(number(j), 0),

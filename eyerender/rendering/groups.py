@@ -29,6 +29,7 @@ class Group:
 
     Attributes:
         count: number of samples.
+        halved: whether half of the samples that meet the globe are shaded for all of them.
         ray: origin, direction (scene's frame) and weight of sample j.
         hit: what sample j hits of the region, from what it meets of the globe alone, its origin and its direction.
         spot: place of sample j on the lamps' discs, [0, 1)^2.
@@ -46,6 +47,7 @@ class Group:
     """
 
     count: mi.UInt32
+    halved: mi.Bool
     ray: Callable[[mi.UInt32], tuple[mi.Vector3f, mi.Vector3f, mi.Float]]
     hit: Callable[[mi.UInt32, View, mi.Vector3f, mi.Vector3f], RegionHit]
     spot: Callable[[mi.UInt32], mi.Point2f]
@@ -78,19 +80,21 @@ def shade_group(
     The parts, from front to back, are what is before the skin, the skin, and the globe. There are none unless the group
     is layered.
 
-    Every sample has a ray of its own, and the globe is shaded for each. The region is shaded once for the sheet of skin
-    and once for everything in front of it (hairs, tears), at the first sample that hits it. The result is multiplied by
-    the number of hits on that surface. In a plain pixel the first sample that hits the skin represents the others.
+    Every sample has a ray of its own, and the globe is shaded for each, or for half where many are taken because of
+    thin hairs. The region is shaded once for the sheet of skin and once for everything in front of it (hairs,
+    tears), at the first sample that hits it. The result is multiplied by the number of hits on that surface. In a plain
+    pixel the first sample that hits the skin represents the others.
     """
     assert textures.region is not None
     shading = _GroupShading(values, lights, textures, textures.region, scene, group)
     no = mi.Bool(False)
-    depths = tuple(mi.Float(0) for _ in range(4)) if group.layered else ()
-    state = (mi.UInt32(0), no, mi.Float(0), Kept.none(), Kept.none(), no, no, mi.UInt32(0), depths)
-    names = ("i", "settled", "total", "sheet", "before", "known", "blocked", "failures", "depths")
-    i, settled, total, sheet, before, _, _, failures, depths = dr.while_loop(
+    depths = tuple(mi.Float(0) for _ in range(3)) if group.layered else ()
+    state = (mi.UInt32(0), no, mi.Float(0), OnGlobe.none(), Kept.none(), Kept.none(), no, no, mi.UInt32(0), depths)
+    names = ("i", "settled", "total", "globe", "sheet", "before", "known", "blocked", "failures", "depths")
+    i, settled, total, globe, sheet, before, _, _, failures, depths = dr.while_loop(
         state, shading.goes_on, shading.trace_sample, labels=names, label="group"
     )
+    total += globe.radiance
     traced = sheet.weight
     sheet = shading.with_untraced(sheet, i, settled)
 
@@ -100,10 +104,10 @@ def shade_group(
         )
 
     if group.layered:
-        globe, *near = depths
+        near = list(depths)
         near[1] *= dr.select(traced > 0, sheet.weight / traced, 1)
         radiance = [shading.add_region(mi.Float(0), before, False), shading.add_region(mi.Float(0), sheet, True)]
-        weights = (before.weight, sheet.weight, globe)
+        weights = (before.weight, sheet.weight, globe.weight)
         parts = tuple(Part(*part) for part in zip((*radiance, total), weights, near, strict=True))
         return parts, total, failures
     return (), with_region(with_region(total, sheet, True), before, False), failures
@@ -144,13 +148,14 @@ class _GroupShading:
         i: mi.UInt32,
         settled: mi.Bool,
         total: mi.Float,
+        globe: OnGlobe,
         sheet: Kept,
         before: Kept,
         known: mi.Bool,
         blocked: mi.Bool,
         failures: mi.UInt32,
         depths: tuple[mi.Float, ...],
-    ) -> tuple[mi.UInt32, mi.Bool, mi.Float, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32, tuple[mi.Float, ...]]:
+    ) -> tuple[mi.UInt32, mi.Bool, mi.Float, OnGlobe, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32, tuple[mi.Float, ...]]:
         """Trace one sample: shade the globe if the sample hits it, else keep the hit on the region.
 
         `known` says whether the previous sample has sent its own ray to the lamp, `blocked` whether that ray met
@@ -175,17 +180,21 @@ class _GroupShading:
             view = View(*parts)
         if group.layered:
             # Before the branches below: Dr.Jit would reuse their values outside of them.
-            weight_globe, *near = depths
             add = weight * view.nearness(values, d)
             seen = (view.other & ~on_sheet, view.other & on_sheet, view.cornea | view.sclera)
-            near = [n + dr.select(there, add, 0) for n, there in zip(near, seen, strict=True)]
-            depths = (weight_globe + dr.select(seen[2], weight, 0), *near)
+            depths = tuple(n + dr.select(there, add, 0) for n, there in zip(depths, seen, strict=True))
 
-        def globe(total: mi.Float, failures: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
+        def shade(lit: mi.Float, shaded: mi.Float, failures: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.UInt32]:
             radiance, missed = self.globe_radiance(view, d, j)
-            return total + radiance * weight, failures + missed
+            return lit + radiance * weight, shaded + weight, failures + missed
 
-        total, failures = dr.if_stmt((total, failures), view.cornea | view.sclera, globe, lambda *unchanged: unchanged)
+        on_globe = view.cornea | view.sclera
+        # Of any four samples the two in the middle: of twelve, these are a lattice about the pixel's centre.
+        in_turn = ~group.halved | (((j + 1) & 2) > 0) | (globe.shaded == 0)
+        lit, shaded, failures = dr.if_stmt(
+            (globe.lit, globe.shaded, failures), on_globe & in_turn, shade, lambda *unchanged: unchanged
+        )
+        globe = OnGlobe(lit, shaded, globe.weight + dr.select(on_globe, weight, 0))
         alone = view.other & group.fine
         if self.soft:
             alone &= ~on_sheet
@@ -205,7 +214,7 @@ class _GroupShading:
         sheet = sheet.with_(view.other & on_sheet, j, face, hit.prim_uv, weight, alone, blocked)
         before = before.with_(view.other & ~on_sheet, j, face, hit.prim_uv, weight, alone, blocked)
         settled = group.plain & view.other & on_sheet & ~alone
-        return i + 1, settled, total, sheet, before, known, blocked, failures, depths
+        return i + 1, settled, total, globe, sheet, before, known, blocked, failures, depths
 
     def past_water(
         self, total: mi.Float, d: mi.Vector3f, view: View, o: mi.Vector3f, j: mi.UInt32, weight: mi.Float
@@ -337,6 +346,25 @@ class _GroupShading:
             return k + 1, total + lit * (dr.select(first, kept.clear, 0) + dr.select(blocked, 0, shared))
 
         return dr.while_loop((mi.UInt32(0), total), more, lamp_light, labels=("k", "total"), label="its lamps")[1]
+
+
+@dataclass
+class OnGlobe:
+    """A group's samples on the globe: radiance times weight of the shaded ones, their weight, and that of all."""
+
+    lit: mi.Float = None
+    shaded: mi.Float = None
+    weight: mi.Float = None
+
+    @classmethod
+    def none(cls) -> OnGlobe:
+        """Return the sums of no samples."""
+        return cls(mi.Float(0), mi.Float(0), mi.Float(0))
+
+    @property
+    def radiance(self) -> mi.Float:
+        """Radiance of all these samples, of which the shaded ones stand for the others."""
+        return self.lit * dr.select(self.shaded > 0, self.weight / self.shaded, 0)
 
 
 @dataclass
