@@ -78,7 +78,7 @@ if TYPE_CHECKING:
     from .values import Lights, Values
 
 RAYS = 24  # from each place on the globe or about it
-_SKIN_RAYS, _INNER_RAYS = 14, 2  # from places on the skin, and on the lids' inner sides, which lie in the dark
+_SKIN_RAYS, _INNER_RAYS = 10, 2  # from places on the skin, and on the lids' inner sides, which lie in the dark
 _HALVINGS = 14, 15  # of the rays that leave the eye into bundles, without and with light from afar
 _LANES = 4096  # there are lanes for so many times as many rays, so that recordings serve many subjects
 _MIRRORED = 256  # and for places that the cornea mirrors lamps to, so that they serve many poses
