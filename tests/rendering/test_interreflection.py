@@ -104,8 +104,8 @@ def plain(renderer, monkeypatch):
 
 @pytest.mark.parametrize("case", CASES)
 def test_all_light_of_lamps_against_path(plain, tmp_path, case):
-    # .5 % and two standard errors of the oracle in rings of the iris, on sclera, and on surround or skin. The iris has a
-    # picture of its own with finer pixels, because few of a coarse picture lie wholly in one ring.
+    # .5 % and two standard errors of the oracle in rings of the iris, on sclera, and on surround or skin. The iris has
+    # a picture of its own with finer pixels, because few of a coarse picture lie wholly in one ring.
     model, camera, side, times, places, more = CASES[case]
     look = FLAT.model_copy(update={k: v for k, v in more.items() if k != "region"})
     whole, fine = (
