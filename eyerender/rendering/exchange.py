@@ -375,6 +375,7 @@ class Exchange:
         self._skins: list[tuple[tuple[Any, ...], Globe, _Plan]] = []  # of subjects
         self._bare: _Plan | None = None
         self._interiors: KeptForEye[_Interior] = KeptForEye()
+        self._shares: tuple[_Plan, _Interior, csr_array] | None = None  # of the last frame
 
     def received(
         self, job: RenderJob, values: Values, lights: Lights, panels: Lights, textures: Textures,
@@ -397,7 +398,8 @@ class Exchange:
         grid = globe_places(globe, None if region is None else region.posed)
         plan = self._plan(region, globe)
         points, normals, plane = _others(job, globe, region, plan.skin)
-        frame = _Frame(job, grid, self._inside(job), plan, points, normals, plane)
+        interior = self._inside(job)
+        frame = _Frame(job, grid, interior, plan, self._shares_of(plan, interior), points, normals, plane)
         if not job.interreflection and not values.structure.ambient:
             return frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
@@ -412,6 +414,13 @@ class Exchange:
         """The chamber of a job's eye."""
         film, look, halvings = job.film_index, job.look, _halvings(job.ambient)
         return self._interiors.get(job.eye, (film, look, halvings), lambda: _Interior.of(job.eye, film, look, halvings))
+
+    def _shares_of(self, plan: _Plan, interior: _Interior) -> csr_array:
+        """Shares as in `_Seen`, which only another subject, eye or pupil changes."""
+        kept = self._shares
+        if kept is None or kept[0] is not plan or kept[1] is not interior:
+            kept = self._shares = plan, interior, plan.shares(interior.gain)
+        return kept[2]
 
     def _plan(self, region: RegionScene | None, globe: Globe) -> _Plan:
         """Places and rays, chosen with the eye straight ahead: no earlier pose may change a picture."""
@@ -441,6 +450,7 @@ class _Frame:
     grid: GlobePlaces
     interior: _Interior
     plan: _Plan
+    shares: csr_array
     points: Floats
     normals: Floats
     plane: tuple[float, float, float]
@@ -724,7 +734,7 @@ def _seen(
         found = _at_spots(values, lights, place.scene, views, spot, ends, globe + inside).numpy()
         lit[:globe], lit[plan.rays :] = found[:globe], found[globe:]
     target, weight, close, sky, free = (r.numpy()[:rays] for r in results)
-    return _Seen(plan.shares(interior.gain), target, weight, close, sky, free, lit)
+    return _Seen(frame.shares, target, weight, close, sky, free, lit)
 
 
 @traversed

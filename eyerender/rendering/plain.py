@@ -118,7 +118,7 @@ def _drawn(curves: list[Floats], camera: PinholeCamera, anchor_mm: Floats, windo
     marked, every = np.zeros((height + 2, width + 2), dtype=bool), True
     for curve in (c for c in curves if c.size):
         z = (curve + anchor_mm - camera.nodal_point_mm) @ camera.R[2]
-        if z.min() < _NEAREST_MM or _HAIR_MM * float(camera.K[0, 0]) > _THICK_PX * z.min():
+        if not _thin(float(z.min()), camera):
             every = False
             continue
         xy = camera.project(curve + anchor_mm)[0] - (x0 - 1, y0 - 1)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import signal, special
 
-from ..arrays import Floats, Reals
+from ..arrays import Floats, Reals, sealed
 from ..rig.camera import Window
 
 _AT_ONCE = 16  # rows or columns of a blurred picture
@@ -54,7 +54,7 @@ def _band(sigma_px: float, dtype: np.dtype[Any]) -> Reals:
     band = np.zeros((_AT_ONCE, _AT_ONCE + len(k) - 1), dtype)
     for row in range(_AT_ONCE):
         band[row, row : row + len(k)] = k
-    return band
+    return sealed(band)
 
 
 def _parts(count: int, m: int, band: Reals) -> Iterator[tuple[slice, slice, Reals]]:
