@@ -137,7 +137,9 @@ def onto_points(
         blocked = lamp_blocked(values, scene, x, source, other, True, asked)
         return i + 1, total + dr.select(blocked, 0, lit), free + lit
 
-    state, labels = (mi.UInt32(0), mi.Float(0) * x.x, mi.Float(0) * x.x), ("i", "total", "free")
+    # One zero for both sums: whether Dr.Jit takes two for one varies, and with it the kernel.
+    dark = mi.Float(0) * x.x
+    state, labels = (mi.UInt32(0), dark, dark), ("i", "total", "free")
     _, total, free = dr.while_loop(state, lambda i, *_: i < lights.count, body, labels=labels, label="lamps on places")
     return total, free
 

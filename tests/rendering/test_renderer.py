@@ -29,16 +29,19 @@ def test_a_seed_gives_the_same_bytes_with_any_threads_and_after_other_frames(ren
     assert digest(renderer.render(replace(noisy_job(), seed=78))) != first
 
 
-def test_a_fresh_process_gives_the_same_bytes(renderer):
+def test_a_fresh_process_gives_the_same_bytes_and_its_second_frame_has_no_new_kernel(renderer):
     code = (
         "from eyerender.backends.choose import choose_backend\n"
         "b = choose_backend('llvm', threads=2)\n"
+        "from tests.rendering.test_renderer import kernels\n"
         "from tests.support.render_rigs import digest, noisy_job\n"
         "from eyerender.rendering.renderer import Renderer\n"
-        "print(digest(Renderer(b, spp=16).render(noisy_job())))\n"
+        "renderer = Renderer(b, spp=16)\n"
+        "first, second = (kernels(renderer, [noisy_job()]) for _ in range(2))\n"
+        "print(digest(renderer.render(noisy_job())), len(first) > 0, len(second - first))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == digest(renderer.render(noisy_job()))
+    assert done.stdout.split() == [digest(renderer.render(noisy_job())), "True", "0"]
 
 
 def kernels(renderer, jobs) -> set:
