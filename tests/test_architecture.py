@@ -205,6 +205,11 @@ def test_a_type_alias_is_defined_once():
 def test_import_is_light():
     heavy = ("mitsuba", "drjit", "cv2", "skimage", "matplotlib", "torch", "pyarrow")
     uses = {"None": heavy, "eyerender.gaze": (*heavy, "scipy", "pydantic"), "eyerender.gaze.Regression": heavy}
+    # Every worker of a run pays for what the renderer imports.
+    renderer = (
+        "from eyerender.backends.choose import choose_backend; choose_backend(); import eyerender.rendering.renderer"
+    )
+    uses[renderer] = ("scipy.signal", "scipy.stats", "trimesh", "matplotlib")
     for use, banned in uses.items():
         code = f"import sys, eyerender; {use}; print([m for m in {banned} if m in sys.modules])"
         out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -10,7 +10,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from ..arrays import Floats
 from ..errors import InputError, Problems
@@ -160,6 +159,8 @@ def _label(draw: Draw, value: Any, k: int) -> Any:
 @lru_cache(maxsize=16)
 def sobol_block(seed: int, unit: str, dimensions: int, block: int) -> Floats:
     """Points block * 256 .. + 255 of a scrambled Sobol sequence in (0, 1), (256, dimensions)."""
+    from scipy.stats import qmc  # which takes half a second
+
     generator = np.random.default_rng([seed, 1 if unit == "subject" else 0])
     engine = qmc.Sobol(dimensions, scramble=True, rng=generator)
     if block:

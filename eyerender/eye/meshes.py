@@ -24,7 +24,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from ..arrays import Floats, Ints
 from ..geometry.surfaces import Surface
@@ -58,7 +57,7 @@ class Patch:
     @property
     def mesh(self) -> Any:
         """Convert to a trimesh."""
-        return trimesh.Trimesh(self.vertices, self.faces, vertex_normals=self.normals, process=False)
+        return _trimesh(self.vertices, self.faces, self.normals)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +161,12 @@ def _rim(patch: Patch, sectors: int) -> Floats:
     return patch.vertices[-sectors:]
 
 
+def _trimesh(vertices: Floats, faces: Ints, normals: Floats | None = None) -> Any:
+    import trimesh  # which takes a quarter of a second, and few processes need it
+
+    return trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
+
+
 def _band(
     name: str, inner: Floats, outer: Floats, exterior: float | None = None, interior: float | None = None
 ) -> Patch:
@@ -169,8 +174,8 @@ def _band(
     sectors = len(inner)
     vertices = np.concatenate([inner, outer])
     faces = _strips(0, 2, sectors)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    return Patch(name, vertices, np.asarray(mesh.vertex_normals), faces, exterior, interior)
+    normals = np.asarray(_trimesh(vertices, faces).vertex_normals)
+    return Patch(name, vertices, normals, faces, exterior, interior)
 
 
 def chamber_rim(eye: EyeModel, surface: Surface, angle: Floats) -> Floats:
@@ -277,7 +282,7 @@ def _closed(*parts: tuple[Patch, int]) -> Any:
         vertices.append(patch.vertices)
         faces.append((patch.faces if sign > 0 else patch.faces[:, ::-1]) + count)
         count += len(patch.vertices)
-    mesh = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
+    mesh = _trimesh(np.concatenate(vertices), np.concatenate(faces))
     mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=9)
     return mesh
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from ..arrays import Floats
 from ..errors import InputError
@@ -210,6 +209,8 @@ def _number(cell: str, source: str, row: int) -> float:
 
 def _mesh(path: Path) -> Floats:
     """Vertices of a PLY file, (n, 3)."""
+    import trimesh  # which takes a quarter of a second
+
     data = read_bytes(path, limit=MAX_FILE_BYTES)
     try:
         loaded: Any = trimesh.load(io.BytesIO(data), file_type="ply", process=False)

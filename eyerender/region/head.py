@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from PIL import Image
 
 from ..arrays import ArrayValue, Floats, Ints, Singles, frozen
@@ -29,6 +28,9 @@ from .anatomy import Region
 from .globe import Globe
 from .headspec import Head
 from .mesh import PARTS, RegionLayout, RegionMesh
+
+if TYPE_CHECKING:
+    import trimesh
 
 HEAD_PARTS = (*PARTS, "head")
 _UNIT_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
@@ -254,6 +256,8 @@ def _picture(path: Path, changed_ns: int) -> Floats:
 
 def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
     """Named objects of a file: an OBJ's objects, or its groups where it has none; a PLY under its stem."""
+    import trimesh  # which takes a quarter of a second, and few processes need it
+
     source, kind = str(path), path.suffix.lower()
     if kind not in (".obj", ".ply"):
         raise InputError("must end with .obj or .ply", source=source)
@@ -309,6 +313,8 @@ def _axes(spec: Head, source: str) -> Floats:
 
 def _smooth(vertices: Floats, faces: Ints) -> Floats:
     """Unit normals of the vertices, equal for vertices at one place, so that seams of a texture do not show."""
+    import trimesh
+
     _, first, same = np.unique(np.round(vertices, 6), axis=0, return_index=True, return_inverse=True)
     same = np.ravel(same)
     merged = trimesh.Trimesh(vertices[first], same[faces], process=False)

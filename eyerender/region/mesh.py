@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
 from ..geometry.vectors import lengths
@@ -25,6 +25,9 @@ from .lids import FINE, ROWS, grid_normals, sheet
 from .skin import BROW, LASH, LASH_U, TEAR, band_row, sheet_v
 from .tears import ROWS as TEAR_ROWS
 from .tears import meniscus
+
+if TYPE_CHECKING:
+    import trimesh
 
 PARTS = ("skin", "lashes", "brow", "tears")
 HAIRS = 2  # the first of a mesh's strands, which are hairs
@@ -68,6 +71,8 @@ class RegionMesh(ArrayValue):
 
     def part(self, name: str) -> trimesh.Trimesh:
         """Return one part as a trimesh: skin, lashes, tears or brow."""
+        import trimesh  # which takes a quarter of a second, and few processes need it
+
         i = PARTS.index(name)
         v0, f0 = (0, 0) if i == 0 else (int(self.layout.vertex_ends[i - 1]), int(self.layout.face_ends[i - 1]))
         v1, f1 = int(self.layout.vertex_ends[i]), int(self.layout.face_ends[i])
