@@ -20,4 +20,6 @@ def dots(a: Floats, b: Floats) -> Floats:
 def crosses(a: Floats, b: Floats) -> Floats:
     """Vector products (..., 3) of vectors (..., 3)."""
     ax, ay, az, bx, by, bz = (v[..., k] for v in (a, b) for k in range(3))
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    out = np.empty(np.broadcast(a, b).shape)
+    out[..., 0], out[..., 1], out[..., 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return out

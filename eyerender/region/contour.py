@@ -16,12 +16,13 @@ Where the contour is in front of the globe it lies on the globe. Beyond a polar 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayValue, Floats
+from ..arrays import ArrayValue, Floats, sealed
 from ..geometry.vectors import crosses, dots, lengths
 from .anatomy import Region
 from .globe import Globe
@@ -63,7 +64,7 @@ class Contour(ArrayValue):
 
 def step(x: NDArray[Any] | float, low: float, high: float) -> NDArray[Any]:
     """Smooth step from 0 at `low` to 1 at `high`, in the precision of `x`."""
-    s = np.clip((np.asarray(x) - low) / (high - low), 0, 1)
+    s = np.minimum(np.maximum((np.asarray(x) - low) / (high - low), 0), 1)  # `np.clip` takes longer
     return np.asarray(s * s * (3 - 2 * s))
 
 
@@ -83,23 +84,29 @@ def canthi(spec: Region) -> tuple[Floats, Floats]:
 
 def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
     """Contour of the fissure for a posed globe."""
-    angle = 2 * np.pi * np.arange(columns) / columns
-    a = np.cos(angle)
-    upper = np.where(np.sin(angle) >= -1e-12, 1.0, -1.0)
+    angle, a, upper, on_globe, flat = _columns(columns)
     yz, openness = _outline(spec, globe, a, upper)
-    on_globe = step(np.abs(np.sin(angle)), 0.08, 0.5)[:, None]
     centre = globe.rest + on_globe * (globe.centre - globe.rest)
     point, normal = _support(globe, centre, yz)
-    film = spec.lids.film_mm
-    point = globe.pushed_out(point, film)
-    sideways = np.sign(a) * np.abs(a) ** 6
-    flat = unit(np.stack([np.zeros_like(a), sideways, np.sin(angle) + 0.02 * upper], axis=-1))
+    point = globe.pushed_out(point, spec.lids.film_mm)
     away = unit(flat - normal * dots(flat, normal)[..., None])
     along_lid = unit(crosses(away, normal) * upper[:, None])
     along_lid = along_lid * np.where(along_lid[:, 1:2] < 0, -1.0, 1.0)
     return Contour(
         angle=angle, along=a, upper=upper, point=point, normal=normal, away=away, along_lid=along_lid, openness=openness
     )
+
+
+@lru_cache(maxsize=4)
+def _columns(count: int) -> tuple[Floats, ...]:
+    """Angle, along, upper of `Contour`, the globe's share in the contour's centre, and the outward directions."""
+    angle = 2 * np.pi * np.arange(count) / count
+    a = np.cos(angle)
+    upper = np.where(np.sin(angle) >= -1e-12, 1.0, -1.0)
+    on_globe = step(np.abs(np.sin(angle)), 0.08, 0.5)[:, None]
+    sideways = np.sign(a) * np.abs(a) ** 6
+    flat = unit(np.stack([np.zeros_like(a), sideways, np.sin(angle) + 0.02 * upper], axis=-1))
+    return tuple(sealed(v) for v in (angle, a, upper, on_globe, flat))
 
 
 def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floats, float]:
@@ -123,10 +130,7 @@ def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floa
     # Closed lids meet near the place of the lower lid. A lower lid that is very low moves up to meet the other.
     shut = 0.92 * low + 0.08 * min(high, 0.0)
     shut = max(shut, -3.2 + 0.5 * (shut + 3.2))
-    shape_up = _shape(a, f.peak, 0.98)
-    shape_low = _shape(a, -0.08, 0.92)
-    # Beside the caruncle the lids run close together.
-    bay = 1 - 0.42 * np.exp(-(((1 - a) / 0.19) ** 2))
+    shape_up, shape_low, bay = _shapes(len(a), f.peak)
     closed = shut * shape_low
     b = spec.blink
     up = (1 - b) * high * shape_up * bay + b * (closed + _GAP_MM * shape_up)
@@ -135,6 +139,14 @@ def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floa
     z = chord[:, 1] + np.where(upper > 0, up, down)
     openness = (1 - b) * float(np.clip((high - low) / (rest - low), 0, 1.3))
     return np.stack([chord[:, 0], z], axis=-1), openness
+
+
+@lru_cache(maxsize=16)
+def _shapes(columns: int, peak: float) -> tuple[Floats, ...]:
+    """Heights of the upper and the lower lid over the chord, and the share of them that is left beside the caruncle."""
+    a = _columns(columns)[1]
+    bay = 1 - 0.42 * np.exp(-(((1 - a) / 0.19) ** 2))  # there, the lids run close together
+    return tuple(sealed(v) for v in (_shape(a, peak, 0.98), _shape(a, -0.08, 0.92), bay))
 
 
 def _shape(a: Floats, peak: float, power: float) -> Floats:

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import ndimage
 
-from ..arrays import ArrayValue, Floats, frozen
+from ..arrays import ArrayValue, Floats, frozen, remembered, sealed
 from ..geometry.surfaces import Surface
 from ..geometry.vectors import lengths
 
@@ -57,7 +56,7 @@ class Globe(ArrayValue):
     @property
     def centre(self) -> Floats:
         """Centre of the sclera's sphere in the region's frame, (3,) mm."""
-        return self._mirror(self.M @ self.centre_mm + self.t)
+        return _posed(self).centre
 
     @property
     def rest(self) -> Floats:
@@ -76,17 +75,26 @@ class Globe(ArrayValue):
 
     def radial(self, direction: Floats) -> Floats:
         """Radius r (n,) mm along unit directions (n, 3) from the centre."""
-        r = np.full(np.shape(direction)[:-1], self.radius_mm)
-        if self.cornea is None:
-            return r
-        local = self._mirror(direction) @ self.M
-        front = local[..., 0] > np.cos(_WIDEST)
-        local = local[front]
-        polar = np.arccos(np.clip(local[:, 0], -1, 1))
-        turn = np.arctan2(local[:, 2], local[:, 1]) / (2 * np.pi) % 1.0
-        place = np.stack([polar / _WIDEST * (_POLAR - 1), turn * _TURNS])
-        r[front] += ndimage.map_coordinates(self._bulge, place, order=1, mode="nearest")
+        direction = np.asarray(direction)
+        r = np.full(direction.shape[:-1], self.radius_mm)
+        if self.cornea is not None:
+            front = direction @ _posed(self).axes[:, 0] > np.cos(_WIDEST)
+            r[front] += self._height(direction[front])
         return r
+
+    def _height(self, direction: Floats) -> Floats:
+        """Height (n,) mm of the cornea above the sphere along unit directions (n, 3) within its table."""
+        posed = _posed(self)
+        x, y, z = (direction @ posed.axes).T
+        row = np.arccos(np.minimum(x, 1.0)) * ((_POLAR - 1) / _WIDEST)
+        column = np.arctan2(z, y) * (_TURNS / (2 * np.pi))
+        column += _TURNS * (column < 0)
+        i, j = np.minimum(row.astype(int), _POLAR - 2), np.minimum(column.astype(int), _TURNS - 1)
+        row -= i
+        column -= j
+        first, table = i * (_TURNS + 1) + j, posed.bulge.ravel()
+        before, after = ((1 - row) * table[k] + row * table[k + _TURNS + 1] for k in (first, first + 1))
+        return np.asarray((1 - column) * before + column * after)
 
     def clearance(self, points: Floats) -> Floats:
         """Distance (n,) mm of points (n, 3) from the globe along the line from its centre; negative inside."""
@@ -96,24 +104,41 @@ class Globe(ArrayValue):
 
     def pushed_out(self, points: Floats, clearance_mm: Floats | float) -> Floats:
         """Move points that are closer to the globe than `clearance_mm` outwards along the line from its centre."""
-        away = points - self.centre
-        distance = np.maximum(lengths(away), 1e-9)
-        direction = away / distance[..., None]
-        least = self.radius_mm + np.broadcast_to(clearance_mm, distance.shape)
+        posed = _posed(self)
+        out = points - posed.centre
+        distance = np.maximum(lengths(out), 1e-9)
+        least = np.empty_like(distance)
+        least[...] = self.radius_mm + clearance_mm
         if self.cornea is not None:
-            near = distance < least + np.max(self._bulge)
-            least[near] += self.radial(direction[near]) - self.radius_mm
-        return np.asarray(self.centre + direction * np.maximum(distance, least)[..., None])
-
-    @property
-    def _bulge(self) -> Floats:
-        """Height of the cornea above the sphere over polar angle and turn, mm."""
-        if self.cornea is None:
-            raise ValueError("a bare sphere has no cornea")
-        return _table(self.cornea, self.limbus_radius_mm, tuple(self.centre_mm.tolist()), self.radius_mm)
+            front = out @ posed.axes[:, 0] > np.cos(_WIDEST) * distance
+            near = front & (distance < least + posed.highest_mm)
+            least[near] += self._height(out[near] / distance[near][:, None])
+        out *= (np.maximum(distance, least) / distance)[..., None]
+        out += posed.centre
+        return np.asarray(out)
 
     def _mirror(self, vector: Floats) -> Floats:
         return vector * np.array([1.0, -1.0, 1.0]) if self.mirrored else np.asarray(vector)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Posed:
+    """What many points ask of a globe: centre and axes (columns) in the region's frame, and the cornea's height."""
+
+    centre: Floats
+    axes: Floats
+    bulge: Floats
+    highest_mm: float
+
+
+@remembered
+def _posed(globe: Globe) -> _Posed:
+    mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    bulge = np.zeros((_POLAR, _TURNS + 1))
+    if globe.cornea is not None:
+        bulge = _table(globe.cornea, globe.limbus_radius_mm, tuple(globe.centre_mm.tolist()), globe.radius_mm)
+    centre = mirror * (globe.M @ globe.centre_mm + globe.t)
+    return _Posed(sealed(centre), mirror[:, None] * globe.M, bulge, float(np.max(bulge)))
 
 
 @lru_cache(maxsize=32)

@@ -26,14 +26,14 @@ class Hairs(ArrayValue):
     points: Floats
     radii: Floats
 
-    def tubes(self, out: Floats | None = None) -> Floats:
-        """Vertices (n * k * 3, 3) of three-sided tubes about the curves; `tube_faces` joins them.
+    def tubes(self, out: Floats | None = None) -> tuple[Floats, Floats]:
+        """Vertices (n * k * 3, 3) of three-sided tubes about the curves, and their normals; `tube_faces` joins them.
 
         The first corner of a ring is the one towards `out` (3,), and the side opposite to it faces the other way.
         """
         p = self.points
         if len(p) == 0:
-            return np.zeros((0, 3))
+            return np.zeros((0, 3)), np.zeros((0, 3))
         along = np.empty_like(p)
         along[:, 1:-1] = p[:, 2:] - p[:, :-2]
         along[:, 0], along[:, -1] = p[:, 1] - p[:, 0], p[:, -1] - p[:, -2]
@@ -48,7 +48,8 @@ class Hairs(ArrayValue):
         e2 = crosses(along, e1)
         angle = 2 * np.pi * np.arange(3) / 3
         ring = np.cos(angle)[:, None] * e1[:, :, None, :] + np.sin(angle)[:, None] * e2[:, :, None, :]
-        return np.asarray((p[:, :, None, :] + self.radii[:, :, None, None] * ring).reshape(-1, 3))
+        corners = p[:, :, None, :] + self.radii[:, :, None, None] * ring
+        return corners.reshape(-1, 3), ring.reshape(-1, 3)
 
 
 @lru_cache(maxsize=8)

@@ -29,6 +29,7 @@ _ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # of the points after th
 _REACH_ROWS = 16
 _CAUGHT_MM = 0.3  # a lash that is still this far inside is caught
 _NEAR_COLUMNS = 6
+_SEARCH_MM = 1.5  # distance up to which skin lifts a lash
 _NEARLY = 0.2  # share by which the skin that is found may be farther away than the nearest
 _TIP = 0.3  # radius of the tip over that of the root; the map makes thin tips paler instead (`skin.lash_band`)
 _KINK = 0.45  # cosine of the sharpest bend between two pieces; no lash's curl is this sharp
@@ -124,9 +125,10 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
     """Make the lashes of a posed sheet."""
     p = plan(spec.lashes, spec.seed)
     c = sheet.contour
-    inner, outer, n, m, t = (_at(p.angle, v) for v in (c.point, sheet.lash_line, c.normal, c.away, c.along_lid))
+    frames = np.concatenate([c.point, sheet.lash_line, c.normal, c.away, c.along_lid], axis=1)
+    inner, outer, n, m, t = np.split(_at(p.angle, frames), 5, axis=1)
     # The roots are on the margin's surface, which bulges beyond the chord between its rounded edges.
-    width = np.linalg.norm(outer - inner, axis=-1)
+    width = lengths(outer - inner)
     swell = EDGE_MM / spec.lids.margin_mm * width * (1 - (2 * p.across - 1) ** 4)
     root = inner + p.across[:, None] * (outer - inner) - swell[:, None] * m
     # There is less room between closed lids.
@@ -140,12 +142,12 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
     ends = np.linspace(0, 1, k) ** 1.25
     points = np.empty((len(root), k, 3))
     points[:, 0] = root - 0.06 * n + 0.08 * m
-    for j in range(1, k):
-        s = 0.5 * (ends[j - 1] + ends[j])
-        b = start + hang * min(s / 0.3, 1.0) + p.curl * s**1.15
-        f = p.fan * (0.5 + 0.7 * s) + p.sway * s * s
-        d = np.cos(f)[:, None] * (np.cos(b)[:, None] * n + np.sin(b)[:, None] * m) + np.sin(f)[:, None] * t
-        points[:, j] = points[:, j - 1] + (p.length_mm * (ends[j] - ends[j - 1]))[:, None] * d
+    s = 0.5 * (ends[:-1] + ends[1:])
+    b = (start[:, None] + hang[:, None] * np.minimum(s / 0.3, 1.0) + p.curl[:, None] * s**1.15)[..., None]
+    f = (p.fan[:, None] * (0.5 + 0.7 * s) + p.sway[:, None] * s * s)[..., None]
+    d = np.cos(f) * (np.cos(b) * n[:, None] + np.sin(b) * m[:, None]) + np.sin(f) * t[:, None]
+    points[:, 1:] = (p.length_mm[:, None] * np.diff(ends))[..., None] * d
+    points = np.cumsum(points, axis=1)
     ahead = unit(n + 0.4 * np.array([1.0, 0.0, 0.0]))
     straight = root[:, None] + (p.length_mm[:, None] * ends)[..., None] * ahead[:, None]
     points[:, 1:] = _out_of_skin(globe, sheet, points, straight)
@@ -188,7 +190,7 @@ def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
 
 
 def _at(angle: Floats, values: Floats) -> Floats:
-    """Values (columns, 3) at column angles, interpolated linearly."""
+    """Values (columns, k) at column angles, interpolated linearly."""
     n = len(values)
     place = angle / (2 * np.pi) * n
     i = np.floor(place).astype(int)
@@ -205,36 +207,47 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
     if not points.size:
         return points[:, 1:]
     root, points, straight = points[:, :1], points[:, 1:], straight[:, 1:]
-    rows = slice(CONJUNCTIVA + MARGIN - 1, CONJUNCTIVA + MARGIN + LID + _REACH_ROWS)
-    skin, normals = (v[rows, ::2].reshape(-1, 3) for v in (sheet.vertices, sheet.normals))
+    grids = ((sheet.fine, sheet.coarse), (sheet.fine_normals, sheet.coarse_normals))
+    skin, normals = (np.concatenate([f[-2:, ::2], c[: LID + _REACH_ROWS - 1]]).reshape(-1, 3) for f, c in grids)
     tree = cKDTree(skin, balanced_tree=False, compact_nodes=False)  # it is built in half the time
+    heights = np.append(dots(skin, normals), 0)
+    normals = np.concatenate([normals, np.zeros((1, 3))])  # the last is found where nothing is
     out, k = points.copy(), points.shape[1]
 
-    def lift(at: Floats, within: float, least: Floats) -> Floats:
+    def lift(at: Floats, within: float, least: Floats) -> tuple[Floats, Floats]:
+        """Moves of points (..., 3) to the height `least`, and their distances from the skin."""
         distance, nearest = tree.query(at, eps=_NEARLY, distance_upper_bound=within)
-        known = np.isfinite(distance)
-        nearest = np.where(known, nearest, 0)
-        above = dots(at - skin[nearest], normals[nearest])
-        return np.asarray(normals[nearest] * np.where(known, np.maximum(least - above, 0), 0)[..., None])
+        normal = normals[nearest]
+        return normal * np.maximum(least + heights[nearest] - dots(at, normal), 0)[..., None], distance
 
-    push = lift(out, np.inf, _ABOVE_MM)
+    push, distance = lift(out, 2 * _SEARCH_MM, _ABOVE_MM)
     everywhere = np.concatenate([_ABOVE_MM, _ABOVE_MM[:-1], _ABOVE_MM[1:]])
     out += push / np.maximum(lengths(push)[..., None] / 1.2, 1.0)
+    # What was not moved, and what is farther from the skin than the search goes, needs no second search.
+    moved = push.any(axis=-1)
+    piece = lengths(out[:, 1:] - out[:, :-1])
+    free = np.where(moved, 0, distance / (1 + _NEARLY))
+    near = [np.maximum(free[:, :-1] - s * piece, free[:, 1:] - (1 - s) * piece) <= _SEARCH_MM for s in (1 / 3, 2 / 3)]
+    search = np.concatenate([moved, *near], axis=1)
     active, left = np.arange(len(out)), np.zeros(len(out))
     for turn in range(16):
         some = out[active]
         if turn >= 6:  # caught in a fold, where the normals of the nearest skin disagree
             some = some + 0.35 * (straight[active] - some)
         middles = (2 * some[:, :-1] + some[:, 1:]) / 3, (some[:, :-1] + 2 * some[:, 1:]) / 3
-        push = lift(np.concatenate([some, *middles], axis=1), 1.5, everywhere)
+        at = np.concatenate([some, *middles], axis=1)
+        push = np.zeros_like(at)
+        push[search], _ = lift(at[search], _SEARCH_MM, np.broadcast_to(everywhere, search.shape)[search])
         some = some + push[:, :k]
         for i in range(2):
-            between = push[:, k + i * (k - 1) : k + (i + 1) * (k - 1)]
-            some[:, :-1] += 0.7 * between
-            some[:, 1:] += 0.7 * between
+            between = 0.7 * push[:, k + i * (k - 1) : k + (i + 1) * (k - 1)]
+            some[:, :-1] += between
+            some[:, 1:] += between
         out[active] = some
-        left[active] = np.abs(push).max(axis=(1, 2))
+        flat = push.reshape(len(push), -1)
+        left[active] = np.maximum(flat.max(axis=1), -flat.min(axis=1))
         active = active[left[active] > 0.01]
+        search = np.ones((len(active), at.shape[1]), dtype=bool)
         if not len(active):
             break
     # A lash that was deformed too much for want of room is reduced to its root.

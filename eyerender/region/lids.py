@@ -21,7 +21,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats, frozen
+from ..arrays import ArrayValue, Floats, frozen, sealed
 from ..geometry.vectors import crosses, dots, lengths
 from .anatomy import Region
 from .contour import LATERAL, Contour, canthi, contour, step, unit
@@ -29,6 +29,7 @@ from .face import face_depth
 from .globe import Globe
 
 CONJUNCTIVA, MARGIN, LID, FACE = 7, 7, 16, 26
+_HELD = step(np.arange(LID + FACE, dtype=float), LID + 0.25 * FACE, LID + 0.72 * FACE)[:, None]  # share of rest
 ROWS = CONJUNCTIVA + MARGIN + LID + FACE
 FINE = CONJUNCTIVA + MARGIN  # rows that have their own place in every column; the others have it in every second one
 _DIP_MM = 0.031
@@ -44,35 +45,47 @@ class Sheet(ArrayValue):
     """The posed sheet.
 
     Attributes:
-        vertices: (ROWS, columns, 3).
-        normals: (ROWS, columns, 3).
+        fine: (FINE + 1, columns, 3) the first rows.
+        fine_normals: (FINE + 1, columns, 3).
+        coarse: (ROWS - FINE - 1, columns / 2, 3) the other rows, in every second column.
+        coarse_normals: (ROWS - FINE - 1, columns / 2, 3).
         contour: frame of the lash line.
         lash_line: (columns, 3) outer edge of the margin.
     """
 
-    vertices: Floats
-    normals: Floats
+    fine: Floats
+    fine_normals: Floats
+    coarse: Floats
+    coarse_normals: Floats
     contour: Contour
     lash_line: Floats
+
+    @property
+    def vertices(self) -> Floats:
+        """All rows in all columns, (ROWS, columns, 3)."""
+        return np.concatenate([self.fine, halved(self.coarse)])
+
+    @property
+    def normals(self) -> Floats:
+        """Normals of all rows in all columns, (ROWS, columns, 3)."""
+        return np.concatenate([self.fine_normals, unit(halved(self.coarse_normals))])
 
 
 def sheet(spec: Region, globe: Globe) -> Sheet:
     """Make the sheet for a posed globe, in the region's frame."""
     c = contour(spec, globe)
     margin, lash_line = _margin(spec, globe, c)
-    conjunctiva = _conjunctiva(spec, globe, c)
     skin = _skin(spec, globe, c.every(2), lash_line[::2])
-    vertices = np.concatenate([conjunctiva, margin, _halved(skin)])
-    coarse = grid_normals(vertices[FINE - 1 :, ::2])[1:]
-    normals = np.concatenate([grid_normals(vertices[: FINE + 1])[:-1], unit(_halved(coarse))])
+    fine = np.concatenate([_conjunctiva(spec, globe, c), margin, halved(skin[:1])])
+    normals, beyond = grid_normals(fine), grid_normals(np.concatenate([margin[-1:, ::2], skin]))[1:]
+    normals[-1:] = unit(halved(beyond[:1]))
     # The conjunctiva leaves the globe without an edge.
-    for row, share in enumerate(_ON_GLOBE):
-        radial = unit(vertices[row] - globe.centre)
-        normals[row] = unit(share * radial + (1 - share) * normals[row])
-    return Sheet(frozen(vertices), frozen(normals), c, frozen(lash_line))
+    share, first = np.array(_ON_GLOBE)[:, None, None], slice(len(_ON_GLOBE))
+    normals[first] = unit(share * unit(fine[first] - globe.centre) + (1 - share) * normals[first])
+    return Sheet(sealed(fine), sealed(normals), sealed(skin[1:]), sealed(beyond[1:]), c, frozen(lash_line))
 
 
-def _halved(grid: Floats) -> Floats:
+def halved(grid: Floats) -> Floats:
     """Grid (rows, 2 n, 3) with a column halfway between each two of a closed one (rows, n, 3)."""
     rows, columns, _ = grid.shape
     out = np.empty((rows, 2 * columns, 3))
@@ -84,15 +97,16 @@ def _halved(grid: Floats) -> Floats:
 
 def grid_normals(vertices: Floats) -> Floats:
     """Unit normals of a grid (rows, columns, 3) that is closed along its columns."""
-    across = np.roll(vertices, -1, axis=1) - np.roll(vertices, 1, axis=1)
-    out = np.empty_like(vertices)
+    across, out = np.empty_like(vertices), np.empty_like(vertices)
+    across[:, 1:-1] = vertices[:, 2:] - vertices[:, :-2]
+    across[:, 0], across[:, -1] = vertices[:, 1] - vertices[:, -1], vertices[:, 0] - vertices[:, -2]
     out[1:-1] = vertices[2:] - vertices[:-2]
     out[0], out[-1] = vertices[1] - vertices[0], vertices[-1] - vertices[-2]
     normal = crosses(out, across)
-    length = lengths(normal)[..., None]
-    # Where rows meet in a point, the neighbour's normal is used.
-    normal = np.where(length > 1e-9, normal, np.array([1.0, 0.0, 0.0]))
-    return unit(normal)
+    length = lengths(normal)
+    normal /= np.maximum(length, 1e-9)[..., None]
+    normal[length <= 1e-9] = 1.0, 0.0, 0.0  # where rows meet in a point
+    return normal
 
 
 def margin_width(spec: Region, c: Contour) -> Floats:
@@ -107,16 +121,24 @@ def margin_width(spec: Region, c: Contour) -> Floats:
     )
 
 
+def _across() -> tuple[Floats, Floats]:
+    """Places of the margin's rows, from its inner edge (0) to the outer one (1), and their rounding (mm)."""
+    turn = np.cos(np.pi * np.linspace(0, 1, MARGIN)[:, None, None])
+    u = 0.5 - 0.5 * turn * (0.6 + 0.4 * turn**2)
+    return u, EDGE_MM * (2 * u - 1) ** 4
+
+
+_ACROSS = _across()
+
+
 def _margin(spec: Region, globe: Globe, c: Contour) -> tuple[Floats, Floats]:
     # The upper margin faces down and is seen edge-on from the front; the lower one opens upwards.
     tilt = np.radians(np.where(c.upper > 0, 0.0, 1.0) * 16.0 + spec.lids.margin_tilt_deg)[:, None]
     tilt = tilt * (0.25 + 0.75 * min(c.openness, 1.0))
     width = margin_width(spec, c)
     out = np.cos(tilt) * c.normal + np.sin(tilt) * c.away
-    u = np.linspace(0, 1, MARGIN)[:, None, None]
-    u = 0.5 - 0.5 * np.cos(np.pi * u) * (0.6 + 0.4 * np.cos(np.pi * u) ** 2)
-    rounding = EDGE_MM * (2 * u - 1) ** 4 * (width / spec.lids.margin_mm)[:, None]
-    rows = c.point + width[:, None] * u * out + rounding * c.away
+    u, edge = _ACROSS
+    rows = c.point + u * (width[:, None] * out) + edge * ((width / spec.lids.margin_mm)[:, None] * c.away)
     rows = globe.pushed_out(rows, spec.lids.film_mm)
     # The lids meet in the middle between them, never beyond.
     return rows, rows[-1]
@@ -141,7 +163,7 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     y_start = np.sign(y) * line * (1.2 * t - np.log1p(np.exp(12 * (1.2 * t - 1))) / 12)
     y_start = y_start - 0.02 * corner * z_start**2 * (y > 0)
     x_start = np.sqrt(np.maximum(globe.radius_mm**2 - y_start**2 - z_start**2, (0.4 * globe.radius_mm) ** 2))
-    reach = unit(np.stack([x_start, y_start, z_start], axis=-1))
+    reach = unit(np.array([x_start, y_start, z_start]).T)
     reach = globe.centre + reach * (globe.radial(reach) - _DIP_MM)[:, None]
     u = (np.arange(CONJUNCTIVA) / CONJUNCTIVA)[:, None, None]
     rows = reach + u * (c.point - reach)
@@ -181,11 +203,12 @@ def _skin(spec: Region, globe: Globe, c: Contour, lash_line: Floats) -> Floats:
     crease = _crease(spec, c)
     v, y, z = _spokes(c, crease, lash_line)
     # Lids move their own skin, and move that of the brow and the cheek less the farther away it is.
-    held = step(np.arange(LID + FACE, dtype=float), LID + 0.25 * FACE, LID + 0.72 * FACE)[:, None]
     y_rest, z_rest = _at_rest(spec.model_copy(update={"blink": 0.0}), len(c.angle))
-    y, z = y + held * (y_rest - y), z + held * (z_rest - z)
-    x = skin_depth(spec, globe, y, z) + _fullness(spec, c, y, z)
-    start = lash_line[:, 0] - skin_depth(spec, globe, lash_line[:, 1], lash_line[:, 2])
+    y, z = y + _HELD * (y_rest - y), z + _HELD * (z_rest - z)
+    depth = skin_depth(spec, globe, *(np.concatenate([lash_line[None, :, k], a]) for k, a in ((1, y), (2, z))))
+    start, x = lash_line[:, 0] - depth[0], depth[1:]
+    if c.openness < 1:
+        x = x + _fullness(spec, c, y, z)
     # Where the lids leave the globe, the canthi lie in a hollow, which is deeper the wider the gap is.
     x = x + start * np.exp(-((v / (2.2 + 0.8 * np.maximum(-start - 1.2, 0))) ** 2))
     strength = _fold_strength(c)
@@ -194,7 +217,8 @@ def _skin(spec: Region, globe: Globe, c: Contour, lash_line: Floats) -> Floats:
     z = z - drop * c.upper
     if spec.fissure.epicanthus_mm > 0:
         x, y, z = _epicanthus(spec, c, v, x, y, z)
-    rows = np.stack([x, y, z], axis=-1)
+    rows = np.empty((*x.shape, 3))
+    rows[..., 0], rows[..., 1], rows[..., 2] = x, y, z
     return globe.pushed_out(rows, 0.4)
 
 
@@ -305,7 +329,7 @@ def skin_depth(spec: Region, globe: Globe, y: Floats, z: Floats) -> Floats:
     outer = globe.radius_mm + spec.lids.thickness_mm
     # Beyond 42 degrees from the front the shell leaves the sphere along its tangent and flattens, because of the
     # orbit's fat.
-    rho, limit = np.hypot(dy, dz), np.radians(42.0)
+    rho, limit = np.sqrt(dy * dy + dz * dz), np.radians(42.0)
     rho0 = outer * np.sin(limit)
     past = np.maximum(rho - rho0, 0.0)
     over = np.sqrt(outer * outer - np.minimum(rho, rho0) ** 2)

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
-from ..geometry.vectors import lengths
+from ..arrays import ArrayValue, Bools, Floats, Ints, frozen, sealed
 from .anatomy import Region
 from .brow import PLACES as BROW_PLACES
 from .brow import brow
@@ -21,7 +20,7 @@ from .contour import COLUMNS, Contour, contour
 from .globe import Globe
 from .hairs import SEGMENTS, Hairs, tube_faces
 from .lashes import lashes
-from .lids import FINE, ROWS, grid_normals, sheet
+from .lids import FINE, ROWS, grid_normals, halved, sheet
 from .skin import BROW, LASH, LASH_U, TEAR, band_row, sheet_v
 from .tears import ROWS as TEAR_ROWS
 from .tears import meniscus
@@ -100,20 +99,19 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
     tears = meniscus(spec, globe, s)
     lash = lashes(spec, globe, s)
     hair, hair_tubes, hair_normals = _brow(spec.model_copy(update={"blink": 0.0}))
-    lash_tubes = lash.tubes()
-    vertices = np.concatenate([_of_sheet(s.vertices), lash_tubes, hair_tubes, _closed(tears)])
-    film = _closed(grid_normals(tears))
-    normals = np.concatenate([_of_sheet(s.normals), _round(lash, lash_tubes), hair_normals, film])
-    upper, lower = _margins(s.contour)
-    curves = [upper, lower, s.vertices[-1], lash.points, hair.points, np.concatenate([tears, tears[:, :1]], axis=1)]
+    lash_tubes, lash_normals = lash.tubes()
+    film, film_normals = _closed(tears), _closed(grid_normals(tears))
+    vertices = _joined(s.fine, s.coarse, lash_tubes, hair_tubes, film)
+    normals = _joined(s.fine_normals, s.coarse_normals, lash_normals, hair_normals, film_normals)
+    curves = [*_margins(s.contour), halved(s.coarse[-1:])[0], lash.points, hair.points, film]
     if globe.mirrored:
         mirror = np.array([1.0, -1.0, 1.0])
         vertices, normals, curves = vertices * mirror, normals * mirror, [c * mirror for c in curves]
     upper, lower, border, *strands = (frozen(c) for c in curves)
     layout = _layout(spec.lashes.upper_count, len(lash.points), len(hair.points), globe.mirrored)
     return RegionMesh(
-        vertices=frozen(vertices),
-        normals=frozen(normals),
+        vertices=sealed(vertices),
+        normals=sealed(normals),
         layout=layout,
         upper_margin=upper,
         lower_margin=lower,
@@ -124,29 +122,22 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
 
 
 def _closed(grid: Floats) -> Floats:
-    """Flattened grid with its first column repeated at the end, where the map's u is 1."""
-    return np.concatenate([grid, grid[:, :1]], axis=1).reshape(-1, 3)
+    """Grid with its first column repeated at the end, where the map's u is 1."""
+    return np.concatenate([grid, grid[:, :1]], axis=1)
 
 
-def _of_sheet(grid: Floats) -> Floats:
-    """Vertices (n, 3) of the sheet from its grid; `sheet_vertices` numbers them."""
-    return np.concatenate([_closed(grid[: FINE + 1]), _closed(grid[FINE + 1 :, ::2])])
+def _joined(fine: Floats, coarse: Floats, lash_tubes: Floats, hair_tubes: Floats, film: Floats) -> Floats:
+    """All vertices (n, 3), or their normals; `sheet_vertices` numbers those of the sheet."""
+    parts = (_closed(fine), _closed(coarse), lash_tubes, hair_tubes, film)
+    return np.concatenate([p.reshape(-1, 3) for p in parts])
 
 
 @lru_cache(maxsize=16)
 def _brow(spec: Region) -> tuple[Hairs, Floats, Floats]:
     """Brow, its tubes and their normals; it does not blink."""
     hairs = brow(spec)
-    tubes = frozen(hairs.tubes(np.array([1.0, 0.0, 0.0])))
-    return hairs, tubes, frozen(_round(hairs, tubes))
-
-
-def _round(hairs: Hairs, tubes: Floats) -> Floats:
-    """Normals of tubes, away from their curves."""
-    if len(tubes) == 0:
-        return np.zeros((0, 3))
-    away = tubes - np.repeat(hairs.points.reshape(-1, 3), 3, axis=0)
-    return np.asarray(away / np.maximum(lengths(away)[..., None], 1e-12))
+    tubes, normals = hairs.tubes(np.array([1.0, 0.0, 0.0]))
+    return hairs, sealed(tubes), sealed(normals)
 
 
 def _margins(fissure: Contour) -> tuple[Floats, Floats]:

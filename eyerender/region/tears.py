@@ -19,6 +19,7 @@ from .lids import Sheet
 
 ROWS = 7
 _OUT = 1.8  # width on the margin over the height on the globe, so that the radius is about 1.6 heights
+_TURN = np.linspace(0, np.pi / 2, ROWS)[:, None]  # of each row along the arc
 _LONG, _SHORT = (6, 40), (6, 20)  # waves once around the fissure, which is about 60 mm long
 _SLOPE = 0.35  # standard deviation of the slope of the short waves at an unevenness of 1
 
@@ -46,8 +47,7 @@ def meniscus(spec: Region, globe: Globe, sheet: Sheet) -> Floats:
     height = height * low
     # The two menisci must not meet.
     height = height + 1e-3
-    u = np.linspace(0, np.pi / 2, ROWS)[:, None]
-    down, out = height * (1 - np.sin(u)), _OUT * height * (1 - np.cos(u))
+    down, out = height * (1 - np.sin(_TURN)), _OUT * height * (1 - np.cos(_TURN))
     rows = c.point - down[..., None] * c.away + out[..., None] * c.normal
     # The strip is far enough out of the globe that no chord between columns enters it.
-    return globe.pushed_out(rows, np.where(np.arange(ROWS)[:, None] == 0, 0.010, 0.014) * np.ones_like(height))
+    return globe.pushed_out(rows, np.where(_TURN == 0, 0.010, 0.014))

@@ -173,7 +173,7 @@ def test_the_sheet_is_one_surface():
 def test_open_tubes_have_the_outlines_of_closed_ones():
     hairs = brow(Region(seed=2))
     hairs = Hairs(hairs.points[:40], hairs.radii[:40])
-    vertices, points = hairs.tubes(np.array([1.0, 0.0, 0.0])), hairs.points.shape[1]
+    (vertices, _), points = hairs.tubes(np.array([1.0, 0.0, 0.0])), hairs.points.shape[1]
     rng = np.random.default_rng(1)
     hair, piece, share = (
         rng.integers(40, size=4000),
