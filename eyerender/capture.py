@@ -141,11 +141,11 @@ def begin_windows(frames: Frames, renderer: Renderer, *, highlights: bool = Fals
     """
     check_windows(frames.scene)
     spp = frames.scene.spec.image.spp
-    after = render_job(frames, 0) if len(frames) else None
+    jobs = (replace(render_job(frames, row), highlights=highlights) for row in range(len(frames)))
+    after = next(jobs, None)
     for row in range(len(frames)):
         assert after is not None
-        job, after = after, render_job(frames, row + 1) if row + 1 < len(frames) else None
-        job = replace(job, highlights=highlights)
+        job, after = after, next(jobs, None)
         made = renderer.begin(job, spp=spp, moments=moments(frames, row, job), after=after)
         yield BegunImage(frames, row, job, made)
 

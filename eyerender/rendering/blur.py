@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats, Reals
-from ..rig import defocus
+from ..region.mesh import RegionMesh
+from ..rig import defocus, psf
+from ..rig.camera import Window
 from .frame import RenderJob
-from .region import RegionScene
-from .surround import Surround
 
 _GLOBE_MM = 13.5  # the globe and the cornea about the sclera's centre
 _BESIDE = 0.25  # of a window's size: the border about it whose things may blur into it
@@ -33,8 +33,8 @@ class Blur:
     reach: int
 
     @classmethod
-    def of(cls, job: RenderJob, place: Surround | RegionScene) -> Blur:
-        """Find the blur of a job before it is rendered.
+    def of(cls, job: RenderJob, posed: RegionMesh | None) -> Blur:
+        """Find the blur of a job, with its posed region, before it is rendered.
 
         Raises:
             InputError: the eye would be blurred over more than 400 px.
@@ -46,13 +46,24 @@ class Blur:
         subject = defocus.checked(
             float(defocus.confusion_px(job.lens, camera, sensor, camera.R[2] @ eye + camera.t[2]))
         )  # fmt: skip
-        depths = _depths(job, place)
+        depths = _depths(job, posed)
         sizes = defocus.confusion_px(job.lens, camera, sensor, depths)
         if np.min(depths) < job.lens.focus_mm < np.max(depths):
             sizes = np.append(sizes, 0.0)
         layered = not defocus.one_blur(sizes, subject, sensor.psf_sigma_px)
         reach = defocus.reach_px(float(np.max(sizes)) if layered else subject)
         return cls(job, subject, layered, reach)
+
+    @property
+    def border_px(self) -> int:
+        """Width of the border about the job's window that lens and point-spread function need."""
+        return self.reach + psf.margin(self.job.sensor.psf_sigma_px)
+
+    @property
+    def window(self) -> Window:
+        """The job's window with this border."""
+        (x0, y0, width, height), pad = self.job.window, self.border_px
+        return x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad
 
     def of_pictures(self, pictures: Reals) -> Reals:
         """Blur a picture, smaller by the reach on every side.
@@ -77,13 +88,13 @@ class Blur:
         return float(np.sqrt(np.mean(defocus.confusion_of(job.lens, job.camera, job.sensor, nearness) ** 2)))
 
 
-def _depths(job: RenderJob, place: Surround | RegionScene) -> Floats:
+def _depths(job: RenderJob, posed: RegionMesh | None) -> Floats:
     """Depths (mm) of things in the window: nearest and farthest."""
     camera = job.camera
     middle = float(camera.R[2] @ (np.asarray(job.eye.sclera.centre_mm) @ job.M.T + job.t) + camera.t[2])
     depths = [middle - _GLOBE_MM, middle]
-    if isinstance(place, RegionScene):
-        points = place.posed.vertices + job.anchor_mm
+    if posed is not None:
+        points = posed.vertices + job.anchor_mm
         xy, front = camera.project(points)
         x0, y0, width, height = job.window
         with np.errstate(invalid="ignore"):

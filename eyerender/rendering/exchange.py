@@ -45,7 +45,7 @@ from .chamber import (
     through_limbus,
 )
 from .chamber import TURNS as IRIS_TURNS
-from .frame import RenderJob, globe_of
+from .frame import RenderJob
 from .kept import KeptForEye
 from .lighting import off_cornea, onto_points, through_cornea
 from .manifold import CORNEA_MM
@@ -62,7 +62,6 @@ from .places import (
     GlobePlaces,
     SkinPlaces,
     filled,
-    globe_places,
     plane_places,
     skin_places,
 )
@@ -72,6 +71,7 @@ from .view import Textures, appearance, iris_albedo, meet, outer_albedo
 
 if TYPE_CHECKING:
     from .lampviews import LampViews
+    from .prepared import Prepared
     from .region import RegionScene
     from .surfaces import Surface
     from .surround import Surround
@@ -378,13 +378,13 @@ class Exchange:
         self._shares: tuple[_Plan, _Interior, csr_array] | None = None  # of the last frame
 
     def received(
-        self, job: RenderJob, values: Values, lights: Lights, panels: Lights, textures: Textures,
+        self, host: Prepared, values: Values, lights: Lights, panels: Lights, textures: Textures,
         place: Surround | RegionScene,
     ) -> Received:  # fmt: skip
-        """Compute what the places of a job's frame receive.
+        """Compute what the places of a frame receive.
 
         Args:
-            job: the job.
+            host: the frame's job, and the places on the globe.
             values: its numbers.
             lights: its lamps.
             panels: parts of its panels, and the bright parts of its map, as lamps.
@@ -394,8 +394,7 @@ class Exchange:
         from .region import RegionScene
 
         region = place if isinstance(place, RegionScene) else None
-        globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
-        grid = globe_places(globe, None if region is None else region.posed)
+        job, grid, globe = host.job, host.places, host.job.globe
         plan = self._plan(region, globe)
         points, normals, plane = _others(job, globe, region, plan.skin)
         interior = self._inside(job)

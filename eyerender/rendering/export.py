@@ -25,7 +25,7 @@ from ..region.anatomy import Region
 from ..region.head import HEAD_PARTS, load_head, placed
 from ..region.mesh import region_mesh
 from ..rig.imaging import Ambient
-from .frame import RenderJob, globe_of, sun_lamps
+from .frame import RenderJob, sun_lamps
 
 _BACKDROP_HALF_MM = 500.0
 _FILM_MM = 0.01  # three times the thickness of real ones, which single precision would not resolve
@@ -215,7 +215,7 @@ def _lamp(root: ET.Element, k: int, position: Floats, axis: Floats, radius: floa
 
 def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
     """Parts of the eye region, without its menisci, or of the head mesh, each with its mean albedo."""
-    globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
+    globe = job.globe
     mesh = region_mesh(spec, globe) if spec.head is None else placed(load_head(spec.head), globe)
     skin = spec.skin
     albedo = {"lashes": spec.lashes.albedo, "brow": spec.brow.albedo, "tears": 0.75 * skin.wet_albedo}

@@ -32,6 +32,7 @@ from .values import SMALL, Lamp, Lights, Values, aligned, quotient
 from .view import RegionHit, Textures, View, meet, meet_globe, region_hit
 
 if TYPE_CHECKING:
+    from .prepared import Prepared
     from .region import SkinGeometry
 
 _LANES = 2**24  # samples at a time; more are rendered in several passes
@@ -46,18 +47,13 @@ _EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and betw
 
 @dataclass(frozen=True, slots=True)
 class Exposed:
-    """A bound frame for rendering: its Mitsuba scene, its numbers, its lamps and its textures.
-
-    `plain` returns which tiles of a window show nothing but skin and thin hairs, and their size (px); `fine` which of
-    its pixels (height, width) may show menisci or thin hairs, and which of them may show menisci.
-    """
+    """A bound frame for rendering: its Mitsuba scene, numbers, lamps and textures, and what NumPy makes of its job."""
 
     scene: mi.Scene
     values: Values
     lights: Lights
     textures: Textures
-    plain: Callable[[Window], tuple[Bools, int]]
-    fine: Callable[[Window], tuple[Bools, Bools]]
+    host: Prepared
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +95,38 @@ def group_size(spp: int, soft: bool = False) -> int:
     return size
 
 
+@dataclass(frozen=True, slots=True)
+class Film:
+    """A window whose samples are being taken: the device may still be at work until `mean` reads the sums.
+
+    Attributes:
+        sums: over the samples of each pixel, in the order of `_sums`.
+        failed: number of failed light paths.
+        shape: height and width.
+        spp: samples per pixel.
+        layered: whether there are sums of each part of the scene.
+    """
+
+    sums: list[mi.Float]
+    failed: mi.UInt32
+    shape: tuple[int, int]
+    spp: int
+    layered: bool
+
+    def mean(self) -> tuple[Singles, int]:
+        """What `mean_parts` or `mean_radiance` returns."""
+        totals = [total.numpy().reshape(self.shape) for total in self.sums]
+        sums = np.asarray(np.stack(totals) / np.float32(self.spp), dtype=np.float32)
+        failed = int(self.failed.numpy()[0])
+        if self.layered:
+            return sums.reshape(-1, 3, *self.shape), failed
+        # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
+        return np.maximum(sums[0], 0), failed
+
+
 def mean_radiance(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
     """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
-    (total,), failed = _sums(shown, window, spp=spp, seed=seed, layered=False)
-    # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
-    return np.maximum(total / np.float32(spp), 0), failed
+    return begun(shown, window, spp, seed, layered=False).mean()
 
 
 def mean_parts(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
@@ -112,36 +135,37 @@ def mean_parts(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Sin
     The array (parts, 3, height, width) holds the radiance of each part (their sum is that of `mean_radiance`), the
     share of the pixel's samples that show the part, and that share times their mean inverse depth (1/mm).
     """
-    sums, failed = _sums(shown, window, spp=spp, seed=seed, layered=True)
-    return np.asarray(np.reshape(sums, (-1, 3, *sums[0].shape)) / np.float32(spp), dtype=np.float32), failed
+    return begun(shown, window, spp, seed, layered=True).mean()
 
 
-def _sums(shown: Exposed, window: Window, *, spp: int, seed: int, layered: bool) -> tuple[list[Singles], int]:
-    """Sums over the samples of each pixel, (height, width): radiance; or radiance, weight, nearness of each part."""
+def begun(shown: Exposed, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
+    """Begin to take the samples of a window: for the radiance; or `layered` for radiance, weight, nearness of parts."""
     width, height = window[2:]
     for grid in (shown.lights.on_iris, shown.lights.on_matte, shown.lights.relief):
         if grid is not None:
             grid.make()
     grouped = shown.values.structure.region
     if not grouped and not layered and spp >= _MANY:
-        total, failed = _adaptive(shown, window, spp, seed)
-        return [total.reshape(height, width)], failed
+        return Film(*_adaptive(shown, window, spp, seed), (height, width), spp, layered)
     size = group_size(spp, shown.values.structure.scattering) if grouped else 1
-    totals: list[Singles] = []
-    failed = 0
+    sums: list[mi.Float] = []
+    failed = mi.UInt32(0)
     each = max(1, min(spp // size, _LANES // (width * height * size)))
-    plain = shown.plain(window) if grouped else None
+    plain = shown.host.plain(window) if grouped else None
     for first in range(0, spp // size, each):
         count = min(each, spp // size - first)
+        if sums:
+            dr.sync_thread()  # else all passes would need memory at once
         if plain is not None:
             seen, failures = _groups(
                 shown, window, plain, spp=spp, seed=seed, first=first, count=count, size=size, layered=layered
             )
         else:
             seen, failures = _singles(shown, window, spp=spp, seed=seed, first=first, count=count, layered=layered)
-        totals = [a + b for a, b in zip(totals, seen, strict=True)] if totals else seen
+        sums = [a + b for a, b in zip(sums, seen, strict=True)] if sums else seen
         failed += failures
-    return [t.reshape(height, width) for t in totals], failed
+        dr.eval(sums, failed)
+    return Film(sums, failed, (height, width), spp, layered)
 
 
 def _samples(u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = False) -> Samples:
@@ -149,7 +173,7 @@ def _samples(u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = 
     return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), pattern, fine)
 
 
-def _adaptive(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
+def _adaptive(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[list[mi.Float], mi.UInt32]:
     """Sums of radiance over the samples of each pixel, (height * width,); failed light paths.
 
     Four samples of each pixel are taken first. Where they agree, and their mean is not far from those of the eight
@@ -187,7 +211,8 @@ def _adaptive(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Sing
             numbers = rest[start : start + at_once]
             more = dr.block_sum(lanes(pixels, numbers), len(numbers))
             dr.scatter(total, dr.gather(mi.Float, total, places) + more, places)
-    return total.numpy(), int(failed.numpy()[0])
+    dr.eval(total, failed)
+    return [total], failed
 
 
 def _with_uneven(radiance: mi.Float, size: tuple[int, int], spp: int) -> tuple[mi.Float, mi.UInt32]:
@@ -228,14 +253,14 @@ def _first_samples(count: int) -> Ints:
 
 def _singles(
     shown: Exposed, window: Window, *, spp: int, seed: int, first: int, count: int, layered: bool
-) -> tuple[list[Singles], int]:
+) -> tuple[list[mi.Float], mi.UInt32]:
     """Sums over `count` samples of each pixel, one per lane."""
     index = dr.arange(mi.UInt32, window[2] * window[3] * count)
     n = dr.opaque(mi.UInt32, count)
     pixel = index // n
     k = index - pixel * n + dr.opaque(mi.UInt32, first)
     lanes, failed = _taken_by(shown, window, spp, seed)(pixel, k, layered)
-    return [dr.block_sum(x, count).numpy() for x in lanes], int(failed.numpy()[0])
+    return [dr.block_sum(x, count) for x in lanes], failed
 
 
 def _taken_by(
@@ -282,7 +307,7 @@ def _groups(
     count: int,
     size: int,
     layered: bool,
-) -> tuple[list[Singles], int]:
+) -> tuple[list[mi.Float], mi.UInt32]:
     """Sums over `count` groups of each pixel, one group per lane; sample j of group g is number g size + j."""
     columns, rows = (-(-n // _TILE) for n in window[2:])  # the last tiles may extend beyond the window
     times = _TIMES if spp <= _ENOUGH else 1
@@ -292,18 +317,17 @@ def _groups(
         (dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])),
         *(tuple(dr.opaque(mi.UInt32, n) for n in part) for part in (window[2:], numbers, (across, *tiles.shape))),
     )
-    finely, wet = (marks.ravel() for marks in shown.fine(window))
+    finely, wet = (marks.ravel() for marks in shown.host.fine(window))
     pattern, chosen = Pattern.of(spp, seed, times), np.flatnonzero(finely) if times > 1 else np.zeros(0, int)
     marks = (finely + 2 * wet).astype(np.uint32)
     marks[chosen] |= 4 * np.arange(1, len(chosen) + 1, dtype=np.uint32)
     fine, seen = mi.UInt32(aligned(marks)), mi.UInt8(aligned(tiles.ravel().astype(np.uint8)))
     hits = _hits_of(shown, window, pattern, chosen, (first * size * times, count * size * times))
-    lanes, failures = _shaded(
+    return _shaded(
         *(shown.values, shown.lights, shown.textures, shown.scene, grid, pattern, fine, hits, seen),
         dr.opaque(mi.Bool, shown.lights.widest < SMALL),
         rows * columns * count, window[2] * window[3], layered,
     )  # fmt: skip
-    return [lane.numpy() for lane in lanes], int(failures.numpy()[0])
 
 
 def _hits_of(

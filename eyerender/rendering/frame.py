@@ -102,6 +102,11 @@ class RenderJob(ArrayValue):
         return np.asarray(self.M @ _GLOBE_CENTRE_MM + self.t - _GLOBE_CENTRE_MM)
 
     @property
+    def globe(self) -> Globe:
+        """Posed globe in the scene's frame."""
+        return globe_of(self.eye, self.M, self.t - self.anchor_mm)
+
+    @property
     def film_index(self) -> float:
         """Index of what lies on the front cornea."""
         return film_index(self.eye, self.look)

@@ -126,10 +126,19 @@ class Glint:
 
 
 @dataclass(frozen=True, slots=True)
-class GlintScene:
-    """Input of the glints: front cornea with its film and rim, pose (x_world = M x + t), camera, and obstacles.
+class Images:
+    """The lamps' images before it is known what hides them, and the circles and points that wide lamps need."""
 
-    `clear` takes points (n, 3) and (n, 3) of the world and returns whether nothing of the scene stands between them.
+    parts: list[Image]
+    counts: dict[int, tuple[int, int]]
+
+
+@dataclass(frozen=True, slots=True)
+class GlintScene:
+    """Input of the glints: front cornea with its film and rim, pose (x_world = M x + t), and camera.
+
+    What stands in the way is told by a function `clear`. It takes points (n, 3) and (n, 3) of the world, and returns
+    whether nothing of the scene stands between them.
     """
 
     surface: Surface
@@ -141,11 +150,10 @@ class GlintScene:
     M: Floats
     t: Floats
     camera: PinholeCamera
-    clear: Visibility
     mesh: SurfaceMesh | None = None
 
-    def glints(self, lights: Sequence[Lamp], sigma_px: float) -> list[Glint]:
-        """Compute the glint of each lamp, as finely as its size, its edges and the point-spread function require."""
+    def images(self, lights: Sequence[Lamp], sigma_px: float) -> Images:
+        """Compute the image of each lamp as finely as its size and the point-spread function require."""
         images = self._trace(lights, [_ROUGH if lamp.radius_mm > 0 else POINT for lamp in lights])
         rims = {k: images[k].last(_ON_RIM) for k, lamp in enumerate(lights) if lamp.radius_mm > 0}
         counts = {k: _node_counts(edge.xy_px[edge.there], sigma_px) for k, edge in rims.items()}
@@ -153,11 +161,15 @@ class GlintScene:
             finely = self._trace([lights[k] for k in more], [quadrature(*counts[k]) for k in more])
             for k, image in zip(more, finely, strict=True):
                 images[k] = image.and_(rims[k])
-        glints = self.seen(images)
-        for k, count in counts.items():
+        return Images(images, counts)
+
+    def glints(self, lights: Sequence[Lamp], images: Images, clear: Visibility) -> list[Glint]:
+        """Glints of lamps from their images, as finely as their edges require."""
+        glints = self.seen(images.parts, clear)
+        for k, count in images.counts.items():
             visible = glints[k].clear & glints[k].image.there
             if np.any(visible) and not np.all(visible):
-                glints[k] = replace(glints[k], spots=self._cut(lights[k], glints[k].image, count))
+                glints[k] = replace(glints[k], spots=self._cut(lights[k], glints[k].image, count, clear))
         return glints
 
     def nearness(self, lights: Sequence[Lamp]) -> Floats:
@@ -176,22 +188,23 @@ class GlintScene:
             out.append((np.array(xy[1]) - xy[0]) / (2 * _PARALLAX_MM * camera.K[axis, axis]))
         return np.stack(out, axis=1)
 
-    def seen(self, images: Sequence[Image]) -> list[Glint]:
+    def seen(self, images: Sequence[Image], clear: Visibility) -> list[Glint]:
         """Glints of images, made of their points that the camera sees."""
         out = []
         ways = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm"))
-        for image, clear in zip(images, _parted(self._clear(*ways), [len(i.energy) for i in images]), strict=True):
-            lit = clear & image.there & (image.energy > 0)
-            out.append(Glint(image, clear, Spots(frozen(image.xy_px[lit]), frozen(image.energy[lit]))))
+        free = _parted(self._clear(clear, *ways), [len(i.energy) for i in images])
+        for image, open_ in zip(images, free, strict=True):
+            lit = open_ & image.there & (image.energy > 0)
+            out.append(Glint(image, open_, Spots(frozen(image.xy_px[lit]), frozen(image.energy[lit]))))
         return out
 
-    def _cut(self, lamp: Lamp, image: Image, counts: tuple[int, int]) -> Spots:
+    def _cut(self, lamp: Lamp, image: Image, counts: tuple[int, int], clear: Visibility) -> Spots:
         """Spots of the visible part of a lamp, whose whole `image` is known at some points."""
         mirror = self._mirror_map(lamp, image)
 
         def visible(points: Floats) -> Bools:
             (seen,) = self._trace([lamp], [Nodes(points, np.ones(len(points)))])
-            return seen.there & self._clear(seen.source_mm, seen.entry_mm, seen.exit_mm)
+            return seen.there & self._clear(clear, seen.source_mm, seen.entry_mm, seen.exit_mm)
 
         def nearly_visible(points: Floats) -> Bools:
             assert mirror is not None
@@ -199,7 +212,7 @@ class GlintScene:
             at = y @ self.M.T + self.t
             there = self.surface.axis_distance(components(y)) <= self.limbus_radius_mm
             there &= ~self._behind_globe(y, (source - self.t) @ self.M - y) & ~self._behind_globe(y, self._eyepoint - y)
-            return np.asarray(there & self._clear(source, at, at))
+            return np.asarray(there & self._clear(clear, source, at, at))
 
         nodes = cut_nodes(visible if mirror is None else nearly_visible, *counts)
         (cut,) = self._trace([lamp], [nodes])
@@ -226,10 +239,10 @@ class GlintScene:
         """The camera's nodal point in the eye frame."""
         return np.asarray(self.M.T @ (self.camera.nodal_point_mm - self.t))
 
-    def _clear(self, sources: Floats, entries: Floats, exits: Floats) -> Bools:
+    def _clear(self, clear: Visibility, sources: Floats, entries: Floats, exits: Floats) -> Bools:
         """Whether nothing of the scene stands between points of lamps and of the eye, and the camera, (k,)."""
         node = np.broadcast_to(self.camera.nodal_point_mm, exits.shape)
-        both = self.clear(np.concatenate([sources, node]), np.concatenate([entries, exits]))
+        both = clear(np.concatenate([sources, node]), np.concatenate([entries, exits]))
         return np.asarray(both[: len(sources)] & both[len(sources) :])
 
     def _trace(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:

@@ -14,15 +14,15 @@ from ..region.globe import Globe
 from ..region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
 from ..region.headspec import Head
 from ..region.mesh import RegionMesh
-from .region import Expected, RegionScene
+from .region import RegionScene
 
 _DEPTH_MM = 4.0
 _RINGS, _TURNS = 40, 240
 
 
-def place_scene(spec: Region, globe: Globe, expected: Expected | None) -> RegionScene:
+def place_scene(spec: Region, globe: Globe, known: RegionMesh | None) -> RegionScene:
     """Make the scene of a spec: its head mesh, or the procedural region, whose mesh may be known."""
-    return (RegionScene if spec.head is None else HeadScene)(spec, globe, expected)
+    return (RegionScene if spec.head is None else HeadScene)(spec, globe, known)
 
 
 class HeadScene(RegionScene):
@@ -35,14 +35,14 @@ class HeadScene(RegionScene):
     parts = HEAD_PARTS
     fixed = True
 
-    def __init__(self, spec: Region, globe: Globe, expected: Expected | None = None) -> None:
-        super().__init__(spec, globe, expected)
+    def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> None:
+        super().__init__(spec, globe, known)
         self._refuse_crossing(spec, globe)
 
-    def show(self, spec: Region, globe: Globe, expected: Expected | None = None) -> RegionMesh:
+    def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
         """Turn to an eye and its pose; the mesh itself moves only with the place of the globe at rest."""
         new = self._shown != (spec, globe)
-        posed = super().show(spec, globe, expected)
+        posed = super().show(spec, globe, known)
         if new:
             self._refuse_crossing(spec, globe)
         return posed

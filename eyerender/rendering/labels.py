@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -48,11 +49,11 @@ class PartLabels(ArrayValue):
         return both / whole if whole else float("nan")
 
 
-def part_labels(shown: Exposed, window: Window) -> PartLabels:
-    """Compute the labels of a window. Rays that miss the globe are not traced."""
+def part_labels(shown: Exposed, window: Window) -> Callable[[], PartLabels]:
+    """Begin to compute the labels of a window; the result waits for them. Rays that miss the globe are not traced."""
     found = _parts(shown.values, shown.scene, *window_of(window), window[2] * window[3])
     shape = (window[3], window[2])
-    return PartLabels(*(frozen(x.numpy().reshape(shape), np.uint8) for x in found))
+    return lambda: PartLabels(*(frozen(x.numpy().reshape(shape), np.uint8) for x in found))
 
 
 @recorded

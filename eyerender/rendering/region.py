@@ -8,9 +8,8 @@ third of the time. The menisci are a scene of their own. The appearance of a hit
 
 from __future__ import annotations
 
-from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -28,9 +27,9 @@ from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh, sheet_en
 from ..region.skin import SHEET_ROWS, skin_texels
 from .parameters import leaves
 from .surround import clear_between, rays_between
+from .tissuecells import GRID_COLUMNS, GRID_ROWS
 from .values import aligned
 
-GRID_ROWS, GRID_COLUMNS = 160, 768  # of the finer grid over the sheet on which its light is computed (`subsurface`)
 SHEET_COLUMNS = COLUMNS + 1  # of the sheet's grid, because the first column is repeated
 _F0_OIL, _F0_TEARS = 0.035, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
 _ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.02, 0.03
@@ -40,10 +39,6 @@ _WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much a
 _RIPPLE = 0.02  # slope of wet tissue
 
 
-Expected: TypeAlias = tuple[Region, Globe, "Future[RegionMesh]"]
-"""A region about a globe, and its mesh, which another thread makes."""
-
-
 class RegionScene:
     """The Mitsuba scene of an eye region; `show` moves it, and `fill` gives it to another subject."""
 
@@ -51,8 +46,8 @@ class RegionScene:
     parts: tuple[str, ...] = PARTS
     fixed = False  # whether the mesh keeps still, and has no menisci that light passes through
 
-    def __init__(self, spec: Region, globe: Globe, expected: Expected | None = None) -> None:
-        posed = self._made(spec, globe, expected)
+    def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> None:
+        posed = self._posed(spec, globe) if known is None else known
         meshes = {name: _mesh(posed, *cut) for name, cut in self._cuts(posed.layout).items()}
         # Without robust intersections rays slip between the triangles of a large face on some processors. An instance
         # cannot have them, but its triangles are small.
@@ -88,9 +83,9 @@ class RegionScene:
         """Whether the scene has the meshes that a subject needs."""
         return not self.fixed and spec.head is None
 
-    def fill(self, spec: Region, globe: Globe, expected: Expected | None) -> None:
+    def fill(self, spec: Region, globe: Globe, known: RegionMesh | None) -> None:
         """Show another subject with the same shapes, so that recordings can still be played back."""
-        posed = self._made(spec, globe, expected)
+        posed = self._posed(spec, globe) if known is None else known
         for name, cut in self._cuts(posed.layout).items():
             self._params[name][f"{name}.mesh.faces"] = _faces(posed.layout, *cut)
             self._send(name, posed)
@@ -103,10 +98,10 @@ class RegionScene:
         files = () if spec.head is None else file_states(spec.head)
         return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files
 
-    def show(self, spec: Region, globe: Globe, expected: Expected | None = None) -> RegionMesh:
-        """Move lids and lashes to a pose and a blink."""
+    def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
+        """Move lids and lashes to a pose and a blink, whose mesh may be known."""
         if self._shown != (spec, globe):
-            posed = self._made(spec, globe, expected)
+            posed = self._posed(spec, globe) if known is None else known
             if posed is not self.posed:
                 self._move(posed)
             self._shown = (spec, globe)
@@ -132,11 +127,6 @@ class RegionScene:
     def _update(self) -> None:
         for params in self._params.values():
             params.update()  # does nothing where nothing was set
-
-    def _made(self, spec: Region, globe: Globe, expected: Expected | None) -> RegionMesh:
-        """The posed mesh, which another thread may have made."""
-        known = expected is not None and expected[:2] == (spec, globe)
-        return expected[2].result() if expected is not None and known else self._posed(spec, globe)
 
     def _posed(self, spec: Region, globe: Globe) -> RegionMesh:
         return region_mesh(spec, globe)

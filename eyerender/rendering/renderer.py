@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -12,16 +12,15 @@ import numpy as np
 
 from ..arrays import Floats, Singles
 from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
-from ..rig import psf
 from .blur import Blur
-from .film import Exposed, mean_parts, mean_radiance
+from .film import Exposed, begun, mean_radiance
 from .frame import RenderJob
 from .labels import PartLabels, depths_mm, highlights, part_labels
 from .lighting import through_cornea
-from .occlusion import lid_margins_px
+from .prepared import Prepared
 from .recorded import uncollected
 from .region import RegionScene
-from .splat import Patch, mirror_images
+from .splat import MirrorImages, Shine
 from .stage import Stage
 from .surround import Obstacle, Surround
 from .window import RenderedWindow, Traced
@@ -73,8 +72,8 @@ class Renderer:
     ) -> Future[RenderedWindow]:
         """Trace one window now, and develop it in a second thread, beside the tracing of the next.
 
-        The arguments are those of `render`. `after` is the job that comes next, if it is known: the mesh of its region
-        is made in the second thread, too. The results do not depend on it.
+        The arguments are those of `render`. `after` is the very job that comes next, if it is known: what NumPy
+        alone makes of it is made in the second thread, too. The results do not depend on it.
         """
         return self._beside.submit(self._traced(job, spp, moments, after).developed)
 
@@ -83,37 +82,38 @@ class Renderer:
         shots = moments or (job,)
         spp = max(1, (spp or self.spp) // len(shots))
         blur: Blur | None = None
-        front = None if job.mesh_edge_mm is None else self._stage.meshes.of(job.eye, job.mesh_edge_mm)[0]
         pictures, failed = [], 0
-        glints: list[Patch] = []
+        glints: list[Shine] = []
         marks: tuple[Any, ...] | None = None
         for shot in shots:
             shown, place = self.bind(shot)
-            if after is not None and shot is shots[-1] and not moments:
+            blur = blur or (Blur.of(job, place.posed) if moments else shown.host.blur)
+            film = begun(shown, blur.window, spp, shot.seed, layered=blur.layered)
+            # The device is at work until something is read, so the host's own work comes first.
+            if after is not None and not moments:
                 self._stage.expect(after, self._beside)
-            blur = blur or Blur.of(job, place)
-            picture, missed = self._pictures(shot, shown, blur, spp)
+            found = _marks(job, shown) if shot.M is job.M and shot.t is job.t else None
+            mirrored, shines = self._mirror_images(shown.host).seen(place, blur, 1 / len(shots))
+            glints += shines
+            picture, missed = film.mean()
             pictures.append(picture)
-            mirrored, patches = mirror_images(shot, place, blur, front, 1 / len(shots))
-            glints += patches
             failed += missed
-            if shot.M is job.M and shot.t is job.t:
-                marks = mirrored, *_marks(job, shown, place)
+            if found is not None:
+                marks = mirrored, *found()
         assert blur is not None
         if marks is None:  # no moment is the middle of the exposure
             shown, place = self.bind(job, lit=False)
-            marks = mirror_images(job, place, blur, front)[0], *_marks(job, shown, place)
+            marks = self._mirror_images(shown.host).seen(place, blur)[0], *_marks(job, shown)()
         mirrored, labels, margins, bright = marks
         radiance = pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0)
         return Traced(job, radiance, tuple(glints), blur, mirrored, labels, failed, margins, bright)
 
-    def _pictures(self, job: RenderJob, shown: Exposed, blur: Blur, spp: int) -> tuple[Singles, int]:
-        """Radiance of a window, or its parts, with the border that the lens needs, and failed light paths."""
-        pad = blur.reach + psf.margin(job.sensor.psf_sigma_px)
-        x0, y0, width, height = job.window
-        padded = (x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad)
-        look = mean_parts if blur.layered else mean_radiance
-        return look(shown, padded, spp, job.seed)
+    def _mirror_images(self, host: Prepared) -> MirrorImages:
+        """The lamps' mirror images, in the closed form of the cornea or in a mesh of it."""
+        job = host.job
+        if job.mesh_edge_mm is None:
+            return host.mirror_images
+        return MirrorImages.of(job, self._stage.meshes.of(job.eye, job.mesh_edge_mm)[0])
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
         """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), before lens and glints."""
@@ -135,7 +135,7 @@ class Renderer:
 
     def labels(self, job: RenderJob) -> PartLabels:
         """Compute the labels of a window alone."""
-        return part_labels(self.bind(job, lit=False)[0], job.window)
+        return part_labels(self.bind(job, lit=False)[0], job.window)()
 
     def depths_mm(self, job: RenderJob) -> Singles:
         """Distances (height, width) from the nodal point of what a window shows, infinite where that is nothing."""
@@ -149,8 +149,11 @@ class Renderer:
         return self._stage.set(job, lit=lit)
 
 
-def _marks(job: RenderJob, shown: Exposed, place: Surround | RegionScene) -> tuple[Any, ...]:
-    """Labels, margins of the lids (px) and highlights of a window, as far as they are wanted."""
-    labels = part_labels(shown, job.window) if job.labels else None
-    margins = lid_margins_px(place.posed, job.camera, job.anchor_mm) if isinstance(place, RegionScene) else None
-    return labels, margins, highlights(shown, job.window) if job.highlights else None
+def _marks(job: RenderJob, shown: Exposed) -> Callable[[], tuple[Any, ...]]:
+    """Begin with labels, margins of the lids (px) and highlights of a window, as far as they are wanted."""
+    labels, margins = part_labels(shown, job.window) if job.labels else None, shown.host.lid_margins_px
+    return lambda: (
+        None if labels is None else labels(),
+        margins,
+        highlights(shown, job.window) if job.highlights else None,
+    )

@@ -1,4 +1,4 @@
-"""Splatting of the lamps' visible mirror images into an image, with the reasons for those that are hidden."""
+"""The lamps' mirror images in a picture: what is seen of them and why, and how they are splatted into it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..arrays import Bools, Floats, Singles, frozen
 from ..rig import defocus, psf
 from ..rig.camera import Window
+from ..rig.light import Lamp
 from .blur import Blur
 from .cut import POINT, quadrature
 from .frame import RenderJob, sun_lamps
-from .glints import Glint, GlintScene, GlintTable, Spots, glint_table
+from .glints import Glint, GlintScene, GlintTable, Image, Images, Spots, glint_table
 from .meshed import SurfaceMesh
 from .occlusion import glint_reason
 from .purkinje import purkinje_images
@@ -22,13 +23,22 @@ from .surround import Surround
 _FRAMED = "occluded by frame"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Patch(ArrayValue):
-    """Blurred radiance (rows, columns) of a mirror image on the part of a window that it reaches."""
+@dataclass(frozen=True, slots=True)
+class Shine:
+    """What a mirror image adds to a picture: its spots, a share of the exposure, and its circle of confusion (px)."""
 
-    rows: slice
-    columns: slice
-    radiance: Floats
+    spots: Spots
+    share: float
+    blur_px: float
+
+    def add(self, picture: Singles, job: RenderJob) -> None:
+        """Add it, blurred by lens and pixels, to the picture (height, width) of a job's window."""
+        if len(self.spots.energy):
+            xy, camera = self.spots.xy_px, job.camera
+            energy = self.share * self.spots.energy * (camera.rays(xy) @ camera.axis) ** 4
+            spread = defocus.disc(self.blur_px)
+            patch, rows, columns = psf.splat(xy, energy, job.sensor.psf_sigma_px, job.window, spread)
+            picture[rows, columns] += patch
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,42 +65,64 @@ class Mirrored:
         return Mirrored(glints, self.others, reasons)
 
 
-def mirror_images(
-    job: RenderJob, place: Surround | RegionScene, blur: Blur, mesh: SurfaceMesh | None, share: float = 1.0
-) -> tuple[Mirrored, list[Patch]]:
-    """The mirror images of a job's lamps and of the sun, and what they add to its blurred image.
+@dataclass(frozen=True, slots=True)
+class MirrorImages:
+    """The mirror images of a job's lamps and of the sun, before it is known what hides them.
 
-    The tables and reasons are those of the lamps alone. `share` is that of the exposure for which the job stands.
+    Attributes:
+        job: the job.
+        lamps: its lamps, and the sun if there is one.
+        scene: the mirrors.
+        first: the images in the front of the cornea.
+        further: the requested images of higher orders.
+        nearness: (n, 2) inverse depths (1/mm) of the first images; NaN where they do not matter.
     """
-    eye, anchor, sigma = job.eye, job.anchor_mm, job.sensor.psf_sigma_px
 
-    def clear(a: Floats, b: Floats) -> Bools:
-        return place.clear(a - anchor, b - anchor)
+    job: RenderJob
+    lamps: tuple[Lamp, ...]
+    scene: GlintScene
+    first: Images
+    further: dict[int, list[Image]]
+    nearness: Floats
 
-    scene = GlintScene(
-        eye.front[0], float(eye.front_indices[0]), job.film_index, float(eye.limbus_radius_mm),
-        np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), job.M, job.t, job.camera, clear, mesh,
-    )  # fmt: skip
-    count, lamps = len(job.lights), (*job.lights, *sun_lamps(job.ambient, anchor))
-    tables, patches = {}, []
-    reasons: tuple[str, ...] = ()
-    for order in sorted({1, *job.purkinje}):
-        if order == 1:
-            glints = scene.glints(lamps, sigma)
-            reasons = tuple(_reason(job, place, glint) for glint in glints[:count])
-        else:
-            # These images are small, because their mirrors are strongly curved, or concave with a short focus.
-            nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in lamps]
-            glints = scene.seen(purkinje_images(scene, eye, order, lamps, nodes))
-        tables[order] = glint_table(glints[:count])
-        if order in job.purkinje:
+    @classmethod
+    def of(cls, job: RenderJob, mesh: SurfaceMesh | None) -> MirrorImages:
+        """Find the images, with NumPy alone unless a mesh takes the place of the cornea's front."""
+        eye = job.eye
+        scene = GlintScene(
+            eye.front[0], float(eye.front_indices[0]), job.film_index, float(eye.limbus_radius_mm),
+            np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), job.M, job.t, job.camera, mesh,
+        )  # fmt: skip
+        lamps = (*job.lights, *sun_lamps(job.ambient, job.anchor_mm))
+        # Further images are small, because their mirrors are strongly curved, or concave with a short focus.
+        nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in lamps]
+        further = {order: purkinje_images(scene, eye, order, lamps, nodes) for order in sorted({*job.purkinje} - {1})}
+        near = 1 in job.purkinje and job.lens.focus_mm is not None
+        nearness = scene.nearness(lamps) if near else np.full((len(lamps), 2), np.nan)
+        return cls(job, lamps, scene, scene.images(lamps, job.sensor.psf_sigma_px), further, nearness)
+
+    def seen(self, place: Surround | RegionScene, blur: Blur, share: float = 1.0) -> tuple[Mirrored, list[Shine]]:
+        """What is seen of the images in posed surroundings, and what they add to the blurred picture.
+
+        The tables and reasons are those of the lamps alone. `share` is that of the exposure for which the job stands.
+        """
+        job, anchor, count = self.job, self.job.anchor_mm, len(self.job.lights)
+
+        def clear(a: Floats, b: Floats) -> Bools:
+            return place.clear(a - anchor, b - anchor)
+
+        glints = self.scene.glints(self.lamps, self.first, clear)
+        reasons = tuple(_reason(job, place, glint) for glint in glints[:count])
+        further = {order: self.scene.seen(images, clear) for order, images in self.further.items()}
+        shines = []
+        for order in sorted({*job.purkinje}):
             # The further images are about as far as the iris.
-            own = order == 1 and job.lens.focus_mm is not None
-            nearness = scene.nearness(lamps) if own else np.full((len(glints), 2), np.nan)
-            for glint, near in zip(glints, nearness, strict=True):
-                patches += _drawn(job, glint.spots, share, defocus.disc(blur.of_image(near)))
-    others = tuple((order, table) for order, table in tables.items() if order > 1)
-    return Mirrored(tables[1], others, reasons), patches
+            sizes = [blur.of_image(near) for near in self.nearness] if order == 1 else [blur.subject_px] * len(glints)
+            shines += [
+                Shine(glint.spots, share, size) for glint, size in zip(further.get(order, glints), sizes, strict=True)
+            ]
+        others = tuple((order, glint_table(found[:count])) for order, found in further.items())
+        return Mirrored(glint_table(glints[:count]), others, reasons), shines
 
 
 def _reason(job: RenderJob, place: Surround | RegionScene, glint: Glint) -> str:
@@ -105,12 +137,3 @@ def _reason(job: RenderJob, place: Surround | RegionScene, glint: Glint) -> str:
         to_camera = blockers(place, node - anchor, image.exit_mm - anchor)
         names = [c if c is not None else a for a, c in zip(to_lamp, to_camera, strict=True)]
     return glint_reason(image.there, open_, names)
-
-
-def _drawn(job: RenderJob, spots: Spots, share: float, spread: Floats) -> list[Patch]:
-    """A share of the spots of a glint, blurred by the lens and convolved with `spread`."""
-    if not len(spots.energy):
-        return []
-    energy = share * spots.energy * (job.camera.rays(spots.xy_px) @ job.camera.axis) ** 4
-    patch, rows, columns = psf.splat(spots.xy_px, energy, job.sensor.psf_sigma_px, job.window, spread)
-    return [Patch(rows, columns, patch)]

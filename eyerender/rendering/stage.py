@@ -4,36 +4,26 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from ..arrays import Bools, frozen
 from ..errors import InputError
-from ..region.anatomy import Region
-from ..region.globe import Globe
-from ..region.mesh import region_mesh
-from ..rig import psf
-from ..rig.camera import Window
+from ..region.mesh import RegionMesh
 from ..rig.imaging import Ambient
-from .blur import Blur
 from .environment import Ambience, Maps
 from .exchange import Exchange
 from .film import Exposed
 from .frame import (
     RenderJob,
     boundary_waves,
-    globe_of,
     kinds,
     light_table,
     panel_lamps,
     panel_table,
-    parameters_of,
-    returned_light,
-    sun_lamps,
     tables,
 )
 from .head import place_scene
@@ -43,11 +33,11 @@ from .kept import KeptForEye
 from .lampviews import LampViews
 from .mattelight import MatteLight
 from .meshed import Meshes, meshed
-from .plain import fine_pixels, plain_tiles
+from .prepared import Prepared
 from .pupillight import PupilLight
 from .recorded import forget
-from .region import Expected, RegionScene
-from .subsurface import TissueLight, tissue_light
+from .region import RegionScene
+from .subsurface import tissue_light
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
 from .view import Textures
@@ -55,7 +45,6 @@ from .view import Textures
 _REGIONS, _TEXTURES = 4, 8  # kept
 _REMEMBERED = 32  # subjects; then recordings are made anew, because those of sizes that never come back take 3 MB each
 _FARTHEST_MM = 60.0  # of places in the plane of a surround that have a grid
-_NOTHING_PLAIN = frozen(np.zeros((1, 1)), np.bool_)
 
 
 class Stage:
@@ -71,23 +60,19 @@ class Stage:
         self.meshes = Meshes()
         self._exchange = Exchange()
         self._shapes: KeptForEye[Shape] = KeptForEye()
-        self._expected: Expected | None = None
+        self._expected: tuple[RenderJob, Future[Prepared]] | None = None
 
     def expect(self, job: RenderJob, beside: Executor) -> None:
-        """Have the mesh made that the region of a later job needs."""
-        if job.region is None or job.region.head is not None:
-            return
-        globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
-        self._expected = job.region, globe, beside.submit(region_mesh, job.region, globe)
+        """Have what NumPy alone makes of the next job made by another thread, but for a head mesh."""
+        if job.region is None or job.region.head is None:
+            self._expected = job, beside.submit(Prepared.made_beside, job)
 
     def set(self, job: RenderJob, *, lit: bool = True) -> tuple[Exposed, Surround | RegionScene]:
         """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call.
 
         `lit`: whether radiance is wanted, not only what is seen where.
         """
-        place = self._place(job)
-        suns = sun_lamps(job.ambient, job.anchor_mm)
-        job = replace(job, lights=(*job.lights, *suns))
+        host, place = self._prepared(job)
         region = place if isinstance(place, RegionScene) else None
         structure = Structure(
             kinds(job.eye),
@@ -98,63 +83,65 @@ class Stage:
             region is not None and region.skin.is_sheet and job.look.scattering is not None,
         )
         anchor = job.anchor_mm
-        values = Values(structure, parameters_of(job), boundary_waves(job.eye), tables(job.eye))
+        values = Values(structure, host.parameters, boundary_waves(job.eye), tables(job.eye))
         if job.mesh_edge_mm is not None:
             values.surfaces = meshed(values.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
-        lights = Lights(light_table(job.lights, job.M, job.t), len(suns))
+        lights = Lights(host.lamps, len(host.lamps) - len(job.lights))
         textures = self._textures_of(job)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
             ambience = Ambience(even, panel_table(job.ambient, anchor), job.ambient.map, self._maps)
             textures = replace(textures, ambience=ambience)
 
-        def plain(window: Window) -> tuple[Bools, int]:
-            if region is None:
-                return _NOTHING_PLAIN, max(window[2:])
-            return plain_tiles(region.posed, job.camera, anchor, window)
-
-        pupil = PupilLight(values, lights, place.scene, returned_light(job))
+        pupil = PupilLight(values, lights, place.scene, host.returned)
         pupil.make()
         textures = replace(textures, pupil=pupil)
         if isinstance(place, Surround):
             textures = replace(textures, surround=place.geometry)
         if region is not None:
-            views = LampViews(job.lights, anchor, _reach_mm(job), region if region.skin.is_sheet else None)
-            tissues = _tissues(job, values, lights, region, views) if structure.scattering and lit else None
+            lamps, sheet = host.sunlit.lights, region if region.skin.is_sheet else None
+            views, tissues = LampViews(lamps, anchor, _reach_mm(job), sheet), None
+            if structure.scattering and lit:
+                tissues = tissue_light(job, values, lights, region, views, host.tissue_cells)
             textures = replace(textures, region=region.skin, lamp_views=views, tissues=tissues)
         if lit:
             parts = panel_lamps(job.ambient, anchor)
             if textures.ambience is not None:
                 parts += textures.ambience.bright(anchor)
             panels = Lights(light_table(parts, job.M, job.t))
-            received = self._exchange.received(job, values, lights, panels, textures, place)
+            received = self._exchange.received(host, values, lights, panels, textures, place)
             textures = replace(textures, received=received)
             lights.relief = IrisRelief(job, values, lights, place.scene, textures, self._shapes)
         _spread(job, values, lights, textures, place)
 
-        def fine(window: Window) -> tuple[Bools, Bools]:
-            return fine_pixels(None if region is None else region.posed, job.camera, anchor, window)
+        return Exposed(place.scene, values, lights, textures, host), place
 
-        return Exposed(place.scene, values, lights, textures, plain, fine), place
+    def _prepared(self, job: RenderJob) -> tuple[Prepared, Surround | RegionScene]:
+        """What NumPy makes of a job, and its posed surroundings."""
+        (expected, beside), self._expected = self._expected or (None, None), None
+        host = beside.result() if beside is not None and expected is job else None
+        place = self._place(job, None if host is None else host.posed)
+        return host or Prepared(job, place.posed), place
 
-    def _place(self, job: RenderJob) -> Surround | RegionScene:
+    def _place(self, job: RenderJob, known: RegionMesh | None) -> Surround | RegionScene:
+        """Posed surroundings; the mesh of a region may be known."""
         if job.region is None:
             self._surround.show(job.look)
             return self._surround
         if self._surround.obstructed:
             raise InputError("obstacles cannot be combined with an eye region")
-        globe = globe_of(job.eye, job.M, job.t - job.anchor_mm)
-        expected, self._expected = self._expected, None
-        place = self._region(job.region, globe, expected)
-        place.show(job.region, globe, expected)
+        place = self._region(job, known)
+        place.show(job.region, job.globe, known)
         return place
 
-    def _region(self, spec: Region, globe: Globe, expected: Expected | None) -> RegionScene:
+    def _region(self, job: RenderJob, known: RegionMesh | None) -> RegionScene:
         """The scene of a subject.
 
         A subject never seen before takes over that of another one, so recordings last. One that comes back after that
         gets a scene of its own, because subjects that take turns would else fill one again and again.
         """
+        assert job.region is not None
+        spec, globe = job.region, job.globe
         key = RegionScene.key(spec, globe)
         place = self._regions.pop(key, None)
         if place is None:
@@ -164,7 +151,7 @@ class Stage:
                 if full:
                     self._regions.pop(next(iter(self._regions)))
                 forget()
-                place = place_scene(spec, globe, expected)
+                place = place_scene(spec, globe, known)
             else:
                 place = self._regions.pop(oldest)
                 self._replaced.append(oldest)
@@ -172,7 +159,7 @@ class Stage:
                 if self._filled % _REMEMBERED == 0:
                     forget()
                     dr.flush_malloc_cache()
-                place.fill(spec, globe, expected)
+                place.fill(spec, globe, known)
         self._regions[key] = place
         return place
 
@@ -192,11 +179,6 @@ def _spread(job: RenderJob, values: Values, lights: Lights, textures: Textures, 
     if textures.received is not None and not place.obstructed:
         reach = min(_reach_mm(job), _FARTHEST_MM)
         lights.on_matte = MatteLight(values, lights, place.scene, textures.received, reach)
-
-
-def _tissues(job: RenderJob, values: Values, lights: Lights, region: RegionScene, views: LampViews) -> TissueLight:
-    spare_px = Blur.of(job, region).reach + psf.margin(job.sensor.psf_sigma_px)
-    return tissue_light(job, values, lights, region, views, spare_px)
 
 
 def _reach_mm(job: RenderJob) -> float:

@@ -20,23 +20,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, frozen
-from ..optics.diffusion import half_space_length_mm, rings, slab_length_mm, transmitted
-from ..region.globe import Globe
-from ..region.mesh import RegionMesh, sheet_neighbours
-from ..region.skin import BANDS, SHEET_ROWS, sheet_place
-from .frame import globe_of
+from ..arrays import Ints
+from ..optics.diffusion import rings, transmitted
+from ..region.skin import BANDS, SHEET_ROWS
 from .lighting import irradiance, lamp_blocked
 from .parameters import leaves, traversed
 from .recorded import recorded
-from .region import GRID_COLUMNS, GRID_ROWS, SHEET_COLUMNS
+from .region import SHEET_COLUMNS
+from .tissuecells import SIDE, WIDTH, GlobeCells, SheetCells, TissueCells
 from .values import Lights, Values, aligned, quotient
 from .view import EPSILON_MM
 
@@ -46,21 +43,16 @@ if TYPE_CHECKING:
     from .region import RegionScene, SkinGeometry
 
 
-_SIDE = 192  # of the grid over the front of the globe
 _LEVELS = 5  # each half as fine as the one before
 _RINGS, _TURNS = 6, 6
-_LEVEL_RINGS = (0, 1), (1, 4), (4, 6)  # whose light is found on the grid over the skin, and on its reductions
+_LEVEL_RINGS = (0, 1), (1, 4), (4, 6)  # whose light is found on the grid over the skin, and on its two reductions
 _FOOTPRINT = 0.8  # size of the cells that a ring reads, in units of its radius
 _RAYS = 6  # to the lamps from each cell, and at least one to each
 _SMALL, _WIDE_RAYS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
-_FINE_PX_PER_MM = 11.0  # in pictures of fewer pixels per mm every second row and column of the skin's grid will do
-_SPARE, _SPARE_MM = 24.0, 10.0  # beyond the window, from where light still arrives: in units of d, and at least
 _FINEST_MM = 0.02  # of a cell; about the corners of the eye they are smaller
 _LID_MM = 4.5  # thicker than any lid
 _BETWEEN_MM = 0.05  # between the two surfaces of a lid, at least
 _JOINT_MM, _ABOVE_MM = 0.05, 0.15  # above the globe, where the light on conjunctiva and globe is found
-_EDGE_MM = 0.4  # about the lids' margins, where the globe may be seen
-_WIDTH = 2.5  # of the grid over the globe in units of its radius, in Lambert's equal-area projection
 _KEYS = (0x51CA, 0x1A3B)
 _ALPHA = (0.7548776662466927, 0.5698402909980532)
 
@@ -205,14 +197,14 @@ class TissueLight:
     def on_globe(self, x: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
         row, column = self._place(x)
-        u = dr.clip(column, 0, _SIDE - 1.001)
+        u = dr.clip(column, 0, SIDE - 1.001)
         j = mi.UInt32(u)
-        return _Cells.at(row, u - mi.Float(j), (j, j + 1), (_SIDE, _SIDE)).of(mi.Float, self._globe[0])
+        return _Cells.at(row, u - mi.Float(j), (j, j + 1), (SIDE, SIDE)).of(mi.Float, self._globe[0])
 
     def globe_sees(self, x: mi.Vector3f) -> Callable[[mi.UInt32], mi.Float]:
         """Shares of the lamps, by their numbers, that points of the globe (eye frame) see."""
-        row, column = (mi.UInt32(dr.clip(p + 0.5, 0, _SIDE - 1)) for p in self._place(x))
-        first = (row * _SIDE + column) * self._lamps
+        row, column = (mi.UInt32(dr.clip(p + 0.5, 0, SIDE - 1)) for p in self._place(x))
+        first = (row * SIDE + column) * self._lamps
         return lambda lamp: dr.gather(mi.Float, self._globe[1], first + lamp)
 
     def _place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
@@ -220,7 +212,7 @@ class TissueLight:
 
 
 def tissue_light(
-    job: RenderJob, values: Values, lights: Lights, place: RegionScene, views: LampViews, spare_px: int
+    job: RenderJob, values: Values, lights: Lights, place: RegionScene, views: LampViews, cells: TissueCells
 ) -> TissueLight:  # fmt: skip
     """Compute the light on the tissues of a frame.
 
@@ -230,15 +222,12 @@ def tissue_light(
         lights: its lamps.
         place: the posed region.
         views: the lamps' views of it.
-        spare_px: pixels beyond the window that are rendered.
+        cells: the cells of the grids.
     """
     scattering = job.look.scattering
     assert scattering is not None
     assert job.region is not None
-    thick = half_space_length_mm(job.region.skin.albedo, scattering.skin_per_mm)
-    thin = slab_length_mm(job.look.sclera_albedo, scattering.sclera_per_mm)
-    skin = SheetGrid.of(place.posed, job, max(_SPARE * thick, _SPARE_MM), spare_px)
-    globe = GlobeGrid.of(place.posed, globe_of(job.eye, job.M, job.t - job.anchor_mm), _SPARE * thin)
+    skin, globe = SheetGrid.of(cells.sheet), GlobeGrid.of(cells.globe)
     wide, count = lights.widest >= _SMALL, max(len(lights), 1)
     rays = -(-_RAYS // count)
     make = _Maker(
@@ -253,7 +242,7 @@ def tissue_light(
         dr.opaque(mi.Float, transmitted(job.region.skin.albedo, scattering.skin_per_mm)),
         count,
     )
-    sheet, between = make.both(skin, globe, Places.of(thick), Places.of(thin))
+    sheet, between = make.both(skin, globe, Places.of(cells.thick_mm), Places.of(cells.thin_mm))
     return TissueLight(skin.size, sheet, between, values, dr.maximum(lights.count, 1))
 
 
@@ -378,9 +367,9 @@ class _Maker:
     def _globe(self, grid: GlobeGrid, size: Size, sheet: mi.Float, places: Places) -> tuple[mi.Float, mi.Float]:
         """Light on the globe between the lids, and how much of each lamp cells see."""
         # What comes through a lid varies slowly, so it is found for two by two cells.
-        coarse = dr.zeros(mi.Float, _SIDE * _SIDE // 4)
+        coarse = dr.zeros(mi.Float, SIDE * SIDE // 4)
         dr.scatter(coarse, self._through_lids(grid.coarse, size, sheet), grid.coarse)
-        cells = dr.zeros(mi.Float, _SIDE * _SIDE)
+        cells = dr.zeros(mi.Float, SIDE * SIDE)
         dr.scatter(cells, dr.gather(mi.Float, coarse, grid.over), grid.under)
         lit, seen = self._on_globe(grid.between)
         dr.scatter(cells, dr.gather(mi.Float, cells, grid.between) + lit, grid.between)
@@ -389,7 +378,7 @@ class _Maker:
     def _on_globe(self, index: mi.UInt32) -> tuple[mi.Float, mi.Float]:
         """Irradiance of cells of the grid over the globe straight from the lamps; shares of each lamp that they see."""
         values, lights = self.values, self.lights
-        seen = dr.zeros(mi.Float, self.lamps * _SIDE * _SIDE)
+        seen = dr.zeros(mi.Float, self.lamps * SIDE * SIDE)
         points = self.rays[1]
         shifts = [mi.sample_tea_32(index, mi.UInt32(key)) for key in _KEYS]
 
@@ -398,7 +387,7 @@ class _Maker:
 
             def at_point(k: mi.UInt32, total: mi.Float, free: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
                 a, b = _spots(shifts[0], k)
-                row, column = mi.Float(index // _SIDE) + b - 0.5, mi.Float(index % _SIDE) + a - 0.5
+                row, column = mi.Float(index // SIDE) + b - 0.5, mi.Float(index % SIDE) + a - 0.5
                 x, normal = self._globe_surface(_globe_direction(row, column))
                 x += _ABOVE_MM * normal
                 u, v = _spots(shifts[1], k)
@@ -435,7 +424,7 @@ class _Maker:
 
     def _through_lids(self, index: mi.UInt32, size: Size, sheet: mi.Float) -> mi.Float:
         """Irradiance of two by two cells of the globe by way of lids on them: exp(-k t) of that on the lid's skin."""
-        values, skin, half = self.values, self.skin, _SIDE // 2
+        values, skin, half = self.values, self.skin, SIDE // 2
         n = _globe_direction(2 * mi.Float(index // half) + 0.5, 2 * mi.Float(index % half) + 0.5)
         start = values.point_to_scene(self._globe_surface(n)[0])
         inner = self._next(start, n, mi.Float(EPSILON_MM), mi.Bool(True))
@@ -519,27 +508,12 @@ class SheetGrid:
     metric: mi.Float | None = None
 
     @classmethod
-    def of(cls, posed: RegionMesh, job: RenderJob, spare_mm: float, spare_px: int) -> SheetGrid:
-        """Make the grid of a pose; what matters is shown in the window or is so close that its light gets there."""
-        each = 1 if float(job.camera.scale_at(job.t)) > _FINE_PX_PER_MM else 2
-        rows, columns = GRID_ROWS // each, GRID_COLUMNS // each
-        texels = SHEET_ROWS // rows
-        edges = sheet_place(np.arange(rows + 1.0) * texels - 0.5)
-        sheet = posed.vertices[: posed.layout.vertex_ends[0]]
-        shown = _in_window(sheet + job.anchor_mm, job, spare_mm, spare_px)
-        near = _grown(np.any(shown[sheet_neighbours()], axis=0))
-        middle = sheet_place((np.arange(rows, dtype=float) + 0.5) * texels - 0.5)
-        marks = [near[np.rint(middle).astype(int)][:, np.arange(columns) * near.shape[1] // columns]]
-        for _ in _LEVEL_RINGS[1:]:
-            rows_of = marks[-1][::2] | marks[-1][1::2]
-            marks.append(_grown(rows_of[:, ::2] | rows_of[:, 1::2]))
-        return cls(
-            rows,
-            columns,
-            Size(dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns)),
-            tuple(_numbers(np.flatnonzero(m)) for m in marks),
-            *(mi.Float(aligned(rows_of.astype(np.float32))) for rows_of in (edges, middle)),
-        )
+    def of(cls, cells: SheetCells) -> SheetGrid:
+        """Send the cells of a pose to the device."""
+        rows, columns = cells.rows, cells.columns
+        size = Size(dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns))
+        sent = tuple(_numbers(numbers) for numbers in cells.numbers)
+        return cls(rows, columns, size, sent, *(mi.Float(aligned(at)) for at in (cells.edges, cells.middles)))
 
     def measured(self, skin: SkinGeometry) -> SheetGrid:
         """The same grid with its metric on a posed surface."""
@@ -624,26 +598,17 @@ class GlobeGrid:
     over: mi.UInt32
 
     @classmethod
-    def of(cls, posed: RegionMesh, globe: Globe, reach_mm: float) -> GlobeGrid:
-        """Make the grid of a pose; light gets as far as `reach_mm` from under a lid."""
-        centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
-        y, z = (v + c for v, c in zip(_globe_cells(globe.radius_mm), centre[1:], strict=True))
-        upper, lower = (m[np.argsort(m[:, 1])] for m in (posed.upper_margin, posed.lower_margin))
-        over = np.maximum(z - np.interp(y, upper[:, 1], upper[:, 2]), np.interp(y, lower[:, 1], lower[:, 2]) - z)
-        beside = np.maximum(upper[0, 1] - y, y - upper[-1, 1])
-        away = np.maximum(over, beside)
-        between, under = np.flatnonzero(away < _EDGE_MM), np.flatnonzero((away > 0) & (away < reach_mm))
-        over = under // _SIDE // 2 * (_SIDE // 2) + under % _SIDE // 2
-        coarse = np.flatnonzero(np.bincount(over, minlength=_SIDE * _SIDE // 4))
-        return cls(*(_numbers(cells) for cells in (between, under, coarse, over)))
+    def of(cls, cells: GlobeCells) -> GlobeGrid:
+        """Send the cells of a pose to the device."""
+        return cls(*(_numbers(numbers) for numbers in (cells.between, cells.under, cells.coarse, cells.over)))
 
     def spread(self, irradiance: mi.Float, radius_mm: mi.Float, places: Places) -> mi.Float:
         """What leaves the globe between the lids, cell by cell, of the light that falls on it, to places about each."""
-        side, light = mi.UInt32(_SIDE), dr.zeros(mi.Float, _SIDE * _SIDE)
-        straight = Pyramid(_SIDE * _SIDE, (side, side), False)
+        side, light = mi.UInt32(SIDE), dr.zeros(mi.Float, SIDE * SIDE)
+        straight = Pyramid(SIDE * SIDE, (side, side), False)
         straight.fill(irradiance)
         index = self.between
-        start = mi.Float(index // _SIDE), mi.Float(index % _SIDE)
+        start = mi.Float(index // SIDE), mi.Float(index % SIDE)
         n = _globe_direction(*start)
         across = dr.normalize(mi.Vector3f(-n.y, n.x, 0))
         up = dr.cross(n, across)
@@ -653,19 +618,10 @@ class GlobeGrid:
             sine, cosine = dr.sincos(distance / radius_mm)
             out = (sine / distance) * (place.x * across + place.y * up)
             row, column = _globe_place(cosine * n + out)
-            return straight.at(row, column, _level(_FOOTPRINT * distance, _WIDTH / _SIDE * radius_mm)), row, column
+            return straight.at(row, column, _level(_FOOTPRINT * distance, WIDTH / SIDE * radius_mm)), row, column
 
         dr.scatter(light, places.share(start, read), index)
         return light
-
-
-@lru_cache(maxsize=4)
-def _globe_cells(radius_mm: float) -> tuple[Floats, Floats]:
-    """Places (y, z) of the cells of the grid over the globe about its middle, mm."""
-    row, column = np.divmod(np.arange(_SIDE * _SIDE), _SIDE)
-    a, b = ((k - 0.5 * (_SIDE - 1)) * (_WIDTH / _SIDE) for k in (column, row))
-    scale = radius_mm * np.sqrt(np.maximum(1 - 0.25 * (a * a + b * b), 0))
-    return frozen(a * scale), frozen(b * scale)
 
 
 def _spots(shift: tuple[mi.UInt32, mi.UInt32], k: mi.UInt32) -> tuple[mi.Float, mi.Float]:
@@ -709,36 +665,16 @@ def _numbers(cells: Ints) -> mi.UInt32:
     return mi.UInt32(aligned((cells if cells.size else np.zeros(1)).astype(np.uint32)))
 
 
-def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -> Bools:
-    """Which points (n, 3) are in a window, or beside it by no more than what is spare."""
-    camera, (x0, y0, width, height) = job.camera, job.window
-    xy, front = camera.project(points)
-    depth = np.maximum((points - camera.nodal_point_mm) @ camera.R[2], 1.0)
-    spare = spare_px + spare_mm * float(max(camera.K[0, 0], camera.K[1, 1])) / depth
-    with np.errstate(invalid="ignore"):
-        inside = np.abs(xy - (x0 + 0.5 * width, y0 + 0.5 * height)) < 0.5 * np.array([width, height]) + spare[..., None]
-    return np.asarray(front & inside[..., 0] & inside[..., 1])
-
-
-def _grown(marked: Bools) -> Bools:
-    """Marks of a grid, whose columns close, and of all neighbours."""
-    out = marked | np.roll(marked, 1, axis=1) | np.roll(marked, -1, axis=1)
-    grown = out.copy()
-    grown[1:] |= out[:-1]
-    grown[:-1] |= out[1:]
-    return grown
-
-
 def _globe_place(n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
     """Row and column of the grid over the globe in directions (scene's frame) from its centre, of any length."""
     n = dr.normalize(n)
-    scale = dr.sqrt(2 * dr.rcp(dr.maximum(1 + n.x, 0.1))) * (_SIDE / _WIDTH)
-    return scale * n.z + 0.5 * (_SIDE - 1), scale * n.y + 0.5 * (_SIDE - 1)
+    scale = dr.sqrt(2 * dr.rcp(dr.maximum(1 + n.x, 0.1))) * (SIDE / WIDTH)
+    return scale * n.z + 0.5 * (SIDE - 1), scale * n.y + 0.5 * (SIDE - 1)
 
 
 def _globe_direction(row: mi.Float, column: mi.Float) -> mi.Vector3f:
     """Directions (scene's frame) of places of the grid over the globe."""
-    a, b = ((k - 0.5 * (_SIDE - 1)) * (_WIDTH / _SIDE) for k in (column, row))
+    a, b = ((k - 0.5 * (SIDE - 1)) * (WIDTH / SIDE) for k in (column, row))
     q = a * a + b * b
     k = dr.sqrt(dr.maximum(1 - 0.25 * q, 0))
     return mi.Vector3f(1 - 0.5 * q, a * k, b * k)

@@ -87,6 +87,8 @@ class SurroundGeometry:
 class Surround:
     """The Mitsuba scene of the surround; `show` changes its look in place."""
 
+    posed = None  # no region
+
     def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
         places, faces, albedos = [_corners(10.0)], [np.array([[0, 1, 2], [0, 2, 3]])], [np.full(4, -1.0)]
         for body in obstacles:

@@ -15,7 +15,7 @@ from .blur import Blur
 from .frame import RenderJob
 from .glints import GlintTable
 from .labels import PartLabels
-from .splat import Mirrored, Patch
+from .splat import Mirrored, Shine
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +56,7 @@ class Traced(ArrayValue):
     Attributes:
         job: the frame's job.
         radiance: mean radiance of the pixels with the border that the lens needs, or its parts.
-        glints: the lamps' mirror images, blurred.
+        glints: what the lamps' mirror images add.
         blur: the lens.
         mirrored: the glints' places and energies.
         labels: raster labels, if they were requested.
@@ -67,7 +67,7 @@ class Traced(ArrayValue):
 
     job: RenderJob
     radiance: Singles
-    glints: tuple[Patch, ...]
+    glints: tuple[Shine, ...]
     blur: Blur
     mirrored: Mirrored
     labels: PartLabels | None
@@ -85,8 +85,8 @@ class Traced(ArrayValue):
         seen = (job.lens, job.camera, job.window)
         # Single precision is finer than the samples' noise, and takes half the time.
         picture = psf.blur(self.blur.of_pictures(self.radiance).astype(np.float32), job.sensor.psf_sigma_px)
-        for patch in self.glints:
-            picture[patch.rows, patch.columns] += patch.radiance
+        for shine in self.glints:
+            shine.add(picture, job)
         if job.lens.vignetting > 0:
             picture *= defocus.vignette(*seen)
         picture = stray.scattered(stray.framed(picture, *seen), *seen)

@@ -56,7 +56,7 @@ def headset_job(focus_mm: float, window: tuple[int, int, int, int]) -> RenderJob
 def blurred(renderer, job: RenderJob, spp: int) -> tuple[np.ndarray, np.ndarray]:
     """The picture blurred by depth, and the sharp one with the border that its blur needs."""
     shown, place = renderer.bind(job)
-    blur = Blur.of(job, place)
+    blur = Blur.of(job, place.posed)
     assert blur.layered
     x0, y0, w, h = job.window
     m = blur.reach
@@ -69,7 +69,7 @@ def test_lashes_before_the_eye_are_blurred_by_their_own_depth(renderer):
     ours, sharp = blurred(renderer, job, 16)
     truth = through_a_lens(renderer, job, 24, 4)
     m = (len(sharp) - len(ours)) // 2
-    single = defocus.defocused(sharp, Blur.of(job, renderer.bind(job)[1]).subject_px)
+    single = defocus.defocused(sharp, Blur.of(job, renderer.bind(job)[1].posed).subject_px)
     cut = (len(single) - len(ours)) // 2
     single = single[cut : len(single) - cut, cut : single.shape[1] - cut]
     away, before = (np.sqrt(np.mean((p - truth) ** 2)) / truth.mean() for p in (ours, single))
@@ -125,12 +125,12 @@ def test_only_pictures_whose_depths_show_are_layered(renderer):
     job = job_of(eye_of("E2"), rig, rig.window(64, 64), sensor=Sensor(f_number=4.0))
     depth = float(rig.camera.R[2] @ -rig.camera.nodal_point_mm)
     _, place = renderer.bind(job)
-    assert Blur.of(job, place) == Blur(job, 0.0, False, 0)
-    in_focus = Blur.of(replace(job, lens=Lens(focus_mm=depth)), place)
+    assert Blur.of(job, place.posed) == Blur(job, 0.0, False, 0)
+    in_focus = Blur.of(replace(job, lens=Lens(focus_mm=depth)), place.posed)
     assert not in_focus.layered
     assert in_focus.reach == 0
     near = headset_job(62.0, (0, 0, 64, 64))
-    assert Blur.of(near, renderer.bind(near)[1]).layered
+    assert Blur.of(near, renderer.bind(near)[1].posed).layered
 
 
 def test_the_depth_behind_the_cornea_is_that_of_its_oblique_image(renderer):

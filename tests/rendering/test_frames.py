@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 
 import numpy as np
 import pytest
@@ -55,10 +56,21 @@ def picture(renderer, **fields):
     return image
 
 
-def test_windows_that_overlap_are_those_rendered_one_by_one(renderer):
+def test_windows_that_overlap_are_those_rendered_one_by_one(renderer, monkeypatch):
+    from eyerender.region.mesh import region_mesh
+
     fields = {"region": {"seed": 3}, "lens": {"glare": 0.02}}
     frames = scene([(0.0, 0.0), (9.0, -4.0), (-6.0, 5.0)], **fields).frames()
+    threads: list[threading.Thread] = []
+
+    def mesh_by(*what):
+        threads.append(threading.current_thread())
+        return region_mesh(*what)
+
+    monkeypatch.setattr("eyerender.rendering.prepared.region_mesh", mesh_by)
     together = list(render_windows(frames, renderer=renderer))
+    assert len(threads) == 2  # those of the second and the third frame
+    assert threading.main_thread() not in threads
     for image in together:
         alone = renderer.render(render_job(frames, image.row), spp=4)
         assert np.array_equal(image.rendered.dn, alone.dn)

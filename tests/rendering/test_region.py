@@ -177,9 +177,9 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
     camera = s.rig.cameras[0]
     job = replace(render_job(s.frames(), 0), window=(0, 0, *camera.resolution_px))
     shown, _ = renderer.bind(job)
-    tiles, size = shown.plain(job.window)
+    tiles, size = shown.host.plain(job.window)
     width, height = job.window[2:]
-    plain = (np.kron(tiles, np.ones((size, size), bool))[:height, :width] & ~shown.fine(job.window)[0]).ravel()
+    plain = (np.kron(tiles, np.ones((size, size), bool))[:height, :width] & ~shown.host.fine(job.window)[0]).ravel()
     assert 0.3 < plain.mean() < 0.95
     u, v = pixels_of(dr.arange(mi.UInt32, width * height), *window_of(job.window))
     for du, dv in ((-0.45, -0.45), (0.45, -0.1), (0.0, 0.45)):
@@ -189,7 +189,7 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
         # A ray in a million or so slips between two triangles: Embree's test is not watertight.
         assert np.count_nonzero(~on_sheet.numpy().astype(bool)[plain]) <= 3
     quick = renderer.radiance(job)
-    monkeypatch.setattr("eyerender.rendering.stage.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000))
+    monkeypatch.setattr("eyerender.rendering.prepared.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000))
     slow = renderer.radiance(job)
     # And that pixel then lacks a sample, where each is asked.
     assert np.count_nonzero(quick != slow) < 1e-4 * plain.size
@@ -207,7 +207,7 @@ def test_plain_tiles_leave_no_seam_where_fine_shadows_begin(renderer, monkeypatc
     s = Scene.of(SceneSpec.from_mapping(data))
     job = replace(render_job(s.frames(), 0), window=(0, 0, 640, 320))
     quick = renderer.radiance(job)
-    monkeypatch.setattr("eyerender.rendering.stage.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000))
+    monkeypatch.setattr("eyerender.rendering.prepared.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000))
     slow = renderer.radiance(job)
     # Some pixels lack a sample without plain tiles, as above.
     assert np.count_nonzero(np.abs(quick - slow) > 0.01 * np.median(slow)) < 1e-4 * slow.size
@@ -248,7 +248,7 @@ def test_hairs_are_sampled_more_finely(renderer, monkeypatch):
     monkeypatch.setattr(film, "_TIMES", 1)
     (plain,) = images(renderer, region=spec, spp=8)
     job = render_job(scene(region=spec).frames(), 0)
-    fine, _ = renderer.bind(job)[0].fine(job.window)
+    fine, _ = renderer.bind(job)[0].host.fine(job.window)
     assert 0.02 < fine.mean() < 0.4
     # Not the standard deviation: a mirror image of the lamp in a drop of water outweighs all hairs.
     error = [np.percentile(np.abs(p.irradiance - many.irradiance)[fine], 90) for p in (few, plain)]
@@ -265,7 +265,7 @@ def test_fine_pixels_are_those_that_hairs_touch(renderer):
     job = render_job(scene(region={}).frames(), 0)
     x0, y0, width, height = job.window
     shown, place = renderer.bind(job)
-    fine, wet = shown.fine(job.window)
+    fine, wet = shown.host.fine(job.window)
     row, column = np.mgrid[y0 : y0 + height, x0 : x0 + width].reshape(2, -1)
     hairs = np.zeros(height * width, dtype=bool)
     for k in range(36):
@@ -283,6 +283,6 @@ def test_which_pixels_are_fine_does_not_depend_on_the_window(renderer):
     job = render_job(scene(region={}).frames(), 0)
     x0, y0 = job.window[:2]
     shown = renderer.bind(job)[0]
-    for whole, part in zip(shown.fine(job.window), shown.fine((x0 + 30, y0 + 20, 90, 70)), strict=True):
+    for whole, part in zip(shown.host.fine(job.window), shown.host.fine((x0 + 30, y0 + 20, 90, 70)), strict=True):
         assert 0 < whole.mean() < 0.4
         assert np.array_equal(part, whole[20:90, 30:120])

@@ -36,18 +36,18 @@ def grids(renderer, bound):
     import mitsuba as mi
 
     from eyerender.rendering import subsurface as light
-    from eyerender.rendering.frame import globe_of
     from eyerender.rendering.region import SHEET_COLUMNS
+    from eyerender.rendering.tissuecells import SIDE, GlobeCells, SheetCells
 
     shown, place = renderer.bind(bound)
-    sheet = light.SheetGrid.of(place.posed, bound, 100.0, 0).measured(place.skin)
+    sheet = light.SheetGrid.of(SheetCells.of(place.posed, bound, 100.0, 0)).measured(place.skin)
     row, column = sheet.sent[0] // sheet.columns, sheet.sent[0] % sheet.columns
     across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / sheet.columns)
     x, _ = place.skin.sheet_point(sheet.vertex_row(row, mi.Float(0.5)), across)
     on_sheet = np.zeros((sheet.rows * sheet.columns, 3), np.float32)
     on_sheet[sheet.sent[0].numpy()] = x.numpy().T
-    globe = light.GlobeGrid.of(place.posed, globe_of(bound.eye, bound.M, bound.t - bound.anchor_mm), 8.0)
-    n = light._globe_direction(*(mi.Float(k) for k in np.divmod(np.arange(light._SIDE**2), light._SIDE)))
+    globe = light.GlobeGrid.of(GlobeCells.of(place.posed, bound.globe, 8.0))
+    n = light._globe_direction(*(mi.Float(k) for k in np.divmod(np.arange(SIDE**2), SIDE)))
     on_globe = float(bound.eye.sclera.radius_mm) * n.numpy().T
     return sheet, on_sheet.reshape(sheet.rows, sheet.columns, 3), globe, on_globe, shown.values.sclera.radius
 

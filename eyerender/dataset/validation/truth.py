@@ -236,9 +236,10 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
     eye, camera = view.eye, scene.rig.cameras[view.camera]
     mirror = GlintScene(
         eye.front[0], float(eye.front_indices[0]), film_index(eye, scene.spec.look), float(eye.limbus_radius_mm),
-        np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), view.M, view.t, camera, _all_clear,
+        np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), view.M, view.t, camera,
     )  # fmt: skip
-    glints = mirror.glints(scene.rig.lights, scene.spec.sensor.psf_sigma_px)
+    images = mirror.images(scene.rig.lights, scene.spec.sensor.psf_sigma_px)
+    glints = mirror.glints(scene.rig.lights, images, _all_clear)
     picture = scene.spec.image
     # The glints of a meshed cornea are off by some thousandths of a pixel at the default edge of 0.1 mm.
     spare = SPOT_PX + (2 * picture.mesh_edge_mm**2 if picture.surfaces == "mesh" else 0.0)
