@@ -377,11 +377,14 @@ class Exchange:
         self._interiors: KeptForEye[_Interior] = KeptForEye()
         self._shares: tuple[_Plan, _Interior, csr_array] | None = None  # of the last frame
 
-    def received(
+    def begun(
         self, host: Prepared, values: Values, lights: Lights, panels: Lights, textures: Textures,
         place: Surround | RegionScene,
-    ) -> Received:  # fmt: skip
-        """Compute what the places of a frame receive.
+    ) -> Callable[[], Received]:  # fmt: skip
+        """Find what the places of a frame receive straight from the lamps, and what they see of each other.
+
+        Returns:
+            What solves for all light, on the host. Before that the device may be given other work.
 
         Args:
             host: the frame's job, and the places on the globe.
@@ -400,14 +403,16 @@ class Exchange:
         interior = self._inside(job)
         frame = _Frame(job, grid, interior, plan, self._shares_of(plan, interior), points, normals, plane)
         if not job.interreflection and not values.structure.ambient:
-            return frame.dark(region)
+            return lambda: frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
         outer = _sent(frame.outer.ravel())
         direct, ambient = _direct(values, lights, panels, place.scene, textures, frame, outer)
         mirrored = _mirrored(values, lights, place.scene, frame)
         lamps, more = (_direct_inside(values, some, place.scene, frame.interior.rows) for some in (lights, panels))
         seen = _seen(values, lights, textures, place, numbers, frame, outer)
-        return frame.solved(region, numbers, direct, mirrored, ambient, lamps, more, seen)
+        # Nothing is read before all is launched, because every read waits for all launches.
+        known = direct(), mirrored(), ambient(), lamps(), more(), seen()
+        return lambda: frame.solved(region, numbers, *known)
 
     def _inside(self, job: RenderJob) -> _Interior:
         """The chamber of a job's eye."""
@@ -514,7 +519,7 @@ class _Frame:
 
     def solved(
         self, region: RegionScene | None, numbers: Received, direct: Floats, mirrored: Floats,
-        ambient: tuple[Floats, Floats, Floats, Floats], lamps: Floats, panels: Floats, seen: _Seen,
+        ambient: list[Floats], lamps: Floats, panels: Floats, seen: _Seen,
     ) -> Received:  # fmt: skip
         """Solve for the irradiance of all places, which `numbers` hold without their light."""
         job, outside = self.job, self.outside
@@ -588,8 +593,8 @@ def _spots(i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
 
 def _direct(
     values: Values, lights: Lights, panels: Lights, scene: mi.Scene, textures: Textures, frame: _Frame, outer: mi.Float
-) -> tuple[Floats, tuple[Floats, Floats, Floats, Floats]]:
-    """Irradiance of places outside the eye, whose points and normals are in `outer`.
+) -> tuple[Callable[[], Floats], Callable[[], list[Floats]]]:
+    """Irradiance of places outside the eye, whose points and normals are in `outer`, to be read later.
 
     Straight from the lamps; from ambient light without shadows: what is soft, and the rest; this rest from its parts,
     without and with shadows.
@@ -598,18 +603,17 @@ def _direct(
     kinds = tuple(dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.on_skin, count - IRIS_TURNS))
     ways = values, scene, outer, kinds
     lit = _over_lamps(lights, count, lambda first: _onto_outer(*ways, lights, textures.lamp_views, first, count)[0])
-    soft = hard = free = shaded = np.zeros(count)
+    soft = hard = free = shaded = None
     if values.structure.ambient:
         assert textures.ambience is not None
         index = dr.arange(mi.UInt32, count)
         n = _row(outer, 6, index)
-        both = textures.ambience.irradiances(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
-        dr.eval(both)
-        soft, hard = (np.asarray(part.numpy(), dtype=float) for part in both)
+        soft, hard = textures.ambience.irradiances(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
+        dr.eval(soft, hard)
     if len(panels):
-        parts = _onto_outer(*ways, panels, None, None, count)
-        shaded, free = (np.asarray(part.numpy(), dtype=float) for part in parts)
-    return lit, (soft, hard, free, shaded)
+        shaded, free = _onto_outer(*ways, panels, None, None, count)
+    parts = soft, hard, free, shaded
+    return lit, lambda: [np.zeros(count) if part is None else part.numpy().astype(float) for part in parts]
 
 
 @recorded
@@ -635,22 +639,27 @@ def _onto_outer(
     return found
 
 
-def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) -> Floats:
+def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) -> Callable[[], Floats]:
     """Irradiance of places outside the eye from the lamps by way of the cornea: of skin near it that may face it."""
     total, job = np.zeros(frame.outside), frame.job
     if frame.plan.skin is None or not len(lights) or not job.interreflection:
-        return total
+        return lambda: total
     bulge = job.M @ (np.asarray(job.eye.front[0].origin_mm) - [CORNEA_MM, 0, 0]) + (job.t - job.anchor_mm)
     way = bulge - frame.points
     near = (lengths(way) < _CLOSE_MM) & (dots(way, frame.normals) > -0.5 * CORNEA_MM)
     places = np.flatnonzero(near)
-    if len(places):
-        lanes = -(-len(places) // _MIRRORED) * _MIRRORED
-        padded = np.append(places, np.full(lanes - len(places), places[0]))
-        rows = _sent(np.column_stack([frame.points[padded], frame.normals[padded]]).ravel())
-        lit = _over_lamps(lights, lanes, lambda first: _off_cornea(values, lights, scene, rows, first, lanes))
-        total[frame.on_globe + places] = lit[: len(places)]
-    return total
+    if not len(places):
+        return lambda: total
+    lanes = -(-len(places) // _MIRRORED) * _MIRRORED
+    padded = np.append(places, np.full(lanes - len(places), places[0]))
+    rows = _sent(np.column_stack([frame.points[padded], frame.normals[padded]]).ravel())
+    lit = _over_lamps(lights, lanes, lambda first: _off_cornea(values, lights, scene, rows, first, lanes))
+
+    def read() -> Floats:
+        total[frame.on_globe + places] = lit()[: len(places)]
+        return total
+
+    return read
 
 
 @recorded
@@ -667,10 +676,10 @@ def _off_cornea(
     return lit
 
 
-def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float) -> Floats:
+def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float) -> Callable[[], Floats]:
     """Irradiance (PLACES,) of the chamber's places straight from lamps; rows hold them as in `_Interior`."""
     if len(lights) == 0:
-        return np.zeros(PLACES)
+        return lambda: np.zeros(PLACES)
     return _over_lamps(lights, PLACES, lambda first: _inside(values, lights, scene, rows, first))
 
 
@@ -693,13 +702,10 @@ def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, fir
     return dr.concat(parts)
 
 
-def _over_lamps(lights: Lights, width: int, light: Callable[[mi.UInt32], mi.Float]) -> Floats:
+def _over_lamps(lights: Lights, width: int, light: Callable[[mi.UInt32], mi.Float]) -> Callable[[], Floats]:
     """Mean (width,) of `light` over places on the lamps' discs, which begin with a number; small lamps need one."""
-    count = 1 if lights.widest < _SMALL else _SPOTS
-    total = np.zeros(width)
-    for k in range(count):
-        total += light(dr.opaque(mi.UInt32, k * width)).numpy()
-    return total / count
+    parts = [light(dr.opaque(mi.UInt32, k * width)) for k in range(1 if lights.widest < _SMALL else _SPOTS)]
+    return lambda: sum((part.numpy() for part in parts), np.zeros(width)) / len(parts)
 
 
 def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
@@ -714,7 +720,7 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
 def _seen(
     values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame,
     outer: mi.Float,
-) -> _Seen:  # fmt: skip
+) -> Callable[[], _Seen]:  # fmt: skip
     """What the rays of the places outside and of those in the chamber meet."""
     plan, interior = frame.plan, frame.interior
     inside = interior.gain.shape[1]
@@ -726,14 +732,20 @@ def _seen(
         values, textures, place.scene, numbers, plan.of_place, outer, interior.leaving, (outside, all_rays), kinds,
         -(-rays // _LANES) * _LANES,
     )  # fmt: skip
-    lit = np.full(rays, -1.0, np.float32)
+    globe, found = frame.on_globe * RAYS, None
     if plan.skin is not None and len(lights):
-        globe = frame.on_globe * RAYS
         views, ends = textures.lamp_views, (dr.opaque(mi.UInt32, globe), outside)
-        found = _at_spots(values, lights, place.scene, views, spot, ends, globe + inside).numpy()
-        lit[:globe], lit[plan.rays :] = found[:globe], found[globe:]
-    target, weight, close, sky, free = (r.numpy()[:rays] for r in results)
-    return _Seen(frame.shares, target, weight, close, sky, free, lit)
+        found = _at_spots(values, lights, place.scene, views, spot, ends, globe + inside)
+
+    def read() -> _Seen:
+        lit = np.full(rays, -1.0, np.float32)
+        if found is not None:
+            straight = found.numpy()
+            lit[:globe], lit[plan.rays :] = straight[:globe], straight[globe:]
+        target, weight, close, sky, free = (r.numpy()[:rays] for r in results)
+        return _Seen(frame.shares, target, weight, close, sky, free, lit)
+
+    return read
 
 
 @traversed

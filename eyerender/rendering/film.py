@@ -141,9 +141,6 @@ def mean_parts(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Sin
 def begun(shown: Exposed, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
     """Begin to take the samples of a window: for the radiance; or `layered` for radiance, weight, nearness of parts."""
     width, height = window[2:]
-    for grid in (shown.lights.on_iris, shown.lights.on_matte, shown.lights.relief):
-        if grid is not None:
-            grid.make()
     grouped = shown.values.structure.region
     if not grouped and not layered and spp >= _MANY:
         return Film(*_adaptive(shown, window, spp, seed), (height, width), spp, layered)

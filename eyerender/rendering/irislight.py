@@ -32,7 +32,7 @@ class IrisLight:
     DRJIT_STRUCT = leaves("_stop", "_points", "_used", "_half", "_cells", "_left")
 
     def __init__(self, values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None) -> None:
-        """Prepare the grid.
+        """Fill the grid.
 
         Args:
             values: the scene's numbers.
@@ -47,6 +47,7 @@ class IrisLight:
         self._half = values.iris.root_radius + _SPARE_MM
         self._cells: mi.Float | None = None
         self._left: mi.UInt32 | None = None
+        self._fill()
 
     def at(self, x: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
         """Irradiance (mW/mm^2) at points of the plane of the iris (eye frame), and the lamps that it lacks.
@@ -67,10 +68,7 @@ class IrisLight:
         left = dr.gather(mi.UInt32, self._left, cell, inside)
         return dr.select(inside, dr.maximum(total, 0), 0), dr.select(inside, left, ALL)
 
-    def make(self) -> None:
-        """Fill the grid, once."""
-        if self._cells is not None:
-            return
+    def _fill(self) -> None:
         if self._lights.gridded and len(self._lights):
             self._cells, self._left = self._filled(
                 self._values, self._lights, self._scene, self._views, len(self._lights)

@@ -71,7 +71,7 @@ class IrisRelief:
         self, job: RenderJob, values: Values, lights: Lights, scene: mi.Scene, textures: Textures,
         shapes: KeptForEye[Shape],
     ) -> None:  # fmt: skip
-        """Prepare the grid.
+        """Fill the grid.
 
         Args:
             job: the job of the frame.
@@ -93,6 +93,7 @@ class IrisRelief:
         self._each = dr.opaque(mi.UInt32, lights.points)
         self._heights: mi.Float | None = None
         self._shades: mi.Float | None = None
+        self._fill()
 
     def hit(self, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Foot in the plane (eye frame) of the place that rays meet.
@@ -115,10 +116,7 @@ class IrisRelief:
         active &= self._on
         return dr.select(active, self._on_grid(self._shades, x, active), 1)
 
-    def make(self) -> None:
-        """Fill the grids, once."""
-        if self._heights is not None:
-            return
+    def _fill(self) -> None:
         if not self._textures.raised:
             self._heights = self._shades = dr.zeros(mi.Float, 4)
             dr.make_opaque(self._heights)

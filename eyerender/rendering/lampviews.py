@@ -45,18 +45,18 @@ class LampViews:
         lights: the lamps.
         anchor_mm: origin of the scene's frame in the world.
         reach_mm: distance from this origin within which skin matters.
-        region: the posed region; None for one whose sheet is not known to be one surface, where every cell is marked.
+        region: the posed region. If its sheet is not known to be one surface, every cell is marked.
     """
 
     DRJIT_STRUCT = leaves("_table", "_known", "_marks")
 
-    def __init__(self, lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float, region: RegionScene | None) -> None:
+    def __init__(self, lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float, region: RegionScene) -> None:
         reach = min(reach_mm, _REACH_MM)
         # Without lamps nothing reads the table, but kernels cannot be compiled for an empty one.
         table = [_frame(lamp, anchor_mm, reach) for lamp in lights] or [[0.0] * _WIDTH]
         self._table = mi.Float(aligned(np.array(table, dtype=np.float32).reshape(-1)))
-        self._known = dr.opaque(mi.Bool, region is not None)
-        if region is None:
+        self._known = dr.opaque(mi.Bool, region.skin.is_sheet)
+        if not region.skin.is_sheet:
             self._marks = dr.zeros(mi.UInt8, 1)
         else:
             skin, pieces = region.skin, _pieces(region.posed)

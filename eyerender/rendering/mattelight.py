@@ -36,7 +36,7 @@ class MatteLight:
     DRJIT_STRUCT = leaves("_used", "_reach", "_grids")
 
     def __init__(self, values: Values, lights: Lights, scene: mi.Scene, received: Received, reach_mm: float) -> None:
-        """Prepare the grids.
+        """Fill the grids.
 
         Args:
             values: the scene's numbers.
@@ -50,6 +50,7 @@ class MatteLight:
         self._used = dr.opaque(mi.Bool, lights.gridded)
         self._reach = dr.opaque(mi.Float, reach_mm)
         self._grids: tuple[LightGrid, LightGrid] | None = None
+        self._fill()
 
     def at(self, values: Values, view: View) -> tuple[mi.Float, mi.Bool]:
         """Irradiance (mW/mm^2) at points that are seen, and whether it is known: not on the rim of the cornea."""
@@ -69,10 +70,7 @@ class MatteLight:
         found: tuple[mi.Float, mi.Bool] = dr.if_stmt((view.point,), view.other, on_plane, on_globe)
         return found
 
-    def make(self) -> None:
-        """Fill the grids, once."""
-        if self._grids is not None:
-            return
+    def _fill(self) -> None:
         if not self._lights.gridded:
             self._grids = LightGrid(_SIDE), LightGrid(_SIDE)
             return

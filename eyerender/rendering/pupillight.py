@@ -22,7 +22,7 @@ class PupilLight:
     DRJIT_STRUCT = leaves("_cells")
 
     def __init__(self, values: Values, lights: Lights, scene: mi.Scene, returned: FundusLight) -> None:
-        """Prepare the grid.
+        """Fill the grid.
 
         Args:
             values: the scene's numbers.
@@ -33,6 +33,7 @@ class PupilLight:
         self._values, self._lights, self._scene = values, lights, scene
         self._factors = aligned(np.ascontiguousarray(returned.factors, dtype=np.float32).reshape(-1))
         self._cells: mi.Float | None = None
+        self._fill()
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> mi.Float:
         """Radiance at coordinates of the stop in units of its semi-axes, bilinearly."""
@@ -47,10 +48,7 @@ class PupilLight:
         low, high = (dr.lerp(cell(0, k), cell(1, k), s) for k in (0, 1))
         return dr.lerp(low, high, t)
 
-    def make(self) -> None:
-        """Fill the grid, once."""
-        if self._cells is not None:
-            return
+    def _fill(self) -> None:
         if not len(self._lights) or not self._factors.any():
             self._cells = dr.zeros(mi.Float, CELLS * CELLS)
             dr.make_opaque(self._cells)

@@ -74,6 +74,8 @@ class Stage:
         """
         host, place = self._prepared(job)
         region = place if isinstance(place, RegionScene) else None
+        # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
+        views = None if region is None else LampViews(host.sunlit.lights, job.anchor_mm, _reach_mm(job), region)
         structure = Structure(
             kinds(job.eye),
             bool(np.any(job.camera.distortion)),
@@ -82,39 +84,47 @@ class Stage:
             job.ambient.model_copy(update={"sun": None}) != Ambient(),
             region is not None and region.skin.is_sheet and job.look.scattering is not None,
         )
-        anchor = job.anchor_mm
         values = Values(structure, host.parameters, boundary_waves(job.eye), tables(job.eye))
         if job.mesh_edge_mm is not None:
             values.surfaces = meshed(values.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
         lights = Lights(host.lamps, len(host.lamps) - len(job.lights))
         textures = self._textures_of(job)
+        if isinstance(place, RegionScene):
+            textures = replace(textures, region=place.skin, lamp_views=views)
+        else:
+            textures = replace(textures, surround=place.geometry)
+        if structure.scattering and lit:
+            assert region is not None
+            assert views is not None
+            tissues = tissue_light(job, values, lights, region, views, host.tissue_cells)
+            textures = replace(textures, tissues=tissues)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
-            ambience = Ambience(even, panel_table(job.ambient, anchor), job.ambient.map, self._maps)
+            ambience = Ambience(even, panel_table(job.ambient, job.anchor_mm), job.ambient.map, self._maps)
             textures = replace(textures, ambience=ambience)
-
-        pupil = PupilLight(values, lights, place.scene, host.returned)
-        pupil.make()
-        textures = replace(textures, pupil=pupil)
-        if isinstance(place, Surround):
-            textures = replace(textures, surround=place.geometry)
-        if region is not None:
-            lamps, sheet = host.sunlit.lights, region if region.skin.is_sheet else None
-            views, tissues = LampViews(lamps, anchor, _reach_mm(job), sheet), None
-            if structure.scattering and lit:
-                tissues = tissue_light(job, values, lights, region, views, host.tissue_cells)
-            textures = replace(textures, region=region.skin, lamp_views=views, tissues=tissues)
+        textures = replace(textures, pupil=PupilLight(values, lights, place.scene, host.returned))
         if lit:
-            parts = panel_lamps(job.ambient, anchor)
-            if textures.ambience is not None:
-                parts += textures.ambience.bright(anchor)
-            panels = Lights(light_table(parts, job.M, job.t))
-            received = self._exchange.received(host, values, lights, panels, textures, place)
-            textures = replace(textures, received=received)
-            lights.relief = IrisRelief(job, values, lights, place.scene, textures, self._shapes)
-        _spread(job, values, lights, textures, place)
-
+            textures = self._lit(host, values, lights, textures, place)
         return Exposed(place.scene, values, lights, textures, host), place
+
+    def _lit(
+        self, host: Prepared, values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene
+    ) -> Textures:
+        """The textures with the light between surfaces; prepares the grids of the lamps' light that a frame can use."""
+        job = host.job
+        parts = panel_lamps(job.ambient, job.anchor_mm)
+        if textures.ambience is not None:
+            parts += textures.ambience.bright(job.anchor_mm)
+        panels = Lights(light_table(parts, job.M, job.t))
+        exchange = self._exchange.begun(host, values, lights, panels, textures, place)
+        if not place.obstructed or (isinstance(place, RegionScene) and place.skin.is_sheet):
+            lights.on_iris = IrisLight(values, lights, place.scene, textures.lamp_views)
+        lights.relief = IrisRelief(job, values, lights, place.scene, textures, self._shapes)
+        received = exchange()
+        if not place.obstructed:
+            reach = min(_reach_mm(job), _FARTHEST_MM)
+            lights.on_matte = MatteLight(values, lights, place.scene, received, reach)
+        return replace(textures, received=received)
 
     def _prepared(self, job: RenderJob) -> tuple[Prepared, Surround | RegionScene]:
         """What NumPy makes of a job, and its posed surroundings."""
@@ -170,15 +180,6 @@ class Stage:
                 self._textures.pop(next(iter(self._textures)))
             self._textures[key] = Textures.of(job.look)
         return self._textures[key]
-
-
-def _spread(job: RenderJob, values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene) -> None:
-    """Prepare the grids of the lamps' light that a frame can use."""
-    if not place.obstructed or (isinstance(place, RegionScene) and place.skin.is_sheet):
-        lights.on_iris = IrisLight(values, lights, place.scene, textures.lamp_views)
-    if textures.received is not None and not place.obstructed:
-        reach = min(_reach_mm(job), _FARTHEST_MM)
-        lights.on_matte = MatteLight(values, lights, place.scene, textures.received, reach)
 
 
 def _reach_mm(job: RenderJob) -> float:

@@ -22,7 +22,6 @@ def test_the_grid_gives_the_light_of_exact_paths(renderer, model, name):
     u, v = (np.asarray(eye.stop.rotation)[:, k] for k in (1, 2))
     x = np.asarray(eye.stop.centre_mm) + np.outer(rho * np.cos(turn), u) + np.outer(rho * np.sin(turn), v)
     grid = renderer.bind(job)[0].lights.on_iris
-    grid.make()
     found, left = (k.numpy() for k in grid.at(mi.Vector3f(*x.astype(np.float32).T), mi.Bool(True)))
     known = left == 0
     lacked = left[rho < 3.0, None] >> np.arange(len(job.lights)) & 1

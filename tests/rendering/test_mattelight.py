@@ -18,7 +18,6 @@ def test_the_grids_change_no_pixel(renderer, monkeypatch, model, name, pose):
     job = rigs.job_of(eye, rig, rig.window(240, 180), pose, labels=False)
     found, part = renderer.radiance(job, spp=4), renderer.labels(job).part
     grids = renderer.bind(job)[0].lights.on_matte
-    grids.make()
     used = [float(np.mean(g.rows.numpy()[::4] > 0)) for g in grids._grids]
     assert min(used) > 0.2
     monkeypatch.setattr(stage, "MatteLight", lambda *_: None)
