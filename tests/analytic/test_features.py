@@ -243,8 +243,10 @@ def test_purkinje_images_of_a_four_surface_eye():
     assert np.isnan(reduced.glints_px[:, 0, 1]).all()
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-@pytest.mark.parametrize(("name", "order"), [("E3", 3), ("E4", 3), ("E4", 4), ("E5", 3), ("E5", 4)])
+@pytest.mark.parametrize(
+    ("name", "order", "side"),
+    [("E3", 3, "right"), ("E4", 3, "left"), ("E4", 4, "right"), ("E5", 3, "right"), ("E5", 4, "left")],
+)
 def test_the_iris_hides_images_of_the_lens_from_the_pupil_on_that_just_lets_them_pass(name, order, side):
     """The narrowest pupil, from where the ray crosses the stop's plane on its way in and out, found here by tracing."""
     cameras, lights = rig()

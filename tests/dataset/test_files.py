@@ -186,9 +186,8 @@ def test_paths_start_at_the_spec_wherever_the_command_and_its_workers_run(made, 
     shutil.copytree(made / "spec", copy)
     (tmp_path / "here").mkdir()
     for argv, folder in (
-        (["../elsewhere/spec.yaml", "one", "--workers", "2", "--threads", "2"], "one"),
-        (["../elsewhere/spec.yaml", "two", "--workers", "1", "--shard", "2/2"], None),
-        (["../elsewhere/spec.yaml", "two", "--workers", "1", "--shard", "1/2"], "two"),
+        (["../elsewhere/spec.yaml", "parts", "--workers", "2", "--threads", "2", "--shard", "2/2"], None),
+        (["../elsewhere/spec.yaml", "parts", "--workers", "1", "--shard", "1/2"], "parts"),
     ):
         process = command("generate", *argv, cwd=tmp_path / "here")
         _, err = process.communicate(timeout=300)

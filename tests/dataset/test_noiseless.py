@@ -19,7 +19,7 @@ pytestmark = pytest.mark.render
 SMALL = {"count": 4, "subjects": 2, "shard_size": 2, "splits": {"train": 1.0}}
 
 
-@pytest.fixture(scope="module", params=[16, 8])
+@pytest.fixture(scope="module", params=[8, pytest.param(16, marks=pytest.mark.slow)])
 def folders(request, tmp_path_factory):
     """The same spec with both exposures, with the noisy one alone, and with a sensor that has no noise."""
     place = tmp_path_factory.mktemp("noiseless")
