@@ -9,7 +9,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, ClassVar, Self, TypeVar
+from operator import is_
+from typing import Any, ClassVar, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,25 +49,25 @@ def sealed(array: _Array) -> _Array:
     return array
 
 
-_Value = TypeVar("_Value")
+_Values = ParamSpec("_Values")
 _Result = TypeVar("_Result")
 _REMEMBERED = 8
 
 
-def remembered(function: Callable[[_Value], _Result]) -> Callable[[_Value], _Result]:
+def remembered(function: Callable[_Values, _Result]) -> Callable[_Values, _Result]:
     """Keep a function's results for the last few values, compared by identity: comparing arrays may take longer."""
-    known: list[tuple[_Value, _Result]] = []
+    known: list[tuple[tuple[object, ...], _Result]] = []
 
     @wraps(function)
-    def found(value: _Value) -> _Result:
-        for one, result in known:
-            if one is value:
+    def found(*values: Any) -> _Result:
+        for some, result in known:
+            if all(map(is_, some, values)):
                 return result
-        result = function(value)
-        known[:] = [*known[1 - _REMEMBERED :], (value, result)]
+        result = function(*values)  # type: ignore[call-arg]
+        known[:] = [*known[1 - _REMEMBERED :], (values, result)]
         return result
 
-    return found
+    return found  # type: ignore[return-value]
 
 
 class ArrayValue:

@@ -64,7 +64,8 @@ class Contour(ArrayValue):
 
 def step(x: NDArray[Any] | float, low: float, high: float) -> NDArray[Any]:
     """Smooth step from 0 at `low` to 1 at `high`, in the precision of `x`."""
-    s = np.minimum(np.maximum((np.asarray(x) - low) / (high - low), 0), 1)  # `np.clip` takes longer
+    s = np.asarray((np.asarray(x) - low) / (high - low))
+    np.minimum(np.maximum(s, 0, out=s), 1, out=s)  # `np.clip` takes longer
     return np.asarray(s * s * (3 - 2 * s))
 
 

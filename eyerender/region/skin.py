@@ -406,7 +406,7 @@ class _Strip:
         along = self.tiles.mixed(self.along, (1.6, 14, (5, 15), (12, 34)), (0.5, 15, (12, 36), (24, 60)))
         swell = self.field(13, (7, 20), (7, 20))
         lines = self.tiles.at(11, _places(y, self.level + self.slowly("sway")), (0, 6), (22, 60))
-        filled = 0.2 + 0.65 * self.roots**3
+        filled = 0.2 + 0.65 * self.roots * self.roots * self.roots
         fine = (1 - filled * oil) * (cells + 0.03 * grain)
         height = skin.relief_mm * (fine + 1.3 * swell + along)
         return np.asarray(height - (1 - 0.7 * oil) * self.slowly("lines") * np.abs(lines))
@@ -419,7 +419,8 @@ class _Strip:
         """
         y, out_mm, tiles = self.y, self.out_mm, self.tiles
         reach = step(out_mm, 0.4, 2.0) * np.exp(-np.square(np.maximum(out_mm - 7.0, 0) * 0.2))
-        reach = reach * step(np.abs(self.upper), 0.05, 0.5) * np.exp(-((np.square(y * (1 / 21.0))) ** 3))
+        far = np.square(y * (1 / 21.0))
+        reach = reach * step(np.abs(self.upper), 0.05, 0.5) * np.exp(-far * far * far)
         depth = np.zeros_like(y)
         if not np.any(reach > 1e-3):
             return depth

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
+from ..arrays import ArrayValue, Bools, Floats, Ints, Singles, frozen, remembered
 from ..eye.meshes import chamber_rim
 from ..eye.model import EyeModel
 from ..geometry.surfaces import Surface, components
@@ -96,6 +96,7 @@ def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
     return _through_limbus(chamber, eye.front[0], float(eye.limbus_radius_mm), float(width_mm))
 
 
+@remembered
 def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
     """Bundle the rays that leave an eye: those of like origin and direction, from whatever places, are one bundle.
 
@@ -114,17 +115,21 @@ def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
     # Some rays are there twice at first, so that all bundles have the same number.
     full = -(-len(rays) // count) * count
     order = np.arange(full) * len(rays) // full
-    at = (rays[:, :6] * np.repeat([1.0, _FAR_MM], 3)).astype(np.float32)
-    for k in range(halvings + 1):
-        order = order.reshape(2**k, -1)
-        away = at[order]
-        away -= away.mean(axis=1, keepdims=True)
-        if k == halvings:
-            break
-        widest = np.argmax(np.einsum("ijk,ijk->ik", away, away), axis=1)
-        along = np.take_along_axis(away, widest[:, None, None], axis=2)[..., 0]
-        order = np.take_along_axis(order, np.argsort(along, axis=1, kind="stable"), axis=1)
-    middle = order[np.arange(count), np.argmin(np.einsum("ijk,ijk->ij", away, away), axis=1)]
+    at = (rays[:, :6] * np.repeat([1.0, _FAR_MM], 3)).astype(np.float32).T.take(order, axis=1)
+
+    def off_middle(parts: int) -> Singles:
+        """Deviations (6, parts, rays) from the mean of each part."""
+        of_part = at.reshape(6, parts, -1)
+        return np.asarray(of_part - of_part.mean(axis=2, keepdims=True))
+
+    for k in range(halvings):
+        off = off_middle(2**k)
+        widest = np.argmax(np.einsum("ijk,ijk->ij", off, off), axis=0)
+        half = np.argpartition(off[widest, np.arange(2**k)], off.shape[2] // 2, axis=1)
+        half += off.shape[2] * np.arange(2**k)[:, None]
+        order, at = order.take(half.ravel()), at.take(half.ravel(), axis=1)
+    off, order = off_middle(count), order.reshape(count, -1)
+    middle = order[np.arange(count), np.argmin(np.einsum("ijk,ijk->jk", off, off), axis=1)]
     bundle = np.empty(len(rays), dtype=int)
     bundle[order] = np.arange(count)[:, None]
     gain = csr_array((rays[:, 6] / RAYS, (place, bundle)), shape=(PLACES, count))
