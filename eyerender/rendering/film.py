@@ -314,11 +314,10 @@ def _groups(
         (dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])),
         *(tuple(dr.opaque(mi.UInt32, n) for n in part) for part in (window[2:], numbers, (across, *tiles.shape))),
     )
-    finely, wet = (marks.ravel() for marks in shown.host.fine(window))
-    pattern, chosen = Pattern.of(spp, seed, times), np.flatnonzero(finely) if times > 1 else np.zeros(0, int)
-    marks = (finely + 2 * wet).astype(np.uint32)
-    marks[chosen] |= 4 * np.arange(1, len(chosen) + 1, dtype=np.uint32)
-    fine, seen = mi.UInt32(aligned(marks)), mi.UInt8(aligned(tiles.ravel().astype(np.uint8)))
+    pattern, (marks, chosen) = Pattern.of(spp, seed, times), shown.host.fine(window)
+    if times == 1:
+        marks, chosen = aligned(marks & 3), chosen[:0]
+    fine, seen = mi.UInt32(marks), mi.UInt8(aligned(tiles.ravel().astype(np.uint8)))
     hits = _hits_of(shown, window, pattern, chosen, (first * size * times, count * size * times))
     return _shaded(
         *(shown.values, shown.lights, shown.textures, shown.scene, grid, pattern, fine, hits, seen),

@@ -42,19 +42,15 @@ class LampViews:
     """The maps of all lamps for one pose of a region, on the device.
 
     Args:
-        lights: the lamps.
-        anchor_mm: origin of the scene's frame in the world.
-        reach_mm: distance from this origin within which skin matters.
+        table: numbers of the lamps' views (see `view_table`).
         region: the posed region. If its sheet is not known to be one surface, every cell is marked.
     """
 
     DRJIT_STRUCT = leaves("_table", "_known", "_marks")
 
-    def __init__(self, lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float, region: RegionScene) -> None:
-        reach = min(reach_mm, _REACH_MM)
+    def __init__(self, table: Singles, region: RegionScene) -> None:
         # Without lamps nothing reads the table, but kernels cannot be compiled for an empty one.
-        table = [_frame(lamp, anchor_mm, reach) for lamp in lights] or [[0.0] * _WIDTH]
-        self._table = mi.Float(aligned(np.array(table, dtype=np.float32).reshape(-1)))
+        self._table = mi.Float(aligned(table.ravel() if len(table) else np.zeros(_WIDTH, np.float32)))
         self._known = dr.opaque(mi.Bool, region.skin.is_sheet)
         if not region.skin.is_sheet:
             self._marks = dr.zeros(mi.UInt8, 1)
@@ -63,7 +59,7 @@ class LampViews:
             counts = skin.of_sheet, len(pieces)
             hairs = mi.Float(aligned(pieces.ravel() if len(pieces) else np.zeros(8, np.float32)))
             on_device = dr.opaque(mi.UInt32, counts[0]), dr.opaque(mi.UInt32, counts[1])
-            self._marks = _marked(self._table, skin, hairs, on_device, counts, len(lights))
+            self._marks = _marked(self._table, skin, hairs, on_device, counts, len(table))
 
     def clear(self, lamp: mi.UInt32, x: mi.Vector3f, active: mi.Bool) -> mi.Bool:
         """Whether nothing of the region stands between points of the sheet (scene's frame) and any point of a lamp."""
@@ -232,6 +228,18 @@ class _Edge:
         x, y = u - self._u, v - self._v
         t = dr.clip((x * self._du + y * self._dv) * self._inverse, 0, 1)
         return dr.square(x - t * self._du) + dr.square(y - t * self._dv)
+
+
+def view_table(lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float) -> Singles:
+    """Numbers of the views of lamps (lamps, 16), with NumPy alone.
+
+    Args:
+        lights: the lamps.
+        anchor_mm: origin of the scene's frame in the world.
+        reach_mm: distance from this origin within which skin matters.
+    """
+    rows = [_frame(lamp, anchor_mm, min(reach_mm, _REACH_MM)) for lamp in lights]
+    return np.array(rows, dtype=np.float32).reshape(-1, _WIDTH)
 
 
 def _frame(lamp: Lamp, anchor_mm: Floats, reach_mm: float) -> list[float]:

@@ -5,18 +5,23 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cached_property
 
-from ..arrays import Bools, Floats, frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Bools, Floats, Ints, Singles, frozen
 from ..eye.fundus import FundusLight
 from ..region.mesh import RegionMesh, region_mesh
 from ..rig.camera import Window
 from .blur import Blur
 from .frame import RenderJob, light_table, parameters_of, returned_light, sun_lamps
+from .lampviews import view_table
 from .occlusion import lid_margins_px
 from .parameters import Parameters
 from .places import GlobePlaces, globe_places
 from .plain import fine_pixels, plain_tiles
 from .splat import MirrorImages
 from .tissuecells import TissueCells
+from .values import aligned
 
 _NO_TILES = frozen([[False]], bool)
 
@@ -32,7 +37,7 @@ class Prepared:
     def __init__(self, job: RenderJob, posed: RegionMesh | None) -> None:
         self.job, self.posed = job, posed
         self._tiles: dict[Window, tuple[Bools, int]] = {}
-        self._fine: dict[Window, tuple[Bools, Bools]] = {}
+        self._fine: dict[Window, tuple[NDArray[np.uint32], Ints]] = {}
 
     @classmethod
     def made_beside(cls, job: RenderJob) -> Prepared:
@@ -44,6 +49,7 @@ class Prepared:
         if made.posed is not None:
             made.plain(made.blur.window)
             made.fine(made.blur.window)
+            _ = made.views
             if job.look.scattering is not None:
                 _ = made.tissue_cells
         return made
@@ -75,6 +81,23 @@ class Prepared:
         return Blur.of(self.job, self.posed)
 
     @cached_property
+    def reach_mm(self) -> float:
+        """Distance from the apex of the unrotated eye within which the window shows skin; with some to spare."""
+        job = self.job
+        x0, y0, width, height = job.window
+        corners = np.array([[x, y] for x in (x0, x0 + width) for y in (y0, y0 + height)], dtype=float) - 0.5
+        apex = job.camera.project(job.anchor_mm)[0]
+        px_per_mm = float(job.camera.scale_at(job.anchor_mm))
+        if not (np.all(np.isfinite(apex)) and px_per_mm > 0):
+            return np.inf
+        return 1.5 * float(np.max(np.linalg.norm(corners - apex, axis=1))) / px_per_mm + 5.0
+
+    @cached_property
+    def views(self) -> Singles:
+        """Numbers of the lamps' views of a region, the sun's too."""
+        return view_table(self.sunlit.lights, self.job.anchor_mm, self.reach_mm)
+
+    @cached_property
     def mirror_images(self) -> MirrorImages:
         """The lamps' mirror images in the closed form of the cornea."""
         return MirrorImages.of(self.job, None)
@@ -103,8 +126,17 @@ class Prepared:
             self._tiles[window] = nothing if posed is None else plain_tiles(posed, job.camera, job.anchor_mm, window)
         return self._tiles[window]
 
-    def fine(self, window: Window) -> tuple[Bools, Bools]:
-        """Which pixels (height, width) of a window may show menisci or thin hairs, and which may show menisci."""
+    def fine(self, window: Window) -> tuple[NDArray[np.uint32], Ints]:
+        """Pixels of a window that may show menisci or thin hairs, in the order of its rows.
+
+        Returns:
+            For each pixel of the window 1 if it may show either, plus 2 if it may show menisci, plus 4 k if it is the
+            k-th of those that may show either; and the indices of these.
+        """
         if window not in self._fine:
-            self._fine[window] = fine_pixels(self.posed, self.job.camera, self.job.anchor_mm, window)
+            fine, wet = fine_pixels(self.posed, self.job.camera, self.job.anchor_mm, window)
+            chosen = np.flatnonzero(fine)
+            marks = aligned((fine + 2 * wet).astype(np.uint32).ravel())
+            marks[chosen] |= 4 * np.arange(1, len(chosen) + 1, dtype=np.uint32)
+            self._fine[window] = marks, chosen
         return self._fine[window]

@@ -75,7 +75,7 @@ class Stage:
         host, place = self._prepared(job)
         region = place if isinstance(place, RegionScene) else None
         # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
-        views = None if region is None else LampViews(host.sunlit.lights, job.anchor_mm, _reach_mm(job), region)
+        views = None if region is None else LampViews(host.views, region)
         structure = Structure(
             kinds(job.eye),
             bool(np.any(job.camera.distortion)),
@@ -122,7 +122,7 @@ class Stage:
         lights.relief = IrisRelief(job, values, lights, place.scene, textures, self._shapes)
         received = exchange()
         if not place.obstructed:
-            reach = min(_reach_mm(job), _FARTHEST_MM)
+            reach = min(host.reach_mm, _FARTHEST_MM)
             lights.on_matte = MatteLight(values, lights, place.scene, received, reach)
         return replace(textures, received=received)
 
@@ -180,14 +180,3 @@ class Stage:
                 self._textures.pop(next(iter(self._textures)))
             self._textures[key] = Textures.of(job.look)
         return self._textures[key]
-
-
-def _reach_mm(job: RenderJob) -> float:
-    """Distance from the apex of the unrotated eye within which the window shows skin, mm; with some to spare."""
-    x0, y0, width, height = job.window
-    corners = np.array([[x0, y0], [x0 + width, y0], [x0, y0 + height], [x0 + width, y0 + height]], dtype=float) - 0.5
-    apex = job.camera.project(job.anchor_mm)[0]
-    px_per_mm = float(job.camera.scale_at(job.anchor_mm))
-    if not (np.all(np.isfinite(apex)) and px_per_mm > 0):
-        return np.inf
-    return 1.5 * float(np.max(np.linalg.norm(corners - apex, axis=1))) / px_per_mm + 5.0
