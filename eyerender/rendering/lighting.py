@@ -221,7 +221,7 @@ def through_cornea(
     """
     bent, left, rest = mi.Float(0), mi.UInt32(ALL), inside & behind((surfaces or values.surfaces)[-1], inner)
     if lights.on_iris is not None:
-        bent, left = lights.on_iris.at(inner, inside)
+        bent, left = lights.on_iris.at(values, inner, rest)
     many = lights.count > BITS
     sine, cosine = dr.sincos(v * (2 * dr.pi))
 
@@ -280,15 +280,15 @@ def off_cornea(
     return total
 
 
-def behind(surface: Surface, x: mi.Vector3f) -> mi.Bool:
-    """Whether points (eye frame) are behind a surface. No light comes to others through it.
+def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
+    """Whether points (eye frame) are behind a surface, or so far before it. No light comes to others through it.
 
     The end of an iris may not be: a cornea with a shallow chamber ends behind the plane of the iris.
     """
     away = 8.0
     o = surface.point_in(x) + mi.Vector3f(away, 0, 0)
     t, met = surface.hit(o, mi.Vector3f(-1, 0, 0))
-    return met & (t < away)
+    return met & (t < away + ahead_mm)
 
 
 def on_relief(lights: Lights, view: View) -> View:
@@ -305,6 +305,8 @@ class LampPath:
 
     Attributes:
         gain: irradiance (mW/mm^2) if nothing is in the way.
+        whole: the same if all of the cornea were clear.
+        out: radius about the front surface's axis where the path enters, mm.
         entry: where the path enters the front surface (eye frame).
         enters: whether there is a path, through the clear part of the cornea.
         blocked: whether anything is in its way.
@@ -312,6 +314,8 @@ class LampPath:
     """
 
     gain: mi.Float
+    whole: mi.Float
+    out: mi.Float
     entry: mi.Vector3f
     enters: mi.Bool
     blocked: mi.Bool
@@ -328,16 +332,23 @@ class LampPath:
         active: mi.Bool,
         normal: mi.Vector3f | None = None,
         surfaces: tuple[Surface, ...] | None = None,
+        ahead_mm: float = 0.0,
     ) -> LampPath:
-        """Find the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame)."""
+        """Find the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame).
+
+        ahead_mm: as for `connect`.
+        """
         # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
         scale, shift = values.image.scale, values.image.shift
         aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
         normal = values.stop.normal if normal is None else normal
-        path = connect(surfaces or values.surfaces, source, inner, normal, aim, values.limbus.radius, active)
+        path = connect(
+            surfaces or values.surfaces, source, inner, normal, aim, values.limbus.radius, active, ahead_mm=ahead_mm
+        )
         local = values.surfaces[0].point_in(path.entry)
-        clear = 1 - opacity(values, dr.sqrt(local.y * local.y + local.z * local.z))
+        out = dr.sqrt(local.y * local.y + local.z * local.z)
+        clear = 1 - opacity(values, out)
         enters = path.found & (clear > 0)
         blocked = lamp_blocked(values, scene, path.entry, source, True, False, enters)
-        gain = dr.select(enters, lamp.radiant_intensity(path.leaving) * path.transfer * clear, 0)
-        return cls(gain, path.entry, enters, blocked, path.failed)
+        whole = dr.select(path.found, lamp.radiant_intensity(path.leaving) * path.transfer, 0)
+        return cls(whole * clear, whole, out, path.entry, enters, blocked, path.failed)

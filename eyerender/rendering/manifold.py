@@ -56,6 +56,7 @@ def connect(
     active: mi.Bool,
     *,
     mirror: bool = False,
+    ahead_mm: float = 0.0,
 ) -> Connection:
     """Paths from `lamp` to `x` through all `surfaces`, all points in the eye frame (mm).
 
@@ -68,6 +69,7 @@ def connect(
         reach: radius about the front surface's axis (mm) beyond which no path enters.
         active: lanes that matter.
         mirror: whether the light comes to points before the first surface, which mirrors it, the only one.
+        ahead_mm: how far before the last surface points may be that are met when a path is extended backwards.
     """
     front = surfaces[0]
     start = _mirror_guess(front, lamp, aim) if mirror else _entry_guess(front, lamp, aim)
@@ -95,7 +97,7 @@ def connect(
         r = x - (b.y + s * b.w)
         a1, a2 = b.da + s * b.wa, b.db + s * b.wb
         det = dr.dot(b.w, dr.cross(a1, a2))
-        done = on & ok & (s > 0) & (dr.squared_norm(r) < TOLERANCE_MM * TOLERANCE_MM)
+        done = on & ok & (s > -ahead_mm) & (dr.squared_norm(r) < TOLERANCE_MM * TOLERANCE_MM)
         cosine = dr.maximum(-dr.dot(b.w, normal), 0)
         transfer = dr.select(done, passed * cosine / dr.abs(det), transfer)
         inv = dr.rcp(dr.select(dr.abs(det) > 1e-9, det, 1e-9))

@@ -38,6 +38,7 @@ GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of maps of the globe
 _FAR = float(np.finfo(np.float32).max)
 _WET = 0.91  # gloss of the sclera
 _WIDE_MM = 2.5  # width of an iris whose relief has its full height
+STEEPEST = 1.5  # slope of the opacity of the cornea's rim where it is steepest, times the width of the rim
 _RING = (0.62, 0.95)  # share of the way from the pupil to the root over which a limbal ring grows dark
 
 

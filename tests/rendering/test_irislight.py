@@ -15,18 +15,26 @@ pytestmark = pytest.mark.render
 def test_the_grid_gives_the_light_of_exact_paths(renderer, model, name):
     import mitsuba as mi
 
+    from eyerender.rendering.lighting import behind
+    from eyerender.rendering.values import ALL
+
     eye, rig = rigs.eye_of(model), rigs.RIGS[name](radius_mm=0.0)
     job = rigs.job_of(eye, rig, rig.window(32, 24), (12.0, -8.0))
     rng = np.random.default_rng(0)
     rho, turn = eye.iris_root_radius_mm * np.sqrt(rng.random(4000)), 2 * np.pi * rng.random(4000)
     u, v = (np.asarray(eye.stop.rotation)[:, k] for k in (1, 2))
     x = np.asarray(eye.stop.centre_mm) + np.outer(rho * np.cos(turn), u) + np.outer(rho * np.sin(turn), v)
-    grid = renderer.bind(job)[0].lights.on_iris
-    found, left = (k.numpy() for k in grid.at(mi.Vector3f(*x.astype(np.float32).T), mi.Bool(True)))
-    known = left == 0
-    lacked = left[rho < 3.0, None] >> np.arange(len(job.lights)) & 1
-    assert np.mean(lacked) < 0.05  # at edges of shadows, of which a wide limbus throws more
-    error = np.abs(found[known] / renderer.iris_irradiance(job, x)[known] - 1)
+    shown, _ = renderer.bind(job)
+    grid = shown.lights.on_iris
+    places = mi.Vector3f(*x.astype(np.float32).T)
+    found, left = (k.numpy() for k in grid.at(shown.values, places, behind(shown.values.surfaces[-1], places)))
+    lacked = left[left != ALL, None] >> np.arange(len(job.lights)) & 1
+    assert np.mean(left == ALL) < 0.05  # before the back of the cornea
+    assert np.mean(lacked) < 0.02  # where lamps set
+    truth = renderer.iris_irradiance(job, x)
+    assert not np.any(found[truth == 0])
+    known = (left == 0) & (truth > 0)
+    error = np.abs(found[known] / truth[known] - 1)
     assert np.sqrt(np.mean(error**2)) < 2e-4
     assert np.quantile(error, 0.995) < 1e-3
 
