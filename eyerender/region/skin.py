@@ -154,7 +154,10 @@ def _over_grid(values: Floats, rows: Floats, columns: Floats) -> Singles:
     u, v = (rows - i)[:, None], columns - j
     along = values[i] + u * (values[i + 1] - values[i])
     left, steps = along.astype(np.float32), np.diff(along, axis=1).astype(np.float32)
-    return np.asarray(left[:, j] + v.astype(np.float32) * steps[:, j])
+    out: Singles = steps.take(j, axis=1)
+    out *= v.astype(np.float32)
+    out += left.take(j, axis=1)
+    return out
 
 
 def _from_line(rest: Floats) -> Floats:
