@@ -115,13 +115,12 @@ class Film:
 
     def mean(self) -> tuple[Singles, int]:
         """What `mean_parts` or `mean_radiance` returns."""
-        totals = [total.numpy().reshape(self.shape) for total in self.sums]
-        sums = np.asarray(np.stack(totals) / np.float32(self.spp), dtype=np.float32)
+        means = [total.numpy().reshape(self.shape) / np.float32(self.spp) for total in self.sums]
         failed = int(self.failed.numpy()[0])
         if self.layered:
-            return sums.reshape(-1, 3, *self.shape), failed
+            return np.reshape(means, (-1, 3, *self.shape)), failed
         # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
-        return np.maximum(sums[0], 0), failed
+        return np.maximum(means[0], 0), failed
 
 
 def mean_radiance(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
