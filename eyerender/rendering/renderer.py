@@ -126,7 +126,6 @@ class Renderer:
         A lamp of finite size is represented by its centre.
         """
         shown, _ = self.bind(job, lit=False)
-        shown.lights.on_iris = shown.lights.relief = None
         x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
         corner = mi.Float(0)  # of the unit square, which is the disc's centre
         inside = dr.full(mi.Bool, True, len(points_mm))

@@ -74,8 +74,13 @@ class Stage:
         """
         host, place = self._prepared(job)
         region = place if isinstance(place, RegionScene) else None
+        textures, views = self._textures_of(job), None
         # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
-        views = None if region is None else LampViews(host.views, region)
+        if isinstance(place, RegionScene):
+            views = LampViews(host.views, place)
+            textures = replace(textures, region=place.skin, lamp_views=views)
+        else:
+            textures = replace(textures, surround=place.geometry)
         structure = Structure(
             kinds(job.eye),
             bool(np.any(job.camera.distortion)),
@@ -88,14 +93,7 @@ class Stage:
         if job.mesh_edge_mm is not None:
             values.surfaces = meshed(values.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
         lights = Lights(host.lamps, len(host.lamps) - len(job.lights))
-        textures = self._textures_of(job)
-        if isinstance(place, RegionScene):
-            textures = replace(textures, region=place.skin, lamp_views=views)
-        else:
-            textures = replace(textures, surround=place.geometry)
-        if structure.scattering and lit:
-            assert region is not None
-            assert views is not None
+        if lit and structure.scattering and region is not None and views is not None:
             tissues = tissue_light(job, values, lights, region, views, host.tissue_cells)
             textures = replace(textures, tissues=tissues)
         if structure.ambient:
