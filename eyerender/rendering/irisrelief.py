@@ -232,7 +232,7 @@ class IrisRelief:
 
     def _lamps(self, values: Values, lights: Lights, scene: mi.Scene, lanes: int) -> mi.Float:
         """E, E t_u, E t_v and E' of points of the lamps at coarse places, in rows."""
-        from .lighting import LampPath
+        from .lighting import LampPath, behind
 
         each, count = self._each, mi.UInt32(_COARSE)
         index = dr.arange(mi.UInt32, lanes)
@@ -243,8 +243,10 @@ class IrisRelief:
         lamp = lights[spot // each]
         source = lamp.node(spot - (spot // each) * each, each)
         normal = values.stop.normal
-        path = LampPath.to(values, scene, lamp, source, x, lights.count > 0)
-        above = LampPath.to(values, scene, lamp, source, x + _RAISED_MM * normal, lights.count > 0)
+        # The search for paths to other points is long, and in vain.
+        reached = (lights.count > 0) & behind(values.surfaces[-1], x)
+        path = LampPath.to(values, scene, lamp, source, x, reached)
+        above = LampPath.to(values, scene, lamp, source, x + _RAISED_MM * normal, reached)
         lit = dr.select(path.blocked, 0, path.gain)
         more = dr.select(above.gain > 0, (above.gain - path.gain) / _RAISED_MM, 0)
         lateral = _arrival(values.surfaces, source, path.entry, normal)
