@@ -159,15 +159,18 @@ set_up() {
 }
 
 # Brings a libLLVM that renders, once. Without one all but rendering works, so that is a warning; a failure is tried
-# again after an hour at the earliest, so that commands that render nothing do not wait each time.
+# again after an hour at the earliest, so that commands that render nothing do not wait each time. Users who share a
+# checkout have a cache each, in which the package looks for the library.
 set_up_llvm() {
+    cache=${XDG_CACHE_HOME-${HOME-}}
     if [ -f "$venv/.llvm" ]; then
-        read -r library <"$venv/.llvm" || :
-        [ ! -r "$library" ] || return 0
-    elif [ -n "$(find "$venv/.llvm-failed" -mmin -60 2>/dev/null)" ]; then
-        return 0
+        library='' of=''
+        { read -r library && read -r of; } <"$venv/.llvm" || :
+        [ ! -r "$library" ] || [ "$of" != "$cache" ] || return 0
     fi
+    [ -z "$(find "$venv/.llvm-failed" -mmin -60 2>/dev/null)" ] || return 0
     if "$venv/bin/python" -m eyerender.backends.set_up --quiet >"$venv/.llvm.$$"; then
+        printf '%s\n' "$cache" >>"$venv/.llvm.$$"
         mv -f "$venv/.llvm.$$" "$venv/.llvm"
         rm -f "$venv/.llvm-failed"
     else

@@ -220,3 +220,15 @@ def _closure(name: str, extras: set[str]) -> set[str]:
 
 def _normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_each_user_of_a_checkout_gets_the_library_once(checkout):
+    """The package looks for the library in its user's cache, so that of another user is none."""
+    stamped(checkout)
+    python = checkout / ".venv" / "bin" / "python"
+    python.write_text('#!/bin/sh\necho "$HOME" >>asked\nprintf "%s\\n" "$PWD/asked"\n')
+    python.chmod(0o755)
+    (checkout / "scripts" / "ask").write_text('. "$(dirname "$0")/_setup.sh"\nset_up_llvm\n')
+    for home in ("/a", "/a", "/b", "/b", "/a"):
+        assert run(checkout, "sh scripts/ask", HOME=home).returncode == 0
+    assert (checkout / "asked").read_text().split() == ["/a", "/b", "/a"]
