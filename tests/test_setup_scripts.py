@@ -226,6 +226,7 @@ def test_each_user_of_a_checkout_gets_the_library_once(checkout):
     """The package looks for the library in its user's cache, so that of another user is none."""
     stamped(checkout)
     python = checkout / ".venv" / "bin" / "python"
+    python.unlink()  # a link to this interpreter
     python.write_text('#!/bin/sh\necho "$HOME" >>asked\nprintf "%s\\n" "$PWD/asked"\n')
     python.chmod(0o755)
     (checkout / "scripts" / "ask").write_text('. "$(dirname "$0")/_setup.sh"\nset_up_llvm\n')
