@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -186,10 +188,16 @@ def _fovea(eye: Mapping[str, float], relaxed: dict[str, Any], wavelength_nm: flo
     """
     if "kappa_horizontal_deg" not in eye:
         return {"field_deg": [eye["alpha_horizontal_deg"], eye["alpha_vertical_deg"]]}
-    parts = EyeParts.from_mapping(relaxed)
-    bare = bare_eye(parts, wavelength_nm, stop_of(parts, parts.stop.diameter_mm))
     kappa = (eye["kappa_horizontal_deg"], eye["kappa_vertical_deg"])
-    return {"position_mm": [float(v) for v in fovea_of_kappa(bare, kappa)]}
+    return {"position_mm": list(_fovea_of(json.dumps(relaxed), kappa, wavelength_nm))}
+
+
+@lru_cache(maxsize=64)
+def _fovea_of(relaxed: str, kappa_deg: tuple[float, float], wavelength_nm: float) -> tuple[float, ...]:
+    """Place of the fovea of an eye (JSON), kept because a person's eye has it in any light and at any distance."""
+    parts = EyeParts.from_mapping(json.loads(relaxed))
+    bare = bare_eye(parts, wavelength_nm, stop_of(parts, parts.stop.diameter_mm))
+    return tuple(float(v) for v in fovea_of_kappa(bare, kappa_deg))
 
 
 def _toric(flat_mm: float, steep_mm: float, axis_deg: float, asphericity: float) -> dict[str, Any]:
