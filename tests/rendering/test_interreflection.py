@@ -104,8 +104,9 @@ def plain(renderer, monkeypatch):
 
 @pytest.mark.parametrize("case", CASES)
 def test_all_light_of_lamps_against_path(plain, tmp_path, case):
-    # .5 % and two standard errors of the oracle in rings of the iris, on sclera, and on surround or skin. The iris has
-    # a picture of its own with finer pixels, because few of a coarse picture lie wholly in one ring.
+    # .5 % and two standard errors in rings of the iris, on sclera, and on surround or skin: those of the oracle, and in
+    # a region those of our rays, because rings differ by .05 to .33 % (rms) from one pattern of rays to another. The
+    # iris has a picture of its own with finer pixels, because few of a coarse picture lie wholly in one ring.
     model, camera, side, times, places, more = CASES[case]
     look = FLAT.model_copy(update={k: v for k, v in more.items() if k != "region"})
     whole, fine = (
@@ -121,8 +122,9 @@ def test_all_light_of_lamps_against_path(plain, tmp_path, case):
     found |= {k: v for k, v in seen.items() if "iris" in k}
     assert len(found) == 4 + (camera is not near_iris)
     assert all(noise < 0.005 for _, noise in found.values()), found
+    own = 0.001 if more.get("region") else 0.0
     for name, (away, noise) in found.items():
-        assert abs(away) < 0.005 + 2 * noise, (name, found)
+        assert abs(away) < 0.005 + 2 * np.hypot(noise, own), (name, found)
 
 
 @pytest.mark.parametrize("model", ["E2", "E4"])
