@@ -26,7 +26,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from ..arrays import Bools, Floats, Ints, Reals
+from ..arrays import Bools, Floats, Ints, Reals, remembered
 from ..eye.model import EyeModel
 from ..geometry.vectors import dots, lengths
 from ..region.globe import Globe
@@ -330,18 +330,6 @@ class _Plan:
         """Number of all rays."""
         return int(self.count.sum())
 
-    def shares(self, gain: Any) -> csr_array:
-        """Shares as in `_Seen`, with the gain of the rays that leave the eye as in `_Interior`."""
-        ends = np.append(0, np.cumsum(self.count))
-        return csr_array(
-            (
-                np.append(np.repeat(1 / self.count, self.count), gain.data),
-                np.append(np.arange(ends[-1]), ends[-1] + gain.indices),
-                np.append(ends[:-1], ends[-1] + gain.indptr),
-            ),
-            shape=(len(self.count) + gain.shape[0], ends[-1] + gain.shape[1]),
-        )
-
     def at_vertices(self, places: Floats) -> mi.Float:
         """Four numbers of every vertex, as in `Received`, from those of places (n, 4); the last is the whole sky."""
         assert self.skin is not None
@@ -368,6 +356,20 @@ def _at_vertices(
     return out
 
 
+@remembered
+def _shares(count: Ints, gain: csr_array) -> csr_array:
+    """Shares as in `_Seen`, from the number of rays of each place and the gain of those that leave the eye."""
+    ends = np.append(0, np.cumsum(count))
+    return csr_array(
+        (
+            np.append(np.repeat(1 / count, count), gain.data),
+            np.append(np.arange(ends[-1]), ends[-1] + gain.indices),
+            np.append(ends[:-1], ends[-1] + gain.indptr),
+        ),
+        shape=(len(count) + gain.shape[0], ends[-1] + gain.shape[1]),
+    )
+
+
 class Exchange:
     """Computes what the places of a frame receive; keeps what does not change between frames of a subject."""
 
@@ -375,7 +377,6 @@ class Exchange:
         self._skins: list[tuple[tuple[Any, ...], Globe, _Plan]] = []  # of subjects
         self._bare: _Plan | None = None
         self._interiors: KeptForEye[_Interior] = KeptForEye()
-        self._shares: tuple[_Plan, _Interior, csr_array] | None = None  # of the last frame
 
     def begun(
         self, host: Prepared, values: Values, lights: Lights, panels: Lights, textures: Textures,
@@ -400,8 +401,7 @@ class Exchange:
         job, grid, globe = host.job, host.places, host.job.globe
         plan = self._plan(region, globe)
         points, normals, plane = _others(job, globe, region, plan.skin)
-        interior = self._inside(job)
-        frame = _Frame(job, grid, interior, plan, self._shares_of(plan, interior), points, normals, plane)
+        frame = _Frame(job, grid, self._inside(job), plan, points, normals, plane)
         if not job.interreflection and not values.structure.ambient:
             return lambda: frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
@@ -418,13 +418,6 @@ class Exchange:
         """The chamber of a job's eye."""
         film, look, halvings = job.film_index, job.look, _halvings(job.ambient)
         return self._interiors.get(job.eye, (film, look, halvings), lambda: _Interior.of(job.eye, film, look, halvings))
-
-    def _shares_of(self, plan: _Plan, interior: _Interior) -> csr_array:
-        """Shares as in `_Seen`, which only another subject, eye or pupil changes."""
-        kept = self._shares
-        if kept is None or kept[0] is not plan or kept[1] is not interior:
-            kept = self._shares = plan, interior, plan.shares(interior.gain)
-        return kept[2]
 
     def _plan(self, region: RegionScene | None, globe: Globe) -> _Plan:
         """Places and rays, chosen with the eye straight ahead: no earlier pose may change a picture."""
@@ -454,7 +447,6 @@ class _Frame:
     grid: GlobePlaces
     interior: _Interior
     plan: _Plan
-    shares: csr_array
     points: Floats
     normals: Floats
     plane: tuple[float, float, float]
@@ -743,7 +735,7 @@ def _seen(
             straight = found.numpy()
             lit[:globe], lit[plan.rays :] = straight[:globe], straight[globe:]
         target, weight, close, sky, free = (r.numpy()[:rays] for r in results)
-        return _Seen(frame.shares, target, weight, close, sky, free, lit)
+        return _Seen(_shares(plan.count, interior.gain), target, weight, close, sky, free, lit)
 
     return read
 

@@ -47,7 +47,7 @@ class RegionScene:
     fixed = False  # whether the mesh keeps still, and has no menisci that light passes through
 
     def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> None:
-        posed = self._posed(spec, globe) if known is None else known
+        posed = known or self._posed(spec, globe)
         meshes = {name: _mesh(posed, *cut) for name, cut in self._cuts(posed.layout).items()}
         # Without robust intersections rays slip between the triangles of a large face on some processors. An instance
         # cannot have them, but its triangles are small.
@@ -85,7 +85,7 @@ class RegionScene:
 
     def fill(self, spec: Region, globe: Globe, known: RegionMesh | None) -> None:
         """Show another subject with the same shapes, so that recordings can still be played back."""
-        posed = self._posed(spec, globe) if known is None else known
+        posed = known or self._posed(spec, globe)
         for name, cut in self._cuts(posed.layout).items():
             self._params[name][f"{name}.mesh.faces"] = _faces(posed.layout, *cut)
             self._send(name, posed)
@@ -101,7 +101,7 @@ class RegionScene:
     def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
         """Move lids and lashes to a pose and a blink, whose mesh may be known."""
         if self._shown != (spec, globe):
-            posed = self._posed(spec, globe) if known is None else known
+            posed = known or self._posed(spec, globe)
             if posed is not self.posed:
                 self._move(posed)
             self._shown = (spec, globe)
