@@ -147,7 +147,7 @@ def _size(kind: str, head: bytes) -> int | None:
 def surrounding(values: Floats) -> Surrounding:
     """Prepare a map (h, 2 h): average it down to at most 1024 x 512, and compute its irradiance."""
     reduced = _reduced(values)
-    if not reduced.any():  # as the map of every renderer is that has none
+    if not reduced.any():  # every renderer keeps such a map for scenes without one
         dark = np.zeros((_NORMALS, 2 * _NORMALS, 2))
         return Surrounding(frozen(reduced, np.float32), 0.0, frozen(dark, np.float32), frozen(np.zeros((0, 3))))
     fold = max(1, -(-_FINE // len(reduced)))

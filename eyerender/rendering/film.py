@@ -138,7 +138,7 @@ def mean_parts(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Sin
 
 
 def begun(shown: Exposed, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
-    """Begin to take the samples of a window: for the radiance; or `layered` for radiance, weight, nearness of parts."""
+    """Begin to take the samples of a window, for what `mean_radiance` returns, or if `layered`, `mean_parts`."""
     width, height = window[2:]
     grouped = shown.values.structure.region
     if not grouped and not layered and spp >= _MANY:
