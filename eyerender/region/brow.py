@@ -16,7 +16,7 @@ from .contour import step
 from .face import face_depth
 from .hairs import Hairs, taper
 
-PLACES = np.array([0.0, 0.25, 0.6, 1.0])  # of a hair's points, as shares of its length; it bends most at its root
+PLACES = np.array([0.0, 0.4, 1.0])  # of a hair's points, as shares of its length; it bends most at its root
 
 
 @lru_cache(maxsize=16)
@@ -48,7 +48,7 @@ def brow(spec: Region) -> Hairs:
             turn = lean + bend * (0.5 * (PLACES[j - 1] + u) - 0.375)
             stride = length * (u - PLACES[j - 1])
             y, z = y - stride * np.sin(turn), z + stride * np.cos(turn)
-        rise = -0.15 if j == 0 else lift * np.sin(np.pi * min(0.62 * u + 0.08, 1.0))
+        rise = -0.1 if j == 0 else lift * np.sin(np.pi * min(0.62 * u + 0.08, 1.0))
         points[:, j] = np.stack([_skin(spec, y, z) + rise, y, z], axis=-1)
     return Hairs(frozen(points), frozen(taper(n, b.diameter_mm, PLACES)))
 

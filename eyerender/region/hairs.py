@@ -1,8 +1,9 @@
 """Hairs as curves, and curves as tapered three-sided tubes.
 
-A hair is a polyline with a radius at each point, which decreases towards the tip. What lies on skin does without the
-side of its tube that faces the skin: a line that goes in or out through it crosses another one, so all outlines and
-shadows stay.
+A hair is a polyline with a radius at each point, which decreases towards the tip. Its tube does without one side: a
+line that goes in or out through it crosses another one, so all outlines and shadows stay. The side that is left out is
+the one that cameras see least: towards the skin if hairs lie on it, else the inner side of the hair's bend. Where that
+one is seen, the sides behind it are shaded much as it would be, because normals are turned to the viewer.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..arrays import ArrayValue, Floats, Ints, frozen
-from ..geometry.vectors import crosses
+from ..geometry.vectors import crosses, dots, lengths
 from .contour import unit
 
 SEGMENTS = 6
@@ -29,7 +30,8 @@ class Hairs(ArrayValue):
     def tubes(self, out: Floats | None = None) -> tuple[Floats, Floats]:
         """Vertices (n * k * 3, 3) of three-sided tubes about the curves, and their normals; `tube_faces` joins them.
 
-        The first corner of a ring is the one towards `out` (3,), and the side opposite to it faces the other way.
+        The first corner of a ring, opposite to the side that is left out, is the one towards `out` (3,), or towards the
+        outer side of the hair's bend.
         """
         p = self.points
         if len(p) == 0:
@@ -40,8 +42,11 @@ class Hairs(ArrayValue):
         along = unit(along)
         if out is None:
             # Each hair has one reference direction, across its chord, so that its tube does not twist.
-            chord = unit(p[:, -1] - p[:, 0])
-            helper = np.where(np.abs(chord[:, 1:2]) < 0.8, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+            chord = p[:, -1] - p[:, 0]
+            steep = np.abs(chord[:, 1:2]) < 0.8 * lengths(chord)[:, None]
+            helper = np.where(steep, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+            bend = p[:, p.shape[1] // 2] - 0.5 * (p[:, 0] + p[:, -1])
+            helper[dots(crosses(chord, helper), bend) < 0] *= -1
             e1 = unit(crosses(along, helper[:, None, :]))
         else:
             e1 = unit(out - along * (along @ out)[..., None])
@@ -53,12 +58,20 @@ class Hairs(ArrayValue):
 
 
 @lru_cache(maxsize=8)
-def tube_faces(count: int, points: int, on_skin: bool = False) -> Ints:
-    """Triangles (m, 3) of `count` tubes of `points` rings, without the side opposite to the first corner `on_skin`."""
-    j, s = np.meshgrid(np.arange(points - 1), [0, 2] if on_skin else [0, 1, 2], indexing="ij")
+def tube_faces(count: int, points: int, sides: tuple[int, ...] = (0, 2), pointed: bool = False) -> Ints:
+    """Triangles (m, 3) of `count` tubes of `points` rings.
+
+    The sides of a tube follow its corners, so the side 1 is opposite to the first corner. Tubes that are `pointed` end
+    in the first corner of their last ring.
+    """
+    j, s = np.meshgrid(np.arange(points - 1), sides, indexing="ij")
     a, b = 3 * j + s, 3 * j + (s + 1) % 3
-    one = np.concatenate([np.stack([a, b, b + 3], -1).reshape(-1, 3), np.stack([a, b + 3, a + 3], -1).reshape(-1, 3)])
-    return frozen((one[None] + 3 * points * np.arange(count)[:, None, None]).reshape(-1, 3), np.int64)
+    one, other = np.stack([a, b, b + 3], -1), np.stack([a, b + 3, a + 3], -1)
+    if pointed:
+        one[-1, :, 2] = 3 * (points - 1)
+        other = other[:-1]
+    tube = np.concatenate([one.reshape(-1, 3), other.reshape(-1, 3)])
+    return frozen((tube[None] + 3 * points * np.arange(count)[:, None, None]).reshape(-1, 3), np.int64)
 
 
 def taper(count: int, root_mm: float, s: Floats, tip: float = 0.1) -> Floats:

@@ -23,10 +23,10 @@ from .anatomy import Lashes, Region
 from .contour import step, unit
 from .globe import Globe
 from .hairs import SEGMENTS, Hairs, taper
-from .lids import CONJUNCTIVA, EDGE_MM, LID, MARGIN, Sheet
+from .lids import CONJUNCTIVA, EDGE_MM, FINE, LID, MARGIN, Sheet
 
 _ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # of the points after the root, which is on the skin
-_REACH_ROWS = 16
+_REACH_ROWS = 12  # beyond the crease, about a centimetre, where lashes may meet skin
 _CAUGHT_MM = 0.3  # a lash that is still this far inside is caught
 _NEAR_COLUMNS = 6
 _SEARCH_MM = 1.5  # distance up to which skin lifts a lash
@@ -207,8 +207,10 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
     if not points.size:
         return points[:, 1:]
     root, points, straight = points[:, :1], points[:, 1:], straight[:, 1:]
-    grids = ((sheet.fine, sheet.coarse), (sheet.fine_normals, sheet.coarse_normals))
-    skin, normals = (np.concatenate([f[-2:, ::2], c[: LID + _REACH_ROWS - 1]]).reshape(-1, 3) for f, c in grids)
+    first = CONJUNCTIVA + MARGIN - FINE - 2  # the lash line
+    skin, normals = (
+        g[first : first + LID + _REACH_ROWS + 1].reshape(-1, 3) for g in (sheet.coarse, sheet.coarse_normals)
+    )
     tree = cKDTree(skin, balanced_tree=False, compact_nodes=False)  # it is built in half the time
     heights = np.append(dots(skin, normals), 0)
     normals = np.concatenate([normals, np.zeros((1, 3))])  # the last is found where nothing is

@@ -1,8 +1,8 @@
 """Lids and skin as one sheet: from the conjunctiva under the lids over their margins out to the face.
 
 The sheet is a grid of `ROWS` rows by columns once around the fissure (see `contour`). Its topology never changes.
-Beyond the lash line, where rows are smooth, every second column lies halfway between its neighbours, and the mesh does
-without it. From inside out the rows are:
+Beyond the margin's inner edge, where rows are smooth, every second column lies halfway between its neighbours, and the
+mesh does without it. From inside out the rows are:
 
     conjunctiva   from the globe (just below its surface, so that no gap shows) to the margin's inner edge; off the
                   globe, beside the nose, it carries the plica and the caruncle
@@ -28,13 +28,16 @@ from .contour import LATERAL, Contour, canthi, contour, step, unit
 from .face import face_depth
 from .globe import Globe
 
-CONJUNCTIVA, MARGIN, LID, FACE = 7, 7, 16, 26
-_HELD = step(np.arange(LID + FACE, dtype=float), LID + 0.25 * FACE, LID + 0.72 * FACE)[:, None]  # share of rest
+CONJUNCTIVA, MARGIN, LID, FACE = 7, 7, 12, 20
+_HELD = step(np.arange(LID + FACE, dtype=float), LID + 0.19 * FACE, LID + 0.68 * FACE)[:, None]  # share of rest
 ROWS = CONJUNCTIVA + MARGIN + LID + FACE
-FINE = CONJUNCTIVA + MARGIN  # rows that have their own place in every column; the others have it in every second one
+FINE = CONJUNCTIVA + 2  # rows that have their own place in every column; the others have it in every second one
 _DIP_MM = 0.031
 EDGE_MM = 0.26  # depth of the margin's rounded edges
 _FAR_MM = (66.0, 58.0)
+# Rows are dense at both ends of the lid: at the lash line for what is wet, at the crease for its fold.
+_LID_ROWS = np.array([1, 2, 3, 4, 6, 8, 10, 12, 13, 14, 15, 16]) / 16
+_GROWTH = 4.0  # natural logarithm of the last row's width over that of the first one beyond the crease
 _JOINT_MM = 2.4
 _SOFT_MM = 9.0
 _ON_GLOBE = (1.0, 0.8, 0.5, 0.2)  # share of the globe's normal in those of the conjunctiva's first rows
@@ -76,13 +79,15 @@ def sheet(spec: Region, globe: Globe) -> Sheet:
     c = contour(spec, globe)
     margin, lash_line = _margin(spec, globe, c)
     skin = _skin(spec, globe, c.every(2), lash_line[::2])
-    fine = np.concatenate([_conjunctiva(spec, globe, c), margin, halved(skin[:1])])
-    normals, beyond = grid_normals(fine), grid_normals(np.concatenate([margin[-1:, ::2], skin]))[1:]
-    normals[-1:] = unit(halved(beyond[:1]))
+    beyond = np.concatenate([margin[FINE - CONJUNCTIVA - 1 :, ::2], skin])
+    fine = np.concatenate([_conjunctiva(spec, globe, c), margin[: FINE - CONJUNCTIVA], halved(beyond[1:2])])
+    normals, normals_beyond = grid_normals(fine), grid_normals(beyond)
+    normals[-1:] = unit(halved(normals_beyond[1:2]))
     # The conjunctiva leaves the globe without an edge.
     share, first = np.array(_ON_GLOBE)[:, None, None], slice(len(_ON_GLOBE))
     normals[first] = unit(share * unit(fine[first] - globe.centre) + (1 - share) * normals[first])
-    return Sheet(sealed(fine), sealed(normals), sealed(skin[1:]), sealed(beyond[1:]), c, frozen(lash_line))
+    coarse, coarse_normals = sealed(beyond[2:]), sealed(normals_beyond[2:])
+    return Sheet(sealed(fine), sealed(normals), coarse, coarse_normals, c, frozen(lash_line))
 
 
 def halved(grid: Floats) -> Floats:
@@ -271,13 +276,11 @@ def _fold_strength(c: Contour) -> Floats:
 
 def _distances(crease: Floats, length: Floats) -> Floats:
     """Distances v (LID + FACE, columns) from the lash line: dense at the lash line and about the crease."""
-    s = np.arange(1, LID + 1) / LID
-    # Rows are dense at both ends of the lid.
-    s = 0.5 - 0.5 * np.cos(np.pi * s) * (0.55 + 0.45 * np.cos(np.pi * s) ** 2)
-    lid = s[:, None] * crease
+    turn = np.cos(np.pi * _LID_ROWS)
+    lid = (0.5 - 0.5 * turn * (0.55 + 0.45 * turn**2))[:, None] * crease
     k = np.arange(1, FACE + 1) / FACE
-    growth = (np.exp(4.6 * k) - 1) / (np.exp(4.6) - 1)
-    face = crease + growth[:, None] * (length - crease)
+    share = np.expm1(_GROWTH * k) / np.expm1(_GROWTH)
+    face = crease + share[:, None] * (length - crease)
     return np.concatenate([lid, face])
 
 

@@ -151,7 +151,7 @@ def _layout(upper_count: int, lash_count: int, brow_count: int, mirrored: bool) 
     parts = [
         (sheet_faces(), _sheet_uv()),
         (tube_faces(lash_count, SEGMENTS + 1), _lash_uv(upper_count, lash_count)),
-        (tube_faces(brow_count, len(BROW_PLACES), on_skin=True), _brow_uv(brow_count)),
+        (tube_faces(brow_count, len(BROW_PLACES), pointed=True), _brow_uv(brow_count)),
         (_tear_faces(), _tear_uv()),
     ]
     faces, uv, start = [], [], 0

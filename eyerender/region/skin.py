@@ -25,7 +25,7 @@ from .anatomy import Region
 from .brow import brow_band
 from .contour import step
 from .globe import Globe
-from .lids import CONJUNCTIVA, LID, MARGIN, ROWS, sheet, skin_depth
+from .lids import CONJUNCTIVA, FACE, LID, MARGIN, ROWS, sheet, skin_depth
 from .look import Look
 from .noise import Padded, Places, band, furrows
 from .tears import waves
@@ -317,7 +317,7 @@ class _Strip:
         self.spec = self.tiles.spec
         self.upper = np.sin(self.turn).astype(np.float32)
         self.lid = step(rows, _LINE - 1, _LINE + 1)
-        self.near = self.lid * (1 - step(rows, ROWS - 18, ROWS - 8))
+        self.near = self.lid * (1 - step(rows, ROWS - 0.75 * FACE, ROWS - 0.35 * FACE))
         # Coordinate z (mm) straightened so that lines along the lids are level.
         self.level = z + 0.017 * np.minimum(y * y, 480.0) * np.tanh(z * 0.25)
         self.places, self.along = _places(y, z), _places(y, self.level)

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Bytes, Singles, frozen
+from ..arrays import ArrayValue, Bools, Bytes, Singles, frozen, sealed
 from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..rig.camera import Window
 from .film import Exposed, pixels_of, window_of
@@ -40,7 +40,9 @@ class PartLabels(ArrayValue):
 
     def behind(self, covered: Bools) -> PartLabels:
         """The labels where what frames the camera's view covers the pixels (height, width)."""
-        return replace(self, part=frozen(np.where(covered, FRAME, self.part), np.uint8))
+        part = self.part.copy()
+        np.copyto(part, FRAME, where=covered)
+        return replace(self, part=sealed(part))
 
     def visible_fraction(self, part: int) -> float:
         """Visible share of the amodal pixels of a part in the window; NaN where there are none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,14 +32,18 @@ class Shine:
     share: float
     blur_px: float
 
-    def add(self, picture: Singles, job: RenderJob) -> None:
-        """Add it, blurred by lens and pixels, to the picture (height, width) of a job's window."""
-        if len(self.spots.energy):
-            xy, camera = self.spots.xy_px, job.camera
-            energy = self.share * self.spots.energy * (camera.rays(xy) @ camera.axis) ** 4
-            spread = defocus.disc(self.blur_px)
-            patch, rows, columns = psf.splat(xy, energy, job.sensor.psf_sigma_px, job.window, spread)
-            picture[rows, columns] += patch
+
+def add_shines(shines: Sequence[Shine], picture: Singles, job: RenderJob) -> None:
+    """Add mirror images, blurred by lens and pixels, to the picture (height, width) of a job's window."""
+    lit = [shine for shine in shines if len(shine.spots.energy)]
+    if not lit:
+        return
+    camera, counts = job.camera, [len(shine.spots.energy) for shine in lit]
+    falloff = (camera.rays(np.concatenate([shine.spots.xy_px for shine in lit])) @ camera.axis) ** 4
+    for shine, part in zip(lit, np.split(falloff, np.cumsum(counts)[:-1]), strict=True):
+        energy, spread = shine.share * shine.spots.energy * part, defocus.disc(shine.blur_px)
+        patch, rows, columns = psf.splat(shine.spots.xy_px, energy, job.sensor.psf_sigma_px, job.window, spread)
+        picture[rows, columns] += patch
 
 
 @dataclass(frozen=True, slots=True)

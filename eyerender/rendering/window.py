@@ -15,7 +15,7 @@ from .blur import Blur
 from .frame import RenderJob
 from .glints import GlintTable
 from .labels import PartLabels
-from .splat import Mirrored, Shine
+from .splat import Mirrored, Shine, add_shines
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +85,7 @@ class Traced(ArrayValue):
         seen = (job.lens, job.camera, job.window)
         # Single precision is finer than the samples' noise, and takes half the time.
         picture = psf.blur(self.blur.of_pictures(self.radiance).astype(np.float32), job.sensor.psf_sigma_px)
-        for shine in self.glints:
-            shine.add(picture, job)
+        add_shines(self.glints, picture, job)
         if job.lens.vignetting > 0:
             picture *= defocus.vignette(*seen)
         picture = stray.scattered(stray.framed(picture, *seen), *seen)

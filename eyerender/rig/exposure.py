@@ -17,7 +17,7 @@ from .stray import border
 
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0
-_STRETCH = 32768  # pixels at a time, so that what is worked on stays in the processor's cache
+_STRETCH = 65536  # pixels at a time, so that what is worked on stays in the processor's cache
 _FEW = 12.0  # below this mean the expansion of a Poisson quantile is too inaccurate, and probabilities are summed
 
 
@@ -99,8 +99,8 @@ class _Noise:
         return _Noise(self.bits[:, rows], *fixed)
 
 
-def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> NDArray[np.uint16]:
-    """Codes (h, w) of mean electrons, which are overwritten."""
+def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> Reals:
+    """Codes (h, w), whole numbers, of mean electrons, which are overwritten."""
     charge: Reals = mean
     read: Any = 0.0
     if noise is not None:
@@ -121,7 +121,7 @@ def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> NDArray[np.ui
     np.clip(dn, 0, full, out=dn)
     if sensor.gamma != 1:
         dn = full * (dn / full) ** (1 / sensor.gamma)
-    return np.asarray(np.rint(dn, out=dn), dtype=np.uint16)
+    return np.asarray(np.rint(dn, out=dn))
 
 
 def recorded(

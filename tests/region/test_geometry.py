@@ -19,7 +19,7 @@ from eyerender.region.contour import COLUMNS, contour
 from eyerender.region.globe import Globe
 from eyerender.region.hairs import SEGMENTS, Hairs, tube_faces
 from eyerender.region.lashes import lashes, plan
-from eyerender.region.lids import CONJUNCTIVA, FACE, FINE, LID, ROWS, _skin, sheet
+from eyerender.region.lids import CONJUNCTIVA, FACE, FINE, LID, MARGIN, ROWS, _margin, _skin, sheet
 from eyerender.region.mesh import region_mesh, sheet_faces
 from eyerender.region.skin import LASH, LASH_U, band_row, skin_map
 
@@ -148,14 +148,15 @@ def test_five_hundred_instances_hold():
         check(i)
 
 
-def test_every_second_column_beyond_the_lash_line_is_enough():
-    """The skin in all columns against the sheet, where every second one lies halfway between others."""
+def test_every_second_column_beyond_the_inner_edge_is_enough():
+    """Margins and skin in all columns against the sheet, where every second one lies halfway between others."""
     off = []
     for i in range(12):
         spec, _, globe, _ = instance(i)
         found, c = sheet(spec, globe), contour(spec, globe)
-        whole = _skin(spec, globe, c, found.lash_line)
-        off.append(np.abs(dots(found.vertices[FINE:] - whole, found.normals[FINE:]))[: LID + FACE // 2])
+        margin, lash_line = _margin(spec, globe, c)
+        whole = np.concatenate([margin[FINE - CONJUNCTIVA :], _skin(spec, globe, c, lash_line)])
+        off.append(np.abs(dots(found.vertices[FINE:] - whole, found.normals[FINE:]))[: MARGIN + LID + FACE // 2])
     assert np.sqrt(np.mean(np.square(off))) < 0.015  # mm
     assert np.percentile(off, 99) < 0.05
     assert np.max(off) < 0.2
@@ -171,23 +172,31 @@ def test_the_sheet_is_one_surface():
 
 
 def test_open_tubes_have_the_outlines_of_closed_ones():
-    hairs = brow(Region(seed=2))
-    hairs = Hairs(hairs.points[:40], hairs.radii[:40])
-    (vertices, _), points = hairs.tubes(np.array([1.0, 0.0, 0.0])), hairs.points.shape[1]
-    rng = np.random.default_rng(1)
-    hair, piece, share = (
-        rng.integers(40, size=4000),
-        rng.integers(points - 1, size=4000),
-        rng.uniform(0.2, 0.8, (4000, 1)),
-    )
-    start = (1 - share) * hairs.points[hair, piece] + share * hairs.points[hair, piece + 1]
-    start, way = start + rng.normal(0, 0.05, (4000, 3)), rng.normal(size=(4000, 3))
-    closed, open_ = (
-        crossings(start - way, start + way, Trimesh(vertices, tube_faces(40, points, on_skin), process=False))
-        for on_skin in (False, True)
-    )
-    assert 400 < np.count_nonzero(closed) < 3600
-    assert np.mean(closed != open_) < 2e-3  # lines along a hair leave it through its open end
+    spec, globe, rng = Region(seed=2), Globe.sphere(), np.random.default_rng(1)
+    for hairs, out in ((brow(spec), np.array([1.0, 0.0, 0.0])), (lashes(spec, globe, sheet(spec, globe)), None)):
+        hairs = Hairs(hairs.points[:40], hairs.radii[:40])
+        (vertices, _), points = hairs.tubes(out), hairs.points.shape[1]
+        hair, piece, share = (
+            rng.integers(40, size=4000),
+            rng.integers(points - 1, size=4000),
+            rng.uniform(0.2, 0.8, (4000, 1)),
+        )
+        start = (1 - share) * hairs.points[hair, piece] + share * hairs.points[hair, piece + 1]
+        start, way = start + rng.normal(0, 0.05, (4000, 3)), rng.normal(size=(4000, 3))
+        closed, open_ = (
+            crossings(start - way, start + way, Trimesh(vertices, tube_faces(40, points, sides), process=False))
+            for sides in ((0, 1, 2), (0, 2))
+        )
+        assert 200 < np.count_nonzero(closed) < 3600
+        assert np.mean(closed != open_) < 2e-3  # lines along a hair leave it through its open end
+
+
+def test_lashes_are_open_on_the_inner_side_of_their_bend():
+    spec, globe = Region(seed=2), Globe.sphere()
+    hairs = lashes(spec, globe, sheet(spec, globe))
+    normals = hairs.tubes()[1].reshape(*hairs.points.shape[:2], 3, 3)
+    bend = hairs.points[:, 3] - 0.5 * (hairs.points[:, 0] + hairs.points[:, -1])
+    assert np.all(dots(normals[:, 3, 0], bend) > 0)
 
 
 def lash_plan(seed, **fields):
