@@ -34,6 +34,7 @@ COLOURED = ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr
 
 
 _WAITING = 8  # images of a `Writer`
+_EVERY, _RUNS = 8, 0.5  # rows that are looked at; share of bytes like the one before from which runs are worth it
 
 
 def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> None:
@@ -59,7 +60,7 @@ def png_bytes(image: NDArray[Any]) -> bytes:
     """PNG file of (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour (ISO/IEC 15948).
 
     Noise does not compress, and writing must not cost more than rendering. So there is no search for the best filter
-    of each row, which takes most of the time elsewhere, nor one for repetitions other than runs.
+    of each row, which takes most of the time elsewhere, nor one for repetitions other than runs, which masks have.
     """
     if image.dtype not in (np.uint8, np.uint16) or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
         raise ValueError(f"no PNG holds {image.shape} of {image.dtype}")
@@ -72,7 +73,8 @@ def png_bytes(image: NDArray[Any]) -> bytes:
     else:  # differences to the pixel on the left
         rows[:, 0], rows[:, 1 : 1 + step] = 1, pixels[:, :step]
         np.subtract(pixels[:, step:], pixels[:, :-step], out=rows[:, 1 + step :])
-    packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, 9, zlib.Z_RLE)
+    runs = np.mean(rows[::_EVERY, 2:] == rows[::_EVERY, 1:-1]) > _RUNS
+    packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, 8, zlib.Z_RLE if runs else zlib.Z_HUFFMAN_ONLY)
     header = struct.pack(">IIBBBBB", width, height, 8 * image.itemsize, 0 if image.ndim == 2 else 2, 0, 0, 0)
     parts = ((b"IHDR", header), (b"IDAT", packer.compress(rows.data) + packer.flush()), (b"IEND", b""))
     chunks = (

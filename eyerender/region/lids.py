@@ -31,7 +31,7 @@ from .globe import Globe
 CONJUNCTIVA, MARGIN, LID, FACE = 7, 7, 12, 20
 _HELD = step(np.arange(LID + FACE, dtype=float), LID + 0.19 * FACE, LID + 0.68 * FACE)[:, None]  # share of rest
 ROWS = CONJUNCTIVA + MARGIN + LID + FACE
-FINE = CONJUNCTIVA + 2  # rows that have their own place in every column; the others have it in every second one
+FINE = CONJUNCTIVA + 1  # rows that have their own place in every column; the others have it in every second one
 _DIP_MM = 0.031
 EDGE_MM = 0.26  # depth of the margin's rounded edges
 _FAR_MM = (66.0, 58.0)

@@ -43,11 +43,7 @@ def lid_margins_px(
     """
     if len(region.upper_margin) == 0:
         return None
-    out = {}
-    for name, margin in (("upper", region.upper_margin), ("lower", region.lower_margin)):
-        marks = margin[np.linspace(0, len(margin) - 1, _MARKS).round().astype(int)] + anchor_mm
-        xy, front = camera.project(marks)
-        if not np.all(front):
-            return None
-        out[name] = np.round(xy, 4).tolist()
-    return out
+    both = region.upper_margin, region.lower_margin
+    marks = [margin[np.linspace(0, len(margin) - 1, _MARKS).round().astype(int)] for margin in both]
+    xy, front = camera.project(np.stack(marks) + anchor_mm)
+    return dict(zip(("upper", "lower"), np.round(xy, 4).tolist(), strict=True)) if np.all(front) else None

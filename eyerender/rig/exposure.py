@@ -200,20 +200,19 @@ def photon_counts(mean: Reals, normal: Reals) -> Reals:
     dark = bool(np.min(mean, initial=_FEW) < _FEW)
     root = np.maximum(mean, _FEW) if dark else mean
     root = np.sqrt(root, out=root if dark else None)
-    w2 = normal * normal
+    inverse, w2 = np.reciprocal(root), normal * normal
     # In powers of 1/root: mean + w root + (2 + w2)/6 - w (2 + w2)/(72 root) + (w2 (7 + 3 w2) - 16)/(810 root^2).
-    count = w2 * 3
-    count += 7
+    count = w2 * (3 / 810)
+    count += 7 / 810
     count *= w2
-    count -= 16
-    count /= root
+    count -= 16 / 810
+    count *= inverse
     w2 += 2
     third = normal * w2
-    third *= 810 / 72
+    third *= 1 / 72
     count -= third
-    count /= root
-    count *= 1 / 810
-    w2 /= 6
+    count *= inverse
+    w2 *= 1 / 6
     count += w2
     root *= normal
     count += root
