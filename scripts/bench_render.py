@@ -19,7 +19,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -450,7 +451,7 @@ class Bench:
         yield row("desktop window 400x300, 2 LEDs, 4 spp, a new pose: CPU", 1e3 * found["desktop"][0], "ms")
 
     def host_time(self) -> Iterable[Row]:
-        """Processor time of a frame outside Dr.Jit's kernels, and the clock of a run in which no kernel runs.
+        """Processor time of a frame outside Dr.Jit's kernels and outside tracing, and the clock without any kernel.
 
         Host time is the CPU time of a frame, with one thread, times the share of the clock in which no kernel runs.
         """
@@ -481,10 +482,54 @@ class Bench:
                     yield row(f"{name}, a new pose: host time, one thread", host, "ms")
                     yield row("the same: share of the frame's time", share, "%")
                     yield row("the same: kernels launched", launched, "kernels")
+            yield from self._outside_tracing()
         finally:
             if self.backend.name == "llvm":
                 dr.set_thread_count(threads)
         yield from self._critical_path()
+
+    def _outside_tracing(self) -> Iterable[Row]:
+        """CPU time of what a headset frame needs beside its light and its samples."""
+        import drjit as dr
+
+        from eyerender.imagefile import png_bytes
+        from eyerender.rendering.labels import part_labels
+        from eyerender.rendering.region import RegionScene
+        from eyerender.rendering.splat import MirrorImages
+
+        job = self._scene_job("headset", 4)
+        spent: dict[str, list[float]] = {}
+
+        @contextmanager
+        def timed(name: str) -> Iterator[None]:
+            dr.sync_thread()
+            start = time.process_time()
+            yield
+            dr.sync_thread()
+            spent.setdefault(name, []).append(time.process_time() - start)
+
+        for k in range(8 if self.small else 20):
+            turned = self._turned(job, k)
+            _, place = self.renderer.bind(self._turned(job, k - 1), lit=False)
+            assert isinstance(place, RegionScene)
+            with timed("mesh and trees of the pose"):
+                place.show(turned.region, turned.globe)
+            shown, place = self.renderer.bind(turned, lit=False)
+            with timed("labels"):
+                _ = part_labels(shown, turned.window)(), shown.host.lid_margins_px
+            with timed("glints"):
+                MirrorImages.of(turned, None).seen(place, shown.host.blur)
+            traced = self.renderer._traced(turned, 4, (), None)
+            with timed("lens and sensor"):
+                done = traced.developed()
+            assert done.labels is not None
+            with timed("PNG of image and labels"):
+                for picture in (done.dn.astype(np.uint8), done.labels.part):
+                    png_bytes(picture)
+        each = {name: 1e3 * np.array(times[3:]) for name, times in spent.items()}
+        for name, times in each.items():
+            yield row(f"headset, outside tracing: {name}, CPU", np.median(times), "ms")
+        yield row("headset, all outside tracing, CPU", np.median(sum(each.values())), "ms")
 
     def _critical_path(self) -> Iterable[Row]:
         """Share of the clock in which no kernel runs while a run of headset frames is rendered and written."""
