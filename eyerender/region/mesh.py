@@ -23,7 +23,7 @@ from .lashes import lashes
 from .lids import FINE, ROWS, grid_normals, halved, sheet
 from .skin import BROW, LASH, LASH_U, TEAR, band_row, sheet_v
 from .tears import ROWS as TEAR_ROWS
-from .tears import meniscus
+from .tears import meniscus, on_globe
 
 if TYPE_CHECKING:
     import trimesh
@@ -171,8 +171,10 @@ def _layout(upper_count: int, lash_count: int, brow_count: int, mirrored: bool) 
 
 
 def _tear_faces() -> Ints:
+    """Triangles (m, 3) of the menisci, where they have any height."""
     n = COLUMNS + 1
-    i, j = np.meshgrid(np.arange(TEAR_ROWS - 1), np.arange(COLUMNS), indexing="ij")
+    high = on_globe(2 * np.pi * np.arange(n) / COLUMNS) > 0
+    i, j = np.meshgrid(np.arange(TEAR_ROWS - 1), np.flatnonzero(high[:-1] | high[1:]), indexing="ij")
     a, b, c, d = i * n + j, i * n + j + 1, (i + 1) * n + j, (i + 1) * n + j + 1
     both = [np.stack([a, c, d], -1).reshape(-1, 3), np.stack([a, d, b], -1).reshape(-1, 3)]
     return np.concatenate(both).astype(np.int64)

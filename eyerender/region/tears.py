@@ -17,7 +17,7 @@ from .contour import step
 from .globe import Globe
 from .lids import Sheet
 
-ROWS = 7
+ROWS = 5
 _OUT = 1.8  # width on the margin over the height on the globe, so that the radius is about 1.6 heights
 _TURN = np.linspace(0, np.pi / 2, ROWS)[:, None]  # of each row along the arc
 _LONG, _SHORT = (6, 40), (6, 20)  # waves once around the fissure, which is about 60 mm long
@@ -38,11 +38,15 @@ def _noise(seed: int, count: int, low: int, high: int) -> Floats:
     return frozen(np.cos(np.arange(low, high) * angle + turn).sum(axis=1) * np.sqrt(2 / (high - low)))
 
 
+def on_globe(angle: Floats) -> Floats:
+    """Share of its height that the meniscus has at angles about the fissure; it ends towards the canthi."""
+    return np.asarray(step(np.abs(np.sin(angle)), 0.25, 0.6))
+
+
 def meniscus(spec: Region, globe: Globe, sheet: Sheet) -> Floats:
     """Vertices (ROWS, columns, 3) of the strip, from the globe to the margin."""
     c = sheet.contour
-    on_globe = step(np.abs(np.sin(c.angle)), 0.25, 0.6)
-    height = spec.tears.height_mm * on_globe * np.where(c.upper > 0, 0.66, 1.0) * step(c.openness, 0.02, 0.25)
+    height = spec.tears.height_mm * on_globe(c.angle) * np.where(c.upper > 0, 0.66, 1.0) * step(c.openness, 0.02, 0.25)
     low = np.maximum(1 + 0.8 * spec.tears.unevenness * _noise(spec.seed, len(c.angle), *_LONG), 0.15)
     height = height * low
     # The two menisci must not meet.

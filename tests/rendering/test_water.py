@@ -54,8 +54,8 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
     values, skin = shown.values, shown.textures.region
     ends, face_ends = place.posed.layout.vertex_ends, place.posed.layout.face_ends
     faces = place.posed.layout.faces[face_ends[-2] :]
-    weights = np.random.default_rng(4).dirichlet(np.ones(3), 20000)
-    aims = np.random.default_rng(5).integers(len(faces), size=20000)
+    weights = np.random.default_rng(4).dirichlet(np.ones(3), 60000)
+    aims = np.random.default_rng(5).integers(len(faces), size=60000)
     x = np.einsum("nk,nkc->nc", weights, place.posed.vertices[faces[aims]])
     o = np.asarray(rig.camera.nodal_point_mm)
     d = (x - o) / np.linalg.norm(x - o, axis=-1, keepdims=True)
@@ -66,7 +66,7 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
     seen, way = through_water(values, skin, film, wet, view, *rays)
     found, turned = seen.point.numpy().T, way.numpy().T
     behind = on_sclera & seen.sclera.numpy() & (np.linalg.norm(turned - d, axis=-1) > 1e-4)
-    assert behind.sum() > 150
+    assert behind.sum() > 500
 
     inner = faces - ends[-2]
     tears = slice(int(ends[-2]), None)
@@ -82,11 +82,11 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
     true = start + (-b - np.sqrt(b * b - np.sum(r * r, axis=-1) + radius**2))[:, None] * inside
     # Water moves what is behind it by 0.2 mm. We follow the ray under water to the globe's tangent plane where it would
     # be met without water. That is off by the globe's curvature over that distance, more for grazing rays. The bar for
-    # 90 % of the rays is a tenth of a pixel of this camera, and 3 % of the way that water moves the picture.
+    # 90 % of the rays is an eighth of a pixel of this camera, and 4 % of the way that water moves the picture.
     moved, error = (np.linalg.norm(p - true, axis=-1) for p in (straight, found))
     assert np.median(moved) > 0.15
     assert np.median(error) < 0.0025
-    assert np.quantile(error, 0.9) < 0.006
+    assert np.quantile(error, 0.9) < 0.008
     # In air it goes on as one that the globe refracts into the same direction, where it would be met without water.
     outside = _refracted(inside, (straight - centre) / radius, _INDEX)
     assert np.quantile(np.linalg.norm(turned @ M - outside, axis=-1), 0.9) < 1e-4
