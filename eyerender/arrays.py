@@ -61,7 +61,7 @@ def remembered(function: Callable[_Values, _Result]) -> Callable[_Values, _Resul
     @wraps(function)
     def found(*values: Any) -> _Result:
         for some, result in known:
-            if all(map(is_, some, values)):
+            if len(some) == len(values) and all(map(is_, some, values)):
                 return result
         result = function(*values)  # type: ignore[call-arg]
         known[:] = [*known[1 - _REMEMBERED :], (values, result)]

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..arrays import ArrayValue, Bools, Floats, frozen, remembered
 from ..geometry.surfaces import Surface, Xyz, components, join
 from ..geometry.transforms import normalize
 from ..optics.interface import fresnel
@@ -154,13 +154,14 @@ class GlintScene:
 
     def images(self, lights: Sequence[Lamp], sigma_px: float) -> Images:
         """Compute the image of each lamp as finely as its size and the point-spread function require."""
-        images = self._trace(lights, [_ROUGH if lamp.radius_mm > 0 else POINT for lamp in lights])
-        rims = {k: images[k].last(_ON_RIM) for k, lamp in enumerate(lights) if lamp.radius_mm > 0}
-        counts = {k: _node_counts(edge.xy_px[edge.there], sigma_px) for k, edge in rims.items()}
+        images = self._traced(_roughly(*lights))
+        wide = [k for k, lamp in enumerate(lights) if lamp.radius_mm > 0]
+        rims = ((images[k].xy_px[-_ON_RIM:], images[k].there[-_ON_RIM:]) for k in wide)
+        counts = {k: _node_counts(xy[there], sigma_px) for k, (xy, there) in zip(wide, rims, strict=True)}
         if more := [k for k, count in counts.items() if count != _LEAST]:
             finely = self._trace([lights[k] for k in more], [quadrature(*counts[k]) for k in more])
             for k, image in zip(more, finely, strict=True):
-                images[k] = image.and_(rims[k])
+                images[k] = image.and_(images[k].last(_ON_RIM))
         return Images(images, counts)
 
     def glints(self, lights: Sequence[Lamp], images: Images, clear: Visibility) -> list[Glint]:
@@ -247,14 +248,12 @@ class GlintScene:
 
     def _trace(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:
         """Images of lamps through the given points of their discs; all lamps in one batch."""
-        camera = self.camera
-        counts = [len(n.weight) for n in nodes]
-        points = np.concatenate([disc_points(lamp, n.point) for lamp, n in zip(lights, nodes, strict=True)])
-        which = np.repeat(np.arange(len(lights)), counts)
-        weights = np.concatenate([n.weight for n in nodes])
-        axes = np.stack([lamp.axis for lamp in lights]) @ self.M
-        strength = np.array([float(lamp.intensity_mw_sr) for lamp in lights])
-        exponent = np.array([float(lamp.lobe_exponent) for lamp in lights])
+        return self._traced(_Emitters.of(lights, nodes))
+
+    def _traced(self, emitters: _Emitters) -> list[Image]:
+        """Images of lamps through points of them."""
+        camera, which, counts, weights = self.camera, emitters.which, emitters.counts, emitters.weights
+        points, axes, strength, exponent = emitters.points, emitters.axes @ self.M, emitters.strength, emitters.exponent
         eyepoint = self._eyepoint
         sources = (points - self.t) @ self.M
         lamp_xyz, node_xyz = components(sources), components(np.broadcast_to(eyepoint, sources.shape))
@@ -301,6 +300,49 @@ class GlintScene:
         b = _dot(o, d)
         disc = b * b - (_dot(o, o) - self.sclera_radius_mm**2)
         return np.asarray((disc > 0) & (-b - np.sqrt(np.maximum(disc, 0)) > 1e-6))
+
+
+@dataclass(frozen=True, slots=True)
+class _Emitters:
+    """Points of lamps.
+
+    Attributes:
+        points: (k, 3) in the world, those of each lamp side by side.
+        weights: (k,) shares of their lamps.
+        which: (k,) numbers of the lamps.
+        counts: number of points of each lamp.
+        axes: (n, 3) of the lamps.
+        strength: (n,) mW/sr along the axes.
+        exponent: (n,) of the lobes.
+    """
+
+    points: Floats
+    weights: Floats
+    which: NDArray[np.intp]
+    counts: list[int]
+    axes: Floats
+    strength: Floats
+    exponent: Floats
+
+    @classmethod
+    def of(cls, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> _Emitters:
+        """Take the given points of the discs of lamps."""
+        counts = [len(n.weight) for n in nodes]
+        return cls(
+            np.concatenate([disc_points(lamp, n.point) for lamp, n in zip(lights, nodes, strict=True)]),
+            np.concatenate([n.weight for n in nodes]),
+            np.repeat(np.arange(len(lights)), counts),
+            counts,
+            np.stack([lamp.axis for lamp in lights]),
+            np.array([float(lamp.intensity_mw_sr) for lamp in lights]),
+            np.array([float(lamp.lobe_exponent) for lamp in lights]),
+        )
+
+
+@remembered  # lamps are the same from frame to frame
+def _roughly(*lights: Lamp) -> _Emitters:
+    """Few points of lamps and points of their rims."""
+    return _Emitters.of(lights, [_ROUGH if lamp.radius_mm > 0 else POINT for lamp in lights])
 
 
 def glint_table(glints: Sequence[Glint]) -> GlintTable:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from eyerender.rendering.glints import _roughly
 from eyerender.rendering.surround import Obstacle
 from eyerender.rig.sensor import Sensor
 from tests.support.light_tracing import trace_backward
@@ -89,3 +90,9 @@ def test_glints_end_at_the_limbus(renderer):
     assert not table.visible[0]
     assert np.isnan(table.xy_px[0]).all()
     assert table.energy[0] == 0.0
+
+
+def test_points_of_some_lamps_are_not_those_of_more():
+    """They are remembered from frame to frame."""
+    lamps = head_rig(count=3).lights
+    assert [len(_roughly(*lamps[:n]).counts) for n in (3, 2, 3, 1)] == [3, 2, 3, 1]
