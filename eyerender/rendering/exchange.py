@@ -381,11 +381,12 @@ class Exchange:
     def begun(
         self, host: Prepared, values: Values, lights: Lights, panels: Lights, textures: Textures,
         place: Surround | RegionScene,
-    ) -> Callable[[], Received]:  # fmt: skip
-        """Find what the places of a frame receive straight from the lamps, and what they see of each other.
+    ) -> Callable[[], Callable[[], Received]]:  # fmt: skip
+        """Begin to find what the places of a frame receive straight from the lamps, and what they see of each other.
 
         Returns:
-            What solves for all light, on the host. Before that the device may be given other work.
+            What reads this. It returns what solves for all light, on the host; before that the device may be given
+            other work.
 
         Args:
             host: the frame's job, and the places on the globe.
@@ -403,16 +404,20 @@ class Exchange:
         points, normals, plane = _others(job, globe, region, plan.skin)
         frame = _Frame(job, grid, self._inside(job), plan, points, normals, plane)
         if not job.interreflection and not values.structure.ambient:
-            return lambda: frame.dark(region)
+            return lambda: lambda: frame.dark(region)
         numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
         outer = _sent(frame.outer.ravel())
         direct, ambient = _direct(values, lights, panels, place.scene, textures, frame, outer)
         mirrored = _mirrored(values, lights, place.scene, frame)
         lamps, more = (_direct_inside(values, some, place.scene, frame.interior.rows) for some in (lights, panels))
         seen = _seen(values, lights, textures, place, numbers, frame, outer)
-        # Nothing is read before all is launched, because every read waits for all launches.
-        known = direct(), mirrored(), ambient(), lamps(), more(), seen()
-        return lambda: frame.solved(region, numbers, *known)
+
+        def read() -> Callable[[], Received]:
+            # Nothing is read before all is launched, because every read waits for all launches.
+            known = direct(), mirrored(), ambient(), lamps(), more(), seen()
+            return lambda: frame.solved(region, numbers, *known)
+
+        return read
 
     def _inside(self, job: RenderJob) -> _Interior:
         """The chamber of a job's eye."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats, Ints, Singles, frozen
 from ..eye.fundus import FundusLight
-from ..region.mesh import RegionMesh, region_mesh
+from ..region.mesh import RegionMesh
 from ..rig.camera import Window
 from .blur import Blur
 from .frame import RenderJob, light_table, parameters_of, returned_light, sun_lamps
@@ -27,7 +27,7 @@ _NO_TILES = frozen([[False]], bool)
 
 
 class Prepared:
-    """What NumPy alone makes of a job. Every part is made when it is first asked for, or all by `made_beside`.
+    """What NumPy alone makes of a job. Every part is made when it is first asked for, or all by `made`.
 
     Args:
         job: the job.
@@ -40,9 +40,9 @@ class Prepared:
         self._fine: dict[Window, tuple[NDArray[np.uint32], Ints]] = {}
 
     @classmethod
-    def made_beside(cls, job: RenderJob) -> Prepared:
-        """Make all that a picture needs, with the mesh of a procedural region."""
-        made = cls(job, None if job.region is None else region_mesh(job.region, job.globe))
+    def made(cls, job: RenderJob, posed: RegionMesh | None) -> Prepared:
+        """Make all that a picture needs."""
+        made = cls(job, posed)
         _ = made.parameters, made.lamps, made.returned, made.places, made.lid_margins_px
         if job.mesh_edge_mm is None:
             _ = made.mirror_images

@@ -45,8 +45,8 @@ class Renderer:
     def __init__(self, backend: Backend, *, spp: int = 16, obstacles: Sequence[Obstacle] = ()) -> None:
         self.backend = backend
         self.spp = spp
-        self._stage = Stage(obstacles)
         self._beside = ThreadPoolExecutor(1, "develop")
+        self._stage = Stage(self._beside, obstacles)
 
     def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()) -> RenderedWindow:
         """Render one window.
@@ -86,13 +86,12 @@ class Renderer:
         glints: list[Shine] = []
         marks: tuple[Any, ...] | None = None
         for shot in shots:
-            shown, place = self.bind(shot)
+            shown, place = self._stage.set(shot, after=None if moments else after)
             blur = blur or (Blur.of(job, place.posed) if moments else shown.host.blur)
             film = begun(shown, blur.window, spp, shot.seed, layered=blur.layered)
             # The device is at work until something is read, so the host's own work comes first.
-            if after is not None and not moments:
-                self._stage.expect(after, self._beside)
             found = _marks(job, shown) if shot.M is job.M and shot.t is job.t else None
+            self._stage.prepare()
             mirrored, shines = self._mirror_images(shown.host).seen(place, blur, 1 / len(shots))
             glints += shines
             picture, missed = film.mean()

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import Executor, Future
-from dataclasses import replace
+from concurrent.futures import Executor, Future, wait
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from ..errors import InputError
-from ..region.mesh import RegionMesh
+from ..region.mesh import RegionMesh, region_mesh
 from ..rig.imaging import Ambient
 from .environment import Ambience, Maps
 from .exchange import Exchange
@@ -36,7 +36,7 @@ from .meshed import Meshes, meshed
 from .prepared import Prepared
 from .pupillight import PupilLight
 from .recorded import forget
-from .region import RegionScene
+from .region import RegionScene, Trees
 from .subsurface import tissue_light
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
@@ -47,10 +47,26 @@ _REMEMBERED = 32  # subjects; then recordings are made anew, because those of si
 _FARTHEST_MM = 60.0  # of places in the plane of a surround that have a grid
 
 
-class Stage:
-    """Scenes, textures and maps; `obstacles` are in the scene's frame about eyes without a region."""
+@dataclass(slots=True)
+class _Next:
+    """The job that comes next, and what other threads make of it: its mesh, trees, and all the rest."""
 
-    def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
+    job: RenderJob
+    posed: Future[RegionMesh] | None = None
+    trees: Trees | None = None
+    host: Future[Prepared] | None = None
+
+
+class Stage:
+    """Scenes, textures and maps.
+
+    Args:
+        beside: what makes what NumPy alone can make, in one other thread.
+        obstacles: in the scene's frame about eyes without a region.
+    """
+
+    def __init__(self, beside: Executor, obstacles: Sequence[Obstacle] = ()) -> None:
+        self._beside = beside
         self._surround = Surround(obstacles)
         self._textures: dict[Any, Textures] = {}
         self._regions: dict[Any, RegionScene] = {}  # the one that was used last is last
@@ -60,17 +76,37 @@ class Stage:
         self.meshes = Meshes()
         self._exchange = Exchange()
         self._shapes: KeptForEye[Shape] = KeptForEye()
-        self._expected: tuple[RenderJob, Future[Prepared]] | None = None
+        self._next: _Next | None = None
 
-    def expect(self, job: RenderJob, beside: Executor) -> None:
-        """Have what NumPy alone makes of the next job made by another thread, but for a head mesh."""
-        if job.region is None or job.region.head is None:
-            self._expected = job, beside.submit(Prepared.made_beside, job)
+    def _expect(self, job: RenderJob) -> None:
+        """Have the mesh of the next job made by another thread, but for a head mesh."""
+        self._next = _Next(job)
+        if job.region is not None and job.region.head is None:
+            self._next.posed = self._beside.submit(region_mesh, job.region, job.globe)
 
-    def set(self, job: RenderJob, *, lit: bool = True) -> tuple[Exposed, Surround | RegionScene]:
+    def prepare(self) -> None:
+        """Have what can be made of the next job without the device made by other threads, once all is launched."""
+        after = self._next
+        if after is None or (after.job.region is not None and after.posed is None):
+            return
+        if after.posed is not None and after.posed.exception():
+            return  # its own frame shall raise the error
+        job, posed = after.job, None if after.posed is None else after.posed.result()
+        after.host = self._beside.submit(Prepared.made, job, posed)
+        if job.region is not None and posed is not None:
+            place = self._regions.get(RegionScene.key(job.region, job.globe))
+            if place is not None and place.double and not place.shows(job.region, job.globe):
+                after.trees = place.begun(posed)
+
+    def set(
+        self, job: RenderJob, *, lit: bool = True, after: RenderJob | None = None
+    ) -> tuple[Exposed, Surround | RegionScene]:
         """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call.
 
-        `lit`: whether radiance is wanted, not only what is seen where.
+        Args:
+            job: the job.
+            lit: whether radiance is wanted, not only what is seen where.
+            after: the next job, if it is known.
         """
         host, place = self._prepared(job)
         region = place if isinstance(place, RegionScene) else None
@@ -102,23 +138,27 @@ class Stage:
             textures = replace(textures, ambience=ambience)
         textures = replace(textures, pupil=PupilLight(values, lights, place.scene, host.returned))
         if lit:
-            textures = self._lit(host, values, lights, textures, place)
+            textures = self._lit(host, values, lights, textures, place, after)
         return Exposed(place.scene, values, lights, textures, host), place
 
     def _lit(
-        self, host: Prepared, values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene
-    ) -> Textures:
+        self, host: Prepared, values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene,
+        after: RenderJob | None,
+    ) -> Textures:  # fmt: skip
         """The textures with the light between surfaces; prepares the grids of the lamps' light that a frame can use."""
         job = host.job
         parts = panel_lamps(job.ambient, job.anchor_mm)
         if textures.ambience is not None:
             parts += textures.ambience.bright(job.anchor_mm)
         panels = Lights(light_table(parts, job.M, job.t))
-        exchange = self._exchange.begun(host, values, lights, panels, textures, place)
+        read = self._exchange.begun(host, values, lights, panels, textures, place)
+        if after is not None:
+            self._expect(after)
+        solved = read()
         if not place.obstructed or (isinstance(place, RegionScene) and place.skin.is_sheet):
             lights.on_iris = IrisLight(values, lights, place.scene, textures.lamp_views)
         lights.relief = IrisRelief(job, values, lights, place.scene, textures, self._shapes)
-        received = exchange()
+        received = solved()
         if not place.obstructed:
             reach = min(host.reach_mm, _FARTHEST_MM)
             lights.on_matte = MatteLight(values, lights, place.scene, received, reach)
@@ -126,20 +166,27 @@ class Stage:
 
     def _prepared(self, job: RenderJob) -> tuple[Prepared, Surround | RegionScene]:
         """What NumPy makes of a job, and its posed surroundings."""
-        (expected, beside), self._expected = self._expected or (None, None), None
-        host = beside.result() if beside is not None and expected is job else None
-        place = self._place(job, None if host is None else host.posed)
+        expected, self._next = self._next, None
+        host: Prepared | None = None
+        trees: Trees | None = None
+        if expected is not None:
+            if expected.trees is not None:
+                wait([expected.trees.built])  # whatever comes now, because it changes the same shapes
+            if expected.job is job:
+                trees = expected.trees
+                host = None if expected.host is None else expected.host.result()
+        place = self._place(job, None if host is None else host.posed, trees)
         return host or Prepared(job, place.posed), place
 
-    def _place(self, job: RenderJob, known: RegionMesh | None) -> Surround | RegionScene:
-        """Posed surroundings; the mesh of a region may be known."""
+    def _place(self, job: RenderJob, known: RegionMesh | None, trees: Trees | None) -> Surround | RegionScene:
+        """Posed surroundings; the mesh of a region and its trees may be known."""
         if job.region is None:
             self._surround.show(job.look)
             return self._surround
         if self._surround.obstructed:
             raise InputError("obstacles cannot be combined with an eye region")
         place = self._region(job, known)
-        place.show(job.region, job.globe, known)
+        place.show(job.region, job.globe, known, trees)
         return place
 
     def _region(self, job: RenderJob, known: RegionMesh | None) -> RegionScene:
