@@ -42,7 +42,7 @@ _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
 _STEEPEST = 2.0  # slope of the map, over the region's frame; margins are seen from their edges
 _STRIP = 32  # rows of the map that are made together, so that they stay in the processor's cache
 _HAIR_GLOSS = 0.2
-_WET, _WET_ROOT = 0.93, 0.06  # gloss of wet tissue, and the share of a lash that is wet
+_WET, _WET_ROOT = 0.97, 0.06  # gloss of wet tissue, and the share of a lash that is wet
 _SHOWN_MM = 25.0  # about the middle of the fissure: the skin whose mean albedo is that of the spec
 _REFERENCE_BLINK = 0.3  # at which the tissue is laid out: neither stretched nor hidden in the fold
 
@@ -341,14 +341,15 @@ class _Strip:
         cells, creases, pores = self.cells(), self.creases(), self.pores()
         oil, wet = self.oil(), self.wet()
         height = self.relief(cells, oil) - (1 - oil) * (0.03 * pores + 0.17 * spec.skin.wrinkles * creases)
-        height = height * self.lid + spec.tears.unevenness * self.lumps()
+        # Water fills the furrows.
+        dry = self.lid * (1 - np.minimum(wet * (1 / 0.7), 1))
+        height = height * dry + spec.tears.unevenness * self.lumps()
         if np.any(self.flesh):
             bumps = 0.075 + 0.25 * spec.tears.unevenness
             height = height + bumps * self.flesh * self.field(6, (10, 36), (10, 36))
         # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
         open_ = 1 + 0.10 * (cells - 0.5) - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
         film = 0.42 * self.slowly("film") * (0.4 + 0.6 * cells) * (1 - pores)
-        # Only beside the roots of the lashes is the oil thick enough to mirror like water.
         sheen = spec.skin.sheen * np.clip(film + oil, 0.04, 0.72 + 0.18 * self.roots)
         gloss = np.where(wet > 0, wet, np.minimum(sheen, 0.49) * self.lid)
         return self.albedo(open_, spots), gloss, height
@@ -356,8 +357,8 @@ class _Strip:
     def oil(self) -> Singles:
         """Share, 0 to 1, of skin whose furrows oil fills: pools about the glands of the lash roots, few farther out.
 
-        At the roots it makes the skin smooth, so each swelling mirrors a lamp as one streak along the skin's lines.
-        Farther out the film is thinner and follows the relief, so the streaks are soft and grained.
+        It is thicker at the roots, so the lines of the skin shine there as streaks. Farther out the film follows the
+        relief, so the sheen is soft and grained.
         """
         beside = np.exp(-np.square(self.out_mm * (1 / 6.0)))
         near = np.maximum(_bell(self.out_mm, 0.9, 1.7), 0.75 * beside)
@@ -370,18 +371,18 @@ class _Strip:
         More than `_WET` stands for the oil on it.
         """
         out: Singles = np.zeros_like(self.y)
-        if np.min(self.rows) < _LINE + 6:
+        if np.min(self.out_mm) < 4:
             tongues = self.tiles.at(43, _places(self.y, self.out_mm / 3), (10, 60), (10, 60))
-            film = 1 - step(self.rows - _LINE - 1.3 - 0.9 * tongues, -0.6, 0.6)
-            out = film * np.clip(0.97 - 0.06 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
+            film = 1 - step(self.out_mm - 0.75 - 0.9 * tongues, -0.2, 0.2)
+            out = film * np.clip(0.99 - 0.06 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
         return out
 
     def lumps(self) -> Singles:
         """Height (mm) of the lumps of the wet margins: mouths of glands, and water between the lashes."""
-        at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0) * (1 - step(self.rows, _LINE + 1.5, _LINE + 3.5))
+        at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0) * (1 - step(self.out_mm, 1.0, 2.5))
         out: Singles = np.zeros_like(self.y)
         if np.any(at > 0):
-            out = 0.09 * at * self.tiles.at(9, _places(self.y, self.out_mm), (8, 20), (24, 60))
+            out = 0.06 * at * self.tiles.at(9, _places(self.y, self.out_mm), (4, 10), (12, 30))
         return out
 
     def cells(self) -> Singles:

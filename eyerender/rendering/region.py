@@ -34,11 +34,10 @@ from .values import aligned
 
 SHEET_COLUMNS = COLUMNS + 1  # of the sheet's grid, because the first column is repeated
 _F0_OIL, _F0_TEARS = 0.035, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
-_ROUGH_SKIN, _ROUGH_OIL, _ROUGH_WET = 0.19, 0.02, 0.03
-_THICK, _THINNER = 0.42, 0.6  # gloss from which a film of oil is smooth, and its roughness per gloss below
-_OILY = 0.93  # share of skin's sheen in the narrow lobe of its film of oil, which the relief breaks into points
+_ROUGH_OIL, _THINNER = 0.05, 0.15  # roughness of a film of oil at a gloss of 0.5, and how much it grows per gloss below
+_ROUGH_WET = 0.015
 _WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
-_RIPPLE = 0.02  # slope of wet tissue
+_RIPPLES = ((0.13, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to those 1 mm long on the globe
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,8 +422,8 @@ def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, glo
         f = w D F / (4 (l . h)^2),  D = a^2 / (pi ((n . h)^2 (a^2 - 1) + 1)^2)
 
     with h half way between lamp and camera (GGX: Walter et al. 2007; the visibility term: Kelemen, Szirmay-Kalos 2001;
-    F: Schlick 1994). Skin has two lobes: a wide one of its rough surface, and a narrow one of the film of oil on it,
-    which is rougher the thinner it is. Oil on tears, which makes their gloss higher than `_WATER`, mirrors more.
+    F: Schlick 1994). The roughness a of skin stands for what is finer than its map, so no oil on it mirrors like
+    water; it is rougher the thinner the film. Oil on tears, which makes their gloss higher than `_WATER`, mirrors more.
     """
     wet = gloss > 0.5
     half = dr.normalize(to_lamp + to_camera)
@@ -432,8 +431,7 @@ def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, glo
     nh = dr.maximum(dr.dot(normal, half), 0)
     water = (2 * gloss - 1) * (1 + 10 * dr.maximum(gloss - _WATER, 0))
     weight = dr.select(wet, water, gloss * (1 / 0.45))
-    narrow = _ggx(nh, dr.select(wet, _ROUGH_WET, _ROUGH_OIL + _THINNER * dr.maximum(_THICK - gloss, 0)))
-    D = dr.select(wet, narrow, _OILY * narrow + (1 - _OILY) * _ggx(nh, mi.Float(_ROUGH_SKIN)))
+    D = _ggx(nh, dr.select(wet, _ROUGH_WET, _ROUGH_OIL + _THINNER * (0.5 - gloss)))
     return weight * D * _schlick(lh, dr.select(wet, _F0_TEARS, _F0_OIL)) * 0.25 / (lh * lh)
 
 
@@ -451,9 +449,11 @@ def glossy_normal(normal: mi.Vector3f, gloss: mi.Float) -> mi.Vector3f:
 
 def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
     """Normal of the tear film (eye frame); the uneven conjunctiva below it breaks up its highlights."""
-    p, q = 71 * normal.y + 23 * normal.z, 67 * normal.z - 29 * normal.y
-    ripple = _RIPPLE * mi.Vector3f(0, dr.sin(p + 1.7 * dr.sin(q)), dr.sin(q + 1.7 * dr.sin(p)))
-    return dr.normalize(normal + ripple)
+    tilted = normal
+    for slope, wave in _RIPPLES:
+        p, q = wave * (71 * normal.y + 23 * normal.z), wave * (67 * normal.z - 29 * normal.y)
+        tilted = tilted + slope * mi.Vector3f(0, dr.sin(p + 1.7 * dr.sin(q)), dr.sin(q + 1.7 * dr.sin(p)))
+    return dr.normalize(tilted)
 
 
 def film_reflectance(cosine: mi.Float, gloss: mi.Float) -> mi.Float:

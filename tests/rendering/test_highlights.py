@@ -33,8 +33,8 @@ def test_masks_mark_where_mirrored_light_exceeds_half_of_the_scattered(renderer,
     # Mask and picture take other samples of a pixel, which matters on relief and hairs that are finer than a pixel.
     assert np.mean(ratio[marked] > 0.25) > 0.8
     assert np.mean(ratio[~marked & (part < 2)] < 0.75) > 0.995
-    # The mirror of the cornea makes glints, not highlights.
-    assert not np.any(marked & (part >= 2) & (ratio < 0.1))
+    # The mirror of the cornea makes glints, not highlights. Tears before it are marked; they may fill part of a pixel.
+    assert not np.any(marked & (part >= 2) & (ratio < 0.05))
     assert done.glints.visible.any()
 
 

@@ -100,7 +100,7 @@ def test_a_cylinder_of_water_mirrors_as_much_as_an_ideal_one(renderer, monkeypat
     # A cylinder of radius r mirrors E F r / 2 cos(i) of parallel light into a radian of its plane. Its roughness
     # spreads this along the axis: slopes of GGX have the density 1 / (2 a) at 0, and a tilt m turns the mirrored ray
     # by 2 m cos(i). The camera at right angles to the axis sees E F r / (8 a).
-    monkeypatch.setattr(region, "_RIPPLE", 0.0)
+    monkeypatch.setattr(region, "_RIPPLES", ())
     rough = region._ROUGH_WET
     turn = np.linspace(-0.6, 0.6, 40001)
     normal = mi.Vector3f(*np.stack([np.cos(turn), np.sin(turn), 0 * turn]).astype(np.float32))
