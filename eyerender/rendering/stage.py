@@ -93,7 +93,8 @@ class Stage:
             return  # its own frame shall raise the error
         job, posed = after.job, None if after.posed is None else after.posed.result()
         after.host = self._beside.submit(Prepared.made, job, posed)
-        if job.region is not None and posed is not None:
+        # With one thread, kernels run while they are launched, so nothing is left to build trees beside.
+        if job.region is not None and posed is not None and dr.thread_count() > 1:
             place = self._regions.get(RegionScene.key(job.region, job.globe))
             if place is not None and place.double and not place.shows(job.region, job.globe):
                 after.trees = place.begun(posed)

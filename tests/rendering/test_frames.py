@@ -79,6 +79,8 @@ def test_windows_that_overlap_are_those_rendered_one_by_one(renderer, monkeypatc
 
 
 def test_trees_built_beside_the_frame_before_give_the_same_bits(renderer, monkeypatch):
+    import drjit as dr
+
     from eyerender.rendering import region
 
     build, threads = region._built, list[threading.Thread]()
@@ -99,7 +101,10 @@ def test_trees_built_beside_the_frame_before_give_the_same_bits(renderer, monkey
     monkeypatch.setattr(region, "_built", built)
     first, left, other = jobs(5, "right"), jobs(5, "left"), jobs(6, "right")
     run = [first[0], first[1], left[0], first[2], left[1], other[0], other[1], first[0]]
+    threaded = dr.thread_count()
+    dr.set_thread_count(2)  # with one, there is nothing to build trees beside
     begun = [renderer.begin(job, spp=4, after=after) for job, after in zip(run, [*run[1:], first[2]], strict=True)]
+    dr.set_thread_count(threaded)
     if renderer.backend.name == "llvm":
         # A subject or a side that comes, or comes back, has no scene before its frame.
         assert sum(thread is not threading.main_thread() for thread in threads) == 4
