@@ -44,6 +44,7 @@ from .view import Textures
 
 _REGIONS, _TEXTURES = 4, 8  # kept
 _REMEMBERED = 32  # subjects; then recordings are made anew, because those of sizes that never come back take 3 MB each
+_BESIDE = 50_000  # trees built beside frames: Embree and Dr.Jit keep 2 kB of every thread that has built one
 _FARTHEST_MM = 60.0  # of places in the plane of a surround that have a grid
 
 
@@ -77,6 +78,7 @@ class Stage:
         self._exchange = Exchange()
         self._shapes: KeptForEye[Shape] = KeptForEye()
         self._next: _Next | None = None
+        self._beside_frames = 0
 
     def _expect(self, job: RenderJob) -> None:
         """Have the mesh of the next job made by another thread, but for a head mesh."""
@@ -94,10 +96,11 @@ class Stage:
         job, posed = after.job, None if after.posed is None else after.posed.result()
         after.host = self._beside.submit(Prepared.made, job, posed)
         # With one thread, kernels run while they are launched, so nothing is left to build trees beside.
-        if job.region is not None and posed is not None and dr.thread_count() > 1:
+        if job.region is not None and posed is not None and dr.thread_count() > 1 and self._beside_frames < _BESIDE:
             place = self._regions.get(RegionScene.key(job.region, job.globe))
             if place is not None and place.double and not place.shows(job.region, job.globe):
                 after.trees = place.begun(posed)
+                self._beside_frames += 1
 
     def set(
         self, job: RenderJob, *, lit: bool = True, after: RenderJob | None = None
