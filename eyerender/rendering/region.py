@@ -35,7 +35,7 @@ from .values import aligned
 SHEET_COLUMNS = COLUMNS + 1  # of the sheet's grid, because the first column is repeated
 _F0_OIL, _F0_TEARS = 0.035, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
 _ROUGH_OIL, _THINNER = 0.05, 0.15  # roughness of a film of oil at a gloss of 0.5, and how much it grows per gloss below
-_ROUGH_WET = 0.015
+_ROUGH_WET = 0.02
 _WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
 _RIPPLES = ((0.13, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to those 1 mm long on the globe
 
