@@ -64,22 +64,30 @@ def blurred(renderer, job: RenderJob, spp: int) -> tuple[np.ndarray, np.ndarray]
     return blur.of_pictures(parts), parts[:, 0].sum(axis=0)
 
 
-def test_lashes_before_the_eye_are_blurred_by_their_own_depth(renderer, monkeypatch):
+@pytest.fixture
+def matte(renderer, monkeypatch):
+    """A renderer of surfaces that mirror no lamp.
+
+    What wet roots of lashes mirror differs from one place of the lens to another, which is not a matter of depth.
+    """
     import mitsuba as mi
 
     from eyerender.rendering import lighting
     from eyerender.rendering.recorded import forget
     from eyerender.rendering.renderer import Renderer
 
-    # What wet roots mirror differs from one place of the lens to another, which is not a matter of depth.
     monkeypatch.setattr(lighting, "sheen", lambda *_: mi.Float(0))
     forget()
-    renderer = Renderer(renderer.backend)
+    yield Renderer(renderer.backend)
+    forget()
+
+
+def test_lashes_before_the_eye_are_blurred_by_their_own_depth(matte):
     job = headset_job(62.0, (280, 120, 96, 64))
-    ours, sharp = blurred(renderer, job, 16)
-    truth = through_a_lens(renderer, job, 24, 4)
+    ours, sharp = blurred(matte, job, 16)
+    truth = through_a_lens(matte, job, 24, 4)
     m = (len(sharp) - len(ours)) // 2
-    single = defocus.defocused(sharp, Blur.of(job, renderer.bind(job)[1].posed).subject_px)
+    single = defocus.defocused(sharp, Blur.of(job, matte.bind(job)[1].posed).subject_px)
     cut = (len(single) - len(ours)) // 2
     single = single[cut : len(single) - cut, cut : single.shape[1] - cut]
     away, before = (np.sqrt(np.mean((p - truth) ** 2)) / truth.mean() for p in (ours, single))
@@ -88,7 +96,6 @@ def test_lashes_before_the_eye_are_blurred_by_their_own_depth(renderer, monkeypa
     assert away < 0.045
     assert away < 0.7 * before
     assert ours.mean() == pytest.approx(truth.mean(), rel=2e-3)
-    forget()
 
 
 def test_parts_make_up_the_picture(renderer):
@@ -182,14 +189,12 @@ PATCHES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("focus_mm", [50.0, 62.0])
 @pytest.mark.parametrize("name", PATCHES)
-def test_the_width_of_the_blur_against_a_sampled_lens(renderer, name, focus_mm):
-    # The brow's skin has highlights of oil that are finer than a pixel. With too few samples their noise would count
-    # as sharpness of the sharp picture.
+def test_the_width_of_the_blur_against_a_sampled_lens(matte, name, focus_mm):
     x, y, w, h = PATCHES[name]
     border = 16
     job = headset_job(focus_mm, (x - 5, y - 5, w + 10, h + 10))
-    truth = psf.blur(through_a_lens(renderer, job, 64, 256), SIGMA_PX)
-    ours, sharp = blurred(renderer, replace(job, window=(x - border, y - border, w + 2 * border, h + 2 * border)), 1024)
+    truth = psf.blur(through_a_lens(matte, job, 64, 256), SIGMA_PX)
+    ours, sharp = blurred(matte, replace(job, window=(x - border, y - border, w + 2 * border, h + 2 * border)), 1024)
     m = (len(sharp) - len(ours)) // 2
     ours = psf.blur(ours[border - 5 : 5 - border, border - 5 : 5 - border], SIGMA_PX)
     sharp = psf.blur(np.pad(sharp, 5, mode="edge"), SIGMA_PX).astype(float)[m : len(sharp) - m, m : sharp.shape[1] - m]
