@@ -21,11 +21,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 import hard_eyes
 from _bench import Report, Row, options_of, row
-from extraction_tally import MATCH_PX
+from extraction_tally import near
 from eyerender.extraction import FAST, REFINED, Extraction, extract
 from eyerender.geometry.ellipse import iou
 
@@ -84,13 +83,6 @@ class Answers:
         true, seen, reported, hit = np.sum(self.glints, axis=0)
         yield row(f"{name}: glints, recall", seen / max(true, 1), "1")
         yield row(f"{name}: glints, precision", hit / max(reported, 1), "1")
-
-
-def near(places: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of the places (n, 2) have one of the others (m, 2) near."""
-    if not len(others):
-        return np.zeros(len(places), dtype=bool)
-    return np.asarray((np.linalg.norm(places[:, None] - others, axis=2) < MATCH_PX).any(axis=1))
 
 
 def judged(path: Path) -> tuple[Extraction, Extraction] | None:

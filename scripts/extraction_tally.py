@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from eyerender.arrays import Floats
+from eyerender.arrays import Bools, Floats
 from eyerender.extraction import Extraction
 from eyerender.geometry.ellipse import Ellipse, iou
 from make_ideal_images import Drawing
@@ -89,6 +89,12 @@ def compare(tally: Tally, found: Extraction, drawing: Drawing) -> None:
             error = near[0].xy_px - xy
             tally.glint.append((index, float(np.hypot(*error))))
             tally.glint_distance.append(float(error @ np.linalg.solve(near[0].covariance, error)))
+
+
+def near(places: Floats, others: Floats) -> Bools:
+    """Which of the places (n, 2) have one of the others (m, 2) near."""
+    apart = np.linalg.norm(places[:, None] - others.reshape(1, -1, 2), axis=-1)
+    return np.asarray(apart.min(axis=1, initial=np.inf) < MATCH_PX)
 
 
 def _shape_error(ellipse: Ellipse, truth: Ellipse, covariance: Floats) -> tuple[Floats, Floats]:

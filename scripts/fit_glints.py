@@ -27,6 +27,7 @@ from scipy.optimize import minimize
 
 import hard_eyes
 import make_ideal_images as ideal
+from extraction_tally import near
 from eyerender.extraction import ExtractionSettings, extract, pipeline
 from eyerender.extraction.glints import classification
 from eyerender.extraction.glints.classification import LEAST_ODDS, classify_spots, compared, features
@@ -37,7 +38,6 @@ CONDITIONS = (
     "noise2", "noise8", "noise16", "noise2-13px", "blur4", "texture6", "edge-glint", "eight-glints", "lid", "remote",
     "bright-pupil", "jpeg", "grey-pupil", "any-size", "ring-light", "head-mounted",
 )  # fmt: skip
-MATCH_PX = 2.0
 # How much an image counts. Drawn glints before a drawn sclera may be as faint as highlights of skin. A webcam's single
 # lamp is often hidden, and its few pixels are the hardest to judge.
 WEIGHTS = {"webcam": 2.0, "stress": 0.5, "jpeg": 1.0}
@@ -76,14 +76,9 @@ def observe(row: str, face: int, eye: hard_eyes.HardEye) -> Observed | None:
         return None
     _, fit, about, _, large = kept[0]
     fit = fit.taken(np.flatnonzero(fit.converged))
-    true, faint = (_near(fit.xy_px, places) for places in (eye.glints, eye.faint))
+    true, faint = (near(fit.xy_px, places) for places in (eye.glints, eye.faint))
     heights = [one.glint.amplitude for one in large]
     return Observed(row, face, features(fit, about), fit, heights, true, ~faint) if true.size else None
-
-
-def _near(spots: Array, places: Array) -> NDArray[np.bool_]:
-    apart = np.linalg.norm(spots[:, None] - places.reshape(1, -1, 2), axis=-1)
-    return np.asarray(apart.min(axis=1, initial=np.inf) < MATCH_PX)
 
 
 def images(rendered: list[Path]) -> Iterator[tuple[str, int, hard_eyes.HardEye]]:
