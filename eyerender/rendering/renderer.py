@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +13,8 @@ import numpy as np
 from ..arrays import Floats, Singles
 from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from .blur import Blur
-from .film import Exposed, begun, mean_radiance
+from .develop import Darkroom, takes
+from .film import Exposed, Film, begun, mean_radiance
 from .frame import RenderJob
 from .labels import PartLabels, depths_mm, highlights, part_labels
 from .lighting import through_cornea
@@ -23,7 +24,7 @@ from .region import RegionScene
 from .splat import MirrorImages, Shine
 from .stage import Stage
 from .surround import Obstacle, Surround
-from .window import RenderedWindow, Traced
+from .window import Developed, RenderedWindow, Traced
 
 if TYPE_CHECKING:
     from ..backends.choose import Backend
@@ -40,11 +41,22 @@ class Renderer:
         backend: the backend.
         spp: samples per pixel.
         obstacles: bodies in the scene's frame that hide and shade the eye.
+        develop: what computes lens and sensor, "device" where it can (`develop.takes`), or "host", NumPy beside the
+            tracing. None: a GPU is the device, and a processor the host.
     """
 
-    def __init__(self, backend: Backend, *, spp: int = 16, obstacles: Sequence[Obstacle] = ()) -> None:
+    def __init__(
+        self,
+        backend: Backend,
+        *,
+        spp: int = 16,
+        obstacles: Sequence[Obstacle] = (),
+        develop: Literal["device", "host"] | None = None,
+    ) -> None:
         self.backend = backend
         self.spp = spp
+        develop = develop or ("device" if backend.name == "cuda" else "host")
+        self._darkroom = Darkroom() if develop == "device" else None
         self._beside = ThreadPoolExecutor(1, "develop")
         self._stage = Stage(self._beside, obstacles)
 
@@ -82,7 +94,9 @@ class Renderer:
         shots = moments or (job,)
         spp = max(1, (spp or self.spp) // len(shots))
         blur: Blur | None = None
-        pictures, failed = [], 0
+        films: list[Film] = []
+        pictures: list[Singles] = []
+        failed = 0
         glints: list[Shine] = []
         marks: tuple[Any, ...] | None = None
         for shot in shots:
@@ -94,9 +108,12 @@ class Renderer:
             self._stage.prepare()
             mirrored, shines = self._mirror_images(shown.host).seen(place, blur, 1 / len(shots))
             glints += shines
-            picture, missed = film.mean()
-            pictures.append(picture)
-            failed += missed
+            if self._darkroom is not None and takes(job, blur):
+                films.append(film)
+            else:
+                mean, missed = film.mean()
+                pictures.append(mean)
+                failed += missed
             if found is not None:
                 marks = mirrored, *found()
         assert blur is not None
@@ -104,8 +121,12 @@ class Renderer:
             shown, place = self.bind(job, lit=False)
             marks = self._mirror_images(shown.host).seen(place, blur)[0], *_marks(job, shown)()
         mirrored, labels, margins, bright = marks
-        radiance = pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0)
-        return Traced(job, radiance, tuple(glints), blur, mirrored, labels, failed, margins, bright)
+        picture: Singles | Developed
+        if self._darkroom is not None and films:
+            picture, failed = self._darkroom.developed(job, films, glints)
+        else:
+            picture = pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0)
+        return Traced(job, picture, tuple(glints), blur, mirrored, labels, failed, margins, bright)
 
     def _mirror_images(self, host: Prepared) -> MirrorImages:
         """The lamps' mirror images, in the closed form of the cornea or in a mesh of it."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from ..arrays import Floats, Reals, Singles, frozen
+from ..arrays import Floats, Indices, Reals, Singles, frozen
 from .camera import PinholeCamera, Window
 from .sensor import Sensor
 from .stray import border
@@ -18,7 +18,8 @@ from .stray import border
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0
 _STRETCH = 65536  # pixels at a time, so that what is worked on stays in the processor's cache
-_FEW = 12.0  # below this mean the expansion of a Poisson quantile is too inaccurate, and probabilities are summed
+NOISE = 0x5E75  # tells the seeds of noise from others
+FEW = 12.0  # below this mean the expansion of a Poisson quantile is too inaccurate, and probabilities are summed
 
 
 def radiance_to_irradiance(sensor: Sensor) -> float:
@@ -68,6 +69,16 @@ def expose(
     return out
 
 
+def expose_at(
+    sensor: Sensor, irradiance: Reals, wavelength_nm: float, seed: int, corner_px: tuple[int, int], places: Indices
+) -> NDArray[np.uint16]:
+    """The codes (n,) that `expose` gives to some pixels, in the order of the rows; no charge may spill."""
+    noise = _Noise.of(sensor, seed, corner_px, irradiance.shape).at(places) if sensor.noise else None
+    scale = electrons(sensor, np.ones(()), wavelength_nm)
+    mean = np.multiply(irradiance.ravel()[places], scale, dtype=np.float32, casting="same_kind")
+    return np.asarray(_codes(sensor, mean, noise), np.uint16)
+
+
 @dataclass(frozen=True, slots=True)
 class _Noise:
     """Noise of a window: 16 bits for the shot noise and for the read noise of each pixel (2, h, w), and what is fixed.
@@ -80,9 +91,9 @@ class _Noise:
     offset: Singles | None
 
     @classmethod
-    def of(cls, sensor: Sensor, seed: int, corner_px: tuple[int, int], shape: tuple[int, int]) -> _Noise:
+    def of(cls, sensor: Sensor, seed: int, corner_px: tuple[int, int], shape: tuple[int, ...]) -> _Noise:
         """Draw the noise of a window."""
-        bits = _bits((0x5E75, seed), 2 * shape[0] * shape[1]).reshape(2, *shape)
+        bits = _bits((NOISE, seed), 2 * shape[0] * shape[1]).reshape(2, *shape)
         sensitivity = offset = None
         if sensor.prnu > 0:
             sensitivity = np.maximum(1 + sensor.prnu * pattern(sensor.pattern_seed, 0, corner_px, shape), 0)
@@ -93,10 +104,20 @@ class _Noise:
             offset = np.broadcast_to(columns, shape) if offset is None else offset + columns
         return cls(bits, sensitivity, offset)
 
+    def at(self, places: Indices) -> _Noise:
+        """The noise of some pixels, in the order of the rows; (2, n) and (n,)."""
+        fixed = (None if v is None else v.ravel()[places] for v in (self.sensitivity, self.offset))
+        return _Noise(self.bits.reshape(2, -1)[:, places], *fixed)
+
     def of_rows(self, rows: slice) -> _Noise:
         """The noise of some rows."""
         fixed = (None if v is None else v[rows] for v in (self.sensitivity, self.offset))
         return _Noise(self.bits[:, rows], *fixed)
+
+
+def most_electrons(sensor: Sensor) -> float:
+    """Mean beyond which a pixel is clipped whatever its noise; none where its charge may spill."""
+    return float("inf") if sensor.blooming > 0 else 4 * sensor.full_well_e + 1e4
 
 
 def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> Reals:
@@ -107,12 +128,10 @@ def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> Reals:
         if noise.sensitivity is not None:
             mean *= noise.sensitivity
         sigmas = 1.0, sensor.read_noise_e
-        shot, read = (_normals(s).take(bits, mode="clip") for s, bits in zip(sigmas, noise.bits, strict=True))
+        shot, read = (normals(s).take(bits, mode="clip") for s, bits in zip(sigmas, noise.bits, strict=True))
         if noise.offset is not None:
             read += noise.offset
-        # Above a few wells a pixel is clipped whatever its noise, but its charge may spill.
-        most = np.inf if sensor.blooming > 0 else 4 * sensor.full_well_e + 1e4
-        charge = photon_counts(np.minimum(mean, most, out=mean), shot)
+        charge = photon_counts(np.minimum(mean, most_electrons(sensor), out=mean), shot)
     dn = bloomed(charge, sensor.full_well_e, sensor.blooming, sensor.blooming_along)
     dn += read
     dn *= sensor.gain
@@ -128,7 +147,11 @@ def recorded(
     sensor: Sensor, camera: PinholeCamera, window: Window, irradiance: Reals, wavelength_nm: float, seed: int
 ) -> NDArray[np.uint16]:
     """Stored codes (h, w) of a window of a camera's sensor, with the sensor's border; see `expose`."""
-    codes = expose(sensor, irradiance, wavelength_nm, seed, window[:2])
+    return bordered(sensor, camera, window, expose(sensor, irradiance, wavelength_nm, seed, window[:2]))
+
+
+def bordered(sensor: Sensor, camera: PinholeCamera, window: Window, codes: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Codes (h, w) of a window, in which those of the sensor's border are replaced."""
     if any(sensor.border_px):
         codes[border(sensor, camera, window)] = round(sensor.border_dn)
     return codes
@@ -141,7 +164,7 @@ def _bits(seed: tuple[int, ...], count: int) -> NDArray[np.uint16]:
 
 
 @lru_cache(maxsize=8)
-def _normals(sigma: float = 1.0) -> Singles:
+def normals(sigma: float = 1.0) -> Singles:
     """Normal numbers (65536,), each the mean over its share of the distribution: 16 bits choose one.
 
     Their variance is that of `sigma` to 3e-6, and the farthest is 4.35 sigma, which one pixel in 30,000 has.
@@ -158,14 +181,19 @@ def pattern(seed: int, which: int, corner_px: tuple[int, int], shape: tuple[int,
     The bits below are those of SplitMix64 (Steele, Lea, Flood 2014), which maps counters to numbers.
     """
     x, y = (np.arange(n, dtype=np.int64) + start for n, start in zip(shape[::-1], corner_px, strict=True))
-    start = np.random.SeedSequence([0xF1C5, seed, which]).generate_state(1, np.uint64)[0]
+    start = pattern_start(seed, which)
     with np.errstate(over="ignore"):
         z = (x.astype(np.uint64)[None, :] | (y.astype(np.uint64)[:, None] << np.uint64(32))) + start
         z = z * np.uint64(0x9E3779B97F4A7C15)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     z ^= z >> np.uint64(31)
-    return frozen(_normals().take((z >> np.uint64(48)).astype(np.uint16)), np.float32)
+    return frozen(normals().take((z >> np.uint64(48)).astype(np.uint16)), np.float32)
+
+
+def pattern_start(seed: int, which: int) -> np.uint64:
+    """Where the counter of a fixed pattern starts."""
+    return np.uint64(np.random.SeedSequence([0xF1C5, seed, which]).generate_state(1, np.uint64)[0])
 
 
 def bloomed(charge: Reals, full_well: float, share: float, along: str = "columns") -> Reals:
@@ -197,8 +225,8 @@ def photon_counts(mean: Reals, normal: Reals) -> Reals:
     The quantile is the normal asymptotic expansion of the Poisson distribution's inverse (Giles 2016, Algorithm 955,
     ACM TOMS 42:7). Where few electrons are expected, probabilities are summed instead.
     """
-    dark = bool(np.min(mean, initial=_FEW) < _FEW)
-    root = np.maximum(mean, _FEW) if dark else mean
+    dark = bool(np.min(mean, initial=FEW) < FEW)
+    root = np.maximum(mean, FEW) if dark else mean
     root = np.sqrt(root, out=root if dark else None)
     inverse, w2 = np.reciprocal(root), normal * normal
     # In powers of 1/root: mean + w root + (2 + w2)/6 - w (2 + w2)/(72 root) + (w2 (7 + 3 w2) - 16)/(810 root^2).
@@ -219,7 +247,7 @@ def photon_counts(mean: Reals, normal: Reals) -> Reals:
     count += mean
     np.floor(count, out=count)
     if dark:
-        few = np.flatnonzero(mean < _FEW)
+        few = np.flatnonzero(mean < FEW)
         count.flat[few] = 0
         few = few[mean.flat[few] > 0]  # large parts of an image may be dark
         count.flat[few] = _few_counts(mean.flat[few], special.ndtr(normal.flat[few]))
@@ -233,7 +261,7 @@ def _few_counts(mean: Reals, probability: Reals) -> Reals:
     reached = term.copy()
     k = 0
     left = np.flatnonzero(probability > reached)
-    while left.size and k < 10 * _FEW:  # rounding can keep the sum below 1
+    while left.size and k < 10 * FEW:  # rounding can keep the sum below 1
         k += 1
         count[left] = k
         term[left] *= mean[left] / k

@@ -91,17 +91,29 @@ def ghost(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> 
 def veil(picture: Reals, radius_px: float) -> Reals:
     """The picture (h, w) convolved with the glare's kernel, continued by its mirror image."""
     # Products of matrices find the long waves that a wide glare leaves in less time than a fast transform takes.
-    share = _FADED / (np.pi * radius_px)
-    if share < _FEW:
-        down, across = (_cosines(n, int(share * n) + 1, picture.dtype) for n in picture.shape)
+    if is_wide(radius_px):
+        down, across, damping = long_waves(picture.shape, radius_px, picture.dtype)
         waves = _product(_product(down, picture), across.T)
-        waves *= _damping(picture.shape, waves.shape, radius_px)
+        waves *= damping
         spread = down.T @ (waves @ across)
     else:
         waves = fft.dctn(picture, type=2)
         waves *= _damping(picture.shape, waves.shape, radius_px)
         spread = fft.idctn(waves, type=2, overwrite_x=True)
     return np.asarray(np.maximum(spread, 0, out=spread))
+
+
+def is_wide(radius_px: float) -> bool:
+    """Whether a glare leaves few waves of a picture."""
+    return _FADED / (np.pi * radius_px) < _FEW
+
+
+def long_waves(shape: tuple[int, ...], radius_px: float, dtype: np.dtype[Any]) -> tuple[Reals, Reals, Singles]:
+    """The waves that a wide glare leaves of a picture (h, w): down (m, h), across (n, w), and their factors (m, n)."""
+    share = _FADED / (np.pi * radius_px)
+    counts = tuple(int(share * n) + 1 for n in shape)
+    down, across = (_cosines(n, count, dtype) for n, count in zip(shape, counts, strict=True))
+    return down, across, _damping(shape, counts, radius_px)
 
 
 def _product(a: Reals, b: Reals) -> Reals:

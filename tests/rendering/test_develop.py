@@ -1,0 +1,73 @@
+"""Pictures that the device develops: codes with NumPy's bits, and irradiance that differs in the last digits alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eyerender.rig import exposure
+from eyerender.rig.imaging import Lens, Opening
+from eyerender.rig.sensor import Sensor
+from tests.support.render_rigs import eye_of, head_rig, job_of
+
+pytestmark = pytest.mark.render
+
+SENSORS = [
+    Sensor(),
+    Sensor(bit_depth=8, read_noise_e=6, full_well_e=1500.0, prnu=0.02, dsnu_e=4.0, column_e=2.0, pattern_seed=5),
+    Sensor(bit_depth=10, full_well_e=30000.0, gain_dn_per_e=0.05, black_level_dn=0.0, column_e=3.0),
+    Sensor(bit_depth=12, prnu=0.01, dsnu_e=1.0, pattern_seed=2**62),
+    Sensor(bit_depth=12, noise=False),
+]
+FRAMED = Lens(
+    vignetting=0.4,
+    glare=0.07,
+    openings=(Opening(half_size=(0.5, 0.4), radiance_w_m2_sr=2.0), Opening(centre=(0.1, 0.1), power=4.0)),
+)
+
+
+@pytest.mark.parametrize("window", [(0, 0, 61, 37), (-3, 1021, 64, 48)])
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_the_device_counts_as_numpy_does(renderer, sensor, window):
+    import mitsuba as mi
+
+    from eyerender.rendering.counts import LEFT, Counter, completed
+
+    counter, shape = Counter(), window[3:1:-1]
+    for seed in (7, 2**64 - 1, 12):
+        draw = np.random.default_rng(seed)
+        # From darkness to several full wells, and pixels without light.
+        mean = np.exp(draw.uniform(np.log(0.1), np.log(6 * sensor.full_well_e), shape))
+        mean[draw.random(shape) < 0.05] = 0
+        irradiance = (mean / exposure.electrons(sensor, np.ones(()), 850.0)).astype(np.float32)
+        codes = counter.codes(sensor, window, mi.Float(irradiance.ravel()), 850.0, seed).numpy().reshape(shape)
+        assert np.mean(codes == LEFT) < (0.6 if sensor.noise else 1e-9)
+        expected = exposure.expose(sensor, irradiance, 850.0, seed, window[:2])
+        assert np.array_equal(completed(codes, sensor, window, irradiance, 850.0, seed), expected)
+
+
+@pytest.mark.parametrize(
+    ("lens", "sensor"),
+    [
+        (Lens(), Sensor(psf_sigma_px=0.0, noise=False)),
+        (FRAMED, Sensor(psf_sigma_px=1.5, prnu=0.01, border_px=(3, 0, 2, 5), border_dn=9)),
+        (Lens(glare=0.05), Sensor(blooming=0.5, gamma=2.2)),
+    ],
+)
+def test_the_device_develops_what_numpy_does(renderer, lens, sensor):
+    from eyerender.rendering.renderer import Renderer
+
+    device = Renderer(renderer.backend, spp=4, develop="device")
+    rig = head_rig(count=2)
+    job = replace(job_of(eye_of("E2"), rig, rig.window(90, 71), (5.0, 3.0)), lens=lens, sensor=sensor)
+    moments = (replace(job, seed=1, labels=False), job)
+    for shots in ((), moments, ()):  # once more, because functions are recorded when they are called again
+        one, other = (r.render(job, spp=4, moments=shots) for r in (renderer, device))
+        # NumPy takes a bright rim away from single numbers and adds it again, which costs it the last digits.
+        assert np.max(np.abs(other.irradiance - one.irradiance)) < 5e-6 * one.irradiance.max()
+        expected = exposure.recorded(sensor, job.camera, job.window, other.irradiance, job.wavelength_nm, job.seed)
+        assert np.array_equal(other.dn, expected)
+        for name in ("labels", "glints", "failed_paths"):
+            assert getattr(other, name) == getattr(one, name)
